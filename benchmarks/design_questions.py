@@ -48,8 +48,7 @@ def goals(family, draws: int) -> None:
             show(family, f"goals.{name}.{limit}", goal=goal, limit=limit)
     usual = hj.multisine(periods=16)
     peaks = design.Limits(rms={"u": 0.01}, peak={"u": 0.02})
-    plan = show(family, "goals.peak", usual, limit=peaks)
-    family.show("goals.peak.price", plan.for_peaks)
+    show(family, "goals.peak", usual, limit=peaks)
 
 
 def show(family, name: str, *design, **about):

@@ -150,13 +150,14 @@ def test_intervals_are_those_of_the_normal_distribution(model):
 
 def test_recordings(recording):
     page = shown(recording)
-    assert {"<i>", "1 <hit>", "100 Hz", "vM (m/s)"} <= set(page.texts) and page.pictures == 3
+    assert "vM (m/s)" in page.texts and page.pictures == 3
+    assert any("(100 Hz; " in x and "1 <hit>" in x for x in page.texts)
     apex = hj.Crossing("vM", "falling")
     data = hj.recordings.section_data(
         recording, apex, inputs="<u>", outputs=("yM & co", "vM"), n_sections=8
     )
     page = shown(data)
-    assert {"<u>", "rms deviation"} <= set(page.texts) and page.pictures == 3
+    assert any("rms deviations: <u> " in x for x in page.texts) and page.pictures == 3
 
 
 def test_what_jax_traces_has_no_page(hopper_cycle, placed_kinematic, kinematic_ldtp):

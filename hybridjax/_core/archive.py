@@ -111,7 +111,7 @@ def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray
     return static, arrays
 
 
-def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> eqx.Module:
+def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """The module that `taken_apart` took apart. Fields that are not there are `None`, or have
     their defaults where they are static."""
     other = ValueError(f"its fields are not those of {kind.__name__}")

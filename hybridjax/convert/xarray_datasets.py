@@ -1,4 +1,4 @@
-"""Results as `xarray.Dataset`, and back.
+"""Results as `xarray.Dataset`, and back where `hj.save` writes them.
 
 Axes of arrays have names in the annotations of fields; these become dimensions. Names of signals
 and numbers of harmonics become their coordinates. All other fields are JSON in an attribute.
@@ -7,7 +7,6 @@ and numbers of harmonics become their coordinates. All other fields are JSON in 
 import json
 import types
 import typing
-from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +20,6 @@ from .._core.executor import is_traced
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError, HybridJaxError
-from ..experiments.record import Record
 from ..io import KINDS, Saved
 from ..linear.ldtp import LDTP
 from ..orbits.branch import Branch
@@ -79,30 +77,34 @@ def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> 
 
 
 @checked
-def from_xarray(dataset: Any) -> Saved | Recording | SectionData:
+def from_xarray(dataset: Any) -> Saved:
     """Return the object of which `to_xarray` made a dataset, bit by bit: one of those that
-    `hj.save` writes, a `Recording`, or `SectionData`. Harmonics, frequencies, experiments, samples
-    and signals may have been selected, and records of `SectionData`.
-
-    There is no way back to `LimitCycles` and a `Branch`: their systems hold functions, which a
-    dataset cannot hold. `find_limit_cycles` and `continuation` find the cycles again from the
-    parameters.
+    `hj.save` writes. Harmonics, frequencies, experiments, samples and signals may have been
+    selected.
 
     **Raises:** `DefinitionError` for other datasets; `PrecisionError` in single precision.
     """
     require_x64()
-    readers = dict.fromkeys(KINDS, _to_module)
-    readers |= {"Recording": _to_recording, "SectionData": _to_section_data}
     try:
         header = json.loads(dataset.attrs[_HEADER])
-        read = readers[header["kind"]]
+        kind = KINDS[header["kind"]]
     except (AttributeError, KeyError, TypeError, ValueError):
         raise DefinitionError(
-            "`dataset` must be an xarray.Dataset that `to_xarray` made of a "
-            f"{', '.join(KINDS)}, Recording or SectionData."
+            f"`dataset` must be an xarray.Dataset that `to_xarray` made of a {', '.join(KINDS)}."
         ) from None
+    static = restored(header["static"], header["units"])
     try:
-        return read(dataset, header)
+        for dimension, field in _COORDINATES.items():
+            if dimension in dataset.coords:
+                static[field] = tuple(x.item() for x in dataset[dimension].values)
+            if f"{dimension}_unit" in dataset.coords:
+                units = dataset[f"{dimension}_unit"].values
+                static[field] = tuple(map(Signal, static[field], map(str, units)))
+        arrays = {
+            str(name): np.asarray(dataset[name].transpose(*_axes(kind, str(name))).values)
+            for name in {*dataset.data_vars, *({"f"} & set(dataset.coords))}
+        }
+        return put_together(kind, static, arrays)
     except (HybridJaxError, IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise DefinitionError(f"the dataset is no {header['kind']}: {error}") from error
 
@@ -120,22 +122,8 @@ def _from_module(module: eqx.Module) -> Any:
     coordinates |= {name: variables.pop(name) for name in {"f"} & set(variables)}
     units = {str(name): name.unit for name in signals_in(static)}
     header = {"kind": type(module).__name__, "static": static, "units": units}
-    return _dataset(variables, coordinates, header)
-
-
-def _to_module(dataset: Any, header: Mapping[str, Any]) -> Any:
-    kind, static = KINDS[header["kind"]], restored(header["static"], header["units"])
-    for dimension, field in _COORDINATES.items():
-        if dimension in dataset.coords:
-            static[field] = tuple(x.item() for x in dataset[dimension].values)
-        if f"{dimension}_unit" in dataset.coords:
-            units = dataset[f"{dimension}_unit"].values
-            static[field] = tuple(map(Signal, static[field], map(str, units)))
-    arrays = {
-        str(name): np.asarray(dataset[name].transpose(*_axes(kind, str(name))).values)
-        for name in {*dataset.data_vars, *({"f"} & set(dataset.coords))}
-    }
-    return put_together(kind, static, arrays)
+    text = json.dumps(header, default=lambda x: x.item())
+    return package("xarray").Dataset(variables, coordinates, {_HEADER: text})
 
 
 def _axes(kind: type, name: str) -> tuple[str, ...]:
@@ -174,34 +162,7 @@ def _from_recording(recording: Recording) -> Any:
         "event_time": ("occurrence", np.array([x for *_, x in events], float), {"units": "s"}),
         "event_trial": ("occurrence", np.array([s for s, *_ in events], int)),
     }
-    header = {
-        "kind": "Recording",
-        "trials": [{"name": t.name, "events": list(t.events)} for t in trials],
-        "notes": recording.notes,
-    }
-    return _dataset(variables, coordinates, header)
-
-
-def _to_recording(dataset: Any, header: Mapping[str, Any]) -> Recording:
-    trials = []
-    names = [str(x) for x in dataset.data_vars if x != "event"]
-    units = {name: _unit(dataset, name) for name in names if _unit(dataset, name)}
-    for s in np.unique(dataset["trial"].values):
-        about, samples = header["trials"][s], dataset["trial"].values == s
-        occurrences = dataset["event_trial"].values == s
-        trial = Recording(
-            dataset["time"].values[samples],
-            {name: dataset[name].values[samples] for name in names},
-            events={
-                name: dataset["event_time"].values[occurrences & (dataset["event"].values == name)]
-                for name in about["events"]
-            },
-            units=units,
-            name=about["name"],
-            notes=header["notes"],
-        )
-        trials.append(trial)
-    return Recording.join(trials)
+    return package("xarray").Dataset(variables, coordinates)
 
 
 def _from_section_data(data: SectionData) -> Any:
@@ -220,36 +181,8 @@ def _from_section_data(data: SectionData) -> Any:
         "phase": np.arange(N) / N,
         "signal": list(map(str, data.signals)),
     }
-    header = {
-        "kind": "SectionData",
-        "inputs": list(map(str, data.inputs)),
-        "spikes": data.spikes,
-        "records": [{"drift": r.drift, "lead": r.lead} for r in records],
-    }
     attributes = {"n_sections": N, "period": data.period, "bandwidth": data.bandwidth}
-    return _dataset(variables, coordinates, header).assign_attrs(attributes)
-
-
-def _to_section_data(dataset: Any, header: Mapping[str, Any]) -> SectionData:
-    records, times, trials = [], [], []
-    signals = [str(x) for x in dataset["signal"].values]
-    names = [Signal(name, _unit(dataset, name)) for name in signals]
-    values = np.stack([dataset[name].values for name in signals], axis=1)
-    nu, N = len(header["inputs"]), int(dataset.attrs["n_sections"])
-    about: Any = {"n_sections": N, "inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
-    for k in np.unique(dataset["record"].values):
-        samples = dataset["record"].values == k
-        about["first_section"] = int(dataset["section"].values[samples][0])
-        u, y = values[samples, :nu], values[samples, nu:]
-        records.append(Record(u, y, **about, **header["records"][k]))
-        times.append(dataset["time"].values[samples])
-        trials.append(int(dataset["trial"].values[samples][0]))
-    cycle = dataset["average_cycle"].transpose("phase", "signal").values
-    return SectionData(
-        tuple(records), tuple(times), tuple(trials), cycle[:, :nu], cycle[:, nu:],
-        float(dataset.attrs["period"]), float(dataset.attrs["bandwidth"]),
-        tuple(header["spikes"]),
-    )  # fmt: skip
+    return package("xarray").Dataset(variables, coordinates, attributes)
 
 
 def _from_limit_cycles(cycles: LimitCycles, dimension: str) -> Any:
@@ -283,11 +216,6 @@ def _from_branch(branch: Branch) -> Any:
     )
 
 
-def _dataset(variables: Mapping, coordinates: Mapping, header: Mapping[str, Any]) -> Any:
-    text = json.dumps(header, default=lambda x: x.item())
-    return package("xarray").Dataset(variables, coordinates, {_HEADER: text})
-
-
 def _signals(data: Recording | SectionData, values: np.ndarray) -> dict[str, Any]:
     """Return a variable for each signal, along the samples.
 
@@ -304,7 +232,3 @@ def _signals(data: Recording | SectionData, values: np.ndarray) -> dict[str, Any
 
 def _variable(dimension: str, values: np.ndarray, unit: str | None) -> tuple:
     return dimension, values, {"units": unit} if unit else {}
-
-
-def _unit(dataset: Any, name: str) -> str:
-    return dataset[name].attrs.get("units", "")

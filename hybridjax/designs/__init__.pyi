@@ -2,7 +2,6 @@ from .candidates import draws as draws
 from .distortion import Distortion as Distortion
 from .goals import (
     FrequencyResponse as FrequencyResponse,
-    ImpulseResponse as ImpulseResponse,
     Multipliers as Multipliers,
     Parameters as Parameters,
 )

@@ -16,12 +16,12 @@ limits $\Psi(q) \ge \Psi(p) / e$ with $e = \max_q \sum_k q_k s_k / \sum_k p_k s_
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy.optimize import linprog
 
 from ..experiments.design.design import Design
 from ..experiments.design.partition import line_class
-from .candidates import Candidates, Powers
+from .candidates import Candidates, Kept, Powers
 from .criterion import Bound, Criterion
 from .limits import PowerLimits
 
@@ -31,7 +31,7 @@ from .limits import PowerLimits
 _FLOOR = 1e-9
 # Excess of the certificate at which powers are accepted. Larger: more strides than necessary (by a
 # tenth of it, typically). Smaller: many more steps for a gain that no experiment shows.
-_ENOUGH = 0.02
+ENOUGH = 0.02
 # Largest number of steps. Fewer: several limits end with a certificate above 1.02.
 _MAX_STEPS = 300
 # Steps between two certificates, and of the iteration for the prices of several limits. Fewer of
@@ -40,14 +40,11 @@ _CHECK, _PRICES = 5, 8
 # Factor by which the length of steps (the multiple of their logarithm) grows; it is halved where a
 # step raises the criterion. Larger: more steps in vain. Smaller: more steps.
 _LONGER = 1.15
-# The smallest multiple. (The criterion falls for sure at 1, but for the worst of several models and
-# the choice of an order, which the sum only approximates.) Larger: these stop too early.
-_SHORTEST = 1 / 16
-# Relative rise of the criterion that counts as rounding, or as that of weak cosines on their
-# floor. Larger: steps that are too long for the worst of several models are accepted.
-_RISE = 1e-6
 # Sweeps by which experiments are brought to the same power. Fewer: they differ by more than 1e-6.
 _SWEEPS = 100
+# Part of the total gain that is left out with weak cosines. Larger: lines are lost whose absence
+# distortion of strong ones reveals. Smaller: lines without effect occupy experiments.
+_NEGLIGIBLE = 1e-4
 # Remaining share of a cosine in an experiment, relative to its largest share, that is dropped.
 # Larger: experiments differ in power. Smaller: cosines without effect occupy experiments.
 _WEAK = 1e-4
@@ -94,9 +91,7 @@ class Allocation(NamedTuple):
     certificate: Certificate
 
 
-def allocate(
-    criterion: Criterion, limits: PowerLimits, start: Powers, max_steps: int = _MAX_STEPS
-) -> Allocation:
+def allocate(criterion: Criterion, limits: PowerLimits, start: Powers) -> Allocation:
     """Return the best powers within limits, starting from others.
 
     **Raises:** `DefinitionError` as `Criterion.bound`.
@@ -105,27 +100,22 @@ def allocate(
     def floored(power: Powers) -> Powers:
         return limits.scaled(np.maximum(power, _FLOOR * power.max()))
 
-    def step_towards(target: Powers, length: float) -> tuple[Powers, Bound]:
-        trial = floored(limits.scaled(power * (floored(target) / power) ** length))
-        return trial, criterion.bound(trial)
-
     power = floored(start)
     shares = len(limits.use(power))
     prices, length = np.full(shares, 1 / shares), _LONGER
     now = criterion.bound(power)
-    for step in range(max_steps + 1):
-        if step % _CHECK == 0 or step == max_steps:
+    for step in range(_MAX_STEPS + 1):
+        if step % _CHECK == 0:
             certificate = certify(now, power, limits)
-            if certificate.excess <= 1 + _ENOUGH or step == max_steps:
+            if certificate.excess <= 1 + ENOUGH:
                 break
         target, prices = _cheapest(power * np.sqrt(now.sensitivity), limits.tangent(power), prices)
-        trial, bound = step_towards(target, length)
-        if bound.criterion > now.criterion:
-            shortest = 1.0 if length > 1 else _SHORTEST
-            length = max(length / 2, shortest)
-            trial, bound = step_towards(target, 1.0 if shortest == 1 else length)
-        if bound.criterion <= now.criterion * (1 + _RISE):
+        trial = floored(limits.scaled(power * (floored(target) / power) ** length))
+        bound = criterion.bound(trial)
+        if bound.criterion <= now.criterion:
             power, now, length = trial, bound, length * _LONGER
+        else:
+            length = 1.0 if length > 1 else length / 2
     return Allocation(power, now, certificate)
 
 
@@ -141,93 +131,59 @@ def _cheapest(
     return limits.scaled(power), prices
 
 
-def worthwhile(
-    cosines: Candidates, gain: Powers, experiments: int, negligible: float
-) -> Bool[np.ndarray, " K"]:
+def worthwhile(cosines: Candidates, gain: Powers, experiments: int) -> Kept:
     """Return the cosines that matter, and that so many experiments can hold: of each class of lines
     that interfere with each other the best ones.
 
-    **Arguments:** `gain` of each; `negligible`: the part of the total gain that is left out.
+    **Arguments:** `gain` of each.
     """
     order = np.argsort(gain)
     kept = np.empty(len(gain), bool)
-    kept[order] = np.cumsum(gain[order]) > negligible * gain.sum()
+    kept[order] = np.cumsum(gain[order]) > _NEGLIGIBLE * gain.sum()
     classes = line_class(cosines.line, cosines.periods)
     for number in np.unique(classes):
         members = np.flatnonzero(kept & (classes == number))
         weakest = members[np.argsort(gain[members])]
         kept[weakest[: max(len(members) - experiments, 0)]] = False
-    return kept
-
-
-def occurrences(
-    cosines: Candidates, use: Powers, need: Powers, experiments: int
-) -> Int[np.ndarray, " K"]:
-    """Return the number of experiments that hold each cosine. No two of one class share an
-    experiment, and all experiments are used: strong cosines occur in several.
-
-    **Arguments:** `use`: the share of the limits that each takes; `need`: the number that each
-    needs for its largest amplitude. Where a class needs more than there are, strong ones get fewer:
-    numerators need all lines.
-    """
-    classes = line_class(cosines.line, cosines.periods)
-    counts = np.maximum(np.ceil(need - _WEAK), 1).astype(int)
-    for number in np.unique(classes):
-        members = np.flatnonzero(classes == number)
-        count = counts[members]
-        while count.sum() > experiments:
-            count[np.argmax(np.where(count > 1, count - need[members], -np.inf))] -= 1
-        while count.sum() < experiments:
-            count[np.argmax(use[members] / count)] += 1
-        counts[members] = count
-    return counts
+    return np.flatnonzero(kept)
 
 
 def to_design(
     cosines: Candidates,
     power: Powers,
     use: Powers,
-    counts: Int[np.ndarray, " K"],
-    largest: Powers,
     experiments: int,
     usual: Design,
     seed: int,
 ) -> Design:
     """Return experiments in which each cosine has this power on the average, and which all take the
-    same share of the limits.
+    same share of the limits. Strong cosines occur in several experiments, weak ones in one.
 
-    **Arguments:** `use` and `counts`: as in `occurrences`; `largest`: the amplitude that no cosine
-    exceeds in an experiment.
+    **Arguments:** `use`: the share of the limits that each cosine takes.
     """
     rng = np.random.default_rng(seed)
-    # Part of its power that a cosine may have in one experiment.
-    most = largest**2 / (2 * experiments * power)
-    classes = line_class(cosines.line, cosines.periods)
     share = np.zeros((len(power), experiments))
+    classes = line_class(cosines.line, cosines.periods)
     for number in np.unique(classes):
         members = np.flatnonzero(classes == number)
-        order = rng.permutation(experiments)[: counts[members].sum()]
-        share[np.repeat(members, counts[members]), order] = 1.0
-    share *= (use / counts)[:, None]
-    even = share
+        count = np.ones(len(members), int)
+        while count.sum() < experiments:
+            count[np.argmax(use[members] / count)] += 1
+        place = np.repeat(np.arange(len(members)), count), rng.permutation(experiments)
+        share[members[place[0]], place[1]] = (use[members] / count)[place[0]]
     for _ in range(_SWEEPS):
-        share = share * (use.sum() / experiments / share.sum(axis=0))
+        share *= use.sum() / experiments / share.sum(axis=0)
         share *= (use / share.sum(axis=1))[:, None]
-    # As far from even shares as the largest amplitudes allow.
-    room, more = (use * most)[:, None] - even, share - even
-    part = np.min(np.divide(room, more, out=np.full(even.shape, np.inf), where=more > 0), axis=1)
-    share = even + np.clip(part, 0, 1)[:, None] * more
     share[share < _WEAK * share.max(axis=1, keepdims=True)] = 0.0
     member, experiment = np.nonzero(share)
     order = np.lexsort((cosines.channel[member], cosines.line[member], experiment))
     member, experiment = member[order], experiment[order]
     part = share[member, experiment] / share.sum(axis=1)[member]
-    amplitude = np.sqrt(2 * experiments * power[member] * part)
     return Design(
         experiment=experiment,
         line=cosines.line[member],
         channel=cosines.channel[member],
-        amplitude=np.minimum(amplitude, largest[member]),
+        amplitude=np.sqrt(2 * experiments * power[member] * part),
         phase=rng.uniform(0, 2 * np.pi, len(member)),
         n_sections=cosines.n_sections,
         periods=cosines.periods,

@@ -1,6 +1,5 @@
 """The cosines among which power is divided: the signals that they cause, and their measurement."""
 
-import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
@@ -9,12 +8,10 @@ from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive, Seed
-from .._core.text import listed
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.partition import is_half_integer
 from ..identify.joint.fit import LDTPFit
-from ..identify.joint.noise import noise_spectrum
 from ..identify.multipliers import StructuredFit
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
@@ -27,7 +24,7 @@ Kept = Int[np.ndarray, " k"]
 """Indices of the cosines that remain, in ascending order."""
 Squares = dict[str, Powers]
 """Mean square of each signal, by name, per unit of each cosine's power."""
-NoiseLike = Mapping[str, Positive | Callable[[np.ndarray], np.ndarray]] | LDTP | LDTPFit
+NoiseLike = Mapping[str, Positive | Callable[[np.ndarray], np.ndarray]]
 
 # Default noise, relative to the rms of the output in the usual design: 20 dB. It scales all
 # standard errors; the optimal powers depend only on the ratios of the outputs.
@@ -97,8 +94,7 @@ class Candidates(NamedTuple):
 
     def power_of(self, design: Design) -> Powers:
         """Return the mean square of each cosine over all experiments of a design."""
-        square = np.asarray(design.amplitude) ** 2 / 2
-        return np.bincount(self.places(design), square, len(self.line)) / design.experiments
+        return self.powers_in(design).mean(axis=0)
 
 
 def rate_of(name: str) -> str:
@@ -106,34 +102,17 @@ def rate_of(name: str) -> str:
 
 
 def mean_squares(model: Model, cosines: Candidates) -> Squares:
-    """Return the mean squares of inputs, outputs, rates of inputs, and states.
+    """Return the mean squares of inputs, outputs, and rates of inputs.
 
     The rate is the change from one section to the next: a cosine of f changes by
-    $2 \\sin(\\pi f / N)$ times its amplitude. States are those whose names no output has; at a
-    section without a state its deviation is zero.
+    $2 \\sin(\\pi f / N)$ times its amplitude.
     """
     inputs = {n: (cosines.channel == i).astype(float) for i, n in enumerate(model.inputs)}
     change = 4 * np.sin(np.pi * cosines.f / cosines.n_sections) ** 2
     rates = {rate_of(name): square * change for name, square in inputs.items()}
-    squares = {**inputs, **_responses(model, cosines), **rates}
-    if isinstance(model, LDTP) and model.coordinates is not None:
-        states = sorted({x for names in model.coordinates for x in names} - set(model.outputs))
-        C = np.zeros((model.n_sections, len(states), model.A.shape[-1]))
-        for n, names in enumerate(model.coordinates):
-            for k, name in enumerate(names):
-                if name in states:
-                    C[n, states.index(name), k] = 1.0
-        if states:
-            dims = np.asarray(model.dims)
-            shown = LDTP(model.A, model.B, C, dims=dims, inputs=model.inputs, outputs=states)
-            squares |= _responses(shown, cosines)
-    return squares
-
-
-def _responses(model: Model, cosines: Candidates) -> Squares:
-    H = np.asarray(model.htf(cosines.f).H)
-    squares = (np.abs(H) ** 2).sum(axis=0)[np.arange(len(cosines.f)), :, cosines.channel]
-    return dict(zip(model.outputs, squares.T, strict=True))
+    H = np.asarray(model.htf(cosines.f).H)[:, np.arange(len(cosines.f)), :, cosines.channel]
+    outputs = dict(zip(model.outputs, (np.abs(H) ** 2).sum(axis=1).T, strict=True))
+    return {**inputs, **outputs, **rates}
 
 
 def rms_of(squares: list[Squares], names: list[str], power: Powers) -> dict[str, float]:
@@ -158,17 +137,6 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
     **Raises:** `DefinitionError` for outputs that do not exist, and spectra that are not positive.
     """
     outputs, N = model.outputs, model.n_sections
-    if isinstance(noise, LDTP | LDTPFit):
-        if noise.n_sections != N or any(name not in outputs for name in noise.outputs):
-            raise DefinitionError(
-                f"`noise` has {noise.n_sections} sections and the outputs {listed(noise.outputs)}, "
-                f"the model {N} and {listed(outputs)}."
-            )
-        if isinstance(noise, LDTPFit):
-            spectrum = noise.noise_spectrum
-        else:
-            spectrum = functools.partial(noise_spectrum, noise)
-        return Noise(np.array([outputs.index(name) for name in noise.outputs]), spectrum)
     if noise is None:
         noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}
     unknown = [name for name in noise if name not in outputs]
@@ -177,12 +145,12 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
         raise DefinitionError(f"`noise` {problem}; the outputs are {', '.join(outputs)}.")
     measured = {name: noise[name] for name in outputs if name in noise}
 
-    def spectrum_by_name(f: np.ndarray, harmonics: tuple[int, ...]) -> np.ndarray:
+    def spectrum(f: np.ndarray, harmonics: tuple[int, ...]) -> np.ndarray:
         shifted = f + np.array(harmonics)[:, None]
         folded = np.abs((shifted + N / 2) % N - N / 2)
         return np.stack([_level(*item, folded) for item in measured.items()], axis=2) ** 2
 
-    return Noise(np.array([outputs.index(name) for name in measured]), spectrum_by_name)
+    return Noise(np.array([outputs.index(name) for name in measured]), spectrum)
 
 
 def _level(

@@ -10,11 +10,12 @@ from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
 from ..identify.denominator import multipliers_of
+from ..identify.joint.model import characteristic_slopes
 from .candidates import Candidates, Model, Noise, Powers, measured_htfs
-from .criterion import Average, Criterion, Information, LinearCriterion
+from .criterion import Channel, Criterion, LinearCriterion
 from .goals import Goal, Multipliers, Parameters
 from .matrices import ldtp_matrices, response_criterion
-from .numerators import denominator_information
+from .numerators import denominator_channels
 
 
 # Exponents of the mean over models. Larger, for the worst one: closer to the largest criterion (of
@@ -52,7 +53,7 @@ def criterion_of(
             each.append(_parameters(goal, model, cosines, noise))
         else:
             each.append(response_criterion(goal, model, cosines, noise, power))
-    return each[0] if len(each) == 1 else Average(each[0].names, tuple(each), _EXPONENT[robust])
+    return Criterion(tuple(each), _EXPONENT[robust])
 
 
 def _multipliers(
@@ -61,7 +62,7 @@ def _multipliers(
     multipliers = np.asarray(model.multipliers)
     if goal.estimator == "fit_ldtp":
         matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
-        c, slopes = matrices.characteristic()
+        c, slopes = characteristic_slopes(matrices.coordinates)
         minimal = multipliers_of(c)
         if goal.which is not None and goal.which < len(multipliers):
             apart = np.abs(minimal - multipliers[goal.which])
@@ -74,9 +75,11 @@ def _multipliers(
         wanted, names = wanted_parts(goal, minimal, c)
         return matrices.criterion(wanted @ slopes, names)
     c = np.poly(multipliers).real[1:]
-    htfs = list(measured_htfs(model, cosines, goal.fitted_harmonics, noise))
+    htfs = measured_htfs(model, cosines, goal.fitted_harmonics, noise)
+    channels = denominator_channels(htfs, c, goal.overhang)
     wanted, names = wanted_parts(goal, multipliers, c)
-    return LinearCriterion(names, denominator_information(htfs, c, goal.overhang), wanted)
+    unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
+    return LinearCriterion(names, unknowns, channels, wanted)
 
 
 def wanted_parts(
@@ -110,16 +113,7 @@ def wanted_parts(
         else:
             wanted += [gradient.real, gradient.imag]
             names += [f"Re({name})", f"Im({name})"]
-    if goal.weights is None:
-        return np.array(wanted), tuple(names)
-    if len(goal.weights) != len(names):
-        raise DefinitionError(
-            f"`weights` of the goal must be {len(names)} numbers: one for each of "
-            f"{', '.join(names)}."
-        )
-    pairs = zip(goal.weights, names, strict=True)
-    total = " ".join(f"{w:+.3g} {name}" for w, name in pairs if w)
-    return np.array([goal.weights]) @ np.array(wanted), (total,)
+    return np.array(wanted), tuple(names)
 
 
 def _parameters(
@@ -130,17 +124,15 @@ def _parameters(
     unknown = [name for name in wanted if name not in free]
     if unknown:
         raise DefinitionError(f"`goal`: '{unknown[0]}' is wanted, but not one of `free`, {free}.")
-    slopes, cosine = [], []
+    channels = []
     for htf, members, _ in measured_htfs(model, cosines, goal.harmonics, noise):
         observed = ObservedHTF(htf, goal.sections)
         data = identifiability(goal.cycle.system, observed, free, guess=goal.cycle)
         if not data.complete:
             lost = "; ".join(data.descriptions())
             raise DefinitionError(f"the data do not identify {lost}: leave it out of `free`.")
-        slopes.append(data.sensitivity.T)
         shape = 2, len(htf.harmonics), len(members), htf.H[0, 0].size
-        cosine.append(np.broadcast_to(members[:, None], shape).ravel())
-    flat = np.concatenate(slopes, axis=1)
-    information = Information.direct(np.concatenate(cosine), flat, free)
+        cosine = np.broadcast_to(members[:, None], shape).ravel()
+        channels.append(Channel.direct(cosine, data.sensitivity.T))
     rows = np.eye(len(free))[[free.index(name) for name in wanted]]
-    return LinearCriterion(wanted, information, rows)
+    return LinearCriterion(wanted, free, tuple(channels), rows)

@@ -11,8 +11,7 @@ $r \ge 1$, so that the certificate holds. With r = 1 it is the mean. With a larg
 less than the largest one, by a factor of $J^{-1/r}$ at most.
 """
 
-import abc
-from collections.abc import Sequence
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -40,24 +39,6 @@ class Bound(NamedTuple):
     """In units of a variance: convex in the powers, and half as large for twice the powers."""
 
 
-class Criterion(eqx.Module):
-    """A function of the powers that a design minimizes."""
-
-    names: eqx.AbstractVar[tuple[str, ...]]
-    """Names of the quantities of interest."""
-
-    @abc.abstractmethod
-    def bound(self, power: Powers) -> Bound:
-        """Return the bound with these powers, all positive.
-
-        **Raises:** `DefinitionError` that names the unknowns that are not identifiable.
-        """
-
-    @abc.abstractmethod
-    def only(self, kept: Kept) -> "Criterion":
-        """Return the criterion where only these cosines are applied."""
-
-
 class Channel(NamedTuple):
     """Measurements with the same E real equations, two or four for each cosine."""
 
@@ -69,61 +50,37 @@ class Channel(NamedTuple):
     """Derivatives in units of standard deviations, for several entries: those by the first unknown
     for all entries, then those by the second, ..."""
 
-
-def only_channels(channels: Sequence[Channel], kept: Kept) -> tuple[Channel, ...]:
-    """Return the channels where only these cosines are applied, which are numbered anew."""
-    reduced = []
-    for channel in channels:
-        rows = np.flatnonzero(np.isin(channel.cosine, kept))
-        if len(rows):
-            basis = channel.basis[rows]
-            basis = powers_basis(basis)[0] if basis.shape[1] else basis
-            number = np.searchsorted(kept, channel.cosine[rows])
-            reduced.append(Channel(number, basis, channel.slopes[rows]))
-    return tuple(reduced)
-
-
-class Information(NamedTuple):
-    """Derivatives of all measurements by d unknowns."""
-
-    channels: tuple[Channel, ...]
-    unknowns: tuple[str, ...]
-
     @classmethod
     def direct(
-        cls,
-        cosine: Int[np.ndarray, " rows"],
-        slopes: Float[np.ndarray, "d rows"],
-        unknowns: tuple[str, ...],
-    ) -> "Information":
-        """Return that of unknowns on which all measurements depend directly, without numerators."""
-        return cls((Channel(cosine, np.zeros((len(cosine), 0)), slopes.T),), unknowns)
+        cls, cosine: Int[np.ndarray, " rows"], slopes: Float[np.ndarray, "d rows"]
+    ) -> "Channel":
+        """Return measurements that depend on the unknowns directly, without numerators."""
+        return cls(cosine, np.zeros((len(cosine), 0)), slopes.T)
 
-    @property
-    def cosine(self) -> Int[np.ndarray, " rows"]:
-        """The cosine that each row of `rows` belongs to."""
-        entries = [channel.slopes.shape[1] // len(self.unknowns) for channel in self.channels]
-        pairs = zip(self.channels, entries, strict=True)
-        return np.concatenate([np.repeat(channel.cosine, n) for channel, n in pairs])
+    def only(self, kept: Kept) -> "Channel":
+        """Return the channel where only these cosines are applied, which are numbered anew."""
+        rows = np.flatnonzero(np.isin(self.cosine, kept))
+        basis = self.basis[rows]
+        basis = powers_basis(basis)[0] if basis.size else basis
+        return Channel(np.searchsorted(kept, self.cosine[rows]), basis, self.slopes[rows])
 
-    def rows(self, power: Powers) -> Float[np.ndarray, "d rows"]:
+    def rows(self, power: Powers, unknowns: int) -> Float[np.ndarray, "d rows"]:
         """Return derivatives with these powers, less the part that numerators explain."""
-        parts = []
-        for channel in self.channels:
-            weight = np.sqrt(power)[channel.cosine, None]
-            slopes = weight * channel.slopes
-            if channel.basis.shape[1]:
-                q, _ = np.linalg.qr(weight * channel.basis)
-                slopes -= q @ (q.T @ slopes)
-            parts.append(slopes.reshape(len(slopes), len(self.unknowns), -1).swapaxes(0, 1))
-        return np.concatenate([x.reshape(len(x), -1) for x in parts], axis=1)
+        weight = np.sqrt(power)[self.cosine, None]
+        slopes = weight * self.slopes
+        if self.basis.shape[1]:
+            q, _ = np.linalg.qr(weight * self.basis)
+            slopes -= q @ (q.T @ slopes)
+        return slopes.reshape(len(slopes), unknowns, -1).swapaxes(0, 1).reshape(unknowns, -1)
 
 
-class LinearCriterion(Criterion):
-    """The sum of the variances of linear functions of unknowns."""
+class LinearCriterion(eqx.Module):
+    """The sum of the variances of linear functions of unknowns, for one model."""
 
     names: tuple[str, ...]
-    information: Information
+    """Names of the quantities of interest."""
+    unknowns: tuple[str, ...]
+    channels: tuple[Channel, ...]
     wanted: Float[np.ndarray, "rows d"]
     """Derivatives of the functions by the unknowns."""
     part: Int[np.ndarray, " rows"] | None = None
@@ -131,31 +88,42 @@ class LinearCriterion(Criterion):
     quantity has one row."""
 
     def only(self, kept: Kept) -> "LinearCriterion":
-        reduced = self.information._replace(channels=only_channels(self.information.channels, kept))
-        return LinearCriterion(self.names, reduced, self.wanted, self.part)
+        channels = (channel.only(kept) for channel in self.channels)
+        return dataclasses.replace(self, channels=tuple(x for x in channels if len(x.cosine)))
 
     def bound(self, power: Powers) -> Bound:
-        rows = self.information.rows(power)
-        half = _root(rows @ rows.T, self.information.unknowns)
+        d = len(self.unknowns)
+        rows = np.concatenate([channel.rows(power, d) for channel in self.channels], axis=1)
+        cosine = [np.repeat(x.cosine, x.slopes.shape[1] // d) for x in self.channels]
+        half = _root(rows @ rows.T, self.unknowns)
         spread = self.wanted @ half
         influence = spread @ half.T @ rows
         variances = (spread**2).sum(axis=1)
-        squares = np.bincount(self.information.cosine, (influence**2).sum(axis=0), len(power))
+        squares = np.bincount(np.concatenate(cosine), (influence**2).sum(axis=0), len(power))
         criterion = float(variances.sum())
         if self.part is not None:
             variances = np.bincount(self.part, variances)
         return Bound(variances, squares / power, criterion)
 
 
-class Average(Criterion):
-    """The mean of r-th powers of the criteria of several models."""
+class Criterion(eqx.Module):
+    """The function of the powers that a design minimizes: the mean of r-th powers of the criteria
+    of one or several models."""
 
-    names: tuple[str, ...]
-    each: tuple[Criterion, ...]
-    exponent: float
+    each: tuple[LinearCriterion, ...]
+    exponent: float = 1.0
     """r."""
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the quantities of interest."""
+        return self.each[0].names
+
     def bound(self, power: Powers) -> Bound:
+        """Return the bound with these powers, all positive.
+
+        **Raises:** `DefinitionError` that names the unknowns that are not identifiable.
+        """
         bounds = [criterion.bound(power) for criterion in self.each]
         criteria = np.array([bound.criterion for bound in bounds])
         top = criteria.max()
@@ -164,8 +132,9 @@ class Average(Criterion):
         variances = share @ np.array([bound.variances for bound in bounds]) / share.sum()
         return Bound(variances, share @ np.array([x.sensitivity for x in bounds]), float(mean))
 
-    def only(self, kept: Kept) -> "Average":
-        return Average(self.names, tuple(x.only(kept) for x in self.each), self.exponent)
+    def only(self, kept: Kept) -> "Criterion":
+        """Return the criterion where only these cosines are applied."""
+        return Criterion(tuple(x.only(kept) for x in self.each), self.exponent)
 
 
 def _root(

@@ -1,7 +1,7 @@
 r"""Limits of experiments: powers p of the cosines with $W p \le 1$ and $p^T Q p \le 1$."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -13,8 +13,7 @@ from .._core.boundary.kinds import Count, Positive
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import optimize_phases
-from ..experiments.design.partition import line_class
-from .candidates import Candidates, Kept, Model, Powers, Squares, rate_of
+from .candidates import Kept, Model, Powers, Squares, rate_of
 from .distortion import Distortion
 
 
@@ -31,9 +30,9 @@ class Limits(eqx.Module):
 
     **Arguments:**
 
-    - `rms`: of inputs, of outputs (their deviation from the cycle), or of states by their names in
-      `LDTP.coordinates`, over all experiments. `"input"` or `"output"` means that none of these may
-      be larger than in the `design` that is improved.
+    - `rms`: of inputs, or of outputs (their deviation from the cycle), over all experiments.
+      `"input"` or `"output"` means that none of these may be larger than in the `design` that is
+      improved.
     - `rate`: rms of the change of an input from one section to the next.
     - `peak`: of an input, in every experiment. Phases are then optimized for a low peak, and
       experiments that still exceed it are scaled down. (Such phases are not random: the scatter of
@@ -78,8 +77,6 @@ class Limits(eqx.Module):
 
 
 Limit = Words | Mapping[str, Positive] | Limits
-Largest = float | Callable[[np.ndarray], np.ndarray] | None
-"""Amplitude that a cosine may have in an experiment, as a function of its frequency."""
 
 
 def as_limits(limit: Limit) -> Limits:
@@ -94,8 +91,7 @@ class PowerLimits(NamedTuple):
     """L limits of sums over cosines, and O of quadratic forms."""
 
     names: tuple[str, ...]
-    """Names of the limited quantities: rms values of signals, rates, peaks, distortions; not of
-    amplitudes."""
+    """Names of the limited quantities: rms values of signals, rates, peaks, distortions."""
     cost: Float[np.ndarray, "L K"]
     """W: share of each limit that a unit of a cosine's power takes."""
     curved: Float[np.ndarray, "O K K"]
@@ -134,19 +130,6 @@ class PowerLimits(NamedTuple):
 
     def only(self, kept: Kept) -> "PowerLimits":
         return self._replace(cost=self.cost[:, kept], curved=self.curved[:, kept][:, :, kept])
-
-    def with_rows(self, cost: Float[np.ndarray, "L K"]) -> "PowerLimits":
-        return self._replace(cost=np.concatenate([self.cost, cost]))
-
-    def with_amplitudes(self, largest: Powers, cosines: Candidates) -> "PowerLimits":
-        r"""Return the limits with those of the cosines' amplitudes in every experiment.
-
-        A cosine of power p (on the average over all experiments) with its largest amplitude a takes
-        a share $2p / a^2$ of them, and each experiment can hold one of each class.
-        """
-        classes = line_class(cosines.line, cosines.periods)
-        limited = np.unique(classes[np.isfinite(largest)])
-        return self.with_rows((classes == limited[:, None]) * 2 / largest**2)
 
     def require_limits(self) -> None:
         """**Raises:** `DefinitionError` if some cosine is not limited."""
@@ -197,37 +180,6 @@ def power_limits(
     cost = np.reshape(rows, (-1, K))
     distinct = np.sort(np.unique(cost, axis=0, return_index=True)[1])
     return PowerLimits(tuple(names[i] for i in distinct), cost[distinct], np.zeros((0, K, K)))
-
-
-def largest_amplitudes(largest: Largest, f: Powers) -> Powers:
-    """Return the largest amplitude at each frequency, infinite where there is no limit.
-
-    **Raises:** `DefinitionError` for anything but numbers that are not negative.
-    """
-    if largest is None:
-        return np.full(len(f), np.inf)
-    given = np.asarray(largest(f) if callable(largest) else largest)
-    if given.dtype.kind not in "fiu" or given.shape not in ((), f.shape):
-        raise DefinitionError("`largest` must return a real number for each frequency.")
-    if not (given >= 0).all():
-        raise DefinitionError("`largest` must return amplitudes that are not negative.")
-    return np.broadcast_to(given, f.shape)
-
-
-def without_forbidden(design: Design, largest: Largest) -> Design:
-    """Return the design with the allowed lines only, none above its largest amplitude; experiments
-    without any are left out.
-
-    **Raises:** `DefinitionError` as `largest_amplitudes`, and if no line remains.
-    """
-    most = largest_amplitudes(largest, design.line / design.periods)
-    kept = most > 0
-    if not kept.any():
-        raise DefinitionError("`largest` is zero at all frequencies: no cosine may be applied.")
-    used, experiment = np.unique(design.experiment[kept], return_inverse=True)
-    parts = {n: getattr(design, n)[kept] for n in ("line", "channel", "phase")}
-    parts["amplitude"] = np.minimum(design.amplitude, most)[kept]
-    return dataclasses.replace(design, experiment=experiment, experiments=len(used), **parts)
 
 
 def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:

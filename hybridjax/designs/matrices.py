@@ -13,53 +13,37 @@ from jaxtyping import Bool, Float, Int
 from ..errors import DefinitionError
 from ..identify.htf_errors import check_values, error_weights
 from ..identify.joint.frequency import transfer, transfer_slopes
-from ..identify.joint.model import (
-    LocalCoordinates,
-    PeriodicModel,
-    characteristic_slopes,
-    local_coordinates,
-)
-from ..identify.joint.realization import realize
+from ..identify.joint.model import LocalCoordinates, PeriodicModel, local_coordinates
+from ..identify.joint.realization import SHORTEST_HORIZON, realize
 from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
-from .criterion import Information, LinearCriterion
-from .goals import FrequencyResponse, ImpulseResponse
+from .criterion import Channel, LinearCriterion
+from .goals import FrequencyResponse
 
 
-# Periods of the impulse response from which a minimal model is made, and the fewest lags. Fewer:
-# states that appear late in the outputs are dropped. More: states that hardly appear are kept.
-_PERIODS, _LAGS = 4, 17
 # Combinations with less information in the usual design, relative to the largest, are rounding
 # errors. Larger: combinations that the data determine are left out. Smaller: rounding is kept.
 _SINGULAR = 1e-13
 # Part of a wanted variance that left-out combinations may have, at least. Larger: standard errors
 # are too small by half of it. Smaller: goals are rejected for rounding errors.
 _MISSED = 0.05
-# Part of a sum of squares, in units of the usual errors, that is left out to have fewer rows.
-# Larger: variances are too small by it. Smaller: more rows, which take longer.
-_NEGLIGIBLE = 1e-8
 # Frequencies of a band at which its mean is taken. Fewer: the mean of a resonant curve is off.
 # More: longer computation.
 _POINTS = 64
-# Length of the imaginary steps by which derivatives are taken: its square must underflow beside 1.
-_STEP = 1e-30
 
 
 class Matrices(NamedTuple):
     """Combinations of the P local coordinates, and the information about them."""
 
     coordinates: LocalCoordinates
-    information: Information
+    channel: Channel
+    """Derivatives by those combinations that the usual design determines."""
     size: Float[np.ndarray, " P"]
     """One over the unit of each coordinate."""
     values: Float[np.ndarray, " P"]
     """Eigenvalues of the usual information in these units."""
     vectors: Float[np.ndarray, "P P"]
-
-    def characteristic(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n P"]]:
-        """Return the coefficients of the multipliers' polynomial, and their derivatives."""
-        return characteristic_slopes(self.coordinates)
 
     def criterion(
         self,
@@ -84,7 +68,8 @@ class Matrices(NamedTuple):
                 "or lines."
             )
         wanted = turned[:, kept] / np.sqrt(self.values[kept])
-        return LinearCriterion(names, self.information, wanted, part)
+        unknowns = tuple(f"combination {k} of the matrices" for k in range(kept.sum()))
+        return LinearCriterion(names, unknowns, (self.channel,), wanted, part)
 
 
 def ldtp_matrices(
@@ -101,7 +86,7 @@ def ldtp_matrices(
             "a goal of `fit_ldtp` needs a model with matrices: an `LDTP`, such as `fit.model` of "
             "`fit_ldtp` or a result of `hj.identify.realize`."
         )
-    lags = max(_PERIODS * model.n_sections, _LAGS - 1) + 1
+    lags = 2 * max(2 * model.n_sections, SHORTEST_HORIZON) + 1
     response = np.asarray(model.impulse_response(lags))[:, :, noise.outputs]
     htfs = list(measured_htfs(model, cosines, harmonics, noise))
     scale = np.sqrt(np.mean([check_values(measured.htf) ** 2 for measured in htfs], axis=0))
@@ -120,10 +105,8 @@ def ldtp_matrices(
     for lines, rows in _rows(coordinates, htfs, scale):
         cosine.append(np.repeat(lines, rows.shape[2]))
         slopes.append(turn @ _flat(rows))
-    unknowns = tuple(f"combination {k} of the matrices" for k in range(kept.sum()))
-    flat = np.concatenate(slopes, axis=1)
-    information = Information.direct(np.concatenate(cosine), flat, unknowns)
-    return Matrices(coordinates, information, size, values, vectors)
+    channel = Channel.direct(np.concatenate(cosine), np.concatenate(slopes, axis=1))
+    return Matrices(coordinates, channel, size, values, vectors)
 
 
 def _determined(values: Float[np.ndarray, " P"]) -> Bool[np.ndarray, " P"]:
@@ -148,92 +131,33 @@ def _flat(rows: Float[np.ndarray, "lines P rows"]) -> Float[np.ndarray, "P lines
 
 
 def response_criterion(
-    goal: FrequencyResponse | ImpulseResponse,
-    model: Model,
-    cosines: Candidates,
-    noise: Noise,
-    power: Powers,
+    goal: FrequencyResponse, model: Model, cosines: Candidates, noise: Noise, power: Powers
 ) -> LinearCriterion:
-    """Return the criterion of transfer functions in a band, or of impulse responses.
+    """Return the criterion of transfer functions in a band.
 
     **Raises:** `DefinitionError` for a band beyond N/2, and as `ldtp_matrices`.
     """
-    N = cosines.n_sections
-    pairs = [
-        f"{model.outputs[i]}{f' from {u}' * (len(model.inputs) > 1)}"
+    N, (low, high) = cosines.n_sections, goal.band
+    if high > N / 2:
+        raise DefinitionError(f"`band` must lie within 0 and {N / 2:g}, not {goal.band}.")
+    harmonics = check_harmonics(goal.wanted, N)
+    matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
+    f = low + (high - low) * (np.arange(_POINTS) + 0.5) / _POINTS
+    H = transfer(matrices.coordinates.model, f, harmonics)
+    parts = [part for _, part in transfer_slopes(matrices.coordinates, f, harmonics)]
+    slopes = np.concatenate(parts, axis=2)
+    size = np.sqrt((np.abs(H) ** 2).mean(axis=1).sum(axis=0))  # (ny, nu)
+    slopes = np.stack([np.real(slopes), np.imag(slopes)], axis=3) / size / np.sqrt(_POINTS)
+    names = [
+        f"H_{m} of {model.outputs[i]}{f' from {u}' * (len(model.inputs) > 1)}"
+        for m in harmonics
         for i in noise.outputs
         for u in model.inputs
     ]
-    if isinstance(goal, ImpulseResponse):
-        matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
-        response, slopes = _impulses(matrices.coordinates, goal.lags)
-        square = (response**2).sum(axis=(0, 1))
-        slopes = slopes / np.sqrt(np.where(square > 0, square, np.inf))
-        names = [f"response of {pair}" for pair in pairs]
-        each = slopes.transpose(3, 4, 0, 1, 2)
-    else:
-        low, high = goal.band
-        if high > N / 2:
-            raise DefinitionError(f"`band` must lie within 0 and {N / 2:g}, not {goal.band}.")
-        harmonics = check_harmonics(goal.wanted, N)
-        matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
-        f = low + (high - low) * (np.arange(_POINTS) + 0.5) / _POINTS
-        H = transfer(matrices.coordinates.model, f, harmonics)
-        parts = [part for _, part in transfer_slopes(matrices.coordinates, f, harmonics)]
-        slopes = np.concatenate(parts, axis=2)
-        size = np.sqrt((np.abs(H) ** 2).mean(axis=1).sum(axis=0))  # (ny, nu)
-        slopes = np.stack([np.real(slopes), np.imag(slopes)], axis=3) / size / np.sqrt(_POINTS)
-        names = [f"H_{m} of {pair}" for m in harmonics for pair in pairs]
-        each = slopes.transpose(1, 4, 5, 0, 2, 3)  # (M, ny, nu, P, F, 2)
-    each = each.reshape(len(names), matrices.coordinates.size, -1)
-    part = np.repeat(np.arange(len(each)), each.shape[2])
-    wanted = each.swapaxes(1, 2).reshape(len(part), -1)
-    return _fewer_rows(matrices.criterion(wanted, tuple(names), part), part)
-
-
-def _fewer_rows(criterion: LinearCriterion, part: Int[np.ndarray, " rows"]) -> LinearCriterion:
-    """Return the criterion with as few rows of each quantity as have the same sum of squares."""
-    rows, parts = [], []
-    for k in range(len(criterion.names)):
-        _, values, vectors = np.linalg.svd(criterion.wanted[part == k], full_matrices=False)
-        square = values**2
-        kept = np.cumsum(square[::-1])[::-1] > _NEGLIGIBLE * square.sum()
-        rows.append(vectors[kept] * values[kept, None])
-        parts.append(np.full(kept.sum(), k))
-    changed = np.concatenate(rows), np.concatenate(parts)
-    return LinearCriterion(criterion.names, criterion.information, *changed)
-
-
-def _impulses(
-    coordinates: LocalCoordinates, lags: int
-) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, "P N lags ny nu"]]:
-    """Return responses at section n to an input r sections earlier, and their derivatives."""
-    P, places = coordinates.size, coordinates.places
-    A, B, C, D = ([x.astype(complex)[None] for x in blocks] for blocks in coordinates.model[:4])
-    N, (ny, nu) = coordinates.model.n_sections, coordinates.model.D[0].shape
-    response = np.zeros((P, N, lags, ny, nu), complex)
-
-    def perturbed(n: int) -> tuple[np.ndarray, ...]:
-        """Return the matrices of a section, with an imaginary step of each coordinate."""
-        step = np.zeros((P, P), complex)
-        at = [i for part in places[n].values() for i in range(part.start, part.stop)]
-        step[at, at] = 1j * _STEP
-        change = {
-            name: step[:, places[n][name]].reshape(P, *shape)
-            for name, shape in coordinates.blocks(n)
-        }
-        return (
-            A[n] + coordinates.to_A[n] @ change["Y"],
-            B[n] + change["B"],
-            C[n] + coordinates.to_C[n] @ change["Y"],
-            D[n] + change.get("D", 0.0),
-        )
-
-    sections = [perturbed(n) for n in range(N)]
-    for first, (_, x, _, direct) in enumerate(sections):
-        response[:, first, 0] = direct
-        for r in range(1, lags):
-            n = (first + r) % N
-            response[:, n, r] = sections[n][2] @ x
-            x = sections[n][0] @ x
-    return np.real(response[0]), np.imag(response) / _STEP
+    each = slopes.transpose(1, 4, 5, 2, 3, 0).reshape(len(names), -1, matrices.coordinates.size)
+    # As few rows of each quantity as have the same sum of squares, up to rounding.
+    _, values, vectors = np.linalg.svd(each, full_matrices=False)
+    kept = values**2 > np.finfo(float).eps * values[:, :1] ** 2
+    rows = [s[k, None] * v[k] for s, v, k in zip(values, vectors, kept, strict=True)]
+    part = np.repeat(np.arange(len(rows)), [len(x) for x in rows])
+    return matrices.criterion(np.concatenate(rows), tuple(names), part)

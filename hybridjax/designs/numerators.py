@@ -1,6 +1,6 @@
 """The information about the denominator in `fit_multipliers`, with all numerators free."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,7 +11,7 @@ from ..identify.htf_errors import check_values, error_weights, require_frequenci
 from ..identify.variable_projection import powers_basis
 from ..linear.htf import HTF
 from .candidates import Measured
-from .criterion import Channel, Information
+from .criterion import Channel
 
 
 # Decimal digits to which the errors of two entries must agree (up to a factor) to be treated
@@ -24,20 +24,20 @@ def coefficients(order: int, n_sections: int, overhang: int | None) -> int:
     return order * n_sections + (n_sections if overhang is None else overhang) + 1
 
 
-def denominator_information(
+def denominator_channels(
     htfs: Iterable[Measured], c: Float[np.ndarray, " d"], overhang: int | None
-) -> Information:
-    """Return the information about the coefficients c of the denominator.
+) -> tuple[Channel, ...]:
+    """Return the measurements with their derivatives by the coefficients c of the denominator.
 
     **Raises:** `DefinitionError` if the HTFs have too few frequencies, or harmonics that are not
     symmetric about 0.
     """
-    channels, d = [], len(c)
+    channels = []
     for htf, cosine, _ in htfs:
-        size = coefficients(d, htf.n_sections, overhang)
-        require_frequencies(htf, d, size)
-        channels += _channels(htf, cosine, c, size, range(1, d + 1))
-    return Information(tuple(channels), tuple(f"c{k}" for k in range(1, d + 1)))
+        size = coefficients(len(c), htf.n_sections, overhang)
+        require_frequencies(htf, len(c), size)
+        channels += _channels(htf, cosine, c, size)
+    return tuple(channels)
 
 
 def require_symmetric(harmonics: tuple[int, ...], n_sections: int) -> None:
@@ -49,13 +49,9 @@ def require_symmetric(harmonics: tuple[int, ...], n_sections: int) -> None:
 
 
 def _channels(
-    htf: HTF,
-    cosine: Int[np.ndarray, " F"],
-    c: Float[np.ndarray, " d"],
-    size: int,
-    delays: Sequence[int],
+    htf: HTF, cosine: Int[np.ndarray, " F"], c: Float[np.ndarray, " d"], size: int
 ) -> list[Channel]:
-    r"""Return H delayed by some periods and divided by the denominator's modulus, and the part of
+    r"""Return H delayed by 1 to d periods and divided by the denominator's modulus, and the part of
     it that numerators of so many coefficients can explain.
 
     From $dH = dB/\chi - H\, d\chi/\chi$ at z and at 1/z, with a channel for all entries whose
@@ -71,7 +67,7 @@ def _channels(
     weight = dict(zip(htf.harmonics, error_weights(htf, check_values(htf))[..., 0], strict=True))
     delay = np.exp(-2j * np.pi * f)
     size_of_chi = np.abs(chi(delay, c))
-    delayed = delay ** np.array(delays)[:, None] / size_of_chi
+    delayed = delay ** np.arange(1, len(c) + 1)[:, None] / size_of_chi
     slope = {
         m: weight[m] * H[:, :, 0] * delayed[..., None]
         for m, H in zip(htf.harmonics, np.asarray(htf.H), strict=True)

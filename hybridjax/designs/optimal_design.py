@@ -34,9 +34,7 @@ class OptimalDesign(eqx.Module):
       No design needs fewer strides than 1/e of this one's. It is 1 at the optimum, except with
       peaks, which are treated as no larger than rms values. With limited distortion it compares
       with designs whose convex bound of the distortion is no larger than the limit, or this one's.
-    - `for_peaks`: the ratio of strides with limits of peaks to those with the same limits of the
-      rms; 1 where no peak is limited.
-    - `frequencies` (K,) and `channels` (K,) of all allowed cosines; `power` and `usual_power` (K,),
+    - `frequencies` (K,) and `channels` (K,) of all cosines; `power` and `usual_power` (K,),
       the mean square of each over all experiments; `sensitivity` (K,), the decrease of the
       criterion by more power in a cosine, divided by its price: 1 where the optimum has power, less
       elsewhere.
@@ -54,7 +52,6 @@ class OptimalDesign(eqx.Module):
     criterion: float
     usual_criterion: float
     certificate: float
-    for_peaks: float
     frequencies: Powers
     channels: np.ndarray
     power: Powers
@@ -120,8 +117,6 @@ class OptimalDesign(eqx.Module):
             f"{'(the convex bound of distortions) ' * bounded}"
             f"needs less than {1 / self.certificate:.1%} of these strides"
         )
-        if self.for_peaks > 1:
-            rows.append(f"  peaks cost {self.for_peaks:.3g} times the strides of such rms values")
         rows += [
             f"  rms of {name}: {self.rms[name]:.3g} ({self.rms[name] / old:.3g} times the usual)"
             for name, old in self.usual_rms.items()

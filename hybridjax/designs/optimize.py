@@ -1,77 +1,44 @@
 """The design that estimates a quantity of interest in the fewest strides."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Positive, Seed
+from .._core.boundary.kinds import Seed
 from .._core.execution import one_blas_thread
 from .._core.progress import working
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
-from .allocation import Allocation, allocate, certify, occurrences, to_design, worthwhile
-from .candidates import Candidates, Model, NoiseLike, Powers, make_noise, mean_squares, rms_of
+from .allocation import ENOUGH, allocate, certify, to_design, worthwhile
+from .candidates import Candidates, Model, NoiseLike, make_noise, mean_squares, rms_of
 from .criteria import criterion_of
 from .criterion import Criterion
 from .distortion import Products, products
 from .goals import Goal, Multipliers
-from .limits import (
-    Largest,
-    Limit,
-    PowerLimits,
-    as_limits,
-    below_peaks,
-    largest_amplitudes,
-    peak_of,
-    power_limits,
-    without_forbidden,
-)
+from .limits import Limit, PowerLimits, as_limits, below_peaks, peak_of, power_limits
 from .optimal_design import OptimalDesign
-
-
-# Parts of the total gain that may be left out with weak cosines, the largest part first with which
-# the criterion grows by less than the factor. Larger: weak lines are lost, whose absence distortion
-# of strong ones reveals. Smaller: lines without effect occupy experiments.
-_NEGLIGIBLE = (2e-3, 1e-4, 0.0)
-_AS_GOOD = 1.01
-# Times that a design is scaled to the limits, since cosines at their largest amplitude do not grow
-# with the others. Fewer: limits are not used up where nearly all cosines are at theirs.
-_SCALINGS = 10
-# Share of a limit from which on it counts as reached. Smaller: inactive limits are named. Larger:
-# active ones are not, since powers are optimal to 2 % only.
-_REACHED = 0.99
 
 
 class Rules(NamedTuple):
     """The limits that experiments must obey."""
 
     linear: PowerLimits
-    """Limits of sums over cosines, without those of amplitudes."""
     distortion: Products | None
     cosines: Candidates
-    largest: Largest
-    most: Powers
-    """The same for each cosine."""
     peak: dict[str, float]
     seed: int
 
     def scaled(self, design: Design) -> Design:
-        """Return the same proportions, as large as allowed, except cosines at their largest
-        amplitude."""
-        for _ in range(_SCALINGS):
-            use = self.linear.cost @ self.cosines.power_of(design)
-            if self.distortion is not None:
-                use = np.append(use, self.distortion.rms(design) / self.distortion.level)
-            root = np.sqrt(1 / max(use.max(), np.finfo(float).tiny))
-            design = dataclasses.replace(design, amplitude=design.amplitude * root)
-            design = without_forbidden(design, self.largest)
-        return design
+        """Return the same proportions, as large as allowed."""
+        use = self.linear.cost @ self.cosines.power_of(design)
+        if self.distortion is not None:
+            use = np.append(use, self.distortion.rms(design) / self.distortion.level)
+        return dataclasses.replace(design, amplitude=design.amplitude / np.sqrt(use.max()))
 
     def below_peaks(self, design: Design) -> Design:
         """Return the design within the peaks, and with these phases also within a distortion."""
@@ -101,16 +68,13 @@ class Rules(NamedTuple):
         kept = np.flatnonzero(power)
         power, share = power[kept], each[:, kept] / power[kept]
         limits = self.linear.only(kept)._replace(curved=self.distortion.divided(kept, share))
-        if np.isfinite(self.most).any():
-            limits = limits.with_rows(np.diag(2 * share.max(axis=0) / self.most[kept] ** 2))
-        factor = np.ones(len(self.most))
+        factor = np.ones(len(self.cosines.line))
         factor[kept] = np.sqrt(allocate(criterion.only(kept), limits, power).power / power)
         amplitude = design.amplitude * factor[self.cosines.places(design)]
         return self.scaled(dataclasses.replace(design, amplitude=amplitude))
 
     def reached(self, design: Design) -> tuple[str, ...]:
-        """Return names of the limits that are reached, or all if only those of amplitudes are;
-        peaks always."""
+        """Return names of the limits that are reached; peaks always are."""
         use: dict[str, float] = {}
         shares = self.linear.cost @ self.cosines.power_of(design)
         for name, share in zip(self.linear.names, shares, strict=True):
@@ -118,7 +82,7 @@ class Rules(NamedTuple):
         if self.distortion is not None:
             levels = zip(self.distorted(design).items(), self.distortion.level, strict=True)
             use |= {name: rms / level for (name, rms), level in levels}
-        return tuple(name for name, share in use.items() if share > _REACHED) or tuple(use)
+        return tuple(name for name, share in use.items() if share > 1 / (1 + ENOUGH))
 
 
 @checked
@@ -131,7 +95,6 @@ def optimal_design(
     goal: Literal["multipliers"] | Goal = "multipliers",
     limit: Limit = "input",
     noise: NoiseLike | None = None,
-    largest: Positive | Callable[[np.ndarray], np.ndarray] | None = None,
     seed: Seed = 0,
     robust: Literal["mean", "worst"] = "mean",
 ) -> OptimalDesign:
@@ -156,18 +119,15 @@ def optimal_design(
     - `design`: the design to improve. Lines that are not in it are forbidden; inputs, periods and
       the number of experiments are kept. Default: `multisine` with all lines.
     - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
-      `FrequencyResponse`, `ImpulseResponse`. Default: `"multipliers"`.
-    - `limit`: largest rms values by name, of inputs, outputs (their deviation from the cycle) or
-      states, over all experiments: `{"u": 0.01}`; `"input"` or `"output"`: rms values of these as
-      in `design`; or `hj.designs.Limits`, also of peaks, rates, strides and distortion.
+      `FrequencyResponse`. Default: `"multipliers"`.
+    - `limit`: largest rms values by name, of inputs or outputs (their deviation from the cycle),
+      over all experiments: `{"u": 0.01}`; `"input"` or `"output"`: rms values of these as in
+      `design`; or `hj.designs.Limits`, also of peaks, rates, strides and distortion.
       Default: `"input"`.
     - `noise`: of each measured output, by name: the standard deviation of white noise, or a
       function that returns it by the frequency of the output (0 to N/2 cycles per period), the root
-      of a spectrum. Or estimated noise: an `LDTPFit` with noise, or a model of noise as for
-      `LDTPFit.noise_spectrum`. Default: all outputs are measured, with white noise 20 dB below
-      their rms deviation in `design` within the limits.
-    - `largest`: largest amplitude of a cosine; a number, or a function of an array of f. Zero
-      forbids a frequency. Default: no limit.
+      of a spectrum. Default: all outputs are measured, with white noise 20 dB below their rms
+      deviation in `design` within the limits.
     - `seed` of phases and division. Default: 0.
     - `robust`: with several models, minimize the mean of their criteria, or the worst one (a mean
       of 16th powers, which is slightly smaller). Default: `"mean"`.
@@ -185,24 +145,18 @@ def optimal_design(
     squares = [mean_squares(each, cosines) for each in models]
     linear = power_limits(given, models, squares, cosines.power_of(usual))
 
-    usual, most = without_forbidden(usual, largest), largest_amplitudes(largest, cosines.f)
-    allowed = np.flatnonzero(most > 0)
-    cosines, linear, most = cosines.only(allowed), linear.only(allowed), most[allowed]
-    squares = [{name: square[allowed] for name, square in each.items()} for each in squares]
-    count = given.experiments(usual, len(allowed))
+    count = given.experiments(usual, len(cosines.line))
     distortion, limits = None, linear
     if given.distortion is not None:
         power = cosines.power_of(usual)
         distortion = products(given.distortion, cosines, models[0].inputs, power)
         distortion.require_those_of(models[0])
         limits = limits._replace(curved=distortion.bound)
-    sums, limits = limits, limits.with_amplitudes(most, cosines)
     limits.require_limits()
-    rules = Rules(linear, distortion, cosines, largest, most, dict(given.peak), seed)
+    rules = Rules(linear, distortion, cosines, dict(given.peak), seed)
     usual = rules.below_peaks(rules.scaled(usual))
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]
-    shown += [name for name in linear.names if name in squares[0] and name not in shown]
     usual_rms = rms_of(squares, shown, usual_power)
     goal = Multipliers() if isinstance(goal, str) else goal
     errors = make_noise(models[0], noise, usual_rms)
@@ -210,20 +164,11 @@ def optimal_design(
 
     before = criterion.bound(usual_power)
     ideal = allocate(criterion, limits, usual_power)
-    kept, best = _with_fewer(criterion, limits, cosines, ideal, count)
-    room = most[kept] ** 2 / (2 * count)
-    used = best.power * limits.only(kept).share(best.power)
-    counts = occurrences(cosines.only(kept), used, best.power / room, count)
-    if np.isfinite(most).any():
-        # The largest power of each cosine in the experiments that hold it.
-        within = sums.only(kept).with_rows(np.diag(1 / (counts * room)))
-        share = limits.only(kept).share(best.power)
-        best = allocate(criterion.only(kept), within, best.power)
-        used = best.power * share
-    made = to_design(cosines.only(kept), best.power, used, counts, most[kept], count, usual, seed)
-    made = rules.less_distorted(criterion, made)
-    free = criterion.only(kept).bound(cosines.power_of(made)[kept])
-    made = rules.below_peaks(made)
+    kept = worthwhile(cosines, ideal.power * ideal.bound.sensitivity, count)
+    best = allocate(criterion.only(kept), limits.only(kept), ideal.power[kept])
+    use = best.power * limits.only(kept).share(best.power)
+    made = to_design(cosines.only(kept), best.power, use, count, usual, seed)
+    made = rules.below_peaks(rules.less_distorted(criterion, made))
     power = cosines.power_of(made)
     after = criterion.only(kept).bound(power[kept])
     shorter = usual.experiments / count
@@ -239,7 +184,6 @@ def optimal_design(
         criterion=after.criterion * shorter,
         usual_criterion=before.criterion,
         certificate=excess * after.criterion / ideal.bound.criterion,
-        for_peaks=after.criterion / free.criterion,
         frequencies=cosines.f,
         channels=cosines.channel,
         power=power,
@@ -249,26 +193,6 @@ def optimal_design(
         rms=rms_of(squares, shown, power) | rules.distorted(made),
         usual_rms=usual_rms | rules.distorted(usual),
     )
-
-
-def _with_fewer(
-    criterion: Criterion,
-    limits: PowerLimits,
-    cosines: Candidates,
-    ideal: Allocation,
-    experiments: int,
-) -> tuple[Int[np.ndarray, " kept"], Allocation]:
-    """Return the cosines that matter, as so many experiments can hold, and their powers.
-
-    **Arguments:** `ideal`: the best powers of all.
-    """
-    gain = ideal.power * ideal.bound.sensitivity
-    for negligible in _NEGLIGIBLE:
-        kept = np.flatnonzero(worthwhile(cosines, gain, experiments, negligible))
-        best = allocate(criterion.only(kept), limits.only(kept), ideal.power[kept])
-        if best.bound.criterion < _AS_GOOD * ideal.bound.criterion:
-            break
-    return kept, best
 
 
 def _check_alike(models: list[Model], design: Design) -> None:

@@ -1,7 +1,6 @@
 """Studies: experiments block after block, until the estimate is as precise as requested."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,7 +19,7 @@ from ..experiments.design.design import Design
 from ..identify.multipliers import StructuredFit
 from .candidates import Candidates
 from .goals import Multipliers
-from .limits import Limit, as_limits, without_forbidden
+from .limits import Limit, as_limits
 from .optimal_design import OptimalDesign
 from .optimize import optimal_design
 from .study_estimate import Block, Estimate, block_of, estimate, refuse_transient
@@ -86,8 +85,7 @@ class Study(eqx.Module):
     - `standard_error`: of each multiplier of `goal`, at which to stop (for `"position"` the root of
       the expected squared distance from the true one).
     - `goal`: the multipliers of interest, estimated by `fit_multipliers`. Default: all.
-    - `limit` and `largest`: as in `optimal_design`, relative to `first`. Default: rms of the input
-      as in `first`.
+    - `limit`: as in `optimal_design`, relative to `first`. Default: rms of the input as in `first`.
     - `seed`: of phases and division of all blocks but the first. Default: 0.
 
     **Raises:** `DefinitionError` for several inputs, other estimators, and a limit of strides.
@@ -98,7 +96,6 @@ class Study(eqx.Module):
     standard_error: Positive = eqx.field(static=True)
     goal: Multipliers
     limit: Limit
-    largest: Positive | Callable[[np.ndarray], np.ndarray] | None
     seed: Seed = eqx.field(static=True)
     _history: History
 
@@ -110,7 +107,6 @@ class Study(eqx.Module):
         *,
         goal: Multipliers | None = None,
         limit: Limit = "input",
-        largest: Positive | Callable[[np.ndarray], np.ndarray] | None = None,
         seed: Seed = 0,
     ):
         if len(first.input_names) > 1:
@@ -118,10 +114,10 @@ class Study(eqx.Module):
                 f"`first` has the inputs {', '.join(first.input_names)}: study one at a time."
             )
         goal = Multipliers() if goal is None else goal
-        if goal.weights is not None or goal.estimator == "fit_ldtp":
+        if goal.estimator == "fit_ldtp":
             raise DefinitionError(
-                "a study estimates multipliers by fit_multipliers: `goal` may have no weights and "
-                "no other estimator."
+                "a study estimates multipliers by fit_multipliers: `goal` may have no other "
+                "estimator."
             )
         if goal.which is not None and goal.which >= order:
             raise DefinitionError(
@@ -133,9 +129,9 @@ class Study(eqx.Module):
                 "`limit` limits the strides, but a study ends at a precision: end it yourself."
             )
         limits.require_inputs(first.input_names)
-        Candidates.of(without_forbidden(first, largest))
+        Candidates.of(first)
         self.first, self.order, self.standard_error = first, order, standard_error
-        self.goal, self.limit, self.largest, self.seed = goal, limit, largest, seed
+        self.goal, self.limit, self.seed = goal, limit, seed
         self._history = History()
 
     @property
@@ -236,7 +232,7 @@ class Study(eqx.Module):
         def planned(limit: Limit) -> OptimalDesign:
             return optimal_design(
                 best.fit, self.first, goal=self.goal, limit=limit, noise=noise,
-                largest=self.largest, seed=self.seed + blocks,
+                seed=self.seed + blocks,
             )  # fmt: skip
 
         plan, periods = planned(self.limit), self.first.periods

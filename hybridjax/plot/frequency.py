@@ -1,7 +1,7 @@
 """Harmonic transfer functions against frequency (paper Figs. 3 and 4)."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,9 +18,10 @@ from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, letters
 
 
 Fit = RationalFit | StructuredFit
-
-_FREQUENCY = "input frequency $f$ (cycles/period)"
+FREQUENCY = "input frequency $f$ (cycles/period)"
 _OUTPUTS = [COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")]
+_FIT_STYLE = {"color": "black", "lw": 0.8, "ls": (0, (4, 1.5))}
+_FIT_NAMES: dict[type, str] = {RationalFit: "rational fit", StructuredFit: "structured fit"}
 
 
 @checked
@@ -44,23 +45,22 @@ def magnitude(
 
     **Raises:** `DefinitionError` for an output, input or harmonic that is not there.
     """
-    if not htfs:
-        raise DefinitionError("`htfs` holds no HTF to draw.")
     if not harmonics:
         raise DefinitionError("`harmonics` must hold one harmonic or more.")
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
-        for htf in sorted(htfs, key=_estimates_last):
-            i, j = _index(htf.outputs, output), _index(htf.inputs, input)
-            f, order = _sorted(htf)
+        for htf in _exact_first(htfs):
             for m in harmonics:
-                size = np.abs(np.asarray(htf.harmonic(m))[order, i, j])
-                line = _line(htf, htfs, _harmonic_style(m, harmonics), _name(m))
+                f, values, radius = _values(htf, m, output, input)
+                size, line = (
+                    np.abs(values),
+                    _line(htf, htfs, _harmonic_style(m, harmonics), _name(m)),
+                )
                 panel.plot(f, size, **line)
-                _band(panel, f, size, _radius(htf, m, order, i, j), line, 0.3 * np.min(size))
-        unit = ratio(htf.outputs[i], htf.inputs[j])
-        size = with_unit(f"$|H_m|$, {label_of(htf.outputs[i], labels)}", unit)
-        panel.set(yscale="log", xlabel=_FREQUENCY, ylabel=size)
+                _band(panel, f, size, radius, line["color"], 0.3 * np.min(size))
+        name, pushed = _pick(htf.outputs, output), _pick(htf.inputs, input)
+        label = with_unit(f"$|H_m|$, {label_of(name, labels)}", ratio(name, pushed))
+        panel.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
         _frequency_limits(panel, f)
         top = max(np.nanmax(line.get_ydata()) for line in panel.get_lines())
         panel.set_ylim(top * 10.0**-decades, top * 2)
@@ -85,22 +85,17 @@ def harmonics(
     scale.
     """
     columns = _columns(families)
-    outputs = columns[0][1][0].outputs
-    size = {"width": _width(columns), "height": 0.4 + 1.7 * len(outputs)}
-    with panels(ax, len(outputs), len(columns), **size, sharex=True, sharey="row") as axes:
-        for i, output in enumerate(outputs):
+    outputs = next(iter(columns.values()))[0].outputs
+    with _grid(columns, len(outputs), 0.4 + 1.7 * len(outputs), ax) as axes:
+        for row, output in zip(axes, outputs, strict=True):
             limits = []
-            for k, (_, htfs) in enumerate(columns):
+            for panel, htfs in zip(row, columns.values(), strict=True):
                 magnitude(
                     *htfs, output=output, input=input, harmonics=harmonics, decades=decades,
-                    labels=labels, ax=axes[i, k],
+                    labels=labels, ax=panel,
                 )  # fmt: skip
-                limits.append(axes[i, k].get_ylim())
-                _tidy(axes[i, k], axes)
-            axes[i, 0].set_ylim(*np.max(limits, axis=0))
-        for k, (family, _) in enumerate(columns):
-            axes[0, k].set_title(family)
-        letters(axes)
+                limits.append(panel.get_ylim())
+            row[0].set_ylim(*np.max(limits, axis=0))
     return Plot(axes)
 
 
@@ -127,51 +122,43 @@ def bode(
 
     **Raises:** `DefinitionError` for a name or harmonic that is not there.
     """
-    if not htfs:
-        raise DefinitionError("`htfs` holds no HTF to draw.")
+    first, *_ = _exact_first(htfs)
+    names = first.outputs if outputs is None else outputs
+    units = [ratio(_pick(first.outputs, name), _pick(first.inputs, input)) for name in names]
+    same = units[0] if len(set(units)) == 1 else ""  # else the label of each curve has its own
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
-        _bode(axes[:, 0], htfs, fits, harmonic, outputs, input, labels)
-        axes[0, 0].set_xlabel("")
-    return Plot(axes)
-
-
-def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) -> None:
-    upper, lower = axes
-    first = htfs[0]
-    names = first.outputs if outputs is None else outputs
-    pushed = first.inputs[_index(first.inputs, input)]
-    units = [ratio(first.outputs[_index(first.outputs, name)], pushed) for name in names]
-    same = units[0] if len(set(units)) == 1 else ""  # else each curve says its own
-    for number, (name, unit) in enumerate(zip(names, units, strict=True)):
-        color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
-        for htf in sorted(htfs, key=_estimates_last):
-            f, order = _sorted(htf)
-            i, j = _index(htf.outputs, name), _index(htf.inputs, input)
-            values = np.asarray(htf.harmonic(harmonic))[order, i, j]
+        upper, lower = axes[:, 0]
+        for number, (name, unit) in enumerate(zip(names, units, strict=True)):
+            color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
             label = with_unit(label_of(name, labels), "" if same else unit)
-            line = _line(htf, htfs, {"color": color}, label)
-            size, radius = np.abs(values), _radius(htf, harmonic, order, i, j)
-            known = np.full(len(f), True) if radius is None else radius < size
-            reference = _curve(upper, lower, f, values, reference, known, **line)
-            _band(upper, f, size, radius, line, 0.3 * np.min(size))
-            if radius is not None:
-                turn = np.degrees(np.arcsin(radius[known] / size[known]))
-                phase, turn = (_spread(known, x, len(f)) for x in (reference[1], turn))
-                _band(lower, f, phase, turn, line)
-        for fit in fits:
-            values = _evaluate(fit, f, harmonic, name, input)
-            line = {"color": "black", "lw": 0.8, "ls": (0, (4, 1.5)), "zorder": 5}
-            reference = _curve(upper, lower, f, values, reference, **line)
-    for fit in dict.fromkeys(type(fit) for fit in fits):
-        upper.plot([], [], color="black", lw=0.8, ls=(0, (4, 1.5)), label=_FIT_NAMES[fit])
-    size = with_unit(f"$|{_name(harmonic)[1:-1]}|$", same)
-    upper.set(yscale="log", xlabel=_FREQUENCY, ylabel=size)
-    lower.set(xlabel=_FREQUENCY, ylabel=f"$\\angle {_name(harmonic)[1:-1]}$ (degrees)")
-    _frequency_limits(upper, f)
-    _frequency_limits(lower, f)
-    lower.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 4.5, 9]))
-    _legend(upper, htfs)
+            for htf in _exact_first(htfs):
+                f, values, radius = _values(htf, harmonic, name, input)
+                size, line = np.abs(values), _line(htf, htfs, {"color": color}, label)
+                known = np.full(len(f), True) if radius is None else radius < size
+                phase = _phase(f, values, known, reference)
+                reference = f[known], phase[known]
+                upper.plot(f, size, **line)
+                lower.plot(f, phase, **line)
+                _band(upper, f, size, radius, color, 0.3 * np.min(size))
+                if radius is not None:
+                    turn = np.degrees(np.arcsin(np.where(known, radius, np.nan) / size))
+                    _band(lower, f, phase, turn, color)
+            for fit in fits:
+                values = _evaluate(fit, f, harmonic, name, input)
+                phase = _phase(f, values, np.full(len(f), True), reference)
+                upper.plot(f, np.abs(values), **_FIT_STYLE, zorder=5)
+                lower.plot(f, phase, **_FIT_STYLE, zorder=5)
+        for fit in dict.fromkeys(type(fit) for fit in fits):
+            upper.plot([], [], **_FIT_STYLE, label=_FIT_NAMES[fit])
+        symbol = _name(harmonic)[1:-1]
+        upper.set(yscale="log", ylabel=with_unit(f"$|{symbol}|$", same))
+        lower.set(xlabel=FREQUENCY, ylabel=f"$\\angle {symbol}$ (degrees)")
+        _frequency_limits(upper, f)
+        _frequency_limits(lower, f)
+        lower.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 4.5, 9]))
+        _legend(upper, htfs)
+    return Plot(axes)
 
 
 @checked
@@ -194,34 +181,43 @@ def bodes(
     for name in fits:
         if name not in families:
             raise DefinitionError(f"there are fits of '{name}', but the HTFs are {list(families)}.")
-    size = {"width": _width(columns), "height": 3.4}
-    with panels(ax, 2, len(columns), **size, sharex=True, sharey="row") as axes:
-        for k, (family, htfs) in enumerate(columns):
+    with _grid(columns, 2, 3.4, ax) as axes:
+        for k, (family, htfs) in enumerate(columns.items()):
             bode(
                 *htfs, fits=fits.get(family, ()), harmonic=harmonic, input=input, labels=labels,
                 ax=axes[:, k],
             )  # fmt: skip
-            axes[0, k].set_title(family)
-            for one in axes[:, k]:
-                _tidy(one, axes)
-        letters(axes)
     return Plot(axes)
 
 
-_FIT_NAMES: dict[type, str] = {RationalFit: "rational fit", StructuredFit: "structured fit"}
-
-
-def _columns(families) -> list[tuple[str, tuple[HTF, ...]]]:
-    columns = [(k, (v,) if isinstance(v, HTF) else tuple(v)) for k, v in dict(families).items()]
-    if not columns or any(not htfs for _, htfs in columns):
+def _columns(families) -> dict[str, tuple[HTF, ...]]:
+    columns = {k: (v,) if isinstance(v, HTF) else tuple(v) for k, v in dict(families).items()}
+    if not columns or not all(columns.values()):
         raise DefinitionError("`families` must hold at least one HTF in each family.")
-    if len({htf.outputs for _, htfs in columns for htf in htfs}) > 1:
+    if len({htf.outputs for htfs in columns.values() for htf in htfs}) > 1:
         raise DefinitionError("the families must have the same outputs to share a figure.")
     return columns
 
 
-def _width(columns) -> float:
-    return COLUMN if len(columns) == 1 else PAGE
+@contextlib.contextmanager
+def _grid(columns, rows: int, height: float, ax: AxesLike | None) -> Iterator[np.ndarray]:
+    """Panels with a column for each family: labels at the edges of the grid and one legend."""
+    size = {"width": COLUMN if len(columns) == 1 else PAGE, "height": height}
+    with panels(ax, rows, len(columns), **size, sharex=True, sharey="row") as axes:
+        yield axes
+        for panel in axes.flat:
+            panel.label_outer()
+            if panel is not axes[0, -1] and (legend := panel.get_legend()):
+                legend.remove()
+        for panel, family in zip(axes[0], columns, strict=True):
+            panel.set_title(family)
+        letters(axes)
+
+
+def _exact_first(htfs: Sequence[HTF]) -> list[HTF]:
+    if not htfs:
+        raise DefinitionError("`htfs` holds no HTF to draw.")
+    return sorted(htfs, key=lambda htf: htf.source != "exact")
 
 
 def _index(names: Sequence[str], which: str | int) -> int:
@@ -232,19 +228,25 @@ def _index(names: Sequence[str], which: str | int) -> int:
     raise DefinitionError(f"there is no {which!r} among {', '.join(names)}.")
 
 
-def _sorted(htf: HTF):
-    f = np.asarray(htf.f)
-    order = np.argsort(f)
-    return f[order], order
+def _pick(names: Sequence[str], which: str | int) -> str:
+    return names[_index(names, which)]
+
+
+def _values(
+    htf: HTF, m: int, output: str | int, input: str | int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
+    hold the true values; None without a variance."""
+    order, at = np.argsort(htf.f), (_index(htf.outputs, output), _index(htf.inputs, input))
+    values, radius = np.asarray(htf.harmonic(m))[(order, *at)], None
+    if htf.variance is not None:
+        radius = np.asarray(htf.select(m).confidence_radius())[(0, order, *at)]
+    return np.asarray(htf.f)[order], values, radius
 
 
 def _frequency_limits(ax: Axes, f) -> None:
     step = f[1] - f[0] if len(f) > 1 else 1.0
     ax.set_xlim(min(0.0, f[0]), f[-1] + step)
-
-
-def _estimates_last(htf: HTF) -> bool:
-    return htf.source != "exact"
 
 
 def _name(m: int) -> str:
@@ -254,53 +256,34 @@ def _name(m: int) -> str:
 def _harmonic_style(m: int, shown: Sequence[int]) -> dict:
     sizes = sorted({abs(k) for k in shown})
     dashed = m < 0 and -m in shown
-    return {
-        "color": CYCLE[sizes.index(abs(m)) % len(CYCLE)],
-        "ls": (0, (3, 1.5)) if dashed else "-",
-    }
+    color = CYCLE[sizes.index(abs(m)) % len(CYCLE)]
+    return {"color": color, "ls": (0, (3, 1.5)) if dashed else "-"}
 
 
 def _line(htf: HTF, htfs: Sequence[HTF], line: dict, label: str) -> dict:
     """Exact HTFs broad and pale, without a label where an estimate of the same curve has one."""
     if htf.source == "exact":
-        label = "" if any(map(_estimates_last, htfs)) else label
+        label = "" if any(other.source != "exact" for other in htfs) else label
         return {**line, "ls": "-", "lw": 3.0, "alpha": 0.3, "zorder": 1, "label": label}
     return {**line, "lw": 0.9, "zorder": 3, "label": label}
 
 
-def _radius(htf: HTF, m: int, order, i: int, j: int) -> np.ndarray | None:
-    """Of the discs that hold the true values, or None if that is not known."""
-    if htf.variance is None:
-        return None
-    return np.asarray(htf.select(m).confidence_radius())[0, order, i, j]
+def _band(ax: Axes, f, middle, radius, color: str, floor: float = -np.inf) -> None:
+    if radius is not None:
+        radius = np.where(np.isfinite(radius), radius, np.nan)
+        low = np.maximum(middle - radius, floor)
+        ax.fill_between(f, low, middle + radius, color=color, alpha=0.25, lw=0, zorder=2)
 
 
-def _band(ax: Axes, f, middle, radius, line: dict, floor: float = -np.inf) -> None:
-    if radius is None:
-        return
-    known = np.isfinite(radius)
-    low = np.where(known, np.maximum(middle - radius, floor), np.nan)
-    high = np.where(known, middle + radius, np.nan)
-    ax.fill_between(f, low, high, color=line["color"], alpha=0.25, lw=0, zorder=2)
-
-
-def _curve(upper: Axes, lower: Axes, f, values, reference, known: Any = slice(None), **line):
-    """Draw magnitude and phase, where it is known; whole turns of phase are chosen as in the curve
-    before."""
-    phase = np.degrees(np.unwrap(np.angle(values[known])))
-    if reference is not None and len(phase) and len(reference[0]):
-        turns = np.median(np.interp(f[known], *reference) - phase) / 360
-        phase = phase + 360 * np.round(turns)
-    upper.plot(f, np.abs(values), **line)
-    lower.plot(f, _spread(known, phase, len(f)), **line)
-    return f[known], phase
-
-
-def _spread(known, values, count: int) -> np.ndarray:
-    """Values where they are known, NaN elsewhere, so that lines have gaps."""
-    out = np.full(count, np.nan)
-    out[known] = values
-    return out
+def _phase(f, values, known, reference: tuple | None) -> np.ndarray:
+    """Return the phase in degrees where it is known, NaN elsewhere; whole turns are chosen as in
+    the reference, a pair of frequencies and phases."""
+    phase = np.full(len(f), np.nan)
+    phase[known] = np.degrees(np.unwrap(np.angle(values[known])))
+    if reference is not None and known.any() and len(reference[0]):
+        turns = np.median(np.interp(f[known], *reference) - phase[known]) / 360
+        phase += 360 * np.round(turns)
+    return phase
 
 
 def _evaluate(fit: Fit, f, harmonic: int, output: str, input: str | int) -> np.ndarray:
@@ -316,10 +299,3 @@ def _legend(ax: Axes, htfs: Sequence[HTF]) -> None:
     if any(htf.source == "exact" for htf in htfs):
         ax.plot([], [], color="0.5", lw=3.0, alpha=0.3, label="exact")
     ax.legend(loc="upper right", ncols=2)
-
-
-def _tidy(ax: Axes, axes) -> None:
-    """In a grid: labels at its edges and one legend only."""
-    ax.label_outer()
-    if ax is not axes[0, -1] and (legend := ax.get_legend()):
-        legend.remove()

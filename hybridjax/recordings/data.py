@@ -10,7 +10,7 @@ from scipy import signal
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
-from .._core.html import COLORS, Curve, card, facts, picture, table
+from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record, uninterrupted_records
@@ -18,7 +18,7 @@ from ..experiments.record import Record, uninterrupted_records
 
 # Fraction of the largest power of an input below which it identifies nothing. Larger: bands end
 # where transfer functions are still identified. Smaller: rounding counts as power.
-_LEAST_POWER = 0.01
+LEAST_POWER = 0.01
 # Fraction of the Nyquist frequency up to which an input must have power to count as broadband.
 # Larger: every band has an edge. Smaller: responses contain frequencies that were not excited.
 WHOLE_BAND = 0.9
@@ -74,22 +74,19 @@ class SectionData(eqx.Module):
         """Number of cycles of samples."""
         return sum(len(r.u) for r in self.records) / self.n_sections
 
+    def _deviations(self) -> Float[np.ndarray, "n nuy"]:
+        """Return the deviations of inputs and outputs in all records."""
+        return np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in self.records])
+
     @property
     def missing(self) -> float:
         """Fraction of samples with a missing input or output."""
-        u, y = self._deviations()
-        return float(np.isnan(np.concatenate([u, y], axis=1)).any(axis=1).mean())
+        return float(np.isnan(self._deviations()).any(axis=1).mean())
 
     def rms(self) -> tuple[Float[np.ndarray, " nu"], Float[np.ndarray, " ny"]]:
         """Return root mean squares of the deviations of inputs and outputs."""
-        u, y = self._deviations()
-        return np.sqrt(np.nanmean(u**2, axis=0)), np.sqrt(np.nanmean(y**2, axis=0))
-
-    def _deviations(self) -> tuple[Float[np.ndarray, "n nu"], Float[np.ndarray, "n ny"]]:
-        return (
-            np.concatenate([r.u for r in self.records]),
-            np.concatenate([r.y for r in self.records]),
-        )
+        size, nu = np.sqrt(np.nanmean(self._deviations() ** 2, axis=0)), len(self.inputs)
+        return size[:nu], size[nu:]
 
     def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""
@@ -120,24 +117,15 @@ class SectionData(eqx.Module):
         )
 
     def _repr_html_(self) -> str:
-        about = {
-            "cycles": f"{self.cycles:.5g} of {self.n_sections} sections",
-            "records": str(len(self.records)),
-            "period": f"{self.period:.6g} s",
-            "missing": f"{100 * self.missing:.2g} %",
-        }
-        sizes = (f"{x:.3g}" for part in self.rms() for x in part)
-        rows = list(zip(self.signals, sizes, self.units, map(str, self.spikes), strict=True))
-        head = ("signal", "rms deviation", "unit", "spikes left out")
         phase = np.arange(self.n_sections) / self.n_sections
         cycles = np.concatenate([self.cycle_inputs, self.cycle_outputs], axis=1)
         drawn = [
             picture([Curve(phase, x, "average cycle", color)], "phase (cycles)", with_unit(*name))
-            for *name, x, color in zip(
-                self.signals[:4], self.units, cycles.T, itertools.cycle(COLORS), strict=False
-            )
+            for *name, x, color in list(
+                zip(self.signals, self.units, cycles.T, itertools.cycle(COLORS), strict=False)
+            )[:4]
         ]
-        return card("SectionData", "", facts(about), table(head, rows), *drawn)
+        return card("SectionData", "", text(repr(self)), *drawn)
 
     def __repr__(self) -> str:
         values = zip(self.signals, np.concatenate(self.rms()), self.units, strict=True)
@@ -169,5 +157,5 @@ def input_spectrum(data: SectionData) -> tuple[Float[np.ndarray, " F"], Float[np
 def input_band(data: SectionData) -> list[float]:
     """Return the frequency (cycles per period) above which an input has next to no power."""
     f, power = input_spectrum(data)
-    strong = power > _LEAST_POWER * power.max(axis=0)
+    strong = power > LEAST_POWER * power.max(axis=0)
     return [float(f[np.flatnonzero(s)[-1]]) if s.any() else 0.0 for s in strong.T]

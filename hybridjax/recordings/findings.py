@@ -8,7 +8,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..errors import DefinitionError
 from .recording import Recording, Trial
+
+
+# Standard deviations that count as certain. Larger: odd trials and weak responses pass. Smaller:
+# chance is reported.
+CLEAR = 4.0
 
 
 class Finding(eqx.Module):
@@ -44,6 +50,13 @@ class Inspection(eqx.Module):
         return print_findings(self.findings) or "Nothing was found."
 
 
+def refuse(findings: Iterable[Finding]) -> None:
+    """**Raises:** `DefinitionError` with the first finding that makes a recording useless."""
+    for finding in findings:
+        if finding.action == "refused":
+            raise DefinitionError(finding.text)
+
+
 def print_findings(findings: Iterable[Finding], indent: str = "") -> str:
     """Return the findings as text, wrapped at 100 columns."""
     return "\n".join(
@@ -57,8 +70,7 @@ def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " _"]]) -> st
     texts = []
     for trial, rows in zip(trials, bad, strict=True):
         edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
-        for a, b in edges.reshape(-1, 2):
-            texts.append(place(trial.name, trial.time[a:b]))
+        texts += [place(trial.name, trial.time[a:b]) for a, b in edges.reshape(-1, 2)]
     return listed(texts)
 
 

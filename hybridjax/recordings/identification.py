@@ -14,10 +14,10 @@ from ..identify.series.records import PreparedRecords
 from .advice import Advice, collect_advice
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
-from .findings import Finding
+from .findings import Finding, refuse
 from .held_out import HeldOut, split
 from .impulse import ImpulseResponses, impulse_responses
-from .inspection.inspect import inspect, inspect_cycles, refuse
+from .inspection.inspect import inspect, inspect_cycles
 from .phase import Phase
 from .phase_estimation import PhaseDefinition, estimate_phase, signals_of
 from .recording import Recording

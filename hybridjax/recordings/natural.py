@@ -21,7 +21,6 @@ from scipy import stats
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Probability, Seed
 from .._core.boundary.values import Whole
-from .._core.html import card, complex_number, table, text
 from .._core.progress import working
 from ..errors import DefinitionError
 from .data import SectionData
@@ -32,15 +31,14 @@ from .findings import Finding, print_findings
 _DRAWS = 1000
 # Fewest cycles of a block (else the third root of their number), and of blocks in a record, below
 # which whole records are drawn. More: few blocks. Fewer: memory of disturbances is cut.
-_SHORTEST_BLOCK, _BLOCKS = 4, 3
+_SHORTEST_BLOCK = 4
 # Number of sections of a state, of sections between a state and its instruments, and of
 # combinations of the instruments per dimension of the state. More: weak instruments, and a first
 # stage that follows noise. Fewer: smoothing correlates their noise, and directions are missed.
 _EACH = 2
-# Limits of warnings: explained fraction of the states' variance below which instruments are weak,
-# and cycles per record below which there are few. Larger: every result comes with warnings.
+# Cycles per record below which there are few. Larger: every result comes with the warning.
 # Smaller: a user trusts biased multipliers.
-_WEAK, _FEW = 0.5, 50
+_FEW = 50
 
 Draws = Complex[np.ndarray, "B d"]
 MultiplierCount = Annotated[int, Whole(1, 12)]
@@ -89,35 +87,17 @@ class NaturalMultipliers(eqx.Module):
         """Limits of what the data support."""
         return tuple(_warnings(self))
 
-    @property
-    def _of(self) -> str:
-        order = len(self.multipliers)
-        return f"{self.cycles} cycles, order {order}, blocks of {self.block} cycles"
-
-    def _rows(self) -> Iterator[tuple[str, complex, float, float]]:
-        """Yield method, multiplier and the interval of its modulus."""
-        for name, values, plain in (
-            ("by instruments", self.multipliers, False),
-            ("least squares", self.plain, True),
-        ):
-            for z, (low, high) in zip(values, self.interval(plain=plain), strict=True):
-                yield name, complex(z), low, high
-
-    def _repr_html_(self) -> str:
-        rows = [
-            (name, complex_number(z, 3), f"{abs(z):.3f}", f"{low:.3f} to {high:.3f}")
-            for name, z, low, high in self._rows()
-        ]
-        head = ("", "multiplier", "modulus", "95 % interval")
-        warnings = text("\n".join(map(repr, self.warnings)))
-        return card("NaturalMultipliers", self._of, table(head, rows), warnings)
-
     def __repr__(self) -> str:
-        lines = [f"NaturalMultipliers({self._of})"]
-        for name, z, low, high in self._rows():
-            value = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
-            bounds = f"modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
-            lines.append(f"  {name:15s} {value:>15s}   {bounds}")
+        lines = [
+            f"NaturalMultipliers({self.cycles} cycles, order {len(self.multipliers)}, blocks of "
+            f"{self.block} cycles)"
+        ]
+        for plain, values in enumerate((self.multipliers, self.plain)):
+            for z, (low, high) in zip(values, self.interval(plain=bool(plain)), strict=True):
+                name = "least squares" if plain else "by instruments"
+                value = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
+                bounds = f"modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
+                lines.append(f"  {name:15s} {value:>15s}   {bounds}")
         return "\n".join([*lines, print_findings(self.warnings, "  ")])
 
 
@@ -156,7 +136,7 @@ def natural_multipliers(
     K = len(moments.records)
     counts = np.unique(moments.records, return_counts=True)[1]
     length, block = K / len(counts), max(_SHORTEST_BLOCK, round(K ** (1 / 3)))
-    if np.median(counts) < _BLOCKS * block and len(counts) >= _BLOCKS:
+    if np.median(counts) < _SHORTEST_BLOCK * block and len(counts) >= _SHORTEST_BLOCK:
         block = int(counts.max())
     rng = np.random.default_rng(seed)
     # The first weights are those of all cycles, the others draws.
@@ -181,10 +161,10 @@ def natural_multipliers(
 
 
 class _Moments(NamedTuple):
-    """Products of quantities of one cycle, for every section; zero where anything is missing."""
+    """Products of the state, the next state and the instruments of one cycle, for every section;
+    zero where anything is missing."""
 
     state: Float[np.ndarray, "N K d d"]
-    """Products of the state with itself."""
     forward: Float[np.ndarray, "N K d d"]
     """Products of the next state with the state."""
     square: Float[np.ndarray, "N K r r"]
@@ -202,20 +182,18 @@ def _moments(data: SectionData, order: int) -> _Moments:
 
     **Raises:** `DefinitionError` for too few cycles, or signals, for so many.
     """
-    N = data.n_sections
+    N, before = data.n_sections, 3 * _EACH + 1  # of instruments there is one section more
     size = np.nanstd(np.concatenate([x.y for x in data.records]), axis=0)
     y = [r.y / size for r in data.records]
-    before, width = 3 * _EACH + 1, len(size)  # of instruments there is one section more
-    if order > _EACH * width:
+    if order > _EACH * len(size):
         raise DefinitionError(
-            f"`order` is {order}, but the state at a section has {_EACH * width} numbers."
+            f"`order` is {order}, but the state at a section has {_EACH * len(size)} numbers."
         )
-    rows = []  # (record, cycle, section, sample)
-    for s, r in enumerate(data.records):
-        at = np.arange(before - 1, len(r.y) - N)
-        place = r.first_section + at
-        rows.append(np.stack([np.full(len(at), s), place // N, place % N, at], axis=1))
-    rows = np.concatenate(rows)
+    rows = np.array([
+        (s, (r.first_section + k) // N, (r.first_section + k) % N, k)
+        for s, r in enumerate(data.records)
+        for k in range(before - 1, len(r.y) - N)
+    ]).reshape(-1, 4)  # fmt: skip
     names, cycle = np.unique(rows[:, :2], axis=0, return_inverse=True)
     K, needed = len(names), 2 * (_EACH * order + 2)
     if K < needed:
@@ -225,7 +203,7 @@ def _moments(data: SectionData, order: int) -> _Moments:
         )
 
     def values(shift: int, count: int) -> Float[np.ndarray, "rows k"]:
-        return np.array([y[s][at - shift - np.arange(count)].ravel() for s, _, _, at in rows])
+        return np.array([y[s][k - shift - np.arange(count)].ravel() for s, _, _, k in rows])
 
     state, after = values(0, _EACH), values(-N, _EACH)
     instruments = values(2 * _EACH - 1, _EACH + 1)
@@ -248,8 +226,7 @@ def _summed(
     weights: Float[np.ndarray, "B K"], products: Float[np.ndarray, "N K a b"]
 ) -> Float[np.ndarray, "B N a b"]:
     """Sum over cycles, each counted as often as its weight."""
-    N, K, a, b = products.shape
-    return (weights @ np.swapaxes(products, 0, 1).reshape(K, -1)).reshape(-1, N, a, b)
+    return np.tensordot(weights, products, (1, 1))
 
 
 def _principal(
@@ -270,11 +247,8 @@ def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Draws:
     for k in range(values.shape[2]):
         later = np.pad(c, ((0, 0), (0, 0), (1, 0))) * values[..., k, None]
         c = np.pad(c, ((0, 0), (0, 0), (0, 1))) - later
-    c = np.real(c).mean(axis=1)[:, 1:]
-    companion = np.zeros((len(c), c.shape[1], c.shape[1]))
-    companion[:, 0] = -c
-    companion[:, np.arange(1, c.shape[1]), np.arange(c.shape[1] - 1)] = 1.0
-    return _largest_first(np.linalg.eigvals(companion).astype(complex))
+    roots = [np.roots(x) for x in np.real(c).mean(axis=1)]
+    return _largest_first(np.array(roots, complex))
 
 
 def _largest_first(z: Draws) -> Draws:
@@ -318,23 +292,14 @@ def _warnings(result: NaturalMultipliers) -> Iterator[Finding]:
     )
     each = result.cycles / result.records
     if each < _FEW:
-        yield Finding(
-            "few cycles",
-            f"{each:.3g} in each of {result.records} records, whose own mean was subtracted. A "
-            f"bias of about {(1 + 3 * modulus) / each:.2f} was corrected to first order only.",
-        )
-    if result.strength < _WEAK:
-        yield Finding(
-            "weak instruments",
-            f"earlier sections explain {100 * result.strength:.0f} % of the states' variance only; "
-            "the rest is noise, or too fast to be seen there.",
-        )
+        bias = f"a bias of about {(1 + 3 * modulus) / each:.2f} was corrected to first order only."
+        yield Finding("few cycles", f"{each:.3g} in each of {result.records} records; {bias}")
+    if result.strength < 0.5:
+        text = f"earlier sections explain {100 * result.strength:.0f} % of the states' variance."
+        yield Finding("weak instruments", text)
     if high >= 1:
-        yield Finding(
-            "stability", f"the interval of the largest modulus reaches {high:.2f}, beyond 1."
-        )
-    yield Finding(
-        "noise",
-        f"least squares gives {plain:.3f} for the largest modulus, {abs(modulus - plain):.3f} "
-        f"{'less' if modulus > plain else 'more'}.",
-    )
+        text = f"the interval of the largest modulus reaches {high:.2f}, beyond 1."
+        yield Finding("stability", text)
+    more = "less" if modulus > plain else "more"
+    text = f"least squares gives {plain:.3f} for the largest modulus, {abs(modulus - plain):.3f}"
+    yield Finding("noise", f"{text} {more}.")

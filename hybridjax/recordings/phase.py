@@ -14,6 +14,9 @@ from .recording import Recording, Trial
 # Longest gap, in cycles, across which cycles are counted. Longer: half a turn of an angle passes
 # unnoticed, and the count is wrong. Shorter: stretches end at every missing sample of a slow rate.
 LONGEST_GAP = 0.25
+# Harmonics of a cycle that are resolved by default: sections, and the bandwidth of the signals of
+# an angle. More: noisier phases, more unknowns. Fewer: impacts and other fast parts are smeared.
+HARMONICS = 32
 
 
 class Winding(eqx.Module):
@@ -86,10 +89,7 @@ class Phase(eqx.Module):
         )
         every = np.concatenate(self.periods)
         if len(every) < 2:
-            raise DefinitionError(
-                f"the recording holds {len(every)} whole cycles; at least two are needed to speak "
-                "of a period."
-            )
+            raise DefinitionError(f"the recording holds {len(every)} whole cycles: two are needed.")
         self.period = float(np.median(every))
         self.n_sections, self.backwards, self.lead = n_sections, backwards, lead
         self.dropped, self.missed = dropped, missed
@@ -111,27 +111,30 @@ class Phase(eqx.Module):
         """Number of whole cycles."""
         return sum(len(p) for p in self.periods)
 
-    @property
-    def drift(self) -> float:
-        """Relative change of the period per cycle: a straight line through each trial."""
-        slopes, weights = [0.0], [1e-300]
+    def _lines(self) -> list[tuple[Float[np.ndarray, " c"], float, Float[np.ndarray, " c"]]]:
+        """Return for each trial of three cycles or more their numbers around 0, and the slope of a
+        line through their periods, and the distances from it."""
+        lines = []
         for p in self.periods:
             k = np.arange(len(p)) - (len(p) - 1) / 2
             if len(p) > 2:
-                slopes.append(float(k @ p / (k @ k)))
-                weights.append(float(k @ k))
-        return float(np.average(slopes, weights=weights)) / self.period
+                slope = float(k @ p / (k @ k))
+                lines.append((k, slope, p - p.mean() - slope * k))
+        return lines
+
+    @property
+    def drift(self) -> float:
+        """Relative change of the period per cycle: a straight line through each trial."""
+        lines = self._lines()
+        weight = sum(float(k @ k) for k, _, _ in lines)
+        return sum(float(k @ k) * slope for k, slope, _ in lines) / max(weight, 1.0) / self.period
 
     @property
     def jitter(self) -> float:
         """Relative standard deviation of the periods of each trial about their line."""
-        squares, freedom = 0.0, 0
-        for p in self.periods:
-            if len(p) > 2:
-                k = np.arange(len(p))
-                squares += float(((p - np.polyval(np.polyfit(k, p, 1), k)) ** 2).sum())
-                freedom += len(p) - 2
-        return float(np.sqrt(squares / max(freedom, 1))) / self.period
+        off = [x for _, _, x in self._lines()]
+        freedom = sum(len(x) - 2 for x in off)
+        return float(np.sqrt(sum(x @ x for x in off) / max(freedom, 1))) / self.period
 
     def __repr__(self) -> str:
         notes = ""

@@ -1,18 +1,29 @@
-"""From a definition of phase to the phase of a recording."""
+"""From a definition of phase to the phase of a recording: angles that wind, events, crossings."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..orbits.crossing import AtEvent, Crossing
 from ..sections.families import KinematicPhase
-from .angle import from_angles, kinematic_angles
-from .events import from_crossings, from_events
-from .phase import Phase
-from .recording import Recording, signal_of
-from .smoothing import Bandwidth
+from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
+from .recording import Recording, check_events, signal_of
+from .smoothing import FEWEST, Bandwidth, Series, bridgeable, gaps, inside, spline, without_spikes
 
 
 PhaseDefinition = KinematicPhase | Crossing | AtEvent
 """Definition of the phase of a recording; see `estimate_phase`."""
+
+# Number of intervals from which the rhythm of a trial is estimated alone. More: long trials are
+# judged by the period of the others. Fewer: it is estimated from too few.
+_ENOUGH = 20
+# Fraction of long intervals that makes them part of the rhythm. Larger: rhythms of long and short
+# cycles are cut at each long one. Smaller: missed events pass for cycles.
+_COMMON = 0.1
 
 
 @checked
@@ -47,14 +58,18 @@ def estimate_phase(
     have (functions of a state, charts), a phase that does not wind, or a recording of less than two
     cycles.
     """
-    if isinstance(definition, Crossing):
-        return from_crossings(recording, definition, bandwidth)
     if isinstance(definition, KinematicPhase):
-        angles = kinematic_angles(recording, definition, bandwidth)
-        return from_angles(angles, definition.n_sections)
+        return _from_angles(_angles(recording, definition, bandwidth), definition.n_sections)
+    if isinstance(definition, Crossing):
+        event = AtEvent(str(definition))
+        if bandwidth is None:  # noise adds crossings of the samples themselves
+            rough = _from_events(recording.mark(event.name, definition), event.name)
+            bandwidth = HARMONICS / 2 / rough.period
+        marked = recording.mark(event.name, definition, bandwidth=bandwidth)
+        return _from_events(marked, event.name)
     if bandwidth is not None:
         raise DefinitionError("events are not smoothed: no `bandwidth`.")
-    return from_events(recording, definition)
+    return _from_events(recording, definition.name)
 
 
 def signals_of(definition: PhaseDefinition) -> set[str]:
@@ -66,3 +81,190 @@ def signals_of(definition: PhaseDefinition) -> set[str]:
         at_anchor = signals_of(anchor) if isinstance(anchor, Crossing) else set()
         return {definition.position, definition.velocity} | at_anchor
     return set()
+
+
+class _Angle(NamedTuple):
+    """An angle of one trial in rad, modulo whole turns; section 0 lies at 0."""
+
+    time: Series
+    angle: Series
+
+
+def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
+    """Return the phase of all trials: their angles in the sense in which they turn."""
+    rate = _turns_per_time(angles)
+    backwards, total, stretches = 0, 0, []
+    for time, angle in angles:
+        stretches.append([])
+        edges = np.flatnonzero(np.diff(time) > LONGEST_GAP / abs(rate)) + 1
+        for part in np.split(np.arange(len(time)), edges):
+            phase = np.sign(rate) * np.unwrap(angle[part]) / (2 * np.pi)
+            low = np.maximum.accumulate(phase)
+            high = np.minimum.accumulate(phase[::-1])[::-1]
+            rising = np.diff((low + high) / 2, prepend=-np.inf) > 1e-12  # more than rounding
+            if len(part) < FEWEST or rising.sum() < 2:
+                continue
+            backwards += int((np.diff(phase) < 0).sum())
+            total += len(part)
+            t, finite = time[part], np.ones(len(part), bool)
+            unseen = gaps(t, finite, bridgeable(t, finite))[1:-1]
+            monotone = ((low + high) / 2)[rising]
+            stretches[-1].append(Winding(t[rising], monotone, False, unseen))
+    return Phase(stretches, n_sections=n_sections, backwards=backwards / max(total, 1))
+
+
+def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | None) -> list[_Angle]:
+    """Return the angle of two signals about a center in each trial; `bandwidth` of the splines in
+    Hz."""
+    names = family.position, family.velocity
+    center, scale = _plane(recording, family)
+    samples = []
+    for trial in recording.trials:
+        columns = [without_spikes(trial.values[:, recording.column(x)]) for x in names]
+        signals = _at_common_times(trial.time, np.stack(columns, axis=1))
+        both = np.isfinite(signals).all(axis=1)
+        if both.sum() < FEWEST:
+            raise DefinitionError(
+                f"trial '{trial.name}' has {int(both.sum())} samples of {names[0]} and "
+                f"{names[1]}: too few for a phase."
+            )
+        samples.append((trial.time[both], (signals[both] - center) / scale))
+    anchor = family.anchor
+    turn = 1.0 if isinstance(anchor, Crossing) else np.exp(-1j * float(anchor))
+
+    def angle_of(time: np.ndarray, z: np.ndarray) -> _Angle:
+        return _Angle(time, np.angle((z[:, 0] + 1j * z[:, 1]) * turn))
+
+    rate = abs(_turns_per_time([angle_of(*sample) for sample in samples]))
+    bandwidth = bandwidth or HARMONICS * rate
+    angles = []
+    for time, z in samples:
+        smooth = [spline(time, x, bandwidth)(time) for x in z.T]
+        angles.append(angle_of(time, np.stack(smooth, axis=1)))
+    if isinstance(anchor, Crossing):
+        first = _angle_at(recording, anchor, bandwidth, angles)
+        angles = [_Angle(time, np.angle(np.exp(1j * (angle - first)))) for time, angle in angles]
+    return angles
+
+
+def _at_common_times(time: Series, signals: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Interpolate two signals with clocks of their own, each at the times of the other, not in
+    gaps."""
+    finite = np.isfinite(signals)
+    fewest = finite.sum(axis=0).min()
+    if finite.all(axis=1).sum() > fewest / 2 or fewest < FEWEST:
+        return signals
+    signals = signals.copy()
+    for k, mine in enumerate(finite.T):
+        holes = gaps(time, mine, bridgeable(time, mine))
+        at = finite.any(axis=1) & ~mine & ~inside(holes, time, time)
+        signals[at, k] = spline(time, signals[:, k], np.inf)(time[at])
+    return signals
+
+
+def _plane(
+    recording: Recording, family: KinematicPhase
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Return center and scale, by default from the middle 98 % of the signals over all trials."""
+    limits = []
+    for name in (family.position, family.velocity):
+        values = np.concatenate([x[np.isfinite(x)] for _, x in recording.samples(name)])
+        if not len(values):
+            raise DefinitionError(f"{name} is missing at every sample.")
+        limits.append(np.quantile(values, [0.01, 0.99]))
+        if family.scale is None and limits[-1][0] == limits[-1][1]:
+            raise DefinitionError(f"the phase needs a {name} that varies.")
+    low, high = np.transpose(limits)
+    center = (low + high) / 2 if family.center is None else np.asarray(family.center)
+    return center, (high - low) / 2 if family.scale is None else np.asarray(family.scale)
+
+
+def _angle_at(
+    recording: Recording, crossing: Crossing, bandwidth: float, angles: Sequence[_Angle]
+) -> float:
+    """Return the mean angle at which a signal crosses a level."""
+    name, crossed = str(crossing), []
+    marked = recording.mark(name, crossing, bandwidth=bandwidth)
+    for trial, (time, angle) in zip(marked.trials, angles, strict=True):
+        at = trial.events[name]
+        at = at[(at >= time[0]) & (at <= time[-1])]
+        crossed.append(np.interp(at, time, np.unwrap(angle)))
+    mean = np.exp(1j * np.concatenate(crossed)).mean()
+    if not abs(mean) > 0.5:
+        raise DefinitionError(
+            f"{name}, the anchor of section 0, happens all around the cycle: choose a crossing "
+            "that comes once in each."
+        )
+    return float(np.angle(mean))
+
+
+def _turns_per_time(angles: Sequence[_Angle]) -> float:
+    """Return the signed rate. **Raises:** `DefinitionError` if the angle does not wind twice."""
+    turns = sum(float(np.unwrap(a)[-1] - a[0]) for _, a in angles) / (2 * np.pi)
+    duration = sum(float(t[-1] - t[0]) for t, _ in angles)
+    if abs(turns) < 2:
+        raise DefinitionError(
+            f"the phase does not wind: {abs(turns):.2g} turns in {duration:.4g}; the center must "
+            "lie within the loop of the two signals, and two cycles or more are needed."
+        )
+    return turns / duration
+
+
+def _from_events(recording: Recording, name: str) -> Phase:
+    """Return a phase with one cycle per event."""
+    times = []
+    for trial in recording.trials:
+        if name not in trial.events:
+            present = ", ".join(trial.events) or "none"
+            raise DefinitionError(
+                f"trial '{trial.name}' has no event '{name}'; its events are: {present}."
+            )
+        times.append(trial.events[name])
+        check_events(f"trial '{trial.name}'", name, times[-1], trial.time)
+    intervals = np.concatenate([np.diff(t) for t in times])
+    if len(intervals) < 2:
+        raise DefinitionError(f"there are too few events '{name}' for two cycles.")
+    common, dropped, missed, stretches = _period(intervals), 0, 0, []
+    for trial, t in zip(recording.trials, times, strict=True):
+        period, doubled, longest = common, 0.5, 1.5
+        if (np.diff(t) > common / 4).sum() >= _ENOUGH:
+            period, doubled, longest = _rhythm(np.diff(t))
+        kept: list[float] = []
+        for x in t:
+            if not kept or x - kept[-1] >= doubled * period:
+                kept.append(x)
+        dropped += len(t) - len(kept)
+        t = np.array(kept)
+        sampled = np.isfinite(trial.time)
+        pauses = gaps(trial.time, sampled, bridgeable(trial.time, sampled, LONGEST_GAP * period))
+        wide = np.flatnonzero((np.diff(t) > longest * period) | inside(pauses, t[:-1], t[1:])) + 1
+        missed += sum(max(round(float(t[k] - t[k - 1]) / period), 1) for k in wide)
+        parts = [part for part in np.split(t, wide) if len(part) > 1]
+        stretches.append([Winding(p, np.arange(len(p), dtype=float), True) for p in parts])
+    return Phase(stretches, dropped=dropped, missed=missed, lead=1)
+
+
+def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
+    """Return the period of a trial and, in periods, the limits of doubled and missed events.
+
+    Irregular rhythms have intervals of all lengths: the limits lie at the first gap in their
+    distribution on either side of the median (0.25 periods above, 0.1 below).
+    """
+    period = _period(intervals)
+    length = np.sort(intervals / period)
+    middle = len(length) // 2
+    above = np.flatnonzero(np.diff(length[middle:]) > 0.25)
+    below = np.flatnonzero(np.diff(length[: middle + 1]) > 0.1)
+    longest = length[middle + above[0]] if len(above) else length[-1]
+    shortest = length[below[-1] + 1] if len(below) else length[0]
+    missed, doubled = max(1.5, 1.01 * float(longest)), min(0.5, 0.99 * float(shortest))
+    if (length > missed).mean() > _COMMON:
+        missed = np.inf
+    if (length < doubled).mean() > 2 * _COMMON:
+        doubled = 0.5  # most events are doubled
+    return period, doubled, missed
+
+
+def _period(intervals: Float[np.ndarray, " n"]) -> float:
+    """Return the median of the intervals without short ones, of which a doubled event makes one."""
+    return float(np.median(intervals[intervals > np.median(intervals) / 4]))

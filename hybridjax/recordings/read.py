@@ -9,12 +9,11 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
 from ..errors import DefinitionError, FileFormatError
-from .formats.arrays import read_hdf5, read_matlab
+from .formats.arrays import read_arrow, read_excel, read_hdf5, read_matlab, read_npz
 from .formats.bag import read_bag
 from .formats.c3d import read_c3d
-from .formats.columns import EVENT, Columns, Wanted, seconds, split_header, time_unit, two_columns
+from .formats.columns import Columns, Wanted, parse_table, time_unit
 from .formats.motion import read_text
-from .formats.tables import read_arrow, read_excel, read_npz
 from .recording import Recording, check_events
 
 
@@ -57,9 +56,9 @@ def read_recording(
     Default: all. `units`: units by name of the signal, for all files.
 
     **Raises:** `DefinitionError` for files that do not exist, columns or signals that they do not
-    have, unknown units of time, columns that differ between files, packages that are not installed,
-    and as `Recording`; `FileFormatError` for files that cannot be read, with the line, and for
-    events that are all outside of the recording.
+    have, unknown units of time, columns that differ between files, events that are all outside of
+    the recording, packages that are not installed, and as `Recording`; `FileFormatError` for files
+    that cannot be read, with the line.
     """
     if not paths:
         raise DefinitionError("there is no file to read.")
@@ -86,9 +85,9 @@ def read_tables(path: Path, wanted: Wanted) -> list[Columns]:
     """
     reader = read_bag if path.is_dir() else _READERS.get(path.suffix.lower())
     if reader is None:
+        kinds = ", ".join(_READERS)
         raise DefinitionError(
-            f"'{path}' ends in '{path.suffix}'; recordings are read from {', '.join(_READERS)} "
-            "files: export it as one of these."
+            f"'{path}' ends in '{path.suffix}'; recordings are read from {kinds}."
         )
     try:
         if path.stat().st_size == 0:
@@ -102,74 +101,30 @@ def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
     parts, names = [], []
     events: dict[str, np.ndarray] = {}
     for columns in read_tables(path, wanted):
-        clock = _column_of_times(path, list(columns.values), wanted)
-        unit = time_unit(clock)
-        scale = seconds(f"'{path}'", clock, unit)
-        time = columns.values[clock] * scale
-        assumed = f"the times in '{clock}' have no unit: taken as seconds"
-        notes = columns.notes if unit else (*columns.notes, assumed)
-        events |= {name: at * scale for name, at in columns.events.items()}
-        chosen = {}
-        for header, values in columns.values.items():
-            name, unit = split_header(header)
-            if header == clock:
-                continue
-            if name.startswith(EVENT):
-                events[name.removeprefix(EVENT)] = time[np.nan_to_num(values) != 0]
-                continue
-            if unit.lower() == "nan":
-                raise FileFormatError(
-                    f"'{path}': the unit of '{name}' is nan: write it, or nothing."
-                )
-            names.append(name)
-            if wanted.includes(name):
-                chosen[name] = (values, unit)
-        if chosen:
-            signals = {name: values for name, (values, _) in chosen.items()}
-            read = {name: unit for name, (_, unit) in chosen.items() if unit} | {
-                name: unit for name, unit in units.items() if name in chosen
-            }
-            parts.append(Recording(time, signals, units=read, name=path.stem, notes=notes))
-    two_columns(path, names)
+        table = parse_table(f"'{path}'", columns, wanted.time)
+        notes = list(columns.notes)
+        if not time_unit(table.clock):
+            notes.append(f"the times in '{table.clock}' have no unit: taken as seconds")
+        events |= table.events
+        names += table.signals
+        signals = {x: values for x, values in table.signals.items() if wanted.includes(x)}
+        known = {x: unit for x, unit in table.units.items() if x in signals}
+        if signals:
+            parts.append(Recording(table.time, signals, units=known, name=path.stem, notes=notes))
     wanted.require(path, names)
     if not parts:
         raise DefinitionError(f"'{path}' has no signals.")
-    if unknown := set(units) - set(names):
-        raise DefinitionError(
-            f"trial '{path.stem}': there is a unit for '{min(unknown)}', but the signals are "
-            f"{', '.join(names)}."
-        )
     whole = Recording.beside(parts)
-    (trial,) = whole.trials
-    step, notes = float(np.median(np.diff(trial.time))), whole.notes
+    (trial,), notes = whole.trials, list(whole.notes)
     for name, at in events.items():
-        check_events(f"'{path}'", name, at, trial.time, step, FileFormatError)
-        inside = (at >= trial.time[0] - step) & (at <= trial.time[-1] + step)
-        events[name] = at[inside | np.isnan(at)]
-        if lost := len(at) - len(events[name]):
-            notes = (
-                *notes,
-                f"{lost} events '{name}' outside of the recording were left out",
-            )
+        events[name] = check_events(f"'{path}'", name, at, trial.time)
+        if lost := int(np.isfinite(at).sum()) - len(events[name]):
+            notes.append(f"{lost} events '{name}' outside of the recording were left out")
     return Recording(
         trial.time,
         dict(zip(whole.signals, trial.values.T, strict=True)),
         events=events,
-        units=dict(zip(whole.signals, whole.units, strict=True)),
+        units=dict(zip(whole.signals, whole.units, strict=True)) | units,
         name=path.stem,
         notes=notes,
     )
-
-
-def _column_of_times(path: Path, headers: list[str], wanted: Wanted) -> str:
-    """Return the header with this name; capitals matter only where there are several."""
-    names = {x: split_header(x)[0] for x in headers}
-    exact = [x for x, name in names.items() if wanted.time in (x, name)]
-    alike = exact or [x for x in headers if wanted.is_time(x)]
-    if len(alike) > 1:
-        two_columns(path, [wanted.time] * 2)
-    if not alike:
-        raise DefinitionError(
-            f"'{path}' has no column '{wanted.time}'; its columns are {', '.join(names.values())}."
-        )
-    return alike[0]

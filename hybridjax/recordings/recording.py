@@ -10,17 +10,12 @@ from jaxtyping import Float
 
 from .._core import limits
 from .._core.boundary.checked import checked
-from .._core.html import COLORS, Curve, card, picture, table, text
+from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import with_unit
-from ..errors import DefinitionError, HybridJaxError
+from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
-from .formats.columns import seconds, split_header, time_unit
+from .formats.columns import Columns, numbers, parse_table
 from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
-
-
-# Relative difference of sampling steps (or rates) that is reported as irregular. Larger: jitter of
-# clocks passes unseen. Smaller: rounded time stamps are called irregular.
-_IRREGULAR = 0.1
 
 
 class Trial(eqx.Module):
@@ -83,45 +78,37 @@ class Recording(eqx.Module):
         backwards, and infinite values, with the sample.
         """
         where, units = f"trial '{name}'", dict(units or {})
-        time = _numbers(where, "time", time)
+        time = numbers(where, "time", time)
         if not signals:
             raise DefinitionError(f"{where} has no signals.")
-        columns = {key: _numbers(where, key, values) for key, values in signals.items()}
+        columns = {key: numbers(where, key, values) for key, values in signals.items()}
+        happened = {key: numbers(where, key, values) for key, values in (events or {}).items()}
         for key, values in columns.items():
             if len(values) != len(time):
                 raise DefinitionError(
                     f"{where}: {key} has {len(values)} samples, but time has {len(time)}."
                 )
+        for key, values in (happened | columns).items():
             if np.isinf(values).any():
+                bad = int(np.argmax(np.isinf(values)))
                 raise DefinitionError(
-                    f"{where}: {key} is infinite at sample {int(np.argmax(np.isinf(values)))}; put "
-                    "NaN where a sample is bad."
+                    f"{where}: {key} is infinite at sample {bad}; put NaN where a sample is bad."
                 )
         if len(time) < 2:
             raise DefinitionError(f"{where} has {len(time)} samples: nothing was recorded.")
-        if not np.isfinite(time).all():
-            bad = int(np.argmax(~np.isfinite(time)))
-            raise DefinitionError(f"{where}: time is not a finite number at sample {bad}.")
-        if (np.diff(time) <= 0).any():
-            bad = int(np.argmax(np.diff(time) <= 0)) + 1
-            how, remedy = "runs backwards", "sort the samples, or make a trial of each part"
-            if time[bad] == time[bad - 1]:
-                how, remedy = "repeats", "export it with more digits, or leave doubled samples out"
+        if not (np.diff(time) > 0).all() or np.isinf(time).any():
+            bad = 1 + int(np.argmin(np.diff(np.where(np.isinf(time), np.nan, time)) > 0))
             raise DefinitionError(
-                f"{where}: time {how} at sample {bad} ({time[bad - 1]:.10g}, then "
-                f"{time[bad]:.10g}); {remedy}."
+                f"{where}: time repeats, runs backwards or is not finite at sample {bad} "
+                f"({time[bad - 1]:.10g}, then {time[bad]:.10g}): sort the samples, export more "
+                "digits, or make a trial of each part."
             )
-        happened = {}
-        for key, values in (events or {}).items():
-            values = _numbers(where, key, values)
-            if np.isinf(values).any():
-                raise DefinitionError(f"{where}: the event {key} has an infinite time.")
-            happened[key] = np.sort(values[~np.isnan(values)])
         if unknown := set(units) - set(columns):
             raise DefinitionError(
                 f"{where}: there is a unit for '{min(unknown)}', but the signals are "
                 f"{', '.join(columns)}."
             )
+        happened = {key: np.sort(values[~np.isnan(values)]) for key, values in happened.items()}
         self.trials = (Trial(time, np.stack(list(columns.values()), axis=1), happened, name),)
         self.signals = tuple(columns)
         self.units = tuple(units.get(key, "") for key in columns)
@@ -139,28 +126,18 @@ class Recording(eqx.Module):
     ) -> "Recording":
         """Make a trial from a table with named columns (pandas, polars, pyarrow, a dictionary).
 
-        **Arguments:** `time`: the column with the times; all others are signals. Units may stand in
-        the names, `time (ms)` and `force (N)`. The other arguments are those of `Recording`.
+        **Arguments:** `time`: the column with the times; all others are signals, or events if they
+        are called `event NAME`. Units may stand in the names, `time (ms)` and `force (N)`. The
+        other arguments are those of `Recording`.
 
         **Raises:** `DefinitionError` if there is no such column, for an unknown unit of time, and
-        as `Recording`.
+        as `Recording`; `FileFormatError` for two columns of one name.
         """
-        columns = getattr(frame, "column_names", None)
-        if columns is None and not hasattr(frame, "keys"):
-            raise DefinitionError(
-                f"`frame` must be a table with named columns, not a {type(frame).__name__}."
-            )
-        names = [str(key) for key in (frame.keys() if columns is None else columns)]
-        if time not in names:
-            raise DefinitionError(
-                f"trial '{name}' has no column '{time}'; its columns are {', '.join(names)}."
-            )
-        scale = seconds(f"trial '{name}'", time, time_unit(time))
-        t = scale * _numbers(f"trial '{name}'", time, frame[time])
-        headers = {key: split_header(key) for key in names if key != time}
-        signals = {plain: np.asarray(frame[key]) for key, (plain, _) in headers.items()}
-        given = {plain: unit for plain, unit in headers.values() if unit} | dict(units or {})
-        return cls(t, signals, events=events, units=given, name=name)
+        keys = getattr(frame, "column_names", None) or getattr(frame, "keys", list)()
+        columns = Columns({str(key): np.asarray(frame[key]) for key in keys})
+        table = parse_table(f"trial '{name}'", columns, time)
+        events, units = table.events | dict(events or {}), table.units | dict(units or {})
+        return cls(table.time, table.signals, events=events, units=units, name=name)
 
     @staticmethod
     def join(recordings: Iterable["Recording"]) -> "Recording":
@@ -172,29 +149,29 @@ class Recording(eqx.Module):
         if not recordings:
             raise DefinitionError("`recordings` holds no recording to join.")
         first = recordings[0]
+        units = dict(zip(first.signals, first.units, strict=True))
         trials: list[Trial] = []
         for other in recordings:
             a, b = first.trials[0].name, other.trials[0].name
-            if set(other.signals) != set(first.signals):
+            if set(other.signals) != set(units):
                 raise DefinitionError(
-                    f"trials '{a}' and '{b}' have different signals: {', '.join(first.signals)}, "
-                    f"and {', '.join(other.signals)}."
+                    f"trials '{a}' and '{b}' have different signals: {', '.join(units)}, and "
+                    f"{', '.join(other.signals)}."
                 )
-            order = [other.signals.index(key) for key in first.signals]
-            for key, unit, k in zip(first.signals, first.units, order, strict=True):
-                if other.units[k] != unit:
+            for key, unit in units.items():
+                if other.unit(key) != unit:
                     raise DefinitionError(
-                        f"{key} is in '{unit}' in trial '{a}', but in '{other.units[k]}' in trial "
+                        f"{key} is in '{unit}' in trial '{a}', but in '{other.unit(key)}' in trial "
                         f"'{b}': convert one of them."
                     )
+            order = list(map(other.column, units))
             if order == sorted(order):
                 trials += other.trials
             else:
                 trials += [replace(t, values=t.values[:, order]) for t in other.trials]
-        notes = tuple(dict.fromkeys(note for other in recordings for note in other.notes))
-        signals = dict(zip(first.signals, trials[0].values.T, strict=True))
-        units = dict(zip(first.signals, first.units, strict=True))
-        return Recording(trials[0].time, signals, units=units, notes=notes).with_trials(trials)
+        notes = dict.fromkeys(note for other in recordings for note in other.notes)
+        signals = dict(zip(units, trials[0].values.T, strict=True))
+        return Recording(trials[0].time, signals, units=units, notes=[*notes]).with_trials(trials)
 
     @staticmethod
     def beside(recordings: Iterable["Recording"]) -> "Recording":
@@ -229,14 +206,12 @@ class Recording(eqx.Module):
                 )
             if any(len(t.time) < len(time) for t in trials):
                 notes.append("signals have different rates or clocks: they are missing in between")
-            values = np.full((len(time), len(names)), np.nan)
-            first = 0
+            values, events = [], {}
             for t in trials:
-                last = first + t.values.shape[1]
-                values[np.searchsorted(time, t.time), first:last] = t.values
-                first = last
-            events = {key: at for t in trials for key, at in t.events.items()}
-            signals = dict(zip(names, values.T, strict=True))
+                values.append(np.full((len(time), t.values.shape[1]), np.nan))
+                values[-1][np.searchsorted(time, t.time)] = t.values
+                events |= t.events
+            signals = dict(zip(names, np.concatenate(values, axis=1).T, strict=True))
             joined.append(
                 Recording(time, signals, events=events, units=units, name=name, notes=notes)
             )
@@ -258,12 +233,11 @@ class Recording(eqx.Module):
         **Raises:** `DefinitionError` for an unknown signal, one that never crosses the level, and a
         crossing of a function or in charts, which recordings do not have.
         """
-        signal, level = signal_of(crossing), float(crossing.value)
-        column, trials = self.column(signal), []
+        signal, level, trials = signal_of(crossing), float(crossing.value), []
         sign = 1.0 if crossing.direction == "rising" else -1.0
-        for trial in self.trials:
-            curve = spline(trial.time, without_spikes(trial.values[:, column]), bandwidth)
-            t, y = curve.time, sign * (curve.values - level)
+        for trial, x in self.samples(signal):
+            curve = spline(trial.time, without_spikes(x), bandwidth)
+            t, y = curve.x, sign * (curve(curve.x) - level)
             longest = bridgeable(t, np.isfinite(t), 0.5 / bandwidth)
             at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & (np.diff(t) <= longest))
             if not len(at):
@@ -294,6 +268,11 @@ class Recording(eqx.Module):
             )
         return self.signals.index(name)
 
+    def samples(self, name: str) -> list[tuple[Trial, Series]]:
+        """Return each trial with the samples of a signal."""
+        column = self.column(name)
+        return [(trial, trial.values[:, column]) for trial in self.trials]
+
     def unit(self, name: str) -> str:
         """Return the unit of a signal, "" where none was given."""
         return self.units[self.column(name)]
@@ -304,51 +283,29 @@ class Recording(eqx.Module):
         for t in self.trials:
             step = np.diff(t.time)
             middle = float(np.median(step))
-            low, high = np.quantile(step, [0.05, 0.95])
-            how = "irregular; " if high - low > _IRREGULAR * middle else ""
             missing = int(np.isnan(t.values).any(axis=1).sum())
             lines.append(
                 f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g} s, every "
-                f"{middle:.4g} s ({1 / middle:.4g} Hz; {how}longest {step.max():.4g} s)"
+                f"{middle:.4g} s ({1 / middle:.4g} Hz; longest {step.max():.4g} s)"
                 + (f", {missing} with gaps" if missing else "")
                 + "".join(f", {len(at)} {name}" for name, at in t.events.items())
             )
-        rates = _rates(self.trials[0])
-        if max(rates, default=0) > (1 + _IRREGULAR) * min(rates, default=0):
-            each = (f"{key} {rate:.4g} Hz" for key, rate in zip(self.signals, rates, strict=True))
+        first = self.trials[0]
+        steps = [np.diff(first.time[np.isfinite(x)]) for x in first.values.T]
+        rates = [f"{1 / np.median(x):.2g} Hz" if len(x) else "0 Hz" for x in steps]
+        if len(set(rates)) > 1:
+            each = map(" ".join, zip(self.signals, rates, strict=True))
             lines.append(f"  sampled at {', '.join(each)}")
         return "\n".join([*lines, *(f"  ({note})" for note in self.notes)])
 
     def _repr_html_(self) -> str:
-        trials = [
-            (t.name, str(len(t.time)), f"{t.time[-1] - t.time[0]:.4g} s",
-             ", ".join(f"{len(at)} {name}" for name, at in t.events.items()))
-            for t in self.trials
-        ]  # fmt: skip
         first, drawn = self.trials[0], []
-        rates = (f"{rate:.4g} Hz" for rate in _rates(first))
-        signals = list(zip(self.signals, self.units, rates, strict=True))
-        for x, color, unit, values in list(
-            zip(self.signals, COLORS, self.units, first.values.T, strict=False)
-        )[:4]:
+        names = map(with_unit, self.signals, self.units)
+        for name, color, values in list(zip(names, COLORS, first.values.T, strict=False))[:4]:
             rows = np.flatnonzero(np.isfinite(values[:600]))
             curve = Curve(first.time[rows], values[rows], color=color)
-            drawn.append(picture([curve], "time (s)", with_unit(x, unit)))
-        return card(
-            "Recording",
-            f"{len(trials)} trials",
-            table(("trial", "samples", "duration", "events"), trials),
-            table(("signal", "unit", "rate"), signals),
-            *drawn,
-            text("\n".join(self.notes)),
-        )
-
-
-def _rates(trial: Trial) -> list[float]:
-    """Return the sampling rate of each signal in Hz, from the median time between its samples; 0
-    without samples."""
-    steps = [np.diff(trial.time[np.isfinite(x)]) for x in trial.values.T]
-    return [1 / float(np.median(step)) if len(step) else 0.0 for step in steps]
+            drawn.append(picture([curve], "time (s)", name))
+        return card("Recording", f"{len(self.trials)} trials", text(repr(self)), *drawn)
 
 
 def signal_of(crossing: Crossing) -> str:
@@ -364,31 +321,18 @@ def signal_of(crossing: Crossing) -> str:
 
 
 def check_events(
-    where: str,
-    name: str,
-    at: Series,
-    time: Float[np.ndarray, " m"],
-    margin: float = 0.0,
-    error: type[HybridJaxError] = DefinitionError,
-) -> None:
-    """**Raises:** `error` if all events lie further than `margin` outside of the recording."""
-    at = at[np.isfinite(at)]
-    if len(at) and not ((at >= time[0] - margin) & (at <= time[-1] + margin)).any():
-        raise error(
+    where: str, name: str, at: Series, time: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, " k"]:
+    """Return the events within the recording, or one sample outside of it.
+
+    **Raises:** `DefinitionError` if all events lie outside.
+    """
+    at, margin = at[np.isfinite(at)], float(np.median(np.diff(time)))
+    within = (at >= time[0] - margin) & (at <= time[-1] + margin)
+    if len(at) and not within.any():
+        raise DefinitionError(
             f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording, "
             f"which is from {time[0]:.6g} to {time[-1]:.6g} s: their times have another zero or "
             "unit."
         )
-
-
-def _numbers(where: str, name: str, values: Any) -> Series:
-    try:
-        values = np.asarray(values)
-    except ValueError:  # rows of different lengths
-        values = np.empty((0, 0), object)
-    if values.dtype.kind not in "fiub" or values.ndim != 1:
-        raise DefinitionError(
-            f"{where}: {name} must be real numbers on one axis, not {values.dtype} of shape "
-            f"{values.shape}."
-        )
-    return values.astype(float)
+    return at[within]

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import OptionalNames, Positive, SectionCount, SignalNames
+from .._core.boundary.kinds import OptionalNames, SectionCount, SignalNames
 from .._core.boundary.values import Number
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record
 from .data import SectionData
-from .phase import LONGEST_GAP, Phase, Winding
+from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
 from .phase_estimation import PhaseDefinition, estimate_phase
 from .recording import Recording, Trial
 from .smoothing import (
@@ -33,14 +33,9 @@ from .smoothing import (
 )
 
 
-DriftCycles = Annotated[float, Number("a positive number of cycles", above=0, infinite=True)]
-"""Shortest duration of a drift, in cycles; infinite: a constant."""
-# Default number of sections where neither the call nor the phase gives it. More: more unknowns per
-# cycle. Fewer: less bandwidth.
-_N_SECTIONS = 32
-# Shortest drift in cycles. Longer: slow trends of sensors are rejected. Shorter: responses to the
-# inputs are removed with the drift.
-_FASTEST_DRIFT = 4
+DriftCycles = Annotated[float, Number("four cycles or more", low=4, infinite=True)]
+"""Shortest duration of a drift; infinite: a constant. Shorter: responses to the inputs are removed
+with the drift."""
 
 
 @checked
@@ -91,7 +86,10 @@ def section_data(
     than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
     inputs, outputs = tuple(inputs), tuple(outputs)
-    _refuse_constant(recording, inputs, outputs)
+    for name in (*inputs, *outputs):
+        values = [x[np.isfinite(x)] for _, x in recording.samples(name)]
+        if not any(len(x) and np.ptp(x) for x in values):
+            raise DefinitionError(f"{name} is constant in all trials.")
     if not outputs and timing is None:
         timing = "duration"
     if not isinstance(phase, Phase):
@@ -101,7 +99,7 @@ def section_data(
             f"n_sections is {n_sections}, but the phase is that of a family of {phase.n_sections} "
             "sections: give it once."
         )
-    N = n_sections or phase.n_sections or _N_SECTIONS
+    N = n_sections or phase.n_sections or HARMONICS
     bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
     nu, columns = len(inputs), [recording.column(x) for x in (*inputs, *outputs)]
     parts, trials, cycles, spikes = [], [], [], np.zeros(len(columns), int)
@@ -156,16 +154,6 @@ def section_data(
         bandwidth=bandwidth,
         spikes=tuple(spikes.tolist()),
     )
-
-
-def _refuse_constant(
-    recording: Recording, inputs: tuple[str, ...], outputs: tuple[str, ...]
-) -> None:
-    for name in (*inputs, *outputs):
-        column = [t.values[:, recording.column(name)] for t in recording.trials]
-        if not any(np.nanmax(x) > np.nanmin(x) for x in column if np.isfinite(x).any()):
-            kind = "input" if name in inputs else "output"
-            raise DefinitionError(f"the {kind} {name} is constant in all trials.")
 
 
 def _without_spikes(
@@ -246,11 +234,8 @@ def _with_times(
     parts: list[_Sections], N: int, period: float, timing: Literal["clock", "duration"]
 ) -> list[_Sections]:
     """Append the time of crossing as an output."""
-    if timing == "duration":
-        late = [np.diff(np.where(p.observed, p.t, np.nan), prepend=np.nan) for p in parts]
-    elif not parts:
-        return []
-    else:
+    late = [np.diff(p.t, prepend=np.nan) for p in parts]
+    if timing == "clock" and parts:
         # A line through the times of each section, t = T cycle + a[section], all with the same
         # slope T; cycles are counted through gaps.
         cycles = [
@@ -262,12 +247,16 @@ def _with_times(
         count = np.maximum(np.bincount(section, minlength=N), 1)
         x = cycle - (np.bincount(section, cycle, N) / count)[section]
         z = t - (np.bincount(section, t, N) / count)[section]
-        edges = np.cumsum([len(p.k) for p in parts])[:-1]
-        late = np.split(z - (x @ z) / (x @ x) * x, edges)
-        late = [np.where(p.observed, z, np.nan) for p, z in zip(parts, late, strict=True)]
-    return [
-        p._replace(values=np.column_stack([p.values, z])) for p, z in zip(parts, late, strict=True)
-    ]
+        late = np.split(z - (x @ z) / (x @ x) * x, np.cumsum([len(p.k) for p in parts])[:-1])
+    sections = []
+    for p, z in zip(parts, late, strict=True):
+        unknown = ~p.observed
+        if timing == "duration":
+            unknown |= np.insert(unknown, 0, True)[:-1]
+        sections.append(
+            p._replace(values=np.column_stack([p.values, np.where(unknown, np.nan, z)]))
+        )
+    return sections
 
 
 def _average(parts: list[_Sections], N: int) -> Float[np.ndarray, "N nuy"]:
@@ -279,15 +268,14 @@ def _average(parts: list[_Sections], N: int) -> Float[np.ndarray, "N nuy"]:
     mean = np.full((N, values.shape[1]), np.nan)
     for n, i in np.ndindex(mean.shape):
         x = values[section == n, i]
-        x = x[np.isfinite(x)]
-        if len(x):
-            mean[n, i] = x.mean()
+        if np.isfinite(x).any():
+            mean[n, i] = np.nanmean(x)
     return mean
 
 
 @checked
 def without_drift(
-    recording: Recording, phase: Phase, signals: SignalNames, cycles: Positive
+    recording: Recording, phase: Phase, signals: SignalNames, cycles: DriftCycles
 ) -> Recording:
     """Remove the slow drift of some signals, such as that of sensors.
 
@@ -298,10 +286,7 @@ def without_drift(
     **Raises:** `DefinitionError` for unknown signals, fewer than four cycles, or a phase of other
     trials.
     """
-    columns = [recording.column(x) for x in signals]
-    if not cycles >= _FASTEST_DRIFT:
-        raise DefinitionError(f"drift takes {_FASTEST_DRIFT} cycles or more, not {cycles:g}.")
-    trials = []
+    columns, trials = [recording.column(x) for x in signals], []
     for trial, stretches in phase.by_trial(recording):
         values = trial.values.copy()
         for k in columns:

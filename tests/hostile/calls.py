@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.experiments.design.multisine import single_cosine
 from hybridjax.identify.joint.noise import noise_spectrum
 from hybridjax.recordings.sampling import without_drift
 
@@ -134,7 +133,6 @@ def designs(t):
     lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
     yield hj.paper_design, lines | dict(experiments=8)
-    yield single_cosine, dict(f=0.25, n_sections=6, periods=16)
     yield (
         hj.Design.from_lines,
         dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0, n_sections=6, periods=16),
@@ -228,7 +226,6 @@ def designs_data(t):
     yield hj.designs.Multipliers, {}
     yield hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
     yield hj.designs.FrequencyResponse, dict(band=(0.1, 1.0))
-    yield hj.designs.ImpulseResponse, dict(lags=4)
     yield hj.designs.Limits, dict(rms={"u0": 1.0})
     limits = hj.designs.Limits(rms={"u0": 1.0}, strides=64)
     yield limits.require_inputs, dict(inputs=("u0",))
@@ -254,7 +251,7 @@ def recordings(t):
     yield hj.Recording.beside, dict(recordings=[t.recording])
     rises, angle = (hj.Crossing("x", "rising"), hj.KinematicPhase(4, position="x", velocity="v"))
     yield t.recording.mark, dict(event="e", crossing=rises)
-    for name in ("column", "unit"):
+    for name in ("column", "samples", "unit"):
         yield getattr(t.recording, name), dict(name="x")
     yield hj.recordings.estimate_phase, dict(recording=t.recording, definition=angle)
     take = dict(recording=t.recording, phase=t.phase, inputs="f", outputs=("x", "v"), n_sections=2)

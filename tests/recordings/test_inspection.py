@@ -84,8 +84,7 @@ SAID = {
     "clock set forward": "jump of the clock",
     "milliseconds in one trial": "another unit of time",
     "slow clock in one trial": "another period",
-    "push late in one trial": "displaced input",
-    "clock of the push is fast": "displaced input",
+    "push late in one trial": "foreign input",
     "another event in one trial": "another event",
 }
 
@@ -114,7 +113,7 @@ def test_all_mishaps_are_tried():
     noisy = {
         "white noise", "hum of the mains", "push leaks into outputs", "jitter of the time stamps",
         "other gain in one trial", "0.1 % spikes", "1 % spikes", "0.1 % spikes of the push",
-        "gaps over the crossing", "events inexact",
+        "gaps over the crossing", "events inexact", "clock of the push is fast",
     }  # fmt: skip
     refused = {"push not plugged in", "clock set back"}
     assert {*SAID, *HARMLESS, *noisy, *refused} == {*MISHAPS, *EVENT_MISHAPS}

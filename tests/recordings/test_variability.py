@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.recordings.inspection.answers import feedback
+from hybridjax.recordings.inspection.inspect import feedback
 
 
 N = 8
@@ -38,7 +38,6 @@ def test_instruments_have_no_bias_by_noise():
     assert abs(np.mean([f.multipliers[0].real for f in found]) - 0.6) < 0.05
     assert np.mean([f.plain[0].real for f in found]) < 0.53
     assert any("least squares gives" in text.text for text in found[0].warnings)
-    assert found[0]._repr_html_().count("<tr>") == 3
 
 
 def test_short_records_are_drawn_whole():

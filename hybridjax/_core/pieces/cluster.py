@@ -2,7 +2,6 @@
 
 import contextlib
 import ctypes
-import importlib
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -17,10 +16,10 @@ from distributed.scheduler import KilledWorker
 from ...errors import ComputationError, DefinitionError, HybridJaxError
 from ..compilation import enable_compilation_cache
 from ..progress import counted, say
-from .store import MemoryStore, ZarrStore
+from .store import ZarrStore
 
 
-_PACKAGES = ("hybridjax", "jax", "jaxlib", "numpy")
+_PACKAGES = ["hybridjax", "jax", "jaxlib", "numpy"]
 # Bytes of freed memory that a worker keeps. With less, the system clears every page again: a fifth
 # of the time of a sweep. With more, a worker holds memory that it does not use.
 _KEPT = 2**28
@@ -30,13 +29,14 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # options of mallopt
 _jobs: dict[str, tuple[Any, ZarrStore | None]] = {}
 
 
-def run_on(client: Any, job: Any, store: MemoryStore | ZarrStore, missing: Sequence[int]) -> None:
+def run_on(client: Any, job: Any, store: ZarrStore, missing: Sequence[int]) -> None:
     """Compute pieces on the workers of a client.
 
     **Raises:** `DefinitionError` for a client whose workers cannot do it; `ComputationError` for a
     piece that ends its workers, and if the cluster is lost.
     """
-    with _job(client, job, store.address) as name:
+    address = store.address if isinstance(store.address, str) else None
+    with _job(client, job, address) as name:
         # Dask gives out the tasks again that a lost worker had.
         tasks = client.map(_piece, [name] * len(missing), missing, pure=False)
         pieces = dict(zip(tasks, missing, strict=True))
@@ -94,21 +94,16 @@ def _job(client: Any, job: Any, address: str | None) -> Iterator[str]:
 
 def _check_packages(client: Client) -> None:
     """**Raises:** `DefinitionError` for workers that would compute other numbers, or none."""
-    find = "__import__('importlib').util.find_spec"
-    # (A built-in function: workers may lack those of this package.)
-    expression = (
-        f"(__import__('importlib.util'), {{x: __import__(x).__version__ for x in {_PACKAGES} "
-        f"if {find}(x)}})[1]"
-    )
-    mine = {x: importlib.import_module(x).__version__ for x in _PACKAGES}
-    versions: Any = client.run(eval, expression, on_error="ignore")
-    for worker, theirs in versions.items():
-        for name, version in mine.items():
-            if theirs.get(name) != version:
-                has = f"has {name} {theirs[name]}" if name in theirs else f"lacks {name}"
+    versions: Any = client.get_versions(packages=_PACKAGES)
+    mine = versions["client"]["packages"]
+    for worker, about in versions["workers"].items():
+        for name in _PACKAGES:
+            theirs = about["packages"].get(name)
+            if theirs != mine[name]:
+                has = f"has {name} {theirs}" if theirs else f"lacks {name}"
                 raise DefinitionError(
-                    f"the Dask worker {worker} {has}, and this process has {version}: let workers "
-                    "run in the same environment."
+                    f"the Dask worker {worker} {has}, and this process has {mine[name]}: let "
+                    "workers run in the same environment."
                 )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..arguments import package
 from ..progress import counted
-from .store import Layout, MemoryStore, ZarrStore, absolute, make_store, open_store
+from .store import Layout, ZarrStore, absolute, make_store, open_store
 
 
 @runtime_checkable
@@ -47,9 +47,7 @@ class DaskClient(Protocol):
     def register_plugin(self, plugin: Any, name: str) -> Any: ...
 
 
-def fill(
-    job: Job, address: Any = None, client: DaskClient | None = None
-) -> MemoryStore | ZarrStore:
+def fill(job: Job, address: Any = None, client: DaskClient | None = None) -> ZarrStore:
     """Compute the pieces of a job that are missing, and return the results.
 
     **Arguments:** `address` of a store; None: memory. `client`: a Dask client. Default: this
@@ -59,15 +57,13 @@ def fill(
     a client whose workers cannot do the work; `ComputationError` if the cluster is lost; otherwise
     as the job. The store keeps what was computed.
     """
-    store = None if address is None else open_store(absolute(address), job.description)
+    address = None if address is None else absolute(address)
+    store = None if address is None else open_store(address, job.description)
     if store is not None:
         job = job.resume(store.layout, store.start)
     else:
         job, layout = job.begin()
-        if address is None:
-            store = MemoryStore(layout)
-        else:
-            store = make_store(absolute(address), layout, job.arrays())
+        store = make_store(address, layout, job.arrays())
     missing = store.missing()
     if missing and client is not None:
         package("distributed")

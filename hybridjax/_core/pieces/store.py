@@ -1,4 +1,4 @@
-"""Results of many independent points, in memory or in a Zarr group that any processes fill.
+"""Results of many independent points, in a Zarr group that any processes fill.
 
 A piece is a block of points, and a chunk of each variable. A chunk appears complete or not at all,
 and holds its own checksum. A piece is present when all its chunks are, so no list of finished
@@ -105,47 +105,14 @@ class Layout(NamedTuple):
         return (*self.dims, *x.dims), (*self.blocks.shape, *x.shape)
 
 
-class MemoryStore:
-    """Results in the memory of this process."""
-
-    address: str | None = None
-
-    def __init__(self, layout: Layout):
-        self.layout = layout
-        self._arrays = {
-            name: np.full(layout.array(name)[1], x.fill, x.dtype)
-            for name, x in layout.variables.items()
-        }
-
-    def missing(self) -> list[int]:
-        """Return the pieces to compute: all of them."""
-        return list(range(len(self.layout.blocks)))
-
-    def write(self, k: int, values: Mapping[str, np.ndarray]) -> None:
-        """Keep piece k."""
-        for name, x in values.items():
-            self._arrays[name][self.layout.blocks.slices(k)] = x
-
-    def dataset(self) -> Any:
-        """Return all results as `xarray.Dataset`."""
-        z = self.layout
-        variables = {
-            name: (z.array(name)[0], x, dict(z.variables[name].attributes))
-            for name, x in self._arrays.items()
-        }
-        coordinates = {name: z.constants[name] for name in z.coordinates}
-        constants = {name: x for name, x in z.constants.items() if name not in coordinates}
-        about = {_ABOUT: json.dumps(z.description)}
-        return package("xarray").Dataset({**variables, **constants}, coordinates, about)
-
-
 class ZarrStore:
-    """Results in a Zarr group; `address` is a path, or an address for fsspec ("s3://bucket/a.zarr").
+    """Results in a Zarr group; `address` is a path, an address for fsspec ("s3://bucket/a.zarr"),
+    or a store of Zarr in memory.
 
     **Fields:** `layout`, without constants; `start`: the arrays that the store was begun with.
     """
 
-    def __init__(self, address: str):
+    def __init__(self, address: Any):
         self.address = address
         with _writing(address):
             self._group = _group(address, "r+")
@@ -212,11 +179,12 @@ class ZarrStore:
                     _sync(x.store.delete(self._chunk(x, k)))
 
     def dataset(self) -> Any:
-        """Return all results as `xarray.Dataset`, whose values are read when they are used."""
+        """Return all results as `xarray.Dataset`; on disk, values are read when they are used."""
         data = package("xarray").open_zarr(self.address, consolidated=False, chunks=None)
         constants = [name for name in data.data_vars if name not in self._arrays]
         description = json.dumps(self.layout.description)
-        return data[[*self._arrays, *constants]].assign_attrs({_ABOUT: description})
+        data = data[[*self._arrays, *constants]].assign_attrs({_ABOUT: description})
+        return data if isinstance(self.address, str) else data.load()
 
     def _chunk(self, array: Any, k: int) -> str:
         place = self.layout.blocks.place(k)
@@ -273,13 +241,17 @@ def open_store(address: str, description: Mapping[str, Any]) -> ZarrStore | None
     return store
 
 
-def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrStore:
-    """Return a new store. It keeps the arrays of `start` for the processes that resume it.
+def make_store(address: str | None, layout: Layout, start: list[np.ndarray]) -> ZarrStore:
+    """Return a new store; in memory without an address. It keeps the arrays of `start` for the
+    processes that resume it.
 
     **Raises:** `DefinitionError` if it cannot be written.
     """
+    package("zarr")
     from zarr.codecs import Crc32cCodec
+    from zarr.storage import MemoryStore
 
+    place = MemoryStore() if address is None else address
     common = {"compressors": [Crc32cCodec()], "config": {"write_empty_chunks": True}}
 
     def constant(group: Any, name: str, dims: Sequence[str], values: Any, attributes: Any = None):
@@ -289,9 +261,9 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
             dimension_names=dims, attributes=dict(attributes or {}), **common,
         )  # fmt: skip
 
-    with _writing(address), warnings.catch_warnings():
+    with _writing(place), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # (Zarr announces that its format of texts may change.)
-        group = _group(address, "a")
+        group = _group(place, "a")
         for name, x in layout.variables.items():
             dims, shape = layout.array(name)
             group.create_array(
@@ -312,7 +284,7 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
             "variables": list(layout.variables),
         }
         group.attrs[_ABOUT] = json.dumps(about)  # last: from now on it is a store
-    return ZarrStore(address)
+    return ZarrStore(place)
 
 
 def absolute(address: Any) -> str:
@@ -321,7 +293,7 @@ def absolute(address: Any) -> str:
     return address if "://" in address else os.path.abspath(address)
 
 
-def _group(address: str, mode: Any) -> Any:
+def _group(address: Any, mode: Any) -> Any:
     return package("zarr").open_group(address, mode=mode)
 
 
@@ -332,7 +304,7 @@ def _sync(coroutine: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _writing(address: str) -> Iterator[None]:
+def _writing(address: Any) -> Iterator[None]:
     """**Raises:** `DefinitionError` if a store cannot be written."""
     try:
         yield

@@ -1,17 +1,21 @@
-"""Files that hold arrays in groups: HDF5 and MATLAB of all versions."""
+"""Files of named arrays (HDF5, MATLAB of all versions, NPZ) and of one table (Parquet, Feather,
+Excel)."""
 
-import zlib
+import csv
+import io
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ..._core import limits
-from ..._core.archive import damaged
+from ..._core.archive import read_arrays
+from ..._core.signal import with_unit
 from ...errors import DefinitionError, FileFormatError
-from .columns import Columns, Wanted, check_declared, library, reading, split_header, with_unit
+from .columns import EVENT, Columns, Wanted, check_declared, library, reading, split_header
+from .text import read_plain
 
 
 Place = tuple[str, ...]
@@ -31,7 +35,7 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
     **Raises:** `FileFormatError` for a damaged file, one that declares more than it can hold, for
     arrays of structs, and as `_read_tree`.
     """
-    h5py = library("h5py", "HDF5 files, and MATLAB's of version 7.3,", "mat")
+    h5py = library(path, "h5py", "mat")
     leaves: dict[Place, Leaf] = {}
 
     def visit(name: str, node: Any) -> None:
@@ -44,17 +48,11 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
         text = "MATLAB_empty" in node.attrs or node.attrs.get("MATLAB_class") == b"char"
         if node.dtype.kind in "fiu" and not text:
             unit = node.attrs.get("units", "")
-            unit = unit.decode() if isinstance(unit, bytes) else unit
-            if not isinstance(unit, str):
-                raise FileFormatError(
-                    f"'{path}': the unit of '{name}' is {unit}, which is no text."
-                )
-            leaves[place] = Leaf(node, unit)
+            leaves[place] = Leaf(node, unit.decode() if isinstance(unit, bytes) else str(unit))
 
     with reading(path, "HDF5 file"), h5py.File(path, "r") as file:
         file.visititems(visit)
-        size = 8 * sum(int(np.prod(x.array.shape)) for x in leaves.values())
-        check_declared(path, size, f"arrays of {size} bytes")
+        check_declared(path, 8 * sum(int(np.prod(x.array.shape)) for x in leaves.values()))
         return _read_tree(path, leaves, separator, wanted)
 
 
@@ -67,14 +65,12 @@ def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
     from scipy.io import loadmat, matlab, whosmat
 
     with reading(path, "MATLAB file"):
-        is_hdf5 = matlab.matfile_version(path)[0] == 2
-        if not is_hdf5:
-            _check_packed(path)
-            names = [name for name, _, _ in whosmat(path)]
-            chosen = [x for x in names if wanted.includes(x) or wanted.reaches(x)]
-            content = loadmat(path, simplify_cells=True, variable_names=chosen)
-    if is_hdf5:
-        return read_hdf5(path, wanted, ".")
+        if matlab.matfile_version(path)[0] == 2:
+            return read_hdf5(path, wanted, ".")
+        shapes = {name: shape for name, shape, _ in whosmat(path)}
+        check_declared(path, 8 * sum(int(np.prod(shape)) for shape in shapes.values()))
+        chosen = [x for x in shapes if wanted.includes(x) or wanted.reaches(x)]
+        content = loadmat(path, simplify_cells=True, variable_names=chosen)
     variables = {name: value for name, value in content.items() if not name.startswith("__")}
     return _read_tree(path, dict(_leaves(path, (), variables, wanted)), ".", wanted)
 
@@ -90,29 +86,6 @@ def _leaves(path: Path, place: Place, value: Any, wanted: Wanted) -> Iterator[tu
         yield place, Leaf(np.asarray(value))
 
 
-def _check_packed(path: Path) -> None:
-    """**Raises:** `FileFormatError` if compressed variables hold more than `limits` allow.
-
-    A file of version 5 has a header of 128 bytes, then elements with a tag of 8 bytes; type 15 is
-    compressed.
-    """
-    size = path.stat().st_size
-    room = limits.unpacked(size)
-    with open(path, "rb") as file:
-        order: Literal["little", "big"] = "little" if file.read(128)[-2:] == b"IM" else "big"
-        while len(tag := file.read(8)) == 8:
-            kind, length = (int.from_bytes(x, order) for x in (tag[:4], tag[4:]))
-            if kind != 15:
-                file.seek(length, 1)
-                continue
-            unpacker, data = zlib.decompressobj(), file.read(min(length, size))
-            while data and not unpacker.eof:
-                room -= len(unpacker.decompress(data, 2**20))
-                data = unpacker.unconsumed_tail
-                if room < 0:
-                    raise damaged(path, "it unpacks to more than a recording of its size would")
-
-
 def _read_tree(
     path: Path, leaves: Mapping[Place, Leaf], separator: str, wanted: Wanted
 ) -> list[Columns]:
@@ -125,20 +98,16 @@ def _read_tree(
     **Raises:** `DefinitionError` where there are no times for a signal; `FileFormatError` for an
     array that is not as long as its times.
     """
-    wanted.require(path, [separator.join(place) for place in leaves], groups=True)
-    clocks: dict[Place, Leaf] = {}
-    for place, leaf in leaves.items():
-        if separator.join(place) == wanted.time:
-            clocks[()] = leaf
-        elif wanted.is_time(place[-1]):
-            clocks[place[:-1]] = leaf
+    names = {place: separator.join(place) for place in leaves}
+    wanted.require(path, list(names.values()), groups=True)
+    clocks = {place[:-1]: place for place in leaves if wanted.is_time(place[-1])}
+    if wanted.time in names.values():
+        clocks[()] = next(place for place, name in names.items() if name == wanted.time)
     tables: dict[Place, Columns] = {}
     for place, leaf in leaves.items():
-        name = separator.join(place)
-        is_event = place[-2:-1] == ("events",)
-        if any(leaf is clock for clock in clocks.values()) or not (
-            is_event or (np.prod(leaf.array.shape) > 1 and wanted.reaches(name))
-        ):
+        name, is_event = names[place], place[-2:-1] == ("events",)
+        is_signal = np.prod(leaf.array.shape) > 1 and wanted.reaches(name)
+        if place in clocks.values() or not (is_event or is_signal):
             continue
         around = next((place[:k] for k in range(len(place), -1, -1) if place[:k] in clocks), None)
         if around is None:
@@ -147,7 +116,7 @@ def _read_tree(
                 "it: name the array that holds them by `time`, or choose `signals`."
             )
         if around not in tables:
-            clock = clocks[around]
+            clock = leaves[clocks[around]]
             times = np.atleast_1d(np.squeeze(clock.array[()]))
             tables[around] = Columns({with_unit(wanted.time, clock.unit): times}, events={})
         if is_event:
@@ -181,3 +150,57 @@ def _refuse_structs(path: Path, name: str, wanted: Wanted) -> None:
             f"'{path}': '{name}' is an array of structs: save each of them in a file of its own, "
             "or choose other `signals`."
         )
+
+
+def read_arrow(path: Path, wanted: Wanted) -> list[Columns]:
+    """Read the wanted columns of a Parquet or Feather file.
+
+    **Raises:** `FileFormatError` for a damaged file, or one that declares more than it can hold.
+    """
+    dataset = library(path, "pyarrow.dataset", "tables")
+    kind = path.suffix.lower().removeprefix(".")
+    with reading(path, f"{kind} file"):
+        file = dataset.dataset(path, format=kind)
+        names = file.schema.names
+        check_declared(path, 8 * file.count_rows() * len(names))
+        wanted.require(path, [split_header(x)[0] for x in names])
+        kept = [x for x in names if wanted.includes(x)]
+        table = file.to_table(columns=kept)
+    return [Columns({name: table[name].to_numpy() for name in kept})]
+
+
+def read_excel(path: Path, wanted: Wanted) -> list[Columns]:
+    """Read the first sheet as a text file with a line for each of its rows.
+
+    **Raises:** `FileFormatError` for a damaged file, one that declares more than it can hold, and
+    a first sheet without a table, with the row.
+    """
+    openpyxl = library(path, "openpyxl", "tables")
+    with reading(path, "Excel file"):
+        with zipfile.ZipFile(path) as archive:
+            check_declared(path, sum(x.file_size for x in archive.infolist()))
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        names = book.sheetnames
+        lines = [_line(row) for row in book.worksheets[0].iter_rows(values_only=True)]
+        book.close()
+    table = read_plain(path, lines)
+    note = f"of {len(names)} sheets the first one, '{names[0]}', was read"
+    return [table._replace(notes=(*table.notes, note)) if len(names) > 1 else table]
+
+
+def _line(row: tuple) -> str:
+    """Join cells with tabs, in quotes where necessary."""
+    text = io.StringIO()
+    cells = ["" if x is None else " ".join(str(x).split()) for x in row]
+    csv.writer(text, delimiter="\t", lineterminator="").writerow(cells)
+    return text.getvalue()
+
+
+def read_npz(path: Path, wanted: Wanted) -> list[Columns]:
+    """Read an array for each column; arrays `event NAME` hold times.
+
+    **Raises:** as `read_arrays`.
+    """
+    arrays = read_arrays(path)
+    events = {x.removeprefix(EVENT): arrays.pop(x) for x in list(arrays) if x.startswith(EVENT)}
+    return [Columns(arrays, events=events)]

@@ -26,39 +26,36 @@ def read_bag(path: Path, wanted: Wanted) -> list[Columns]:
     **Raises:** `DefinitionError` for a topic that does not exist; `FileFormatError` for a damaged
     file, and arrays whose length changes.
     """
-    reader = library("rosbags.highlevel", "Bags of ROS and MCAP files", "ros").AnyReader
-    typesys = library("rosbags.typesys", "Bags of ROS and MCAP files", "ros")
+    reader = library(path, "rosbags.highlevel", "ros").AnyReader
+    typesys = library(path, "rosbags.typesys", "ros")
     store = typesys.get_typestore(typesys.Stores.LATEST)
     with reading(path, "bag of ROS"), reader([path], default_typestore=store) as bag:
         names = {x.topic.lstrip("/") for x in bag.connections}
         wanted.require(path, sorted(names), groups=True)
         chosen = [x for x in bag.connections if wanted.reaches(x.topic.lstrip("/"))]
-        topics = {x.topic: _Topic(path, x.topic.lstrip("/"), wanted) for x in chosen}
+        topics = {x.topic: _Topic(x.topic.lstrip("/")) for x in chosen}
         for connection, arrival, data in bag.messages(chosen) if chosen else ():
             message = bag.deserialize(data, connection.msgtype)
-            topics[connection.topic].add(message, arrival)
+            topics[connection.topic].add(path, message, arrival, wanted)
         return [x.columns(bag.start_time) for x in topics.values() if x.names]
 
 
 class _Topic:
     """The numbers of one topic, message by message."""
 
-    def __init__(self, path: Path, name: str, wanted: Wanted):
-        self.path, self.name, self.wanted = path, name, wanted
-        self.names: tuple[str, ...] = ()
+    def __init__(self, name: str):
+        self.name, self.names = name, ()
         self.values, self.stamps, self.arrivals = array("d"), array("q"), array("q")
 
-    def add(self, message: Any, arrival: int) -> None:
-        pairs = [(x, v) for x, v in _numbers(message, self.name) if self.wanted.includes(x)]
-        names = tuple(x for x, _ in pairs)
-        if self.arrivals and names != self.names:
-            other = min(set(names) ^ set(self.names))
+    def add(self, path: Path, message: Any, arrival: int, wanted: Wanted) -> None:
+        numbers = {x: v for x, v in _numbers(message, self.name) if wanted.includes(x)}
+        if self.arrivals and tuple(numbers) != self.names:
             raise FileFormatError(
-                f"'{self.path}': '{other}' is not in all messages of '{self.name}', whose arrays "
-                "differ in length: choose other `signals`."
+                f"'{path}': arrays in messages of '{self.name}' differ in length: choose other "
+                "`signals`."
             )
-        self.names = names
-        self.values.extend(v for _, v in pairs)
+        self.names = tuple(numbers)
+        self.values.extend(numbers.values())
         self.arrivals.append(arrival)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
         self.stamps.append(0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
@@ -83,7 +80,5 @@ def _numbers(message: Any, name: str) -> Iterator[tuple[str, float]]:
             yield path, float(value)
         elif isinstance(value, np.ndarray) and value.size <= _LONGEST:
             yield from ((f"{path}.{k}", float(x)) for k, x in enumerate(value))
-        elif dataclasses.is_dataclass(value) and (
-            getattr(value, "__msgtype__", "") != "std_msgs/msg/Header"
-        ):
+        elif dataclasses.is_dataclass(value) and field.name != "header":
             yield from _numbers(value, path)

@@ -2,14 +2,16 @@
 
 import struct
 from collections.abc import Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.signal import with_unit
 from ...errors import FileFormatError
-from .columns import Columns, Wanted, library, reading, two_columns, with_unit
+from .columns import Columns, Wanted, library, reading, two_columns
 
 
 Named = list[tuple[str, Float[np.ndarray, " n"]]]
@@ -23,7 +25,7 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
 
     **Raises:** `FileFormatError` for a damaged or truncated file.
     """
-    ezc3d = library("ezc3d", "C3D files", "c3d")
+    ezc3d = library(path, "ezc3d", "c3d")
     with reading(path, "C3D file"):
         file = ezc3d.c3d(str(path))
         declared = _declared_frames(path)
@@ -35,7 +37,7 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
         )
     tables = []
     for columns in (_points(parameters["POINT"], data), _analogs(parameters["ANALOG"], data)):
-        two_columns(path, [name for name, _ in columns], "signals")
+        two_columns(path, [name for name, _ in columns])
         if columns:
             per_frame = len(columns[0][1]) // frames
             ticks = np.arange(first * per_frame, (first + frames) * per_frame)
@@ -76,12 +78,8 @@ def _points(parameters: Mapping[str, Any], data: Mapping[str, Any]) -> Named:
 
 def _analogs(parameters: Mapping[str, Any], data: Mapping[str, Any]) -> Named:
     labels, units = _texts(parameters, "LABELS"), _texts(parameters, "UNITS")
-    units += [""] * (len(labels) - len(units))
-    return [
-        (with_unit(label, unit), row)
-        for label, unit, row in zip(labels, units, data["analogs"][0], strict=False)
-        if label
-    ]
+    names = (with_unit(*x) if x[0] else "" for x in zip_longest(labels, units, fillvalue=""))
+    return [(name, row) for name, row in zip(names, data["analogs"][0], strict=False) if name]
 
 
 def _texts(parameters: Mapping[str, Any], name: str) -> list[str]:
@@ -95,10 +93,10 @@ def _texts(parameters: Mapping[str, Any], name: str) -> list[str]:
 
 def _events(parameters: Mapping[str, Any]) -> dict[str, Float[np.ndarray, " _"]]:
     """Return times in s by context and label; the file holds minutes and seconds."""
-    contexts, labels = _texts(parameters, "CONTEXTS"), _texts(parameters, "LABELS")
-    contexts += [""] * (len(labels) - len(contexts))
+    contexts, labels = iter(_texts(parameters, "CONTEXTS")), _texts(parameters, "LABELS")
     times = np.reshape(parameters["TIMES"]["value"], (2, -1)) if labels else np.zeros((2, 0))
     events: dict[str, list[float]] = {}
-    for context, label, (minutes, seconds) in zip(contexts, labels, times.T, strict=False):
-        events.setdefault(f"{context} {label}".strip(), []).append(60.0 * minutes + seconds)
+    for label, (minutes, seconds) in zip(labels, times.T, strict=False):
+        name = f"{next(contexts, '')} {label}".strip()
+        events.setdefault(name, []).append(60.0 * minutes + seconds)
     return {name: np.array(at) for name, at in events.items()}

@@ -42,6 +42,74 @@ class Columns(NamedTuple):
     """Times of events by name, in the unit of the table's times."""
 
 
+class Table(NamedTuple):
+    """The columns of a table by their plain names."""
+
+    time: Float[np.ndarray, " n"]
+    """In s."""
+    signals: dict[str, Float[np.ndarray, " n"]]
+    units: dict[str, str]
+    """Units of the signals that have one."""
+    events: dict[str, Float[np.ndarray, " _"]]
+    """Times of events in s."""
+    clock: str
+    """The header of the times."""
+
+
+def parse_table(where: str, columns: Columns, time: str) -> Table:
+    """Separate the times, events and signals of a table, and names and units.
+
+    Capitals in the name of the times matter only if there are several such columns.
+
+    **Raises:** `DefinitionError` if there are no times, or their unit is unknown; `FileFormatError`
+    if there are several, or a unit is NaN.
+    """
+    headers = {x: split_header(x) for x in columns.values}
+    exact = [x for x, (name, _) in headers.items() if time in (x, name)]
+    clocks = exact or [x for x, (name, _) in headers.items() if name.lower() == time.lower()]
+    if len(clocks) > 1:
+        raise FileFormatError(f"{where} has two columns '{time}'.")
+    if not clocks:
+        names = ", ".join(name for name, _ in headers.values())
+        raise DefinitionError(f"{where} has no column '{time}'; its columns are {names}.")
+    clock = clocks[0]
+    scale = _seconds(where, clock)
+    times = scale * numbers(where, clock, columns.values[clock])
+    events = {name: at * scale for name, at in columns.events.items()}
+    signals, units = {}, {}
+    for header, (name, unit) in headers.items():
+        if header == clock:
+            continue
+        if name.startswith(EVENT):
+            happened = np.nan_to_num(numbers(where, name, columns.values[header])) != 0
+            events[name.removeprefix(EVENT)] = times[happened]
+            continue
+        if unit.lower() == "nan":
+            raise FileFormatError(f"{where}: the unit of '{name}' is nan: write it, or nothing.")
+        if name in signals:
+            raise FileFormatError(f"{where} has two columns '{name}'.")
+        signals[name] = columns.values[header]
+        units |= {name: unit} if unit else {}
+    return Table(times, signals, units, events, clock)
+
+
+def numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
+    """Return one axis of real numbers.
+
+    **Raises:** `DefinitionError` for other values.
+    """
+    try:
+        values = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        values = np.empty((0, 0), object)
+    if values.dtype.kind not in "fiub" or values.ndim != 1:
+        raise DefinitionError(
+            f"{where}: {name} must be real numbers on one axis, not {values.dtype} of shape "
+            f"{values.shape}."
+        )
+    return values.astype(float)
+
+
 class Wanted(NamedTuple):
     """The wanted part of a file."""
 
@@ -55,13 +123,12 @@ class Wanted(NamedTuple):
         name = split_header(header)[0]
         if self.signals is None or name.startswith(EVENT) or self.is_time(header):
             return True
-        return any(belongs(name, x) for x in self.signals)
+        return any(_belongs(name, x) for x in self.signals)
 
     def reaches(self, group: str) -> bool:
         """Return whether a signal, or a member of a group, is wanted."""
-        return self.signals is None or any(
-            belongs(group, x) or belongs(x, group) for x in self.signals
-        )
+        wanted = self.signals or ()
+        return self.signals is None or any(_belongs(group, x) or _belongs(x, group) for x in wanted)
 
     def is_time(self, header: str) -> bool:
         """Return whether a column may hold the times."""
@@ -73,21 +140,15 @@ class Wanted(NamedTuple):
         **Raises:** `DefinitionError` that lists up to 20 names.
         """
         for name in self.signals or ():
-            if not any(belongs(x, name) or (groups and belongs(name, x)) for x in names):
-                more = ", ..." if len(names) > 20 else ""
-                listed = ", ".join(names[:20]) or "none"
-                raise DefinitionError(f"'{path}' has no signal '{name}'; it has {listed}{more}.")
+            if not any(_belongs(x, name) or (groups and _belongs(name, x)) for x in names):
+                listed = ", ".join([*names[:20], *["..."][: len(names) // 21]]) or "none"
+                raise DefinitionError(f"'{path}' has no signal '{name}'; it has {listed}.")
 
 
-def belongs(name: str, group: str) -> bool:
+def _belongs(name: str, group: str) -> bool:
     """Return whether a signal has this name or is in the group of this name: `imu.gyro.x` belongs
     to `imu`."""
     return name == group or name.startswith((f"{group}.", f"{group}/"))
-
-
-def with_unit(name: str, unit: str) -> str:
-    """Return the header of a signal."""
-    return f"{name} ({unit})" if unit else name
 
 
 def split_header(header: str) -> tuple[str, str]:
@@ -107,37 +168,37 @@ def time_unit(header: str) -> str:
     return split_header(header)[1] or (trailing[2] if trailing else "")
 
 
-def seconds(where: str, column: str, unit: str) -> float:
-    """Return a unit of time in seconds; no unit means seconds.
+def _seconds(where: str, header: str) -> float:
+    """Return the unit of times in seconds; no unit means seconds.
 
     **Raises:** `DefinitionError` for an unknown unit.
     """
-    if unit and unit not in _SECONDS:
+    unit = time_unit(header) or "s"
+    if unit not in _SECONDS:
         raise DefinitionError(
-            f"{where}: the times in '{column}' are in '{unit}', which is no known unit of time: "
+            f"{where}: the times in '{header}' are in '{unit}', which is no known unit of time: "
             "convert them to s, ms, us, ns, min or h (divide frames by the sampling rate)."
         )
-    return _SECONDS[unit] if unit else 1.0
+    return _SECONDS[unit]
 
 
-def two_columns(path: Path, names: Sequence[str], what: str = "columns") -> None:
+def two_columns(path: Path, names: Sequence[str]) -> None:
     """**Raises:** `FileFormatError` if a name occurs twice."""
     if len(set(names)) < len(names):
         twice = next(x for x in names if names.count(x) > 1)
-        raise FileFormatError(f"'{path}' has two {what} '{twice}'.")
+        raise FileFormatError(f"'{path}' has two columns '{twice}'.")
 
 
-def library(module: str, what: str, extra: str) -> Any:
-    """Import the package that reads a format.
+def library(path: Path, module: str, extra: str) -> Any:
+    """Import the package that reads a file.
 
     **Raises:** `DefinitionError` if it is not installed.
     """
     try:
-        importlib.import_module(module.split(".")[0])
         return importlib.import_module(module)
     except ImportError as error:
         raise DefinitionError(
-            f"{what} are read with the package {module.split('.')[0]}, which is not installed: "
+            f"'{path}' is read by the package {module.split('.')[0]}, which is not installed: "
             f"`pip install 'hybridjax[{extra}]'`."
         ) from error
 
@@ -154,7 +215,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
         raise FileFormatError(f"'{path}' is no {kind}, or damaged ({reason}).") from error
 
 
-def check_declared(path: Path, size: int, what: str) -> None:
+def check_declared(path: Path, size: int) -> None:
     """**Raises:** `FileFormatError` if a file declares more than a file of its size can hold."""
     if size > limits.unpacked(path.stat().st_size):
-        raise damaged(path, f"it declares {what}, and is not that large")
+        raise damaged(path, f"it declares arrays of {size} bytes, and is not that large")

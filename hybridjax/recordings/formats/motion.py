@@ -1,16 +1,15 @@
 """Text files with or without the layouts of OpenSim, Motion Analysis and Vicon."""
 
+from collections.abc import Iterator
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
+from ..._core.signal import with_unit
 from ...errors import FileFormatError
-from .columns import Columns, Wanted, with_unit
+from .columns import Columns, Wanted
 from .text import read_lines, read_plain, read_table, split_line, split_names, to_number
-
-
-# Lines of a header before the numbers, of `.trc` files and of a block of Vicon's.
-_HEADER = 5
 
 
 def read_text(path: Path, wanted: Wanted) -> list[Columns]:
@@ -24,9 +23,8 @@ def read_text(path: Path, wanted: Wanted) -> list[Columns]:
         return [_opensim(path, lines, head.index("endheader"))]
     if head[0].startswith("pathfiletype"):
         return [_trc(path, lines)]
-    if _blocks(lines[: 2 * _HEADER]):
-        return _vicon(path, lines)
-    return [read_plain(path, lines)]
+    blocks = any(x.startswith(("frame", '"frame')) for x in head) and list(_vicon(path, lines))
+    return blocks or [read_plain(path, lines)]
 
 
 def _check_rows(path: Path, rows: int, declared: str | None, what: str) -> None:
@@ -53,66 +51,54 @@ def _opensim(path: Path, lines: list[str], end: int) -> Columns:
 
 def _trc(path: Path, lines: list[str]) -> Columns:
     """Read columns `MARKER.x`, `MARKER.y` and `MARKER.z`; empty fields are missing samples."""
-    head = [split_line(x, "\t") for x in lines[:_HEADER]]
-    names = split_names(lines[3], "\t") if len(head) == _HEADER else []
+    head = [split_line(x, "\t") for x in lines[:5]]
+    names = split_names(lines[3], "\t") if len(head) == 5 else []
     if [x.lower() for x in names[:2]] != ["frame#", "time"]:
         raise FileFormatError(f"'{path}' does not name 'Frame#', 'Time' and its markers in line 4.")
     facts = dict(zip((x.lower() for x in head[1]), head[2], strict=False))
     unit = facts.get("units", "")
     columns = [with_unit(f"{marker}.{axis}", unit) for marker in names[2::3] for axis in "xyz"]
-    table = read_table(path, ["frame#", "time (s)", *columns], lines, _HEADER, "\t")
+    table = read_table(path, ["frame#", "time (s)", *columns], lines, 5, "\t")
     _check_rows(path, len(table.values.pop("frame#")), facts.get("numframes"), "frames")
     return table
 
 
-def _vicon(path: Path, lines: list[str]) -> list[Columns]:
+def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
     """Read a table for each block of devices or markers; times count from the first frame.
 
-    Columns are named by device, or marker, and component, such as `Plate 1.Fx`.
+    A block has a title, a rate, the devices, their components, units, and then a row for each
+    sample. Columns are named by device, or marker, and component, such as `Plate 1.Fx`.
     """
-    rates, tables = set(), []
-    for start, stop in _blocks(lines):
-        separator, names = _names(lines[start : start + _HEADER])
-        table = read_table(path, names, lines[:stop], start + _HEADER, separator)
+    ends = [k for k in range(len(lines)) if not lines[k].strip(" ,;\t")] + [len(lines)]
+    rates = set()
+    for start in range(len(lines) - 4):
+        separator = max("\t;,", key=lines[start + 3].count)
+        names = _names(*(split_names(x, separator) for x in lines[start + 2 : start + 5]))
+        rate = to_number(lines[start + 1].strip(" ,;\t")) or 0
+        if not (rate > 0 and names and names[0].lower() == "frame"):
+            continue
+        stop = next(k for k in ends if k >= start + 5)
+        table = read_table(path, names, lines[:stop], start + 5, separator)
         columns = {name.lower(): name for name in table.values}
         frame = table.values.pop(columns["frame"])
         sub = table.values.pop(columns.get("sub frame", ""), np.zeros(len(frame)))
         parts = int(np.nan_to_num(sub).max()) + 1
         if not np.isfinite(frame + sub).all() or (np.diff(frame + sub / parts) <= 0).any():
             raise FileFormatError(f"'{path}' has frames that are missing, or not in order.")
-        rate = float(lines[start + 1].strip(" ,;\t")) / parts
-        rates.add(rate)
-        time = ((frame - 1) * parts + sub) / (parts * rate)
-        tables.append(Columns({"time (s)": time} | table.values, table.notes))
+        time = ((frame - 1) * parts + sub) / rate
+        yield Columns({"time (s)": time} | table.values, table.notes)
+        rates.add(rate / parts)
     if len(rates) > 1:
         raise FileFormatError(
             f"'{path}' has blocks whose frames differ in rate: export them one by one."
         )
-    return tables
 
 
-def _blocks(lines: list[str]) -> list[tuple[int, int]]:
-    """Return the first line of each block (a title, a rate, devices, components, units) and the
-    line after its last."""
-    starts = [
-        k
-        for k in range(len(lines) - _HEADER + 1)
-        if lines[k + 3].strip('" ').lower().startswith("frame")
-        and (to_number(lines[k + 1].strip(" ,;\t")) or 0) > 0
-        and _names(lines[k : k + _HEADER])[1][0].lower() == "frame"
-    ]
-    ends = [k for k in range(len(lines)) if not lines[k].strip(" ,;\t")] + [len(lines)]
-    return [(start, next(k for k in ends if k >= start + _HEADER)) for start in starts]
-
-
-def _names(head: list[str]) -> tuple[str, list[str]]:
-    """Return the separator, and `device.component (unit)` for each column."""
-    separator = max("\t;,", key=head[3].count)
-    devices, components, units = (split_names(x, separator) for x in head[2:])
+def _names(devices: list[str], components: list[str], units: list[str]) -> list[str]:
+    """Return `device.component (unit)` for each column."""
     device, names = "", []
-    for k, component in enumerate(components):
+    for above, component, unit in zip_longest(devices, components, units, fillvalue=""):
         # A name stands above the first of its columns; of `subject:marker` the marker counts.
-        device = devices[k].split(":")[-1] if k < len(devices) and devices[k] else device
-        name = f"{device}.{component}" if device else component
-        names.append(with_unit(name, units[k] if k < len(units) else ""))
-    return separator, names
+        device = above.split(":")[-1] if above else device
+        names.append(with_unit(f"{device}.{component}" if device else component, unit))
+    return names[: len(components)]

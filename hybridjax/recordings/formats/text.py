@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.signal import with_unit
 from ...errors import FileFormatError
-from .columns import Columns, is_unit, split_header, two_columns, with_unit
+from .columns import Columns, is_unit, split_header, two_columns
 
 
 # Bytes that no text holds, in any encoding with one byte for each ASCII character.
