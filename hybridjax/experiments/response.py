@@ -20,7 +20,7 @@ from ..engine.move import Options, move
 from ..engine.settings import EXPERIMENT, Settings
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
-from ..sections.abstract import BoundSections
+from ..sections.families import BoundSections
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike, observe, section_target
 from ..systems.output import Output, OutputNames
