@@ -31,7 +31,7 @@ from .experiments.data import ExperimentData as ExperimentData
 from .experiments.design.design import Design as Design
 from .experiments.design.multisine import multisine as multisine, paper_design as paper_design
 from .experiments.record import Record as Record
-from .experiments.response_function import response_function as response_function
+from .experiments.response import response_function as response_function
 from .experiments.run import run_experiments as run_experiments
 from .fitting.fit import fit_model as fit_model, identifiability as identifiability
 from .fitting.observations import (
@@ -64,13 +64,11 @@ from .recordings.recording import Recording as Recording
 from .scale.draws import monte_carlo as monte_carlo
 from .scale.family import Points as Points
 from .scale.sweep import sweep as sweep
-from .sections.abstract import (
+from .sections.families import (
     AbstractLevels as AbstractLevels,
     AbstractSections as AbstractSections,
-    BoundSections as BoundSections,
-)
-from .sections.families import (
     ArcLength as ArcLength,
+    BoundSections as BoundSections,
     ClockPhase as ClockPhase,
     KinematicPhase as KinematicPhase,
     SectionList as SectionList,

@@ -81,7 +81,7 @@ class LimitCycle(eqx.Module):
     def structure(self) -> Structure:
         """The system by the indices of its charts and transitions. (Made anew: it holds values of
         one trace that are invalid in the next.)"""
-        return Structure(self.system)
+        return self.return_map.structure
 
     @property
     def scale(self) -> dict[str, float]:
