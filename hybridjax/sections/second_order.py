@@ -13,8 +13,8 @@ from .._core.executor import from_host, to_host
 from ..engine.replay import replay
 from ..linear.time_response import monodromy, periodic_states
 from ..orbits.cycle import LimitCycle
-from ..systems.output import Output
 from ..systems.structure import Structure
+from ..systems.system import Output
 from .families import FamilyLike
 from .linearize import inputs_of
 from .place import as_placed
