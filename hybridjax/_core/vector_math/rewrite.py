@@ -204,7 +204,7 @@ def _ours(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn | None:
     avals: Any = tuple(v.aval for v in eqn.invars)
     if eqn.primitive in _FACTORIZATIONS:
         rows, columns = avals[0].shape[-2:]
-        square = rows == columns and 0 < rows <= factorizations.IN_LOOPS
+        square = rows == columns and 0 < rows <= factorizations.MOST_ROWS
         if not square or not jnp.issubdtype(avals[0].dtype, jnp.floating):
             return None
         names = {"left_side", "lower", "transpose_a", "unit_diagonal"} & set(eqn.params)
