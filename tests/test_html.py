@@ -89,16 +89,6 @@ def test_linear_models_and_transfer_functions(model):
     assert shown(htf.at(htf.f[:1])).pictures == 2  # of one frequency there is no curve
 
 
-def test_experiments(model):
-    design = hj.multisine(periods=16, band=(0, 4.0))
-    data = hj.experiments.simulate_experiments(model, design, start="periodic")
-    page = shown(data)
-    assert {"<u>", "yM & co"} <= set(page.texts)
-    failed = np.full(len(data.u), int(hj.Result.ZENO))
-    lost = eqx.tree_at(lambda d: d.result, data, failed)
-    assert "Zeno" in "".join(shown(lost).texts)
-
-
 def test_fits():
     A, B, C = [[[0.6, 0.5], [-0.5, 0.6]]] * 4, [[[1.0], [0.3]]] * 4, [[[1.0, 0.0], [0.2, 1.0]]] * 4
     model = hj.LDTP(A, B, C, inputs="<u>", outputs=("yM & co", "vM"))

@@ -9,7 +9,7 @@ from .._core.boundary.checked import checked
 from .._core.signal import unit_of, with_unit
 from ..designs.candidates import Model
 from ..designs.information import InformationMap
-from ..designs.optimal_design import OptimalDesign
+from ..designs.optimize import OptimalDesign
 from ..designs.study import Study
 from ..errors import DefinitionError
 from .frequency import FREQUENCY
