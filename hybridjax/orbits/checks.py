@@ -18,13 +18,9 @@ from ..systems.transition import Scheduled
 from .coincidence import SAME, coincident, events_of
 from .cycle import LimitCycle
 from .return_map import Turn
-from .scale import STIFF, fastest, is_implicit, points
+from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 
 
-# The part of a function's change over the states' sizes and the period, as its derivatives predict
-# it, that is no difference between two times. Smaller: rounding is. Larger: small errors of a
-# stated period pass.
-_SAME_SLOPE = 1e-9
 # Times at which functions are compared, after that of each point, in parts of the period: fields
 # that jump with a clock do not jump there, and no shift is a multiple of another.
 _BASE, _LATER = 0.0729, np.array([0.1459, 0.3820, 0.6180, 1.4142])
@@ -85,7 +81,7 @@ def check_times(
             values = function(first, states)
             size = np.concatenate([[time], sizes[a, :n]])[:, None]
             slope = np.sum(np.abs(values[:, 1 : 2 + n]) * size, axis=1)
-            same = SAME * np.abs(values[:, 0]) + _SAME_SLOPE * slope
+            same = SAME * np.abs(values[:, 0]) + ROUNDING * slope
             for shift in later:
                 if np.any(np.abs(function(first + shift, states)[:, 0] - values[:, 0]) > same):
                     if period is None:
