@@ -1,5 +1,7 @@
 """From a recording to multipliers, where the truth is known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,7 @@ def test_slow_change_of_the_period(hopper_recording, hopper_cycle, angle):
     assert fit.contains(hopper_cycle.multipliers, 0.999).all()
 
 
+@pytest.mark.slow
 def test_van_der_pol_without_a_clock():
     system = hj.models.VanDerPol(mu=0.1)
     cycle = hj.find_limit_cycle(system)
@@ -95,29 +98,6 @@ def test_compass_gait_by_events():
 
 
 @pytest.mark.slow
-def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
-    """Against the exact linearization, averaged over the push."""
-    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
-    data = hj.recordings.section_data(hopper_recording, angle, **options)
-    fit = hj.fit_series(data.records, order=2)
-    found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
-    sections = hj.KinematicPhase(
-        16, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
-        anchor=hj.Crossing("vM", "falling"),
-    )  # fmt: skip
-    exact = hj.linearize(hopper_cycle, sections, ("yM", "vM")).impulse_response(64)
-    reach, step = 4, found.period / 16
-    k = np.arange(-reach, reach + 1)
-    push = np.exp(-0.5 * (k / (16 * found.width)) ** 2)
-    for m in (0, 5, 11):
-        for r in (8, 20, 31):
-            n = (m + r) % 16
-            value = sum(w * exact[n, r - j] for w, j in zip(push / push.sum(), k, strict=True))
-            miss = np.abs(found.values[m, r, :, 0] - value[:, 0] / step)
-            assert (miss < 0.03 * np.abs(found.values[..., 0]).max(axis=(0, 1))).all()
-
-
-@pytest.mark.slow
 def test_order_and_advice(hopper_recording, angle):
     noisy = spoil(hopper_recording, noise=1e-3)
     options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
@@ -142,3 +122,38 @@ def test_order_and_advice(hopper_recording, angle):
     poor = hj.recordings.section_data(slow, angle, **options)
     said = hj.recordings.advise(poor, hj.fit_series(poor.records, order=2, **fast)).warnings
     assert any(w.cause == "narrow excitation" for w in said)
+
+
+def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycle):
+    """Sixteen sections of four samples each, spikes in one per cent of force and outputs."""
+    clean = spoil(hopper_recording, noise=1e-4)
+    fits, data, apex = [], [], hj.Crossing("vM", "falling")
+    dirty = spoil(clean, ("u", "yM", "vM"), spikes=1e-2, seed=1)
+    for recording in (clean, dirty):
+        options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
+        data.append(hj.recordings.section_data(recording, apex, **options))
+        fits.append(hj.fit_series(data[-1], order=2))
+    changed = (clean.trials[0].values != dirty.trials[0].values).sum(axis=0)
+    assert np.abs(data[1].spikes - changed).max() <= 0.05 * max(changed) + 1
+    assert fits[1].standard_errors[0] < 2 * fits[0].standard_errors[0]
+    assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
+    assert any(w.cause == "spikes" for w in hj.recordings.advise(data[1], fits[1]).warnings)
+
+
+@pytest.mark.slow
+def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
+    """Against the exact linearization, averaged over the push."""
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
+    data = hj.recordings.section_data(hopper_recording, angle, **options)
+    fit = hj.fit_series(data.records, order=2)
+    found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
+    sections = dataclasses.replace(angle, anchor=hj.Crossing("vM", "falling"))
+    exact = hj.linearize(hopper_cycle, sections, ("yM", "vM")).impulse_response(64)
+    reach, step = 4, found.period / 16
+    k = np.arange(-reach, reach + 1)
+    push = np.exp(-0.5 * (k / (16 * found.width)) ** 2)
+    for m, r in [(0, 8), (5, 20), (11, 31)]:
+        n = (m + r) % 16
+        value = sum(w * exact[n, r - j] for w, j in zip(push / push.sum(), k, strict=True))
+        miss = np.abs(found.values[m, r, :, 0] - value[:, 0] / step)
+        assert (miss < 0.03 * np.abs(found.values[..., 0]).max(axis=(0, 1))).all()
