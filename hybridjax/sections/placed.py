@@ -65,11 +65,8 @@ class PlacedSections(eqx.Module):
         head = f"PlacedSections({self.n_sections} sections of a {family} on a cycle of {system}"
         if is_traced(self):
             return f"{head}, traced)"
-        lines = self._facts()
-        low, high = lines["dimension"].split(" to ")
-        dimension = low if low == high else f"{low} to {high}"
-        start = lines["section 0 at t"]
-        return f"{head}: {lines['sections']}; dimension {dimension}; section 0 at t = {start})"
+        sections, dimension, start, _ = self._facts().values()
+        return f"{head}: {sections}; dimension {dimension}; section 0 at t = {start})"
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
@@ -86,7 +83,7 @@ class PlacedSections(eqx.Module):
         inside = (f"{np.sum(charts == a)} in {names[a]}" for a in dict.fromkeys(charts.tolist()))
         return {
             "sections": ", ".join(inside),
-            "dimension": f"{np.min(dims)} to {np.max(dims)}",
+            "dimension": " to ".join(str(n) for n in np.unique([np.min(dims), np.max(dims)])),
             "section 0 at t": number(t[0], unit=unit),
             "from one to the next": (
                 f"{np.min(durations):.4g} to {number(np.max(durations), 4, unit)}"
