@@ -111,14 +111,6 @@ def identify_recording(
     of_events = all(w.linear for parts in phase.stretches for w in parts)
     if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:
         curve = phase_response(recording, phase, input=data.inputs[0])
-    return Identification(
-        recording=recording,
-        findings=findings,
-        phase=phase,
-        data=data,
-        fit=fit,
-        held_out=held,
-        responses=impulse_responses(fit, data),
-        curve=curve,
-        advice=collect_advice(data, records, fit, held.validation, findings, curve),
-    )
+    responses = impulse_responses(fit, data)
+    advice = collect_advice(data, records, fit, held.validation, findings, curve)
+    return Identification(recording, findings, phase, data, fit, held, responses, curve, advice)

@@ -272,12 +272,6 @@ class Recording(eqx.Module):
                 + (f", {missing} with gaps" if missing else "")
                 + "".join(f", {len(at)} {name}" for name, at in t.events.items())
             )
-        first = self.trials[0]
-        steps = [np.diff(first.time[np.isfinite(x)]) for x in first.values.T]
-        rates = [f"{1 / np.median(x):.2g} Hz" if len(x) else "0 Hz" for x in steps]
-        if len(set(rates)) > 1:
-            each = map(" ".join, zip(self.signals, rates, strict=True))
-            lines.append(f"  sampled at {', '.join(each)}")
         return "\n".join([*lines, *(f"  ({note})" for note in self.notes)])
 
     def _repr_html_(self) -> str:

@@ -196,18 +196,9 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     return Smoothness(penalty, noise, excess, max(-float(top.fun), 0.0))
 
 
-class Accuracy(NamedTuple):
-    """Accuracy of a curve."""
-
-    covariance: Covariance
-    left_out: Float[np.ndarray, " blocks"]
-    """Sums of squared errors of each block, forecast by a fit to the others."""
-    detail: float
-    """Number of coefficients that the data determine: the trace of their share in the curvature."""
-
-
-def accuracy_of(intervals: Intervals, fit: CurveFit) -> Accuracy:
-    """Estimate the accuracy from blocks of intervals whose errors may depend on each other.
+def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float, float]:
+    """Return the covariance of a curve, the sum of squared errors of intervals forecast by fits to
+    other blocks, and the number of coefficients that the data determine.
 
     The errors of each block are those of a forecast by a curve fitted to the other blocks, to first
     order (the jackknife that deletes blocks: Bell and McCaffrey 2002). Smoothness makes a bias,
@@ -227,7 +218,8 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> Accuracy:
         score[k], left_out[k] = x.T @ error, error @ error
     meat = score.T @ score + fit.smoothness.noise * smooth
     covariance = sandwich(curvature, meat, shares + smooth / count)
-    return Accuracy(covariance, left_out, float(np.trace(np.linalg.lstsq(curvature, data)[0])))
+    detail = float(np.trace(np.linalg.lstsq(curvature, data)[0]))
+    return covariance, float(left_out.sum()), detail
 
 
 def plain_curve(intervals: Intervals, fit: CurveFit) -> Float[np.ndarray, " p"]:

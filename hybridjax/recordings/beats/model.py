@@ -29,14 +29,11 @@ from ..smoothing import bridgeable, gaps, inside
 # Integration steps in a median interval of a trial. More: time. Fewer: errors of durations approach
 # the jitter of fast curves.
 _STEPS = 32
-# Length, in longest intervals of the trial, over which the input is kept. Longer: memory. Shorter:
-# slow models are extrapolated at their own rate.
-_REACH = 1.5
 # Intervals that are integrated together. More: memory. Fewer: more calls of NumPy.
 _CHUNK = 4096
 # Points per cycle at which curves are tabulated, up to 1.5 cycles (the step in which an interval
-# ends goes beyond 1); linear in between. More: memory. Fewer: errors of the finest half wave (1e-5
-# of it at 1024).
+# ends goes beyond 1; inputs are kept for 1.5 of the longest interval), linear in between. More:
+# memory. Fewer: errors of the finest half wave (1e-5 of it at 1024).
 _POINTS = 1024
 
 
@@ -100,7 +97,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
             continue
         start, duration = start[used], duration[used]
         step = float(np.median(duration)) / _STEPS
-        nodes = np.arange(2 * int(np.ceil(_REACH * duration.max() / step)) + 1) / 2
+        nodes = np.arange(2 * int(np.ceil(1.5 * duration.max() / step)) + 1) / 2
         inputs.append(np.interp(start + nodes[:, None] * step, trial.time[finite], x[finite]))
         starts.append(start)
         durations.append(duration)

@@ -41,17 +41,13 @@ def read_lines(path: Path) -> list[str]:
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
-def _is_comment(line: str) -> bool:
-    return line.lstrip().startswith(_COMMENTS)
-
-
 def read_plain(path: Path, lines: list[str]) -> Columns:
     """Read names in the first line that is no comment, perhaps units below, then numbers.
 
     **Raises:** `FileFormatError` if there is no table, with the line.
     """
     filled = [k for k, x in enumerate(lines) if x.strip(" \t,;")]
-    content = [k for k in filled if not _is_comment(lines[k])]
+    content = [k for k in filled if not lines[k].lstrip().startswith(_COMMENTS)]
     if not content:
         raise FileFormatError(f"'{path}' has no line with the names of its columns.")
     first = content[0]
@@ -126,7 +122,7 @@ def read_table(
     """
     two_columns(path, [x for x in headers if x])
     notes = []
-    lines = ["" if _is_comment(x) else x for x in lines[start:]]
+    lines = ["" if x.lstrip().startswith(_COMMENTS) else x for x in lines[start:]]
     if separator != "," and any("," in x for x in lines):
         notes.append("decimal commas were read as such")
         mixed = next((k for k, x in enumerate(lines) if "." in x), None)
