@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from .._core import limits
 from .._core.boundary.checked import checked
-from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import with_unit
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
@@ -273,15 +272,6 @@ class Recording(eqx.Module):
                 + "".join(f", {len(at)} {name}" for name, at in t.events.items())
             )
         return "\n".join([*lines, *(f"  ({note})" for note in self.notes)])
-
-    def _repr_html_(self) -> str:
-        first, drawn = self.trials[0], []
-        names = map(with_unit, self.signals, self.units)
-        for name, color, values in list(zip(names, COLORS, first.values.T, strict=False))[:4]:
-            rows = np.flatnonzero(np.isfinite(values[:600]))
-            curve = Curve(first.time[rows], values[rows], color=color)
-            drawn.append(picture([curve], "time (s)", name))
-        return card("Recording", f"{len(self.trials)} trials", text(repr(self)), *drawn)
 
 
 def signal_of(crossing: Crossing) -> str:

@@ -151,7 +151,7 @@ def projected(
 
 def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
     """Return the blocks whose errors count as independent."""
-    if len(intervals.names) >= _BLOCKS:
+    if int(intervals.trial[-1]) + 1 >= _BLOCKS:
         return intervals.trial
     return intervals.blocks(max(_SHORTEST_BLOCK, len(intervals.start) // (2 * _BLOCKS)))
 
@@ -165,7 +165,7 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     curvature, pull = across.T @ across, across.T @ residual
     # Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
     noise_only = residual - across @ np.linalg.lstsq(curvature, pull)[0]
-    freedom = max(int(fit.used.sum()) - len(intervals.names) - p, 1)
+    freedom = max(int(fit.used.sum()) - len(fit.rates) - p, 1)
     variance = float(noise_only @ noise_only) / freedom
     block = _blocks(intervals)
     sums = np.stack([np.bincount(block, x * noise_only) for x in across.T], axis=1)

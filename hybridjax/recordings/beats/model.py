@@ -52,8 +52,6 @@ class Intervals(NamedTuple):
     duration: Float[np.ndarray, " L"]
     trial: Int[np.ndarray, " L"]
     """Index among the trials that have intervals."""
-    names: tuple[str, ...]
-    """Names of these trials."""
     step: Float[np.ndarray, " L"]
     """Step of integration, in s."""
     inputs: Float[np.ndarray, "nodes L"]
@@ -61,7 +59,7 @@ class Intervals(NamedTuple):
 
     def sums(self, values: Float[np.ndarray, " L"]) -> Float[np.ndarray, " trials"]:
         """Return sums over each trial."""
-        return np.bincount(self.trial, values, len(self.names))
+        return np.bincount(self.trial, values)
 
     def blocks(self, length: int) -> Int[np.ndarray, " L"]:
         """Return the block of each interval: successive intervals of one trial."""
@@ -83,7 +81,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
         raise DefinitionError(
             "`phase` must be one of events (`AtEvent`) or crossings: an angle has no intervals."
         )
-    starts, durations, steps, inputs, names = [], [], [], [], []
+    starts, durations, steps, inputs = [], [], [], []
     for (trial, x), (_, parts) in zip(samples, pairs, strict=True):
         finite = np.isfinite(x)
         if finite.sum() < 2:
@@ -102,16 +100,15 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
         starts.append(start)
         durations.append(duration)
         steps.append(np.full(len(start), step))
-        names.append(trial.name)
-    if not names:
+    if not starts:
         raise DefinitionError(f"no interval between events lies where {name} was recorded.")
     if not any(np.ptp(x) > 0 for x in inputs):
         raise DefinitionError(f"the input {name} is constant in all trials.")
     longest = max(map(len, inputs))
     inputs = [np.pad(x, ((0, longest - len(x)), (0, 0)), "edge") for x in inputs]
-    trial = np.repeat(np.arange(len(names)), list(map(len, starts)))
+    trial = np.repeat(np.arange(len(starts)), list(map(len, starts)))
     start, duration, step = map(np.concatenate, (starts, durations, steps))
-    return Intervals(start, duration, trial, tuple(names), step, np.concatenate(inputs, axis=1))
+    return Intervals(start, duration, trial, step, np.concatenate(inputs, axis=1))
 
 
 def basis(

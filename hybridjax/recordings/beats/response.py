@@ -155,7 +155,7 @@ def phase_response(
         phase = estimate_phase(recording, phase)
     intervals = intervals_of(recording, phase, input)
     total = len(intervals.start)
-    if total < 2 * (10 + len(intervals.names)):  # half of them for errors
+    if total < 2 * (11 + intervals.trial[-1]):  # half of them for errors
         text = f"{total} intervals are too few for a curve and the rates of their trials"
         raise DefinitionError(f"{text}: record more.")
     say("flat")

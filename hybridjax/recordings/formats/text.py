@@ -62,9 +62,6 @@ def read_plain(path: Path, lines: list[str]) -> Columns:
         if len(names) != width or any(to_number(x) is not None for x in names):
             raise FileFormatError(f"'{path}' begins with numbers: its first line must be names.")
         return read_table(path, names, lines, first, separator)
-    if len(names) == 1 and max(len(split_line(below, x)) for x in ",;\t") > 1:
-        text = f"'{path}', line {first + 1}: '{lines[first].strip()[:40]}' names one column, but "
-        raise FileFormatError(f"{text}there are more below: begin lines before the names with '#'.")
     start, fields = first + 1, split_line(below, separator)
     units = [x for x in fields if x]
     if units and all(map(is_unit, units)) and any(to_number(x) is None for x in fields):

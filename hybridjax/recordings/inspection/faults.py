@@ -63,9 +63,8 @@ def placeholders(x: Series, period: float, is_input: bool) -> Rows:
 def _is_placeholder(size: float) -> bool:
     """Return whether programs write this number for "no value": 999, 8888, 32768, 1e20, ..."""
     digits = f"{size:.0f}"
-    if len(digits) >= 3 and set(digits) in ({"9"}, {"8"}):
-        return True
-    return size in (2.0**15, 2.0**15 - 1, 2.0**16 - 1, 2.0**31, 2.0**31 - 1) or size >= 1e15
+    full = size in {2.0**15, 2.0**15 - 1, 2.0**16 - 1, 2.0**31, 2.0**31 - 1}
+    return full or size >= 1e15 or (len(digits) >= 3 and set(digits) in ({"9"}, {"8"}))
 
 
 def frozen(x: Series, period: float, is_input: bool) -> Rows:
