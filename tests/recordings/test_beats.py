@@ -73,7 +73,9 @@ def test_slopes_are_derivatives(noisy):
         difference = (moved.duration - base.duration) / 1e-5
         np.testing.assert_allclose(base.slopes[:, k], difference, atol=0.02 * 0.1)
     moved = forecast(intervals, table, a, rates + 1e-5)
-    np.testing.assert_allclose(base.slopes[:, -1], (moved.duration - base.duration) / 1e-5, atol=5e-4)
+    np.testing.assert_allclose(
+        base.slopes[:, -1], (moved.duration - base.duration) / 1e-5, atol=5e-4
+    )
 
 
 def test_intervals_of_all_lengths_are_no_missed_events():
