@@ -10,6 +10,7 @@ import pytest
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
 
+from .linear.test_variances import htf as htf
 from .sessions import blocks, same_output
 
 
@@ -268,3 +269,15 @@ def test_the_session_of_the_page_prints_what_it_shows(capsys):
     (shown,) = (text for kind, text in blocks(PAGE) if kind == "text")
     exec(compile(code, PAGE, "exec"), {"__name__": "session"})
     assert same_output(shown, capsys.readouterr().out)
+
+
+def test_scatter_is_kept(htf, tmp_path):
+    """In files, datasets, and by transformations of JAX."""
+    hj.save(tmp_path / "htf.npz", htf)
+    radius = htf.confidence_radius()
+    dataset = hj.convert.to_xarray(htf)
+    assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
+    for other in (hj.load(tmp_path / "htf.npz"), hj.convert.from_xarray(dataset)):
+        assert jax.tree.structure(other) == jax.tree.structure(htf)
+        np.testing.assert_array_equal(other.confidence_radius(), radius)
+    np.testing.assert_allclose(jax.jit(lambda x: x.confidence_radius())(htf), radius)

@@ -283,9 +283,13 @@ def _fit_to_series(
             model = model._replace(K=[np.zeros((len(A), len(C))) for A, C in columns])
     model = _without_direct(model, direct)
     unknowns = local_coordinates(model, direct).size
-    freedom = numbers - unknowns
-    if free_start:
-        freedom -= sum(model.dims[n] for n in first)
+    starts = sum(model.dims[n] for n in first) if free_start else 0
+    freedom = numbers - unknowns - starts
+    if 3 * starts > numbers:  # errors would be smaller, and regions with them
+        raise DefinitionError(
+            f"{starts} coordinates of the states at the start of {len(first)} records are to be "
+            f"found from {numbers} numbers: leave out records shorter than a cycle."
+        )
     fewest = records.sampled.min()
     if freedom < 1 or fewest <= ny + unknowns / (N * ny):
         raise DefinitionError(
