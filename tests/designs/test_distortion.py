@@ -153,34 +153,23 @@ def test_two_inputs(two, inputs):
     assert np.abs(even - quadratic.second_order(u)).max() < 1e-5 * np.abs(even).max()
 
 
-def test_the_expected_size_with_two_inputs(two):
-    """Over draws of the phases."""
-    cosines = Candidates.of(SHORT)
+@pytest.mark.parametrize("gaussian", [False, True])
+def test_the_expected_size_with_two_inputs(two, gaussian):
+    """Over draws of the phases; and of amplitudes, too, which makes the inputs Gaussian."""
+    count, cosines = 400, Candidates.of(SHORT)
     limit = Distortion(*two[:2], {"x": 1.0, "z": 1.0})
-    found = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
-    drawn = [found.rms(SHORT.realizations(1, seed=k), phases=True) ** 2 for k in range(300)]
-    error = np.std(drawn, axis=0) / np.sqrt(300)
-    assert (np.abs(np.mean(drawn, axis=0) - found.rms(SHORT) ** 2) < 3.5 * error).all()
-    assert (error < 0.02 * found.rms(SHORT) ** 2).all()
-
-
-def test_the_expected_size_of_gaussian_inputs(two):
-    """Lines whose amplitudes are random, too."""
-    cosines = Candidates.of(SHORT)
-    quadratic = second_order(*two[:2], ("x", "z"), two[2].inputs)
-    form = quadratic.products(cosines.f, cosines.channel).gaussian()
-    limit = Distortion(*two[:2], {"x": 1.0, "z": 1.0})
-    found = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
-    power, rng, drawn = found.cosines.powers_in(SHORT), np.random.default_rng(0), []
-    expected = np.mean([form @ p @ p for p in power], axis=0)
-    for k in range(500):
-        one = SHORT.realizations(1, seed=k)
-        size = np.sqrt(rng.exponential(size=len(one.amplitude)))
-        one = dataclasses.replace(one, amplitude=one.amplitude * size)
-        drawn.append(found.rms(one, phases=True) ** 2)
-    error = np.std(drawn, axis=0) / np.sqrt(500)
-    assert (np.abs(np.mean(drawn, axis=0) - expected) < 3.5 * error).all()
-    assert (error < 0.05 * expected).all()
+    form = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
+    drawn, expected = SHORT.realizations(count), form.rms(SHORT) ** 2
+    if gaussian:
+        size = np.sqrt(np.random.default_rng(0).exponential(size=len(drawn.line)))
+        drawn = dataclasses.replace(drawn, amplitude=drawn.amplitude * size)
+        matrix = form.quadratic.products(cosines.f, cosines.channel).gaussian()
+        expected = np.mean([matrix @ p @ p for p in cosines.powers_in(SHORT)], axis=0)
+    squares = np.mean(form.quadratic.second_order(drawn.inputs()) ** 2, axis=1)
+    each = squares.reshape(count, -1, 2).mean(axis=1)
+    error = np.std(each, axis=0) / np.sqrt(count)
+    assert (np.abs(np.mean(each, axis=0) - expected) < 3.5 * error).all()
+    assert (error < (0.05 if gaussian else 0.02) * expected).all()
 
 
 def test_products_in_parts_and_of_a_design(two, monkeypatch):
