@@ -77,13 +77,13 @@ from .sections.linearize import linearize as linearize
 from .sections.place import place_sections as place_sections
 from .sections.section_map import section_map as section_map
 from .systems.chart import Chart as Chart
-from .systems.output import Output as Output
 from .systems.quotient import Quotient as Quotient
 from .systems.sliding import sliding as sliding
 from .systems.solver import Radau as Radau
 from .systems.system import (
     Guess as Guess,
     HybridSystem as HybridSystem,
+    Output as Output,
     Parameter as Parameter,
     parameter as parameter,
 )

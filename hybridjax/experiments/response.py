@@ -23,9 +23,8 @@ from ..orbits.cycle import LimitCycle
 from ..sections.families import BoundSections
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike, observe, section_target
-from ..systems.output import Output, OutputNames
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem
+from ..systems.system import HybridSystem, Output, OutputNames
 from .plan import ROUNDING, Accuracy, Plan, Stepping, plan_flow
 
 

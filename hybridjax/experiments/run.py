@@ -23,8 +23,8 @@ from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
-from ..systems.output import Output, OutputNames
 from ..systems.structure import Outputs
+from ..systems.system import Output, OutputNames
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design
 from .noise import ProcessNoise

@@ -14,7 +14,7 @@ from ..linear.ldtp import LDTP
 from ..linear.time_response import monodromy
 from ..sections.linearize import linearize
 from ..sections.placed import PlacedSections
-from ..systems.output import Output
+from ..systems.system import Output
 from .plan import Plan, Stepping
 from .response import Course, flow_batch
 

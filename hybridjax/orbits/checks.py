@@ -18,13 +18,9 @@ from ..systems.transition import Scheduled
 from .coincidence import SAME, coincident, events_of
 from .cycle import LimitCycle
 from .return_map import Turn
-from .scale import STIFF, fastest, is_implicit, points
+from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 
 
-# The part of a function's change over the states' sizes and the period, as its derivatives predict
-# it, that is no difference between two times. Smaller: rounding is. Larger: small errors of a
-# stated period pass.
-_SAME_SLOPE = 1e-9
 # Times at which functions are compared, after that of each point, in parts of the period: fields
 # that jump with a clock do not jump there, and no shift is a multiple of another.
 _BASE, _LATER = 0.0729, np.array([0.1459, 0.3820, 0.6180, 1.4142])
@@ -85,7 +81,7 @@ def check_times(
             values = function(first, states)
             size = np.concatenate([[time], sizes[a, :n]])[:, None]
             slope = np.sum(np.abs(values[:, 1 : 2 + n]) * size, axis=1)
-            same = SAME * np.abs(values[:, 0]) + _SAME_SLOPE * slope
+            same = SAME * np.abs(values[:, 0]) + ROUNDING * slope
             for shift in later:
                 if np.any(np.abs(function(first + shift, states)[:, 0] - values[:, 0]) > same):
                     if period is None:
@@ -141,15 +137,11 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     """The outputs that are conserved near the cycle, with their values: their gradients are left
     eigenvectors of the monodromy."""
     cycle = to_host(cycle)
-    s, t = cycle.structure, cycle.anchor.t
-    a = int(cycle.anchor.chart[0])
-    n = s.dims[a]
-    returned, sizes = monodromy(cycle.factors)[:n, :n], cycle.return_map.scale[a, :n]
-    items = tuple(s.resolve_outputs(names).items)
-    rows = kernels.outputs(s, a, items, t, cycle.anchor.q[:n], np.zeros((s.nu, 1)))[..., 0]
-    values, gradients = rows[:, 0], rows[:, 2 : 2 + n]
-    changes = np.abs((gradients @ returned - gradients) * sizes).max(axis=1)
-    kept = changes <= SAME * np.abs(gradients * sizes).max(axis=1)
+    map = cycle.return_map
+    values, gradients = map.outputs(cycle.anchor.q[:, 0], names)
+    changes = gradients @ monodromy(cycle.factors) - gradients
+    changes = np.abs(changes * map.sizes).max(axis=1)
+    kept = changes <= SAME * np.abs(gradients * map.sizes).max(axis=1)
     return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
 
 

@@ -21,7 +21,7 @@ from ..experiments.response import ResponseFunction, response_function
 from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording, Trial
 from ..sections.families import ClockPhase
-from ..systems.output import OutputNames
+from ..systems.system import OutputNames
 
 
 # Longest step of `simulate_beats`, in cycles. Longer: events are late by more than the noise of

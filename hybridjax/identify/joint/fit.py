@@ -4,7 +4,7 @@ from typing import Annotated, Literal, cast
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from ..._core.arguments import Numbers, require_same
 from ..._core.boundary.checked import checked
@@ -64,10 +64,6 @@ class LDTPFit(MultiplierEstimate):
     """
 
     model: LDTP
-    multipliers: Complex[np.ndarray, " d"]
-    coefficients: Float[np.ndarray, " d"]
-    covariance: Float[np.ndarray, "d d"]
-    covariance_freedom: float = eqx.field(static=True)
     cost: float = eqx.field(static=True)
     freedom: int = eqx.field(static=True)
     result: int = eqx.field(static=True)
@@ -147,9 +143,6 @@ class LDTPFit(MultiplierEstimate):
             K=[K / size.T if K.shape[1] else K for K in model.K],
         )
         return Predictor(model, D @ D.swapaxes(1, 2), self.inputs, self.outputs)
-
-    def __repr__(self) -> str:
-        return f"LDTPFit(multipliers {self.show_multipliers()}; {self._about()})"
 
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
