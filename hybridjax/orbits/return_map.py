@@ -259,27 +259,29 @@ class ReturnMap(eqx.Module):
         xp, sizes = namespace(q), self.sizes
         if not self.conserved:
             return xp.zeros_like(q), xp.zeros((len(q), len(q)))
-        excess, gradient = self._excess(q)
+        values, gradient = self.outputs(q, tuple(self.conserved))
+        excess = values - xp.stack(list(self.conserved.values()))
         steep = xp.linalg.norm(gradient * sizes, axis=1, keepdims=True)
         steep = xp.where(steep > 0, steep, 1.0)
         back = sizes[:, None] * xp.linalg.pinv(gradient * sizes / steep) / steep.T
         back = stop_gradient(back)
         return back @ excess, back @ gradient
 
-    def _excess(self, q: Float[Array, " d"]) -> tuple[Float[Array, " c"], Float[Array, "c d"]]:
-        """Conserved quantities less their values, and the derivative."""
-        s, names, t = self.structure, tuple(self.conserved), self.anchor.t[0]
-        values = namespace(q).stack(list(self.conserved.values()))
+    def outputs(
+        self, q: Float[Array, " d"], names: tuple[str, ...]
+    ) -> tuple[Float[Array, " c"], Float[Array, "c d"]]:
+        """Outputs at the anchor's time in its chart, and their derivatives by the state."""
+        s, t = self.structure, self.anchor.t[0]
         if on_host(q):
             a = int(self.anchor.chart[0])
             n = s.dims[a]
             point = t[None], q[:n, None], np.zeros((s.nu, 1))
             rows = kernels.outputs(s, a, names, *point)[..., 0]
-            return rows[:, 0] - values, np.pad(rows[:, 2 : 2 + n], [(0, 0), (0, s.d - n)])
+            return rows[:, 0], np.pad(rows[:, 2 : 2 + n], [(0, 0), (0, s.d - n)])
         outputs, u = s.resolve_outputs(names), jnp.zeros(s.nu)
         branches = [lambda q, a=a: outputs(a, t, q[: s.dims[a]], u) for a in range(len(s.charts))]
-        excess = lambda q: jax.lax.switch(self.anchor.chart[0], branches, q) - values  # noqa: E731
-        return excess(q), jax.jacfwd(excess)(q)
+        values = lambda q: jax.lax.switch(self.anchor.chart[0], branches, q)  # noqa: E731
+        return values(q), jax.jacfwd(values)(q)
 
     def travel(self, q: Float[Array, " d"], flow: Callable) -> tuple[Return, Any]:
         """One turn, piece by piece, each computed by `flow`, and the other results of `flow`.

@@ -6,7 +6,6 @@ import equinox as eqx
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
-from .._core.html import card, text
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..identify.series.fit import SeriesFit, fit_records
@@ -47,11 +46,6 @@ class Identification(eqx.Module):
     def __repr__(self) -> str:
         parts = (self.phase, self.data, self.fit, self.held_out.validation, self.advice)
         return "\n".join(map(repr, parts))
-
-    def _repr_html_(self) -> str:
-        parts = (x._repr_html_() for x in (self.data, self.fit, self.held_out.validation))
-        first = card("Identification", "", text(repr(self.phase)))
-        return first + "".join(parts) + card("Advice", "", text(repr(self.advice)))
 
 
 @checked

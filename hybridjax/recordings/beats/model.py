@@ -41,6 +41,8 @@ _POINTS = 1024
 
 
 Lanes = Float[np.ndarray, " l"]
+Curve = Float[np.ndarray, " _"]
+Nodes = Float[np.ndarray, "nodes l"]
 Table = Float[np.ndarray, "M p"]
 """A basis of curves at equal steps of the phase from 0 on."""
 
@@ -140,12 +142,7 @@ class Forecast(NamedTuple):
     without input."""
 
 
-def forecast(
-    intervals: Intervals,
-    table: Table,
-    coefficients: Float[np.ndarray, " p"],
-    rates: Float[np.ndarray, " trials"],
-) -> Forecast:
+def forecast(intervals: Intervals, table: Table, coefficients: Curve, rates: Curve) -> Forecast:
     """Return durations of all intervals, and their derivatives."""
     curve, rate = table @ coefficients, rates[intervals.trial]
 
@@ -157,13 +154,7 @@ def forecast(
     return Forecast(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _integrate(
-    inputs: Float[np.ndarray, "nodes L"],
-    h: Float[np.ndarray, " L"],
-    w: Float[np.ndarray, " L"],
-    curve: Float[np.ndarray, " M"],
-    table: Table,
-) -> Forecast:
+def _integrate(inputs: Nodes, h: Lanes, w: Lanes, curve: Curve, table: Table) -> Forecast:
     """Integrate by the classical Runge-Kutta method, and derivatives by the trapezoidal rule."""
     L, p = len(h), table.shape[1] + 1
     result, rows = Forecast(np.zeros(L), np.zeros(L), np.zeros((L, p))), np.arange(L)

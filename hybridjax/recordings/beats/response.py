@@ -12,7 +12,6 @@ from ..._core.arguments import Numbers
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability
 from ..._core.boundary.values import Reals
-from ..._core.html import COLORS, Curve, card, picture, text
 from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.signal import Signal, unit_of, with_unit
@@ -108,17 +107,6 @@ class PhaseResponse(eqx.Module):
     def _waves(self, phase: Phases) -> Float[np.ndarray, "n p"]:
         return basis(np.asarray(phase, float) % 1.0, len(self.coefficients) - 1)
 
-    def _repr_html_(self) -> str:
-        low, high = self.interval(self.phase)
-        drawn = [
-            Curve(self.phase, low, color=COLORS[-1]),
-            Curve(self.phase, high, "95 %", COLORS[-1]),
-            Curve(self.phase, self.plain, "plain regression", COLORS[1]),
-            Curve(self.phase, self.values, "estimated", COLORS[0]),
-        ]
-        shown = picture(drawn, "phase (cycles)", with_unit("Z", curve_unit(self.input)))
-        return card("PhaseResponse", "", shown, text(repr(self)))
-
     def __repr__(self) -> str:
         mean, error = self.coefficients[0], np.sqrt(self.covariance[0, 0])
         return (
@@ -170,10 +158,8 @@ def phase_response(
     intervals = intervals_of(recording, phase, input)
     total = len(intervals.start)
     if total < 2 * (10 + len(intervals.names)):  # half of them for errors
-        raise DefinitionError(
-            f"{total} intervals are too few for a curve and the rates of {len(intervals.names)} "
-            "trials: record more."
-        )
+        text = f"{total} intervals are too few for a curve and the rates of their trials"
+        raise DefinitionError(f"{text}: record more.")
     say("flat")
     flat = fit_curve(intervals, 0)
     say("smooth")
@@ -240,24 +226,14 @@ def _warnings(r: PhaseResponse) -> Iterator[Finding]:
         yield Finding("wide", f"{text}either side, more than half of the mean.")
     off = np.sqrt(np.mean((r.plain - r.values) ** 2))
     if off > np.sqrt(np.mean(r.errors**2)):
-        yield Finding(
-            "plain regression",
-            f"at phases that grow linearly it would be off by {off:.2g} (rms, of a mean of "
-            f"{mean:.2g}); do not use it here.",
-        )
+        text = f"at phases that grow linearly it would be off by {off:.2g} (rms, of a mean of "
+        yield Finding("plain regression", f"{text}{mean:.2g}); do not use it here.")
     finest = max(1, round(1 / (np.pi * max(r.jitter, 1e-6))))
-    yield Finding(
-        "resolution",
-        f"the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than harmonic "
-        f"{finest} at the end of a cycle.",
-    )
+    text = f"the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than harmonic "
+    yield Finding("resolution", f"{text}{finest} at the end of a cycle.")
     if r.excess > 2:
-        yield Finding(
-            "misfit",
-            f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
-            "independent errors: the phase model lacks something. Errors of the curve by that are "
-            "not in the intervals.",
-        )
+        text = f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
+        yield Finding("misfit", f"{text}independent errors: the phase model lacks something.")
     if abs(r.memory) > _MEMORY:
         text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the phase"
         yield Finding("memory", f"{text} is not all of the state. Standard errors allow for it.")

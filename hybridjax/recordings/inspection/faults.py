@@ -49,6 +49,7 @@ _OTHER_PERIOD = 0.02
 # that of the others. Larger: drift passes. A ratio below 14: a multiplier of 0.9 is reported.
 _COSINES, _RATIO = 24, 20.0
 
+Cycles = Float[np.ndarray, "k P"]
 Rows = Bool[np.ndarray, " n"]
 
 
@@ -257,7 +258,7 @@ def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
     finite = np.flatnonzero(np.isfinite(mean).all(axis=(0, 2))) if outputs else np.zeros(0, int)
     for s in finite if len(finite) > 1 else ():
         usual = np.median(mean[:, finite[finite != s]], axis=1)
-        yield from _difference(mean[:, s], usual, names[s], outputs)
+        yield from _difference(mean[:, s], usual, names[s], list(outputs))
 
 
 def _average_cycles(recording: Recording, phase: Phase, name: str) -> Float[np.ndarray, "S P"]:
@@ -277,12 +278,7 @@ def _average_cycles(recording: Recording, phase: Phase, name: str) -> Float[np.n
     return np.array(cycles)
 
 
-def _difference(
-    mean: Float[np.ndarray, "k P"],
-    usual: Float[np.ndarray, "k P"],
-    name: str,
-    outputs: tuple[str, ...],
-) -> Iterator[Finding]:
+def _difference(mean: Cycles, usual: Cycles, name: str, outputs: list[str]) -> Iterator[Finding]:
     """Find the cause of a low correlation of the average cycles of a trial with those of others."""
 
     def correlations(x):

@@ -293,8 +293,6 @@ def feedback(data: SectionData) -> Iterator[Finding]:
         repeated = float(np.nanvar(data.cycle_inputs[:, i]))
         share = repeated / max(repeated + float(deviations[i]) ** 2, np.finfo(float).tiny)
         if share > 0.5:
-            yield Finding(
-                "feedback",
-                f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: it is not "
-                "exogenous, and fits are biased. Add a perturbation, and name that as the input.",
-            )
+            text = f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: fits "
+            text += "are biased. Add a perturbation, and name it as the input."
+            yield Finding("feedback", text)
