@@ -7,8 +7,6 @@ import pytest
 
 import hybridjax as hj
 
-from .mishaps import mishandle
-
 
 def spoil(recording, signals=("yM", "vM"), **dirt):
     return hj.testing.spoil(recording, signals, **dirt)
@@ -36,65 +34,6 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
     assert not any(w.cause == "outputs" for w in hj.recordings.advise(data[1], fits[1]).warnings)
-
-
-def test_slow_change_of_the_period(hopper_recording, hopper_cycle, angle):
-    """Everything goes slower and slower: multipliers stay what they are, and phase says by how
-    much."""
-    names = {"input": "u", "outputs": ("yM", "vM"), "event": ""}
-    slower = mishandle(spoil(hopper_recording, noise=1e-4), "clock slows down", **names)
-    phase = hj.recordings.estimate_phase(slower, angle)
-    assert phase.drift * phase.cycles == pytest.approx(0.05, rel=0.1)
-    data = hj.recordings.section_data(
-        slower, phase, inputs="u", outputs=("yM", "vM"), n_sections=16
-    )
-    fit = hj.fit_series(data.records, order=2)
-    assert fit.compare(hopper_cycle.multipliers).max_error < 3e-3
-    assert fit.contains(hopper_cycle.multipliers, 0.999).all()
-
-
-@pytest.mark.slow
-def test_van_der_pol_without_a_clock():
-    system = hj.models.VanDerPol(mu=0.1)
-    cycle = hj.find_limit_cycle(system)
-    period = float(cycle.period)
-    rate = 64 / period
-    force = np.stack(
-        [hj.testing.random_force(100 * period, rate, 2 / period, rms=0.02, seed=k) for k in (0, 1)]
-    )
-    made = hj.testing.simulate_recording(cycle, force, ("x", "v"), rate=rate, steps=1)
-    noisy = spoil(made, ("x", "v"), noise=1e-4)
-    data = hj.recordings.section_data(
-        noisy,
-        hj.KinematicPhase(8, position="x", velocity="v"),
-        inputs="u",
-        outputs=("x", "v"),
-        n_sections=8,
-        timing="duration",
-    )
-    fit = hj.fit_series(data.records, order=1)
-    assert fit.compare(cycle.multipliers[:1]).max_error < 5e-3
-    assert fit.contains(cycle.multipliers[:1], 0.999).all()
-
-
-@pytest.mark.slow
-def test_compass_gait_by_events():
-    """Its third multiplier, 0.13, is small enough for the overhang."""
-    cycle = hj.find_limit_cycle(hj.models.CompassGait(), section=hj.AtEvent("heelstrike"))
-    period, outputs = float(cycle.period), ("n", "s", "vn", "vs")
-    rate = 200 / period
-    force = [
-        hj.testing.random_force(100 * period, rate, 8 / period, rms=0.05, seed=k) for k in range(5)
-    ]
-    made = hj.testing.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
-    noisy = spoil(made, outputs, noise=1e-4)
-    marked = noisy.mark("middle", hj.Crossing("s", "falling"), bandwidth=20 / period)
-    data = hj.recordings.section_data(
-        marked, hj.AtEvent("middle"), inputs="u", outputs=outputs, n_sections=16, timing="duration"
-    )
-    fit = hj.fit_series(data.records, order=2, overhang=32)
-    assert fit.compare(cycle.multipliers[:2]).max_error < 1e-2
-    assert fit.contains(cycle.multipliers[:2], 0.999).all()
 
 
 @pytest.mark.slow

@@ -123,17 +123,3 @@ def test_a_crossing_in_a_gap_is_not_known(wave):
     hidden = np.where(np.abs(t - np.round(t)) < 0.05, np.nan, v)
     with pytest.raises(hj.DefinitionError, match="v is never seen to cross 0, falling"):
         hj.Recording(t, {"v": hidden}).mark("top", top)
-
-
-def test_a_pause_of_the_instruments_ends_a_stretch(wave):
-    """Even where the events before and after it are about a period apart."""
-    t, v = wave.trials[0].time, wave.trials[0].values[:, 2]
-    kept = (t < 7.4) | (t > 9.6)
-    later = np.where(t > 8, t - 1.0, t)[kept]  # what happened in the pause took 1.2 s, not 2.2
-    recording = hj.Recording(
-        later, {"v": v[kept]}, events={"top": np.array([*range(8), *range(9, 19)]) + 0.0}
-    )
-    for definition in (hj.Crossing("v", "falling"), hj.AtEvent("top")):
-        found = hj.recordings.estimate_phase(recording, definition)
-        assert len(found.stretches[0]) == 2 and found.stretches[0][0].time[-1] < 7.4
-        assert found.stretches[0][1].time[0] > 8.6

@@ -2,12 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 
 import hybridjax as hj
 from hybridjax.errors import FileFormatError
-from hybridjax.recordings.formats.columns import Wanted
-from hybridjax.recordings.formats.motion import read_text
 
 
 T = np.arange(5.0)
@@ -44,17 +41,6 @@ def test_trials_must_belong_together():
         hj.Recording.join([one, hj.Recording(T, {"a": T})])
 
 
-def test_pandas_and_parquet(tmp_path):
-    pandas = pytest.importorskip("pandas")
-    frame = pandas.DataFrame({"time": T, "a": T, "event e": [0, 1, 0, 0, 1]})
-    assert hj.Recording.from_frame(frame[["time", "a"]]).signals == ("a",)
-    pytest.importorskip("pyarrow")
-    frame.to_parquet(tmp_path / "x.parquet")
-    np.testing.assert_array_equal(
-        hj.read_recording(tmp_path / "x.parquet").trials[0].events["e"], [1.0, 4.0]
-    )
-
-
 def test_csv_with_units_events_and_missing_samples(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("time (s);force [N];event strike\n0;1;0\n1;;1\n2;NA;0\n3;4;0\n")
@@ -66,28 +52,6 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
     np.savez(tmp_path / "x.npz", time=np.arange(4.0), force=np.ones(4), **{"event strike": [1.5]})
     both = hj.read_recording(path, tmp_path / "x.npz", units={"force": "kN"})
     assert both.units == ("kN",) and both.trials[1].events["strike"] == [1.5]
-
-
-_PART = st.sampled_from(
-    ["1.5", "-2e-3", "nan", "e", "E+", ".", "-", " ", "NaN", "N", "A", "$", "_"]
-)
-_FIELD = st.lists(_PART, max_size=3).map("".join)
-
-
-@given(st.lists(st.lists(_FIELD, min_size=1, max_size=3), min_size=1, max_size=3))
-def test_what_is_no_number_is_not_read_as_one(tmp_path_factory, rows):
-    file = tmp_path_factory.mktemp("table") / "x.csv"
-    rows = [["1.5"] * len(rows[0]), *rows]  # no row of units
-    file.write_text("\n".join(["a,b,c"[: 2 * len(rows[0]) - 1], *map(",".join, rows)]) + "\n")
-    try:
-        (found,) = (x.values for x in read_text(file, Wanted("time")))
-    except FileFormatError:
-        return
-    width = len(rows[0])
-    rows = [row[:width] for row in rows if any(map(str.strip, row))]
-    missing = {"", "nan", "na"}
-    numbers = [[np.nan if x.strip().lower() in missing else float(x) for x in r] for r in rows]
-    np.testing.assert_array_equal(np.stack(list(found.values()), axis=1), numbers)
 
 
 @pytest.mark.parametrize(
@@ -106,9 +70,9 @@ def test_what_is_no_number_is_not_read_as_one(tmp_path_factory, rows):
         ("time (min);F (µN)\n0.00833333333333333333;1\n0.025;-0.25\n", "utf-8"),
     ],
 )
-@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_what_spreadsheets_write(tmp_path, text, encoding, end):
-    (tmp_path / "x.csv").write_text(text.replace("\n", end), encoding=encoding, newline="")
+def test_what_spreadsheets_write(tmp_path, text, encoding):
+    text = text.replace("\n", "\r\n" if ";" in text else "\r" if "\t" in text else "\n")
+    (tmp_path / "x.csv").write_text(text, encoding=encoding, newline="")
     found = hj.read_recording(tmp_path / "x.csv", time="time_ms" if "_ms" in text else "time")
     assert found.signals == ("F",) and found.units == ("µN",)
     np.testing.assert_allclose(found.trials[0].time, [0.5, 1.5], rtol=1e-15)

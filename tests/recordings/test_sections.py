@@ -1,6 +1,5 @@
 """Section data against closed forms, its masks, tables of designs, and the command."""
 
-import functools
 import html
 import json
 import re
@@ -11,7 +10,6 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
-from hybridjax.identify.series.fit import fit_records
 from hybridjax.recordings.sampling import without_drift
 
 from .conftest import MULTIPLIER
@@ -59,35 +57,6 @@ def test_gaps_are_masked_and_cut(wave):
         end = np.append(times[1:], times[-1] + 0.125)
         np.testing.assert_array_equal(np.isnan(record.u[:, 0]), (end > 9.11) & (times < 9.29))
     assert 0 < data.missing < 0.1
-
-
-def test_nothing_is_made_up_before_and_after_a_signal(wave):
-    """A signal that begins later than the events that are the phase, and ends earlier."""
-    t, (f, x, _) = wave.trials[0].time, wave.trials[0].values.T
-    late, early = np.where(t < 3.3, np.nan, x), np.where(t > 17.3, np.nan, f)
-    recording = hj.Recording(t, {"f": early, "x": late}, events={"top": np.arange(-1.0, 25)})
-    data = sample(recording, hj.AtEvent("top"), outputs="x", n_sections=8)
-    (record,), (times,) = data.records, data.times
-    assert times[0] == 0.0 and times[-1] < 20.0
-    np.testing.assert_array_equal(np.isnan(record.y[:, 0]), times < 3.29)
-    np.testing.assert_array_equal(np.isnan(record.u[:, 0]), times + 1 / 8 > 17.31)
-
-
-def test_a_gap_in_the_signals_of_the_phase_masks_all_outputs(wave):
-    """Where the phase was not seen, sections are not known to be sections, nor their times."""
-    t, (f, x, v) = wave.trials[0].time, wave.trials[0].values.T
-    hidden = np.where((t > 4.3) & (t < 4.5), np.nan, v)
-    recording = hj.Recording(t, {"f": f, "x": x, "v": hidden, "w": np.cos(4 * np.pi * t)})
-    for timing, late in (("clock", 0), ("duration", 1 / 8)):
-        data = sample(recording, outputs=("x", "w"), timing=timing)
-        (record,), (times,) = data.records, data.times
-        lost = (times > 4.3) & (times < 4.5)
-        assert lost.sum() == 2
-        np.testing.assert_array_equal(np.isnan(record.y[:, :2]).all(axis=1), lost)
-        after = (times > 4.3) & (times < 4.5 + late)
-        after[0] = timing == "duration"
-        np.testing.assert_array_equal(np.isnan(record.y[:, 2]), after)
-        assert not np.isnan(record.u).any()
 
 
 def test_short_stretches_between_missed_events_and_a_pause(rhythm):
@@ -227,38 +196,6 @@ def test_the_command(files, tmp_path, monkeypatch):
     assert {p.suffix for p in (out / "figures").iterdir()} == {".png"}
     assert (out / "notes.txt").read_text() == "mine"
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.slow
-def test_the_command_says_what_has_not_converged(files, tmp_path, monkeypatch, capsys):
-    short = functools.partial(fit_records, max_steps=1)
-    monkeypatch.setattr("hybridjax.recordings.identification.fit_records", short)
-    assert identify(files, tmp_path / "out", "--order", "2") == 1
-    assert "a fit did not converge" in capsys.readouterr().err
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert "<code>order</code>" in page and "`" not in page
-
-
-@pytest.mark.parametrize("text", ["x:up", "x:rising:high"])
-def test_the_command_says_how_crossings_are_written(files, tmp_path, text, capsys):
-    options = ["--input", "force", "--outputs", "x,v", "--crossing", text, "--out", str(tmp_path)]
-    with pytest.raises(SystemExit):
-        main(["identify", str(files / "trial0.csv"), *options])
-    assert "is not a signal, a direction and a value" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--outputs", "x,q"], "no signal 'q'"),
-        (["--time", "t"], "no column 't'"),
-    ],
-)
-def test_the_command_writes_nothing_half(files, tmp_path, more, message):
-    with pytest.raises(SystemExit, match=message) as error:
-        identify(files, tmp_path / "out", *more)
-    assert "\n" not in str(error.value)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["summary.json", "figures/bode.png"])

@@ -58,11 +58,7 @@ RINGING = np.exp(-40 * (T % 1)) * np.where(np.arange(len(T)) % 2, 1, -1)
         np.zeros(len(T)),
         np.arange(5.0),
     ],
-    ids=[
-        "wave", "bounce", "sawtooth", "steps", "quantized", "noisy-quantized", "pulses",
-        "short-pulses", "ringing", "noise", "nothing", "few",
-    ],
-)  # fmt: skip
+)
 def test_what_is_no_spike(x):
     for values in (x, x + 1e-5 * np.random.default_rng(3).normal(size=len(x))):
         assert not spike_heights(values).any()
