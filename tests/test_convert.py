@@ -2,7 +2,6 @@
 
 import warnings
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ import pytest
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
 
-from .sessions import blocks, same_output
+from .linear.test_variances import htf as htf
 
 
 convert = hj.convert
@@ -75,14 +74,6 @@ def test_the_lifted_system_is_the_periodic_one(model):
     for m in H.harmonics:
         found = np.einsum("fnyru,fn,fr->fyu", G, wave(-(f + m)), wave(f)) / N
         np.testing.assert_allclose(found, H[m], rtol=0, atol=1e-12)
-
-
-def test_lifting_can_be_compiled_and_differentiated(model):
-    def power(scale):
-        return (convert.to_lti(eqx.tree_at(lambda m: m.B, model, scale * model.B)).B ** 2).sum()
-
-    value, slope = eqx.filter_jit(jax.value_and_grad(power))(2.0)
-    np.testing.assert_allclose(value, slope, rtol=1e-12)  # 4 c and 2 * 2 c
 
 
 def test_python_control(model):
@@ -261,10 +252,13 @@ def test_what_is_refused(model, monkeypatch):
             call(model)
 
 
-def test_the_session_of_the_page_prints_what_it_shows(capsys):
-    for name in ("control", "xarray", "pandas"):
-        pytest.importorskip(name)
-    (code,) = (text for kind, text in blocks(PAGE) if kind == "python")
-    (shown,) = (text for kind, text in blocks(PAGE) if kind == "text")
-    exec(compile(code, PAGE, "exec"), {"__name__": "session"})
-    assert same_output(shown, capsys.readouterr().out)
+def test_scatter_is_kept(htf, tmp_path):
+    """In files, datasets, and by transformations of JAX."""
+    hj.save(tmp_path / "htf.npz", htf)
+    radius = htf.confidence_radius()
+    dataset = hj.convert.to_xarray(htf)
+    assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
+    for other in (hj.load(tmp_path / "htf.npz"), hj.convert.from_xarray(dataset)):
+        assert jax.tree.structure(other) == jax.tree.structure(htf)
+        np.testing.assert_array_equal(other.confidence_radius(), radius)
+    np.testing.assert_allclose(jax.jit(lambda x: x.confidence_radius())(htf), radius)

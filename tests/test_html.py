@@ -49,8 +49,9 @@ def many(cycle, n):
 @pytest.fixture(scope="module")
 def recording(hopper_cycle):
     t = np.linspace(0.0, 20.0, 2001)
-    tt, y, v = hopper_cycle.trajectory(21)("yM", "vM")
-    signals = {"<u>": np.cos(3 * t), "yM & co": np.interp(t, tt, y), "vM": np.interp(t, tt, v)}
+    tt, *values = hopper_cycle.trajectory()("yM", "vM")
+    y, v = (np.interp(t, tt, x, period=1.0) for x in values)
+    signals = {"<u>": np.cos(3 * t), "yM & co": y, "vM": v}
     return hj.Recording(t, signals, units={"vM": "m/s"}, events={"<hit>": [1.0]}, name="<i>")
 
 
