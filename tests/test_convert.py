@@ -9,6 +9,8 @@ import pytest
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
 
+from .linear.test_variances import htf as htf
+
 
 convert = hj.convert
 PAGE = "docs/how-to/other-libraries.md"
@@ -248,3 +250,15 @@ def test_what_is_refused(model, monkeypatch):
         monkeypatch.setitem(__import__("sys").modules, name, None)
         with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{name}\]'"):
             call(model)
+
+
+def test_scatter_is_kept(htf, tmp_path):
+    """In files, datasets, and by transformations of JAX."""
+    hj.save(tmp_path / "htf.npz", htf)
+    radius = htf.confidence_radius()
+    dataset = hj.convert.to_xarray(htf)
+    assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
+    for other in (hj.load(tmp_path / "htf.npz"), hj.convert.from_xarray(dataset)):
+        assert jax.tree.structure(other) == jax.tree.structure(htf)
+        np.testing.assert_array_equal(other.confidence_radius(), radius)
+    np.testing.assert_allclose(jax.jit(lambda x: x.confidence_radius())(htf), radius)

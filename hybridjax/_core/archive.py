@@ -35,10 +35,8 @@ _FORMAT, _VERSION = "hybridjax", 2
 _HEADER = "header"
 
 
-def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
+def write_module(path: Path, thing: eqx.Module) -> None:
     """Write a module whose fields are arrays, modules, `None`, or static values of JSON.
-
-    `part`: which part of a larger whole it is.
 
     **Raises:** `DefinitionError` if a field is not what its annotation says, or the file cannot be
     written.
@@ -52,7 +50,6 @@ def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
         "format_version": _VERSION,
         "package_version": __version__,
         "kind": kind,
-        "part": part,
         "static": static,
         "units": {str(name): name.unit for name in signals_in(static)},
         "arrays": {name: f"{array.dtype}{list(array.shape)}" for name, array in arrays.items()},
@@ -65,8 +62,8 @@ def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
         os.fsync(file.fileno())
 
 
-def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) -> Any:
-    """Read a module of one of these kinds; `part`: as it was written with, if that matters.
+def read_module(path: Path, kinds: Mapping[str, type]) -> Any:
+    """Read a module of one of these kinds.
 
     **Raises:** `DefinitionError` if the file cannot be read; `FileFormatError` if it is damaged, of
     another format or version, or holds something else.
@@ -77,10 +74,6 @@ def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) 
         raise DefinitionError(f"cannot read '{path}': {error.strerror}.") from error
     header = _read_header(path, members.pop(_HEADER, None), kinds)
     kind = kinds[header["kind"]]
-    if part is not None and part != header.get("part"):
-        raise FileFormatError(
-            f"'{path}' was replaced by another file: delete it, and make it again."
-        )
     static = restored(header["static"], header["units"])
     if set(header["arrays"]) != set(members):
         raise damaged(path, "its arrays are not those that its header lists")

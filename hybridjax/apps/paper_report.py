@@ -55,9 +55,6 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
                 output: {f"H_{m}": float(errors[at[m], k]) for m in (-2, -1, 0, 1, 2) if m in at}
                 for k, output in enumerate(OUTPUTS)
             },
-            "largest_htf_error_of_max_H_0": {
-                output: float(np.max(errors[:, k])) for k, output in enumerate(OUTPUTS)
-            },
         }
     summary["observations"] = _observations(families)
     return summary

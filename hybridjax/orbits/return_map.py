@@ -199,16 +199,10 @@ class ReturnMap(eqx.Module):
             jacobian, moved, tape = flow_jacobian(
                 s, lanes, target, self.settings, h, result, new_input=False, wanted=wanted
             )
-
-            def end(step):
-                other = along(step)
-                grown = other.expected / self.expected
-                time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
-                begin = lanes._replace(t=lanes.t * grown)
-                to = dataclasses.replace(target, time=time)
-                return replay(other.structure, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
-
-            moves = None if along is None else _derivative(end)
+            moves = None
+            if along is not None:
+                other = along  # (known to be a function in the function below, too)
+                moves = _derivative(lambda step: self._end(other(step), lanes, target, tape))
             return moved, (lanes, jacobian[0, 1:], moves, tape.code, tape.t)
 
         end, (legs, factors, moves, codes, times) = self.travel(q, flow)
@@ -229,6 +223,14 @@ class ReturnMap(eqx.Module):
             end.residual, jacobian, legs, factors, codes, times[..., 0],
             end.period, xp.max(defect / self.sizes), end.result, self._meetings(legs, codes),
         )  # fmt: skip
+
+    def _end(self, other: "ReturnMap", lanes: Lanes, target: Target, tape) -> Float[Array, " d"]:
+        """The end of a recorded piece of a turn, by another map at the same phases of its clock."""
+        grown = other.expected / self.expected
+        time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
+        begin, to = lanes._replace(t=lanes.t * grown), dataclasses.replace(target, time=time)
+        u = jnp.zeros((self.structure.nu, 1))
+        return replay(other.structure, begin, u, to, tape)[1][:, 0]
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""

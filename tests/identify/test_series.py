@@ -103,6 +103,7 @@ def test_regions_cover(small):
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_regions_cover_with_process_noise(small):
     """A second, unrecorded random input: the variance of the residuals alone gives too little."""
     true, runs = small.multipliers, 16
