@@ -75,20 +75,9 @@ def advise(
     of an inspection, which come first. `curve`: the phase response curve of events alone, whose
     warnings come last. Default: None.
     """
-    return collect_advice(data, PreparedRecords(data), fit, validation, findings, curve)
-
-
-def collect_advice(
-    data: SectionData,
-    records: PreparedRecords,
-    fit: SeriesFit,
-    validation: Validation | None,
-    findings: Sequence[Finding],
-    curve: PhaseResponse | None,
-) -> Advice:
-    """Collect the advice on a fit to the data; `records`: those of the data."""
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
+    records = PreparedRecords(data)
     problem = OutputErrorProblem.from_data(records, d, R - 1 - fit.lead - d * N, free_start=True)
     delayed, grid = delayed_outputs(problem, d), records.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())

@@ -112,17 +112,10 @@ def impulse_responses(
     slope, root = pushed(slope), pushed(fit.roots.transpose(2, 0, 1, 3, 4))
     by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
     errors = np.sqrt((root**2).sum(axis=4) * fit.noise[:, None] ** 2 + by_coefficients)
-    step = data.period / N
     # From the section of the response to that of the push.
     m, r = np.arange(N)[:, None], np.arange(lags)
-    place = (r, (m + r) % N)
+    values, errors = (x[r, (m + r) % N] / (data.period / N) for x in (pushed(h), errors))
+    phase, lag, period = np.arange(N) / N, np.arange(lags) / N, data.period
     return ImpulseResponses(
-        values=pushed(h)[place] / step,
-        errors=errors[place] / step,
-        phase=np.arange(N) / N,
-        lag=np.arange(lags) / N,
-        width=float(width),
-        period=data.period,
-        inputs=fit.inputs,
-        outputs=fit.outputs,
+        values, errors, phase, lag, float(width), period, fit.inputs, fit.outputs
     )

@@ -148,15 +148,9 @@ def natural_multipliers(
     plain = _multipliers(forward @ np.linalg.inv(state))
     explained = cross[0] @ np.linalg.solve(square[0], np.swapaxes(cross[0], 1, 2))
     shares = np.trace(explained, axis1=1, axis2=2) / np.trace(state[0], axis1=1, axis2=2)
+    draws, plain_draws, strength = by_instruments[1:], plain[1:], float(shares.mean())
     return NaturalMultipliers(
-        multipliers=by_instruments[0],
-        plain=plain[0],
-        draws=by_instruments[1:],
-        plain_draws=plain[1:],
-        strength=float(shares.mean()),
-        cycles=K,
-        records=len(counts),
-        block=block,
+        by_instruments[0], plain[0], draws, plain_draws, strength, K, len(counts), block
     )
 
 

@@ -1,7 +1,6 @@
 """From a definition of phase to the phase of a recording: angles that wind, events, crossings."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -83,11 +82,8 @@ def signals_of(definition: PhaseDefinition) -> set[str]:
     return set()
 
 
-class _Angle(NamedTuple):
-    """An angle of one trial in rad, modulo whole turns; section 0 lies at 0."""
-
-    time: Series
-    angle: Series
+_Angle = tuple[Series, Series]
+"""Times, and an angle of one trial in rad, modulo whole turns; section 0 lies at 0."""
 
 
 def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
@@ -131,7 +127,7 @@ def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | Non
     turn = 1.0 if isinstance(anchor, Crossing) else np.exp(-1j * float(anchor))
 
     def angle_of(time: np.ndarray, z: np.ndarray) -> _Angle:
-        return _Angle(time, np.angle((z[:, 0] + 1j * z[:, 1]) * turn))
+        return time, np.angle((z[:, 0] + 1j * z[:, 1]) * turn)
 
     rate = abs(_turns_per_time([angle_of(*sample) for sample in samples]))
     bandwidth = bandwidth or HARMONICS * rate
@@ -141,7 +137,7 @@ def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | Non
         angles.append(angle_of(time, np.stack(smooth, axis=1)))
     if isinstance(anchor, Crossing):
         first = _angle_at(recording, anchor, bandwidth, angles)
-        angles = [_Angle(time, np.angle(np.exp(1j * (angle - first)))) for time, angle in angles]
+        angles = [(time, np.angle(np.exp(1j * (angle - first)))) for time, angle in angles]
     return angles
 
 

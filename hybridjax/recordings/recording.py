@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from .._core import limits
 from .._core.boundary.checked import checked
-from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import with_unit
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
@@ -272,22 +271,7 @@ class Recording(eqx.Module):
                 + (f", {missing} with gaps" if missing else "")
                 + "".join(f", {len(at)} {name}" for name, at in t.events.items())
             )
-        first = self.trials[0]
-        steps = [np.diff(first.time[np.isfinite(x)]) for x in first.values.T]
-        rates = [f"{1 / np.median(x):.2g} Hz" if len(x) else "0 Hz" for x in steps]
-        if len(set(rates)) > 1:
-            each = map(" ".join, zip(self.signals, rates, strict=True))
-            lines.append(f"  sampled at {', '.join(each)}")
         return "\n".join([*lines, *(f"  ({note})" for note in self.notes)])
-
-    def _repr_html_(self) -> str:
-        first, drawn = self.trials[0], []
-        names = map(with_unit, self.signals, self.units)
-        for name, color, values in list(zip(names, COLORS, first.values.T, strict=False))[:4]:
-            rows = np.flatnonzero(np.isfinite(values[:600]))
-            curve = Curve(first.time[rows], values[rows], color=color)
-            drawn.append(picture([curve], "time (s)", name))
-        return card("Recording", f"{len(self.trials)} trials", text(repr(self)), *drawn)
 
 
 def signal_of(crossing: Crossing) -> str:

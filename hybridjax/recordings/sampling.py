@@ -240,16 +240,12 @@ def _with_times(
 
 def _average(parts: list[_Sections], N: int) -> Float[np.ndarray, "N nuy"]:
     """Return the average cycle of a trial; NaN where nothing was sampled."""
-    if not parts:
-        return np.zeros((N, 0))
-    section = np.concatenate([p.k % N for p in parts])
-    values = np.concatenate([p.values for p in parts])
-    mean = np.full((N, values.shape[1]), np.nan)
-    for n, i in np.ndindex(mean.shape):
-        x = values[section == n, i]
-        if np.isfinite(x).any():
-            mean[n, i] = np.nanmean(x)
-    return mean
+    total, count = np.zeros((2, N, max((p.values.shape[1] for p in parts), default=0)))
+    for p in parts:
+        np.add.at(total, p.k % N, np.nan_to_num(p.values))
+        np.add.at(count, p.k % N, np.isfinite(p.values))
+    with np.errstate(invalid="ignore"):
+        return total / count
 
 
 @checked

@@ -161,7 +161,7 @@ def test_vicon(tmp_path, separator):
         ("t,a\n0,1\n1,2\n", "no column 'time'; its columns are t, a"),
         ("time,a\n0,5,1,2\n1,5,1,3\n", "line 2: 4 fields, .* another separator"),
         ("time;a\n0,5;1\n1.5;2\n", "line 3: there are points beside"),
-        ("Subject 3\ntime,a\n0,1\n1,2\n", "line 1: 'Subject 3' names one column"),
+        ("Subject 3\ntime,a\n0,1\n1,2\n", "fields, but the header names 1|is not a number"),
         ("time (ms),time (s)\n0,1\n1,2\n", "two columns 'time'"),
     ],
 )

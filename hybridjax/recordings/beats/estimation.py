@@ -151,7 +151,7 @@ def projected(
 
 def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
     """Return the blocks whose errors count as independent."""
-    if len(intervals.names) >= _BLOCKS:
+    if int(intervals.trial[-1]) + 1 >= _BLOCKS:
         return intervals.trial
     return intervals.blocks(max(_SHORTEST_BLOCK, len(intervals.start) // (2 * _BLOCKS)))
 
@@ -165,7 +165,7 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     curvature, pull = across.T @ across, across.T @ residual
     # Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
     noise_only = residual - across @ np.linalg.lstsq(curvature, pull)[0]
-    freedom = max(int(fit.used.sum()) - len(intervals.names) - p, 1)
+    freedom = max(int(fit.used.sum()) - len(fit.rates) - p, 1)
     variance = float(noise_only @ noise_only) / freedom
     block = _blocks(intervals)
     sums = np.stack([np.bincount(block, x * noise_only) for x in across.T], axis=1)
@@ -196,18 +196,9 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     return Smoothness(penalty, noise, excess, max(-float(top.fun), 0.0))
 
 
-class Accuracy(NamedTuple):
-    """Accuracy of a curve."""
-
-    covariance: Covariance
-    left_out: Float[np.ndarray, " blocks"]
-    """Sums of squared errors of each block, forecast by a fit to the others."""
-    detail: float
-    """Number of coefficients that the data determine: the trace of their share in the curvature."""
-
-
-def accuracy_of(intervals: Intervals, fit: CurveFit) -> Accuracy:
-    """Estimate the accuracy from blocks of intervals whose errors may depend on each other.
+def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float, float]:
+    """Return the covariance of a curve, the sum of squared errors of intervals forecast by fits to
+    other blocks, and the number of coefficients that the data determine.
 
     The errors of each block are those of a forecast by a curve fitted to the other blocks, to first
     order (the jackknife that deletes blocks: Bell and McCaffrey 2002). Smoothness makes a bias,
@@ -227,7 +218,8 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> Accuracy:
         score[k], left_out[k] = x.T @ error, error @ error
     meat = score.T @ score + fit.smoothness.noise * smooth
     covariance = sandwich(curvature, meat, shares + smooth / count)
-    return Accuracy(covariance, left_out, float(np.trace(np.linalg.lstsq(curvature, data)[0])))
+    detail = float(np.trace(np.linalg.lstsq(curvature, data)[0]))
+    return covariance, float(left_out.sum()), detail
 
 
 def plain_curve(intervals: Intervals, fit: CurveFit) -> Float[np.ndarray, " p"]:

@@ -50,11 +50,11 @@ class PhaseResponse(eqx.Module):
     - `phase` (P,), `values` (P,), `errors` (P,): the curve and its standard errors. `plain` (P,):
       the curve by regression of durations on the input at phases that grow linearly from event to
       event, which is biased.
-    - `rates` (trials,): w, in cycles per second. `trials`: their names.
+    - `rates` (trials,): w, in cycles per second.
     - `jitter`: standard deviation of the phase at the end of a cycle, in cycles.
     - `left_out`: fraction of the variance of durations within trials (R2) that is forecast in
       blocks of intervals to which the curve was not fitted, by fits to the others to first order.
-      `left_out_flat`: the same for a flat curve. `r2`: the same for the fit to all intervals.
+      `left_out_flat`: the same for a flat curve.
     - `p_flat`: probability of so much shape if the curve is flat (likelihood ratio; Self and Liang
       1987).
     - `excess`: variance of sums of residuals over blocks relative to that of independent errors.
@@ -73,11 +73,9 @@ class PhaseResponse(eqx.Module):
     errors: Float[np.ndarray, " P"]
     plain: Float[np.ndarray, " P"]
     rates: Float[np.ndarray, " trials"]
-    trials: tuple[str, ...] = eqx.field(static=True)
     jitter: float = eqx.field(static=True)
     left_out: float = eqx.field(static=True)
     left_out_flat: float = eqx.field(static=True)
-    r2: float = eqx.field(static=True)
     p_flat: float = eqx.field(static=True)
     excess: float = eqx.field(static=True)
     intervals: int = eqx.field(static=True)
@@ -111,7 +109,7 @@ class PhaseResponse(eqx.Module):
         mean, error = self.coefficients[0], np.sqrt(self.covariance[0, 0])
         return (
             f"PhaseResponse(detail of {self.detail:.1f} numbers, {self.intervals} intervals of "
-            f"{len(self.trials)} trials, {self.miscounted} of them miscounted)\n"
+            f"{len(self.rates)} trials, {self.miscounted} of them miscounted)\n"
             f"  mean {with_unit('Z', curve_unit(self.input))}  {mean:.4g} +- {error:.2g}; from "
             f"{self.values.min():.4g} to {self.values.max():.4g}\n"
             f"  rates        {self.rates.min():.4g} to {self.rates.max():.4g} cycles/s, jitter "
@@ -157,32 +155,30 @@ def phase_response(
         phase = estimate_phase(recording, phase)
     intervals = intervals_of(recording, phase, input)
     total = len(intervals.start)
-    if total < 2 * (10 + len(intervals.names)):  # half of them for errors
+    if total < 2 * (11 + intervals.trial[-1]):  # half of them for errors
         text = f"{total} intervals are too few for a curve and the rates of their trials"
         raise DefinitionError(f"{text}: record more.")
     say("flat")
     flat = fit_curve(intervals, 0)
     say("smooth")
     fit = fit_curve(intervals, WAVES, flat)
-    accuracy = accuracy_of(intervals, fit)
-    matrix = accuracy.covariance.matrix
+    covariance, left_out, detail = accuracy_of(intervals, fit)
+    matrix = covariance.matrix
     x = np.arange(200) / 200
     waves = basis(x, WAVES)
     return PhaseResponse(
         coefficients=fit.coefficients,
         covariance=matrix,
-        freedom=max(accuracy.covariance.freedom, 1.0),
-        detail=accuracy.detail,
+        freedom=max(covariance.freedom, 1.0),
+        detail=detail,
         phase=x,
         values=waves @ fit.coefficients,
         errors=np.sqrt(np.einsum("ni,ij,nj->n", waves, matrix, waves)),
         plain=waves @ plain_curve(intervals, fit),
         rates=fit.rates,
-        trials=intervals.names,
         jitter=fit.jitter,
-        left_out=_explained(intervals, fit, accuracy.left_out.sum()),
-        left_out_flat=_explained(intervals, flat, accuracy_of(intervals, flat).left_out.sum()),
-        r2=_explained(intervals, fit, (fit.residual[fit.used] ** 2).sum()),
+        left_out=_explained(intervals, fit, left_out),
+        left_out_flat=_explained(intervals, flat, accuracy_of(intervals, flat)[1]),
         p_flat=float(stats.chi2.sf(fit.smoothness.evidence, 1) / 2),
         excess=fit.smoothness.excess,
         intervals=total,

@@ -41,17 +41,13 @@ def read_lines(path: Path) -> list[str]:
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
-def _is_comment(line: str) -> bool:
-    return line.lstrip().startswith(_COMMENTS)
-
-
 def read_plain(path: Path, lines: list[str]) -> Columns:
     """Read names in the first line that is no comment, perhaps units below, then numbers.
 
     **Raises:** `FileFormatError` if there is no table, with the line.
     """
     filled = [k for k, x in enumerate(lines) if x.strip(" \t,;")]
-    content = [k for k in filled if not _is_comment(lines[k])]
+    content = [k for k in filled if not lines[k].lstrip().startswith(_COMMENTS)]
     if not content:
         raise FileFormatError(f"'{path}' has no line with the names of its columns.")
     first = content[0]
@@ -66,9 +62,6 @@ def read_plain(path: Path, lines: list[str]) -> Columns:
         if len(names) != width or any(to_number(x) is not None for x in names):
             raise FileFormatError(f"'{path}' begins with numbers: its first line must be names.")
         return read_table(path, names, lines, first, separator)
-    if len(names) == 1 and max(len(split_line(below, x)) for x in ",;\t") > 1:
-        text = f"'{path}', line {first + 1}: '{lines[first].strip()[:40]}' names one column, but "
-        raise FileFormatError(f"{text}there are more below: begin lines before the names with '#'.")
     start, fields = first + 1, split_line(below, separator)
     units = [x for x in fields if x]
     if units and all(map(is_unit, units)) and any(to_number(x) is None for x in fields):
@@ -126,7 +119,7 @@ def read_table(
     """
     two_columns(path, [x for x in headers if x])
     notes = []
-    lines = ["" if _is_comment(x) else x for x in lines[start:]]
+    lines = ["" if x.lstrip().startswith(_COMMENTS) else x for x in lines[start:]]
     if separator != "," and any("," in x for x in lines):
         notes.append("decimal commas were read as such")
         mixed = next((k for k, x in enumerate(lines) if "." in x), None)
