@@ -12,7 +12,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.html import Curve, picture
-from hybridjax.orbits.branch import Branch, BranchEnd, BranchPoint
+from hybridjax.orbits.continuation import Branch, BranchEnd, BranchPoint
 from hybridjax.orbits.limit_cycles import LimitCycles
 
 

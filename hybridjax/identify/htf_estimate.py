@@ -116,8 +116,6 @@ class _LineEstimates(NamedTuple):
     """Least-squares estimates at F lines."""
 
     H: Complex[np.ndarray, "M F ny nu"]
-    residual: Float[np.ndarray, "F M ny"]
-    """Sum of squares over experiments."""
     realizations: Int[np.ndarray, " F"]
     """Experiments beyond those that the unknowns need: degrees of freedom of the residual."""
     total: Float[np.ndarray, "M F ny nu"]
@@ -156,7 +154,7 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
     mean = residual / np.maximum(realizations, 1)[:, None, None]
     mean[realizations < 1] = np.inf
     noise = variance(sums.noise[rows] / count[:, None, None]) if sums.repeats > 1 else None
-    return _LineEstimates(H.transpose(2, 0, 3, 1), residual, realizations, variance(mean), noise)
+    return _LineEstimates(H.transpose(2, 0, 3, 1), realizations, variance(mean), noise)
 
 
 def _roundness(
