@@ -1,7 +1,5 @@
 """Other libraries get the same numbers, and give them back."""
 
-import warnings
-
 import jax
 import numpy as np
 import pytest
@@ -90,23 +88,6 @@ def test_python_control(model):
     np.testing.assert_array_equal(data(1j * data.omega)[1], np.asarray(H[-1])[:, 0].T)
     np.testing.assert_allclose(data.omega, np.pi * f)
     assert isinstance(data, control.FrequencyResponseData)
-
-
-def test_nyquist_plots_and_controllers_of_python_control():
-    """From the lifted system in a line each: the response is that of the transfer functions, to
-    1e-10, and a controller moves the multipliers of the periodic system to where it says."""
-    control = pytest.importorskip("control")
-    model = _model([2] * N, nu=1)
-    system, lti = convert.to_control(model), convert.to_lti(model)
-    with warnings.catch_warnings(action="ignore"):  # (of python-control, about its own NumPy)
-        nyquist = control.nyquist_response(system[0, 0])
-    f = np.angle(nyquist.contour) / (2 * np.pi)
-    assert len(f) > 100
-    np.testing.assert_allclose(nyquist.response, lti.htf(f).H[0][:, 0, 0], rtol=0, atol=1e-10)
-    gain, _, poles = control.dlqr(system, np.eye(2), np.eye(N))
-    closed = np.linalg.eigvals(np.asarray(lti.A[0] - lti.B[0] @ gain))
-    np.testing.assert_allclose(np.sort_complex(closed), np.sort_complex(poles), atol=1e-10)
-    assert abs(closed).max() < abs(model.multipliers).max()
 
 
 def test_the_norm_of_the_lifted_system_is_that_of_the_transfer_functions():

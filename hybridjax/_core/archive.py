@@ -212,12 +212,6 @@ def _matches(value: Any, hint: Any) -> bool:
     return isinstance(value, hint)
 
 
-_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
-
-
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays by name. Members are read whole, so that their checksums are checked.
 
@@ -250,10 +244,9 @@ def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(member) as stream:
-        version = np.lib.format.read_magic(stream)
-        if version not in _HEADERS:
-            raise ValueError(f"an array is of version {version}")
-        shape, _, dtype = _HEADERS[version](stream)
+        major, minor = np.lib.format.read_magic(stream)
+        read_header = getattr(np.lib.format, f"read_array_header_{major}_{minor}")
+        shape, _, dtype = read_header(stream)
         declared = stream.tell() + math.prod(shape) * dtype.itemsize
     if dtype.hasobject:
         raise ValueError(f"'{member.filename}' holds Python objects")
