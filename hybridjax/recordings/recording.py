@@ -124,7 +124,7 @@ class Recording(eqx.Module):
         as `Recording`; `FileFormatError` for two columns of one name.
         """
         keys = getattr(frame, "column_names", None) or getattr(frame, "keys", list)()
-        columns = Columns({str(key): np.asarray(frame[key]) for key in keys})
+        columns = Columns({str(key): frame[key] for key in keys})
         table = parse_table(f"trial '{name}'", columns, time)
         events, units = table.events | dict(events or {}), table.units | dict(units or {})
         return cls(table.time, table.signals, events=events, units=units, name=name)

@@ -59,20 +59,6 @@ def test_random_systems(shape, seed):
     assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)
 
 
-@pytest.mark.parametrize(
-    "message, arguments",
-    {
-        "50 frequencies are too few .* 97 coefficients and 2 multipliers: 98": dict(
-            order=2, harmonics=1
-        ),
-    }.items(),
-)
-def test_bad_arguments(message, arguments, exact):
-    few = hj.HTF(exact.f[:50], exact.H[:, :50], exact.harmonics, 32)
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.fit_multipliers(few, **arguments)
-
-
 def test_pairs_are_matched_by_distance():
     comparison = compare_multipliers(np.array([0.1, -0.5 - 0.2j, -0.5 + 0.21j]), [-0.5 + 0.2j, 0.1])
     np.testing.assert_array_equal(comparison.true, [-0.5 + 0.2j, 0.1])

@@ -118,16 +118,6 @@ def test_amplitudes(small):
         hj.identify.amplitude_sweep(run, small, u, [0.0, 1.0])
 
 
-def test_bad_requests(small):
-    data = record(small, 4 * 50)
-    with pytest.raises(hj.DefinitionError, match="different n_sections: 6 and 4"):
-        hj.validate(hj.testing.synthetic_ldtp(), data)
-    with pytest.raises(hj.DefinitionError, match="sampled 5 times only"):
-        hj.validate(small, record(small, 20))
-    with pytest.raises(hj.DefinitionError, match="output y0 is constant or missing"):
-        hj.validate(small, hj.Record(data.u, data.y * [0, 1], n_sections=4))
-
-
 def test_records_shorter_than_the_lags(small):
     """Short pieces count where they can: not where an unknown start explains all of them."""
     whole = record(small, 4 * 100, 0, 0.3)

@@ -254,10 +254,10 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
         u = np.stack(means, axis=1)
         rows = np.arange(1, b - a - ahead)
         inputs = np.stack([u[rows + c] for c in range(-1, ahead + 1)], axis=1)
-        known = np.isfinite(inputs).all(axis=(1, 2, 3))
-        known &= np.isfinite(y[rows - 1]).all(axis=1) & np.isfinite(y[rows]).all(axis=1)
-        if known.sum() >= _SHORTEST / 2:
-            rows, inputs = rows[known], inputs[known]
+        usable = np.isfinite(inputs).all(axis=(1, 2, 3))
+        usable &= np.isfinite(y[rows - 1]).all(axis=1) & np.isfinite(y[rows]).all(axis=1)
+        if usable.sum() >= _SHORTEST / 2:
+            rows, inputs = rows[usable], inputs[usable]
             each = [_centered(inputs[..., i].reshape(len(rows), -1)) for i in range(u.shape[2])]
             outputs = [_centered(y[rows - 1]), each, _centered(y[rows])]
             yield _Part(data.trials[r], data.times[r][where], *outputs)
