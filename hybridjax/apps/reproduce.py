@@ -239,7 +239,7 @@ def _comparisons(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -
     """Figs. 3 and 4, multipliers, poles and zeros: all families in each."""
     pairs = {name: (family.estimate, family.exact) for name, family in families.items()}
     rational = {name: family.rational for name, family in families.items()}
-    estimates = {}
+    estimates: dict[str, Any] = {}
     for name, family in families.items():
         estimates |= {f"2p1z, {name}": family.rational, f"structured, {name}": family.structured}
     deviations = {name: rf"$\delta$ {symbol}" for name, symbol in _SYMBOLS.items()}
