@@ -97,11 +97,12 @@ def fit_model(
         ends.append(_descend(problem, system, start, near))
         if ends[-1].explains(problem.weighted):
             break
-    best = min(ends, key=lambda end: end.cost)
+    best = min(ends, key=lambda end: (end.cost, -end.residuals))
     if best.cost == np.inf:
+        why = "its residuals are not finite" if best.residuals else Result(best.result).message
         raise ComputationError(
             f"none of {guesses} guesses has a limit cycle on which the data can be observed "
-            f"({Result(best.result).message}): give another system, or more `guesses`."
+            f"({why}): give another system, or more `guesses`."
         )
     return _summary(problem, system, near, ends, best)
 
