@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybridjax._core import execution
-from hybridjax._core.execution import Library, on_all_cores, one_blas_thread, thread_count
+from hybridjax._core.execution import Execution, Library, on_all_cores, one_blas_thread
 from hybridjax._core.executor import on_cpu
 
 
@@ -16,7 +16,7 @@ def test_the_default_device_counts_more_than_the_backend(monkeypatch):
     """A CPU that is asked for on a machine with a GPU is a CPU."""
     assert on_cpu()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert not on_cpu() and thread_count(None) == 1
+    assert not on_cpu() and Execution().threads == 1
     with jax.default_device("cpu"):
         assert on_cpu() and jnp.ones(1).devices() == {jax.devices("cpu")[0]}
     assert not on_cpu()

@@ -50,10 +50,8 @@ class _Topic:
     def add(self, path: Path, message: Any, arrival: int, wanted: Wanted) -> None:
         numbers = {x: v for x, v in _numbers(message, self.name) if wanted.includes(x)}
         if self.arrivals and tuple(numbers) != self.names:
-            raise FileFormatError(
-                f"'{path}': arrays in messages of '{self.name}' differ in length: choose other "
-                "`signals`."
-            )
+            text = f"arrays in messages of '{self.name}' differ in length: choose other `signals`."
+            raise FileFormatError(f"'{path}': {text}")
         self.names = tuple(numbers)
         self.values.extend(numbers.values())
         self.arrivals.append(arrival)
