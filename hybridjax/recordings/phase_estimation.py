@@ -89,7 +89,8 @@ _Angle = tuple[Series, Series]
 def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
     """Return the phase of all trials: their angles in the sense in which they turn."""
     rate = _turns_per_time(angles)
-    backwards, total, stretches = 0, 0, []
+    backwards, total = 0, 0
+    stretches: list[list[Winding]] = []
     for time, angle in angles:
         stretches.append([])
         edges = np.flatnonzero(np.diff(time) > LONGEST_GAP / abs(rate)) + 1

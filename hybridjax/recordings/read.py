@@ -98,7 +98,8 @@ def read_tables(path: Path, wanted: Wanted) -> list[Columns]:
 
 
 def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
-    parts, names = [], []
+    parts: list[Recording] = []
+    names: list[str] = []
     events: dict[str, np.ndarray] = {}
     for columns in read_tables(path, wanted):
         table = parse_table(f"'{path}'", columns, wanted.time)

@@ -190,7 +190,8 @@ class Recording(eqx.Module):
                 raise DefinitionError(f"trial '{name}': {text}: choose `signals`.")
             if any(len(t.time) < len(time) for t in trials):
                 notes.append("signals have different rates or clocks: they are missing in between")
-            values, events = [], {}
+            values: list[np.ndarray] = []
+            events: dict[str, np.ndarray] = {}
             for t in trials:
                 values.append(np.full((len(time), t.values.shape[1]), np.nan))
                 values[-1][np.searchsorted(time, t.time)] = t.values

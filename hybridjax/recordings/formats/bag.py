@@ -44,7 +44,7 @@ class _Topic:
     """The numbers of one topic, message by message."""
 
     def __init__(self, name: str):
-        self.name, self.names = name, ()
+        self.name, self.names = name, tuple[str, ...]()
         self.values, self.stamps, self.arrivals = array("d"), array("q"), array("q")
 
     def add(self, path: Path, message: Any, arrival: int, wanted: Wanted) -> None:

@@ -201,8 +201,8 @@ def _odd(name: str, answers: Float[np.ndarray, "n 4"], where: list[str]) -> Iter
         spans = [where[k] for k in np.flatnonzero(parts & left_over)]
         left_over &= ~parts
         if spans:
-            action = "refused" if cause == "another sign" else "warned"
-            yield Finding(cause, texts[cause].format(name, listed(spans)), action)
+            text = texts[cause].format(name, listed(spans))
+            yield Finding(cause, text, "refused" if cause == "another sign" else "warned")
 
 
 def _answers(parts: list[_Part], i: int) -> Float[np.ndarray, "n 4"]:
@@ -244,7 +244,7 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
     at = np.linspace(0, N, sections, endpoint=False).astype(int)
     cycles = (len(record.u) - first) // N
     number = min(_PARTS, cycles // _SHORTEST)
-    edges = np.linspace(0, cycles, number + 1).astype(int) if number else []
+    edges = np.linspace(0, cycles, number + 1).astype(int)[: number and None]
     for a, b in zip(edges[:-1], edges[1:], strict=True):
         where = slice(first + a * N, first + b * N)
         u = (record.u[where] / size_u).reshape(b - a, N, -1)
@@ -259,8 +259,8 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
         if usable.sum() >= _SHORTEST / 2:
             rows, inputs = rows[usable], inputs[usable]
             each = [_centered(inputs[..., i].reshape(len(rows), -1)) for i in range(u.shape[2])]
-            outputs = [_centered(y[rows - 1]), each, _centered(y[rows])]
-            yield _Part(data.trials[r], data.times[r][where], *outputs)
+            before, outputs = _centered(y[rows - 1]), _centered(y[rows])
+            yield _Part(data.trials[r], data.times[r][where], before, each, outputs)
 
 
 def _centered(x: Float[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
