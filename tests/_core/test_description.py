@@ -53,11 +53,9 @@ MADE = {
     "a constant in a function within": lambda k: module(
         "def f(q):\n    return list(map(lambda x: G * x, q))", G=(k, "m")
     ),
-    "a table": lambda k: module("def f(q):\n    return G @ q", G=np.array([k, 1.0])),
     "a key": lambda k: module("def f(q):\n    return G", G=jax.random.key(int(k))),
     "a model": lambda k: module("def f(q):\n    return G.k * q", G=Module(k)),
     "a function": lambda k: module(HELPER.format(k)),
-    "a compiled function": lambda k: module("import jax\n@jax.jit\n" + HELPER.format(k)),
     "a dataclass around it": lambda k: around(Plain(k)),
     "an equinox module around it": lambda k: around(Module(k)),
     "a dictionary around it": lambda k: functools.partial(lambda q, d: d, d={"k": k}),
@@ -97,7 +95,6 @@ POINT = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((3,), float)
 TABLE = np.linspace(0, 1, 100)
 DIFFERENT = {
     "product": lambda t, q: t * q,
-    "constant": lambda t, q: t * q + 1e-9,
     "last digit": lambda t, q: t * q + 1.0000000000000002e-9,
     "branch": lambda t, q: jnp.where(t > 0, q, 0.0),
     "table": lambda t, q: jnp.interp(t, TABLE, TABLE**2),
