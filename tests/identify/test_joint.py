@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.joint.descent import minimize
+from hybridjax.identify.joint.fit import minimize
 from hybridjax.identify.joint.frequency import FrequencyProblem, transfer, transfer_slopes
 from hybridjax.identify.joint.model import PeriodicModel, characteristic_slopes, local_coordinates
 from hybridjax.linear.frequency_response import harmonic_transfer
