@@ -13,15 +13,10 @@ def main() -> int:
     parser.add_argument("--systems", type=int, default=1000, help="number, over all structures")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--accuracy", type=float, default=ACCURACY, help="tolerances of hybridjax")
-    parser.add_argument("--only", help="one structure, or one system of it: dips or dips:17")
     arguments = parser.parse_args()
     hj.enable_x64()
-    jobs = shares(arguments.systems)
-    if arguments.only:
-        name, _, number = arguments.only.partition(":")
-        jobs = {name: [int(number)] if number else jobs[name]}
     reports = []
-    for name, numbers in jobs.items():
+    for name, numbers in shares(arguments.systems).items():
         if numbers:
             reports.append(check(name, numbers, arguments.seed, arguments.accuracy))
             print(reports[-1], flush=True)
