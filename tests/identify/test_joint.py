@@ -133,15 +133,6 @@ def test_a_step_that_damping_makes_small_is_not_the_last(model):
     assert converged and again.cost < minimum.cost + 0.01 * again.coordinates.size
 
 
-def test_no_direct_term_stays_zero(model):
-    silent = eqx.tree_at(lambda m: m.D, model, jnp.zeros_like(model.D))
-    htf = silent.htf(F)
-    fit = hj.fit_ldtp(htf, shaken(silent, np.random.default_rng(2)), direct=False)
-    assert not np.asarray(fit.model.D).any()
-    assert fit.compare(model.multipliers).max_error < 1e-8
-    assert fit.unknowns == hj.fit_ldtp(htf, silent).unknowns - 6 * 4
-
-
 def test_errors_are_as_small_as_the_bound(model, exact):
     """The rms error, the misfit and the coverage of 40 draws, each at the level of 0.1 %."""
     rng, draws = np.random.default_rng(3), 40
