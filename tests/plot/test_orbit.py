@@ -2,9 +2,7 @@ import numpy as np
 
 import hybridjax as hj
 
-
-def labeled(ax):
-    return {line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"}
+from .test_plots import labeled
 
 
 def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kinematic):
