@@ -134,17 +134,13 @@ def _prepare(
 ) -> tuple[FitProblem, LimitCycle]:
     """Return the problem, and a limit cycle near which to search for others."""
     parameters = free_parameters(system, free)
-    observations = _several(data)
+    observations = [data] if isinstance(data, AbstractObservation) else data
     if not observations:
         raise DefinitionError("`data` holds no observation, but one or more are needed.")
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
     near = _anchored(near)
     prepared = tuple(observation.prepare(near) for observation in observations)
     return FitProblem(parameters, prepared), near
-
-
-def _several(data: Data) -> tuple[AbstractObservation, ...]:
-    return (data,) if isinstance(data, AbstractObservation) else tuple(data)
 
 
 def _anchored(cycle: LimitCycle) -> LimitCycle:

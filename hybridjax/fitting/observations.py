@@ -169,18 +169,9 @@ class ObservedSeries(AbstractObservation):
             )
         if not data.ok.any():
             raise DefinitionError("no experiment ran well, so there is nothing to fit to.")
-        self.inputs, self.outputs, ny = data.inputs, data.outputs, len(data.outputs)
+        self.inputs, self.outputs = data.inputs, data.outputs
         y = data.y[data.ok]
-        scale = np.sqrt(np.mean(y**2, axis=(0, 1))) if std is None else np.asarray(std, float)
-        if scale.shape not in ((), (ny,)):
-            raise DefinitionError(
-                f"`std` must be one number or one for each of {ny} outputs, not {scale.shape}."
-            )
-        if not np.all(scale > 0):
-            raise DefinitionError(
-                "an output does not move in any experiment: leave it out, or give `std`."
-            )
-        self.scale = jnp.broadcast_to(scale, (ny,))
+        self.scale = _scale("outputs", std, jnp.asarray(y.reshape(-1, y.shape[2])))
         self.weighted = jnp.asarray(std is not None)
         self.absolute = data.cycle_outputs is not None
         if data.cycle_outputs is not None:
@@ -321,8 +312,8 @@ def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
         size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))  # of the shape seen.shape[1:]
         if not jnp.all(size > 0):
             raise DefinitionError(
-                f"`{name}` are zero at all sections, so they have no size: leave them out, or give "
-                "their standard deviation."
+                f"`{name}` are zero throughout and have no size: leave them out, or give their "
+                "standard deviation."
             )
         return size
     std = jnp.asarray(std, float)

@@ -386,8 +386,8 @@ def _noise_ratios(groups: list[HTFGroup], order: int) -> tuple[Float[np.ndarray,
     They ascend, in units of the noise (1 where only noise is left); then the standard deviation of
     each where it is noise.
     """
-    white = delayed_responses(groups, np.zeros(order)).whitened()
-    values = np.linalg.svd(white, compute_uv=False)[::-1] ** 2
+    whitened, _ = delayed_responses(groups, np.zeros(order))
+    values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2
     return values, float(np.sqrt(2 / sum(group.freedom * group.size for group in groups)))
 
 

@@ -133,25 +133,15 @@ def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     return Misfit(residual, np.reshape(slopes, (d, *residual.shape)), by_noise, group.leverage(q))
 
 
-class DelayedResponses(NamedTuple):
-    """The residuals of $z^{-jN} H$, j = 0, ..., d, less numerators, weighted by $1/|\\chi|$."""
+def delayed_responses(
+    groups: list[HTFGroup], c: Coefficients
+) -> tuple[Float[np.ndarray, "d1 r"], Float[np.ndarray, "d1 d1"]]:
+    r"""Return roots of two Gram matrices of $z^{-jN} H$, j = 0, ..., d, less numerators.
 
-    columns: Float[np.ndarray, "rows d1"]
-    """One for each j, over all entries."""
-    noise_gram: Float[np.ndarray, "d1 d1"]
-    """The part of their Gram matrix that is expected from errors of variance 1."""
-
-    def whitened(self) -> Float[np.ndarray, "d1 r"]:
-        """Return a root of the columns' Gram matrix, in units of that of errors alone.
-
-        (The Gram matrix itself would lose half of the digits.)
-        """
-        _, triangle = np.linalg.qr(self.columns)
-        return np.linalg.solve(np.linalg.cholesky(self.noise_gram), triangle.T)
-
-
-def delayed_responses(groups: list[HTFGroup], c: Coefficients) -> DelayedResponses:
-    """Return those of all groups. The coefficients of chi combine the columns to errors alone."""
+    The responses of all groups are weighted by $1/|\chi|$; the coefficients of chi combine them to
+    errors alone. The first root is in units of the second, which is that of the Gram matrix that is
+    expected from errors of variance 1. (The Gram matrix itself would lose half of the digits.)
+    """
     delays, columns, noise_gram = np.arange(len(c) + 1), [], 0.0
     for group in groups:
         q, _ = group.numerator_space(c)
@@ -161,7 +151,9 @@ def delayed_responses(groups: list[HTFGroup], c: Coefficients) -> DelayedRespons
         left = (2 - group.leverage(q).sum(axis=0)) / np.abs(chi(group.period_delay, c)) ** 2
         by_delay = (left * (group.period_delay ** delays[:, None]).real).sum(axis=1)
         noise_gram = noise_gram + by_delay[np.abs(delays[:, None] - delays)] * group.size
-    return DelayedResponses(np.concatenate(columns), np.asarray(noise_gram))
+    noise = np.linalg.cholesky(noise_gram)
+    _, triangle = np.linalg.qr(np.concatenate(columns))
+    return np.linalg.solve(noise, triangle.T), noise
 
 
 def maximum_likelihood(
@@ -190,9 +182,9 @@ def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
     """
     c = np.zeros(order)
     for _ in range(_MAX_REWEIGHTINGS):
-        responses = delayed_responses(groups, c)
-        vectors, _, _ = np.linalg.svd(responses.whitened())
-        null = np.linalg.solve(np.linalg.cholesky(responses.noise_gram).T, vectors[:, -1])
+        whitened, noise = delayed_responses(groups, c)
+        vectors, _, _ = np.linalg.svd(whitened)
+        null = np.linalg.solve(noise.T, vectors[:, -1])
         if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
             break
         c, last = null[1:] / null[0], c
@@ -201,20 +193,13 @@ def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
     return c
 
 
-class Summary(NamedTuple):
-    """The covariance of the coefficients at the minimum, and how large the misfit is."""
-
-    covariance: Covariance
-    cost: float
-    """Sum of squares of the misfit, in units of the errors supposed."""
-    freedom: int
-    """The real equations that the numerators leave: the expected cost."""
-
-
 def summarize(
     groups: list[HTFGroup], c: Coefficients, errors: Literal["residuals", "variance"]
-) -> Summary:
-    r"""Return the covariance of the coefficients, and how large the misfit is.
+) -> tuple[Covariance, float, int]:
+    r"""Return the covariance of the coefficients, the cost, and its expected value.
+
+    The cost is the sum of squares of the misfit in units of the errors supposed; its expected value
+    is the number of real equations that the numerators leave.
 
     With the residuals r, their Jacobian J and its part Q that errors make,
     $\mathrm{Cov}(c) = (J^T J - Q)^{-1} M (J^T J - Q)^{-1}$, where M is the covariance of the
@@ -238,7 +223,7 @@ def summarize(
         np.add.at(shares, group.line, products)
     square = shares.sum(axis=0)
     if errors == "variance":
-        return Summary(sandwich(square - noise, square), cost, freedom)
+        return sandwich(square - noise, square), cost, freedom
     try:
         root = np.linalg.cholesky(square)
         half = np.linalg.inv(root)
@@ -246,7 +231,7 @@ def summarize(
         score = np.einsum("lij,lj->li", left, score @ half.T) @ root.T
     except np.linalg.LinAlgError:  # some combination of coefficients is unknown
         pass
-    return Summary(sandwich(square - noise, score.T @ score, shares), cost, freedom)
+    return sandwich(square - noise, score.T @ score, shares), cost, freedom
 
 
 def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"]:
