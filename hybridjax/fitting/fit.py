@@ -24,7 +24,6 @@ from .problem import (
     Parameters,
     evaluate,
     free_parameters,
-    levenberg_marquardt,
 )
 
 
@@ -213,7 +212,7 @@ def _descend(
     cycle = _cycle_at(problem, system, start, near)
     if cycle.result != Result.OK:
         return End(start, start, np.inf, 0, 0, int(cycle.result))
-    end = levenberg_marquardt(problem, jnp.asarray(start), cycle)
+    end = evaluate(problem, jnp.asarray(start), cycle, descend=True)
     r, steps = np.asarray(end.residuals), int(end.steps)
     if not np.isfinite(r).all():  # there is a cycle, but no observation on it
         return End(start, start, np.inf, len(r), steps, int(Result.NOT_CONVERGED))

@@ -15,13 +15,13 @@ from .._core.boundary.checked import checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar
 from .._core.boundary.values import Reals
-from .._core.text import fields, listed, value
+from .._core.text import fields
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.plan import Plan
 from ..experiments.response import course, flow_batch, response_function
-from ..identify.htf_errors import check_values, error_weights
+from ..identify.variable_projection import check_values, error_weights
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections, FamilyLike, as_family
@@ -119,11 +119,6 @@ class ObservedHTF(AbstractObservation):
         self.weights = jnp.asarray(error_weights(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
 
-    def __repr__(self):
-        M, F = self.H.shape[:2]
-        signals = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        return _shown(self, f"{M} harmonics at {F} frequencies: {signals}", self.sections)
-
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         model = linearize(cycle, self.sections, self.outputs, self.inputs)
         error = (model.htf(self.f, self.harmonics).H - self.H) * self.weights
@@ -192,11 +187,6 @@ class ObservedSeries(AbstractObservation):
             y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.n_sections, 1))
         self.u, self.y = jnp.asarray(data.u[data.ok]), jnp.asarray(y)
         self.flow = None
-
-    def __repr__(self):
-        S, n, _ = self.y.shape
-        signals = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        return _shown(self, f"{S} experiments of {n} samples: {signals}", self.sections)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         placed = place_sections(cycle, self.sections)
@@ -293,11 +283,6 @@ class ObservedCycle(AbstractObservation):
         times = _times(placed) if np.any(_times(placed)) else None
         return cls(placed.family, outputs, values, times=times, period=cycle.period)
 
-    def __repr__(self):
-        values = (f"{name} {value(x)}" for name, x in zip(self.which, self.measured, strict=True))
-        outputs = f"{listed(self.outputs)}: " if self.outputs else ""
-        return _shown(self, outputs + "; ".join(values), self.sections)
-
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         placed = place_sections(cycle, self.sections)
         parts = []
@@ -317,11 +302,6 @@ class ObservedCycle(AbstractObservation):
     def prepare(self, cycle: LimitCycle) -> "ObservedCycle":
         place_sections(cycle, self.sections)
         return self
-
-
-def _shown(observation: AbstractObservation, what: str, sections: AbstractSections) -> str:
-    family = f"{sections.n_sections} sections of a {type(sections).__name__}"
-    return f"{type(observation).__name__}({what}; {family})"
 
 
 def _times(placed: PlacedSections) -> Float[Array, " N"]:

@@ -160,7 +160,7 @@ def fit_rational(
     column, rows = channel_index("input", input, htf.inputs), range(len(htf.outputs))
     if output is not None:
         rows = [channel_index("output", output, htf.outputs)]
-    H = np.asarray(htf.harmonic(harmonic))[:, :, column]
+    H = np.asarray(htf[harmonic])[:, :, column]
     if 2 * len(H) < poles + zeros + 1:
         raise DefinitionError(
             f"{poles} poles and {zeros} zeros have {poles + zeros + 1} coefficients, too many for "

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
-from hybridjax.identify.series.covariance import gradient_covariance
+from hybridjax.identify.series.fit import gradient_covariance
 from hybridjax.identify.series.linearization import each_fit, linearize
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.records import PreparedRecords

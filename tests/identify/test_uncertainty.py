@@ -5,9 +5,8 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.htf_errors import error_spectrum, weights_of
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
-from hybridjax.identify.variable_projection import group_htf
+from hybridjax.identify.variable_projection import error_spectrum, group_htf, weights_of
 
 from ..linear.conftest import blocks_at_random
 
