@@ -1,0 +1,181 @@
+"""Digests of what functions compute: their code, and all values that the code can read.
+
+A user's function reads constants of a notebook, calls helpers and methods, and holds arrays. JAX
+traces it once, and does not notice that one of these has changed. A digest of all of them does.
+"""
+
+import contextlib
+import functools as ft
+import hashlib
+import inspect
+import sys
+import sysconfig
+import types
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+
+# Names by which code reads values that are not named in it.
+_HIDDEN = frozenset(("eval", "exec", "globals", "__import__"))
+# Attributes of a class that do not change what its methods compute.
+_IGNORED = frozenset(
+    "__module__ __doc__ __dict__ __weakref__ __qualname__ __annotations__ __firstlineno__ "
+    "__static_attributes__ __dataclass_fields__ __dataclass_params__ __abstractmethods__ _abc_impl "
+    "__match_args__ __parameters__ __orig_bases__ __slots__ __annotate_func__".split()
+)
+_PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range
+_FOLDERS = tuple({sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib", "purelib", "platlib")})
+
+
+class HiddenError(Exception):
+    """Code reads values by names that it makes."""
+
+
+def meaning(*things: Any) -> str:
+    """Return a digest of functions, classes and objects: of their code, and of all values that they
+    read. Two of the same digest compute the same.
+
+    Installed packages are known by the names of their functions; what users replace in them is not
+    noticed, except in `hybridjax.models`.
+
+    **Raises:** `HiddenError` if code calls `eval`, `exec`, `globals` or `__import__`.
+    """
+    walk = _Walk()
+    walk.visit_all(things)
+    return walk.digest.hexdigest()
+
+
+class _Walk:
+    def __init__(self):
+        self.digest = hashlib.blake2b(digest_size=16)
+        self.number: dict[int, int] = {}
+        self.alive: list[Any] = []  # an id belongs to an object while this lives
+
+    def note(self, *words: Any) -> None:
+        self.digest.update(repr(words).encode())
+
+    def visit_all(self, things: Iterable[Any]) -> None:
+        things = list(things)
+        self.note(len(things))
+        for x in things:
+            self.visit(x)
+
+    def visit(self, x: Any) -> None:
+        if type(x) in _PLAIN:
+            return self.note(type(x).__name__, x)
+        if id(x) in self.number:
+            return self.note(self.number[id(x)])
+        self.number[id(x)] = len(self.number)
+        self.alive.append(x)
+        self.note(type(x).__qualname__)
+        match x:
+            case np.ndarray() | np.generic() | jax.Array():
+                self._array(x)
+            case types.FunctionType():
+                self._function(x)
+            case types.CodeType():
+                self.note(x.co_code, x.co_names, x.co_varnames, x.co_freevars, x.co_argcount)
+                self.visit_all(x.co_consts)
+            case types.CellType():
+                with contextlib.suppress(ValueError):  # an empty cell
+                    self.visit(x.cell_contents)
+            case type():
+                self._class(x)
+            case list() | tuple():
+                self.visit_all(x)
+            case set() | frozenset():
+                self.note(sorted(map(meaning, x)))
+            case property():
+                self.visit_all((x.fget, x.fset))
+            case types.MethodType():
+                self.visit_all((x.__func__, x.__self__))
+            case types.ModuleType() | types.BuiltinFunctionType():
+                self.note(x.__name__)
+            case _:
+                self._object(x)
+
+    def _array(self, x: Any) -> None:
+        if isinstance(x, jax.core.Tracer):
+            return self.note(str(x.aval))
+        values = np.asarray(x)
+        self.note(values.dtype.str, values.shape)
+        if values.dtype.hasobject:
+            self.visit_all(values.ravel().tolist())
+        else:
+            self.digest.update(values.tobytes())
+
+    def _function(self, x: types.FunctionType) -> None:
+        if _is_installed(x.__module__):
+            self.note(x.__module__, x.__qualname__)
+        else:
+            self.visit(x.__code__)
+            self._globals(x)
+        self.visit_all((x.__defaults__, x.__kwdefaults__, x.__closure__ or ()))
+        self.visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})
+
+    def _globals(self, x: types.FunctionType) -> None:
+        """Visit what a function, and the functions written in it, read of their module."""
+        names = _names(x.__code__)
+        for name in names:
+            if name in x.__globals__:
+                self.note(name)
+                self.visit(value := x.__globals__[name])
+                if isinstance(value, types.ModuleType):
+                    self._attributes(value, names)
+            elif name in _HIDDEN:
+                raise HiddenError(f"`{x.__qualname__}` calls `{name}`")
+
+    def _attributes(self, module: types.ModuleType, names: tuple[str, ...]) -> None:
+        """Visit the attributes of a module that a function names."""
+        for name in names:
+            value = vars(module).get(name)
+            if name not in vars(module) or (_is_installed(module.__name__) and callable(value)):
+                continue
+            is_new = id(value) not in self.number
+            self.note(name)
+            self.visit(value)
+            if isinstance(value, types.ModuleType) and is_new:
+                self._attributes(value, names)
+
+    def _class(self, x: type) -> None:
+        for base in inspect.getmro(x):
+            self.note(base.__module__, base.__qualname__)
+            if not _is_installed(base.__module__):
+                self.visit({k: v for k, v in vars(base).items() if k not in _IGNORED})
+
+    def _object(self, x: Any) -> None:
+        self.visit(type(x))
+        if isinstance(x, Mapping):
+            self.visit_all(part for item in x.items() for part in item)
+        if _is_installed(type(x).__module__) and not hasattr(x, "__wrapped__"):
+            with contextlib.suppress(Exception):  # whatever an object raises that cannot be pickled
+                _, arguments, *parts = x.__reduce_ex__(4)
+                state, *items = parts or [None]
+                return self.visit_all([arguments, state, *(list(y or ()) for y in items)])
+        self.visit_all((getattr(x, "__dict__", None), getattr(x, "__wrapped__", None)))
+        slots = [vars(base).get("__slots__", ()) for base in type(x).__mro__]
+        names = [y for z in slots for y in ((z,) if isinstance(z, str) else z)]
+        self.visit_all(getattr(x, y, None) for y in names if y not in ("__dict__", "__weakref__"))
+
+
+@ft.lru_cache(4096)
+def _names(code: types.CodeType) -> tuple[str, ...]:
+    """Names and words in code, and in functions that are written in it."""
+    inner = [name for x in code.co_consts if isinstance(x, types.CodeType) for name in _names(x)]
+    words = [x for x in code.co_consts if isinstance(x, str) and x.isidentifier()]
+    return tuple(dict.fromkeys([*code.co_names, *words, *inner]))
+
+
+def _is_installed(module: str | None) -> bool:
+    name = module or "builtins"
+    return not name.startswith("hybridjax.models") and _is_package(name.partition(".")[0])
+
+
+@ft.cache
+def _is_package(name: str) -> bool:
+    path = getattr(sys.modules.get(name), "__file__", None)
+    known = name in sys.stdlib_module_names or name == "hybridjax"
+    return known or (name != "__main__" and path is not None and path.startswith(_FOLDERS))
