@@ -135,7 +135,7 @@ def main(model: str, family: str, folder: str | None) -> None:
     import jax.monitoring
 
     import hybridjax as hj
-    from hybridjax.experiments import campaign
+    from hybridjax.experiments import run as batched
 
     hj.enable_x64()
     hj.enable_compilation_cache()
@@ -145,7 +145,7 @@ def main(model: str, family: str, folder: str | None) -> None:
         print(json.dumps({"cores": cores, **first_calls(model, family)}))
         return
     if folder == "thoroughly":
-        campaign._LARGE = 0  # more is not needed for a job to wait
+        batched._LARGE = 0  # more is not needed for a job to wait
         print(json.dumps(first_calls(model, family)))
         return
     pathlib.Path(folder).mkdir()

@@ -6,7 +6,7 @@ states on the cycle as the reported ones are, but not below 1e-13.
 
 import numpy as np
 
-from hybridjax.experiments.campaign import Options, prepare
+from hybridjax.experiments.run import Options, prepare
 
 from .problems import ALL, N, Problem, problem, record
 

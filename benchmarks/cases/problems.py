@@ -14,9 +14,9 @@ from job import Job, make_job
 from peers.contest import Seconds, measure
 
 import hybridjax as hj
-from hybridjax.experiments import campaign
-from hybridjax.experiments.campaign import Options, prepare
+from hybridjax.experiments import run as batched
 from hybridjax.experiments.flow_batch import course, flow_batch
+from hybridjax.experiments.run import Options, prepare
 from hybridjax.sections.placed import PlacedSections
 
 
@@ -64,7 +64,7 @@ class Problem:
 
     def run(self, accuracy: float = 1e-9, workers: int = 1) -> hj.ExperimentData:
         """All experiments, as a user runs them, by the program that jobs find after a while."""
-        campaign._LARGE = 0
+        batched._LARGE = 0
         return hj.run_experiments(
             self.cycle, self.placed, self.u, self.outputs,
             discard=0, accuracy=accuracy,

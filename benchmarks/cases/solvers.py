@@ -46,7 +46,7 @@ def _relaxation(show, mu: float, options) -> None:
         s = Structure(system)
         t = jax.numpy.zeros(q.shape[1])
         lanes = start_lanes(s, t, jax.numpy.zeros(q.shape[1], int), q)
-        return move(s, lanes, jax.numpy.zeros((1, q.shape[1])), until(t + period), settings)
+        return move(s, lanes, jax.numpy.zeros((1, q.shape[1])), until(t + period), settings).moved
 
     def seconds_of(q):
         moved, compiling, seconds = first_and_later(

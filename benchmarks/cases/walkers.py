@@ -9,8 +9,8 @@ sections. `ratio` is how many times as long the biped takes.
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.experiments import campaign
-from hybridjax.experiments.campaign import Options, prepare
+from hybridjax.experiments import run as batched
+from hybridjax.experiments.run import Options, prepare
 
 from .problems import first_and_later
 
@@ -43,7 +43,7 @@ def _costs(show, case, options) -> dict[str, float]:
     placed = hj.place_sections(cycle, sections)
     count, cycles = (16, 4) if options.quick else (EXPERIMENTS, CYCLES)
     u = amplitude * np.random.default_rng(0).standard_normal((count, cycles * SECTIONS, 1))
-    campaign._LARGE = 0
+    batched._LARGE = 0
     how = {"discard": 0, "accuracy": ACCURACY, "execution": hj.Execution(workers=1)}
     _, _, seconds = first_and_later(
         lambda: hj.run_experiments(cycle, placed, u, output, **how), options.repeat

@@ -153,41 +153,21 @@ def compiler_options() -> dict[str, Any]:
     return _QUICK
 
 
-class _Uncollected:
-    """A context in which Python's collector of cyclic garbage rests; threads may share it.
+@contextlib.contextmanager
+def uncollected() -> Iterator[None]:
+    """A context in which Python's collector of cyclic garbage rests.
 
     Tracing makes hundreds of thousands of objects that live until the program is compiled, and the
-    collector would visit all of them repeatedly: an eighth of the time of a first limit cycle.
+    collector would visit all of them repeatedly: an eighth of the time of a first limit cycle. If
+    threads share it, the collector may start early, and runs when all of them have left.
     """
-
-    def __init__(self):
-        self._lock, self._inside, self._was_on = threading.Lock(), 0, False
-
-    def __enter__(self):
-        with self._lock:
-            if self._inside == 0:
-                self._was_on = gc.isenabled()
-                gc.disable()
-            self._inside += 1
-
-    def __exit__(self, *_):
-        with self._lock:
-            self._inside -= 1
-            if self._inside == 0 and self._was_on:
-                gc.enable()
-
-
-uncollected = _Uncollected()
-
-
-@contextlib.contextmanager
-def _compiling() -> Iterator[None]:
-    say_compiling(True)
+    was_on = gc.isenabled()
+    gc.disable()
     try:
-        with uncollected:
-            yield
+        yield
     finally:
-        say_compiling(False)
+        if was_on:
+            gc.enable()
 
 
 def quick_jit(function: Callable) -> Callable:
@@ -211,7 +191,7 @@ def quick_jit(function: Callable) -> Callable:
 
     @ft.wraps(function)
     def call(*arguments):
-        with uncollected:
+        with uncollected():
             # JAX allows options of the compiler at the top level only, and refuses them elsewhere
             # after it has traced the function.
             if not on_cpu() or is_traced(arguments) or is_inside_program():
@@ -244,7 +224,7 @@ def host_first(function: Callable) -> Callable:
         if left <= 0:
             return compiled(*arguments)
         try:
-            with uncollected, at_ease(), at_most(left):
+            with uncollected(), at_ease(), at_most(left):
                 return from_host(function(*to_host(arguments)))
         except OutOfTimeError:
             return compiled(*arguments)
@@ -280,7 +260,7 @@ class TwoTiers:
 
     def __call__(self, *arguments: Any) -> Any:
         if not _is_simple() or is_traced(arguments) or is_inside_program():
-            return _one_tier(self._function, self.large)(*arguments)
+            return one_tier(self._function, self.large)(*arguments)
         key = self._function, _settings(), kind(arguments)
         arrays, static = eqx.partition(arguments, _is_array)
         leaves, structure = jax.tree_util.tree_flatten(arrays)
@@ -290,10 +270,12 @@ class TwoTiers:
                 arrays = jax.tree_util.tree_unflatten(structure, leaves)
                 return self._function(*eqx.combine(arrays, static))
 
-            with _choosing, _compiling():
+            with _choosing, uncollected():
                 if key not in self._chosen:  # by another thread in the meantime
+                    say_compiling(True)
                     program = _lowered(key, run, leaves)
                     self._chosen[key] = program, program.choose(self.large)
+                    say_compiling(False)
         program, executable = self._chosen[key]
         return program.run(executable, leaves)
 
@@ -319,7 +301,8 @@ def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
 
 
 @ft.lru_cache(_KEPT)
-def _one_tier(function: Callable, large: bool) -> Callable:
+def one_tier(function: Callable, large: bool) -> Callable:
+    """Return `function` compiled: fully optimized if the job is `large`."""
     return eqx.filter_jit(function) if large else quick_jit(function)
 
 

@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import uuid
 from collections.abc import Iterable, Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
 from ..errors import DefinitionError
@@ -72,10 +72,6 @@ def temporary_name() -> str:
 Format = Literal["png", "pdf", "svg"]
 
 
-Digests = dict[str, list[str]]
-"""Digests by name that a file has if nobody has changed it."""
-
-
 @contextlib.contextmanager
 def results_folder(folder: Path, kind: str, names: Iterable[str] = ()) -> Iterator[Path]:
     """A new folder for results of this kind, which are moved to `folder` when all are there.
@@ -115,18 +111,17 @@ def _put(new: Path, folder: Path, kind: str) -> None:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(new / name, folder / name)
     for name in before.keys() - digests.keys():
-        if _is_listed(folder, name, before):
+        if _is_result(folder, name, before):
             (folder / name).unlink()
     _write_list(folder, kind, digests)
 
 
-def _refuse_others(folder: Path, names: Iterable[str], listed: Digests) -> None:
+def _refuse_others(folder: Path, names: Iterable[str], listed: dict[str, list[str]]) -> None:
     for name in names:
         path = folder / name
-        for above in _between(path, folder):
-            if os.path.lexists(above) and (above.is_symlink() or not above.is_dir()):
-                raise _in_the_way(above)
-        if os.path.lexists(path) and not _is_listed(folder, name, listed):
+        if path.parent.resolve() != folder.resolve() / Path(name).parent:
+            raise _in_the_way(path.parent)
+        if os.path.lexists(path) and not _is_result(folder, name, listed):
             raise _in_the_way(path)
 
 
@@ -137,19 +132,16 @@ def _in_the_way(path: Path) -> DefinitionError:
     )
 
 
-def _is_listed(folder: Path, name: str, listed: Digests) -> bool:
-    """Return whether a file is on the list, and no link leads to it."""
-    path = folder / name
-    links = any(x.is_symlink() for x in (path, *_between(path, folder)))
-    return path.is_file() and not links and _digest(path) in listed.get(name, ())
+def _is_result(folder: Path, name: str, listed: dict[str, list[str]]) -> bool:
+    """Return whether a file in the folder has a digest of the list, and no link leads to it."""
+    root = folder.resolve()
+    path = root / name
+    direct = root in path.parents and path.resolve() == path and path.is_file()
+    return direct and _digest(path) in listed.get(name, ())
 
 
-def _between(path: Path, folder: Path) -> list[Path]:
-    """Return the folders above a path, up to `folder`."""
-    return [x for x in path.parents if folder in x.parents]
-
-
-def _listed(folder: Path, kind: str) -> Digests:
+def _listed(folder: Path, kind: str) -> dict[str, list[str]]:
+    """Return the digests by name that results have if nobody has changed them."""
     path = folder / f".hybridjax-{kind}.json"
     if not os.path.lexists(path):
         return {}
@@ -157,15 +149,12 @@ def _listed(folder: Path, kind: str) -> Digests:
         if path.is_symlink() or path.stat().st_size > limits.TEXT:
             raise ValueError
         listed = json.loads(path.read_text())
-        for name in map(PurePosixPath, dict(listed)):
-            if name.is_absolute() or ".." in name.parts or not name.parts:
-                raise ValueError
-        return {name: list(map(str, digests)) for name, digests in listed.items()}
+        return {str(name): list(map(str, digests)) for name, digests in listed.items()}
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         raise _in_the_way(path) from None
 
 
-def _write_list(folder: Path, kind: str, digests: Digests) -> None:
+def _write_list(folder: Path, kind: str, digests: dict[str, list[str]]) -> None:
     with replacing(folder / f".hybridjax-{kind}.json") as path:
         path.write_text(json.dumps(digests, indent=1))
 

@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.fingerprint import IndescribableError, program_digest
-from .._core.pieces.description import array_digest, digest_of
+from .._core.pieces.description import IndescribableError, array_digest, digest_of, program_digest
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled

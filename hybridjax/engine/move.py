@@ -1,21 +1,31 @@
-"""Flow of many lanes to their targets, differentiable in forward and reverse mode."""
+"""Flow of many lanes to targets, differentiable in forward and reverse mode, and its Jacobians."""
+
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
-from jaxtyping import Bool
+import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from .._core.executor import namespace, on_host
 from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
 from .arrays import Array, Index, Inputs, Times
+from .chain import chain
 from .lanes import Lanes, constant
 from .replay import replay
-from .search.first_step import initial_step, stride
-from .search.search import Moved, Options, Recorded, search
-from .search.state import Stride
+from .search.search import initial_step, search
+from .search.state import Moved, Options, Recorded, Stride
 from .settings import Settings
+from .tape import Tape
 from .target import Target
+
+
+Jacobians = Float[Array, "L n m"]
+Wanted = Bool[Array, ""] | bool
+_PLAIN = Options()
 
 
 def move(
@@ -26,61 +36,22 @@ def move(
     settings: Settings,
     setout: Stride | Times | None = None,
     result: Index | None = None,
-    new_input: bool = True,
-) -> Moved:
+    options: Options = _PLAIN,
+) -> Recorded:
     """Flow every lane to its target under a constant input.
 
     Lanes fail one by one, with a code each; nothing is raised. Times and states have exact
     derivatives (first and second, through crossings too) with respect to everything that is a
-    floating-point array: states, times, inputs, parameters, the target.
+    floating-point array: states, times, inputs, parameters, the target. The tape has none.
 
-    `setout` is the first step, or a `Stride`. With `new_input`, the guards are armed anew;
-    otherwise they stay armed as they are.
+    `setout` is the first step, or a `Stride`.
     """
-    options = Options(new_input=new_input)
-    return _flow(s, lanes, u, target, settings, setout, result, options).moved
-
-
-def glide(
-    s: Structure,
-    lanes: Lanes,
-    u: Inputs,
-    target: Target,
-    settings: Settings,
-    setout: Stride,
-    result: Index,
-) -> Moved:
-    """The same as `move`, for lanes most of which are expected to arrive in one step."""
-    options = Options(glide=True)
-    return _flow(s, lanes, u, target, settings, setout, result, options).moved
-
-
-def record(
-    s: Structure,
-    lanes: Lanes,
-    u: Inputs,
-    target: Target,
-    settings: Settings,
-    setout: Stride | Times | None = None,
-    result: Index | None = None,
-    new_input: bool = True,
-    tangents: Bool[Array, ""] | bool = False,
-) -> Recorded:
-    """The same as `move`, with a record of every step, which has no derivatives.
-
-    With `tangents`, steps are also short enough for the derivatives of a replay.
-    """
-    options = Options(tape=True, new_input=new_input, tangents=tangents)
-    return _flow(s, lanes, u, target, settings, setout, result, options)
-
-
-def _flow(s: Structure, lanes, u, target, settings, setout, result, options) -> Recorded:
+    xp = namespace(lanes.t)
     if setout is None:
         setout = initial_step(s, lanes, u, target.limit - lanes.t, settings)
     if not isinstance(setout, Stride):
-        setout = stride(setout)
+        setout = Stride(setout, xp.zeros_like(setout), xp.ones_like(setout))
     if result is None:
-        xp = namespace(lanes.t)
         result = xp.full(lanes.t.shape, Result.OK, xp.int32)
     if on_host(lanes.t):
         return search(s, lanes, u, target, setout, result, settings, options)
@@ -89,17 +60,22 @@ def _flow(s: Structure, lanes, u, target, settings, setout, result, options) -> 
 
 @eqx.filter_jit
 def _search(s, lanes, u, target, setout, result, settings, options: Options) -> Recorded:
-    """`search`, with the axes that `jax.vmap` maps as more lanes."""
+    def run(s, target, common, by_lane):
+        (settings, options), (lanes, u, setout, result) = common, by_lane
+        return search(s, lanes, u, target, setout, result, shared(settings), options)
 
-    def run(common, by_lane):
-        s, levels, settings, options = common
-        lanes, u, target, setout, result = by_lane
-        target = target.with_levels(levels)
-        return search(Structure(s), lanes, u, target, setout, result, shared(settings), options)
+    return _over_lanes(run, s, target, (settings, options), (lanes, u, setout, result))
+
+
+def _over_lanes(run: Callable, s: Structure, target: Target, common: tuple, by_lane: tuple) -> Any:
+    """`run(s, target, common, by_lane)`, with the axes that `jax.vmap` maps as more lanes."""
+
+    def whole(common, by_lane):
+        (source, levels, *common), (target, *by_lane) = common, by_lane
+        return run(Structure(source), target.with_levels(levels), common, by_lane)
 
     target, levels = target.split()
-    common = s.source, levels, settings, options
-    return vmap_to_lanes(run)(common, (lanes, u, target, setout, result))
+    return vmap_to_lanes(whole)((s.source, levels, *common), (target, *by_lane))
 
 
 @eqx.filter_custom_jvp
@@ -131,3 +107,93 @@ def _move_jvp(primals, tangents):
     out = eqx.tree_at(ends, Recorded(recorded.moved, tape if options.tape else None), (t, q))
     none = jax.tree_util.tree_map(lambda _: None, out)
     return out, eqx.tree_at(ends, none, (t_t, t_q), is_leaf=lambda x: x is None)
+
+
+def flow_jacobian(
+    s: Structure,
+    lanes: Lanes,
+    target: Target,
+    settings: Settings,
+    h: Times | None = None,
+    result: Index | None = None,
+    new_input: bool = True,
+    wanted: Wanted = True,
+) -> tuple[Jacobians, Moved, Tape]:
+    """Derivative of (t, q) at the targets with respect to q at the start, without input. If it is
+    not `wanted`, zeros: only the flow is computed then.
+
+    Exact, through every event on the way, and differentiable once more. Each column is one
+    forward-mode tangent; all columns and lanes are pushed forward in one pass. (Linearizing first
+    and mapping afterwards would store every stage, and takes 20 times as long.)
+
+    **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
+    """
+    u = namespace(lanes.t).zeros((s.nu, lanes.t.shape[0]))
+    still, start, goal = (s, lanes, target) if on_host(lanes.t) else constant((s, lanes, target))
+    options = Options(tape=True, new_input=new_input, tangents=wanted)
+    moved, tape = move(still, start, u, goal, settings, h, result, options)
+    assert tape is not None
+    jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True, wanted=wanted)
+    if wanted is not True:
+        end = jnp.where(wanted, end, jnp.concatenate([moved.lanes.t[None], moved.lanes.q]))
+    return jacobian, moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:])), tape
+
+
+def tape_jacobian(
+    s: Structure,
+    lanes: Lanes,
+    target: Target,
+    tape: Tape,
+    of_states: bool = False,
+    wanted: Wanted = True,
+    across: Float[Array, "A d"] | None = None,
+) -> tuple[Jacobians, Float[Array, "n L"]]:
+    """Derivative of (t, q) at the targets of a recorded flow with respect to (t, q, u) at the
+    start, at u = 0, or to q only (`of_states`), and (t, q) at the targets; both are zeros if they
+    are not `wanted`. `across`: see `chain`; traced, it makes no difference."""
+    if on_host(lanes.t):
+        return chain(s, lanes, target, tape, of_states, across)
+    columns, end = _push(s, lanes, target, tape, of_states, wanted)
+    return columns.transpose(2, 1, 0), end
+
+
+def _columns(s, lanes, target, tape, of_states):
+    """Derivatives (m, n, L) and (t, q) at the end (n, L)."""
+    L, d = lanes.t.shape[0], s.d
+    n = 1 + d + s.nu
+
+    def flow(x):
+        start = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1 : 1 + d]))
+        t, q = replay(s, start, x[1 + d :], target, tape)
+        return jnp.concatenate([t[None], q])
+
+    x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
+    directions = jnp.eye(n)[1 : 1 + d] if of_states else jnp.eye(n)
+    tangents = jnp.broadcast_to(directions[:, :, None], (*directions.shape, L))
+    push = jax.vmap(lambda tangent: jax.jvp(flow, (x,), (tangent,)), out_axes=(None, 0))
+    end, columns = push(tangents)
+    return columns, end
+
+
+@eqx.filter_custom_jvp
+def _push(s, lanes, target, tape, of_states, wanted):
+    """`_columns` where they are wanted."""
+
+    def run(s, target, common, by_lane):
+        (wanted,), (lanes, tape) = common, by_lane
+
+        def columns():
+            return _columns(s, lanes, target, tape, of_states)
+
+        def zeros():
+            shapes = jax.eval_shape(columns)
+            return jax.tree_util.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+        return columns() if wanted is True else jax.lax.cond(wanted, columns, zeros)
+
+    return _over_lanes(run, s, target, (wanted,), (lanes, tape))
+
+
+@_push.def_jvp
+def _push_jvp(primals, tangents):
+    return eqx.filter_jvp(_columns, primals[:-1], tangents[:-1])

@@ -25,8 +25,8 @@ from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
 from .cubic import interpolate
 from .lanes import start_lanes
-from .move import record
-from .search.first_step import initial_step
+from .move import Options, move
+from .search.search import initial_step
 from .settings import SIMULATION, Settings
 from .tape import IDLE
 from .target import until
@@ -227,7 +227,7 @@ def _start(s, t, a, state, u, span, settings):
 
 @host_first
 def _piece(s, lanes, u, end, settings, h):
-    return record(s, lanes, u, until(end), settings, h)
+    return move(s, lanes, u, until(end), settings, h, options=Options(tape=True))
 
 
 def _slopes(s: Structure, t, chart, q, u) -> np.ndarray:

@@ -1,9 +1,8 @@
-from .campaign import Options as Options
 from .design.multisine import optimize_phases as optimize_phases
 from .noise import (
     ProcessNoise as ProcessNoise,
     add_noise as add_noise,
     simulate_experiments as simulate_experiments,
 )
-from .run import stream_experiments as stream_experiments
-from .stored import StoredExperiments as StoredExperiments
+from .run import Options as Options
+from .stored import StoredExperiments as StoredExperiments, stream_experiments as stream_experiments

@@ -1,5 +1,6 @@
 """Data of experiments on a hybrid system, on a linear model or in a laboratory."""
 
+import dataclasses
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -10,16 +11,14 @@ from .._core.arguments import Numbers, names
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
 from .._core.boundary.values import Integers, Reals
-from .._core.html import COLORS, Curve, card, facts, picture, table
+from .._core.html import card, facts, table
 from .._core.results import Result
-from .._core.signal import unit_of, with_unit
+from .._core.signal import unit_of
 from .._core.text import fields, listed
 from ..errors import DefinitionError
 from .record import Record
 
 
-# Cycles that the notebook summary draws. Fewer: the picture is empty. More: it is illegible.
-_DRAWN = 4
 # Inputs are opposite if their sum is this small, relative to their peak. Smaller: rounding of
 # recorded inputs separates pairs. Larger: even-order distortion is left in the odd part.
 _OPPOSITE = 1e-9
@@ -109,12 +108,10 @@ class ExperimentData(eqx.Module):
         self.n_sections, self.periods = n_sections, periods
         self.inputs = names("inputs", inputs, self.u.shape[2])
         self.outputs = names("outputs", outputs, self.y.shape[2])
-
         self._check()
 
     def _check(self) -> None:
-        S, n, _ = self.u.shape
-        N, P, ny = self.n_sections, self.periods, self.y.shape[2]
+        (S, n, ny), N, P = self.y.shape, self.n_sections, self.periods
         if n % N:
             raise DefinitionError(
                 f"the record has {n} samples, not a multiple of N = {N} sections: cut it to whole "
@@ -125,8 +122,7 @@ class ExperimentData(eqx.Module):
                 f"the window of P = {P} periods is longer than the record, {n // N} periods of "
                 f"{N} sections."
             )
-        each = self.result, self.failed_at, self.error
-        if any(x.shape != (S,) for x in each):
+        if any(x.shape != (S,) for x in (self.result, self.failed_at, self.error)):
             raise DefinitionError(
                 f"result, failed_at and error must have one entry for each of {S} experiments."
             )
@@ -210,9 +206,8 @@ class ExperimentData(eqx.Module):
         )
 
     def _repr_html_(self) -> str:
-        S, n, _ = self.u.shape
         about = {
-            "cycles": f"{n // self.n_sections} of {self.n_sections} sections",
+            "cycles": f"{self.u.shape[1] // self.n_sections} of {self.n_sections} sections",
             "window": f"the last {self.periods} periods",
             "sections": self.label,
         }
@@ -224,20 +219,8 @@ class ExperimentData(eqx.Module):
             (x, f"{np.sqrt(np.mean(v**2)):.4g} {unit_of(x)}", f"{np.abs(v).max():.4g}")
             for x, v in signals
         ]
-        k = slice(self.window.start, self.window.start + _DRAWN * self.n_sections)
-        drawn = [
-            picture(
-                [Curve(np.arange(n)[k] / self.n_sections, v[0, k], color=color)],
-                "cycles",
-                with_unit(x, unit_of(x)),
-            )
-            for (x, v), color in (
-                (signals[0], COLORS[-1]),
-                (signals[len(self.inputs)], COLORS[0]),
-            )
-        ]
         rms = table(("signal", "rms", "largest"), sizes)
-        return card("ExperimentData", self.summary(), facts(about), rms, *drawn)
+        return card("ExperimentData", self.summary(), facts(about), rms)
 
     def odd_part(self) -> "ExperimentData":
         """Return half the difference of each pair of experiments with opposite inputs.
@@ -263,16 +246,12 @@ class ExperimentData(eqx.Module):
         broken = first != Result.OK
         failed_at = np.where(broken, self.failed_at[::2], self.failed_at[1::2])
         error = np.maximum(self.error[::2], self.error[1::2])
-        return ExperimentData(
-            plus,
-            (self.y[::2] - self.y[1::2]) / 2,
-            n_sections=self.n_sections,
-            periods=self.periods,
-            inputs=self.inputs,
-            outputs=self.outputs,
+        return dataclasses.replace(
+            self,
+            u=plus,
+            y=(self.y[::2] - self.y[1::2]) / 2,
             result=np.where(broken, first, second),
-            simulated=Simulated(failed_at, error, label=self.label),
-            cycle_outputs=self.cycle_outputs,
+            simulated=Simulated(failed_at, error, self.label),
         )
 
 

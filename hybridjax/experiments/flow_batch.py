@@ -11,8 +11,9 @@ from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
 from ..engine.lanes import Lanes
-from ..engine.move import glide
+from ..engine.move import Options, move
 from ..engine.settings import Settings
+from ..errors import DefinitionError
 from ..sections.abstract import BoundSections
 from ..sections.placed import PlacedSections, observe, section_target
 from ..systems.output import Output
@@ -65,6 +66,15 @@ def course(placed: PlacedSections, outputs: Sequence[str | Output]) -> Course:
     )
 
 
+def require_shape(shape: tuple[int, ...], n_sections: int, nu: int) -> None:
+    """**Raises:** `DefinitionError` for inputs that are not (S, n, nu) with n a multiple of N."""
+    if len(shape) != 3 or shape[2] != nu or shape[1] % n_sections or 0 in shape:
+        raise DefinitionError(
+            f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple of "
+            f"the {n_sections} sections; got {shape}."
+        )
+
+
 def flow_batch(
     course: Course,
     plan: Plan,
@@ -97,7 +107,7 @@ def flow_batch(
         target = section_target(course.bound, course.lanes, period, *to)
         target = dataclasses.replace(target, event_sequence=sequence)
         stride = plan.stride(i, S)
-        moved = glide(s, lanes, u, target, settings, stride, result)
+        moved = move(s, lanes, u, target, settings, stride, result, Options(glide=True)).moved
         # An event may change places with a section, but none may be left out or come in addition.
         due = course.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - due) > 1

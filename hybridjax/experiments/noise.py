@@ -40,11 +40,6 @@ class ProcessNoise:
     memory: NonNegative = 0.0
 
     def __post_init__(self):
-        if np.ndim(self.std) > 1 or np.size(self.std) == 0:
-            raise DefinitionError(
-                f"ProcessNoise: `std` must be one number, or one for each section, not of shape "
-                f"{np.shape(self.std)}."
-            )
         # (Numbers and tuples of them can be compared and written down, arrays cannot.)
         plain = np.asarray(self.std).tolist()
         object.__setattr__(self, "std", tuple(plain) if isinstance(plain, list) else plain)

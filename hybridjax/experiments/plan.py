@@ -18,8 +18,7 @@ from .._core.compilation import at_ease, host_first
 from .._core.executor import Array, from_host, namespace, to_host
 from .._core.memo import Memory
 from .._core.results import Result
-from ..engine.jacobian import tape_jacobian
-from ..engine.move import move
+from ..engine.move import move, tape_jacobian
 from ..engine.search.state import Stride
 from ..engine.settings import Settings
 from ..engine.watch import watch
@@ -177,7 +176,7 @@ def _try_ways(placed: PlacedSections, settings: Settings) -> _Ways:
     accuracy = each(rtol), each(settings.atol * rtol / settings.rtol)
     tolerance = Settings(1.0, 1.0, patience, settings.scale)
     tolerance = eqx.tree_at(lambda x: (x.rtol, x.atol), tolerance, accuracy)
-    moved = move(s, lanes, xp.zeros((s.nu, W * N)), target, tolerance, start)
+    moved = move(s, lanes, xp.zeros((s.nu, W * N)), target, tolerance, start).moved
     ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
     ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, N)
     estimate = moved.error.reshape(W, N)[:K] * (rtol[:K, None] / settings.rtol)

@@ -127,37 +127,26 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
 
     **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift.
     """
-    return list(each_uninterrupted_record(data))
-
-
-def each_uninterrupted_record(data: RecordedData) -> Iterator[Record]:
-    """Yield `uninterrupted_records` one after the other."""
-    common, usable = None, False
-    for record in _records(data):
-        if not record.inputs:
-            raise DefinitionError(
-                "`data` holds no input: name the signals that acted, or use what needs none "
-                "(`hj.recordings.natural_multipliers`)."
-            )
-        about = (record.n_sections, record.inputs, record.outputs, record.lead, record.drift)
-        common = about if common is None else common
-        if about != common:
-            raise DefinitionError(
-                f"`data` holds records that do not belong together: some have {common}, others "
-                f"{about}."
-            )
-        for part in _with_known_inputs(record):
-            usable = True
-            yield part
-    if common is None:
+    parts = [data] if isinstance(data, HasRecords) else data
+    records = [record for part in parts for record in part.records]
+    if not records:
         raise DefinitionError("`data` holds no experiment that ran to its end.")
+    if not all(record.inputs for record in records):
+        raise DefinitionError(
+            "`data` holds no input: name the signals that acted, or use what needs none "
+            "(`hj.recordings.natural_multipliers`)."
+        )
+    about = [(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records]
+    other = [x for x in about if x != about[0]]
+    if other:
+        raise DefinitionError(
+            f"`data` holds records that do not belong together: some have {about[0]}, others "
+            f"{other[0]}."
+        )
+    usable = [part for record in records for part in _with_known_inputs(record)]
     if not usable:
         raise DefinitionError("the input is NaN at every sample.")
-
-
-def _records(data: RecordedData) -> Iterator[Record]:
-    for part in [data] if isinstance(data, HasRecords) else data:
-        yield from part.records
+    return usable
 
 
 def _with_known_inputs(record: Record) -> Iterator[Record]:

@@ -13,19 +13,19 @@ from .._core.boundary.values import Reals
 from .._core.precision import require_x64
 from .._core.text import listed
 from ..engine.settings import EXPERIMENT
-from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.output import Output, OutputNames
 from ..systems.system import HybridSystem
-from .flow_batch import Response, course, flow_batch
+from .flow_batch import Response, course, flow_batch, require_shape
 from .plan import Accuracy, Stepping, plan_flow
 
 
-# Steps that a derivative may use between two sections, and in a period of the cycle. Fewer:
-# experiments far from the cycle fail at the limit on steps. More: derivatives need more memory.
-_STEPS, _STEPS_PER_PERIOD = 32, 1024
+# Steps that a derivative may use between two of as many sections, and its square in a period of the
+# cycle. Fewer: experiments far from the cycle fail at the limit on steps. More: derivatives need
+# more memory.
+_STEPS = 32
 
 
 @checked_methods
@@ -69,7 +69,8 @@ class ResponseFunction(eqx.Module):
         **Raises:** `DefinitionError` for inputs of another shape.
         """
         require_x64(system)
-        u, placed = self._inputs(u), self.placed
+        u, placed = jnp.asarray(u, float), self.placed
+        require_shape(u.shape, placed.n_sections, len(placed.cycle.system.inputs))
         if system is not None:
             placed = eqx.tree_at(lambda x: x.cycle.system, placed, system)
         if start is None:
@@ -77,16 +78,6 @@ class ResponseFunction(eqx.Module):
         return flow_batch(
             course(placed, self.outputs), self.stepping.plan, start, u, self.stepping.settings
         )
-
-    def _inputs(self, u: Numbers) -> Float[Array, "S n nu"]:
-        u = jnp.asarray(u, float)
-        N, nu = self.placed.n_sections, len(self.placed.cycle.system.inputs)
-        if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % N or 0 in u.shape:
-            raise DefinitionError(
-                f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple "
-                f"of the {N} sections; got {u.shape}."
-            )
-        return u
 
 
 @checked
@@ -122,7 +113,7 @@ def response_function(
     placed = as_placed(cycle, sections)
     z = placed.structure().resolve_outputs(outputs)
     stepping = plan_flow(placed, accuracy)
-    steps = max(_STEPS, _STEPS_PER_PERIOD // placed.n_sections)
+    steps = max(_STEPS, _STEPS**2 // placed.n_sections)
     settings = dataclasses.replace(stepping.settings, max_steps=steps)
     stepping = dataclasses.replace(stepping, settings=settings)
     return ResponseFunction(placed, stepping, tuple(z.items))

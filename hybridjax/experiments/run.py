@@ -1,23 +1,66 @@
 """Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
 
-from collections.abc import Iterator
+import dataclasses
+from typing import Annotated, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import ExperimentCount, Index, Path
+from .._core.boundary.kinds import Index
+from .._core.boundary.values import Reals
+from .._core.compilation import TwoTiers
 from .._core.execution import Execution
-from .._core.pieces.run import DaskClient
+from .._core.executor import from_host
+from .._core.memo import Memory, remembered
 from .._core.progress import working
+from .._core.results import Result
 from ..engine.settings import EXPERIMENT
-from ..errors import DefinitionError
+from ..errors import ComputationError, DefinitionError
+from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
-from ..sections.placed import SectionsLike
-from ..systems.output import OutputNames
-from .campaign import CHUNK, DesignLike, Options, prepare
-from .data import ExperimentData
+from ..sections.place import as_placed
+from ..sections.placed import PlacedSections, SectionsLike
+from ..systems.output import Output, OutputNames
+from ..systems.structure import Outputs
+from .batches import divide, in_batches
+from .data import ExperimentData, Simulated
+from .design.design import DISCARD, Design
+from .flow_batch import Course, course, flow_batch, require_shape
 from .noise import ProcessNoise
-from .plan import Accuracy
-from .start import StartName
-from .stored import StoredExperiments, store_experiments
+from .plan import Accuracy, Stepping, plan_flow
+from .start import StartName, linearized, on_cycle, periodic_start, predict, settle_batch
+
+
+DesignLike = (
+    Design | Annotated[np.ndarray | jax.Array, Reals("S n nu", missing=True, infinite=True)]
+)
+"""A design, or inputs. (Arrays may lie on disk: their values are checked part by part.)"""
+
+# From so many samples in all, a run waits for the optimized program: it takes 10 s longer to
+# compile and saves 2 microseconds per sample. Fewer: short runs wait in vain. More: runs of 20 s
+# take twice as long.
+_LARGE = 5_000_000
+# Experiments of a chunk, also when inputs on disk are checked. More need more memory; fewer leave
+# batches and threads unfilled.
+CHUNK = 640
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of experiments, the keyword arguments of `run_experiments`.
+
+    **Fields:** `start`, `discard`, `process_noise`, `accuracy` and `execution`,
+    with the defaults and the meaning that they have in `run_experiments`.
+    """
+
+    start: StartName = "cycle"
+    discard: Index | None = None
+    process_noise: ProcessNoise | None = None
+    accuracy: Accuracy = EXPERIMENT
+    execution: Execution | None = None
 
 
 @checked
@@ -68,55 +111,267 @@ def run_experiments(
     return prepare(cycle, sections, design, outputs, options).run()
 
 
-@checked
-def stream_experiments(
+@dataclasses.dataclass(frozen=True)
+class Inputs:
+    """Inputs of a set of experiments, generated or read in parts.
+
+    **Fields:** `source`: a design or an array (S, n, nu). `cycles`: length of the experiments in
+    periods of the limit cycle. `periods`: number of the last periods that are for estimation.
+    """
+
+    source: Design | np.ndarray
+    cycles: int
+    periods: int
+
+    def __len__(self) -> int:
+        return self.source.experiments if isinstance(self.source, Design) else len(self.source)
+
+    def part(self, rows: slice) -> Float[np.ndarray, "S n nu"]:
+        """Return the inputs of consecutive experiments."""
+        if isinstance(self.source, Design):
+            return self.source.inputs(self.cycles, rows)
+        return np.asarray(self.source[rows], float)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Campaign:
+    """Experiments that differ in their inputs only. A campaign can be pickled: nothing that is
+    compiled belongs to it.
+
+    **Fields:**
+
+    - `placed`: the sections on the limit cycle. `outputs`: recorded there.
+    - `inputs`: source of the inputs. `start`: the kind of initial condition. `model`: the
+      linearization that predicts it, except for starts on the cycle.
+    - `stepping`: tolerances and step schedule between sections.
+    - `process_noise`: as in `run_experiments`.
+    - `execution`: batch size and number of threads.
+    - `large`: whether to wait for the optimized program.
+    """
+
+    placed: PlacedSections
+    outputs: tuple[str | Output, ...]
+    inputs: Inputs
+    start: StartName
+    model: LDTP | None
+    stepping: Stepping
+    process_noise: ProcessNoise | None
+    execution: Execution
+    large: bool
+
+    def run(self, rows: slice | None = None, workers: int | None = None) -> ExperimentData:
+        """Run the experiments of consecutive `rows`. Default: all of them.
+
+        **Raises:** `DefinitionError` for an output that is not defined where experiments go;
+        `ComputationError` if a steady start is not found.
+        """
+        rows = slice(0, len(self.inputs)) if rows is None else rows
+        workers = self.execution.workers if workers is None else workers
+        execution = dataclasses.replace(self.execution, workers=workers)
+        u, N = self.inputs.part(rows), self.placed.n_sections
+        start = self._starts(u, rows.start, execution)
+        applied = u
+        if self.process_noise is not None:
+            applied = u + self.process_noise.draw(u.shape, N, rows.start)
+        y, result, failed_at, error = self._respond(applied, start, execution)
+        self._require_outputs(y, result)
+        z, label = self.at_sections.outputs, self.placed.family.label
+        return ExperimentData(
+            u,
+            y,
+            n_sections=N,
+            periods=self.inputs.periods,
+            inputs=z.structure.inputs,
+            outputs=z.names,
+            result=result,
+            simulated=Simulated(failed_at, error, label),
+            cycle_outputs=self.at_sections.on_cycle,
+        )
+
+    @property
+    def at_sections(self) -> "_AtSections":
+        """Outputs, compiled definitions and values at the sections."""
+        return _at_sections(self.placed, self.outputs)
+
+    @remembered
+    def _programs(self) -> tuple[TwoTiers, TwoTiers]:
+        return TwoTiers(flow_batch, self.large), TwoTiers(settle_batch, self.large)
+
+    def _starts(self, u, first: int, execution: Execution) -> Float[np.ndarray, "m S"]:
+        """Return times and states on section 0 at which experiments start.
+
+        **Raises:** `ComputationError` if a periodic response is not found near the predicted one.
+        """
+        if self.model is None:
+            return np.repeat(on_cycle(self.placed), len(u), axis=1)
+        stepping, periods = self.stepping, self.inputs.periods
+        window = u[:, : periods * self.placed.n_sections]
+        predicted = periodic_start(self.placed, self.model, window)
+        if self.start == "periodic":
+            return predicted
+        prediction = predict(self.placed, self.model, stepping, periods)
+        silent = dataclasses.replace(self.at_sections.course, outputs=())
+
+        def arguments(rows):
+            start, u = from_host((predicted[:, rows], window[rows]))
+            return silent, stepping.plan, start, u, stepping.settings, prediction
+
+        parts = in_batches(self._programs[1], arguments, len(u), execution, "steady starts")
+        each = zip(*(part for _, part in parts), strict=True)
+        start, change = (np.concatenate(x).astype(float) for x in each)
+        if (change > stepping.accuracy).any():
+            s = int(np.nanargmax(change))
+            raise ComputationError(
+                f"experiment {first + s}: no periodic response was found near the one that the "
+                f"linearization predicts (Newton's last step is {change[s]:.1e} of the state's "
+                "size): make the input smaller, or discard cycles instead."
+            )
+        return np.where(np.isnan(change), predicted, start.T)
+
+    def _respond(self, u, start, execution: Execution):
+        """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures
+        and errors."""
+        stepping, N, base = self.stepping, self.placed.n_sections, self.at_sections.on_cycle
+
+        def arguments(rows):
+            # (Nobody changes them before the program is done, so they may share memory.)
+            x, held = jax.device_put((start[:, rows], u[rows]))
+            course = self.at_sections.course
+            return course, stepping.plan, x, held, stepping.settings
+
+        S, n, _ = u.shape
+        y, parts = np.empty((S, n // N, *base.shape)), []
+        for rows, part in in_batches(self._programs[0], arguments, S, execution, "experiments"):
+            np.subtract(part.y.reshape(-1, *y.shape[1:]), base, out=y[rows])
+            parts.append((part.result, part.failed_at, part.error))
+        result, failed_at, error = map(np.concatenate, zip(*parts, strict=True))
+        return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error
+
+    def _require_outputs(self, y, result) -> None:
+        finite = np.isfinite(y)
+        if finite.all() or (finite.all(axis=(1, 2)) | (result != Result.OK)).all():
+            return
+        for a in np.unique(self.placed.lanes.chart):
+            self.at_sections.outputs.require(int(a))
+        raise DefinitionError(
+            "an output is NaN although its experiment ran well: it is not defined everywhere "
+            "that the experiments go."
+        )
+
+
+def prepare(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
     outputs: OutputNames,
-    options: Options = Options(),  # noqa: B008 (immutable)
-    *,
-    chunk: ExperimentCount = CHUNK,
-    store: Path | None = None,
-    client: DaskClient | None = None,
-) -> Iterator[ExperimentData] | StoredExperiments:
-    """Run experiments chunk by chunk, in memory that does not depend on their number.
+    options: Options,
+    chunk: int | None = None,
+    one_program: bool = False,
+) -> Campaign:
+    """Check the arguments of `run_experiments`, and do what is done once for all experiments.
 
-    ```python
-    chunks = hj.experiments.stream_experiments(cycle, sections, design, "yM")
-    estimate = hj.estimate_htf(chunks)
-    ```
-
-    Without a `store`, each chunk is run when the iterator gets to it. With one, all chunks are run
-    and kept. Experiments that are in the store already are not run again: after an interruption,
-    repeat the call. The records are the same to the last bit for any number of processes and
-    interruptions, on machines of one kind. For this, all of them wait for the optimized program
-    (10 s, once).
-
-    **Arguments:** those of `run_experiments`, with its keyword arguments as one object, and
-
-    - `options`: for example `hj.experiments.Options(start="periodic")`. Default: its defaults.
-    - `design`: an array may lie on disk (`numpy.load(file, mmap_mode="r")`).
-    - `chunk`: number of experiments per chunk. Default: 640.
-    - `store`: a folder, or an address for fsspec ("s3://bucket/records.zarr"), of a Zarr group. It
-        holds the experiments of one call only.
-    - `client`: a `distributed.Client`, whose workers fill the store. Each of them gets the
-        `design`, so pass a `Design` or a small array.
-
-    **Returns:** an iterator over `ExperimentData` of consecutive experiments, or with a store
-    `StoredExperiments`.
-
-    **Raises:** as `run_experiments`, for arguments that do not fit together at once;
-    `DefinitionError` if the store holds other experiments (with the difference) or cannot be
-    written, or if the workers of the client cannot run them; `ComputationError` if the cluster is
-    lost.
+    **Arguments:** `chunk`: number of experiments that run together. Default: all. `one_program`:
+    whether all runs have to use the optimized program.
     """
-    if store is not None:
-        arguments = cycle, sections, design, outputs
-        with working("stream_experiments"):
-            return store_experiments(arguments, options, chunk, store, client)
-    if client is not None:
-        raise DefinitionError("a `client` needs a `store` to put records into.")
-    campaign = prepare(cycle, sections, design, outputs, options, chunk)
-    S = len(campaign.inputs)
-    return (campaign.run(slice(k, min(k + chunk, S))) for k in range(0, S, chunk))
+    placed = as_placed(cycle, sections)
+    items = (outputs,) if isinstance(outputs, str | Output) else tuple(outputs)
+    placed.structure().resolve_outputs(items)
+    _require_return(cycle, placed)
+    start, noise = options.start, options.process_noise
+    discard = (DISCARD if start == "cycle" else 0) if options.discard is None else options.discard
+    N, nu = placed.n_sections, len(cycle.system.inputs)
+    inputs = check_inputs(design, discard, N, nu)
+    if noise is not None:
+        noise.require(N)
+    if start != "cycle" and inputs.cycles % inputs.periods:
+        raise DefinitionError(
+            f"a {start} start needs inputs of a whole number of windows: use `discard=0`."
+        )
+    together = len(inputs) if chunk is None else min(chunk, len(inputs))
+    execution = divide(together, options.execution or Execution())
+    return Campaign(
+        placed=placed,
+        outputs=items,
+        inputs=inputs,
+        start=start,
+        model=None if start == "cycle" else linearized(placed),
+        stepping=plan_flow(placed, options.accuracy),
+        process_noise=noise,
+        execution=execution,
+        large=one_program or len(inputs) * inputs.cycles * N > _LARGE,
+    )
+
+
+def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> Inputs:
+    """Return the inputs for N sections and nu inputs, with the first `discard` cycles not for
+    estimation.
+
+    **Raises:** `DefinitionError` if they do not fit, or hold NaN.
+    """
+    if isinstance(design, Design):
+        if design.n_sections != n_sections:
+            raise DefinitionError(
+                f"the design is for {design.n_sections} sections, but the family has {n_sections}."
+            )
+        if len(design.input_names) != nu:
+            raise DefinitionError(
+                f"the design has {len(design.input_names)} inputs, but the system has {nu}."
+            )
+        return Inputs(design, discard + design.periods, design.periods)
+    u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
+    require_shape(u.shape, n_sections, nu)
+    for k in range(0, len(u), CHUNK):
+        finite = np.isfinite(np.asarray(u[k : k + CHUNK], float)).all(axis=(1, 2))
+        if not finite.all():
+            raise DefinitionError(
+                "`design` has NaN or infinity in the input of experiment "
+                f"{k + int(np.argmin(finite))}."
+            )
+    cycles = u.shape[1] // n_sections
+    if discard >= cycles:
+        raise DefinitionError(
+            f"inputs of {cycles} cycles less {discard} discarded ones leave none for estimation."
+        )
+    return Inputs(u, cycles, cycles - discard)
+
+
+def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
+    """**Raises:** an error for cycles that experiments would leave."""
+    if not cycle.clocked and bool(np.isfinite(placed.bound.time).any()):
+        raise DefinitionError(
+            f"clock sections sample {type(cycle.system).__name__}, which has no clock, at fixed "
+            "times: nothing brings its phase back (a multiplier of exactly 1), so that every input "
+            "shifts it for good. Use sections that depend on the state (KinematicPhase, or a list "
+            "of Crossing and AtEvent)."
+        )
+    if not cycle.stable:
+        largest = np.abs(cycle.multipliers[0])
+        raise ComputationError(
+            f"the limit cycle is not stable (largest multiplier {largest:.4g} in modulus), so "
+            "experiments would leave it: stabilize the system, or use the exact linearization "
+            "(`linearize`), which needs no experiments."
+        )
+
+
+class _AtSections(NamedTuple):
+    outputs: Outputs
+    course: Course
+    on_cycle: Float[np.ndarray, "N ny"]
+    given: tuple[str | Output, ...]
+    """The outputs by whose `id` this is found: they must not be collected."""
+
+
+_resolved = Memory()
+
+
+def _at_sections(placed: PlacedSections, outputs) -> _AtSections:
+    """Return outputs and course, made once for the same sections and outputs."""
+    names = tuple(x if isinstance(x, str) else id(x) for x in outputs)
+
+    def make() -> _AtSections:
+        z = placed.structure().resolve_outputs(outputs)
+        return _AtSections(
+            z, course(placed, z.items), np.asarray(placed.observe(tuple(z.items))), outputs
+        )
+
+    return _resolved.recall(placed, names, make)

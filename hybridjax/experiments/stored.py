@@ -10,11 +10,12 @@ import jax
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Index, Path
+from .._core.boundary.kinds import ExperimentCount, Index, Path
 from .._core.execution import Execution
 from .._core.pieces.description import array_digest, digest_of, function_digest, versions
 from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, absolute
+from .._core.progress import working
 from .._core.results import Result
 from .._core.signal import Signal, unit_of
 from ..engine.describe import describe
@@ -22,9 +23,9 @@ from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle, rough
 from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
-from .campaign import CHUNK, Campaign, DesignLike, Options, prepare
 from .data import ExperimentData, Simulated, summary
 from .design.design import Design
+from .run import CHUNK, Campaign, DesignLike, Options, prepare
 
 
 _KIND = "experiments"
@@ -116,19 +117,62 @@ class StoredExperiments:
         )
 
 
-def store_experiments(
-    arguments: tuple[LimitCycle, SectionsLike, DesignLike, OutputNames],
-    options: Options,
-    chunk: int,
-    store: Any,
-    client: DaskClient | None,
-) -> StoredExperiments:
-    """Run the experiments that are missing in a store; see `stream_experiments`."""
-    fill(prepare_pieces(*arguments, options, chunk), store, client)
-    return StoredExperiments(store)
+@checked
+def stream_experiments(
+    cycle: LimitCycle,
+    sections: SectionsLike,
+    design: DesignLike,
+    outputs: OutputNames,
+    options: Options = Options(),  # noqa: B008 (immutable)
+    *,
+    chunk: ExperimentCount = CHUNK,
+    store: Path | None = None,
+    client: DaskClient | None = None,
+) -> Iterator[ExperimentData] | StoredExperiments:
+    """Run experiments chunk by chunk, in memory that does not depend on their number.
+
+    ```python
+    chunks = hj.experiments.stream_experiments(cycle, sections, design, "yM")
+    estimate = hj.estimate_htf(chunks)
+    ```
+
+    Without a `store`, each chunk is run when the iterator gets to it. With one, all chunks are run
+    and kept. Experiments that are in the store already are not run again: after an interruption,
+    repeat the call. The records are the same to the last bit for any number of processes and
+    interruptions, on machines of one kind. For this, all of them wait for the optimized program
+    (10 s, once).
+
+    **Arguments:** those of `run_experiments`, with its keyword arguments as one object, and
+
+    - `options`: for example `hj.experiments.Options(start="periodic")`. Default: its defaults.
+    - `design`: an array may lie on disk (`numpy.load(file, mmap_mode="r")`).
+    - `chunk`: number of experiments per chunk. Default: 640.
+    - `store`: a folder, or an address for fsspec ("s3://bucket/records.zarr"), of a Zarr group. It
+        holds the experiments of one call only.
+    - `client`: a `distributed.Client`, whose workers fill the store. Each of them gets the
+        `design`, so pass a `Design` or a small array.
+
+    **Returns:** an iterator over `ExperimentData` of consecutive experiments, or with a store
+    `StoredExperiments`.
+
+    **Raises:** as `run_experiments`, for arguments that do not fit together at once;
+    `DefinitionError` if the store holds other experiments (with the difference) or cannot be
+    written, or if the workers of the client cannot run them; `ComputationError` if the cluster is
+    lost.
+    """
+    if store is not None:
+        with working("stream_experiments"):
+            job = experiment_job(cycle, sections, design, outputs, options, chunk)
+            fill(job, store, client)
+        return StoredExperiments(store)
+    if client is not None:
+        raise DefinitionError("a `client` needs a `store` to put records into.")
+    campaign = prepare(cycle, sections, design, outputs, options, chunk)
+    S = len(campaign.inputs)
+    return (campaign.run(slice(k, min(k + chunk, S))) for k in range(0, S, chunk))
 
 
-def prepare_pieces(
+def experiment_job(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
@@ -191,19 +235,19 @@ class ExperimentJob:
     def arrays(self) -> list[np.ndarray]:
         """Return the arrays that records depend on beside inputs and parameters: those of the
         cycle, of the sections on it, of the step schedule and of the linearization."""
-        arrays = eqx.filter(self._computed(), eqx.is_array)
-        return [np.asarray(x) for x in jax.tree_util.tree_leaves(arrays)]
+        leaves = jax.tree_util.tree_leaves(self._computed())
+        return [np.asarray(x) for x in leaves if eqx.is_array(x)]
 
     def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "ExperimentJob":
         """Return the job with the arrays of another process."""
-        mine, static = eqx.partition(self._computed(), eqx.is_array)
-        leaves, structure = jax.tree_util.tree_flatten(mine)
-        leaves = [
-            jax.numpy.asarray(new) if isinstance(old, jax.Array) else new
-            for old, new in zip(leaves, arrays, strict=True)
-        ]
-        mine = jax.tree_util.tree_unflatten(structure, leaves)
-        placed, stepping, model = eqx.combine(mine, static)
+        new = iter(arrays)
+
+        def theirs(x: Any) -> Any:
+            if not eqx.is_array(x):
+                return x
+            return jax.numpy.asarray(next(new)) if isinstance(x, jax.Array) else next(new)
+
+        placed, stepping, model = jax.tree_util.tree_map(theirs, self._computed())
         campaign = dataclasses.replace(self.campaign, placed=placed, stepping=stepping, model=model)
         return dataclasses.replace(self, campaign=campaign)
 

@@ -1,7 +1,6 @@
 """Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from .._core.compilation import is_left_to_lapack, quick_jit, uncollected
+from .._core.compilation import is_left_to_lapack, one_tier, uncollected
 from .._core.execution import in_threads
 from .._core.progress import working
 from .._core.results import Result
@@ -24,14 +23,12 @@ from .coincidence import together
 from .crossing import AtEvent, to_section
 from .newton import FEW_STEPS, USUAL_STEPS, excess, newton_steps
 from .return_map import ReturnMap, Turn
+from .scale import ROUNDING
 
 
 # Periods for which a system is simulated before Newton's method tries again. Fewer: slow transients
 # remain. More: each failure takes longer.
 _SETTLE = 40
-# Ridge of the least squares, relative to their trace: directions in which neighbors hardly differ
-# get no slope. Smaller: slopes from rounding. Larger: slopes are biased.
-_RIDGE = 1e-12
 # Largest step, in sizes of the states, that is taken with a guessed Jacobian. Larger: steps lead
 # astray. Smaller: few are taken.
 _NEAR = 0.06
@@ -80,28 +77,15 @@ def _settled(systems, map: ReturnMap, anchor: Lanes, period):
         each = _one(map, *system)
         s, anchor, expected = each.structure, each.anchor, each.expected
         u = jnp.zeros((s.nu, 1))
-        moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient)
+        moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient).moved
         if each.base is not None:
             target = toward(jnp.full(1, jnp.inf), -1, moved.lanes.t + 3 * expected)
             target = to_section(target, each.base, each.event)
-            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result)
+            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result).moved
         q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
         return anchor._replace(chart=moved.lanes.chart, q=q), expected
 
     return eqx.filter_vmap(settle)(systems, anchor, period)
-
-
-class Programs(NamedTuple):
-    """The functions above, compiled."""
-
-    turn: Callable
-    verdict: Callable
-    settled: Callable
-
-
-# For few systems, and for many.
-QUICK = Programs(quick_jit(_turn), quick_jit(_verdict), quick_jit(_settled))
-FULL = Programs(eqx.filter_jit(_turn), eqx.filter_jit(_verdict), eqx.filter_jit(_settled))
 
 
 class Rounds(NamedTuple):
@@ -144,8 +128,8 @@ class Tiles(NamedTuple):
     size: int
     """Systems in one compiled call."""
     workers: int
-    programs: Programs
-    """`QUICK` or `FULL`."""
+    large: bool
+    """Whether there are so many systems in all that programs are fully optimized."""
     known: Known | None = None
 
     @property
@@ -155,10 +139,9 @@ class Tiles(NamedTuple):
         flat = _numbers(self.systems)
         if self.known is not None:
             flat = np.concatenate([flat, _numbers(self.known.systems)])
-        good = np.isfinite(flat)
-        count = np.maximum(good.sum(axis=0), 1)
-        flat = np.where(good, flat - np.where(good, flat, 0.0).sum(axis=0) / count, 0.0)
-        spread = np.sqrt((flat**2).sum(axis=0) / count)
+        numbers = np.ma.masked_invalid(flat)
+        flat = (numbers - numbers.mean(axis=0)).filled(0.0)
+        spread = np.sqrt(np.mean(flat**2, axis=0))
         return flat[:, spread > 0] / spread[spread > 0] if spread.any() else flat[:, :1]
 
     def solve(self, S: int) -> Rounds:
@@ -181,7 +164,7 @@ class Tiles(NamedTuple):
         with working("cycles", S) as call:
             if self.known is None:
                 call.done, rows = 0, order[: self.size]
-                with uncollected:  # the programs are compiled during this call
+                with uncollected():  # the programs are compiled during this call
                     out = self._settled(
                         rows, self._newton(rows, *self._given(len(rows)), FEW_STEPS)
                     )
@@ -199,11 +182,6 @@ class Tiles(NamedTuple):
                 part = part._replace(steps=part.steps + 1)
                 out = part if out is None else _join(out, part)
         assert out is not None
-        late = np.flatnonzero(out.excess > 1)
-        if len(late):
-            anchor, period = _pick((out.anchor, out.period), late)
-            part = self._newton(order[late], anchor, period, FEW_STEPS - USUAL_STEPS)
-            out = _replace(out, late, part._replace(steps=part.steps + out.steps[late]))
         failed = np.flatnonzero(out.result != Result.OK)
         if len(failed) and (self.known is not None or len(failed) < S):
             anchor, period, _ = neighbors(order[failed], out, moved=False)
@@ -222,7 +200,7 @@ class Tiles(NamedTuple):
         failed = np.flatnonzero(out.result != Result.OK)
         if not len(failed):
             return out
-        begin = self._in_tiles(self.programs.settled, rows[failed], *self._given(len(failed)))
+        begin = self._in_tiles(_settled, rows[failed], *self._given(len(failed)))
         arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
         if not arrived.any():
             return out
@@ -251,11 +229,7 @@ class Tiles(NamedTuple):
         same = anchor.chart[near] == anchor.chart[first][:, None]
         apart = _powers(parameters[near] - parameters[first][:, None]) * same
         change = (values[near] - values[first][:, None]) * same
-        across = apart.transpose(0, 2, 1)
-        gram = across @ apart
-        size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
-        ridge = np.where(size > 0, _RIDGE * size, 1.0) * np.eye(gram.shape[-1])
-        slope = np.linalg.solve(gram + ridge, across @ change)
+        slope = np.linalg.pinv(apart, rcond=ROUNDING) @ change
         guess = values[first] + (_powers(wanted - parameters[first])[:, None] @ slope)[:, 0]
         d = anchor.q.shape[1]
         anchor = _pick(anchor, first)._replace(q=guess[:, :d, None])
@@ -280,7 +254,7 @@ class Tiles(NamedTuple):
                 break
             part = self._step(rows[going], *_pick((out.anchor, out.period), going))
             out = _replace(out, going, part._replace(steps=part.steps + out.steps[going]))
-        judged = self._in_tiles(self.programs.verdict, rows, out.anchor, out.period, out.turn)
+        judged = self._in_tiles(_verdict, rows, out.anchor, out.period, out.turn)
         anchor, period, result = judged
         return out._replace(anchor=anchor, period=period, result=result)
 
@@ -315,12 +289,11 @@ class Tiles(NamedTuple):
             return anchor, expected, turn, front(codes), coincide
 
         options = (np.asarray(wanted),)
-        return self._in_tiles(
-            self.programs.turn, rows, anchor, period, options=options, then=events
-        )
+        return self._in_tiles(_turn, rows, anchor, period, options=options, then=events)
 
-    def _in_tiles(self, program, rows, *arguments, options=(), then=lambda x: x):
-        """`program` for some systems, in calls of one size, so that there is one for all."""
+    def _in_tiles(self, function, rows, *arguments, options=(), then=lambda x: x):
+        """`function` of some systems, in calls of one size, so that one program serves all."""
+        program = one_tier(function, self.large)
         arrays, static = eqx.partition(self.systems, eqx.is_array)
 
         def of_tile(k):

@@ -4,6 +4,7 @@ H. B. Keller, Numerical solution of bifurcation and nonlinear eigenvalue problem
 Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 10 (test functions).
 """
 
+import dataclasses
 from typing import Annotated, NamedTuple, cast
 
 import equinox as eqx
@@ -35,9 +36,9 @@ _STRAIGHT = 0.97
 # Parts of a step by which a test function is evaluated beside a point where Newton's method fails,
 # as it does at a crossing of two branches.
 _ASIDE = (0.0, 1e-6, -1e-6, 1e-4, -1e-4, 1e-2, -1e-2)
-# The first and the shortest step, relative to the longest. A longer first step loses the branch; a
-# longer shortest one ends it far from a grazing, a shorter one takes time.
-_FIRST, _SHORTEST = 0.2, 1e-5
+# The shortest step, relative to the longest. Longer: the branch ends far from a grazing. Shorter:
+# its end takes more time.
+_SHORTEST = 1e-5
 
 
 @checked
@@ -81,28 +82,27 @@ def continuation(
     """
     values = _check(cycle, values)
     curve = Curve(cycle, parameter, float(np.ptp(values)))
-    value = curve.value_of(cycle.system)
-    if not values.min() <= value <= values.max():
+    if not values.min() <= curve.value <= values.max():
         raise DefinitionError(
-            f"the cycle has {parameter} = {value:.6g}, outside of the values {values[0]:.6g} to "
-            f"{values[-1]:.6g}: begin within them."
+            f"the cycle has {parameter} = {curve.value:.6g}, outside of the values "
+            f"{values[0]:.6g} to {values[-1]:.6g}: begin within them."
         )
-    first = curve.first(value)
+    first = curve.first()
     if isinstance(first, Result):
         raise DefinitionError(
             f"the cycle given is none of {type(cycle.system).__name__} at {parameter} = "
-            f"{value:.6g}: {first.message}. Find it anew."
+            f"{curve.value:.6g}: {first.message}. Find it anew."
         )
     trace = _Trace(curve, np.sort(values), step, max_points)
     sense = np.sign(values[-1] - values[0])
-    back, marks_back, begin = trace.run(first.oriented(-sense))
-    ahead, marks, end = trace.run(first.oriented(sense))
-    points, shift = [*back[:0:-1], *ahead], len(back) - 1
-    marks = [*((-k, kind) for k, kind in reversed(marks_back)), *marks]
+    back, begin = trace.run(first.oriented(-sense))
+    ahead, end = trace.run(first.oriented(sense))
+    points = [*back[:0:-1], *ahead]
     cycles = _stack(curve, points)
     marked = tuple(
-        BranchPoint(kind, shift + k, points[shift + k].value, cycles[shift + k].multipliers)
-        for k, kind in marks
+        BranchPoint(point.kind, k, point.value, cycles[k].multipliers)
+        for k, point in enumerate(points)
+        if point.kind
     )
     return Branch(parameter, np.array([p.value for p in points]), cycles, marked, (begin, end))
 
@@ -126,14 +126,6 @@ def _check(cycle, values) -> np.ndarray:
     return np.asarray(values)
 
 
-class _Event(NamedTuple):
-    """A marked point on a segment of the curve, at the part `where` of its length."""
-
-    where: float
-    kind: str
-    point: Point
-
-
 class _Trace(NamedTuple):
     """A curve between the least and the largest of some values, in steps."""
 
@@ -142,48 +134,42 @@ class _Trace(NamedTuple):
     step: float
     max_points: int
 
-    def run(self, start: Point) -> tuple[list[Point], list[tuple[int, str]], BranchEnd]:
-        """The points along a tangent, the marks (row, kind) among them, and the end."""
-        marks: list[tuple[int, str]] = []
-        points, length, moved = [start], _FIRST * self.step, None
+    def run(self, start: Point) -> tuple[list[Point], BranchEnd]:
+        """The points along a tangent, those of changes of stability among them, and the end."""
+        points, length, moved = [start], self.step, None
         low, high = self.values[0], self.values[-1]
-        upward = start.tangent[-1]
-        if (start.value >= high and upward > 0) or (start.value <= low and upward < 0):
-            return points, marks, BranchEnd(start.value, Result.OK, "end of the parameter range")
-        while len(points) < self.max_points:
+        edge = high if start.tangent[-1] > 0 else low
+        over = start.value == edge
+        while not over and len(points) < self.max_points:
             last = points[-1]
             say(f"{self.curve.parameter} = {last.value:.5g}, {len(points)} cycles")
             point = self.curve.step(last, length)
-            over = False
             if isinstance(point, Point) and not low <= point.value <= high:
                 over = True
                 point = self.curve.land(last, point, np.clip(point.value, low, high))
             if isinstance(point, Point) and point.cosine(last) < _STRAIGHT:
                 point = Result.NOT_CONVERGED
-            if isinstance(point, Result):
-                length /= 2
-                if length >= _SHORTEST * self.step:
+            if isinstance(point, Point):
+                points += self.between(last, point)
+                length = min(self.step, length * (1.5 if point.steps <= USUAL_STEPS else 1.0))
+                continue
+            length, over = length / 2, False
+            if length >= _SHORTEST * self.step:
+                continue
+            if point in (Result.EVENT_ORDER, Result.GRAZING) and last is not moved:
+                moved = self.curve.elsewhere(last)
+                if moved is not None:
+                    points[-1], length = moved, self.step
                     continue
-                if point in (Result.EVENT_ORDER, Result.GRAZING) and last is not moved:
-                    moved = self.curve.elsewhere(last)
-                    if moved is not None:
-                        points[-1], length = moved, _FIRST * self.step
-                        continue
-                return points, marks, BranchEnd(last.value, point, point.message)
-            for event in self.events(last, point):
-                if event.kind:
-                    marks.append((len(points), event.kind))
-                points.append(event.point)
-            points.append(point)
-            if over:
-                end = "end of the parameter range"
-                return points, marks, BranchEnd(point.value, Result.OK, end)
-            length = min(self.step, length * (1.5 if point.steps <= USUAL_STEPS else 1.0))
+            return points, BranchEnd(last.value, point, point.message)
+        value = points[-1].value
+        if over:
+            return points, BranchEnd(value, Result.OK, "end of the parameter range")
         message = f"{self.max_points} cycles; `max_points` raises it"
-        return points, marks, BranchEnd(points[-1].value, Result.STEP_LIMIT, message)
+        return points, BranchEnd(value, Result.STEP_LIMIT, message)
 
-    def events(self, a: Point, b: Point) -> list[_Event]:
-        """Marked points and values between two neighbors, in order."""
+    def between(self, a: Point, b: Point) -> list[Point]:
+        """Changes of stability and values after a point until its neighbor, which comes last."""
         marked = []
         for kind in KINDS:
             before, after = a.tests[kind], b.tests[kind]
@@ -191,23 +177,20 @@ class _Trace(NamedTuple):
                 continue
             if kind == "branch point" and a.tests["fold"] * b.tests["fold"] < 0:
                 continue  # the parameter turns back
-            if (event := self.locate(a, b, kind)) is not None:
-                marked.append(event)
-        events, last = [], a
-        for event in [*sorted(marked, key=lambda event: event.where), _Event(1.0, "", b)]:
-            events += self.landings(last, event.point) + [event]
-            last = event.point
-        return events[:-1]
+            if (located := self.locate(a, b, kind)) is not None:
+                marked.append(located)
+        points, last = [], a
+        for point in [*(point for _, point in sorted(marked, key=lambda x: x[0])), b]:
+            passed = [v for v in self.values if (last.value - v) * (point.value - v) < 0]
+            for value in sorted(passed, key=lambda v: abs(v - last.value)):
+                landed = self.curve.land(last, point, value)
+                points += [landed] if isinstance(landed, Point) else []
+            points.append(point)
+            last = point
+        return points
 
-    def landings(self, a: Point, b: Point) -> list[_Event]:
-        """Points at the values that the parameter passes between two neighbors."""
-        passed = [v for v in self.values if (a.value - v) * (b.value - v) < 0]
-        passed.sort(key=lambda v: abs(v - a.value))
-        points = [self.curve.land(a, b, v) for v in passed]
-        return [_Event(0.0, "", p) for p in points if isinstance(p, Point)]
-
-    def locate(self, a: Point, b: Point, kind: str) -> _Event | None:
-        """The zero of a test function between two points.
+    def locate(self, a: Point, b: Point, kind: str) -> tuple[float, Point] | None:
+        """The zero of a test function between two points, and its part of the distance.
 
         On the crossing of two branches itself no point can be computed, but beside it.
         """
@@ -231,7 +214,8 @@ class _Trace(NamedTuple):
             return None
         if kind == "Neimark-Sacker" and not points[where].has_pair_on_circle():
             return None  # two real multipliers with the product 1
-        return _Event(where, "branch point" if crossing else kind, points[where])
+        mark = "branch point" if crossing else kind
+        return where, dataclasses.replace(points[where], kind=mark)
 
 
 def _stack(curve: Curve, points: list[Point]) -> LimitCycles:

@@ -17,6 +17,7 @@ from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem
+from .coincidence import SAME
 from .cycle import LimitCycle
 from .newton import FEW_STEPS, newton_steps
 from .return_map import ReturnMap, Turn, turn_product
@@ -26,12 +27,9 @@ from .return_map import ReturnMap, Turn, turn_product
 # rounding errors may be all that is left. Smaller: it does not end. Larger: points are less
 # accurate.
 _SMALL, _ROUNDING = 1e-11, 1e-8
-# States that hardly move on the cycle count as if they moved by these parts of the largest move and
-# of their own size. Smaller: they shorten the steps. Larger: steps are longer than the orbit.
-_FLOOR, _SHARE = 1e-3, 0.02
-# Nothing moves if the largest move is at most this part of the largest state, all in sizes.
-# Smaller: an equilibrium passes for a cycle. Larger: small cycles are taken for equilibria.
-_REST = 1e-6
+# The least range over the cycle that counts, in sizes of the states. Smaller: states that hardly
+# move shorten the steps. Larger: steps are longer than the orbit.
+_LEAST_RANGE = 0.02
 
 
 @dataclasses.dataclass
@@ -39,19 +37,20 @@ class Point:
     """A cycle on the curve.
 
     **Fields:** `anchor`, chart and phase (as the time of the first cycle's clock) at which it
-    begins; `departure`, the lane there; `dim`, its number of states; `z` (n,), state (padded) and
-    parameter; `size` (n,), what counts as 1 in each; `tangent` (n,) of the curve, a unit vector in
-    these sizes; `turn` from there; `steps` of Newton.
+    begins; `departure`, the lane there; `z` (n,), state (padded) and parameter; `size` (n,), what
+    counts as 1 in each; `tangent` (n,) of the curve, a unit vector in these sizes; `turn` from
+    there, with derivatives with respect to `z`; `steps` of
+    Newton; `kind` of a change of stability there.
     """
 
     anchor: Lanes
     departure: Lanes
-    dim: int
     z: Float[np.ndarray, " n"]
     size: Float[np.ndarray, " n"]
     tangent: Float[np.ndarray, " n"]
     turn: Turn
     steps: int
+    kind: str = ""
 
     @property
     def value(self) -> float:
@@ -68,32 +67,30 @@ class Point:
         tangent = other.tangent * other.size / self.size
         return float(self.tangent @ tangent / np.linalg.norm(tangent))
 
-    @ft.cached_property
+    @property
     def scaled(self) -> Float[np.ndarray, "d n"]:
         """Derivatives of the residual, all in sizes."""
-        return _scaled(self.turn, self.size)
-
-    @ft.cached_property
-    def monodromy(self) -> Float[np.ndarray, "m m"]:
-        """Derivative of the return map; for an autonomous system across the flow."""
-        return turn_product(self.turn.factors[None])[0, : self.dim, : self.dim]
+        return self.turn.jacobian * self.size / self.size[:-1, None]
 
     @ft.cached_property
     def pairs(self) -> list[tuple[complex, complex]]:
         """All pairs of multipliers."""
-        values = np.linalg.eigvals(self.monodromy).astype(complex)
-        return list(itertools.combinations(values, 2))
+        return list(itertools.combinations(np.linalg.eigvals(self._monodromy).astype(complex), 2))
+
+    @property
+    def _monodromy(self) -> Float[np.ndarray, "d d"]:
+        """Derivative of the return map, padded; for an autonomous system across the flow."""
+        return turn_product(self.turn.factors[None])[0]
 
     @ft.cached_property
     def tests(self) -> dict[str, float]:
         """Functions that change their signs when a multiplier crosses the unit circle."""
-        M = self.monodromy
-        products = [x * y - 1 for x, y in self.pairs]
+        M = self._monodromy
         return {
             "fold": float(self.tangent[-1]),
             "branch point": float(np.linalg.det(np.vstack([self.scaled, self.tangent]))),
             "flip": float(np.linalg.det(M + np.eye(len(M)))),
-            "Neimark-Sacker": float(np.prod(products).real) if products else 1.0,
+            "Neimark-Sacker": float(np.real(np.prod([x * y - 1 for x, y in self.pairs]))),
         }
 
     def has_pair_on_circle(self) -> bool:
@@ -108,25 +105,20 @@ class Curve:
     def __init__(self, cycle: LimitCycle, parameter: str, span: float):
         self.cycle, self.parameter, self.span = cycle, parameter, span
         self.map, self.sequence = cycle.return_map, _rotated(cycle.event_sequence)
-        self.structure = self.map.structure
-        _leaf(cycle.system, parameter)
+        self.value = float(_leaf(cycle.system, parameter))
         flat = jax.tree_util.tree_map(
             lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else x, cycle.system
         )
         self.direction = _with(flat, parameter, 1.0)
 
-    def value_of(self, system: HybridSystem) -> float:
-        return float(_leaf(system, self.parameter))
-
     def system_at(self, value: float) -> HybridSystem:
         return _with(self.cycle.system, self.parameter, value)
 
-    def first(self, value: float) -> Point | Result:
+    def first(self) -> Point | Result:
         """The cycle itself."""
-        z = np.append(np.asarray(self.cycle.anchor.q[:, 0]), value)
-        row = np.append(np.zeros(self.structure.d), 1.0)
+        z = np.append(np.asarray(self.cycle.anchor.q[:, 0]), self.value)
         size = np.append(np.asarray(self.map.sizes), self.span)
-        return self._correct(z, row / size, size, row, self.cycle.anchor)
+        return self._correct(z, self._by_value(size), size, self._by_value(), self.cycle.anchor)
 
     def step(self, last: Point, length: float) -> Point | Result:
         """The next point, about `length` further along the tangent."""
@@ -147,11 +139,10 @@ class Curve:
 
     def land(self, a: Point, b: Point, value: float) -> Point | Result:
         """The point between a and b where the parameter has a value."""
-        where = (value - a.value) / (b.value - a.value)
-        z = a.z + where * (b.z - a.z)
+        change = b.z - a.z
+        z = a.z + (value - a.value) / change[-1] * change
         z[-1] = value
-        row = np.append(np.zeros(len(z) - 1), 1 / a.size[-1])
-        point = self._correct(z, row, a.size, (b.z - a.z) / a.size, a.anchor)
+        point = self._correct(z, self._by_value(a.size), a.size, change / a.size, a.anchor)
         if not isinstance(point, Result):
             point.z[-1] = value
         return point
@@ -162,47 +153,44 @@ class Curve:
         An event that moves across the phase at which the cycle begins changes the chart there, and
         is no obstacle to the cycle.
         """
-        codes = point.turn.codes
+        codes, legs = point.turn.codes, point.turn.legs
         events = np.flatnonzero((codes >= 0).any(axis=1)) + 0.5
         if self.map.base is not None or not len(events):
             return None
         K = len(codes)
         apart = np.abs(np.arange(K)[:, None] - events)
         k = int(np.argmax(np.min(np.minimum(apart, K - apart), axis=1)))
-        legs = point.turn.legs
         phase = legs.t[k : k + 1] / point.turn.period * float(self.map.expected)
         anchor = point.anchor._replace(t=jnp.asarray(phase), chart=jnp.asarray(legs.chart[[k]]))
-        row = np.append(np.zeros(len(point.z) - 1), 1.0)
-        forward = row * np.sign(point.tangent[-1])
-        z = np.append(legs.q[:, k], point.value)
-        moved = self._correct(z, row / point.size, point.size, forward, anchor)
+        forward = self._by_value() * np.sign(point.tangent[-1])
+        z, row = np.append(legs.q[:, k], point.value), self._by_value(point.size)
+        moved = self._correct(z, row, point.size, forward, anchor)
         return None if k == 0 or isinstance(moved, Result) else moved
+
+    def _by_value(self, size: float | Float[np.ndarray, " n"] = 1.0) -> Float[np.ndarray, " n"]:
+        """The derivative of the parameter with respect to z, in sizes."""
+        return np.append(np.zeros(self.map.structure.d), 1.0) / size
 
     def _correct(self, z0, row, size, forward, anchor: Lanes) -> Point | Result:
         """Newton's method for a point with row @ (z - z0) = 0."""
         z, last, rounding = z0.copy(), np.inf, len(z0) * np.finfo(float).eps
+        map = dataclasses.replace(self.map, anchor=anchor)
         for k in range(FEW_STEPS):
-            departure, turn = self._turn(z, anchor)
+            out = _turn_along(map, self.system_at(z[-1]), self.direction, jnp.asarray(z[:-1]))
+            departure, turn = jax.tree_util.tree_map(np.asarray, out)
             if (failure := self._failure(turn)) is not None:
                 return failure
-            equations = np.vstack([_scaled(turn, size), row * size])
+            point = Point(anchor, departure, z, size, forward, turn, k)
+            equations = np.vstack([point.scaled, row * size])
             residual = np.append(turn.residual / size[:-1], row @ (z - z0))
             (change,) = newton_steps(equations[None], residual[None], rounding)
-            if not np.all(np.isfinite(change)):
-                return Result.NOT_CONVERGED
             length = np.linalg.norm(change)
             if length <= _SMALL or (length <= _ROUNDING and length >= 0.5 * last):
-                dim = self.structure.dims[int(anchor.chart[0])]
-                return self._settled(Point(anchor, departure, dim, z, size, forward, turn, k))
-            if length > 2 * last:
+                return self._settled(point)
+            if not length <= 2 * last:
                 break
             z, last = z + change * size, length
         return Result.NOT_CONVERGED
-
-    def _turn(self, z, anchor: Lanes) -> tuple[Lanes, Turn]:
-        map = dataclasses.replace(self.map, anchor=anchor)
-        out = _turn_along(map, self.system_at(z[-1]), self.direction, jnp.asarray(z[:-1]))
-        return jax.tree_util.tree_map(np.asarray, out)
 
     def _failure(self, turn: Turn) -> Result | None:
         if int(turn.result) != Result.OK:
@@ -215,34 +203,16 @@ class Curve:
         return None
 
     def _settled(self, point: Point) -> Point | Result:
-        """The point with sizes and a tangent of its own."""
-        moves, largest = self._extent(point)
-        still = np.max(moves) <= _REST * np.max(largest)
-        if still and self.map.base is not None:
+        """The point with a tangent, and sizes by the range of each state on the cycle."""
+        legs, scale = point.turn.legs, np.asarray(self.map.scale)
+        ranges = np.ptp(legs.q / scale[legs.chart].T, axis=1)
+        if self.map.base is not None and np.max(ranges) <= SAME:
             return Result.EQUILIBRIUM
-        floor = np.maximum(_FLOOR * np.max(moves), _SHARE * largest)
-        moves = np.ones_like(moves) if still else np.maximum(moves, floor)
-        sizes = self._sizes(point)
-        point = dataclasses.replace(point, size=np.append(moves * sizes, self.span))
+        sizes = scale[int(point.anchor.chart[0])] * np.maximum(ranges, _LEAST_RANGE)
+        point = dataclasses.replace(point, size=np.append(sizes, self.span))
         _, _, right = np.linalg.svd(point.scaled)
         tangent = right[-1] * (1.0 if right[-1] @ point.tangent >= 0 else -1.0)
         return dataclasses.replace(point, tangent=tangent)
-
-    def _sizes(self, point: Point) -> Float[np.ndarray, " d"]:
-        return np.asarray(dataclasses.replace(self.map, anchor=point.anchor).sizes)
-
-    def _extent(self, point: Point) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-        """The range of each state of the anchor's chart on the cycle, over all charts that have a
-        state of its name, and its largest modulus, both in sizes of the states."""
-        s, legs, sizes = self.structure, point.turn.legs, self._sizes(point)
-        moves, largest = np.zeros(s.d), np.zeros(s.d)
-        for k, name in enumerate(s.charts[int(point.anchor.chart[0])].states):
-            values = [point.z[k]]
-            for a, chart in enumerate(s.charts):
-                if name in chart.states:
-                    values.extend(legs.q[chart.states.index(name), legs.chart == a])
-            moves[k], largest[k] = np.ptp(values) / sizes[k], np.max(np.abs(values)) / sizes[k]
-        return moves, largest
 
 
 @quick_jit
@@ -250,15 +220,14 @@ def _turn_along(
     map: ReturnMap, system: HybridSystem, direction: HybridSystem, q: Float[Array, " d"]
 ) -> tuple[Lanes, Turn]:
     """The lane at the beginning, and one turn with derivatives by the state and along `direction`
-    in the parameters: so one program serves all parameters."""
+    in the parameters, at the same phase of the clock: so one program serves all parameters."""
     map = map.at_phase_of(system)
-    return map.departure(q), map.turn_with_jacobian(q, direction=direction)
 
+    def along(step):
+        change = lambda x, v: x + step * v if eqx.is_inexact_array(x) else x  # noqa: E731
+        return map.at_phase_of(jax.tree_util.tree_map(change, system, direction))
 
-def _scaled(turn: Turn, size: Float[np.ndarray, " n"]) -> Float[np.ndarray, "d n"]:
-    """Derivatives of the residual by state and parameter, all in sizes."""
-    by_z = np.column_stack([turn.jacobian, turn.by_parameter])
-    return by_z * size / size[:-1, None]
+    return map.departure(q), map.turn_with_jacobian(q, along=along)
 
 
 def _rotated(sequence: Iterable[int]) -> tuple[int, ...]:

@@ -15,7 +15,7 @@ from .._core.progress import say
 from .._core.results import Result
 from ..engine.lanes import Lanes, start_lanes
 from ..engine.move import move
-from ..engine.search.search import Moved
+from ..engine.search.state import Moved
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
 from ..errors import ComputationError, DefinitionError
@@ -193,4 +193,4 @@ def _go(
 def _moved(map: ReturnMap, lanes: Lanes, target: Target) -> Moved:
     settings = dataclasses.replace(map.settings, max_steps=1_000_000)
     u = namespace(lanes.t).zeros((map.structure.nu, 1))
-    return move(map.structure, lanes, u, target, settings)
+    return move(map.structure, lanes, u, target, settings).moved

@@ -23,7 +23,7 @@ from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.check import check_system
 from ..systems.system import HybridSystem
-from .batches import FULL, QUICK, Programs, Rounds, Tiles
+from .batches import Rounds, Tiles
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
@@ -33,7 +33,7 @@ from .scale import given_sizes, scale_of
 
 # Largest number of systems for programs that are compiled in half the time and run longer. Larger:
 # they run more than 3 s longer. Smaller: compiling takes longer than they run.
-_SMALL = 2000
+SMALL = 2000
 # Cycles, among those on which events coincide, that are tested for whether the events commute; all
 # are, if they do not in one of these. More: the test takes longer. Fewer: exceptions are missed.
 _LOOKED_AT = 50
@@ -174,7 +174,7 @@ def find_limit_cycles(
     check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
     map = map_for_sweep(guess, scale, settings)
     size = min(execution.batch or BATCH, S)
-    tiles = Tiles(systems, map, size, execution.threads, programs_for(S))
+    tiles = Tiles(systems, map, size, execution.threads, S > SMALL)
     return as_cycles(tiles, tiles.solve(S))
 
 
@@ -186,11 +186,6 @@ def map_for_sweep(
     rough = guess.settings.scale if settings.scale is None else settings.scale
     settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), rough))
     return dataclasses.replace(guess.return_map, settings=settings)
-
-
-def programs_for(S: int) -> Programs:
-    """The compiled functions for S systems in all."""
-    return QUICK if S <= _SMALL else FULL
 
 
 def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:

@@ -20,9 +20,8 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.events import arm
-from ..engine.jacobian import flow_jacobian
 from ..engine.lanes import Lanes, start_lanes
-from ..engine.move import move
+from ..engine.move import Options, flow_jacobian, move
 from ..engine.replay import replay
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
@@ -71,10 +70,8 @@ class Turn(NamedTuple):
 
     residual: Float[Array, " d"]
     """As in `Return`."""
-    jacobian: Float[Array, "d d"]
-    """Derivative of the residual with respect to the state."""
-    by_parameter: Float[Array, " d"]
-    """Derivative of the residual along a direction of the parameters; None if none was given."""
+    jacobian: Float[Array, "d n"]
+    """Derivative of the residual with respect to the state, and along the parameters if asked."""
     legs: Lanes
     """States at the beginnings of the K pieces."""
     factors: Float[Array, "K d d"]
@@ -180,7 +177,8 @@ class ReturnMap(eqx.Module):
         s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
 
         def flow(lanes, target, h, result):
-            return move(s, lanes, u, target, self.settings, h, result, new_input=False), None
+            options = Options(new_input=False)
+            return move(s, lanes, u, target, self.settings, h, result, options).moved, None
 
         return self.travel(q, flow)[0]
 
@@ -188,59 +186,47 @@ class ReturnMap(eqx.Module):
         self,
         q: Float[Array, " d"],
         wanted: Bool[Array, ""] | bool = True,
-        direction: HybridSystem | None = None,
+        along: "Callable[[Array], ReturnMap] | None" = None,
     ) -> Turn:
         """One turn from a state on the section, with its derivatives.
 
         **Arguments:** `wanted`: whether derivatives with respect to the state are computed;
-        otherwise they are meaningless. `direction`: a system whose numbers are a direction of the
-        parameters (the phase of the clock at the anchor is held).
+        otherwise they are meaningless. `along`: the map after a step of the parameters.
         """
-        s, n, xp = self.structure, q.shape[0], namespace(q)
-        moved_system = lambda step: jax.tree_util.tree_map(  # noqa: E731
-            lambda x, v: x + step * v if eqx.is_inexact_array(x) else x, self.system, direction
-        )
-        growth = 0.0  # relative change of all times with the parameter, as the clock's period
-        if direction is not None and self.base is None:
-            period = lambda step: jnp.asarray(moved_system(step).period(), float)  # noqa: E731
-            growth = _derivative(period) / period(0.0)
+        s, xp = self.structure, namespace(q)
 
         def flow(lanes, target, h, result):
             jacobian, moved, tape = flow_jacobian(
-                s, lanes, target, self.settings, h, result,
-                new_input=False, wanted=wanted,
-            )  # fmt: skip
-            factor = jacobian[0, 1 : n + 1]
-            if direction is not None:
+                s, lanes, target, self.settings, h, result, new_input=False, wanted=wanted
+            )
 
-                def end(step):
-                    grown = 1 + growth * step
-                    begin = lanes._replace(t=lanes.t * grown)
-                    time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
-                    to = dataclasses.replace(target, time=time)
-                    other = dataclasses.replace(self, system=moved_system(step)).structure
-                    return replay(other, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
+            def end(step):
+                other = along(step)
+                grown = other.expected / self.expected
+                time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
+                begin = lanes._replace(t=lanes.t * grown)
+                to = dataclasses.replace(target, time=time)
+                return replay(other.structure, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
 
-                # The parameter is one more state, which is constant.
-                last = jnp.zeros((1, n + 1)).at[0, n].set(1.0)
-                factor = jnp.concatenate([jnp.column_stack([factor, _derivative(end)]), last])
-            return moved, (lanes, factor, tape.code, tape.t)
+            moves = None if along is None else _derivative(end)
+            return moved, (lanes, jacobian[0, 1:], moves, tape.code, tape.t)
 
-        end, (legs, factors, codes, times) = self.travel(q, flow)
+        end, (legs, factors, moves, codes, times) = self.travel(q, flow)
         legs = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), legs)
-        codes, product = codes[..., 0], monodromy(factors)
+        codes, valid = codes[..., 0], self.valid
         off, by_state = self.held(q)
-        jacobian = xp.where(self.valid[:, None], product[:n, :n], 0.0) - np.eye(n) - by_state
-        by_parameter = None
-        if direction is not None:
-            hold = lambda x: dataclasses.replace(self, system=moved_system(x)).held(q)[0]  # noqa: E731
-            by_parameter = jnp.where(self.valid, product[:n, n], 0.0) - _derivative(hold)
-        factors = factors[:, :n, :n]
+        returned = xp.where(valid[:, None], monodromy(factors), 0.0)
+        jacobian = returned - np.eye(len(q)) - by_state
+        if along is not None:
+            add = lambda total, leg: (leg[0] @ total + leg[1], None)  # noqa: E731
+            total, _ = scan(add, jnp.zeros_like(q), (factors, moves))
+            held = _derivative(lambda step: along(step).held(q)[0])
+            jacobian = jnp.column_stack([jacobian, jnp.where(valid, total, 0.0) - held])
         if self.base is not None:
             factors = self._across(legs, factors)
         defect = xp.abs(end.residual) + xp.abs(off)
         return Turn(
-            end.residual, jacobian, by_parameter, legs, factors, codes, times[..., 0],
+            end.residual, jacobian, legs, factors, codes, times[..., 0],
             end.period, xp.max(defect / self.sizes), end.result, self._meetings(legs, codes),
         )  # fmt: skip
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from .._core.compilation import at_ease
 from .._core.executor import to_host
 from ..engine.chain import Link, divergence, links
-from ..engine.move import record
+from ..engine.move import Options, move
 from .return_map import ReturnMap
 
 
@@ -29,11 +29,11 @@ def fine_factors(map: ReturnMap) -> list[Matrix]:
     """
     map = to_host(map)
     moves = [move for piece in _pieces(map, links, tangents=True) for move in piece]
-    frames = [_frame(map, move) for move in moves]
+    frames = [_frame(map, link) for link in moves]
     factors: list[Matrix] = []
-    for k, move in enumerate(moves):
+    for k, link in enumerate(moves):
         out, into = frames[(k + 1) % len(moves)], frames[k]
-        factor = out[0] @ move.jacobian @ into[1]
+        factor = out[0] @ link.jacobian @ into[1]
         merged = factor @ factors[-1] if factors else factor
         if factors and weakest(merged) > WEAKEST:
             factors[-1] = merged
@@ -59,9 +59,8 @@ def _pieces(map: ReturnMap, measure: Callable, tangents: bool = False) -> list:
 
     def flow(lanes, target, h, result):
         u = np.zeros((s.nu, 1))
-        moved, tape = record(
-            s, lanes, u, target, map.settings, h, result, new_input=False, tangents=tangents
-        )
+        options = Options(tape=True, new_input=False, tangents=tangents)
+        moved, tape = move(s, lanes, u, target, map.settings, h, result, options)
         parts.append(measure(s, lanes, target, tape))
         return moved, None
 

@@ -1,5 +1,12 @@
+from .data import (
+    experiment as experiment,
+    impulse_responses as impulse_responses,
+    phase as phase,
+    phase_response as phase_response,
+    section_data as section_data,
+    validation as validation,
+)
 from .designs import information as information, spectrum as spectrum, strides as strides
-from .fit_quality import validation as validation
 from .frequency import (
     bode as bode,
     bodes as bodes,
@@ -15,10 +22,3 @@ from .look import (
 from .orbit import cycle as cycle
 from .over_parameters import branch as branch, sweep as sweep
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros
-from .recorded import (
-    impulse_responses as impulse_responses,
-    phase as phase,
-    phase_response as phase_response,
-    section_data as section_data,
-)
-from .signals import experiment as experiment

@@ -12,14 +12,8 @@ from ..designs.information import InformationMap
 from ..designs.optimal_design import OptimalDesign
 from ..designs.study import Study
 from ..errors import DefinitionError
+from .frequency import FREQUENCY
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, panels
-
-
-_FREQUENCY = "input frequency $f$ (cycles/period)"
-# Part of the information that a figure shows. Closer to 1: a wider band, mostly empty.
-_SHOWN = 0.9
-# Amplitudes that a figure shows, relative to the largest. Smaller: lines that do not matter, too.
-_WEAKEST = 1e-3
 
 
 @checked
@@ -60,10 +54,10 @@ def spectrum(
             style = dict(marker="o", ms=2, lw=0, color=color, label=label)
             below.plot(f[used], amplitude[used], **style)
         unit = unit_of(model.inputs[0])
-        below.set(yscale="log", xlabel=_FREQUENCY, ylabel=with_unit("amplitude", unit))
+        below.set(yscale="log", xlabel=FREQUENCY, ylabel=with_unit("amplitude", unit))
         below.set_xlim(0, f.max())
         top = np.sqrt(2 * max(plan.power.max(), plan.usual_power.max()))
-        below.set_ylim(_WEAKEST * top, 2 * top)
+        below.set_ylim(1e-3 * top, 2 * top)
         below.legend()
         axes[0, 0].get_figure(root=True).align_ylabels(axes)
     return Plot(axes)
@@ -87,7 +81,7 @@ def information(
     lines = np.rint(found.f * found.periods).astype(int)
     by_line = found.share.sum(axis=(0, 2))
     order = np.argsort(-by_line)
-    kept = order[: 1 + int(np.argmax(np.cumsum(by_line[order]) >= _SHOWN))]
+    kept = order[: 1 + int(np.argmax(np.cumsum(by_line[order]) >= 0.9))]
     first, last = lines[kept].min(), lines[kept].max()
     density = np.zeros((ny, last - first + 1, N))
     inside = (lines >= first) & (lines <= last)
@@ -111,7 +105,7 @@ def information(
             bar.ax.tick_params(labelsize=7)
             side.barh(np.arange(N) / N, profile[k], height=1 / N, color=CYCLE[0])
             side.axvline(profile[k].mean(), color="0.5", lw=0.6)
-        axes[-1, 0].set_xlabel(_FREQUENCY)
+        axes[-1, 0].set_xlabel(FREQUENCY)
         axes[-1, 1].set_xlabel("over all $f$")
     return Plot(axes)
 

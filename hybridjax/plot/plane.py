@@ -13,17 +13,7 @@ from ..identify.multiplier_estimate import MultiplierEstimate, Multipliers, comp
 from ..identify.rational import RationalFit
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
-from .look import (
-    COLORS,
-    COLUMN,
-    CYCLE,
-    PAGE,
-    AxesLike,
-    Plot,
-    label_of,
-    letters,
-    panels,
-)
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 
 
 _MARKERS = "osD^vP*X"

@@ -15,8 +15,12 @@ from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed
 from .._core.boundary.values import Reals
-from .._core.fingerprint import IndescribableError, program_digest
-from .._core.pieces.description import digest_of, function_digest
+from .._core.pieces.description import (
+    IndescribableError,
+    digest_of,
+    function_digest,
+    program_digest,
+)
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
 from ..engine.describe import describe

@@ -22,7 +22,7 @@ from ..errors import ComputationError, DefinitionError
 from ..orbits.batches import Known, Tiles
 from ..orbits.cycle import LimitCycle, rough
 from ..orbits.find import find_limit_cycle
-from ..orbits.limit_cycles import BATCH, LimitCycles, as_cycles, map_for_sweep, programs_for
+from ..orbits.limit_cycles import BATCH, SMALL, LimitCycles, as_cycles, map_for_sweep
 from ..orbits.return_map import ReturnMap
 from ..systems.system import HybridSystem
 from .family import Axes, Family, Points, Space
@@ -224,8 +224,8 @@ class SweepJob:
         points = math.prod(self.blocks.block)
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
         size, threads = min(BATCH, points), Execution(workers=workers).threads
-        programs = programs_for(math.prod(self.blocks.shape))
-        return Tiles(systems, self.begun.map, size, threads, programs)
+        large = math.prod(self.blocks.shape) > SMALL
+        return Tiles(systems, self.begun.map, size, threads, large)
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""

@@ -13,8 +13,8 @@ from .._core.lanes import by_lane
 from .._core.progress import working
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.jacobian import tape_jacobian
 from ..engine.lanes import for_each_chart, only
+from ..engine.move import tape_jacobian
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle

@@ -19,7 +19,7 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.cubic import interpolate
 from ..engine.lanes import Lanes, for_each_chart, only
-from ..engine.move import record
+from ..engine.move import Options, move
 from ..engine.tape import IDLE, Tape
 from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
@@ -116,7 +116,7 @@ def _place(cycle: LimitCycle, family: AbstractSections) -> tuple[PlacedSections,
 
     def go(lanes, h, result, target):
         u = xp.zeros((s.nu, 1))
-        return record(s, lanes, u, target, settings, h, result, tangents=True)
+        return move(s, lanes, u, target, settings, h, result, Options(tape=True, tangents=True))
 
     def to(lanes, h, result, time, i, event, levels):
         ends = time[None], i[None], event[None], lanes.t + (1 + GRACE) * period

@@ -121,7 +121,7 @@ def _map(map: SectionMap, q, u, t) -> Arrival:
     start = jax.tree_util.tree_map(lambda x: x[..., i : i + 1], lanes)._replace(t=t[None], q=q)
     u = xp.broadcast_to(u, s.nu)[:, None]
     target = placed.target(xp.array([j]), t[None], xp.array([1 if j <= i else 0]))
-    moved = move(s, start, u, target, placed.cycle.settings)
+    moved = move(s, start, u, target, placed.cycle.settings).moved
     end = moved.lanes
     result = update_result(moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER)
     keep = xp.where(result == Result.OK, 1.0, xp.nan)  # a factor makes derivatives NaN, too

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybridjax._core.fingerprint import IndescribableError, program_digest
+from hybridjax._core.pieces.description import IndescribableError, program_digest
 
 
 def with_rule(slope):

@@ -7,7 +7,7 @@ import pytest
 from hybridjax._core.executor import from_host
 from hybridjax.engine.chain import chain
 from hybridjax.engine.lanes import start_lanes
-from hybridjax.engine.move import record
+from hybridjax.engine.move import Options, move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
@@ -26,7 +26,7 @@ def flow(s, t, q, u, end):
     lanes = start_lanes(s, np.array([t]), np.zeros(1, np.int32), q[:, None])
     target, sizes = until(np.array([end])), np.ones((len(s.charts), s.d))
     settings = Settings(1e-12, 1e-12, 2000, sizes)
-    done = record(s, lanes, u[:, None], target, settings, tangents=True)
+    done = move(s, lanes, u[:, None], target, settings, options=Options(True, tangents=True))
     moved = done.moved.lanes
     return np.concatenate([moved.t, moved.q[:, 0]]), lanes, target, done
 

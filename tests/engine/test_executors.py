@@ -9,7 +9,7 @@ from hybridjax._core import compilation
 from hybridjax._core.compilation import quick_jit
 from hybridjax._core.executor import from_host, on_host, to_host
 from hybridjax.engine.lanes import start_lanes
-from hybridjax.engine.move import record
+from hybridjax.engine.move import Options, move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.tape import IDLE
 from hybridjax.engine.target import until
@@ -32,9 +32,9 @@ def slow_but(names, few):
 
 def flow(system, t, chart, q, u, end, settings):
     """A recorded flow of one lane (of either executor's arrays)."""
-    return record(
-        Structure(system), start_lanes(Structure(system), t, chart, q), u, until(end), settings
-    )
+    s = Structure(system)
+    lanes = start_lanes(s, t, chart, q)
+    return move(s, lanes, u, until(end), settings, options=Options(tape=True))
 
 
 compiled_flow = quick_jit(flow)

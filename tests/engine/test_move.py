@@ -33,7 +33,7 @@ def flow(system, chart, q, u, t, end):
     q = jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
     index = jnp.full(1, s.chart_index(chart), jnp.int32)
     lanes = start_lanes(s, t[None], index, q)
-    moved = move(s, lanes, u[:, None], until(end[None]), tight(s))
+    moved = move(s, lanes, u[:, None], until(end[None]), tight(s)).moved
     return moved.lanes.q[:, 0], moved.result[0]
 
 
@@ -100,7 +100,7 @@ def test_lanes_fail_one_by_one():
     end = jnp.full(4, 0.6)
     u = jnp.array([[0.0, 0.0, 0.0, jnp.inf]])
     lanes = start_lanes(s, jnp.zeros(4), chart, q)
-    moved = move(s, lanes, u, until(end), tight(s))
+    moved = move(s, lanes, u, until(end), tight(s)).moved
     bad, zeno = hj.Result.BAD_INPUT, hj.Result.ZENO
     assert moved.result.tolist() == [hj.Result.OK, bad, zeno, bad]
     x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])

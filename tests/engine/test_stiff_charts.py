@@ -142,7 +142,7 @@ def test_a_stiff_chart_costs_only_where_lanes_are():
         q, t = jnp.array([[0.6, 0.65], [0.5, 0.55]]), jnp.zeros(2)
         lanes = start_lanes(s, t, chart, q)
         settings = hj.Settings(1e-6, 1e-6, scale=np.ones((2, 2)))
-        return move(s, lanes, jnp.zeros((1, 2)), until(t + 0.05), settings).result
+        return move(s, lanes, jnp.zeros((1, 2)), until(t + 0.05), settings).moved.result
 
     for chart, visited in ((1, False), (0, True)):
         np.testing.assert_array_equal(run(np.full(2, chart, np.int32)), 0)

@@ -11,7 +11,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
-from hybridjax.engine.move import record
+from hybridjax.engine.move import Options, move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
@@ -54,7 +54,9 @@ def flow(length, time, scale, tangents):
     lanes, u = begin(system, length, time), jnp.zeros((1, 2))
     settings = Settings(1e-10, 1e-10, 256, scale)
     end = until(jnp.full(2, 1.5 * time))
-    moved, tape = record(Structure(system), lanes, u, end, settings, tangents=tangents)
+    moved, tape = move(
+        Structure(system), lanes, u, end, settings, options=Options(True, tangents=tangents)
+    )
     return tape.h / time, tape.code, moved.lanes.q.T / sizes(length, time), moved.result
 
 

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
-from hybridjax.experiments.design.multisine import single_cosine
 
 
 def disturb(i, j, periods):
@@ -98,20 +97,6 @@ def test_signals_are_sums_of_cosines():
     np.testing.assert_allclose(
         design.crest_factors(), np.abs(expected).max(axis=(1, 2)) / rms, rtol=1e-12
     )
-
-
-def test_single_cosines():
-    design = single_cosine(0.25, n_sections=8, periods=4, amplitude=0.5, phase=0.3)
-    n = np.arange(32)
-    np.testing.assert_allclose(
-        design.inputs()[0, :, 0], 0.5 * np.cos(2 * np.pi * 0.25 / 8 * n + 0.3), atol=1e-14
-    )
-    several = single_cosine([0.25, 1.5, 4.0], 8, 4, half_integers="two-phase", inputs=2)
-    assert several.experiments == 8
-    assert [lines_of(several, e) for e in range(4)] == [[1], [6], [6], [16]]
-    np.testing.assert_array_equal(several.channel, [0] * 4 + [1] * 4)
-    with pytest.raises(hj.DefinitionError, match="experiment 1: f = 1.5 lies on a multiple of 1/2"):
-        single_cosine([0.25, 1.5], 8, 4)
 
 
 BAD = {

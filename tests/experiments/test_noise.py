@@ -76,5 +76,5 @@ def test_other_numbers_of_sections_are_refused(data, hopper_cycle, placed_isochr
     with pytest.raises(hj.DefinitionError, match=r"or of shape \(8, 2\)"):
         hj.experiments.add_noise(data, std=np.ones((3, 2)))
     for std in (np.ones((N, 2)), ()):
-        with pytest.raises(hj.DefinitionError, match="one for each section"):
-            ProcessNoise(std)
+        with pytest.raises(hj.DefinitionError, match="for each of"):
+            ProcessNoise(std).require(N)

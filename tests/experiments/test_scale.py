@@ -6,7 +6,6 @@ import pytest
 from jaxtyping import Array, Float
 
 import hybridjax as hj
-from hybridjax.experiments.design.multisine import single_cosine
 
 from ..toys import Field
 
@@ -40,7 +39,8 @@ def resting():
 
 
 def test_experiments_judge_errors_by_the_sizes_of_the_cycle(resting):
-    family, design = hj.ClockPhase(4), single_cosine([0.25, 0.75], 4, 4)
+    family = hj.ClockPhase(4)
+    design = hj.Design.from_lines([[0.25], [0.75]], n_sections=4, periods=4)
     data = hj.run_experiments(resting, family, design, ("x", "w"))
     assert data.summary() == "2/2 ok" and np.all(data.error < 1e-8)
     model = hj.linearize(resting, family, ("x", "w"))  # the system is linear

@@ -9,9 +9,8 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.experiments import StoredExperiments
-from hybridjax.experiments.campaign import Options
-from hybridjax.experiments.design.multisine import single_cosine
-from hybridjax.experiments.stored import prepare_pieces
+from hybridjax.experiments.run import Options
+from hybridjax.experiments.stored import experiment_job
 
 from ..conftest import OUTPUTS
 
@@ -122,9 +121,9 @@ def test_another_system_is_refused(made, arguments):
 def test_another_process_can_run_a_piece(hopper_cycle, placed_isochrons, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")
-    design = single_cosine([0.25, 0.75], 32, 4)
+    design = hj.Design.from_lines([[0.25], [0.75]], n_sections=32, periods=4)
     options = Options(start=start)
-    job = prepare_pieces(hopper_cycle, placed_isochrons, design, OUTPUTS, options, 2)
+    job = experiment_job(hopper_cycle, placed_isochrons, design, OUTPUTS, options, 2)
     _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
     here, there = job.run(0, None), sent.run(0, 1)

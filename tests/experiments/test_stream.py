@@ -8,7 +8,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.experiments.batches import divide
-from hybridjax.experiments.campaign import Options
+from hybridjax.experiments.run import Options
 
 from ..conftest import OUTPUTS, no_compilation
 

@@ -9,7 +9,7 @@ import numpy as np
 import hybridjax as hj
 from hybridjax._core.compilation import quick_jit
 from hybridjax.engine.lanes import start_lanes
-from hybridjax.engine.move import record
+from hybridjax.engine.move import Options, move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
@@ -162,7 +162,7 @@ def _flow(plan: Plan, many: Sample, ends, accuracy):
         q = jnp.zeros((s.d, 1)).at[: plan.dims[0], 0].set(q)
         settings = Settings(rtol=accuracy, atol=accuracy, max_steps=STEPS)
         lanes = start_lanes(s, t[None], jnp.zeros(1, jnp.int32), q)
-        moved, tape = record(s, lanes, u[:, None], until(end[None]), settings)
+        moved, tape = move(s, lanes, u[:, None], until(end[None]), settings, options=Options(True))
         happens = tape.code[:, 0] >= 0
         (rows,) = jnp.nonzero(happens, size=EVENTS, fill_value=0)
         events = [x[rows, ..., 0] for x in (tape.t, tape.code, tape.chart, tape.after)]

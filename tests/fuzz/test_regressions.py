@@ -58,7 +58,7 @@ def two_pieces(x, first, second):
     lanes = start_lanes(s, jnp.zeros(1), jnp.zeros(1, jnp.int32), jnp.full((1, 1), x))
     h = None
     for end, u in ((1.0, first), (2.0, second)):
-        moved = move(s, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), SETTINGS, h)
+        moved = move(s, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), SETTINGS, h).moved
         lanes, h = moved.lanes, moved.h
     return hj.Result(int(moved.result[0])), int(lanes.events[0])
 
@@ -86,7 +86,7 @@ def across(x, time, duration):
     s = Structure(Rounded(-0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit))))
     lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
     u = jnp.zeros((1, 1))
-    moved = move(s, lanes, u, until(t + duration), SETTINGS)
+    moved = move(s, lanes, u, until(t + duration), SETTINGS).moved
     return moved.result[0], moved.lanes.events[0]
 
 

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.experiments.design.multisine import single_cosine
 from hybridjax.identify.joint.noise import noise_spectrum
 from hybridjax.recordings.sampling import without_drift
 
@@ -134,7 +133,6 @@ def designs(t):
     lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
     yield hj.paper_design, lines | dict(experiments=8)
-    yield single_cosine, dict(f=0.25, n_sections=6, periods=16)
     yield (
         hj.Design.from_lines,
         dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0, n_sections=6, periods=16),

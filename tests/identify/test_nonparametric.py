@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
-from hybridjax.experiments.design.multisine import single_cosine
 
 from ..linear.conftest import blocks_at_random
 
@@ -101,7 +100,8 @@ def test_failed_experiments_are_left_out(paper_data, paper_estimate):
 
 
 def test_a_lost_phase_loses_the_frequency(hopper):
-    design = single_cosine([0.25, 1.5], 32, 4, half_integers="two-phase")
+    phases = [[0.0], [0.0], [np.pi / 2]]
+    design = hj.Design.from_lines([[0.25], [1.5], [1.5]], phases=phases, n_sections=32, periods=4)
     data = hj.experiments.simulate_experiments(hopper, design, start="periodic")
     half = failed(data, [2])
     np.testing.assert_array_equal(hj.estimate_htf(half).f, [0.25])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.experiments.design.multisine import single_cosine
 
 from ..linear.conftest import hopper as hopper
 
@@ -24,7 +23,7 @@ def test_the_transient_of_a_linear_system_is_removed_exactly(hopper, full):
     """The window begins one period after the start."""
     for design, discard in (
         (full, 10),
-        (single_cosine(np.arange(1, 48, 2) / 16, 32, 16), 1),
+        (hj.Design.from_lines([[j / 16] for j in range(1, 48, 2)], n_sections=32, periods=16), 1),
     ):
         data = hj.experiments.simulate_experiments(hopper, design, discard=discard)
         assert errors(hopper, data) > 1e-3

@@ -18,17 +18,7 @@ import numpy as np
 
 from .. import limits
 from ..arguments import Numbers
-from .containers import (
-    Either,
-    Function,
-    Having,
-    Instance,
-    Items,
-    Names,
-    Subclass,
-    Table,
-    Tuple,
-)
+from .containers import Either, Function, Having, Instance, Items, Names, Subclass, Table, Tuple
 from .values import (
     Complexes,
     ComplexNumber,

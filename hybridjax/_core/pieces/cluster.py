@@ -2,7 +2,6 @@
 
 import contextlib
 import ctypes
-import importlib
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -20,7 +19,7 @@ from ..progress import counted, say
 from .store import ZarrStore
 
 
-_PACKAGES = ("hybridjax", "jax", "jaxlib", "numpy")
+_PACKAGES = ["hybridjax", "jax", "jaxlib", "numpy"]
 # Bytes of freed memory that a worker keeps. With less, the system clears every page again: a fifth
 # of the time of a sweep. With more, a worker holds memory that it does not use.
 _KEPT = 2**28
@@ -95,21 +94,16 @@ def _job(client: Any, job: Any, address: str | None) -> Iterator[str]:
 
 def _check_packages(client: Client) -> None:
     """**Raises:** `DefinitionError` for workers that would compute other numbers, or none."""
-    find = "__import__('importlib').util.find_spec"
-    # (A built-in function: workers may lack those of this package.)
-    expression = (
-        f"(__import__('importlib.util'), {{x: __import__(x).__version__ for x in {_PACKAGES} "
-        f"if {find}(x)}})[1]"
-    )
-    mine = {x: importlib.import_module(x).__version__ for x in _PACKAGES}
-    versions: Any = client.run(eval, expression, on_error="ignore")
-    for worker, theirs in versions.items():
-        for name, version in mine.items():
-            if theirs.get(name) != version:
-                has = f"has {name} {theirs[name]}" if name in theirs else f"lacks {name}"
+    versions: Any = client.get_versions(packages=_PACKAGES)
+    mine = versions["client"]["packages"]
+    for worker, about in versions["workers"].items():
+        for name in _PACKAGES:
+            theirs = about["packages"].get(name)
+            if theirs != mine[name]:
+                has = f"has {name} {theirs}" if theirs else f"lacks {name}"
                 raise DefinitionError(
-                    f"the Dask worker {worker} {has}, and this process has {version}: let workers "
-                    "run in the same environment."
+                    f"the Dask worker {worker} {has}, and this process has {mine[name]}: let "
+                    "workers run in the same environment."
                 )
 
 

@@ -7,13 +7,12 @@ from jaxtyping import Bool
 
 from ..._core.executor import cond, namespace
 from ..._core.lanes import pick
-from ...systems.structure import Structure
 from ..arrays import Array, Index, Mask, Times
 from ..cubic import CubicCrossing, first_crossing
 from ..events import INSTANT, width
 from ..lanes import Lanes
 from ..watch import Watch
-from .locate import LANDING, LANDING_TRIES
+from .attempt import LANDING, LANDING_TRIES
 from .state import Aim, Attempt, State, Task
 
 
@@ -60,15 +59,15 @@ def accurate(new: Attempt, task: Task) -> Mask:
     return new.error <= task.stride.slack
 
 
-def uneventful(s: Structure, state: State, aim: Aim, new: Attempt, task: Task) -> Mask:
+def uneventful(state: State, aim: Aim, new: Attempt, task: Task) -> Mask:
     """Lanes whose step `accept` would accept on sight: accurate, no event, and no watched function
     near a zero, save the target's level on which the lane lands."""
-    at_guard = new.lands & (aim.which < len(s.transitions))
+    at_guard = new.lands & (aim.which < len(task.s.transitions))
     calm = new.calm & accurate(new, task) & ~state.approach.on & (aim.schedule < 0) & ~at_guard
     return calm | ~state.active
 
 
-def accept(s: Structure, state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdict:
+def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdict:
     """Accept or reject the attempted steps, which end at t.
 
     A step is accepted if it is accurate, every watched function is resolved over it, and none
@@ -117,10 +116,10 @@ def step_length(aim: Aim, new: Attempt) -> Times:
     return aim.step + namespace(aim.step).where(new.lands, new.past, 0.0)
 
 
-def next_step(s: Structure, h: Times, aim: Aim, error: Times, lanes: Lanes) -> Times:
-    """The length of the step after one with this error relative to the tolerance, where h was
-    allowed."""
-    xp, orders = namespace(error), [s.method(a).order for a in range(len(s.charts))]
+def next_step(h: Times, aim: Aim, error: Times, lanes: Lanes, task: Task) -> Times:
+    """The length of the step after one with this error, where h was allowed."""
+    s, xp, error = task.s, namespace(error), error / task.stride.slack
+    orders = [s.method(a).order for a in range(len(s.charts))]
     if set(orders) == {8.0}:  # cheaper than a power
         length = xp.sqrt(xp.sqrt(xp.sqrt(error)))
     else:
@@ -136,18 +135,11 @@ def of_row(x: Array, which: Index) -> Times:
 
 
 def _crossing(
-    some: Mask, watched: Watch, end: Watch, moved: Times, ready: Bool[Array, "W L"]
+    some: Mask, start: Watch, end: Watch, moved: Times, ready: Bool[Array, "W L"]
 ) -> CubicCrossing:
     """The crossings on the way. (In a branch, so that XLA does not compute it for every user.)"""
     xp = namespace(ready)
-
-    def look():
-        return first_crossing(
-            watched.value, end.value, moved * watched.rate, moved * end.rate, ready
-        )
-
-    def none():
-        no = xp.zeros_like(ready)
-        return CubicCrossing(xp.full_like(end.value, xp.inf), no, no)
-
-    return cond(some.any(), look, none)
+    cubic = start.value, end.value, moved * start.rate, moved * end.rate
+    no, nowhere = xp.zeros_like(ready), xp.full_like(end.value, xp.inf)
+    none = CubicCrossing(nowhere, no, no)
+    return cond(some.any(), lambda: first_crossing(*cubic, ready), lambda: none)

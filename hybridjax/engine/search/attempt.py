@@ -1,19 +1,20 @@
-"""One step of every lane, before it is accepted: its end, and how far it can be trusted."""
+"""One step of every lane, before it is accepted: its end, on the zero that it aims at if it comes
+close, and how far it can be trusted."""
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..._core.executor import cond, namespace, put
-from ..._core.lanes import take_rows
-from ...systems.structure import Structure
-from ..arrays import AnyTimes, Array, Mask, Padded, States
-from ..cubic import NEAR, control_points
-from ..events import width
+from ..._core.lanes import pick, take_rows
+from ..arrays import AnyTimes, Array, Mask, Padded, States, Times
+from ..cubic import NEAR, control_points, root_near_end
+from ..events import INSTANT, width
 from ..lanes import Lanes, for_each_chart, only
 from ..runge_kutta import Step, rounding_error
-from ..settings import Settings, size, tolerance
+from ..settings import size, tolerance
 from ..watch import ChartFlow, Watch, chart_flow, no_events, write
-from .locate import Landing, land
 from .state import Aim, Attempt, State, Task
 
 
@@ -30,17 +31,71 @@ _BEND = 2e-3
 # The error of a derivative is estimated by a step from a state that is shifted by this part of its
 # size. Higher: second derivatives contribute. Lower: rounding errors do.
 _ASIDE = 1e-4
+# A lane lands if its crossing is nearer to the end of the step than this part of its length,
+# measured from its expected time. Higher: a method of order 4 goes further, and more landings are
+# rejected as too inaccurate. Lower: more steps until a lane lands.
+_LANDING_REACH = 0.25
+# A landing is accurate to this part of the step: its last correction is at most as large (or lasts
+# no longer than an instant), and it lies no farther beyond the step in which the crossing was met.
+# Corrections square their error. Higher: a crossing is off by more than a replay corrects to
+# rounding. Lower: landings are repeated.
+LANDING = 1e-6
+# Attempts to land on a crossing before the step in which it was met is halved. Higher: they cost
+# time where the cubic interpolant is no guide to the crossing. Lower: steps are halved too early.
+LANDING_TRIES = 8
+
+
+class Landing(NamedTuple):
+    """Ends of steps, of lanes that land on the zero itself."""
+
+    q: States
+    f: States
+    past: Times
+    """Time from the end of the step to the zero, as far as is known."""
+    lands: Mask
+    error: Times
+    """Error of the way from the step's end to the zero, relative to the tolerance."""
+
+
+def land(
+    flow: ChartFlow, before: Watch, step: Step, allowed: States, t: Times, aim: Aim, span: Times
+) -> Landing:
+    """The zero of the function aimed at, before or beyond the end of a step from t.
+
+    `before` are the watched functions at its start, `allowed` the errors that it may have.
+    """
+    xp, tau, which = namespace(t), aim.step, aim.which
+    after = flow.watch(t + tau, step.q, step.f1)
+    v0, r0, v1, r1 = (pick(x, flow.rows, which) for x in (*before, *after))
+    by_cubic = tau * (root_near_end(v0, v1, tau * r0, tau * r1) - 1)
+    by_newton = -v1 / xp.where(r1 == 0, 1.0, r1)
+    # (The cubic between the ends of a very short step is a worse guess than Newton's.)
+    first = xp.where(tau > 1e-3 * aim.reach, by_cubic, by_newton)
+    near = (which >= 0) & (xp.abs(first) <= aim.reach)
+    first = xp.where(near, first, 0.0)
+    end = flow.locate(t + tau, step.q, step.f1, which, first)
+    share = xp.abs(first) / xp.where(aim.reach > 0, aim.reach, 1.0)
+    error = xp.max(end.error / allowed * xp.where(share > 0, share, 0.0) ** 2, axis=0)
+    fine = xp.abs(end.last) <= LANDING * xp.abs(tau + end.past) + INSTANT * span
+    lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(error) <= 1.0)
+    return Landing(
+        xp.where(lands, end.q, step.q),
+        xp.where(lands, end.f, step.f1),
+        xp.where(near, end.past, by_newton),
+        lands,
+        xp.where(lands, xp.abs(error), 0.0),
+    )
 
 
 def attempt(
-    s: Structure, state: State, aim: Aim, task: Task, unroll: bool = False, in_step: bool = False
+    state: State, aim: Aim, task: Task, unroll: bool = False, in_step: bool = False
 ) -> Attempt:
     """Let the active lanes step, and land those that come close to the zero they aim at.
 
     With `in_step`, all lanes are assumed to go equally far from the same time, to no zero; then
     terms that depend on time only are computed once.
     """
-    lanes, L = state.lanes, state.lanes.t.shape[0]
+    s, lanes, L = task.s, state.lanes, state.lanes.t.shape[0]
     xp = namespace(lanes.t)
     zero, no, yes = xp.zeros(L), xp.zeros(L, bool), xp.ones(L, bool)
     empty = Attempt(lanes.q, no_events(s, lanes.t), zero, zero, no, no, no, state.along, yes)
@@ -189,12 +244,13 @@ def _clearance(
     return far, slow
 
 
-def deviation(s: Structure, lanes: Lanes, settings: Settings) -> Padded:
+def deviation(lanes: Lanes, task: Task) -> Padded:
     """A deviation of every lane, as large as its states."""
+    s = task.s
 
     def work(a, here, out):
         n = s.dims[a]
-        scaled = size(settings, a, only(here, lanes.q[:n])) * _direction(n)
+        scaled = size(task.settings, a, only(here, lanes.q[:n])) * _direction(n)
         return put(out, slice(n), xp.where(here, scaled, out[:n]))
 
     xp = namespace(lanes.q)

@@ -4,7 +4,6 @@ from jaxtyping import Bool
 
 from ..._core.executor import cond, namespace, put
 from ..._core.results import Result, update_result
-from ...systems.structure import Structure
 from ..arrays import Array, Index, Mask, Times
 from ..events import INSTANT, LEVEL_CLEAR, apply_resets, enabled, keep_pace, rearm, width
 from ..lanes import Lanes
@@ -15,9 +14,7 @@ from .attempt import SLOW, deviation
 from .state import Aim, Approach, Attempt, State, Task
 
 
-def without_events(
-    s: Structure, state: State, aim: Aim, new: Attempt, task: Task
-) -> tuple[State, Tape]:
+def without_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State, Tape]:
     """The state after steps that are accepted in all active lanes, without events, and the row of
     the tape. Lanes may arrive."""
     lanes, active = state.lanes, state.active
@@ -28,7 +25,7 @@ def without_events(
     arrived = level | on_time
     pace = put(lanes.pace, 0, lanes.pace[0] + moved)
     lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, pace)
-    h = next_step(s, state.h, aim, new.error / task.stride.slack, lanes)
+    h = next_step(state.h, aim, new.error, lanes, task)
     late = active & ~arrived & (t >= task.target.limit)
     code = xp.where(on_time, ARRIVE_TIME, xp.where(level, ARRIVE_LEVEL, MOVE))
     code = xp.where(active, code, IDLE).astype(xp.int32)
@@ -45,14 +42,12 @@ def without_events(
     return end, Tape(moved, code, t, new.q, new.q, lanes.chart)
 
 
-def with_events(
-    s: Structure, state: State, aim: Aim, new: Attempt, task: Task
-) -> tuple[State, Tape]:
+def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State, Tape]:
     """The state after steps that may be rejected or end in events, and the row of the tape."""
-    lanes, active, target = state.lanes, state.active, task.target
+    s, lanes, active, target = task.s, state.lanes, state.active, task.target
     xp, G, moved = namespace(lanes.t), len(s.transitions), step_length(aim, new)
     t = xp.where(aim.last, aim.due, xp.where(active, lanes.t + moved, lanes.t))
-    verdict = accept(s, state, aim, new, t, task)
+    verdict = accept(state, aim, new, t, task)
     accepted, lands = verdict.accepted, verdict.lands
     # Events, and arrivals.
     fires = lands & (aim.which < G) & enabled(s, t, new.q, task.u, aim.which)
@@ -61,8 +56,8 @@ def with_events(
     level = lands & (aim.which == G)
     on_time = verdict.plain & aim.last & ~by_clock
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
-    after, watched, aimed, zeno, slow = _after(s, state, aim, new, verdict, fired, t, task)
-    h, stuck = _next_step(s, state, aim, new, verdict, fired, task)
+    after, watched, aimed, zeno, slow = _after(state, aim, new, verdict, fired, t, task)
+    h, stuck = _next_step(state, aim, new, verdict, fired, task)
     # Failures; the first one counts.
     grazes = verdict.touch | (slow & ~zeno) | (stuck & (verdict.refine | verdict.lost))
     # (Any part between rounding errors and a tenth tells a field that jumps from a blow-up.)
@@ -81,7 +76,7 @@ def with_events(
         result = update_result(result, failed, code)
     along = new.along
     if along is not None:
-        fresh = cond((fired >= 0).any(), lambda: deviation(s, after, task.settings), lambda: along)
+        fresh = cond((fired >= 0).any(), lambda: deviation(after, task), lambda: along)
         along = xp.where(fired >= 0, fresh, xp.where(accepted, along, state.along))
     end = State(
         after,
@@ -101,14 +96,7 @@ def with_events(
 
 
 def _after(
-    s: Structure,
-    state: State,
-    aim: Aim,
-    new: Attempt,
-    verdict: Verdict,
-    fired: Index,
-    t: Times,
-    task: Task,
+    state: State, aim: Aim, new: Attempt, verdict: Verdict, fired: Index, t: Times, task: Task
 ) -> tuple[Lanes, Watch, Mask, Mask, Mask]:
     """Lanes after their steps and events, the watched functions there, whether the target's level
     counts, whether events accumulate, and whether a zero is crossed at a vanishing speed."""
@@ -132,21 +120,15 @@ def _after(
         pace,
     )
     watched = _merge(accepted, end, state.watched)
-    return *_reset(s, after, watched, ready[-1], fired, together, task), zeno, slow
+    return *_reset(after, watched, ready[-1], fired, together, task), zeno, slow
 
 
 def _reset(
-    s: Structure,
-    lanes: Lanes,
-    watched: Watch,
-    aimed: Mask,
-    fired: Index,
-    together: Mask,
-    task: Task,
+    lanes: Lanes, watched: Watch, aimed: Mask, fired: Index, together: Mask, task: Task
 ) -> tuple[Lanes, Watch, Mask]:
     """Lanes after the resets of their events, the watched functions there, and whether the target's
     level counts."""
-    xp, fires = namespace(fired), fired >= 0
+    s, xp, fires = task.s, namespace(fired), fired >= 0
 
     def work():
         q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, task.u, fired)
@@ -180,11 +162,11 @@ def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> App
 
 
 def _next_step(
-    s: Structure, state: State, aim: Aim, new: Attempt, verdict: Verdict, fired: Index, task: Task
+    state: State, aim: Aim, new: Attempt, verdict: Verdict, fired: Index, task: Task
 ) -> tuple[Times, Mask]:
     """The next step, and lanes that are stuck: the step is too short to be taken."""
     xp, (plain, too_long) = namespace(fired), (verdict.plain, verdict.too_long)
-    adapted = next_step(s, state.h, aim, new.error / task.stride.slack, state.lanes)
+    adapted = next_step(state.h, aim, new.error, state.lanes, task)
     h = xp.where(plain | too_long, adapted, state.h)
     h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
     h = xp.where(verdict.lost, 0.5 * aim.reach, h)

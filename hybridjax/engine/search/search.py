@@ -4,60 +4,36 @@ The search decides on step sizes, on the order of events, and on failures. It is
 its decisions are recorded in a `Tape`, which `replay` follows.
 """
 
-from typing import NamedTuple
+import numpy as np
 
-from jaxtyping import Bool
-
-from ..._core.executor import cond, namespace, while_loop
+from ..._core.executor import cond, namespace, put, while_loop
 from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
-from ..arrays import Array, Index, Inputs, Mask, Times
-from ..events import arm
-from ..lanes import Lanes
-from ..settings import Settings
-from ..tape import Tape, blank_tape, write_row
+from ..arrays import Index, Inputs, Mask, Times
+from ..events import SAME_TIME, arm, next_schedule
+from ..lanes import Lanes, for_each_chart, only
+from ..settings import Settings, size
+from ..tape import blank_tape, write_row
 from ..target import Target
-from ..watch import watch
+from ..watch import chart_field, watch
 from .accept import uneventful
-from .aim import take_aim
 from .attempt import attempt, deviation
 from .outcome import level_counts, with_events, without_events
-from .state import Aim, Approach, Attempt, State, Stride, Task
+from .state import Aim, Approach, Attempt, Moved, Options, Recorded, State, Stride, Task
 
 
-class Moved(NamedTuple):
-    """Lanes at the end of a piece of flow."""
-
-    lanes: Lanes
-    h: Times
-    """Step size to go on with."""
-    error: Times
-    """Sum of the steps' error estimates, relative to the tolerance."""
-    result: Index
-    """`Result` codes. A lane that failed stays where it failed."""
-
-
-class Recorded(NamedTuple):
-    """Lanes at the end of a piece of flow, and the record of the way."""
-
-    moved: Moved
-    tape: Tape | None
-    """`None` if it was not requested."""
-
-
-class Options(NamedTuple):
-    """Further results and properties of a search."""
-
-    tape: bool = False
-    """Record a tape."""
-    glide: bool = False
-    """Try one step of all lanes first: if it ends at the target in all of them, the loop is
-    skipped."""
-    new_input: bool = True
-    """Arm the guards for the input u, which may have jumped."""
-    tangents: Bool[Array, ""] | bool = False
-    """Make steps also short enough for the derivatives of a replay."""
+# A guard's zero is aimed at if Newton's guess places it within this part of the step. Nearer to 1:
+# steps are spent on zeros that are not there. Nearer to 0: zeros are met without being aimed at.
+_AIM_WITHIN = 0.7
+# The first step, as a part of the time in which the state changes by its size (for errors of 1e-2;
+# the default method has order 7), and at most as a part of the time allowed. Higher: first steps
+# are rejected. Lower: steps are taken until they have grown.
+_FIRST_STEP, _FIRST_STEP_OF_SPAN = 0.1, 0.01
+# Where sizes of states are not known, a state that begins near zero changes by its own size at
+# once: the first step is no shorter than this part of the time allowed. Higher: stiff systems
+# reject it. Lower: more steps until they have grown.
+_SHORTEST = 1e-6
 
 
 def search(
@@ -74,8 +50,8 @@ def search(
 
     Lanes whose `result` is not OK at the start stay there.
     """
-    task = Task(u, target, target.limit - lanes.t, stride, settings, options.tangents)
-    begin = _begin(s, lanes, result, task, options.new_input)
+    task = Task(s, u, target, target.limit - lanes.t, stride, settings, options.tangents)
+    begin = _begin(lanes, result, task, options.new_input)
     tape = blank_tape(settings.max_steps, lanes) if options.tape else None
 
     def all_the_way() -> Recorded:
@@ -85,13 +61,10 @@ def search(
 
         def iterate(carry):
             state, tape = carry
-            aim = take_aim(s, state, task)
-            new = attempt(s, state, aim, task)
-            end, row = cond(
-                uneventful(s, state, aim, new, task).all(),
-                lambda: without_events(s, state, aim, new, task),
-                lambda: with_events(s, state, aim, new, task),
-            )
+            aim = take_aim(state, task)
+            step = state, aim, attempt(state, aim, task), task
+            calm = uneventful(*step).all()
+            end, row = cond(calm, lambda: without_events(*step), lambda: with_events(*step))
             return end, None if tape is None else write_row(tape, state.i, row)
 
         end, written = while_loop(going, iterate, (begin, tape))
@@ -100,19 +73,19 @@ def search(
 
     if not options.glide:
         return all_the_way()
-    aim, new, arrives = _one_step(s, begin, task)
+    aim, new, arrives = _one_step(begin, task)
 
     def in_one_step() -> Recorded:
-        end, row = without_events(s, begin, aim, new, task)
+        end, row = without_events(begin, aim, new, task)
         written = None if tape is None else write_row(tape, begin.i, row)
         return Recorded(Moved(end.lanes, end.h, end.error, end.result), written)
 
     return cond(arrives.all(), in_one_step, all_the_way)
 
 
-def _begin(s: Structure, lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
+def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
     """The state of the iteration at its start."""
-    xp, L, u = namespace(lanes.t), lanes.t.shape[0], task.u
+    s, xp, L, u = task.s, namespace(lanes.t), lanes.t.shape[0], task.u
     finite = xp.isfinite(lanes.t) & xp.isfinite(lanes.q).all(axis=0) & xp.isfinite(u).all(axis=0)
     result = update_result(result, ~finite, Result.BAD_INPUT)
     watched = watch(s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK)
@@ -125,7 +98,7 @@ def _begin(s: Structure, lanes: Lanes, result: Index, task: Task, new_input: boo
         level_counts(watched, task.span),
         Approach(no, none, zero, zero, zero, none),
         task.stride.h,
-        deviation(s, lanes, task.settings) if follows else None,
+        deviation(lanes, task) if follows else None,
         zero,
         result,
         no,
@@ -133,14 +106,71 @@ def _begin(s: Structure, lanes: Lanes, result: Index, task: Task, new_input: boo
     )
 
 
-def _one_step(s: Structure, begin: State, task: Task) -> tuple[Aim, Attempt, Mask]:
+def _one_step(begin: State, task: Task) -> tuple[Aim, Attempt, Mask]:
     """One step of all lanes, and in which of them it ends at the target."""
-    levels = shared(task.target.levels)
+    s, levels = task.s, shared(task.target.levels)
     clock = levels is None or not any(levels.present(s, a) for a in range(len(s.charts)))
-    aim = take_aim(s, begin, task)
-    new = attempt(s, begin, aim, task, unroll=True, in_step=clock)
-    arrives = uneventful(s, begin, aim, new, task) & (new.lands | aim.last)
+    aim = take_aim(begin, task)
+    new = attempt(begin, aim, task, unroll=True, in_step=clock)
+    arrives = uneventful(begin, aim, new, task) & (new.lands | aim.last)
     if clock:
         for x in (begin.lanes.t, aim.step):  # the same in all active lanes, as `attempt` assumed
             arrives = arrives & (x == x[namespace(x).argmax(begin.active)])
     return aim, new, arrives | ~begin.active
+
+
+def take_aim(state: State, task: Task) -> Aim:
+    """The steps of active lanes; steps of length 0 of all others."""
+    s, lanes, approach, target = task.s, state.lanes, state.approach, task.target
+    xp = namespace(lanes.t)
+    # Known times: the step is cut so that it ends on them exactly, in equal pieces.
+    due, schedule = target.time, xp.full_like(lanes.chart, -1)
+    if s.has_schedules:
+        scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time)
+        due = xp.minimum(target.time, scheduled)
+        schedule = xp.where(scheduled <= target.time, which, -1)
+    left = xp.maximum(due - lanes.t, 0.0)
+    steps = xp.where(xp.isfinite(left), left / state.h, 2.0)
+    pieces = xp.ceil(steps - SAME_TIME)
+    last = (pieces <= 1) & ~approach.on
+    step = xp.where(xp.isfinite(left), left / xp.maximum(pieces, 1.0), state.h)
+    which = xp.where(approach.on, approach.which, -1)
+    # A zero that Newton's guess places within the first step is aimed at, where the way is known.
+    value, rate = state.watched
+    lead = task.stride.lead
+    guess = value / xp.where(rate < 0, -rate, xp.inf)
+    guess = put(guess, -1, guess[-1] * xp.where(state.i == 0, lead, 1.0))
+    level = np.arange(len(value))[:, None] == len(s.transitions)
+    new = (state.i == 0) | (lanes.pace[0] == 0)  # at the start, or right after an event
+    within = guess <= xp.where(level, 1.0, _AIM_WITHIN) * step
+    expected = state.ready & (guess > 0) & within & (level | new) & ~approach.on & (lead > 0)
+    guess = xp.where(expected, guess, xp.inf)
+    nearest = xp.min(guess, axis=0)
+    lands = xp.isfinite(nearest)
+    step = xp.where(lands, nearest, step)
+    which = xp.where(lands, xp.argmin(guess, axis=0).astype(xp.int32), which)
+    last = last & ~lands & state.active
+    step = xp.where(state.active, xp.where(approach.on, approach.tau, step), 0.0)
+    reach = xp.where(approach.on, approach.reach, step)
+    return Aim(which, step, reach, due, xp.where(last, schedule, -1), last)
+
+
+def initial_step(s: Structure, lanes: Lanes, u: Inputs, span: Times, settings: Settings) -> Times:
+    """A cautious first step: a part of the time in which the state changes by its size."""
+
+    def work(a, here, out):
+        q = only(here, lanes.q[: s.dims[a]])
+        f = chart_field(s, a, only(here, u))(only(here, lanes.t), q)
+        scaled = settings.scale is not None
+        rates = xp.abs(f) / (size(settings, a, q) if scaled else xp.abs(q))
+        rate = xp.max(xp.where(xp.isfinite(rates), rates, 0.0), axis=0, initial=0.0)
+        time = xp.where(rate > 0, 1 / rate, xp.inf)
+        part = _FIRST_STEP * (rtol / 1e-2) ** (1 / 7)
+        first = xp.minimum(part * time, _FIRST_STEP_OF_SPAN * span)
+        first = first if scaled else xp.maximum(first, _SHORTEST * span)
+        return xp.where(here, first, out)
+
+    assert settings.rtol is not None
+    xp, rtol = namespace(lanes.t), settings.rtol
+    everywhere = xp.ones(lanes.t.shape[0], bool)
+    return for_each_chart(s, lanes.chart, everywhere, work, _FIRST_STEP_OF_SPAN * span)

@@ -6,9 +6,11 @@ from jaxtyping import Bool, Float, Int
 
 from ..._core.executor import namespace
 from ..._core.results import Result
+from ...systems.structure import Structure
 from ..arrays import Array, Index, Inputs, Mask, Padded, Times
 from ..lanes import Lanes
 from ..settings import Settings
+from ..tape import Tape
 from ..target import Target
 from ..watch import Watch
 
@@ -25,9 +27,44 @@ class Stride(NamedTuple):
     """A step's error estimate may be this many times the tolerance."""
 
 
+class Options(NamedTuple):
+    """Further results and properties of a search."""
+
+    tape: bool = False
+    """Record a tape."""
+    glide: bool = False
+    """Try one step of all lanes first: if it ends at the target in all of them, the loop is
+    skipped."""
+    new_input: bool = True
+    """Arm the guards for the input u, which may have jumped; otherwise they stay as they are."""
+    tangents: Bool[Array, ""] | bool = False
+    """Make steps also short enough for the derivatives of a replay."""
+
+
+class Moved(NamedTuple):
+    """Lanes at the end of a piece of flow."""
+
+    lanes: Lanes
+    h: Times
+    """Step size to go on with."""
+    error: Times
+    """Sum of the steps' error estimates, relative to the tolerance."""
+    result: Index
+    """`Result` codes. A lane that failed stays where it failed."""
+
+
+class Recorded(NamedTuple):
+    """Lanes at the end of a piece of flow, and the record of the way."""
+
+    moved: Moved
+    tape: Tape | None
+    """`None` if it was not requested."""
+
+
 class Task(NamedTuple):
     """The constants of a search."""
 
+    s: Structure
     u: Inputs
     """The constant input of each lane."""
     target: Target

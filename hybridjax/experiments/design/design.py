@@ -54,8 +54,8 @@ class Design(eqx.Module):
     `u[n] = sum_k a_k cos(2 pi j_k n / (N P) + phi_k)` over its own cosines k, so that
     `f_k = j_k / P` is in cycles per period of the limit cycle and all signals repeat after P
     periods. The amplitude is `a` (the paper divides it by pi). Every design that exists obeys
-    the rules of Sec. V (see `check`); the functions `multisine`, `paper_design` and
-    `single_cosine` make the usual ones, `Design.from_lines` any other.
+    the rules of Sec. V (see `check`); the functions `multisine` and `paper_design` make the usual
+    ones, `Design.from_lines` any other.
 
     **Fields:** one entry per cosine in the flat arrays, all on the host.
 
@@ -354,11 +354,7 @@ def _count(number: int | str, noun: str) -> str:
 
 
 def check_window(n_sections: int, periods: int) -> None:
-    """**Raises:** `DefinitionError` for numbers below one, and windows that no memory holds."""
-    if n_sections < 1 or periods < 1:
-        raise DefinitionError(
-            f"n_sections ({n_sections}) and periods ({periods}) must be at least 1."
-        )
+    """**Raises:** `DefinitionError` for windows that no memory holds."""
     if n_sections * periods > limits.WINDOW:
         raise DefinitionError(
             f"{n_sections} sections in {periods} periods are more samples than an experiment may "

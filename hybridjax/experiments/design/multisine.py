@@ -1,4 +1,4 @@
-"""Multisines over a band, the paper's design, single cosines; phases for a low crest factor."""
+"""Multisines over a band, the paper's design; phases for a low crest factor."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,13 +12,11 @@ from ..._core.boundary.kinds import (
     NonNegative,
     PeriodCount,
     Positive,
-    Scalar,
     SectionCount,
     Seed,
-    Vector,
 )
 from ...errors import DefinitionError
-from .design import OFF_LINE, Design, InputNames, check_window, input_names, to_lines
+from .design import OFF_LINE, Design, InputNames, check_window, input_names
 from .partition import (
     assign,
     avoid_second_order,
@@ -220,44 +218,6 @@ def paper_design(
         n_sections, periods, band, amplitude, seed,
         division=division, experiments=experiments,
     )  # fmt: skip
-
-
-@checked
-def single_cosine(
-    f: Vector | Scalar,
-    n_sections: SectionCount = 32,
-    periods: PeriodCount = 64,
-    amplitude: Positive = 0.01,
-    phase: float = 0.0,
-    *,
-    half_integers: Literal["error", "two-phase"] = "error",
-    inputs: InputNames = 1,
-) -> Design:
-    """Return one cosine per experiment (Sec. V-A), at the frequency or each of the frequencies `f`.
-
-    **Arguments:** as for `multisine`; `f` in cycles per period, a multiple of 1/periods;
-    `phase` in rad. With several inputs each frequency is applied to one after the other.
-    A multiple of 1/2 is an error, or with `half_integers="two-phase"` makes two experiments.
-
-    **Raises:** `DefinitionError` as `Design.check`.
-    """
-    names = input_names(inputs)
-    lines = to_lines(np.atleast_1d(np.asarray(f, float)), periods)
-    if not len(lines):
-        raise DefinitionError("`f` must hold one frequency or more.")
-    twice = needs_two_phases(lines, periods, n_sections) & (half_integers == "two-phase")
-    repeats = np.where(twice, 2, 1)
-    each = np.repeat(lines, repeats) / periods
-    quarter = np.concatenate([np.arange(r) * np.pi / 2 for r in repeats])
-    return Design.from_lines(
-        [[x] for _ in names for x in each],
-        amplitude,
-        [[phase + x] for _ in names for x in quarter],
-        n_sections=n_sections,
-        periods=periods,
-        channels=[[i] for i in range(len(names)) for _ in each],
-        inputs=names,
-    )
 
 
 @checked
