@@ -12,10 +12,14 @@ import sys
 import sysconfig
 import types
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
 import numpy as np
+
+from ..errors import DefinitionError
+from .executor import Definition
 
 
 # Names by which code reads values that are not named in it.
@@ -30,8 +34,28 @@ _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), rang
 _FOLDERS = tuple({sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib", "purelib", "platlib")})
 
 
-class HiddenError(Exception):
-    """Code reads values by names that it makes."""
+Thing = TypeVar("Thing")
+
+
+def current(x: Thing) -> Thing:
+    """Return a `Definition` with the digest of its code as it is now; other things as they are.
+
+    **Raises:** `DefinitionError`, as `meaning`.
+    """
+    if not isinstance(x, Definition):
+        return x
+    leaves, structure = jax.tree_util.tree_flatten(x)
+    marked = jax.tree_util.tree_unflatten(structure, leaves)
+    object.__setattr__(marked, "code_digest", code_digest(x))
+    return marked
+
+
+def code_digest(x: Definition) -> str:
+    """Return the digest of all of a definition but the values of its arrays.
+
+    **Raises:** `DefinitionError`, as `meaning`.
+    """
+    return meaning(jax.tree_util.tree_map(lambda x: None if eqx.is_array(x) else x, x))
 
 
 def meaning(*things: Any) -> str:
@@ -41,7 +65,7 @@ def meaning(*things: Any) -> str:
     Installed packages are known by the names of their functions; what users replace in them is not
     noticed, except in `hybridjax.models`.
 
-    **Raises:** `HiddenError` if code calls `eval`, `exec`, `globals` or `__import__`.
+    **Raises:** `DefinitionError` if code calls `eval`, `exec`, `globals` or `__import__`.
     """
     walk = _Walk()
     walk.visit_all(things)
@@ -120,13 +144,18 @@ class _Walk:
         """Visit what a function, and the functions written in it, read of their module."""
         names = _names(x.__code__)
         for name in names:
-            if name in x.__globals__:
+            local = f"{x.__globals__.get('__package__')}.{name}"  # imported in the function
+            value = x.__globals__.get(name, sys.modules.get(name, sys.modules.get(local)))
+            if value is not None:
                 self.note(name)
-                self.visit(value := x.__globals__[name])
+                self.visit(value)
                 if isinstance(value, types.ModuleType):
                     self._attributes(value, names)
             elif name in _HIDDEN:
-                raise HiddenError(f"`{x.__qualname__}` calls `{name}`")
+                raise DefinitionError(
+                    f"`{x.__qualname__}` calls `{name}`, so that a change of the values that it "
+                    "reads cannot be noticed: read them by their names."
+                )
 
     def _attributes(self, module: types.ModuleType, names: tuple[str, ...]) -> None:
         """Visit the attributes of a module that a function names."""
@@ -155,7 +184,10 @@ class _Walk:
                 _, arguments, *parts = x.__reduce_ex__(4)
                 state, *items = parts or [None]
                 return self.visit_all([arguments, state, *(list(y or ()) for y in items)])
-        self.visit_all((getattr(x, "__dict__", None), getattr(x, "__wrapped__", None)))
+        state = dict(getattr(x, "__dict__", {}))
+        if isinstance(x, Definition):
+            state.pop("code_digest", None)
+        self.visit_all((state, getattr(x, "__wrapped__", None)))
         slots = [vars(base).get("__slots__", ()) for base in type(x).__mro__]
         names = [y for z in slots for y in ((z,) if isinstance(z, str) else z)]
         self.visit_all(getattr(x, y, None) for y in names if y not in ("__dict__", "__weakref__"))

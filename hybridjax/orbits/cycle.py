@@ -11,6 +11,7 @@ from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Positive
 from .._core.executor import is_traced, to_host
 from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, thinned, unit_circle
+from .._core.meaning import code_digest
 from .._core.memo import remembered
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
@@ -18,6 +19,7 @@ from .._core.text import number
 from ..engine.lanes import Lanes
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
+from ..errors import DefinitionError
 from ..linear.multipliers import product_eigenvalues
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
@@ -80,7 +82,15 @@ class LimitCycle(eqx.Module):
     @property
     def structure(self) -> Structure:
         """The system by the indices of its charts and transitions. (Made anew: it holds values of
-        one trace that are invalid in the next.)"""
+        one trace that are invalid in the next.)
+
+        **Raises:** `DefinitionError` if the system's code has changed since the cycle was found.
+        """
+        if self.system.code_digest != code_digest(self.system):
+            raise DefinitionError(
+                f"the functions of {type(self.system).__name__}, or values that they read, have "
+                "changed since this limit cycle was found: find it again."
+            )
         return Structure(self.system)
 
     @property

@@ -49,7 +49,7 @@ def unit_of_parameter(system: Any, path: str) -> str:
 
 def own_fields(system: Any) -> tuple[dataclasses.Field, ...]:
     """The fields of a system or its class that its author wrote: its parameters."""
-    return tuple(x for x in dataclasses.fields(system) if x.name != "solver")
+    return tuple(x for x in dataclasses.fields(system) if x.name not in ("solver", "code_digest"))
 
 
 def _number(x: Scalar) -> Array:

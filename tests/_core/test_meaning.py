@@ -1,16 +1,11 @@
 """Whatever changes what a function computes changes its digest; what does not, leaves it."""
 
-import contextlib
-import importlib
-import os
-import subprocess
-import sys
-import textwrap
 import types
 
 import pytest
 
-from hybridjax._core.meaning import HiddenError, meaning
+from hybridjax._core.meaning import meaning
+from hybridjax.errors import DefinitionError
 
 
 # What a function computes, before and after one statement.
@@ -36,7 +31,10 @@ WAYS = {
         "import numpy as np\nK = np.array([{'k': 1}, None])\ndef f(x): return K[0]['k'] * x",
         "K[0]['k'] = 2",
     ),
-    "a deque": ("import collections\nK = collections.deque([1])\ndef f(x): return K[0]", "K[0] = 2"),
+    "a deque": (
+        "import collections\nK = collections.deque([1])\ndef f(x): return K[0]",
+        "K[0] = 2",
+    ),
     "a set": ("K = {1}\ndef f(x): return x in K", "K.add(2)"),
     "a bytearray": ("K = bytearray(2)\ndef f(x): return K[0]", "K[0] = 2"),
     "the cell of a closure": (
@@ -143,5 +141,5 @@ def test_a_change_is_noticed(way, monkeypatch):
 def test_names_that_code_makes_are_refused():
     space = {"__name__": "users_module"}
     exec("K = 1\ndef f(x): return eval('K') * x", space)
-    with pytest.raises(HiddenError, match="calls `eval`"):
+    with pytest.raises(DefinitionError, match="calls `eval`"):
         meaning(space["f"])

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from ..executor import is_tracer
+from ..meaning import current
 from ..signal import Signal
 from .values import Kind, Misfit, Text, listed, refuse_traced, show, with_article
 
@@ -38,7 +39,7 @@ class Instance(Kind):
 
     def take(self, value):
         if isinstance(value, self.cls):
-            return value
+            return current(value)
         if isinstance(value, type) and issubclass(value, self.cls):
             raise Misfit(
                 f"must be {self.allowed}, not the class itself: write {value.__name__}(...)",
