@@ -8,6 +8,8 @@ import contextlib
 import functools as ft
 import hashlib
 import inspect
+import os
+import pathlib
 import sys
 import sysconfig
 import types
@@ -24,14 +26,16 @@ from .executor import Definition
 
 # Names by which code reads values that are not named in it.
 _HIDDEN = frozenset(("eval", "exec", "globals", "__import__"))
-# Attributes of a class that do not change what its methods compute.
+# Attributes of objects that do not change what its methods compute.
 _IGNORED = frozenset(
-    "__module__ __doc__ __dict__ __weakref__ __qualname__ __annotations__ __firstlineno__ "
+    "__module__ __name__ __doc__ __dict__ __weakref__ __qualname__ __annotations__ __firstlineno__ "
     "__static_attributes__ __dataclass_fields__ __dataclass_params__ __abstractmethods__ _abc_impl "
     "__match_args__ __parameters__ __orig_bases__ __slots__ __annotate_func__".split()
 )
 _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range
-_FOLDERS = tuple({sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib", "purelib", "platlib")})
+_PACKAGE = str(pathlib.Path(__file__).parents[1])
+_MODELS = os.path.join(_PACKAGE, "models")
+_FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib", "purelib"))
 
 
 Thing = TypeVar("Thing")
@@ -132,13 +136,18 @@ class _Walk:
             self.digest.update(values.tobytes())
 
     def _function(self, x: types.FunctionType) -> None:
-        if _is_installed(x.__module__):
-            self.note(x.__module__, x.__qualname__)
+        is_installed = _is_of_package(x.__code__.co_filename)
+        if is_installed:
+            self.note(x.__code__.co_filename, x.__qualname__)
         else:
             self.visit(x.__code__)
             self._globals(x)
-        self.visit_all((x.__defaults__, x.__kwdefaults__, x.__closure__ or ()))
-        self.visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})
+        wrapped = getattr(x, "__wrapped__", None)
+        # A wrapper of a package may remember what it has been called with.
+        self.visit_all((wrapped,) if is_installed and wrapped else (x.__closure__ or ()))
+        self.visit_all((x.__defaults__, x.__kwdefaults__))
+        if not is_installed:
+            self.visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})
 
     def _globals(self, x: types.FunctionType) -> None:
         """Visit what a function, and the functions written in it, read of their module."""
@@ -160,8 +169,10 @@ class _Walk:
     def _attributes(self, module: types.ModuleType, names: tuple[str, ...]) -> None:
         """Visit the attributes of a module that a function names."""
         for name in names:
-            value = vars(module).get(name)
-            if name not in vars(module) or (_is_installed(module.__name__) and callable(value)):
+            if name not in vars(module) and name not in _lazy_names(module):
+                continue
+            value = getattr(module, name)
+            if _is_installed(module.__name__) and callable(value):
                 continue
             is_new = id(value) not in self.number
             self.note(name)
@@ -179,12 +190,13 @@ class _Walk:
         self.visit(type(x))
         if isinstance(x, Mapping):
             self.visit_all(part for item in x.items() for part in item)
-        if _is_installed(type(x).__module__) and not hasattr(x, "__wrapped__"):
+        is_wrapped = isinstance(x, eqx.Module) or hasattr(x, "__wrapped__")
+        if _is_installed(type(x).__module__) and not is_wrapped:
             with contextlib.suppress(Exception):  # whatever an object raises that cannot be pickled
                 _, arguments, *parts = x.__reduce_ex__(4)
                 state, *items = parts or [None]
                 return self.visit_all([arguments, state, *(list(y or ()) for y in items)])
-        state = dict(getattr(x, "__dict__", {}))
+        state = {k: v for k, v in sorted(getattr(x, "__dict__", {}).items()) if k not in _IGNORED}
         if isinstance(x, Definition):
             state.pop("code_digest", None)
         self.visit_all((state, getattr(x, "__wrapped__", None)))
@@ -201,13 +213,22 @@ def _names(code: types.CodeType) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*code.co_names, *words, *inner]))
 
 
+@ft.cache
+def _lazy_names(module: types.ModuleType) -> frozenset[str]:
+    """Names that a package imports when they are used."""
+    return frozenset(dir(module)) if hasattr(module, "__getattr__") else frozenset()
+
+
 def _is_installed(module: str | None) -> bool:
     name = module or "builtins"
-    return not name.startswith("hybridjax.models") and _is_package(name.partition(".")[0])
+    if name.startswith("hybridjax.models"):
+        return False
+    root = name.partition(".")[0]
+    path = getattr(sys.modules.get(root), "__file__", None)
+    return root in sys.stdlib_module_names or (path is not None and _is_of_package(path))
 
 
 @ft.cache
-def _is_package(name: str) -> bool:
-    path = getattr(sys.modules.get(name), "__file__", None)
-    known = name in sys.stdlib_module_names or name == "hybridjax"
-    return known or (name != "__main__" and path is not None and path.startswith(_FOLDERS))
+def _is_of_package(path: str) -> bool:
+    """Test whether a file belongs to Python or to a package, `hybridjax.models` excepted."""
+    return path.startswith(_FOLDERS) and not path.startswith(_MODELS)
