@@ -64,13 +64,11 @@ from .recordings.recording import Recording as Recording
 from .scale.draws import monte_carlo as monte_carlo
 from .scale.family import Points as Points
 from .scale.sweep import sweep as sweep
-from .sections.abstract import (
+from .sections.families import (
     AbstractLevels as AbstractLevels,
     AbstractSections as AbstractSections,
-    BoundSections as BoundSections,
-)
-from .sections.families import (
     ArcLength as ArcLength,
+    BoundSections as BoundSections,
     ClockPhase as ClockPhase,
     KinematicPhase as KinematicPhase,
     SectionList as SectionList,

@@ -33,8 +33,7 @@ from ..models.hoppers import VerticalHopper
 from ..orbits.crossing import Crossing
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
-from ..sections.abstract import AbstractSections
-from ..sections.families import ClockPhase, KinematicPhase
+from ..sections.families import AbstractSections, ClockPhase, KinematicPhase
 from ..sections.linearize import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections

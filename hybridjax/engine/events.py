@@ -1,35 +1,29 @@
 """Events: arming of guards, resets, schedules, and the accumulation of events (Zeno)."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.executor import cond, namespace, on_host, put, stop_gradient
+from .._core.executor import cond, namespace, put, stop_gradient
 from .._core.lanes import put_rows
 from ..systems.kinds import Kind, Member
-from ..systems.structure import Structure, stacked
+from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from . import kernels
-from .arrays import Array, Index, Inputs, Mask, Padded, States, Times
+from .arrays import Array, Index, Inputs, Mask, Padded, Times
 from .lanes import Lanes, for_each_chart, needed, only
 from .settings import ROUNDING
 from .watch import Watch
 
 
-# Parts of the time allowed.
-# An instant: shorter steps are not taken, and landings may lie beyond a step by as much. Higher:
-# lanes are given up earlier. Lower: they are given up after many useless halvings.
-INSTANT = 1e-13
-# A watched function counts as zero if its rate would have made its value in this time. Higher:
-# separate events are taken for simultaneous ones. Lower: simultaneous ones for separate ones.
-ZERO = 1e-12
-# A target's level counts once it is above the change that its rate makes in this time. Higher: a
-# level that falls right after the start is missed. Lower: one that was zero up to rounding is met.
-LEVEL_CLEAR = 1e-10
+# An instant, as a part of the time allowed: shorter steps are not taken, and a watched function
+# counts as zero if its rate would have made its value in an instant. Higher: separate events are
+# taken for simultaneous ones. Lower: simultaneous ones for separate ones.
+INSTANT = 1e-12
 # Times of a schedule are equal if they differ by less than this part of its period, and numbers of
-# steps if they differ by less than it. Higher: a piece of flow that ends shortly before an event
-# has it. Lower: an event happens twice, or a step of rounding errors is taken.
+# steps if they differ by less than it; a target's level counts once it is above the change that its
+# rate makes in this part of the time allowed. Higher: a piece of flow that ends shortly before an
+# event has it, and a level that falls right after the start is missed. Lower: an event happens
+# twice, a step of rounding errors is taken, or a level that was zero up to rounding is met.
 SAME_TIME = 1e-11
 # Events accumulate (Zeno) if this many intervals between them in a row shrink, and the sum of the
 # intervals to come (as a geometric series) is at most this part of the sum so far. Higher and
@@ -43,7 +37,7 @@ _ZENO_SLOW = 3
 def width(t: Float[Array, " #L"], span: Times, rate: Float[Array, "W L"]) -> Float[Array, "W L"]:
     """Values of watched functions that count as zero: their change in a time of rounding errors."""
     xp = namespace(rate)
-    return (ZERO * span + ROUNDING * xp.abs(t)) * xp.abs(rate)
+    return (INSTANT * span + ROUNDING * xp.abs(t)) * xp.abs(rate)
 
 
 def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
@@ -97,29 +91,15 @@ def _noise(s: Structure, lanes: Lanes, u: Inputs, mask: Mask) -> Float[Array, "G
         if not rows:
             return out
 
-        n = s.dims[a]
-        point = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
-        noise = ROUNDING * _guard_rounding(s, a, *point)
-        return put_rows(out, rows, here, noise)
+        t, q = only(here, lanes.t), only(here, lanes.q[: s.dims[a]])
+        first = xp.asarray(np.zeros(1, np.int32))
+        slopes = kernels.watched(s, a, None, t, q, only(here, u), first)[:, 1 : 2 + len(q)]
+        by_size = xp.sum(xp.abs(slopes * xp.concatenate([t[None], q])), axis=1)
+        return put_rows(out, rows, here, ROUNDING * by_size)
 
     xp = namespace(lanes.t)
     nothing = xp.zeros((len(s.transitions), lanes.t.shape[0]))
     return for_each_chart(s, lanes.chart, mask, work, nothing)
-
-
-def _guard_rounding(s: Structure, a: int, t: Times, q: States, u: Inputs) -> Float[Array, "g L"]:
-    """A bound on the change of the guards of chart a by relative changes of time and states."""
-    if on_host(t):
-        slopes = kernels.watched(s, a, None, t, q, u, np.zeros(1, np.int32))[:, 1 : 2 + len(q)]
-        return np.sum(np.abs(slopes * np.concatenate([t[None], q])), axis=1)
-    kinds = s.guard_kinds(a)
-
-    def bound(s, t, q, u):
-        guards = lambda t, q: stacked(s.guard_values(kinds, t, q, u))  # noqa: E731
-        by_t, by_q = jax.jacfwd(guards, (0, 1))(t, q)
-        return jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q)
-
-    return s.by_lane(bound)(t, q, u)
 
 
 def apply_resets(
@@ -135,11 +115,8 @@ def apply_resets(
         def work(carry, kind=kind, n=n, b=b, here=chosen, place=place):
             q, chart = carry
             xp, point = namespace(q), (only(here, t), only(here, q[:n]), only(here, u))
-            if on_host(q):
-                new = kernels.reset(s, Member(kind, place), *point, some=here)[:, 0]
-            else:
-                reset = lambda s, t, q, u, k: s.reset(Member(kind, k), t, q, u)  # noqa: E731
-                new = needed(here, s).by_lane(reset)(*needed(here, point), place)
+            system, point = needed(here, (s, point))
+            new = kernels.reset(system, Member(kind, place), *point, some=here)[:, 0]
             new = put(xp.zeros_like(q), slice(s.dims[b]), new)
             return xp.where(here, new, q), xp.where(here, b, chart)
 
@@ -157,12 +134,7 @@ def enabled(s: Structure, t: Times, q: Padded, u: Inputs, which: Index) -> Mask:
             chosen, place = _within(kind, which)
             n = s.dims[s.chart_index(transition.source)]
             point = only(chosen, t), only(chosen, q[:n]), only(chosen, u)
-            if on_host(t):
-                holds = kernels.enabled(s, Member(kind, place), *point)
-            else:
-                of = lambda s, t, q, u, k, kind=kind: s.enabled(Member(kind, k), t, q, u)  # noqa: E731
-                holds = s.by_lane(of)(*point, place)
-            out = xp.where(chosen, holds, out)
+            out = xp.where(chosen, kernels.enabled(s, Member(kind, place), *point), out)
     return out
 
 

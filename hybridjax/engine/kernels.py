@@ -1,10 +1,11 @@
 """Users' functions for code that runs on the host, each with its first derivatives.
 
-All take and return NumPy's arrays. A column of values stands before those of derivatives, by the
+`watched`, `reset` and `enabled` also take and return arrays of JAX, the others NumPy's. A column of values stands before those of derivatives, by the
 time, the n states and the inputs: (rows, 2 + n + nu, L). Where only `some` lanes are needed, the
 others are copies of one of these; one lane may stand for all.
 """
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._core.executor import on_host
 from .._core.lanes import PerLane, by_lane
 from ..systems.kinds import Kind, Member
 from ..systems.output import Output
@@ -34,9 +36,6 @@ Items = tuple[str | Output, ...]
 # points as well. Higher: single points wait for lanes that nobody needs. Lower: many points take
 # more calls.
 _MANY_POINTS, _POINTS = 16, 4
-# The program for many points is compiled from this number of lanes on. Higher: plans of experiments
-# with many sections are slow. Lower: it is compiled for few points.
-_MANY_LANES = 64
 
 
 def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
@@ -82,20 +81,31 @@ def watched(
     some: Some = None,
 ) -> Expanded:
     """The guards of chart a, and the level if it has one, with their derivatives."""
-    lanes = 1 if q.shape[-1] < _MANY_LANES else _MANY_POINTS
     static = a, s.guard_kinds(a)
+    if not on_host(q):
+        of_lanes = s.by_lane(_columns(ft.partial(_watched, *static)), levels)
+        return of_lanes(t, q, u, index)
+    # (A program for many points is worth its compilation from four calls on.)
+    lanes = 1 if q.shape[-1] < 4 * _MANY_POINTS else _MANY_POINTS
     rows = s.kernel(_watched, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
 
 def reset(s: Structure, g: Member, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
-    """The state after transitions of one kind, and its derivatives."""
-    return s.kernel(_reset, _expanded, g.kind)(t, q, u, g.place, some=some)
+    """The state after transitions of one kind, and (on the host) its derivatives."""
+    if on_host(q):
+        return s.kernel(_reset, _expanded, g.kind)(t, q, u, g.place, some=some)
+    return s.by_lane(ft.partial(_reset, g.kind))(t, q, u, g.place)[:, None]
 
 
 def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Array, " L"]:
     """Test whether the predicates of transitions of one kind hold."""
-    return s.kernel(_enabled, by_lane, g.kind)(t, q, u, g.place)
+    of_lanes = (
+        s.kernel(_enabled, by_lane, g.kind)
+        if on_host(q)
+        else s.by_lane(ft.partial(_enabled, g.kind))
+    )
+    return of_lanes(t, q, u, g.place)
 
 
 def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) -> Expanded:
@@ -160,9 +170,14 @@ def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q)
 
 def _expanded(function: Callable, *trees: Any) -> Callable:
     """Lanes of a vector function of (t, q, u) and its derivatives, as columns of one array."""
+    return by_lane(_columns(function, len(trees)), *trees)
+
+
+def _columns(function: Callable, trees: int = 2) -> Callable:
+    """A vector function of some trees and (t, q, u), and its derivatives, as columns."""
 
     def expand(*x):
-        bound, (t, q, u, *further) = x[: len(trees)], x[len(trees) :]
+        bound, (t, q, u, *further) = x[:trees], x[trees:]
         n, m = q.shape[0], 1 + q.shape[0] + u.shape[0]
         at = lambda t, q, u: function(*bound, t, q, u, *further)  # noqa: E731
         split = lambda x: (x[0], x[1 : 1 + n], x[1 + n :])  # noqa: E731
@@ -170,7 +185,7 @@ def _expanded(function: Callable, *trees: Any) -> Callable:
         value, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(m))
         return jnp.concatenate([value[:, None], columns], axis=1)
 
-    return by_lane(expand, *trees)
+    return expand
 
 
 class _ByMethod(NamedTuple):

@@ -1,6 +1,5 @@
 """Single trajectories with their events, dense enough to plot."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
@@ -14,7 +13,6 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.compilation import host_first
-from .._core.executor import namespace, put
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
@@ -26,16 +24,10 @@ from . import kernels
 from .cubic import interpolate
 from .lanes import start_lanes
 from .move import Options, move
-from .search.search import initial_step
 from .settings import SIMULATION, Settings
 from .tape import IDLE
 from .target import until
 from .watch import slopes
-
-
-# Rows of a tape that is filled in one compiled call. Higher: more memory. Lower: more calls for a
-# long trajectory.
-_ROWS = 512
 
 
 class Event(NamedTuple):
@@ -61,7 +53,7 @@ class Trajectory(eqx.Module):
     end.
     """
 
-    system: HybridSystem
+    structure: Structure
     t: Float[np.ndarray, " n"]
     chart: Int[np.ndarray, " n"]
     before: Float[np.ndarray, "n d"]
@@ -72,18 +64,19 @@ class Trajectory(eqx.Module):
     result: Result = eqx.field(static=True)
 
     @property
-    def structure(self) -> Structure:
-        """The system by the indices of its charts and transitions."""
-        return Structure(self.system)
+    def system(self) -> HybridSystem:
+        return self.structure.system
 
     @property
     def events(self) -> list[Event]:
         """The events in order of time."""
-        events, charts, transitions = [], self.system.charts(), self.system.transitions()
+        events, s = [], self.structure
         for k in np.flatnonzero(self.event >= 0):
-            tr = transitions[self.event[k]]
-            before = dict(zip(charts[tr.source].states, self.before[k].tolist(), strict=False))
-            after = dict(zip(charts[tr.target].states, self.after[k].tolist(), strict=False))
+            tr = s.transitions[self.event[k]]
+            before, after = (
+                dict(zip(s.charts[s.chart_index(name)].states, q[k].tolist(), strict=False))
+                for name, q in ((tr.source, self.before), (tr.target, self.after))
+            )
             events.append(Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after))
         return events
 
@@ -120,13 +113,13 @@ class Trajectory(eqx.Module):
         return (t, *values)
 
     def __repr__(self):
-        fired, system = self.event[self.event >= 0], self.system
-        counts = ((np.sum(fired == g), tr.name) for g, tr in enumerate(system.transitions()))
+        s, system = self.structure, self.system
+        counts = ((np.sum(self.event == g), tr.name) for g, tr in enumerate(s.transitions))
         events = ", ".join(f"{count} {name}" for count, name in counts if count) or "no events"
         span = f"t = {number(self.t[0])} to {number(self.t[-1], unit=system.time_unit)}"
         return (
             f"Trajectory({type(system).__name__}: {span}, {len(self.t) - 1} steps; {events}; "
-            f"ends in {[*system.charts()][self.chart[-1]]}: {self.result.message})"
+            f"ends in {s.names[self.chart[-1]]}: {self.result.message})"
         )
 
 
@@ -152,7 +145,8 @@ def simulate(
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are judged against the size that
         each state has in the step at hand, whatever its unit. Default: 1e-10.
-    - `max_steps`: bound on the number of steps, rounded up to a multiple of 512. Default: 100 000.
+    - `max_steps`: bound on the number of steps, rounded up to a multiple of that of the settings.
+        Default: 100 000.
     - `throw`: raise an error if the trajectory ends early. Default: True; with False, its `result`
         has the reason.
 
@@ -171,58 +165,53 @@ def simulate(
             f"chart '{chart}' has the states {', '.join(s.charts[a].states)}, so the start needs "
             f"shape ({s.dims[a]},); it has {start.state.shape}."
         )
-    settings = dataclasses.replace(settings.filled(SIMULATION), max_steps=_ROWS)
-    u, span = constant[:, None], np.array([duration], float)
-    end = np.asarray(start.time) + span
-    lanes, h = _start(s, np.array([start.time]), a, start.state, u, span, settings)
-    q = np.asarray(lanes.q).T
-    rows = [(lanes.t, q, q, lanes.chart, np.full(1, -1))]
-    steps = 0
+    settings = settings.filled(SIMULATION)
+    u, end = constant[:, None], np.asarray(start.time) + np.array([duration], float)
+    q = np.zeros((s.d, 1))
+    q[: s.dims[a], 0] = start.state
+    lanes = start_lanes(s, np.array([start.time]), np.full(1, a, np.int32), q)
+    rows, steps, h = [(lanes.t, q.T, q.T, lanes.chart, np.full(1, -1))], 0, None
     while True:
         moved, tape = _piece(s, lanes, u, end, settings, h)
         tape = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
-        used = tape.code != IDLE
-        rows.append(
-            tuple(getattr(tape, x)[used] for x in ("t", "before", "after", "chart", "code"))
-        )
-        lanes, h, steps = moved.lanes, moved.h, steps + _ROWS
+        columns = tape.t, tape.before, tape.after, tape.chart, tape.code
+        rows.append(tuple(x[tape.code != IDLE] for x in columns))
+        lanes, h, steps = moved.lanes, moved.h, steps + settings.max_steps
         result = Result(int(np.asarray(moved.result)[0]))
         if result != Result.STEP_LIMIT or steps >= max_steps:
             break
     t, before, after, charts, event = (np.concatenate(x) for x in zip(*rows, strict=True))
+
+    def rates(chart, q):
+        # Filled up to whole pieces, so that few lengths are compiled.
+        fill = -len(t) % settings.max_steps
+        end, chart, q = (np.concatenate([x, np.repeat(x[-1:], fill, 0)]) for x in (t, chart, q))
+        return np.asarray(_slopes(s, end, chart, q.T, u))[:, : len(t)].T
+
     source = np.concatenate([charts[:1], charts[:-1]])
-    left, right = _slopes(s, t, source, before, u), _slopes(s, t, charts, after, u)
-    trajectory = Trajectory(s.system, t, charts, before, after, left, right, event, result)
+    left, right = rates(source, before), rates(charts, after)
     if throw and result != Result.OK:
         raise ComputationError(
             f"the trajectory stopped at t = {t[-1]:.6g} in chart '{s.names[charts[-1]]}': "
             f"{result.message}. `throw=False` returns it up to there."
         )
-    return trajectory
+    return Trajectory(s, t, charts, before, after, left, right, event, result)
 
 
 def _constant_input(system: HybridSystem, input) -> np.ndarray:
     """The constant part of an input of the right shape; zero for a function of time."""
-    nu = len(system.inputs)
+    nu, value = len(system.inputs), np.asarray(0.0)
     if callable(input):
-        shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), jnp.zeros(())).shape
+        shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), value).shape
     else:
-        shape = np.shape(0.0 if input is None else input)
+        value = value if input is None else np.asarray(input, float)
+        shape = value.shape
     if shape not in ((), (nu,)):
         raise DefinitionError(
             f"the input has shape {shape}, but {type(system).__name__} has the {nu} inputs "
             f"({', '.join(system.inputs)}): give one number for each."
         )
-    value = 0.0 if input is None or callable(input) else np.asarray(input, float)
     return np.broadcast_to(value, (nu,))
-
-
-@host_first
-def _start(s, t, a, state, u, span, settings):
-    xp = namespace(t)
-    q = put(xp.zeros((s.d, 1)), (slice(len(state)), 0), state)
-    lanes = start_lanes(s, t, xp.full(1, a, xp.int32), q)
-    return lanes, initial_step(s, lanes, u, span, settings)
 
 
 @host_first
@@ -230,13 +219,4 @@ def _piece(s, lanes, u, end, settings, h):
     return move(s, lanes, u, until(end), settings, h, options=Options(tape=True))
 
 
-def _slopes(s: Structure, t, chart, q, u) -> np.ndarray:
-    """Fields at states (n, d). Filled up to whole pieces, so that few lengths are compiled."""
-    n = t.shape[0]
-    filled = (np.concatenate([x, np.repeat(x[-1:], -n % _ROWS, 0)]) for x in (t, chart, q))
-    return np.asarray(_fields(s, *filled, u))[:, :n].T
-
-
-@host_first
-def _fields(s, t, chart, q, u):
-    return slopes(s, t, chart, q.T, namespace(u).broadcast_to(u, (s.nu, t.shape[0])))
+_slopes = host_first(slopes)

@@ -14,7 +14,7 @@ from ..engine.lanes import Lanes
 from ..engine.move import Options, move
 from ..engine.settings import Settings
 from ..errors import DefinitionError
-from ..sections.abstract import BoundSections
+from ..sections.families import BoundSections
 from ..sections.placed import PlacedSections, observe, section_target
 from ..systems.output import Output
 from ..systems.structure import Structure

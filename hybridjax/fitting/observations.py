@@ -25,8 +25,7 @@ from ..experiments.response_function import response_function
 from ..identify.htf_errors import check_values, error_weights
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
-from ..sections.abstract import AbstractSections
-from ..sections.families import FamilyLike, as_family
+from ..sections.families import AbstractSections, FamilyLike, as_family
 from ..sections.linearize import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections

@@ -91,7 +91,7 @@ class LimitCycle(eqx.Module):
                 f"the functions of {type(self.system).__name__}, or values that they read, have "
                 "changed since this limit cycle was found: find it again."
             )
-        return Structure(self.system)
+        return self.return_map.structure
 
     @property
     def scale(self) -> dict[str, float]:

@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Positive
 from .._core.boundary.values import Number
 from .._core.text import listed
 from ..errors import DefinitionError
@@ -57,6 +56,7 @@ class ImpulseResponses(eqx.Module):
 
 
 ResponseCycles = Annotated[float, Number("a number above 0, up to 10000", above=0, high=1e4)]
+PushWidth = Annotated[float, Number("a number above 0, up to 1000", above=0, high=1e3)]
 
 
 @checked
@@ -65,7 +65,7 @@ def impulse_responses(
     data: SectionData,
     cycles: ResponseCycles | None = None,
     *,
-    width: Positive | None = None,
+    width: PushWidth | None = None,
 ) -> ImpulseResponses:
     """Return the responses of a fit to a push at each phase, with standard errors.
 

@@ -63,10 +63,10 @@ def linearize(
         z.require(int(a))
     names, columns = inputs_of(s, inputs)
     if traced or is_inside_program():
-        A, B = _section_jacobians(placed)
+        A, B = _section_jacobians(s, placed)
     else:
         with at_ease():
-            A, B = _section_jacobians(to_host(placed))
+            A, B = _section_jacobians(s, to_host(placed))
     C, D = _output_jacobians(placed, tuple(z.items))
     d = s.d + 1
     if not traced:
@@ -92,7 +92,7 @@ def inputs_of(
 
 
 def _section_jacobians(
-    placed: PlacedSections,
+    s: Structure, placed: PlacedSections
 ) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
     """A and B, padded; NaN if the flow failed.
 
@@ -103,9 +103,7 @@ def _section_jacobians(
     across = None
     if on_host(placed.lanes.t) and not placed.cycle.clocked and np.isinf(placed.bound.time).all():
         across = placed.cycle.settings.scale
-    jacobian, _ = tape_jacobian(
-        placed.structure(), placed.lanes, target, placed.tape, across=across
-    )
+    jacobian, _ = tape_jacobian(s, placed.lanes, target, placed.tape, across=across)
     xp = namespace(jacobian)
     jacobian = xp.where((placed.result == Result.OK)[:, None, None], jacobian, xp.nan)
     embed, select = placed.frames()

@@ -2,7 +2,6 @@
 
 import collections
 import dataclasses
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,19 +19,17 @@ from ..engine import kernels
 from ..engine.cubic import interpolate
 from ..engine.lanes import Lanes, for_each_chart, only
 from ..engine.move import Options, move
-from ..engine.tape import IDLE, Tape
+from ..engine.tape import IDLE
 from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
 from ..orbits.coincidence import SAME, TOGETHER
 from ..orbits.crossing import Crossing, to_section
 from ..orbits.cycle import LimitCycle
-from ..orbits.return_map import PATIENCE
+from ..orbits.return_map import PATIENCE, ReturnMap
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem
-from .abstract import AbstractSections, BoundSections, Orbit
-from .families import FamilyLike, as_family
-from .placed import GRACE, PlacedSections, SectionsLike
+from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
+from .placed import PlacedSections, SectionsLike
 
 
 # Parts of every step of the flow in which further crossings of a section are sought. Fewer: two
@@ -64,12 +61,14 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     for placed in list(_recent):
         if placed.cycle is cycle and placed.family is family:
             return placed
-    family.check(cycle.structure)
-    placed, first = _place(cycle, family)
+    map = cycle.return_map
+    family.check(map.structure)
+    steps = max(map.settings.max_steps, PATIENCE)
+    map = dataclasses.replace(map, settings=dataclasses.replace(map.settings, max_steps=steps))
+    first, fields = _place(map, family)
+    placed = PlacedSections(cycle, family, *fields)
     if not is_traced((cycle, family)):
         _check(placed, int(first))
-        # The program has copied its arguments.
-        placed = dataclasses.replace(placed, cycle=cycle, family=family)
         _recent.append(placed)
     return placed
 
@@ -96,97 +95,72 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
     return sections
 
 
-class _Arrivals(NamedTuple):
-    """Arrivals at N sections, one after the other, and the recorded steps to each."""
-
-    lanes: Lanes
-    result: Int[Array, "N 1"]
-    tape: Tape
-
-
 @host_first
-def _place(cycle: LimitCycle, family: AbstractSections) -> tuple[PlacedSections, Int[Array, ""]]:
-    """The sections on the cycle, and the `Result` of the flow to section 0, which lies at the
-    anchor if that is a crossing."""
-    s, xp = cycle.structure, namespace(cycle.period)
-    N, period = family.n_sections, cycle.period
-    settings = dataclasses.replace(
-        cycle.settings, max_steps=max(cycle.settings.max_steps, PATIENCE)
-    )
+def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tuple]:
+    """The `Result` of the flow to section 0, which lies at the anchor if that is a crossing, and
+    the fields of `PlacedSections` from `bound` on."""
+    s, N = Structure(map.system), family.n_sections
+    period, begin, xp = map.expected, map.anchor, namespace(map.expected)
+    u = xp.zeros((s.nu, 1))
 
-    def go(lanes, h, result, target):
-        u = xp.zeros((s.nu, 1))
-        return move(s, lanes, u, target, settings, h, result, Options(tape=True, tangents=True))
-
-    def to(lanes, h, result, time, i, event, levels):
-        ends = time[None], i[None], event[None], lanes.t + (1 + GRACE) * period
-        return go(lanes, h, result, Target(*ends, None, levels, Result.SECTION_MISSED))
-
-    begin = cycle.anchor, (0.1 * period / N)[None], xp.zeros(1, xp.int32)
-    zero = xp.zeros(1, xp.int32)[0]
-    if isinstance(family.anchor, Crossing):
-        target = toward(xp.full(1, np.inf), -1, cycle.anchor.t + (1 + GRACE) * period)
-        first, _ = go(*begin, to_section(target, family.anchor))
-        bound = _bind(s, cycle, family, first.lanes, go)
-    else:
-        bound = _bind(s, cycle, family, cycle.anchor, go)
-        first, _ = to(*begin, bound.time[0], zero, bound.event[0], bound.levels)
-
-    def next_section(carry, k):
-        i = k % N
-        time = bound.time[i] + (k // N) * period
+    def go(carry, target):
         lanes, h, result = carry
-        moved, tape = to(lanes, h, result, time, i, bound.event[i], bound.levels)
-        assert tape is not None
-        return (moved.lanes, moved.h, moved.result), _Arrivals(moved.lanes, moved.result, tape)
+        options = Options(tape=True, tangents=True)
+        moved, tape = move(s, lanes, u, target, map.settings, h, result, options)
+        return (moved.lanes, moved.h, moved.result), tape
 
-    carry = first.lanes, first.h, first.result
-    _, arrivals = scan(next_section, carry, xp.arange(1, N + 1))
-    # From an axis of sections and one of a single lane to one of lanes.
-    arrivals = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), arrivals)
-    lanes = jax.tree_util.tree_map(
-        lambda x, y: xp.concatenate([x, y[..., :-1]], axis=-1), first.lanes, arrivals.lanes
-    )
+    def to_next(carry, k):
+        i, lanes = k % N, carry[0]
+        ends = (bound.time[i] + (k // N) * period)[None], i[None], bound.event[i][None]
+        limit = lanes.t + 1.5 * period
+        target = Target(*ends, limit, None, bound.levels, Result.SECTION_MISSED)
+        carry, tape = go(carry, target)
+        return carry, (lanes, carry[0].t, carry[2], tape)
+
+    carry = begin, (0.1 * period / N)[None], xp.zeros(1, xp.int32)
+    if isinstance(family.anchor, Crossing):
+        target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
+        carry, _ = go(carry, to_section(target, family.anchor))
+        bound = _bind(s, map, family, carry[0], go)
+    else:
+        bound = _bind(s, map, family, begin, go)
+        carry, _ = to_next(carry, xp.arange(1)[0])
+    first = carry[2][0]
+    _, flows = scan(to_next, carry, xp.arange(1, N + 1))
+    lanes, end, result, tape = _side_by_side(flows)
     normal = _normals(s, bound, lanes)
     f = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
     share = xp.abs(normal.T * xp.concatenate([xp.ones((1, N)), f]))
     flat = xp.max(share, axis=0) == 0
-    with_time = xp.isinf(bound.time) & cycle.clocked
-    placed = PlacedSections(
-        cycle=cycle,
-        family=family,
-        bound=bound,
-        lanes=lanes,
-        tape=arrivals.tape,
-        duration=arrivals.lanes.t - lanes.t,
-        result=arrivals.result,
-        drop=xp.where(flat, -1, xp.argmax(share, axis=0)),
-        dims=xp.asarray(s.dims)[lanes.chart] + with_time - ~flat,
-        normal=normal,
-    )
-    return placed, first.result[0]
+    drop = xp.where(flat, -1, xp.argmax(share, axis=0))
+    with_time = xp.isinf(bound.time) & (map.base is None)
+    dims = xp.asarray(s.dims)[lanes.chart] + with_time - ~flat
+    return first, (bound, lanes, tape, end - lanes.t, result, drop, dims, normal)
+
+
+def _side_by_side(tree):
+    """An axis of pieces of the flow of a single lane, as one of lanes."""
+    return jax.tree_util.tree_map(lambda x: namespace(x).moveaxis(x[..., 0], 0, -1), tree)
 
 
 def _bind(
-    s: Structure, cycle: LimitCycle, family: AbstractSections, anchor: Lanes, go
+    s: Structure, map: ReturnMap, family: AbstractSections, anchor: Lanes, go
 ) -> BoundSections:
     """The family evaluated on the cycle; clock sections in the period that begins at the anchor."""
-    period, t, xp, M = cycle.period, anchor.t[0], namespace(cycle.period), family.points
+    period, t, M = map.expected, anchor.t[0], family.points
+    xp = namespace(period)
 
     def later(carry, k):
-        moved, _ = go(*carry, toward(anchor.t + period * k / M, -1, anchor.t + 2 * period))
-        return (moved.lanes, moved.h, moved.result), moved.lanes
+        target = toward(anchor.t + period * k / M, -1, anchor.t + 2 * period)
+        return go(carry, target)[0], carry[0]
 
     lanes = anchor
     if M > 1:
         carry = anchor, (0.1 * period / M)[None], xp.zeros(1, xp.int32)
-        _, points = scan(later, carry, xp.arange(1, M))
-        points = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), points)
-        lanes = jax.tree_util.tree_map(lambda *x: xp.concatenate(x, axis=-1), anchor, points)
-    f = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, M)))
-    orbit = Orbit(period, lanes.t, lanes.chart, lanes.q.T, f.T)
+        lanes = _side_by_side(scan(later, carry, xp.arange(1, M + 1))[1])
+    orbit = Orbit(period, lanes.t, lanes.chart, lanes.q.T)
     if on_host(period):
-        bound = to_host(_bind_program(cycle.system, family, orbit))
+        bound = to_host(_bind_program(map, family, orbit))
     else:
         bound = family.bind(s, orbit)
     late = xp.ceil((t - bound.time[0]) / period - TOGETHER)
@@ -195,8 +169,8 @@ def _bind(
 
 
 @quick_jit
-def _bind_program(system: HybridSystem, family: AbstractSections, orbit: Orbit) -> BoundSections:
-    return family.bind(Structure(system), orbit)
+def _bind_program(map: ReturnMap, family: AbstractSections, orbit: Orbit) -> BoundSections:
+    return family.bind(map.structure, orbit)
 
 
 def _normals(s: Structure, bound: BoundSections, lanes: Lanes) -> Float[Array, "N n"]:

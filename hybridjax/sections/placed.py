@@ -19,13 +19,7 @@ from ..engine.target import Target
 from ..orbits.cycle import LimitCycle, orbit_picture
 from ..systems.output import Output, OutputNames
 from ..systems.structure import Outputs, Structure
-from .abstract import AbstractSections, BoundSections
-from .families import FamilyLike
-
-
-# Periods after the arrival of the cycle itself at which a flow to a section gives up. Smaller: late
-# arrivals are lost. Larger: failures take longer.
-GRACE = 0.5
+from .families import AbstractSections, BoundSections, FamilyLike
 
 
 @checked_methods
@@ -168,10 +162,11 @@ def section_target(
     t: Float[Array, " L"],
     turns: Int[Array, " #L"],
 ) -> Target:
-    """The target of lanes that flow to section i, `turns` periods after the first turn."""
+    """The target of lanes that flow to section i, `turns` periods after the first turn. They may
+    arrive half a period after the cycle itself."""
     xp, arrival = namespace(t), lanes.t[i] + turns * period
     time = xp.broadcast_to(bound.time[i] + turns * period, t.shape)
-    limit = xp.maximum(arrival, t) + GRACE * period
+    limit = xp.maximum(arrival, t) + 0.5 * period
     return Target(time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED)
 
 

@@ -1,6 +1,7 @@
 """A chart: one mode of a hybrid system, with its own states and its own vector field."""
 
 import abc
+import operator
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -82,3 +83,17 @@ class FieldChart(Chart):
 
     def field(self, t, q, u):
         return self.function(t, q, u)
+
+
+def attribute_of(part: str, name: str) -> Any:
+    """A property that is an attribute of a part of the object."""
+    return property(operator.attrgetter(f"{part}.{name}"))
+
+
+class DerivedChart(Chart):
+    """A chart made of another one, of which it has all that it does not define anew."""
+
+    chart: Chart
+    states, units = attribute_of("chart", "states"), attribute_of("chart", "units")
+    inputs, absent = attribute_of("chart", "inputs"), attribute_of("chart", "absent")
+    solver = attribute_of("chart", "solver")

@@ -12,7 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
 from .._core.executor import is_traced
 from ..errors import DefinitionError
-from .chart import Chart
+from .chart import DerivedChart
 from .output import Output
 from .structure import as_vector
 from .system import Derived, Guess, HybridSystem
@@ -233,10 +233,9 @@ class Quotient(Derived):
         return q[np.array(order)] * np.array([-1.0 if x in self.flipped else 1.0 for x in names])
 
 
-class _Reduced(Chart):
+class _Reduced(DerivedChart):
     """A chart without the states of a translation."""
 
-    chart: Chart
     translation: Sequence[str] = eqx.field(static=True)
 
     @property
@@ -250,18 +249,6 @@ class _Reduced(Chart):
     @property
     def units(self) -> tuple[str, ...]:  # type: ignore[override]
         return tuple(self.chart.units[k] for k in self.kept) if self.chart.units else ()
-
-    @property
-    def inputs(self) -> tuple[str, ...] | None:  # type: ignore[override]
-        return self.chart.inputs
-
-    @property
-    def solver(self) -> Any:  # type: ignore[override]
-        return self.chart.solver
-
-    @property
-    def absent(self) -> Mapping[str, float]:  # type: ignore[override]
-        return self.chart.absent
 
     def full(self, q, shift=0.0):
         """The state of the whole chart, translated by a shift."""

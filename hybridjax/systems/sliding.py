@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
-from .chart import Chart
+from .chart import Chart, DerivedChart
 from .structure import as_vector
 from .transition import Direction, Transition
 
@@ -91,31 +91,14 @@ def sliding(
     return Sliding({**charts, name: middle}, transitions)
 
 
-class _Slides(Chart):
-    """Motion along the surface."""
+class _Slides(DerivedChart):
+    """Motion along the surface, above which is the `chart`."""
 
-    above: Chart
     below: Chart
     surface: Callable[[Any, Any], Any]
 
-    @property
-    def states(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.above.states
-
-    @property
-    def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.above.units
-
-    @property
-    def inputs(self) -> tuple[str, ...] | None:  # type: ignore[override]
-        return self.above.inputs
-
-    @property
-    def absent(self) -> Mapping[str, float]:  # type: ignore[override]
-        return self.above.absent
-
     def fields(self, t, q, u):
-        return [as_vector(chart.field(t, q, u)) for chart in (self.above, self.below)]
+        return [as_vector(chart.field(t, q, u)) for chart in (self.chart, self.below)]
 
     def rates(self, t, q, u):
         """Those of the surface's function in both fields."""

@@ -14,7 +14,7 @@ from .._core.boundary.kinds import Scalar, Vector
 from .._core.executor import Definition
 from .._core.precision import real
 from .._core.text import columns, fields, value
-from .chart import Chart
+from .chart import Chart, attribute_of
 from .output import Output
 from .solver import ByChart, Method, Solver, solvers
 from .transition import Transition
@@ -160,17 +160,8 @@ class Derived(HybridSystem):
 
     system: HybridSystem
 
-    @property
-    def inputs(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.system.inputs
-
-    @property
-    def input_units(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.system.input_units
-
-    @property
-    def time_unit(self) -> str:  # type: ignore[override]
-        return self.system.time_unit
+    inputs, time_unit = attribute_of("system", "inputs"), attribute_of("system", "time_unit")
+    input_units = attribute_of("system", "input_units")
 
     def charts(self):
         return self.system.charts()

@@ -200,13 +200,13 @@ def simulate_beats(
 
     **Returns:** a `Recording` with S trials, the input `u` and the events `beat`.
 
-    **Raises:** `DefinitionError` for a curve without values, not as many rhythms as trials, or a
-    rhythm above the `rate` of the force.
+    **Raises:** `DefinitionError` for a curve or a force without values, not as many rhythms as
+    trials, or a rhythm above the `rate` of the force.
     """
     force, table = np.asarray(force, float), np.asarray(curve, float)
     (S, m), n = force.shape, len(table)
-    if not n:
-        raise DefinitionError("`curve` needs at least one value.")
+    if not n or not S:
+        raise DefinitionError("`curve` and `force` need at least one value.")
     if np.size(rhythm) not in (1, S) or np.max(rhythm) > rate:
         raise DefinitionError(f"`rhythm` must be one number or {S}, none above `rate`.")
     w = np.broadcast_to(np.asarray(rhythm, float), S)

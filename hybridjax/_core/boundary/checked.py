@@ -99,53 +99,44 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
 
 
 class _Kinds:
-    """What a function's parameters may be, found out at its first call, when all names that its
-    annotations use are known."""
+    """The kinds of a function's parameters, determined at its first call, when all names that its
+    annotations use exist."""
 
     def __init__(self, function: Callable, cls: type | None):
         self.function, self.cls = function, cls
 
+    def hints(self) -> dict[str, Any]:
+        where = vars(sys.modules[self.cls.__module__]) if self.cls else None
+        return typing.get_type_hints(self.function, where, include_extras=True)
+
     @functools.cached_property
     def by_name(self) -> dict[str, Kind | None]:
         """Kinds of all parameters that can be given by name."""
-        where = vars(sys.modules[self.cls.__module__]) if self.cls else None
-        hints = typing.get_type_hints(self.function, where, include_extras=True)
-        kinds = {}
-        for name, parameter in inspect.signature(self.function).parameters.items():
-            hint = hints.get(name, Any)
-            if parameter.kind is not parameter.VAR_KEYWORD:
-                kinds[name] = kind_of(hint)
-            elif typing.get_origin(hint) is typing.Unpack:
-                options = typing.get_type_hints(typing.get_args(hint)[0], include_extras=True)
-                kinds |= {option: kind_of(hint) for option, hint in options.items()}
-        return kinds
+        hints, parameters = self.hints(), inspect.signature(self.function).parameters.values()
+        named = (p.name for p in parameters if p.kind is not p.VAR_KEYWORD)
+        return {name: kind_of(hints.get(name, Any)) for name in named}
 
     @functools.cached_property
-    def in_order(self) -> tuple[tuple[str, Kind | None], ...]:
-        """Names and kinds of those that can be given by position."""
+    def in_order(self) -> tuple[list[tuple[str, Kind | None]], tuple[str, Kind | None]]:
+        """Names and kinds of those that can be given by position, and of all further ones
+        (`*args`)."""
         parameters = inspect.signature(self.function).parameters.values()
-        positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        return tuple((p.name, self.by_name[p.name]) for p in parameters if p.kind in positional)
-
-    @functools.cached_property
-    def variadic(self) -> tuple[str, Kind | None]:
-        """Name and kind of all further ones: `*args`."""
-        for parameter in inspect.signature(self.function).parameters.values():
-            if parameter.kind is parameter.VAR_POSITIONAL:
-                return parameter.name, self.by_name[parameter.name]
-        return "", None
+        further = [p.name for p in parameters if p.kind is p.VAR_POSITIONAL]
+        by_name = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+        positional = [p.name for p in parameters if p.kind not in by_name and p.name not in further]
+        name = further[0] if further else ""
+        return [(x, self.by_name[x]) for x in positional], (name, self.by_name.get(name))
 
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:
         """The arguments in the form in which the function gets them.
 
         **Raises:** `Misfit` for the first that does not fit.
         """
+        positional, further = self.in_order
         taken, name = [], ""
         try:
-            for (name, kind), value in zip(self.in_order, args, strict=False):  # noqa: B007
-                taken.append(value if kind is None else kind.take(value))
-            for value in args[len(taken) :]:
-                name, kind = self.variadic
+            for k, value in enumerate(args):
+                name, kind = positional[k] if k < len(positional) else further
                 taken.append(value if kind is None else kind.take(value))
             for name, value in kwargs.items():
                 kind = self.by_name.get(name)
@@ -156,16 +147,11 @@ class _Kinds:
 
 
 class _Fields(_Kinds):
-    """What fields with converters may be."""
+    """The kinds of fields with converters."""
 
-    @functools.cached_property
-    def by_name(self) -> dict[str, Kind | None]:
-        hints = self.function.__annotations__
-        kinds = dict.fromkeys(inspect.signature(self.function).parameters)
-        annotated = {
-            name: kind_of(x) for name, x in hints.items() if typing.get_origin(x) is Annotated
-        }
-        return kinds | annotated
+    def hints(self) -> dict[str, Any]:
+        hints = self.function.__annotations__.items()
+        return {name: x for name, x in hints if typing.get_origin(x) is Annotated}
 
 
 _fields = Memory()

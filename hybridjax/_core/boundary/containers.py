@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import numpy as np
@@ -53,30 +53,11 @@ class Having(Kind):
     would do.)"""
 
     def __init__(self, protocol: type):
-        self.names = sorted(set(vars(protocol)) - _OF_EVERY_PROTOCOL)
+        self.names = sorted(name for name in vars(protocol) if not name.startswith("_"))
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
     def fits(self, value):
         return all(inspect.getattr_static(value, name, self) is not self for name in self.names)
-
-
-@runtime_checkable
-class _Empty(Protocol):
-    pass
-
-
-_OF_EVERY_PROTOCOL = set(vars(_Empty))
-
-
-class Subclass(Kind):
-    """A class derived from another one."""
-
-    def __init__(self, cls: type):
-        self.cls = cls
-        self.allowed = f"a class derived from {cls.__name__}"
-
-    def fits(self, value):
-        return isinstance(value, type) and issubclass(value, self.cls)
 
 
 class Function(Kind):
@@ -220,21 +201,18 @@ class Stream(Kind):
             return Items(self.item).take(value)
         if isinstance(value, np.ndarray | jax.Array | Mapping) or not isinstance(value, Iterable):
             raise self.refused(value)
-        once = iter(value) is value
-        return self.checked(value) if once else _Again(self, value)
-
-    def checked(self, value: Iterable) -> Iterator[Any]:
-        for i, item in enumerate(value):
-            if not isinstance(item, self.item.cls):
-                raise self.item.refused(item).inside(i).of(self.argument)
-            yield item
+        return _Checked(self, value)
 
 
-class _Again:
-    """What can be iterated over more than once, checked each time."""
+class _Checked:
+    """An iterable whose items are checked each time that it is iterated over."""
 
     def __init__(self, stream: Stream, value: Iterable):
         self._stream, self._value = stream, value
 
     def __iter__(self) -> Iterator[Any]:
-        return self._stream.checked(self._value)
+        item = self._stream.item
+        for i, x in enumerate(self._value):
+            if not isinstance(x, item.cls):
+                raise item.refused(x).inside(i).of(self._stream.argument)
+            yield x

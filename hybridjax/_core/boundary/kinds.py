@@ -9,7 +9,7 @@ import os
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ import numpy as np
 
 from .. import limits
 from ..arguments import Numbers
-from .containers import Either, Function, Having, Instance, Items, Names, Subclass, Table, Tuple
+from .containers import Either, Function, Having, Instance, Items, Names, Table, Tuple
 from .values import (
     Complexes,
     ComplexNumber,
@@ -120,10 +120,6 @@ def kind_of(hint: Any) -> Kind | None:
         return Items(kind_of(arguments[0]) if arguments else None, **_SEQUENCES[container])
     if container in _MAPPINGS:
         return Table(*map(kind_of, arguments)) if arguments else Table(None, None)
-    if origin is type:
-        return Subclass(arguments[0])
-    if isinstance(hint, TypeVar):
-        return None if hint.__bound__ is None else kind_of(hint.__bound__)
     if isinstance(container, type):
         return _of_class(container)
     raise TypeError(f"there is no kind for the annotation {hint}.")

@@ -144,7 +144,7 @@ class Whole(Kind):
 class Number(Kind):
     """A finite real number between bounds, as a Python `float`: numbers of Python and NumPy, arrays
     of one number without axes; no bools, strings and complex numbers. With `infinite`, infinity may
-    stand for no bound; with `missing`, NaN for a value that is not known."""
+    stand for no bound."""
 
     def __init__(
         self,
@@ -155,11 +155,10 @@ class Number(Kind):
         high: int | float = math.inf,
         below: int | float = math.inf,
         infinite: bool = False,
-        missing: bool = False,
     ):
         self.allowed = allowed
         self.above, self.low, self.high, self.below = above, low, high, below
-        self.infinite, self.missing = infinite, missing
+        self.infinite = infinite
 
     def take(self, value):
         number = value
@@ -177,7 +176,7 @@ class Number(Kind):
 
     def fits(self, value):
         if not math.isfinite(value):
-            return (self.infinite and value > 0) or (self.missing and math.isnan(value))
+            return self.infinite and value > 0
         return self.low <= value <= self.high and self.above < value < self.below
 
 
@@ -261,8 +260,8 @@ class Reals(Kind):
 
     **Arguments:**
 
-    - `shape`: jaxtyping's words: `""` one number, `"N d"` two axes, `"2"` two numbers, `"... d"`
-      any axes and one more. Axes of the same name have the same length; one called "#L" has any.
+    - `shape`: words of jaxtyping: `""` one number, `"N d"` two axes, `"2"` two numbers, `"..."` any
+      axes. Axes of the same name have the same length.
     - `sign`: "positive", "nonnegative" or "any".
     - `missing`: whether NaN may stand for what is missing. `infinite`: whether infinity may stand.
     - `form`: makes arrays of one library of all: `np.asarray`, `jnp.asarray`.
@@ -283,9 +282,6 @@ class Reals(Kind):
     ):
         self.shape, self.sign = tuple(shape.split()), sign
         self.missing, self.infinite, self.form = missing, infinite, form
-        self._only_axes = all(word.isidentifier() for word in self.shape) and (
-            len(set(self.shape)) == len(self.shape)
-        )
         self.items = self.sort if sign == "any" else f"{sign} numbers"
         if self.shape == ():
             self.allowed = self.single if sign == "any" else f"a {sign} number"
@@ -331,24 +327,12 @@ class Reals(Kind):
         )
 
     def _fits(self, shape: tuple[int, ...]) -> bool:
-        words = self.shape
-        if self._only_axes:
-            return len(shape) == len(words)
-        if "..." in words:
-            first = words.index("...")
-            after = len(words) - first - 1
-            if len(shape) < first + after:
-                return False
-            words = words[:first] + words[first + 1 :]
-            shape = shape[:first] + shape[len(shape) - after :]
-        if len(words) != len(shape):
+        if self.shape == ("...",):
+            return True
+        if len(shape) != len(self.shape):
             return False
-        sizes: dict[str, int] = {}
-        for word, n in zip(words, shape, strict=True):
-            size = int(word) if word.isdecimal() else sizes.setdefault(word, n)
-            if n != size and word.isalnum():
-                return False
-        return True
+        sizes = {word: int(word) for word in self.shape if word.isdecimal()}
+        return all(n == sizes.setdefault(x, n) for x, n in zip(self.shape, shape, strict=True))
 
     def _check_values(self, array: np.ndarray | jax.Array) -> None:
         values = np.asarray(array)

@@ -5,7 +5,7 @@ from jaxtyping import Bool
 from ..._core.executor import cond, namespace, put
 from ..._core.results import Result, update_result
 from ..arrays import Array, Index, Mask, Times
-from ..events import INSTANT, LEVEL_CLEAR, apply_resets, enabled, keep_pace, rearm, width
+from ..events import INSTANT, SAME_TIME, apply_resets, enabled, keep_pace, rearm, width
 from ..lanes import Lanes
 from ..tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape
 from ..watch import Watch, watch
@@ -177,7 +177,7 @@ def _next_step(
 
 def level_counts(watched: Watch, span: Times) -> Mask:
     """Test whether the target's level is clearly positive, so that its next fall counts."""
-    return watched.value[-1] > LEVEL_CLEAR * span * abs(watched.rate[-1])
+    return watched.value[-1] > SAME_TIME * span * abs(watched.rate[-1])
 
 
 def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:
