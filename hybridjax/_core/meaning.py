@@ -22,6 +22,7 @@ import numpy as np
 
 from ..errors import DefinitionError
 from .executor import Definition
+from .memo import Memory
 
 
 # Names by which code reads values that are not named in it.
@@ -48,10 +49,18 @@ def current(x: Thing) -> Thing:
     """
     if not isinstance(x, Definition):
         return x
+    digest = code_digest(x)
+    return x if x.code_digest == digest else _marked.recall(x, digest, lambda: _mark(x, digest))
+
+
+def _mark(x: Definition, digest: str) -> Definition:
     leaves, structure = jax.tree_util.tree_flatten(x)
     marked = jax.tree_util.tree_unflatten(structure, leaves)
-    object.__setattr__(marked, "code_digest", code_digest(x))
+    object.__setattr__(marked, "code_digest", digest)
     return marked
+
+
+_marked = Memory()  # an object that is given again has the same copy, which others may remember
 
 
 def code_digest(x: Definition) -> str:

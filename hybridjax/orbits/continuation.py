@@ -114,6 +114,7 @@ def _check(cycle, values) -> np.ndarray:
             "JAX transformations, and differentiate `find_limit_cycle` at its points."
         )
     require_x64(cycle)
+    cycle.require_current()
     if int(cycle.result) != Result.OK:
         raise DefinitionError(
             f"the cycle to follow was not found: {Result(int(cycle.result)).message}."

@@ -73,24 +73,29 @@ class LimitCycle(eqx.Module):
 
     @property
     def return_map(self) -> ReturnMap:
-        """The map that has the cycle as a fixed point."""
+        """The map that has the cycle as a fixed point.
+
+        **Raises:** `DefinitionError` if the system's code has changed since the cycle was found.
+        """
+        self.require_current()
         return ReturnMap(
             self.system, self.settings, self.anchor, self.base, self.period, self.conserved,
             self.multiplicity,
         )  # fmt: skip
 
-    @property
-    def structure(self) -> Structure:
-        """The system by the indices of its charts and transitions. (Made anew: it holds values of
-        one trace that are invalid in the next.)
-
-        **Raises:** `DefinitionError` if the system's code has changed since the cycle was found.
-        """
+    def require_current(self) -> None:
+        """**Raises:** `DefinitionError` if the system's code has changed since the cycle was
+        found."""
         if self.system.code_digest != code_digest(self.system):
             raise DefinitionError(
                 f"the functions of {type(self.system).__name__}, or values that they read, have "
                 "changed since this limit cycle was found: find it again."
             )
+
+    @property
+    def structure(self) -> Structure:
+        """The system by the indices of its charts and transitions. (Made anew: it holds values of
+        one trace that are invalid in the next.)"""
         return self.return_map.structure
 
     @property

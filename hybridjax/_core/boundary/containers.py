@@ -158,7 +158,7 @@ class Names(Kind):
             raise self.refused(value)
         if not all(map(self._fits, value)) or not (len(value) or self.empty):
             raise self.refused(value)
-        given = tuple(str(x) if isinstance(x, np.str_) else x for x in value)
+        given = tuple(str(x) if isinstance(x, np.str_) else current(x) for x in value)
         names = [x for x in given if isinstance(x, str)]
         if len(set(names)) < len(names):
             raise Misfit(f"must name each only once, not {show(given)}", near=True)
