@@ -18,25 +18,17 @@ from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validate import Validation
 from .beats.response import PhaseResponse
-from .data import WHOLE_BAND, SectionData, input_band, input_spectrum
+from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import Finding, print_findings
 
 
-# Fraction of the samples of a section beyond the number of unknowns, below which strides are few.
-# Larger: long recordings are called short. Smaller: fits with next to no freedom pass.
-_FEW_LEFT_OVER = 0.25
-# Power of an input within 0.1 cycles per period of a multiplier's frequency, relative to its mean,
-# below which it is weak. Larger: colored inputs are called weak. Smaller: multipliers that the
-# input hardly excites pass.
-_WEAK_POWER = 0.02
-# Fraction of missing samples that is reported. Larger: incomplete recordings pass. Smaller: every
-# real one is reported.
-_MANY_MISSING = 0.2
+# Fraction of samples: if fewer remain beyond the number of unknowns, strides are few; if more are
+# missing, they are reported. Larger: long recordings are called short. Smaller: fits with next to
+# no freedom pass, and every gap is reported.
+_FEW = 0.25
 # Correlation of two outputs at a section that makes them redundant. Larger: nearly equal ones
 # pass. Smaller: outputs that share most of a response are reported.
 _SAME_OUTPUTS = 0.98
-# Numbers of strides for which standard errors are predicted.
-_STRIDES = (100, 300, 1000, 3000)
 
 
 class Advice(eqx.Module):
@@ -104,33 +96,28 @@ def collect_advice(
     plain = ordinary_least_squares(delayed)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
     warnings = list(findings)
-    if sampled - unknowns < _FEW_LEFT_OVER * sampled:
-        warnings.append(
-            Finding(
-                "few strides",
-                f"a section was sampled {sampled} times for {unknowns} unknowns; record more, take "
-                "fewer sections, or excite fewer inputs.",
-            )
-        )
+    if sampled - unknowns < _FEW * sampled:
+        text = f"a section was sampled {sampled} times for {unknowns} unknowns; record more, take "
+        warnings.append(Finding("few strides", f"{text}fewer sections, or excite fewer inputs."))
     try:
         refuse_order(delayed, fit.noise / problem.scale)
     except DefinitionError:
-        warnings.append(
-            Finding(
-                "order",
-                f"the data do not carry {d} multipliers. The weakest may be noise alone (or nearly "
-                "zero in truth); neither its value nor its interval then means anything.",
-            )
-        )
+        text = f"the data do not carry {d} multipliers: the weakest, and its region, may be noise."
+        warnings.append(Finding("order", text))
     band = input_band(data)
     warnings += [*_about_excitation(data, fit, band), *_about_outputs(grid, fit)]
     if bias > 2 * fit.standard_errors.max():
         values = ", ".join(f"{z:.4f}" for z in plain)
         text = f"plain regression (ARX) would give {values}, off by {bias:.2g}; do not use it here."
         warnings.append(Finding("noise", text))
-    warnings += _about_the_fit(fit)
+    for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
+        if z.imag >= 0 and abs(z) + 2 * error > 1:
+            text = f"the interval of the multiplier {z:.3g} reaches the unit circle."
+            warnings.append(Finding("stability", text))
+    if fit.result != Result.OK:
+        warnings.append(Finding("no convergence", f"{Result(fit.result).message}."))
     warnings += () if validation is None else _about_residuals(validation)
-    if data.missing > _MANY_MISSING:
+    if data.missing > _FEW:
         warnings.append(Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing."))
     for name, count in zip(data.signals, data.spikes, strict=True):
         if count:
@@ -138,45 +125,45 @@ def collect_advice(
             warnings.append(Finding("spikes", text))
     warnings += () if curve is None else curve.warnings
     # Variances decrease with the number of strides beyond that of the unknowns.
-    now = max(sampled - unknowns, 1)
-    later = np.array([max(n - (R * nu + d + 1), 0) for n in _STRIDES], float)
+    strides = (100, 300, 1000, 3000)
+    later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
     with np.errstate(divide="ignore"):
-        expected = fit.standard_errors * np.sqrt(now / later)[:, None]
-    return Advice(tuple(warnings), plain, bias, tuple(band), _STRIDES, expected)
+        expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
+    return Advice(tuple(warnings), plain, bias, tuple(band), strides, expected)
 
 
 def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> Iterator[Finding]:
     f, power = input_spectrum(data)
-    for i, name in enumerate(fit.inputs):
-        for z in fit.multipliers:
+    for name, edge, strength in zip(fit.inputs, band, power.T, strict=True):
+        for z in fit.multipliers[fit.multipliers.imag >= 0]:
             at = abs(np.angle(z)) / (2 * np.pi)
-            near = [np.abs((f - x + 0.5) % 1 - 0.5) < 0.1 for x in (at, -at)]
-            strongest = power[near[0] | near[1], i].max(initial=0)
-            if z.imag >= 0 and strongest < _WEAK_POWER * power[:, i].mean():
-                yield Finding(
-                    "weak excitation",
-                    f"{name} has next to no power at the frequencies {at:.2f} + k cycles per "
-                    f"period, where the multiplier {z:.3g} is seen.",
-                )
-    for name, edge in zip(fit.inputs, band, strict=True):
+            near = np.abs((f[:, None] - [at, -at] + 0.5) % 1 - 0.5).min(axis=1) < 0.1
+            if strength[near].max(initial=0) < LEAST_POWER * strength.max():
+                text = f"{name} has next to no power at the frequencies {at:.2f} + k cycles per "
+                text += f"period, where the multiplier {z:.3g} is seen."
+                yield Finding("weak excitation", text)
         if edge < 1:
+            text = f"{name} has power only up to {edge:.2g} cycles per period, so that responses "
             yield Finding(
-                "narrow excitation",
-                f"{name} has power only up to {edge:.2g} cycles per period, so that responses at "
-                "different phases can hardly be told apart.",
+                "narrow excitation", f"{text}at different phases can hardly be told apart."
             )
         elif edge < WHOLE_BAND * fit.n_sections / 2:
-            yield Finding(
-                "band",
+            text = (
                 f"transfer functions are determined up to f = {edge:.3g} cycles per period only, "
-                f"where the power of {name} ends.",
             )
+            yield Finding("band", f"{text}where the power of {name} ends.")
 
 
 def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
     y = np.where(grid.sampled, grid.y, np.nan)
     for i, j in combinations(range(y.shape[3]), 2):
-        if _correlation(y[..., i], y[..., j]) > _SAME_OUTPUTS:
+        both = np.stack([y[..., i], y[..., j]]).reshape(2, -1, y.shape[2])
+        both = np.where(np.isfinite(both).all(axis=0), both, np.nan)
+        count = np.maximum(np.isfinite(both[0]).sum(axis=0), 1)
+        both = np.nan_to_num(both - np.nansum(both, axis=1, keepdims=True) / count)
+        size = np.sqrt(np.prod((both**2).sum(axis=1), axis=0))
+        correlation = np.abs(np.prod(both, axis=0).sum(axis=0)) / np.maximum(size, 1e-300)
+        if np.median(correlation) > _SAME_OUTPUTS:
             yield Finding(
                 "outputs",
                 f"where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are two sides "
@@ -186,39 +173,19 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
             )
 
 
-def _correlation(x: Float[np.ndarray, "S T N"], y: Float[np.ndarray, "S T N"]) -> float:
-    """Return the median over sections of the modulus of the correlation."""
-    finite = np.isfinite(x) & np.isfinite(y)
-    both = np.where(finite, [x, y], 0.0)
-    mean = both.sum(axis=(1, 2), keepdims=True) / np.maximum(finite.sum(axis=(0, 1)), 1)
-    x, y = np.where(finite, both - mean, 0.0)
-    xy, xx, yy = ((a * b).sum(axis=(0, 1)) for a, b in ((x, y), (x, x), (y, y)))
-    return float(np.median(np.abs(xy) / np.sqrt(np.maximum(xx * yy, np.finfo(float).tiny))))
-
-
-def _about_the_fit(fit: SeriesFit) -> Iterator[Finding]:
-    for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
-        if z.imag >= 0 and abs(z) + 2 * error > 1:
-            text = f"the interval of the multiplier {z:.3g} reaches the unit circle."
-            yield Finding("stability", text)
-    if fit.result != Result.OK:
-        yield Finding("no convergence", f"{Result(fit.result).message}.")
-
-
 def _about_residuals(validation: Validation) -> Iterator[Finding]:
     if not validation.white:
         yield Finding(
             "left over",
             "residuals of the held-out strides are correlated in time "
-            f"({p_value(validation.whiteness.min())}). Smoothing does that, and so do disturbances "
-            "of the state, and standard errors allow for both; if the multipliers change with "
-            "another `bandwidth` or `order`, the model lacks something.",
+            f"({p_value(validation.whiteness.min())}), as by smoothing and disturbances of the "
+            "state, which standard errors allow for; if the multipliers change with another "
+            "`bandwidth` or `order`, the model lacks something.",
         )
     if not validation.independent:
         yield Finding(
             "left over",
             "residuals of the held-out strides depend on the input "
-            f"({p_value(validation.independence.min())}). Few strides for many coefficients do "
-            "that, and so do pushes beyond the linear range: record more, or push less; if it "
-            "remains, raise the `order`.",
+            f"({p_value(validation.independence.min())}), as with few strides or pushes beyond the "
+            "linear range: record more, or push less; if it remains, raise the `order`.",
         )

@@ -18,7 +18,7 @@ from ..experiments.record import Record, uninterrupted_records
 
 # Fraction of the largest power of an input below which it identifies nothing. Larger: bands end
 # where transfer functions are still identified. Smaller: rounding counts as power.
-_LEAST_POWER = 0.01
+LEAST_POWER = 0.01
 # Fraction of the Nyquist frequency up to which an input must have power to count as broadband.
 # Larger: every band has an edge. Smaller: responses contain frequencies that were not excited.
 WHOLE_BAND = 0.9
@@ -157,5 +157,5 @@ def input_spectrum(data: SectionData) -> tuple[Float[np.ndarray, " F"], Float[np
 def input_band(data: SectionData) -> list[float]:
     """Return the frequency (cycles per period) above which an input has next to no power."""
     f, power = input_spectrum(data)
-    strong = power > _LEAST_POWER * power.max(axis=0)
+    strong = power > LEAST_POWER * power.max(axis=0)
     return [float(f[np.flatnonzero(s)[-1]]) if s.any() else 0.0 for s in strong.T]

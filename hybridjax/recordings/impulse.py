@@ -1,10 +1,11 @@
 """Phase-dependent impulse responses: the effect of a brief push at each phase, and its duration."""
 
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy import ndimage, signal
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
@@ -96,17 +97,34 @@ def impulse_responses(
             f"`width` is {width:g} periods, too wide for responses of {cycles:g} cycles."
         )
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
-    responses = _responses(fit, max(fit.lead + lags + reach, R))
-    h, slope, root = (_pushed(x, weights / weights.sum(), lags, fit.lead) for x in responses)
-    by_numerators = (root**2).sum(axis=4) * fit.noise[:, None] ** 2
+    # Responses to inputs of one section continue by the recursion from cycle to cycle.
+    recursion = np.zeros(len(fit.coefficients) * N + 1)
+    recursion[::N] = [1.0, *fit.coefficients]
+    longest = max(fit.lead + lags + reach, R)
+
+    def pushed(x: Float[np.ndarray, "r ..."]) -> Float[np.ndarray, "lags ..."]:
+        """Return responses to a push, which begins some sections before its middle."""
+        x = np.pad(x, [(0, longest - len(x))] + [(0, 0)] * (x.ndim - 1))
+        x = signal.lfilter([1.0], recursion, x, axis=0)
+        x = ndimage.correlate1d(x, weights / weights.sum(), axis=0, mode="constant")
+        return x[fit.lead : fit.lead + lags]
+
+    h = fit.numerators.swapaxes(0, 1)
+    whole = np.pad(h, [(0, longest - R), (0, 0), (0, 0), (0, 0)])
+    whole = signal.lfilter([1.0], recursion, whole, axis=0)
+    slope = np.zeros((longest, len(fit.coefficients), *h.shape[1:]))
+    slope[:R] = fit.slopes.transpose(2, 0, 1, 3, 4)
+    for j in range(slope.shape[1]):
+        slope[(j + 1) * N :, j] -= whole[: max(longest - (j + 1) * N, 0)]
+    slope, root = pushed(slope), pushed(fit.roots.transpose(2, 0, 1, 3, 4))
     by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
-    errors = np.sqrt(by_numerators + by_coefficients)
+    errors = np.sqrt((root**2).sum(axis=4) * fit.noise[:, None] ** 2 + by_coefficients)
     step = data.period / N
     # From the section of the response to that of the push.
     m, r = np.arange(N)[:, None], np.arange(lags)
     place = (r, (m + r) % N)
     return ImpulseResponses(
-        values=h[place] / step,
+        values=pushed(h)[place] / step,
         errors=errors[place] / step,
         phase=np.arange(N) / N,
         lag=np.arange(lags) / N,
@@ -115,44 +133,3 @@ def impulse_responses(
         inputs=fit.inputs,
         outputs=fit.outputs,
     )
-
-
-class _Responses(NamedTuple):
-    """Responses to a unit input that was held for one section, r sections earlier."""
-
-    h: Float[np.ndarray, "r N ny nu"]
-    slope: Float[np.ndarray, "r d N ny nu"]
-    """Derivatives of h with respect to each coefficient of the denominator."""
-    root: Float[np.ndarray, "r N ny nu k"]
-    """Square root of the covariance of h that comes from the numerators."""
-
-
-def _responses(fit: SeriesFit, longest: int) -> _Responses:
-    """Continue the responses up to lag `longest` by the recursion from cycle to cycle."""
-    N, R, ny, nu = fit.numerators.shape
-    h = np.zeros((longest, N, ny, nu))
-    h[:R] = fit.numerators.swapaxes(0, 1)
-    slope = np.zeros((longest, len(fit.coefficients), N, ny, nu))
-    slope[:R] = fit.slopes.transpose(2, 0, 1, 3, 4)
-    root = np.zeros((longest, N, ny, nu, fit.roots.shape[4]))
-    root[:R] = fit.roots.transpose(2, 0, 1, 3, 4)
-    for r in range(N, longest):
-        for j, c in enumerate(fit.coefficients[: r // N], 1):
-            before = r - j * N
-            h[r] -= c * h[before]
-            slope[r] -= c * slope[before]
-            slope[r, j - 1] -= h[before]
-            root[r] -= c * root[before]
-    return _Responses(h, slope, root)
-
-
-def _pushed(
-    x: Float[np.ndarray, "r ..."], weights: Float[np.ndarray, " k"], lags: int, lead: int
-) -> Float[np.ndarray, "lags ..."]:
-    """Return the response to a push from those to inputs of one section: the push begins some
-    sections before its middle, and ends as many later."""
-    out, reach = np.zeros((lags, *x.shape[1:])), len(weights) // 2
-    for k, weight in zip(range(-reach, reach + 1), weights, strict=True):
-        first = max(0, k - lead)
-        out[first:] += weight * x[first - k + lead : lags - k + lead]
-    return out

@@ -219,7 +219,7 @@ def _moments(data: SectionData, order: int) -> _Moments:
         q, _ = _principal(instruments[at], instruments[at], r)
         for part, (a, b) in zip(parts, ((x, x), (z, x), (q, q), (x, q), (z, q)), strict=True):
             part[n, cycle[at]] = a[:, :, None] * b[:, None, :]
-    return _Moments(*parts, names[:, 0])
+    return _Moments._make([*parts, names[:, 0]])
 
 
 def _summed(

@@ -139,7 +139,7 @@ def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | Non
     bandwidth = bandwidth or HARMONICS * rate
     angles = []
     for time, z in samples:
-        smooth = [spline(time, x, bandwidth).values for x in z.T]
+        smooth = [spline(time, x, bandwidth)(time) for x in z.T]
         angles.append(angle_of(time, np.stack(smooth, axis=1)))
     if isinstance(anchor, Crossing):
         first = _angle_at(recording, anchor, bandwidth, angles)

@@ -9,12 +9,11 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
 from ..errors import DefinitionError, FileFormatError
-from .formats.arrays import read_hdf5, read_matlab
+from .formats.arrays import read_arrow, read_excel, read_hdf5, read_matlab, read_npz
 from .formats.bag import read_bag
 from .formats.c3d import read_c3d
 from .formats.columns import Columns, Wanted, parse_table, time_unit
 from .formats.motion import read_text
-from .formats.tables import read_arrow, read_excel, read_npz
 from .recording import Recording, check_events
 
 

@@ -237,7 +237,7 @@ class Recording(eqx.Module):
         sign = 1.0 if crossing.direction == "rising" else -1.0
         for trial, x in self.samples(signal):
             curve = spline(trial.time, without_spikes(x), bandwidth)
-            t, y = curve.time, sign * (curve.values - level)
+            t, y = curve.x, sign * (curve(curve.x) - level)
             longest = bridgeable(t, np.isfinite(t), 0.5 / bandwidth)
             at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & (np.diff(t) <= longest))
             if not len(at):

@@ -2,10 +2,10 @@
 
 from typing import Annotated
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 
 from .._core.boundary.values import Number
@@ -25,17 +25,19 @@ FEWEST = 5
 _LONGEST = 3
 # Number of neighboring samples with which a spike is compared. More: spikes where a signal is steep
 # are missed. Fewer: their median is a spike itself.
-_NEIGHBORHOOD = 9
+_NEIGHBORHOOD = 3 * _LONGEST
 # Least height of a spike in ranges of the closest half of its neighbors (for an input also of its
-# middle 98 %), and in standard deviations of the noise (or smallest steps of the signal). Larger:
-# spikes stay in. Smaller: steep parts, noise, rounding and the perturbation itself are left out.
-_RANGES, _NOISES = 3.0, 6.0
-# Spikes are isolated if there are at most `_CROWD` of them within `_NEAR` samples on either side.
-# More: ringing after an impact is taken for spikes. Fewer: independent spikes nearby stay in.
-_NEAR, _CROWD = 10, 6
+# middle 98 %; for a number that stands for no value, of all samples), and in standard deviations of
+# the noise (or smallest steps of the signal). Larger: spikes stay in. Smaller: steep parts, noise,
+# rounding and the perturbation itself are left out.
+RANGES, _NOISES = 3.0, 6.0
+# Spikes are isolated if within so many samples on either side there are no more of them than two
+# longest spikes have. Fewer: ringing after an impact is taken for spikes. More: independent spikes
+# nearby stay in.
+_NEAR = 10
 # Cubic prediction of a sample from two neighbors on either side.
 _PREDICTION = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6
-# Transients within this many cycles, with heights within a factor of `_RANGES`, are alike, and part
+# Transients within this many cycles, with heights within a factor of `RANGES`, are alike, and part
 # of the motion if they occur in half of the cycles. Larger: spikes that are near each other by
 # chance stay in. Smaller: impacts in a jittering rhythm are left out.
 _SAME_PHASE = 0.01
@@ -45,23 +47,7 @@ _SAME_PHASE = 0.01
 _SMOOTH_INPUT = 0.3
 
 
-class Spline(eqx.Module):
-    """A natural cubic spline: its values and second derivatives at the knots."""
-
-    time: Series
-    values: Series
-    curvature: Series
-
-    def __call__(self, t: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
-        h = self.time[k + 1] - self.time[k]
-        before, after = t - self.time[k], self.time[k + 1] - t
-        line = (after * self.values[k] + before * self.values[k + 1]) / h
-        bend = (1 + before / h) * self.curvature[k + 1] + (1 + after / h) * self.curvature[k]
-        return line - before * after * bend / 6
-
-
-def spline(time: Series, values: Series, bandwidth: int | float) -> Spline:
+def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     r"""Return a natural cubic spline through samples; NaN are left out.
 
     A finite bandwidth b (Hz) makes it a smoothing spline (Reinsch 1967; Green and Silverman,
@@ -88,7 +74,7 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> Spline:
     smooth = values.copy()
     for k in range(3):
         smooth[k : len(values) - 2 + k] -= weight * q[k] * curvature
-    return Spline(time, smooth, np.pad(curvature, 1) / step**2)
+    return CubicSpline(time, smooth, bc_type="natural")
 
 
 def bridgeable(time: Series, finite: Bool[np.ndarray, " n"], longest: int | float = 0.0) -> float:
@@ -160,9 +146,9 @@ def spike_heights(values: Series) -> Series:
     first = np.clip(large - half, 0, len(x) - _NEIGHBORHOOD)
     around = np.sort(x[first[:, None] + np.arange(_NEIGHBORHOOD)], axis=1)
     closest_half = (around[:, half:] - around[:, : half + 1]).min(axis=1)
-    large = large[np.abs(out[large]) > _RANGES * closest_half]
+    large = large[np.abs(out[large]) > RANGES * closest_half]
     near = np.searchsorted(large, large + _NEAR + 1) - np.searchsorted(large, large - _NEAR)
-    large = large[near <= _CROWD]
+    large = large[near <= 2 * _LONGEST]
     heights[np.flatnonzero(finite)[large]] = out[large]
     return heights
 
@@ -185,7 +171,7 @@ def recurring(
     recurs = np.zeros(len(heights), bool)
     for k in range(len(heights)):
         ratio, away = heights / heights[k], phase - phase[k]
-        alike = (ratio > 1 / _RANGES) & (ratio < _RANGES)
+        alike = (ratio > 1 / RANGES) & (ratio < RANGES)
         alike &= np.abs((away + 0.5) % 1 - 0.5) < _SAME_PHASE
         recurs[k] = len(np.unique(np.round(away[alike]))) > 0.5 * cycles
     return recurs
@@ -201,5 +187,5 @@ def input_spikes(values: Series) -> Series:
     low, high = np.quantile(usual, [0.01, 0.99])
     if high == low or noise_of(usual) > _SMOOTH_INPUT * usual.std():
         return np.zeros(len(values))
-    beyond = np.abs(values - (low + high) / 2) > _RANGES * (high - low) / 2
+    beyond = np.abs(values - (low + high) / 2) > RANGES * (high - low) / 2
     return np.where(beyond, heights, 0.0)

@@ -71,9 +71,9 @@ def test_slopes_are_derivatives(noisy):
     for k in range(5):
         moved = forecast(intervals, table, a + 1e-5 * np.eye(5)[k], rates)
         difference = (moved.duration - base.duration) / 1e-5
-        np.testing.assert_allclose(base.by_curve[:, k], difference, atol=0.02 * 0.1)
+        np.testing.assert_allclose(base.slopes[:, k], difference, atol=0.02 * 0.1)
     moved = forecast(intervals, table, a, rates + 1e-5)
-    np.testing.assert_allclose(base.by_rate, (moved.duration - base.duration) / 1e-5, atol=5e-4)
+    np.testing.assert_allclose(base.slopes[:, -1], (moved.duration - base.duration) / 1e-5, atol=5e-4)
 
 
 def test_intervals_of_all_lengths_are_no_missed_events():

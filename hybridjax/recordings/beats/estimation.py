@@ -119,7 +119,6 @@ def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
         a = fit.coefficients
         return float((fit.residual[fit.used] ** 2).sum() + a @ (fit.penalty * a))
 
-    cost = cost_of(fit)
     for _ in range(_STEPS):
         across, along = projected(intervals, fit)
         curvature = across.T @ across + np.diag(fit.penalty)
@@ -130,13 +129,12 @@ def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
             rates = np.maximum(fit.rates + faster / 2**k, fit.rates / 2)  # (never zero)
             a = fit.coefficients + step / 2**k
             new = _look(intervals, table, a, rates, fit.used, fit.smoothness)
-            if cost_of(new) < cost:
+            if cost_of(new) < cost_of(fit):
                 break
         else:
             return fit
-        settled = cost - cost_of(new) < _SETTLED * cost
-        fit, cost = new, cost_of(new)
-        if settled:
+        gain, fit = 1 - cost_of(new) / cost_of(fit), new
+        if gain < _SETTLED:
             return fit
     return fit._replace(converged=False)
 
@@ -147,18 +145,17 @@ def projected(
     """Return derivatives with respect to the coefficients, without the part that the rates of the
     trials explain (zero for miscounted intervals), and what rates explain of the residuals, and of
     these derivatives."""
-    ahead = fit.forecast
-    by_rate = ahead.by_rate * fit.used
-    square = np.maximum(intervals.sums(by_rate**2), np.finfo(float).tiny)
-    columns = np.column_stack([fit.residual, ahead.by_curve])
-    along = np.stack([intervals.sums(by_rate * x) for x in columns.T], axis=1) / square[:, None]
-    explained = ahead.by_rate[:, None] * along[intervals.trial, 1:]
-    return (ahead.by_curve - explained) * fit.used[:, None], along
+    slopes, by_rate = fit.forecast.slopes[:, :-1], fit.forecast.slopes[:, -1]
+    square = np.maximum(intervals.sums(by_rate**2 * fit.used), np.finfo(float).tiny)
+    columns = np.column_stack([fit.residual, slopes]) * (by_rate * fit.used)[:, None]
+    along = np.stack([intervals.sums(x) for x in columns.T], axis=1) / square[:, None]
+    explained = by_rate[:, None] * along[intervals.trial, 1:]
+    return (slopes - explained) * fit.used[:, None], along
 
 
 def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
     """Return the blocks whose errors count as independent."""
-    if intervals.trials >= _BLOCKS:
+    if len(intervals.names) >= _BLOCKS:
         return intervals.trial
     return intervals.blocks(max(_SHORTEST_BLOCK, len(intervals.start) // (2 * _BLOCKS)))
 
@@ -167,12 +164,12 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     """Maximize the marginal likelihood of the durations near a fit."""
     tiny = np.finfo(float).tiny
     across, along = projected(intervals, fit)
-    residual = (fit.residual - fit.forecast.by_rate * along[intervals.trial, 0]) * fit.used
+    residual = (fit.residual - fit.forecast.slopes[:, -1] * along[intervals.trial, 0]) * fit.used
     p = across.shape[1]
     curvature, pull = across.T @ across, across.T @ residual
     # Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
     noise_only = residual - across @ np.linalg.lstsq(curvature, pull)[0]
-    freedom = max(int(fit.used.sum()) - intervals.trials - p, 1)
+    freedom = max(int(fit.used.sum()) - len(intervals.names) - p, 1)
     variance = float(noise_only @ noise_only) / freedom
     block = _blocks(intervals)
     sums = np.stack([np.bincount(block, x * noise_only) for x in across.T], axis=1)
@@ -246,11 +243,10 @@ def plain_curve(intervals: Intervals, fit: CurveFit) -> Float[np.ndarray, " p"]:
     """
     waves = len(fit.coefficients) - 1
     across = np.zeros((len(intervals.start), waves + 1))
-    for rows, inputs in intervals.chunks():
-        half, duration = intervals.step[rows] / 2, intervals.duration[rows]
-        for k, u in enumerate(inputs):
-            phase = k * half / duration
-            across[rows] += (np.where(phase < 1, u, 0.0) * half)[:, None] * basis(phase, waves)
+    for k, u in enumerate(intervals.inputs):
+        phase = k * intervals.step / 2 / intervals.duration
+        acting = np.where(phase < 1, u, 0.0) * intervals.step / 2
+        across += acting[:, None] * basis(phase, waves)
     across *= (-1 / fit.rates)[intervals.trial, None] * fit.used[:, None]
     count = np.maximum(intervals.sums(1.0 * fit.used), 1.0)
     both = np.column_stack([across, intervals.duration * fit.used])

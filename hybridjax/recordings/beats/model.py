@@ -14,11 +14,10 @@ need not be the same at 0 and at 1, and of which term k is weaker by
 $\exp(-\pi^2 k^2 s^2 \varphi / 2)$.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..._core.execution import on_all_cores
 from ...errors import DefinitionError
@@ -39,9 +38,6 @@ _CHUNK = 4096
 # ends goes beyond 1); linear in between. More: memory. Fewer: errors of the finest half wave (1e-5
 # of it at 1024).
 _POINTS = 1024
-# Fewest intervals of a trial that is used. More: short trials are left out. Fewer: its rate is all
-# that they determine.
-_FEWEST = 3
 
 
 Lanes = Float[np.ndarray, " l"]
@@ -61,21 +57,12 @@ class Intervals(NamedTuple):
     """Names of these trials."""
     step: Float[np.ndarray, " L"]
     """Step of integration, in s."""
-    inputs: list[Float[np.ndarray, "nodes chunk"]]
-    """Inputs at half steps since the start of each interval, for `_CHUNK` intervals at a time."""
-
-    @property
-    def trials(self) -> int:
-        return len(self.names)
-
-    def chunks(self) -> Iterator[tuple[slice, Float[np.ndarray, "nodes chunk"]]]:
-        """Yield places of intervals, and their inputs."""
-        for k, values in enumerate(self.inputs):
-            yield slice(k * _CHUNK, k * _CHUNK + values.shape[1]), values
+    inputs: Float[np.ndarray, "nodes L"]
+    """Inputs at half steps since the start of each interval."""
 
     def sums(self, values: Float[np.ndarray, " L"]) -> Float[np.ndarray, " trials"]:
         """Return sums over each trial."""
-        return np.bincount(self.trial, values, self.trials)
+        return np.bincount(self.trial, values, len(self.names))
 
     def blocks(self, length: int) -> Int[np.ndarray, " L"]:
         """Return the block of each interval: successive intervals of one trial."""
@@ -91,14 +78,14 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     **Raises:** `DefinitionError` for a phase that is an angle or has other trials, an input that is
     missing or constant, and too few intervals during which it is finite.
     """
+    samples = recording.samples(name)
     pairs = phase.by_trial(recording)
     if not all(w.linear for _, parts in pairs for w in parts):
         raise DefinitionError(
             "`phase` must be one of events (`AtEvent`) or crossings: an angle has no intervals."
         )
-    column, trials, outside = recording.column(name), [], 0
-    for trial, parts in pairs:
-        x = trial.values[:, column]
+    starts, durations, steps, inputs, names = [], [], [], [], []
+    for (trial, x), (_, parts) in zip(samples, pairs, strict=True):
         finite = np.isfinite(x)
         if finite.sum() < 2:
             raise DefinitionError(f"trial '{trial.name}' has no samples of the input {name}.")
@@ -107,33 +94,25 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
         holes = gaps(trial.time, finite, bridgeable(trial.time, finite))
         # An interval may begin or end just where the input does.
         used = ~inside(holes, start + 1e-9 * duration, start + (1 - 1e-9) * duration)
-        outside += int((~used).sum())
-        if used.sum() >= _FEWEST:
-            trials.append((trial.name, trial.time[finite], x[finite], start[used], duration[used]))
-    if not trials:
-        lost = f"; {outside} lie where {name} was not recorded" if outside else ""
-        raise DefinitionError(
-            f"the recording holds too few intervals between events during which {name} is known: "
-            f"a trial needs {_FEWEST} or more{lost}."
-        )
-    names, times, inputs, starts, durations = zip(*trials, strict=True)
+        if not used.any():
+            continue
+        start, duration = start[used], duration[used]
+        step = float(np.median(duration)) / _STEPS
+        nodes = np.arange(2 * int(np.ceil(_REACH * duration.max() / step)) + 1) / 2
+        inputs.append(np.interp(start + nodes[:, None] * step, trial.time[finite], x[finite]))
+        starts.append(start)
+        durations.append(duration)
+        steps.append(np.full(len(start), step))
+        names.append(trial.name)
+    if not names:
+        raise DefinitionError(f"no interval between events lies where {name} was recorded.")
     if not any(np.ptp(x) > 0 for x in inputs):
         raise DefinitionError(f"the input {name} is constant in all trials.")
-    counts = list(map(len, durations))
-    trial = np.repeat(np.arange(len(trials)), counts)
-    step = np.repeat([float(np.median(d)) / _STEPS for d in durations], counts)
-    steps = np.repeat([_REACH * d.max() for d in durations], counts) / step
-    start, duration, chunks = np.concatenate(starts), np.concatenate(durations), []
-    for first in range(0, len(start), _CHUNK):
-        rows = np.arange(first, min(first + _CHUNK, len(start)))
-        nodes = np.arange(2 * int(np.ceil(steps[rows].max())) + 1) / 2
-        values = np.empty((len(nodes), len(rows)))
-        for k in np.unique(trial[rows]):
-            chosen = trial[rows] == k
-            at = start[rows[chosen]] + nodes[:, None] * step[rows[chosen]]
-            values[:, chosen] = np.interp(at, times[k], inputs[k])
-        chunks.append(values)
-    return Intervals(start, duration, trial, names, step, chunks)
+    longest = max(map(len, inputs))
+    inputs = [np.pad(x, ((0, longest - len(x)), (0, 0)), "edge") for x in inputs]
+    trial = np.repeat(np.arange(len(names)), list(map(len, starts)))
+    start, duration, step = map(np.concatenate, (starts, durations, steps))
+    return Intervals(start, duration, trial, tuple(names), step, np.concatenate(inputs, axis=1))
 
 
 def basis(
@@ -156,14 +135,9 @@ class Forecast(NamedTuple):
     duration: Float[np.ndarray, " L"]
     rate: Float[np.ndarray, " L"]
     """Rate at which the phase reaches 1, in cycles per second."""
-    by_curve: Float[np.ndarray, "L p"]
-    """Derivatives of the durations with respect to the coefficients of the curve."""
-    by_rate: Float[np.ndarray, " L"]
-    """Derivatives with respect to the rate without input."""
-
-    @classmethod
-    def empty(cls, L: int, p: int) -> "Forecast":
-        return cls(np.zeros(L), np.zeros(L), np.zeros((L, p)), np.zeros(L))
+    slopes: Float[np.ndarray, "L p1"]
+    """Derivatives of the durations with respect to the coefficients of the curve, and to the rate
+    without input."""
 
 
 def forecast(
@@ -173,17 +147,14 @@ def forecast(
     rates: Float[np.ndarray, " trials"],
 ) -> Forecast:
     """Return durations of all intervals, and their derivatives."""
-    whole = Forecast.empty(len(intervals.start), table.shape[1])
     curve, rate = table @ coefficients, rates[intervals.trial]
 
-    def chunk(item):
-        rows, inputs = item
-        part = _integrate(inputs, intervals.step[rows], rate[rows], curve, table)
-        for target, values in zip(whole, part, strict=True):
-            target[rows] = values
+    def chunk(first: int) -> Forecast:
+        rows = slice(first, first + _CHUNK)
+        return _integrate(intervals.inputs[:, rows], intervals.step[rows], rate[rows], curve, table)
 
-    on_all_cores(chunk, intervals.chunks())
-    return whole
+    parts = on_all_cores(chunk, range(0, len(rate), _CHUNK))
+    return Forecast(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _integrate(
@@ -194,8 +165,8 @@ def _integrate(
     table: Table,
 ) -> Forecast:
     """Integrate by the classical Runge-Kutta method, and derivatives by the trapezoidal rule."""
-    L, p = len(h), table.shape[1]
-    result, rows = Forecast.empty(L, p), np.arange(L)
+    L, p = len(h), table.shape[1] + 1
+    result, rows = Forecast(np.zeros(L), np.zeros(L), np.zeros((L, p))), np.arange(L)
     slope = np.gradient(curve) * _POINTS
 
     def at(values, phase):
@@ -209,42 +180,35 @@ def _integrate(
         nearest = np.ceil(x - 0.5).astype(np.int64)
         return np.concatenate([table[nearest] * u[:, None], np.ones((len(u), 1))], axis=1)
 
-    def growth_of(x):
-        """Return exp(x), limited where a curve jumps and its slope is unknown."""
-        return np.exp(np.clip(x, -0.5, 0.5))
-
-    phase, drift, u0 = np.zeros(L), np.zeros((L, p + 1)), inputs[0]
+    phase, drift, u0 = np.zeros(L), np.zeros((L, p)), inputs[0]
     forced, growth = force(phase, u0), at(slope, phase) * u0
     steps = (len(inputs) - 1) // 2
     for j in range(steps):
         u1, u2 = inputs[2 * j + 1][rows], inputs[2 * j + 2][rows]
-        k1 = w + at(curve, phase) * u0
-        k2 = w + at(curve, phase + h / 2 * k1) * u1
-        k3 = w + at(curve, phase + h / 2 * k2) * u1
-        k4 = w + at(curve, phase + h * k3) * u2
-        after = phase + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        done = after >= 1
-        if j == steps - 1:
-            done[:] = True  # the rest of the interval passes at its own rate
+        k1 = h * (w + at(curve, phase) * u0)
+        k2 = h * (w + at(curve, phase + k1 / 2) * u1)
+        k3 = h * (w + at(curve, phase + k2 / 2) * u1)
+        k4 = h * (w + at(curve, phase + k3) * u2)
+        after = phase + (k1 + 2 * k2 + 2 * k3 + k4) / 6
+        done = (after >= 1) | (j == steps - 1)  # what is left passes at its own rate
+        part, ended = np.ones(len(h)), rows[done]
+        if len(ended):
+            part[done], speed = _end(*(x[done] for x in (phase, after, k1, k4, w * h)))
+            result.rate[ended] = speed / h[done]
+        short = np.minimum(part, 1.0)
         forced_after, growth_after = force(after, u2), at(slope, after) * u2
-        if done.any():
-            d = done
-            part, rate = _end(phase[d], after[d], (k1 * h)[d], (k4 * h)[d], w[d] * h[d])
-            rate = rate / h[d]
-            result.duration[rows[d]] = (j + part) * h[d]
-            result.rate[rows[d]] = rate
-            short = np.minimum(part, 1.0)[:, None]
-            gain = (1 - short) * growth[d, None] + short * growth_after[d, None]
-            gain = growth_of(short * h[d, None] * (growth[d, None] + gain) / 2)
-            last = (1 - short) * forced[d] + short * forced_after[d]
-            half = short * h[d, None] / 2
-            at_end = -(gain * (drift[d] + half * forced[d]) + half * last) / rate[:, None]
-            result.by_curve[rows[d]], result.by_rate[rows[d]] = at_end[:, :p], at_end[:, p]
-        gain, half = growth_of(h * (growth + growth_after) / 2)[:, None], h[:, None] / 2
-        drift = gain * (drift + half * forced) + half * forced_after
+        half = short * h / 2
+        exponent = half * ((2 - short) * growth + short * growth_after)
+        gain = np.exp(np.clip(exponent, -0.5, 0.5))  # where a curve jumps, its slope is unknown
+        drift += half[:, None] * forced
+        drift *= gain[:, None]
+        drift[done] += (half * (1 - short))[done, None] * forced[done]
+        drift += (half * short)[:, None] * forced_after
+        result.duration[ended] = (j + part[done]) * h[done]
+        result.slopes[ended] = -drift[done] / result.rate[ended, None]
         if done.all():
             break
-        keep: Bool[np.ndarray, " l"] = ~done
+        keep = ~done
         rows, u0, h, w, phase = rows[keep], u2[keep], h[keep], w[keep], after[keep]
         drift, forced, growth = drift[keep], forced_after[keep], growth_after[keep]
     return result

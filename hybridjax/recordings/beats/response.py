@@ -28,11 +28,10 @@ from .estimation import WAVES, CurveFit, accuracy_of, fit_curve, plain_curve
 from .model import Intervals, basis, intervals_of
 
 
-# Limits of warnings: half width of the 95 % band relative to the mean of the curve, correlation of
-# neighboring residuals, fraction of miscounted intervals, excess variance of sums over blocks, and
-# level of the test for a flat curve. Larger (the level: smaller): a user trusts what the data do
-# not support. Smaller: every curve comes with warnings.
-_WIDE, _MEMORY, _MISCOUNTED, _EXCESS, _LEVEL = 0.5, 0.2, 0.01, 2.0, 0.01
+# Limits of warnings: correlation of neighboring residuals, and level of the test for a flat curve.
+# Larger (the level: smaller): a user trusts what the data do not support. Smaller: every curve
+# comes with warnings.
+_MEMORY, _LEVEL = 0.2, 0.01
 
 Phases = Annotated[Numbers, Reals("n")]
 
@@ -117,10 +116,8 @@ class PhaseResponse(eqx.Module):
             Curve(self.phase, self.plain, "plain regression", COLORS[1]),
             Curve(self.phase, self.values, "estimated", COLORS[0]),
         ]
-        first, *lines = repr(self).splitlines()
-        of = first.removeprefix("PhaseResponse(").removesuffix(")")
         shown = picture(drawn, "phase (cycles)", with_unit("Z", curve_unit(self.input)))
-        return card("PhaseResponse", of, shown, text("\n".join(x.strip() for x in lines)))
+        return card("PhaseResponse", "", shown, text(repr(self)))
 
     def __repr__(self) -> str:
         mean, error = self.coefficients[0], np.sqrt(self.covariance[0, 0])
@@ -172,9 +169,9 @@ def phase_response(
         phase = estimate_phase(recording, phase)
     intervals = intervals_of(recording, phase, input)
     total = len(intervals.start)
-    if total < 2 * (10 + intervals.trials):  # half of them for errors
+    if total < 2 * (10 + len(intervals.names)):  # half of them for errors
         raise DefinitionError(
-            f"{total} intervals are too few for a curve and the rates of {intervals.trials} "
+            f"{total} intervals are too few for a curve and the rates of {len(intervals.names)} "
             "trials: record more."
         )
     say("flat")
@@ -229,28 +226,18 @@ def _memory(intervals: Intervals, fit: CurveFit) -> float:
 
 
 def _warnings(r: PhaseResponse) -> Iterator[Finding]:
-    mean = abs(r.coefficients[0])
+    mean, flat = abs(r.coefficients[0]), r.left_out_flat
+    text = f"it adds {r.left_out - flat:.3f} to the R2 of intervals left out; a flat curve has "
+    text += f"{flat:.3f} of {r.left_out:.3f}."
     if r.p_flat > _LEVEL:
-        yield Finding(
-            "shape",
-            f"nothing is seen of it ({p_value(r.p_flat)} for a flat one); R2 of intervals left out "
-            f"is {r.left_out_flat:.3f} with the mean alone.",
-        )
-    else:
-        yield Finding(
-            "shape",
-            f"it adds {r.left_out - r.left_out_flat:.3f} to the R2 of intervals left out; a flat "
-            f"curve has {r.left_out_flat:.3f} of {r.left_out:.3f}.",
-        )
+        text = f"nothing is seen of it ({p_value(r.p_flat)} for a flat one, with R2 {flat:.3f})."
+    yield Finding("shape", text)
     low, high = r.interval(r.phase)
     half = (high - low) / 2
-    if half.max() > _WIDE * mean:
+    if half.max() > mean / 2:
         worst = int(np.argmax(half))
-        yield Finding(
-            "wide",
-            f"at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to either "
-            f"side, {100 * half[worst] / max(mean, 1e-300):.0f} % of the mean.",
-        )
+        text = f"at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
+        yield Finding("wide", f"{text}either side, more than half of the mean.")
     off = np.sqrt(np.mean((r.plain - r.values) ** 2))
     if off > np.sqrt(np.mean(r.errors**2)):
         yield Finding(
@@ -264,25 +251,18 @@ def _warnings(r: PhaseResponse) -> Iterator[Finding]:
         f"the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than harmonic "
         f"{finest} at the end of a cycle.",
     )
-    if r.excess > _EXCESS:
+    if r.excess > 2:
         yield Finding(
             "misfit",
             f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
-            "independent errors: the phase model lacks something. Intervals allow for that, but "
-            "not for what it does to the curve.",
+            "independent errors: the phase model lacks something. Errors of the curve by that are "
+            "not in the intervals.",
         )
     if abs(r.memory) > _MEMORY:
-        yield Finding(
-            "memory",
-            f"residuals of neighboring intervals are correlated by {r.memory:.2f}: one number, the "
-            "phase, is not all of the state. Standard errors allow for it.",
-        )
-    if r.miscounted > _MISCOUNTED * r.intervals:
-        yield Finding(
-            "miscounted",
-            f"{r.miscounted} of {r.intervals} intervals "
-            f"({100 * r.miscounted / r.intervals:.1f} %) miss the model by half a cycle or more, "
-            "as if an event had been missed; they are not used.",
-        )
+        text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the phase"
+        yield Finding("memory", f"{text} is not all of the state. Standard errors allow for it.")
+    if r.miscounted:
+        text = f"{r.miscounted} of {r.intervals} intervals miss the model by half a cycle or more"
+        yield Finding("miscounted", f"{text}, as if an event had been missed; they are not used.")
     if r.result != Result.OK:
         yield Finding("no convergence", f"{Result(r.result).message}.")
