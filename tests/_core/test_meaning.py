@@ -56,7 +56,8 @@ WAYS = {
         "A.h = lambda self, x: 2 * x",
     ),
     "a method of a base class": (
-        "class B:\n    def h(self): return 1\nclass A(B):\n    pass\na = A()\ndef f(x): return a.h()",
+        "class B:\n    def h(self): return 1\nclass A(B):\n    i = 0\n"
+        "a = A()\ndef f(x): return a.h()",
         "B.h = lambda self: 2",
     ),
     "an attribute of a base class": (
