@@ -15,11 +15,10 @@ from .._core.progress import say, working
 from .._core.results import Result
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..errors import ComputationError, DefinitionError
-from ..systems.check import check_system
 from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, integrated
-from .checks import check_clock, check_conserved, check_times, explain
+from .checks import check_clock, check_conserved, check_periodic, check_times, explain
 from .coincidence import check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
@@ -112,7 +111,7 @@ def find_limit_cycle(
     traced = is_traced((system, conserved))
     if not traced:
         require_x64(system, guess, section, settings)
-        check_system(system)
+        check_periodic(system)
     s = Structure(system)
     settings = settings.filled(LIMIT_CYCLE)
     if has_implicit(s):

@@ -21,9 +21,9 @@ from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
-from ..systems.check import check_system
 from ..systems.system import HybridSystem
 from .batches import Rounds, Tiles
+from .checks import check_periodic
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
@@ -171,7 +171,7 @@ def find_limit_cycles(
     systems = settings.system(systems)
     arrays, static = eqx.partition(systems, eqx.is_array)
     S = len(jax.tree_util.tree_leaves(arrays)[0])
-    check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
+    check_periodic(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
     map = map_for_sweep(guess, scale, settings)
     size = min(execution.batch or BATCH, S)
     tiles = Tiles(systems, map, size, execution.threads, S > SMALL)

@@ -25,7 +25,7 @@ from .._core.pieces.store import Constant
 from .._core.precision import require_x64
 from ..engine.describe import describe
 from ..errors import DefinitionError
-from ..systems.check import check_system
+from ..orbits.checks import check_periodic
 from ..systems.system import HybridSystem, unit_of_parameter
 
 
@@ -159,7 +159,7 @@ class Family:
                 f"{type(system).__name__}."
             )
         require_x64(system)
-        check_system(system)
+        check_periodic(system)
         return system
 
     def units(self, system: HybridSystem) -> dict[str, str]:
