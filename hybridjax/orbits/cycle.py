@@ -73,11 +73,7 @@ class LimitCycle(eqx.Module):
 
     @property
     def return_map(self) -> ReturnMap:
-        """The map that has the cycle as a fixed point.
-
-        **Raises:** `DefinitionError` if the system's code has changed since the cycle was found.
-        """
-        self.require_current()
+        """The map that has the cycle as a fixed point."""
         return ReturnMap(
             self.system, self.settings, self.anchor, self.base, self.period, self.conserved,
             self.multiplicity,
@@ -86,11 +82,14 @@ class LimitCycle(eqx.Module):
     def require_current(self) -> None:
         """**Raises:** `DefinitionError` if the system's code has changed since the cycle was
         found."""
-        if self.system.code_digest != code_digest(self.system):
+        if not self._is_current():
             raise DefinitionError(
                 f"the functions of {type(self.system).__name__}, or values that they read, have "
                 "changed since this limit cycle was found: find it again."
             )
+
+    def _is_current(self) -> bool:
+        return self.system.code_digest == code_digest(self.system)
 
     @property
     def structure(self) -> Structure:
@@ -179,8 +178,12 @@ class LimitCycle(eqx.Module):
         return dict(zip(chart.states, anchor.q[:, 0].tolist(), strict=False))
 
     def trajectory(self, periods: Positive = 1.0) -> Trajectory:
-        """The orbit from `anchor` on, with its events, dense enough to plot."""
+        """The orbit from `anchor` on, with its events, dense enough to plot.
+
+        **Raises:** `DefinitionError` if the system's code has changed since the cycle was found.
+        """
         _require_values(self, "trajectory")
+        self.require_current()
         s, anchor = self.structure, to_host(self.anchor)
         a = int(anchor.chart[0])
         return simulate(
@@ -204,7 +207,7 @@ class LimitCycle(eqx.Module):
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
-        if self.result != Result.OK:
+        if self.result != Result.OK or not self._is_current():
             return card("LimitCycle", self._title(), facts(self._facts()))
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
         orbit = orbit_picture(self.trajectory())

@@ -94,7 +94,11 @@ class PlacedSections(eqx.Module):
         }
 
     def structure(self) -> Structure:
-        """The system by the indices of its charts and transitions, made anew."""
+        """The system by the indices of its charts and transitions, made anew.
+
+        **Raises:** `DefinitionError` if the system's code has changed since the cycle was found.
+        """
+        self.cycle.require_current()
         return self.cycle.structure
 
     def observe(self, outputs: OutputNames) -> Float[Array, "N ny"]:
