@@ -27,12 +27,6 @@ from .memo import Memory
 
 # Names by which code reads values that are not named in it.
 _HIDDEN = frozenset(("eval", "exec", "globals", "__import__"))
-# Attributes of objects that do not change what its methods compute.
-_IGNORED = frozenset(
-    "__module__ __name__ __doc__ __dict__ __weakref__ __qualname__ __annotations__ __firstlineno__ "
-    "__static_attributes__ __dataclass_fields__ __dataclass_params__ __abstractmethods__ _abc_impl "
-    "__match_args__ __parameters__ __orig_bases__ __slots__ __annotate_func__".split()
-)
 _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range
 _PACKAGE = str(pathlib.Path(__file__).parents[1])
 _MODELS = os.path.join(_PACKAGE, "models")
@@ -193,7 +187,7 @@ class _Walk:
         for base in inspect.getmro(x):
             self.note(base.__module__, base.__qualname__)
             if not _is_installed(base.__module__):
-                self.visit({k: v for k, v in vars(base).items() if k not in _IGNORED})
+                self.visit({k: v for k, v in vars(base).items() if not _is_description(k, v)})
 
     def _object(self, x: Any) -> None:
         self.visit(type(x))
@@ -205,7 +199,8 @@ class _Walk:
                 _, arguments, *parts = x.__reduce_ex__(4)
                 state, *items = parts or [None]
                 return self.visit_all([arguments, state, *(list(y or ()) for y in items)])
-        state = {k: v for k, v in sorted(getattr(x, "__dict__", {}).items()) if k not in _IGNORED}
+        items = sorted(getattr(x, "__dict__", {}).items())
+        state = {k: v for k, v in items if not _is_description(k, v)}
         if isinstance(x, Definition):
             state.pop("code_digest", None)
         self.visit_all((state, getattr(x, "__wrapped__", None)))
@@ -220,6 +215,11 @@ def _names(code: types.CodeType) -> tuple[str, ...]:
     inner = [name for x in code.co_consts if isinstance(x, types.CodeType) for name in _names(x)]
     words = [x for x in code.co_consts if isinstance(x, str) and x.isidentifier()]
     return tuple(dict.fromkeys([*code.co_names, *words, *inner]))
+
+
+def _is_description(name: str, value: Any) -> bool:
+    """Test for attributes that Python and its tools add to classes and objects."""
+    return name == "_abc_impl" or (name.startswith("__") and not callable(value))
 
 
 @ft.cache
