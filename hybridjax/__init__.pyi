@@ -31,7 +31,7 @@ from .experiments.data import ExperimentData as ExperimentData
 from .experiments.design.design import Design as Design
 from .experiments.design.multisine import multisine as multisine, paper_design as paper_design
 from .experiments.record import Record as Record
-from .experiments.response_function import response_function as response_function
+from .experiments.response import response_function as response_function
 from .experiments.run import run_experiments as run_experiments
 from .fitting.fit import fit_model as fit_model, identifiability as identifiability
 from .fitting.observations import (
@@ -77,13 +77,13 @@ from .sections.linearize import linearize as linearize
 from .sections.place import place_sections as place_sections
 from .sections.section_map import section_map as section_map
 from .systems.chart import Chart as Chart
-from .systems.output import Output as Output
 from .systems.quotient import Quotient as Quotient
 from .systems.sliding import sliding as sliding
 from .systems.solver import Radau as Radau
 from .systems.system import (
     Guess as Guess,
     HybridSystem as HybridSystem,
+    Output as Output,
     Parameter as Parameter,
     parameter as parameter,
 )

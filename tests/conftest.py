@@ -180,10 +180,5 @@ def kinematic_ldtp(hopper_cycle, placed_kinematic):
 
 
 @pytest.fixture(scope="session")
-def bar_cycle():
-    return hj.find_limit_cycle(hj.models.TwoLeggedBar())
-
-
-@pytest.fixture(scope="session")
 def vanderpol_cycle():
     return hj.find_limit_cycle(hj.models.VanDerPol(mu=1.0), section=hj.Crossing("v", "falling"))

@@ -1,4 +1,4 @@
-"""The sessions of how-to pages, index.md and experiments.md print the output that the pages show."""
+"""The sessions of how-to pages, index.md and experiments.md print what the pages show."""
 
 import pytest
 from matplotlib import pyplot

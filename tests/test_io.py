@@ -1,6 +1,5 @@
 import json
 import pickle
-import zipfile
 
 import jax
 import numpy as np
@@ -91,7 +90,7 @@ def test_a_file_can_be_read_without_the_package(folder, things):
     assert "evaluated at the input frequency" in header["conventions"]
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(st.data())
 def test_round_trip_of_any_htf(folder, data):
     F, ny, nu = data.draw(array_shapes(min_dims=3, max_dims=3, max_side=3))
@@ -104,7 +103,7 @@ def test_round_trip_of_any_htf(folder, data):
     assert same(htf, trip(folder, htf))
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(st.data())
 def test_damaged_files_are_refused_or_harmless(folder, things, data):
     thing = things[data.draw(st.integers(0, len(things) - 1))]
@@ -146,13 +145,10 @@ def rewrite(path, header=None, arrays=None):
         ({"header": {"format_version": 9, "package_version": "9.0"}}, "version 9 .hybridjax 9.0"),
         ({"header": {"format": "other"}}, "not written by hybridjax.save"),
         ({"header": {"kind": "os.system"}}, "holds a 'os.system'; load knows Design"),
-        ({"header": {"kind": ["HTF"]}}, "load knows"),
         ({"header": {"kind": "LDTP"}}, "not those of LDTP"),
-        ({"header": {"static": {}}}, "not those of HTF"),
         ({"header": {"static": 3}}, "header is incomplete"),
         ({"header": {"arrays": {}}}, "header lists"),
         ({"arrays": {"source": np.zeros(2)}}, "not those of HTF"),
-        ({"arrays": {"H": np.zeros((1, 2, 3))}}, "content is no HTF"),
         ({"arrays": {"f": np.array(["a"])}}, "content is no HTF"),
     ],
 )
@@ -161,14 +157,6 @@ def test_foreign_content(folder, things, change, says):
     hj.save(path, things[2])
     rewrite(path, **change)
     with pytest.raises(hj.errors.FileFormatError, match=says):
-        hj.load(path)
-
-
-def test_fields_are_checked_against_each_other(folder, things):
-    path = folder / "foreign.npz"
-    hj.save(path, things[5])
-    rewrite(path, arrays={"poles": np.zeros((7, 2), complex)})
-    with pytest.raises(hj.errors.FileFormatError, match="poles"):
         hj.load(path)
 
 
@@ -183,27 +171,9 @@ def test_pickles_are_not_executed(folder, things):
         hj.load(path)
 
 
-def test_other_files(folder):
-    path = folder / "other.npz"
-    np.savez(path, a=np.zeros(3))
-    with pytest.raises(hj.errors.FileFormatError, match="not written by hybridjax.save"):
-        hj.load(path)
-    with zipfile.ZipFile(path, "w") as file:
-        file.writestr("readme.txt", "hello")
-    with pytest.raises(hj.errors.FileFormatError, match="damaged"):
-        hj.load(path)
-    path.write_bytes(b"")
-    with pytest.raises(hj.errors.FileFormatError, match="not an npz file"):
-        hj.load(path)
-
-
-@pytest.mark.parametrize("thing", [None, {"f": np.zeros(3)}, hj.HTF])
-def test_other_objects(folder, thing):
-    with pytest.raises(hj.DefinitionError, match="`thing` must be a"):
-        hj.save(folder / "x.npz", thing)
-
-
 def test_where_nothing_can_be_written_or_read(folder, things):
+    with pytest.raises(hj.DefinitionError, match="`thing` must be a"):
+        hj.save(folder / "x.npz", {"f": np.zeros(3)})
     with pytest.raises(hj.DefinitionError, match="end in '.npz'"):
         hj.save(folder / "data.mat", things[0])
     with pytest.raises(hj.DefinitionError, match="cannot write .*No such file or directory"):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.text import p_value
 from hybridjax.experiments.data import Simulated
 from hybridjax.systems.system import own_fields
 
@@ -85,3 +86,8 @@ def test_results_print_briefly(hopper_cycle, placed_kinematic, kinematic_ldtp, h
     assert "period       1 s" in repr(hopper_cycle) and "yM = 1.96504037 m, " in repr(hopper_cycle)
     assert "u (N) -> yM (m), vM (m/s)" in repr(hopper_data)
     assert "27 in flight, 5 in stance; dimension 2 to 4" in repr(placed_kinematic)
+
+
+def test_p_values_have_few_digits():
+    given = {4e-11: "p < 0.001", 0.001: "p = 0.001", 0.0314: "p = 0.031", 0.997: "p > 0.99"}
+    assert {p: p_value(p) for p in given} == given

@@ -40,7 +40,7 @@ GIVEN = UNCHECKED["made by this package"] | {
 
 
 def test_every_public_name_that_a_user_writes_is_in_an_example():
-    """Slow tests run the how-to pages and the README; notebooks are executed when they are built."""
+    """Slow tests run the how-to pages and the README; notebooks run when they are built."""
     pages = [ROOT / "README.md", *(ROOT / "docs/how-to").glob("*.md")]
     text = "".join(page.read_text() for page in pages)
     code = "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))

@@ -15,7 +15,7 @@ from peers.contest import Seconds, measure
 
 import hybridjax as hj
 from hybridjax.experiments import run as batched
-from hybridjax.experiments.flow_batch import course, flow_batch
+from hybridjax.experiments.response import course, flow_batch
 from hybridjax.experiments.run import Options, prepare
 from hybridjax.sections.placed import PlacedSections
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from peers import contest
 
-from hybridjax.experiments.batches import divide
+from hybridjax.experiments.run import divide
 
 from .problems import HOPPER, Problem, first_and_later, problem, program
 

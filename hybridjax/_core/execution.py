@@ -41,14 +41,7 @@ class Execution:
     @property
     def threads(self) -> int:
         """The number of threads that `workers` stands for on this machine."""
-        return thread_count(self.workers)
-
-
-def thread_count(workers: int | None) -> int:
-    """Return the number of threads: by default all cores on CPU, and one on an accelerator."""
-    if workers is not None:
-        return workers
-    return core_count() if on_cpu() else 1
+        return self.workers or (core_count() if on_cpu() else 1)
 
 
 def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -> Iterator[Any]:

@@ -18,11 +18,11 @@ def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
 
     def __getattr__(name: str):
         try:
-            if find is not None:
-                return find(name)
+            if find is None:
+                raise AttributeError
+            return find(name)
         except AttributeError as error:
             raise AttributeError(_message(package, prefix, name)) from error
-        raise AttributeError(_message(package, prefix, name))
 
     return __getattr__, listed, names
 
@@ -31,16 +31,11 @@ def _message(package: str, prefix: str, name: str) -> str:
     """The line of `moved.txt` for this name, or for all names of a namespace that is gone."""
     old = f"{prefix}.{name}".removeprefix(".")
     table = (pathlib.Path(__file__).with_name("moved.txt")).read_text().splitlines()
-    rows = [row.partition(" -> ") for row in table if " -> " in row]
-    for keys, _, new in rows:
-        if old in keys.split(", "):
-            return f"hj.{old} is gone or has a new name: {new}."
-    moved = [
-        f"{key}: {new}"
-        for keys, _, new in rows
-        for key in keys.split(", ")
-        if key.startswith(f"{old}.")
-    ]
-    if moved:
-        return f"the namespace hj.{old} is gone: {'; '.join(moved)}."
+    rows = (row.partition(" -> ") for row in table if " -> " in row)
+    moved = {key: new for keys, _, new in rows for key in keys.split(", ")}
+    if old in moved:
+        return f"hj.{old} is gone or has a new name: {moved[old]}."
+    inside = [f"{key}: {new}" for key, new in moved.items() if key.startswith(f"{old}.")]
+    if inside:
+        return f"the namespace hj.{old} is gone: {'; '.join(inside)}."
     return f"module {package!r} has no attribute {name!r}"

@@ -1,10 +1,9 @@
 from .candidates import draws as draws
-from .distortion import Distortion as Distortion
 from .goals import (
     FrequencyResponse as FrequencyResponse,
     Multipliers as Multipliers,
     Parameters as Parameters,
 )
 from .information import information_map as information_map
-from .limits import Limits as Limits
+from .limits import Distortion as Distortion, Limits as Limits
 from .study import Study as Study

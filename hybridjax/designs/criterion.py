@@ -23,9 +23,10 @@ from ..identify.variable_projection import powers_basis
 from .candidates import Kept, Powers
 
 
-# An unknown is lost where an eigenvalue of the scaled information is below this. Larger: goals with
-# a large but finite variance are rejected. Smaller: variances are rounding errors.
-_SINGULAR = 1e-12
+# An unknown is lost where an eigenvalue of the scaled information is below this (relative to the
+# largest, for combinations of matrices). Larger: goals with a large but finite variance are
+# rejected. Smaller: variances are rounding errors.
+SINGULAR = 1e-12
 
 
 class Bound(NamedTuple):
@@ -146,7 +147,7 @@ def _root(
     if len(lost):
         raise DefinitionError(f"the data do not depend on {unknowns[lost[0]]} at all.")
     values, vectors = np.linalg.eigh(information / size / size[:, None])
-    if not values[0] > _SINGULAR:
+    if not values[0] > SINGULAR:
         direction = vectors[:, 0] / size
         largest = np.abs(direction).max()
         named = zip(direction, unknowns, strict=True)

@@ -11,9 +11,8 @@ from ..identify.htf_errors import check_values, error_weights, require_frequenci
 from ..identify.variable_projection import HTFGroup, group_htf, misfit_of
 from ..linear.htf import HTF
 from .candidates import Model, NoiseLike, make_noise, with_variance
-from .criteria import wanted_parts
+from .criteria import coefficients, require_symmetric, wanted_parts
 from .goals import Multipliers
-from .numerators import coefficients, require_symmetric
 
 
 class InformationMap(eqx.Module):
@@ -32,19 +31,6 @@ class InformationMap(eqx.Module):
     share: Float[np.ndarray, "ny F N"]
     outputs: tuple[str, ...] = eqx.field(static=True)
     periods: int = eqx.field(static=True)
-
-    def __repr__(self) -> str:
-        by_line, by_phase = self.share.sum(axis=(0, 2)), self.share.sum(axis=(0, 1))
-        order = np.argsort(-by_line)
-        half = order[: 1 + int(np.argmax(np.cumsum(by_line[order]) >= 0.5))]
-        shares = zip(self.outputs, self.share.sum(axis=(1, 2)), strict=True)
-        outputs = ", ".join(f"{name} {100 * x:.0f} %" for name, x in shares)
-        return (
-            f"InformationMap(half of it: in {len(half)} of {len(self.f)} lines, "
-            f"f = {self.f[half].min():.3g} to {self.f[half].max():.3g}; outputs: {outputs}; "
-            f"best section: {np.argmax(by_phase)} of {len(by_phase)}, "
-            f"{100 * by_phase.max():.2g} % ({100 / len(by_phase):.2g} % on the average))"
-        )
 
 
 @checked

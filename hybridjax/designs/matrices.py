@@ -18,13 +18,10 @@ from ..identify.joint.realization import SHORTEST_HORIZON, realize
 from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
-from .criterion import Channel, LinearCriterion
+from .criterion import SINGULAR, Channel, LinearCriterion
 from .goals import FrequencyResponse
 
 
-# Combinations with less information in the usual design, relative to the largest, are rounding
-# errors. Larger: combinations that the data determine are left out. Smaller: rounding is kept.
-_SINGULAR = 1e-13
 # Part of a wanted variance that left-out combinations may have, at least. Larger: standard errors
 # are too small by half of it. Smaller: goals are rejected for rounding errors.
 _MISSED = 0.05
@@ -59,7 +56,7 @@ class Matrices(NamedTuple):
         """
         kept = _determined(self.values)
         turned = wanted / self.size @ self.vectors
-        square = turned**2 / np.maximum(self.values, _SINGULAR * self.values[-1])
+        square = turned**2 / np.maximum(self.values, SINGULAR * self.values[-1])
         quantity = np.arange(len(wanted)) if part is None else part
         whole = np.bincount(quantity, square.sum(axis=1))
         if (np.bincount(quantity, square[:, ~kept].sum(axis=1)) > _MISSED * whole).any():
@@ -110,7 +107,7 @@ def ldtp_matrices(
 
 
 def _determined(values: Float[np.ndarray, " P"]) -> Bool[np.ndarray, " P"]:
-    return values > _SINGULAR * values[-1]
+    return values > SINGULAR * values[-1]
 
 
 def _rows(

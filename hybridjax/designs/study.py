@@ -20,8 +20,7 @@ from ..identify.multipliers import StructuredFit
 from .candidates import Candidates
 from .goals import Multipliers
 from .limits import Limit, as_limits
-from .optimal_design import OptimalDesign
-from .optimize import optimal_design
+from .optimize import OptimalDesign, optimal_design
 from .study_estimate import Block, Estimate, block_of, estimate, refuse_transient
 
 
@@ -206,7 +205,7 @@ class Study(eqx.Module):
             )
         block = block_of(data, self.goal, repeats)
         for earlier in self._history.blocks[:1]:
-            require_same("blocks of one study", earlier, block, ("inputs", "outputs"))
+            require_same("blocks of one study", earlier.htf, block.htf, ("inputs", "outputs"))
         blocks = (*self._history.blocks, block)
         best = estimate(blocks, self.order, self.goal)
         errors = _standard_errors(best.fit, self.goal)

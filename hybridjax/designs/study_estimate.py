@@ -1,5 +1,6 @@
 """The estimate of the multipliers from all blocks of a study, whose noise is unknown."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -13,15 +14,14 @@ from ..identify.order import require_order
 from ..identify.spectral_sums import spectral_sums
 from ..identify.variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of
 from ..linear.htf import HTF
+from .allocation import ENOUGH
+from .criteria import coefficients
 from .goals import Multipliers
-from .numerators import coefficients
 
 
-# Estimates of the noise, at most, each from the residual of a fit weighted by the last one; and the
-# relative change that ends them. Fewer: weights that are off by the signal in the first estimate.
-# A smaller change: more fits for weights that are known to a few percent only.
+# Estimates of the noise, at most, each from the residual of a fit weighted by the last one. Fewer:
+# weights that are off by the signal in the first estimate.
 _SWEEPS = 10
-_SETTLED = 0.02
 # Steps of each of these fits. Fewer: the noise is overestimated, until the next fit continues.
 _MAX_STEPS = 50
 # Standard deviations by which a transient exceeds the noise before the data are rejected. Larger:
@@ -30,17 +30,11 @@ _BEYOND_NOISE = 3.0
 
 
 class Block(NamedTuple):
-    """The data of one block of experiments that a study keeps: R responses to one cosine each, in
-    one experiment each."""
+    """The data of one block of experiments that a study keeps."""
 
-    f: Float[np.ndarray, " R"]
-    H: Complex[np.ndarray, "M R ny"]
-    variance: Float[np.ndarray, " R"]
-    """Variance of each H for white noise of variance 1 on each sample."""
-    harmonics: tuple[int, ...]
-    n_sections: int
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
+    htf: HTF
+    """Responses to one cosine each, in one experiment each, with the variances for white noise of
+    variance 1 on each sample."""
     strides: int
     """All cycles of the records, with those that are discarded."""
 
@@ -49,25 +43,18 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     """**Raises:** `DefinitionError` as `estimate_htf`, and if no experiment ran to its end."""
     each = []
     for s in np.flatnonzero(data.ok):
-        single = ExperimentData(
-            data.u[s : s + 1], data.y[s : s + 1], n_sections=data.n_sections,
-            periods=data.periods, inputs=data.inputs, outputs=data.outputs,
-        )  # fmt: skip
+        u, y = data.u[s : s + 1], data.y[s : s + 1]
+        single = dataclasses.replace(data, u=u, y=y, result=None, simulated=None)
         each.append(spectral_sums(single, goal.fitted_harmonics, repeats=repeats))
     if not each:
         raise DefinitionError(f"no experiment ran well: {data.summary()}.")
-    power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])
-    H = np.concatenate([sums.along[:, 0] for sums in each]) / power[:, None, None]
-    return Block(
-        f=np.concatenate([sums.line for sums in each]) / data.periods,
-        H=np.moveaxis(H, 1, 0),
-        variance=data.n_sections * data.periods / repeats / power,
-        harmonics=each[0].harmonics,
-        n_sections=data.n_sections,
-        inputs=data.inputs,
-        outputs=data.outputs,
-        strides=data.u.shape[0] * data.u.shape[1] // data.n_sections,
-    )
+    N, P, f = data.n_sections, data.periods, np.concatenate([sums.line for sums in each])
+    power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])[:, None]
+    H = np.concatenate([sums.along[:, 0] for sums in each], axis=0).swapaxes(0, 1) / power
+    variance = np.broadcast_to((N * P / repeats / power)[..., None], (*H.shape, 1))
+    names = data.inputs, data.outputs
+    htf = HTF(f / P, H[..., None], each[0].harmonics, N, *names, variance=variance)
+    return Block(htf, data.u.shape[0] * data.u.shape[1] // N)
 
 
 class Estimate(NamedTuple):
@@ -96,15 +83,22 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     and distortion at the lines that matter, valid for any spectrum of the noise, but uncertain
     where these are few; and from the levels of the noise, as if it were white.
     """
-    size = coefficients(order, blocks[0].n_sections, goal.overhang)
-    member = np.repeat(np.arange(len(blocks)), [len(block.f) for block in blocks])
-    H = np.concatenate([block.H for block in blocks], axis=1)
+    htfs = [block.htf for block in blocks]
+    first, f = htfs[0], np.concatenate([htf.f for htf in htfs])
+    H = np.concatenate([htf.H for htf in htfs], axis=1)
+    size = coefficients(order, first.n_sections, goal.overhang)
+    member = np.repeat(np.arange(len(blocks)), [len(htf.f) for htf in htfs])
     # To begin with, all of it may be noise.
-    square = [np.mean(np.abs(b.H) ** 2 / b.variance[:, None], axis=(0, 1)) for b in blocks]
+    square = [np.mean(np.abs(htf.H) ** 2 / htf.variance, axis=(0, 1, 3)) for htf in htfs]
     noise, c = np.sqrt(square), None
 
     def grouped() -> tuple[HTF, list[HTFGroup]]:
-        htf = _joined(blocks, noise, H)
+        """Return all lines of all blocks, one after the other, with their variances."""
+        each = [htf.variance * std[:, None] ** 2 for htf, std in zip(htfs, noise, strict=True)]
+        htf = HTF(
+            f, H, first.harmonics, first.n_sections, first.inputs, first.outputs,
+            variance=np.concatenate(each, axis=1),
+        )  # fmt: skip
         require_frequencies(htf, order, size)
         return htf, group_htf(htf, error_weights(htf, check_values(htf)), size)
 
@@ -113,26 +107,18 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
         c, _ = maximum_likelihood(groups, order, _MAX_STEPS, c)
         change = _relative_noise(groups, c, member, noise.shape)
         noise = noise * change
-        if np.abs(np.log(change)).max() < _SETTLED:
+        if np.abs(np.log(change)).max() < ENOUGH:
             break
     htf, groups = grouped()
     by_scatter = fit_multipliers(htf, order, overhang=goal.overhang, check=False)
     by_level = fit_multipliers(htf, order, overhang=goal.overhang, check=False, errors="variance")
     fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
-    return Estimate(fit, by_level, noise, _objection(groups, htf, fit))
-
-
-def _joined(
-    blocks: tuple[Block, ...], noise: Float[np.ndarray, "B ny"], H: Complex[np.ndarray, "M F ny"]
-) -> HTF:
-    """Return all lines of all blocks, one after the other, with their variances."""
-    first = blocks[0]
-    variance = [b.variance[:, None] * std**2 for b, std in zip(blocks, noise, strict=True)]
-    f, v = np.concatenate([b.f for b in blocks]), np.concatenate(variance)
-    return HTF(
-        f, H[..., None], first.harmonics, first.n_sections, first.inputs, first.outputs,
-        variance=np.broadcast_to(v[..., None], (*H.shape, 1)),
-    )  # fmt: skip
+    objection = ""
+    try:
+        require_order(groups, htf, len(fit.coefficients), fit.cost / fit.freedom)
+    except DefinitionError as error:
+        objection = str(error)
+    return Estimate(fit, by_level, noise, objection)
 
 
 def _relative_noise(
@@ -149,15 +135,6 @@ def _relative_noise(
             np.add.at(square[:, output], block, (misfit.residual[:, :, k] ** 2).sum(axis=0))
             np.add.at(freedom[:, output], block, (1 - misfit.leverage).sum(axis=0))
     return np.sqrt(square / freedom)
-
-
-def _objection(groups: list[HTFGroup], htf: HTF, fit: StructuredFit) -> str:
-    """Return the objection of `fit_multipliers` to an order that the data do not support."""
-    try:
-        require_order(groups, htf, len(fit.coefficients), fit.cost / fit.freedom)
-    except DefinitionError as error:
-        return str(error)
-    return ""
 
 
 def refuse_transient(

@@ -5,8 +5,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.executor import cond, namespace, put, stop_gradient
 from .._core.lanes import put_rows
-from ..systems.kinds import Kind, Member
-from ..systems.structure import Structure
+from ..systems.structure import Kind, Member, Structure
 from ..systems.transition import Scheduled
 from . import kernels
 from .arrays import Array, Index, Inputs, Mask, Padded, Times

@@ -1,8 +1,9 @@
 """Users' functions for code that runs on the host, each with its first derivatives.
 
-`watched`, `reset` and `enabled` also take and return arrays of JAX, the others NumPy's. A column of values stands before those of derivatives, by the
-time, the n states and the inputs: (rows, 2 + n + nu, L). Where only `some` lanes are needed, the
-others are copies of one of these; one lane may stand for all.
+`watched`, `reset` and `enabled` also take and return arrays of JAX, the others NumPy's. A column of
+values stands before those of derivatives, by the time, the n states and the inputs: (rows, 2 + n +
+nu, L). Where only `some` lanes are needed, the others are copies of one of these; one lane may
+stand for all.
 """
 
 import functools as ft
@@ -16,18 +17,14 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.executor import on_host
 from .._core.lanes import PerLane, by_lane
-from ..systems.kinds import Kind, Member
-from ..systems.output import Output
 from ..systems.solver import Method, Radau, as_method
-from ..systems.structure import Structure, stacked
-from .arrays import Array
+from ..systems.structure import Kind, Member, Structure, stacked
+from ..systems.system import Output
+from .arrays import AnyInputs as Inputs, AnyTimes as Times, Array, States
 from .runge_kutta import Step, integrated_divergence, take_step
 from .target import AbstractLevels
 
 
-Times = Float[Array, " #L"]
-States = Float[Array, "n L"]
-Inputs = Float[Array, "nu #L"]
 Expanded = Float[Array, "rows columns L"]
 Some = Bool[Array, " L"] | None
 Items = tuple[str | Output, ...]
@@ -83,11 +80,11 @@ def watched(
     """The guards of chart a, and the level if it has one, with their derivatives."""
     static = a, s.guard_kinds(a)
     if not on_host(q):
-        of_lanes = s.by_lane(_columns(ft.partial(_watched, *static)), levels)
+        of_lanes = s.by_lane(_columns(ft.partial(watched_at, *static)), levels)
         return of_lanes(t, q, u, index)
     # (A program for many points is worth its compilation from four calls on.)
     lanes = 1 if q.shape[-1] < 4 * _MANY_POINTS else _MANY_POINTS
-    rows = s.kernel(_watched, _expanded, *static, trees=(levels,), lanes=lanes)
+    rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
 
@@ -135,9 +132,10 @@ def _field(a: int, s: Structure, t, q, u, *_):
     return s.field(a, t, q, u)
 
 
-def _watched(
+def watched_at(
     a: int, kinds: tuple[Kind, ...], s: Structure, levels: AbstractLevels | None, t, q, u, i
 ):
+    """The guards of chart a, of these kinds, and the level of section i if the chart has one."""
     guards = s.guard_values(kinds, t, q, u)
     if levels is not None and levels.present(s, a):
         guards = [*guards, levels.level(s, a, i, t, q)]

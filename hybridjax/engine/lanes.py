@@ -1,4 +1,4 @@
-"""Lanes: the hybrid states of many trajectories that move side by side."""
+"""Lanes: the hybrid states of many trajectories that move side by side; the tape of their moves."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,9 +7,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from .._core.executor import cond, lane, namespace, on_host
+from .._core.executor import cond, lane, namespace, on_host, put
 from ..systems.structure import Structure
 from .arrays import Array, Index, Mask, Padded, Times
 
@@ -88,3 +88,41 @@ def needed(mask: Mask, tree):
         return jnp.where(present, x, jax.lax.stop_gradient(x)) if eqx.is_inexact_array(x) else x
 
     return jax.tree_util.tree_map(cut, tree)
+
+
+# Codes on a tape. Codes >= 0 are the transition that fires at the end of a move.
+IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = range(-4, 0)
+
+
+class Tape(NamedTuple):
+    """The moves, one row per iteration and one column per lane. Without its first axis: one row."""
+
+    h: Float[Array, "R L"]
+    """Length of the move."""
+    code: Int[Array, "R L"]
+    """Its end: IDLE (no move), MOVE, ARRIVE_TIME, ARRIVE_LEVEL, or a transition's index."""
+    t: Float[Array, "R L"]
+    """Time at the end of the move."""
+    before: Float[Array, "R d L"]
+    """State at the end of the move, before a reset."""
+    after: Float[Array, "R d L"]
+    """State after the reset."""
+    chart: Int[Array, "R L"]
+    """Chart after the reset."""
+
+
+def blank_tape(rows: int, lanes: Lanes) -> Tape:
+    """A tape without moves."""
+    xp, (d, L) = namespace(lanes.q), lanes.q.shape
+    times, states = lambda: xp.zeros((rows, L)), lambda: xp.zeros((rows, d, L))
+    code, chart = xp.full((rows, L), IDLE, xp.int32), xp.zeros((rows, L), xp.int32)
+    return Tape(times(), code, times(), states(), states(), chart)
+
+
+def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:
+    """The tape with its row i filled in: in place on the host, and by XLA outside of branches."""
+    if on_host(tape.h):
+        for x, y in zip(tape, row, strict=True):
+            x[i] = y
+        return tape
+    return Tape(*(put(x, i, y.astype(x.dtype)) for x, y in zip(tape, row, strict=True)))

@@ -13,13 +13,11 @@ from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
 from .arrays import Array, Index, Inputs, Times
-from .chain import chain
-from .lanes import Lanes, constant
-from .replay import replay
+from .lanes import Lanes, Tape, constant
+from .replay import chain, replay
 from .search.search import initial_step, search
 from .search.state import Moved, Options, Recorded, Stride
 from .settings import Settings
-from .tape import Tape
 from .target import Target
 
 

@@ -1,25 +1,43 @@
-"""Differentiable flow: the moves on a tape, integrated again.
+"""Derivatives of recorded flow: the moves on a tape, integrated again.
 
 The decisions of a search (step sizes, the order of events) are fixed here; only smooth arithmetic
-is left, so that this function has exact derivatives in forward and reverse mode. The times of
-crossings follow from two Newton steps on the true guard, which is the saltation formula.
+is left. The times of crossings follow from two Newton steps on the true guard, which is the
+saltation formula.
+
+- `replay` is a function of JAX's arrays with exact derivatives in forward and reverse mode.
+- `chain` multiplies the Jacobians of the moves on the host: of the Runge-Kutta step, of the
+  crossing at its end, and of the reset. Every move is linearized at its recorded start, so that all
+  moves in a chart are done in one pass.
 """
 
 import dataclasses
 import functools as ft
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
 
-from ..systems.structure import Structure
+from ..systems.structure import Member, Structure
 from ..systems.transition import Scheduled
+from . import kernels
 from .arrays import Index, Inputs, Mask, Padded, Times
 from .events import apply_resets, scheduled_time
-from .lanes import Lanes, constant, for_each_chart, needed, only
+from .lanes import (
+    ARRIVE_LEVEL,
+    ARRIVE_TIME,
+    IDLE,
+    Lanes,
+    Tape,
+    constant,
+    for_each_chart,
+    needed,
+    only,
+)
 from .runge_kutta import Step, take_step
-from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Tape
 from .target import Target
-from .watch import ChartFlow
+from .watch import ChartFlow, slopes
 
 
 # Rows of a tape that are skipped, or computed again by reverse mode, together. Higher: empty rows
@@ -106,3 +124,214 @@ def _advance(
         return jnp.where(here, t1, t_out), q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
 
     return for_each_chart(s, chart, moving, work, (t, q))
+
+
+class _Moves(NamedTuple):
+    """Moves of any lanes, on the last axis."""
+
+    t: Float[np.ndarray, " M"]
+    chart: Int[np.ndarray, " M"]
+    q: Float[np.ndarray, "d M"]
+    h: Float[np.ndarray, " M"]
+    code: Int[np.ndarray, " M"]
+    lane: Int[np.ndarray, " M"]
+    order: Int[np.ndarray, " M"]
+    """Number of moves of the same lane before this one."""
+
+
+class _Linear(NamedTuple):
+    """(t, q) after some moves, and its derivatives by (t, q, u) before them: moves come first."""
+
+    end: Float[np.ndarray, "M n"]
+    by: Float[np.ndarray, "M n m"]
+
+
+def chain(
+    s: Structure,
+    lanes: Lanes,
+    target: Target,
+    tape: Tape,
+    of_states: bool,
+    across: Float[np.ndarray, "A d"] | None = None,
+) -> tuple[Float[np.ndarray, "L n m"], Float[np.ndarray, "n L"]]:
+    """Derivatives of (t, q) at the end of a record by (t, q, u) at its start, at u = 0, or by q
+    only; and (t, q) at the end.
+
+    `across` holds sizes of states by chart, for autonomous systems and targets at which the
+    direction of the flow has no meaning: it is projected out of every move, so that it does not
+    drown the other directions, however strongly the flow contracts.
+    """
+    n, L = 1 + s.d, len(lanes.t)
+    moves = _moves(lanes, tape)
+    end, by = _linear_moves(s, moves, target)
+    if across is not None:
+        by[:, :, 1:n] = by[:, :, 1:n] @ _across(s, moves, across)
+    columns = np.tile(np.eye(n, n + s.nu), (L, 1, 1))
+    ends = np.concatenate([lanes.t[None], lanes.q]).T
+    for order in range(1 + max(moves.order, default=-1)):
+        now = moves.order == order
+        lane = moves.lane[now]
+        columns[lane] = by[now, :, :n] @ columns[lane]
+        columns[lane, :, n:] += by[now, :, n:]
+        ends[lane] = end[now]
+    return columns[:, :, 1:n] if of_states else columns, ends.T
+
+
+class Link(NamedTuple):
+    """One move of a lane."""
+
+    chart: int
+    """The chart in which it starts."""
+    field: Float[np.ndarray, " d"]
+    """The field at its start."""
+    jacobian: Float[np.ndarray, "n n"]
+    """Derivative of (t, q) at its end by those at its start, padded."""
+
+
+def links(s: Structure, lanes: Lanes, target: Target, tape: Tape) -> list[Link]:
+    """The moves of one lane."""
+    moves = _moves(lanes, tape)
+    by, f = _linear_moves(s, moves, target).by[:, :, : 1 + s.d], _fields(s, moves)
+    return [Link(*x) for x in zip(moves.chart.tolist(), f.T, by, strict=True)]
+
+
+def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
+    """The divergence of the field, integrated over the moves of one lane, up to their ends."""
+    moves, total = _moves(lanes, tape), 0.0
+    for a in np.unique(moves.chart):
+        in_chart = moves.chart == a
+        t, q, h = moves.t[in_chart], moves.q[: s.dims[a], in_chart], moves.h[in_chart]
+        total += kernels.divergence(s, int(a), t, q, np.zeros((s.nu, 1)), h).sum()
+    return total
+
+
+def _linear_moves(s: Structure, moves: _Moves, target: Target) -> _Linear:
+    n, M = 1 + s.d, len(moves.t)
+    linear = _Linear(np.zeros((M, n)), np.zeros((M, n, n + s.nu)))
+    for a in np.unique(moves.chart):
+        in_chart = np.flatnonzero(moves.chart == a)
+        of_chart = _linear(s, int(a), _Moves(*(x[..., in_chart] for x in moves)), target)
+        linear.end[in_chart], linear.by[in_chart] = of_chart
+    return linear
+
+
+def _fields(s: Structure, moves: _Moves) -> Float[np.ndarray, "d M"]:
+    """The field where moves start."""
+    return slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1)))
+
+
+def _across(s: Structure, moves: _Moves, sizes) -> Float[np.ndarray, "M d d"]:
+    """Projections of states along the flow where moves start, orthogonal in sizes."""
+    size = sizes[moves.chart]
+    f = _fields(s, moves).T / size
+    f = f / np.linalg.norm(f, axis=1, keepdims=True)
+    return np.eye(s.d) - (size * f)[:, :, None] * (f / size)[:, None, :]
+
+
+def _moves(lanes: Lanes, tape: Tape) -> _Moves:
+    """The moves of a tape, lane by lane."""
+    lane, row = np.nonzero(tape.code.T != IDLE)
+    first = np.diff(lane, prepend=-1) > 0
+    last = np.roll(row, 1)  # the move before, but for the first of a lane
+    begins = np.flatnonzero(first)
+    order = np.arange(len(lane)) - np.repeat(begins, np.diff(begins, append=len(lane)))
+    return _Moves(
+        np.where(first, lanes.t[lane], tape.t[last, lane]),
+        np.where(first, lanes.chart[lane], tape.chart[last, lane]),
+        np.where(first, lanes.q[:, lane], tape.after[last, :, lane].T),
+        np.asarray(tape.h)[row, lane], np.asarray(tape.code)[row, lane], lane, order,
+    )  # fmt: skip
+
+
+def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
+    """Moves that start in chart a."""
+    n, M, code = s.dims[a], len(moves.t), moves.code
+    u = np.zeros((s.nu, M))
+    by_clock, on_time = np.isin(code, s.schedules(a)), code == ARRIVE_TIME
+    index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
+    goal = target.time[moves.lane]
+    h = np.where(on_time, goal - moves.t, moves.h)
+    q, dq, f = _step(s, a, moves.t, moves.q[:n], u, h)
+    t = np.where(on_time, goal, moves.t + h)
+    # By (t, q, u), with the length of the step as the last; that to a known time shrinks with t.
+    dt = np.zeros((M, 1, dq.shape[2]))
+    dt[:, 0, [0, -1]] = 1.0
+    shrinks = (by_clock | on_time)[:, None]
+    dq[:, :, 0] -= shrinks * dq[:, :, -1]
+    dt[:, :, 0] -= shrinks
+    dq, dt = dq[:, :, :-1], dt[:, :, :-1]
+
+    which = np.where(code == ARRIVE_LEVEL, len(s.transitions), np.where(by_clock, -1, code))
+    lands = np.flatnonzero(which >= 0)
+    if len(lands):
+        point = t[lands], q[:, lands], f[:, lands]
+        flow = ChartFlow(s, a, u[:, lands], dataclasses.replace(target, index=index[lands]))
+        zero = flow.locate(*point, which[lands])
+        t[lands] += zero.past
+        q[:, lands] = zero.q
+        f = kernels.field(s, a, t[lands], q[:, lands], u[:, lands])[:, 0].T[:, :, None]
+        rows = kernels.watched(
+            s, a, target.levels, t[lands], q[:, lands], u[:, lands], index[lands]
+        )
+        row = np.argmax(np.array(flow.rows)[:, None] == which[lands], axis=0)
+        by_t, by_q, by_u = _split(rows[row, :, np.arange(len(lands))][:, None], n)
+        change = by_t @ dt[lands] + by_q @ dq[lands]
+        change[:, :, 1 + n :] += by_u
+        delay = -change / (by_t + by_q @ f)
+        dt[lands] += delay
+        dq[lands] += f @ delay
+
+    end, by = np.zeros((M, 1 + s.d)), np.zeros((M, 1 + s.d, 1 + s.d + s.nu))
+    columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
+    for kind in [(-1,), *s.kinds]:
+        now = np.flatnonzero(np.isin(np.maximum(code, -1), kind))
+        new, dnew = q[:, now], dq[now]
+        if len(now) == 0:
+            continue
+        if kind != (-1,):
+            place = np.argmax(np.array(kind)[:, None] == code[now], axis=0).astype(np.int32)
+            by_reset = kernels.reset(s, Member(kind, place), t[now], new, u[:, now])
+            new = by_reset[:, 0]
+            by_t, by_q, by_u = _split(np.moveaxis(by_reset, -1, 0), n)
+            dnew = by_t @ dt[now] + by_q @ dnew
+            dnew[:, :, 1 + n :] += by_u
+        m = len(new)
+        end[now, 1 : 1 + m] = new.T
+        by[np.ix_(now, np.arange(1, 1 + m), columns)] = dnew
+    end[:, 0] = t
+    by[:, :1, columns] = dt
+    return _Linear(end, by)
+
+
+def _step(s: Structure, a: int, t, q, u, h):
+    """States (n, M) at the end of Runge-Kutta steps, their derivatives (M, n, m) by (t, q, u, h) at
+    the start, and the field (n, M) at the end."""
+    n, M = q.shape
+    m = 2 + n + s.nu
+    method = s.method(a)
+    if method.implicit:
+        expanded = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h), -1, 0))
+        return expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
+    stages = len(method.b) + 1
+    K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
+    straight = np.zeros((M, n, m))
+    straight[:, :, 1 : 1 + n] = np.eye(n)
+    rows = [*(row[:i] for i, row in enumerate(np.array(method.a))), np.array(method.b)]
+    for i, (row, c) in enumerate(zip(rows, [*method.c, 1.0], strict=True)):
+        slope = (row @ K.reshape(stages, -1)[:i]).reshape(n, M)
+        dslope = (row @ dK.reshape(stages, -1)[:i]).reshape(M, n, m)
+        state, dstate = q + h * slope, straight + h[:, None, None] * dslope
+        dstate[:, :, -1] += slope.T
+        expanded = kernels.field(s, a, t + c * h, state, u)
+        by_t, by_q, by_u = _split(np.moveaxis(expanded, -1, 0), n)
+        dK[i] = by_q @ dstate
+        dK[i, :, :, 0] += by_t[:, :, 0]
+        dK[i, :, :, 1 + n : -1] += by_u
+        dK[i, :, :, -1] += c * by_t[:, :, 0]
+        K[i] = expanded[:, 0]
+    return state, dstate, K[-1]
+
+
+def _split(expanded, n: int):
+    """Derivatives by t, q and u (see `kernels`), moves first."""
+    return expanded[:, :, 1:2], expanded[:, :, 2 : 2 + n], expanded[:, :, 2 + n :]

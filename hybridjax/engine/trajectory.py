@@ -22,10 +22,9 @@ from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
 from .cubic import interpolate
-from .lanes import start_lanes
+from .lanes import IDLE, start_lanes
 from .move import Options, move
 from .settings import SIMULATION, Settings
-from .tape import IDLE
 from .target import until
 from .watch import slopes
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from .._core.executor import namespace, on_host, put
 from .._core.lanes import pick, put_rows, shared
 from ..systems.solver import Method
-from ..systems.structure import Structure, stacked
+from ..systems.structure import Structure
 from . import kernels
 from .arrays import AnyInputs, AnyTimes, Array, Index, Inputs, Mask, Padded, States, Times
 from .lanes import for_each_chart, only
@@ -104,17 +104,14 @@ class ChartFlow(NamedTuple):
 
     def watch(self, t: AnyTimes, q: States, f: States) -> Watch:
         """The watched functions, in the order of `rows`; f is the field there."""
-        a, levels, index, has_level = self.a, self.target.levels, self.target.index, self.has_level
+        a, levels, index = self.a, self.target.levels, self.target.index
         if on_host(q):
             rows = kernels.watched(self.s, a, levels, t, q, self.u, index, self.subset)
             return Watch(rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1))
         kinds = self.s.guard_kinds(a)
 
         def watch(s, levels, t, q, u, i, f):
-            def functions(t, q):
-                guards = s.guard_values(kinds, t, q, u)
-                return stacked(guards + ([levels.level(s, a, i, t, q)] if has_level else []))
-
+            functions = lambda t, q: kernels.watched_at(a, kinds, s, levels, t, q, u, i)  # noqa: E731
             return jax.jvp(functions, (t, q), (jnp.ones_like(t), f))
 
         return Watch(*self.s.by_lane(watch, levels, name=("watch", a))(t, q, self.u, index, f))

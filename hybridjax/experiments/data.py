@@ -11,9 +11,7 @@ from .._core.arguments import Numbers, names
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
 from .._core.boundary.values import Integers, Reals
-from .._core.html import card, facts, table
 from .._core.results import Result
-from .._core.signal import unit_of
 from .._core.text import fields, listed
 from ..errors import DefinitionError
 from .record import Record
@@ -204,23 +202,6 @@ class ExperimentData(eqx.Module):
             f"{self.n_sections} sections each, window P = {self.periods} periods; "
             f"{listed(self.inputs)} -> {listed(self.outputs)})"
         )
-
-    def _repr_html_(self) -> str:
-        about = {
-            "cycles": f"{self.u.shape[1] // self.n_sections} of {self.n_sections} sections",
-            "window": f"the last {self.periods} periods",
-            "sections": self.label,
-        }
-        if not self.ok.any():
-            return card("ExperimentData", self.summary(), facts(about))
-        signals = [(x, self.u[self.ok, :, k]) for k, x in enumerate(self.inputs)]
-        signals += [(y, self.y[self.ok, :, k]) for k, y in enumerate(self.outputs)]
-        sizes = [
-            (x, f"{np.sqrt(np.mean(v**2)):.4g} {unit_of(x)}", f"{np.abs(v).max():.4g}")
-            for x, v in signals
-        ]
-        rms = table(("signal", "rms", "largest"), sizes)
-        return card("ExperimentData", self.summary(), facts(about), rms)
 
     def odd_part(self) -> "ExperimentData":
         """Return half the difference of each pair of experiments with opposite inputs.

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, NonNegative, Numbers, SectionCount, Seed
@@ -132,11 +132,7 @@ def simulate_experiments(
     )
 
 
-@eqx.filter_jit
-def _simulate(
-    ldtp: LDTP, u: Float[Array, "S n nu"], x0: Float[Array, "S d"] | None
-) -> Float[Array, "S n ny"]:
-    return jax.vmap(ldtp.simulate)(u, x0)
+_simulate = eqx.filter_jit(lambda ldtp, u, x0: jax.vmap(ldtp.simulate)(u, x0))
 
 
 @checked

@@ -32,9 +32,10 @@ from ..sections.placed import PlacedSections
 # More: plans take longer to make.
 _EQUAL_STEPS = (1, 2, 3, 4, 6, 8)
 _TOLERANCES = (1.0, 1e-2, 1e-4)
-# Relative tolerance of the reference solution. Larger: errors near 1e-13 are estimated wrongly.
-# Smaller: rounding dominates.
-_REFERENCE_RTOL = 1e-13
+# Rounding error at a section, relative to the states' scales: the tolerance of the reference
+# solution, and the least accuracy. Larger: errors near it are estimated wrongly. Smaller: rounding
+# exceeds estimates.
+ROUNDING = 1e-13
 # Duration of the path to a level relative to that on the cycle, for which equal steps are made.
 # Smaller: experiments that take longer need one step more. Larger: steps are longer than planned.
 _ROOM = 1.25
@@ -57,7 +58,7 @@ _LEAST_SHARE = 1e-6
 # bad guesses set the length of the last step. Smaller: good ones are not used.
 _WORST_GUESS = 3.0
 
-Accuracy = Annotated[float, Number("a number from 1e-13 to 0.01", low=1e-13, high=1e-2)]
+Accuracy = Annotated[float, Number("a number from 1e-13 to 0.01", low=ROUNDING, high=1e-2)]
 """Relative to the states' scales. Below the least, rounding is larger; above the largest, errors on
 the cycle differ from those of experiments beside it."""
 
@@ -165,7 +166,7 @@ def _try_ways(placed: PlacedSections, settings: Settings) -> _Ways:
     divide = np.array([*_EQUAL_STEPS, *[_EQUAL_STEPS[-1]] * len(_TOLERANCES), 2])
     slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, 1.0])
     by_estimate = np.isfinite(slack) & (np.arange(W) < K)
-    rtol = xp.where(by_estimate, settings.rtol, _REFERENCE_RTOL)
+    rtol = xp.where(by_estimate, settings.rtol, ROUNDING)
 
     all_ways = lambda tree: jax.tree_util.tree_map(lambda x: xp.tile(x, W), tree)  # noqa: E731
     each = lambda x: xp.repeat(xp.asarray(x), N)  # noqa: E731

@@ -1,5 +1,6 @@
 """Recorded inputs and outputs at the sections of a cycle, of any length and with gaps."""
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Protocol, runtime_checkable
 
@@ -87,16 +88,9 @@ class Record(eqx.Module):
 
         **Raises:** `DefinitionError` if there are none.
         """
-        return Record(
-            self.u[first:stop],
-            self.y[first:stop],
-            n_sections=self.n_sections,
-            first_section=(self.first_section + first) % self.n_sections,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            lead=self.lead,
-            drift=self.drift,
-        )
+        section = (self.first_section + first) % self.n_sections
+        u, y = self.u[first:stop], self.y[first:stop]
+        return dataclasses.replace(self, u=u, y=y, first_section=section)
 
     def __repr__(self) -> str:
         missing = int(np.isnan(self.y).any(axis=1).sum())

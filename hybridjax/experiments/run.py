@@ -1,7 +1,8 @@
 """Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
 
 import dataclasses
-from typing import Annotated, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -11,10 +12,10 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index
 from .._core.boundary.values import Reals
 from .._core.compilation import TwoTiers
-from .._core.execution import Execution
-from .._core.executor import from_host
+from .._core.execution import Execution, in_threads
+from .._core.executor import from_host, on_cpu
 from .._core.memo import Memory, remembered
-from .._core.progress import working
+from .._core.progress import counted, working
 from .._core.results import Result
 from ..engine.settings import EXPERIMENT
 from ..errors import ComputationError, DefinitionError
@@ -22,15 +23,14 @@ from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
-from ..systems.output import Output, OutputNames
 from ..systems.structure import Outputs
-from .batches import divide, in_batches
+from ..systems.system import Output, OutputNames
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design
-from .flow_batch import Course, course, flow_batch, require_shape
 from .noise import ProcessNoise
 from .plan import Accuracy, Stepping, plan_flow
-from .start import StartName, linearized, on_cycle, periodic_start, predict, settle_batch
+from .response import Course, course, flow_batch, require_shape
+from .start import StartName, linearized, periodic_start, predict, settle_batch
 
 
 DesignLike = (
@@ -42,9 +42,16 @@ DesignLike = (
 # compile and saves 2 microseconds per sample. Fewer: short runs wait in vain. More: runs of 20 s
 # take twice as long.
 _LARGE = 5_000_000
+# Experiments per compiled call. On CPU: fewer pay more for the work that is done once for all of
+# them, more leave the cache. On accelerators: more need more memory.
+_BATCH, _BATCH_ON_ACCELERATOR = 320, 16384
+# Fewer experiments than this are not split among workers: smaller batches cost more than they gain.
+_UNDIVIDED = 32
+# Batches are multiples of this, the width of vector instructions: others take up to a third longer.
+_VECTOR = 8
 # Experiments of a chunk, also when inputs on disk are checked. More need more memory; fewer leave
 # batches and threads unfilled.
-CHUNK = 640
+CHUNK = 2 * _BATCH
 
 
 @checked
@@ -190,8 +197,16 @@ class Campaign:
 
     @property
     def at_sections(self) -> "_AtSections":
-        """Outputs, compiled definitions and values at the sections."""
-        return _at_sections(self.placed, self.outputs)
+        """Outputs, compiled definitions and values at the sections, made once for the same sections
+        and outputs."""
+        names = tuple(x if isinstance(x, str) else id(x) for x in self.outputs)
+
+        def make() -> _AtSections:
+            z = self.placed.structure().resolve_outputs(self.outputs)
+            on_cycle = np.asarray(self.placed.observe(tuple(z.items)))
+            return _AtSections(z, course(self.placed, z.items), on_cycle, self.outputs)
+
+        return _resolved.recall(self.placed, names, make)
 
     @remembered
     def _programs(self) -> tuple[TwoTiers, TwoTiers]:
@@ -203,7 +218,7 @@ class Campaign:
         **Raises:** `ComputationError` if a periodic response is not found near the predicted one.
         """
         if self.model is None:
-            return np.repeat(on_cycle(self.placed), len(u), axis=1)
+            return np.tile(np.asarray(self.placed.section_zero)[:, None], len(u))
         stepping, periods = self.stepping, self.inputs.periods
         window = u[:, : periods * self.placed.n_sections]
         predicted = periodic_start(self.placed, self.model, window)
@@ -364,14 +379,44 @@ class _AtSections(NamedTuple):
 _resolved = Memory()
 
 
-def _at_sections(placed: PlacedSections, outputs) -> _AtSections:
-    """Return outputs and course, made once for the same sections and outputs."""
-    names = tuple(x if isinstance(x, str) else id(x) for x in outputs)
+def divide(S: int, execution: Execution) -> Execution:
+    """Return `execution` with the batch size for S experiments and the number of threads filled
+    in."""
+    workers = execution.threads
+    if execution.batch is not None:
+        size = min(execution.batch, S)
+    else:
+        most = _BATCH if on_cpu() else _BATCH_ON_ACCELERATOR
+        # So many batches that all workers take equally many, and all batches of one size.
+        rounds = -(-S // (most * workers))
+        size = max(-(-S // (rounds * workers)), min(_UNDIVIDED, S))
+        size = min(-(-size // _VECTOR) * _VECTOR, max(S, 1))
+    return dataclasses.replace(execution, batch=size, workers=min(workers, -(-S // size)))
 
-    def make() -> _AtSections:
-        z = placed.structure().resolve_outputs(outputs)
-        return _AtSections(
-            z, course(placed, z.items), np.asarray(placed.observe(tuple(z.items))), outputs
-        )
 
-    return _resolved.recall(placed, names, make)
+def in_batches(
+    program: Callable[..., Any],
+    arguments: Callable[[slice | np.ndarray], tuple],
+    S: int,
+    execution: Execution,
+    name: str,
+) -> Iterator[tuple[slice, Any]]:
+    """Yield rows and the results of `program` for them, batch after batch.
+
+    **Arguments:** `program`: compiled, with experiments first in all that it returns. `arguments`:
+    returns its arguments for some experiments. `execution`: from `divide`.
+    `name`: of the experiments, for the progress line.
+    """
+    size = execution.batch or S
+
+    def work(k: int):
+        rows = slice(k, k + size)
+        if k + size > S:  # the last batch is filled up with repetitions
+            rows = np.arange(k, k + size) % S
+        out = program(*arguments(rows))
+        return jax.tree_util.tree_map(lambda x: np.asarray(x)[: S - k], out)
+
+    starts = range(0, S, size)
+    parts = in_threads(work, starts, execution.workers or 1)
+    for k, part in counted(zip(starts, parts, strict=True), f"batches of {name}", len(starts)):
+        yield slice(k, min(k + size, S)), part

@@ -14,9 +14,9 @@ from ..linear.ldtp import LDTP
 from ..linear.time_response import monodromy
 from ..sections.linearize import linearize
 from ..sections.placed import PlacedSections
-from ..systems.output import Output
-from .flow_batch import Course, flow_batch
+from ..systems.system import Output
 from .plan import Plan, Stepping
+from .response import Course, flow_batch
 
 
 StartName = Literal["cycle", "periodic", "steady"]
@@ -46,13 +46,7 @@ def periodic_start(
     that repeat the `window`."""
     embed = to_host(placed).frames()[0][0, :, : model.A.shape[1]]
     x0 = model.periodic_states(window, window.shape[1] // placed.n_sections)
-    return on_cycle(placed) + embed @ np.asarray(x0).T
-
-
-def on_cycle(placed: PlacedSections) -> Float[np.ndarray, "m 1"]:
-    """Return the time and the state of the limit cycle on section 0."""
-    lanes = placed.lanes
-    return np.concatenate([np.asarray(lanes.t)[None], np.asarray(lanes.q)])[:, :1]
+    return np.asarray(placed.section_zero)[:, None] + embed @ np.asarray(x0).T
 
 
 class Prediction(NamedTuple):

@@ -22,7 +22,7 @@ from ..engine.describe import describe
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle, rough
 from ..sections.placed import SectionsLike
-from ..systems.output import OutputNames
+from ..systems.system import OutputNames
 from .data import ExperimentData, Simulated, summary
 from .design.design import Design
 from .run import CHUNK, Campaign, DesignLike, Options, prepare

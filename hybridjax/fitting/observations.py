@@ -19,9 +19,8 @@ from .._core.text import fields, listed, value
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.flow_batch import course, flow_batch
 from ..experiments.plan import Plan
-from ..experiments.response_function import response_function
+from ..experiments.response import course, flow_batch, response_function
 from ..identify.htf_errors import check_values, error_weights
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float
 from .._core.vector_math.factorizations import solve_positive
 from ..mechanics.mechanism import Mechanism
 from ..systems.chart import FieldChart
-from ..systems.output import Output
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.system import Guess, HybridSystem, Output, Parameter, parameter
 from ..systems.transition import Transition
 
 

@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked_methods
 from ..systems.chart import FieldChart
-from ..systems.output import Output
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.system import Guess, HybridSystem, Output, Parameter, parameter
 from ..systems.transition import Transition
 
 

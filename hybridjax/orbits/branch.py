@@ -10,13 +10,10 @@ from .._core.boundary.checked import checked_methods
 from .._core.html import COLORS, Curve, card, complex_number, picture, table
 from .._core.memo import remembered
 from .._core.results import Result
+from .coincidence import SAME
 from .cycle import LimitCycle
 from .limit_cycles import LimitCycles
 
-
-# A multiplier is printed with a point if its modulus is this near to 1. Smaller: rounding hides
-# critical ones. Larger: others are printed, too.
-_ON_CIRCLE = 1e-6
 
 Kind = Literal["fold", "branch point", "flip", "Neimark-Sacker"]
 KINDS = get_args(Kind)
@@ -38,7 +35,7 @@ class BranchPoint(NamedTuple):
     @property
     def critical(self) -> Complex[np.ndarray, " c"]:
         """The multipliers on the unit circle."""
-        return self.multipliers[np.abs(np.abs(self.multipliers) - 1) < _ON_CIRCLE]
+        return self.multipliers[np.abs(np.abs(self.multipliers) - 1) < SAME]
 
 
 class BranchEnd(NamedTuple):
@@ -116,14 +113,11 @@ class Branch(eqx.Module):
     def _repr_html_(self) -> str:
         largest = np.abs(self.multipliers).max(axis=1)
         marks = [p.index for p in self.points]
-        rows = [
-            (p.kind, f"{p.value:.9g}", ", ".join(complex_number(z) for z in p.critical))
-            for p in self.points
-        ]
-        begin, end = (
-            (word, f"{x.value:.9g}", x.message)
-            for word, x in zip(("from", "to"), self.ends, strict=True)
-        )
+        begin, end = self.ends
+        rows = [("from", begin.value, begin.message)]
+        rows += [(p.kind, p.value, ", ".join(map(complex_number, p.critical))) for p in self.points]
+        rows += [("to", end.value, end.message)]
+        rows = [(name, f"{value:.9g}", text) for name, value, text in rows]
         curves = [
             Curve(self.values[[0, -1]], np.ones(2), color=COLORS[-1]),
             Curve(self.values, largest),
@@ -131,5 +125,4 @@ class Branch(eqx.Module):
         ]
         drawn = picture(curves, self.parameter, "largest modulus of multipliers")
         title = f"of {type(self.cycles.systems).__name__}: {len(self)} cycles"
-        rows = [begin, *rows, end]
         return card("Branch", title, table(("", self.parameter, ""), rows), drawn)

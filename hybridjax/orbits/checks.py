@@ -20,13 +20,9 @@ from ..systems.transition import Scheduled
 from .coincidence import SAME, coincident, events_of
 from .cycle import LimitCycle
 from .return_map import Turn
-from .scale import STIFF, fastest, is_implicit, points
+from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 
 
-# The part of a function's change over the states' sizes and the period, as its derivatives predict
-# it, that is no difference between two times. Smaller: rounding is. Larger: small errors of a
-# stated period pass.
-_SAME_SLOPE = 1e-9
 # The time at which functions are compared with those a period later, in parts of the period after
 # each point: fields that jump with a clock do not jump there.
 _BASE = 0.0729
@@ -100,7 +96,7 @@ def check_times(
             now, later = function(first, states), function(first + period, states)
             size = np.concatenate([[time], sizes[a, :n]])[:, None]
             slope = np.sum(np.abs(now[:, 1 : 2 + n]) * size, axis=1)
-            differs = np.abs(later - now)[:, 0] > SAME * np.abs(now[:, 0]) + _SAME_SLOPE * slope
+            differs = np.abs(later - now)[:, 0] > SAME * np.abs(now[:, 0]) + ROUNDING * slope
             gains = slice(2 + n, None)  # derivatives by inputs
             if np.any(differs) or np.any(
                 np.abs(later - now)[:, gains] > SAME * np.abs(now)[:, gains].max(initial=0.0)

@@ -158,17 +158,12 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
     """True if all orders lead from chart a to the same state, with the same derivative."""
     if len(orders) < 2:  # in the other order an event does not happen
         return False
-    first = orders[0]
-    m, n = first.derivative.shape
-    after = scale[first.chart, :m]
-    for order in orders[1:]:
-        if order.chart != first.chart:
-            return False
-        apart = np.abs(order.state - first.state) / after
-        tilted = np.abs(order.derivative - first.derivative) * scale[a, :n] / after[:, None]
-        if not max(apart.max(), tilted.max()) < SAME:
-            return False
-    return True
+    b = orders[0].chart
+    if any(order.chart != b for order in orders):
+        return False
+    m, n = orders[0].derivative.shape
+    rows = [np.column_stack([x.state, x.derivative * scale[a, :n]]) for x in orders]
+    return bool(np.max(np.ptp(rows, axis=0) / scale[b, :m, None]) < SAME)
 
 
 def _orders(s: Structure, t: float, before: _Order, left: int, due: float) -> Iterator[_Order]:
@@ -212,14 +207,10 @@ def check_begin(map: ReturnMap) -> None:
         due[map.event] = False
     if due.any():
         name = s.transitions[int(np.argmax(due))].name
-        if base is not None:
-            raise ComputationError(
-                f"the event '{name}' coincides with '{base.name}', at which every turn begins "
-                "and ends, so that it may or may not belong to the turn: take another section."
-            )
+        begins = "the beginning of every turn" if base is None else f"'{base.name}', its beginning"
         raise ComputationError(
-            f"the search begins exactly at the event '{name}', which may or may not belong to the "
-            "turn: give a guess at another time."
+            f"the event '{name}' coincides with {begins}, so that it may or may not belong to the "
+            "turn: take another section, or a guess at another time."
         )
 
 

@@ -15,8 +15,8 @@ from .._core.executor import Definition, namespace
 from .._core.precision import real
 from .._core.text import fields
 from ..engine.target import AbstractLevels, Target
-from ..systems.output import Output
 from ..systems.structure import Structure
+from ..systems.system import Output
 
 
 Direction = Literal["falling", "rising"]

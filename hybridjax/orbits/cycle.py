@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Positive
 from .._core.executor import is_traced, to_host
-from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, thinned, unit_circle
+from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, unit_circle
 from .._core.meaning import code_digest
 from .._core.memo import remembered
 from .._core.results import Result
@@ -286,16 +286,11 @@ def orbit_picture(
         values = [np.take_along_axis(q, c[:, None], axis=1)[:, 0] for c in columns]
         return values if len(names) == 2 else [t, *values]
 
-    (t, chart, _), (x, y) = turn, axes(*turn)
-    cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
-    named: set[int] = set()
+    chart, (x, y) = turn[1], axes(*turn)
     curves = []
-    for k in np.split(np.arange(len(t)), cuts):
-        a = int(chart[k[0]])
-        name = s.names[a] if len(s.names) > 1 and a not in named else ""
-        named.add(a)
-        k = k[thinned(len(k), len(k) / len(t))]
-        curves.append(Curve(x[k], y[k], name, COLORS[a % len(COLORS)]))
+    for a in np.unique(chart):
+        name = s.names[a] if len(s.names) > 1 else ""
+        curves.append(Curve(np.where(chart == a, x, np.nan), y, name, COLORS[a % len(COLORS)]))
     if sections is not None:
         x, y = axes(*sections)
         curves.append(Curve(x, y, color="currentColor", points=True))

@@ -19,7 +19,7 @@ from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, integrated
 from .checks import check_clock, check_conserved, check_periodic, check_times, explain
-from .coincidence import check_begin, coincident, commutes, events_of
+from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
 from .guess import return_map_near
@@ -31,9 +31,6 @@ from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_o
 # A cycle is computed again, in the sizes of its states, if a rough size was larger by more than
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
-# A state keeps its rough size if on the cycle it is smaller than this part of it. Smaller: a state
-# at rest gets its rounding errors for a size. Larger: states that move little lose accuracy.
-_VANISHING = 1e-6
 
 
 @checked
@@ -187,7 +184,8 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     s, period = map.structure, solution.turn.period
     rough = sizes_of(s, map.scale)
     sizes = sizes_on(s, solution.turn.legs, float(period))
-    sizes = {k: x if x > _VANISHING * rough[k] else rough[k] for k, x in sizes.items()} | given
+    # A state at rest keeps its rough size: on the cycle it has only rounding errors.
+    sizes = {k: x if x > SAME * rough[k] else rough[k] for k, x in sizes.items()} | given
     fine = dataclasses.replace(
         map,
         settings=dataclasses.replace(map.settings, scale=scale_of(s, sizes)),

@@ -22,15 +22,12 @@ from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure
 from ..systems.system import Guess
 from .checks import check_times
+from .coincidence import SAME
 from .crossing import AtEvent, Crossing, to_section
 from .return_map import ReturnMap
 from .scale import Sizes, scale_of, sizes_near, slow_time
 
 
-# A guess lies on the section if it would reach it within this part of the time scale of the states.
-# Smaller: rounding moves a guess off its section, and a cycle is simulated to return to it. Larger:
-# the search begins at states that are not on the section.
-_ON_SECTION = 1e-6
 # An autonomous system is given up if it does not return within this multiple of the time scale of
 # the states at the guess. Smaller: slow cycles are lost. Larger: vain searches last longer.
 _PATIENCE = 1000.0
@@ -124,7 +121,7 @@ def _on_section(
             "moves: start elsewhere."
         )
     place, advice = str(section), ""
-    on_section = rate < 0 and abs(level) <= -_ON_SECTION * time * rate
+    on_section = rate < 0 and abs(level) <= -SAME * time * rate  # up to rounding
     if isinstance(section, AtEvent):
         on_section = is_after
     if section is None:

@@ -215,10 +215,9 @@ def _multipliers(
     factors: Float[np.ndarray, "S K d d"], ok: Bool[np.ndarray, " S"]
 ) -> Complex[np.ndarray, "S d"]:
     """See `LimitCycles.multipliers`."""
-    product = np.where(ok[:, None, None], turn_product(factors), 0.0)
-    values = np.linalg.eigvals(product).astype(complex)
+    values = np.linalg.eigvals(np.where(ok[:, None, None], turn_product(factors), 0.0))
     order = np.lexsort((-np.imag(values), -np.round(np.abs(values), 12)), axis=-1)
-    values = np.take_along_axis(values, order, axis=-1)
+    values = np.take_along_axis(values.astype(complex), order, axis=-1)
     values[~ok] = np.nan
     return values
 

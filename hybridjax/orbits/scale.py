@@ -35,9 +35,6 @@ _MODES = 20.0
 # Shifts of states and of times by which rounding errors of the field show, in their rounding
 # errors: odd ones and even ones, of several sizes, since equal ones may cancel.
 _SHIFTS = np.array([-4.7, -3.1, -1.9, -0.8, 1.1, 2.3, 3.6, 5.2])
-# Phases of the clock at which rounding errors of the field are evaluated at a guess: an odd number,
-# since an even one may repeat a symmetry.
-_PHASES = 7
 # A chart is stiff if its fastest mode decays to more than this power of e in one turn. Smaller: an
 # implicit method is used where an explicit one is faster. Larger: explicit methods take thousands
 # of steps.
@@ -69,7 +66,8 @@ def sizes_near(
     points = _reached(s, chart, t, q)
     reached = np.flatnonzero(np.isfinite(points).all(axis=1))
     reached = np.roll(reached, -int(np.argmax(reached == chart)))  # the guess's chart first
-    phases = np.zeros(1) if period is None else period * np.arange(_PHASES) / _PHASES
+    # Of the clock's phases an odd number, since an even one may repeat a symmetry.
+    phases = np.zeros(1) if period is None else period * np.arange(7) / 7
     R, n = len(reached), len(phases)
     times, states = np.repeat(float(t) + phases, R), np.tile(points[reached].T, n)
     fields = _fields(s, np.tile(reached, n), times, states)

@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from .._core.compilation import at_ease
 from .._core.executor import to_host
-from ..engine.chain import Link, divergence, links
 from ..engine.move import Options, move
+from ..engine.replay import Link, divergence, links
 from .return_map import ReturnMap
 
 

@@ -59,45 +59,37 @@ def phase(found: Phase, *, ax: AxesLike | None = None) -> Plot:
 def section_data(
     data: SectionData, *, labels: Mapping[str, str] | None = None, ax: AxesLike | None = None
 ) -> Plot:
-    """For each signal the average cycle, the deviations from it, and the input's spectrum.
+    """Draw for each signal the average cycle, the deviations from it, and the input's spectrum.
 
     Left: the average cycle. Middle: deviations against phase, gray, with twice their standard
     deviation. Right: the power of inputs against frequency, for outputs the deviation from cycle to
     cycle, at the section where it is largest.
     """
-    N = data.n_sections
+    N, nu = data.n_sections, len(data.inputs)
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
+    values = np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in data.records])
+    at = np.concatenate([(r.first_section + np.arange(len(r.u))) % N for r in data.records])
+    thin = slice(None, None, max(1, len(at) // 20000))
     f, power = input_spectrum(data)
-    at_phase = np.arange(N) / N
+    phase = np.arange(N) / N
     with panels(ax, len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names)) as axes:
-        for i, name in enumerate(names):
+        for i, (name, x) in enumerate(zip(names, values.T, strict=True)):
             average, spread, last = axes[i]
             deviation = axis_of(name, labels, deviation=True)
-            average.plot(at_phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
+            average.plot(phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
             average.set_ylabel(axis_of(name, labels))
-            values = np.concatenate(
-                [np.concatenate([r.u, r.y], axis=1)[:, i] for r in data.records]
-            )
-            at = np.concatenate([(r.first_section + np.arange(len(r.u))) % N for r in data.records])
-            thin = slice(None, None, max(1, len(at) // 20000))
-            spread.plot(at[thin] / N, values[thin], ",", color=COLORS["gray"], rasterized=True)
-            std = np.array([np.nanstd(values[at == n]) for n in range(N)])
+            spread.plot(at[thin] / N, x[thin], ",", color=COLORS["gray"], rasterized=True)
+            std = np.array([np.nanstd(x[at == n]) for n in range(N)])
             for sign in (-2, 2):
-                spread.plot(at_phase, sign * std, color=CYCLE[0])
+                spread.plot(phase, sign * std, color=CYCLE[0])
             spread.set_ylabel(deviation)
-            if i < len(data.inputs):
+            if i < nu:
                 last.semilogy(f, np.maximum(power[:, i], 1e-12 * power[:, i].max()), color=CYCLE[1])
                 label = with_unit("power", square(name))
                 last.set(xlabel="frequency (cycles/period)", ylabel=label)
             else:
-                most = int(np.argmax(std))
-                each = [
-                    np.flatnonzero((r.first_section + np.arange(len(r.u))) % N == most)
-                    for r in data.records
-                ]
-                y = [r.y[k, i - len(data.inputs)] for r, k in zip(data.records, each, strict=True)]
-                last.plot(np.concatenate(y), lw=0.5, color=CYCLE[1])
+                last.plot(x[at == np.argmax(std)], lw=0.5, color=CYCLE[1])
                 last.set(xlabel="cycle", ylabel=deviation)
         for panel in axes[-1, :2]:
             panel.set_xlabel("phase (cycles)")

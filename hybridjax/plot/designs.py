@@ -9,7 +9,7 @@ from .._core.boundary.checked import checked
 from .._core.signal import unit_of, with_unit
 from ..designs.candidates import Model
 from ..designs.information import InformationMap
-from ..designs.optimal_design import OptimalDesign
+from ..designs.optimize import OptimalDesign
 from ..designs.study import Study
 from ..errors import DefinitionError
 from .frequency import FREQUENCY
@@ -32,8 +32,8 @@ def spectrum(
 
     **Raises:** `DefinitionError` for a model of other signals.
     """
-    known = {*model.inputs, *model.outputs}
-    if model.n_sections != plan.design.n_sections or known != set(plan.rms) & known:
+    signals = {*model.inputs, *model.outputs}
+    if model.n_sections != plan.design.n_sections or not signals <= set(plan.rms):
         raise DefinitionError("`model` is not the one that the plan was made for: other signals.")
     with panels(ax, 2, 1, width=COLUMN, height=3.2, sharex=True) as axes:
         above, below = axes[:, 0]
@@ -70,7 +70,7 @@ def information(
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """Where an experiment learns: one row per output.
+    """Draw the phases and frequencies at which an experiment learns: one row per output.
 
     Left: how dense the information is over input frequency and the phase at which the output is
     measured, relative to the mean (of all outputs together). Right: over the phase alone,
@@ -133,13 +133,13 @@ def strides(
         for k, (label, given) in enumerate((studies or {}).items()):
             several = [given] if isinstance(given, Study) else list(given)
             color = CYCLE[k % len(CYCLE)]
-            for number, one in enumerate(several):
-                if not one.blocks:
+            for number, study in enumerate(several):
+                if not study.blocks:
                     raise DefinitionError("a study without a block has no errors: `add` data.")
-                error = np.linalg.norm(one.standard_errors, axis=1)
+                error = np.linalg.norm(study.standard_errors, axis=1)
                 style = dict(label=label if number == 0 else None, color=color, zorder=2)
-                panel.plot(one.strides, error, marker="o", ms=3, lw=0.6, **style)
-                reached += one.strides.tolist()
+                panel.plot(study.strides, error, marker="o", ms=3, lw=0.6, **style)
+                reached += study.strides.tolist()
         around = 1.5 if studies else 10.0
         low, high = min(reached) / around, max(reached) * around
         for errors, cycles, color, label in (

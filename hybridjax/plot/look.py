@@ -68,13 +68,11 @@ _STYLE: dict[Any, Any] = {
 }
 # Text stays text: it can be searched and edited.
 _FONTS_IN_FILES: Any = {"pdf.fonttype": 42, "svg.fonttype": "none"}
-# Figures that have no layout engine are given none.
-_IN_FILES = _FONTS_IN_FILES | {"figure.autolayout": False, "figure.constrained_layout.use": False}
 
 
 @functools.cache
 def _load_backend() -> None:
-    """In Jupyter, the backend turns interactive mode on when it is loaded, which is when the first
+    """Load the backend. In Jupyter, this turns interactive mode on, by default when the first
     figure is made. Inside of `style` that would be undone, and no later figure would be shown."""
     pyplot.switch_backend(matplotlib.get_backend())
 
@@ -193,16 +191,8 @@ def save(
     if not path.name:
         raise DefinitionError(f"'{path}' is a folder: add the name of a file without its suffix.")
     paths = tuple(path.with_name(f"{path.name}.{format}") for format in formats)
-    layout = figure.get_layout_engine()
-    with matplotlib.rc_context(_IN_FILES):
-        try:
-            if layout is not None:
-                layout.execute(figure)
-                figure.set_layout_engine(None)  # once for all files
-            for one, format in zip(paths, formats, strict=True):
-                with replacing(one) as new:
-                    figure.savefig(new, format=format, dpi=dpi)
-        finally:
-            if layout is not None:
-                figure.set_layout_engine(layout)
+    with matplotlib.rc_context(_FONTS_IN_FILES):
+        for target, format in zip(paths, formats, strict=True):
+            with replacing(target) as new:
+                figure.savefig(new, format=format, dpi=dpi)
     return paths

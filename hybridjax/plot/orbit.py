@@ -24,7 +24,6 @@ _NUMBER: dict[str, Any] = {
     "fontsize": "x-small", "color": "0.35", "ha": "center", "va": "center", "zorder": 6,
     "path_effects": [withStroke(linewidth=2, foreground="white")],
 }  # fmt: skip
-_TURN = 1 + 1e-6  # so that an event at the very end of a turn is seen
 
 
 @checked
@@ -56,11 +55,11 @@ def cycle(
     """
     s = cycle.structure
     x, y = _plane(s, x, y)
-    others: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
-    for name, other in others.items():
+    added: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
+    for name, other in added.items():
         if other is not None and other.structure.names != s.names:
             raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
-    orbit = cycle.trajectory(_TURN)
+    orbit = cycle.trajectory(1 + 1e-6)  # with an event at the very end of a period
     with panels(ax, height=3.0) as axes:
         panel = axes[0, 0]
         if perturbed is not None:
@@ -68,10 +67,10 @@ def cycle(
             for _, px, py in pieces:
                 panel.plot(px, py, color=COLORS["red"], lw=0.7, zorder=1)
             panel.plot(pieces[0][1][0], pieces[0][2][0], "s", ms=3.5, color=COLORS["red"], zorder=5)
-        seen = set()
+        labeled = set()
         for a, px, py in _pieces(orbit, x, y):
-            label = None if a in seen else s.names[a]
-            seen.add(a)
+            label = None if a in labeled else s.names[a]
+            labeled.add(a)
             color = _CHARTS[a % len(_CHARTS)]
             panel.plot(px, py, color=color, lw=1.8, label=label, zorder=3, solid_capstyle="butt")
         _, px, py = orbit(x, y)
@@ -118,7 +117,7 @@ def _pieces(trajectory: Trajectory, x: str, y: str):
 
 
 def _points(s: Structure, a: int, names, t, q) -> tuple[np.ndarray, np.ndarray]:
-    """Where states (n, L) of chart a lie in the plane, and which way they move: (L, 2) each."""
+    """Return the places of states (n, L) of chart a in the plane, and their rates: (L, 2) each."""
     q, u = q[: s.dims[a]], np.zeros((s.nu, 1))
     flow = kernels.field(s, a, t, q, u)[:, 0]
     point, by_time, *by_state = np.moveaxis(
@@ -129,13 +128,12 @@ def _points(s: Structure, a: int, names, t, q) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
-    named: list[tuple[np.ndarray, list[str]]] = []  # what happens at a point stands there together
+    texts: dict[tuple, dict[str, None]] = {}  # names of what happens at a point
     for k in np.flatnonzero(orbit.event >= 0):
         transition = s.transitions[orbit.event[k]]
         a, b = s.chart_index(transition.source), s.chart_index(transition.target)
-        here, t = slice(k, k + 1), orbit.t[k : k + 1]
-        (before,), _ = _points(s, a, names, t, orbit.before[here].T)
-        (after,), _ = _points(s, b, names, t, orbit.after[here].T)
+        (before,), _ = _points(s, a, names, orbit.t[k : k + 1], orbit.before[k][:, None])
+        (after,), _ = _points(s, b, names, orbit.t[k : k + 1], orbit.after[k][:, None])
         if not np.all(np.isfinite([before, after])):
             continue
         if np.any(np.abs(after - before) > 1e-9 * (1 + np.abs(before))):
@@ -143,28 +141,22 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
             ax.plot(*ends, "--", color="black", lw=0.8, zorder=2)
             ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
         ax.plot(*before, "o", ms=4, color="black", zorder=5)
-        if any(transition.name in texts for _, texts in named):
-            continue
-        at = [texts for point, texts in named if np.allclose(point, before, atol=1e-9)]
-        if at:
-            at[0].append(transition.name)
-        else:
-            named.append((before, [transition.name]))
-    for point, texts in named:
-        _text(ax, "\n".join(texts), point, center, distance=-9)
+        if not any(transition.name in there for there in texts.values()):
+            texts.setdefault(tuple(before.round(9)), {})[transition.name] = None
+    for point, there in texts.items():
+        _text(ax, "\n".join(there), point, center)
 
 
-def _text(ax: Axes, text: str, point, center, distance: int, **options) -> None:
-    """A text beside `point`, away from `center` (towards it if `distance` is negative)."""
+def _text(ax: Axes, text: str, point, center) -> None:
+    """A text beside `point`, towards `center`."""
     span = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())])
-    away = (np.asarray(point) - center) / span
-    away = np.sign(distance) * away / (np.linalg.norm(away) or 1.0)
+    x, y = (center - np.asarray(point)) / span
+    x, y = np.array([x, y]) / (np.hypot(x, y) or 1.0)
     ax.annotate(
-        text, point, xytext=abs(distance) * away, textcoords="offset points", zorder=6,
+        text, point, xytext=(9 * x, 9 * y), textcoords="offset points", zorder=6,
         path_effects=[withStroke(linewidth=2, foreground="white")],
-        ha="left" if away[0] > 0.35 else "right" if away[0] < -0.35 else "center",
-        va="bottom" if away[1] > 0.35 else "top" if away[1] < -0.35 else "center",
-        **options,
+        ha="left" if x > 0.35 else "right" if x < -0.35 else "center",
+        va="bottom" if y > 0.35 else "top" if y < -0.35 else "center",
     )  # fmt: skip
 
 
@@ -174,10 +166,10 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit) -> N
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
     taken = orbit[np.isfinite(orbit).all(axis=1)] / unit  # where no number may stand
     bars, step = [], max(1, round(placed.n_sections / 8))
-    for i, (here, along) in enumerate(_meetings(s, placed, names, unit)):
-        bars.append(np.stack([here - _BAR * along, here + _BAR * along]))
+    for i, (point, along) in enumerate(_meetings(s, placed, names, unit)):
+        bars.append(np.stack([point - _BAR * along, point + _BAR * along]))
         if i % step == 0:
-            beside = np.stack([here + 2 * side * _BAR * along for side in (-1, 1)]) / unit
+            beside = np.stack([point - 2 * _BAR * along, point + 2 * _BAR * along]) / unit
             room = np.linalg.norm(beside[:, None] - taken, axis=2).min(axis=1)
             if room.max() > _BAR:
                 at = beside[np.argmax(room)]
@@ -190,19 +182,19 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit) -> N
 
 
 def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tuple]:
-    """For each section where the cycle meets it, and a step of length 1 on the page along it, in
-    the units of the axes."""
+    """Yield the point of the cycle at each section, and a step of length 1 on the page along the
+    section, in the units of the axes."""
     lanes, normals = placed.lanes, np.asarray(placed.normal)
     charts, times, states = (np.asarray(v) for v in (lanes.chart, lanes.t, lanes.q))
     points, rates = np.empty((2, len(charts), 2))
     for a in np.unique(charts):
-        here = charts == a
-        points[here], rates[here] = _points(s, int(a), names, times[here], states[:, here])
+        mask = charts == a
+        points[mask], rates[mask] = _points(s, int(a), names, times[mask], states[:, mask])
     for a, normal, point, rate in zip(charts, normals, points, rates, strict=True):
         states = s.charts[a].states
         inside = [1 + states.index(name) for name in names if name in states]
-        others = np.delete(normal, inside)
-        curve = len(inside) == 2 and np.any(normal) and not np.any(np.abs(others) > 1e-12)
+        beyond = np.delete(normal, inside)
+        curve = len(inside) == 2 and np.any(normal) and not np.any(np.abs(beyond) > 1e-12)
         x, y = normal[inside] * unit if curve else rate / unit
         step = np.array([-y, x])
         yield point, unit * step / (np.linalg.norm(step) or 1.0)

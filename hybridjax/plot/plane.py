@@ -46,35 +46,31 @@ def multipliers(
     """
     reference = "estimate" if isinstance(true, MultiplierEstimate) else "exact"
     borders = _borders({reference: true, **(estimates or {})})
-    true = _values(true.multipliers if isinstance(true, LDTP) else true)
+    true = _values(true)
     if true.size == 0:
         raise DefinitionError("`true` holds no multiplier to draw.")
     series = _series(estimates or {}, labels)
+    cross: dict[str, Any] = {"marker": "+", "ms": 9, "mew": 1.2, "color": "black"}
+    drawn = [(reference, reference, true, cross)]
+    for k, (label, z) in enumerate(series.items()):
+        marker, color = _MARKERS[k % len(_MARKERS)], CYCLE[k % len(CYCLE)]
+        text = rf"{label}: $|\Delta\lambda|$ = {compare_multipliers(z, true).max_error:.1e}"
+        line = {"marker": marker, "ms": 5, "mew": 1.0, "color": color, "mfc": "none"}
+        drawn.append((label, text, z, line))
     with panels(ax, height=3.5 + 0.15 * len(series)) as axes:
         panel = axes[0, 0]
         _unit_circle(panel)
-        boxes = [panel]
-        far = max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
-        panel.set(xlim=(-1.1 * far, 1.1 * far), ylim=(-1.1 * far, 1.1 * far), aspect="equal")
+        far = 1.1 * max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
+        panel.set(xlim=(-far, far), ylim=(-far, far), aspect="equal")
         panel.locator_params(nbins=5)
+        boxes = [panel]
         if zoom and (series or borders):
             boxes.append(_zoom(panel, true, series, borders))
         for box in boxes:
-            box.plot(
-                true.real, true.imag, "+", ms=9, mew=1.2, color="black", label=reference, ls=""
-            )
-            for border in borders.get(reference, ()):
-                box.plot(np.real(border), np.imag(border), lw=0.7, color="black")
-            for k, (label, z) in enumerate(series.items()):
-                error = compare_multipliers(z, true).max_error
-                box.plot(
-                    np.real(z), np.imag(z), _MARKERS[k % len(_MARKERS)], mfc="none", ms=5, mew=1.0,
-                    ls="", color=CYCLE[k % len(CYCLE)],
-                    label=rf"{label}: $|\Delta\lambda|$ = {error:.1e}",
-                )  # fmt: skip
+            for label, text, z, line in drawn:
+                box.plot(np.real(z), np.imag(z), ls="", label=text, **line)
                 for border in borders.get(label, ()):
-                    color = CYCLE[k % len(CYCLE)]
-                    box.plot(np.real(border), np.imag(border), lw=0.7, color=color)
+                    box.plot(np.real(border), np.imag(border), lw=0.7, color=line["color"])
         _complex_axes(panel, r"\lambda")
         if ax is None and series:
             shown = panel.get_legend_handles_labels()
@@ -143,7 +139,7 @@ def _near(poles: np.ndarray, zeros: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _values(source: Any) -> np.ndarray:
-    if isinstance(source, LimitCycle | MultiplierEstimate):
+    if isinstance(source, LimitCycle | LDTP | MultiplierEstimate):
         source = source.multipliers
     return np.asarray(source).ravel().astype(complex)
 
@@ -160,7 +156,7 @@ def _series(estimates: Mapping[str, Any], labels) -> dict[str, np.ndarray]:
 
 
 def _borders(estimates: Mapping[str, Any]) -> dict[str, list[np.ndarray]]:
-    """Where covariances are finite: the borders of the confidence regions by label."""
+    """Return the borders of the confidence regions by label, where covariances are finite."""
     return {
         label: [fit.ellipse(i) for i in range(len(fit.multipliers))]
         for label, fit in estimates.items()
@@ -172,30 +168,24 @@ def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders)
     """An inset around the leading true multiplier, at a place that is free of markers."""
     leading = complex(true[np.lexsort((-np.imag(true), -np.abs(true)))[0]])
     nearest = [z[np.argmin(np.abs(z - leading))] for z in series.values()]
-    far = [np.abs(z - leading) for z in nearest]
-    for one in borders.values():  # of the region next to the leading multiplier, all of it
-        far.append(min(np.abs(border - leading).max() for border in one))
-    reach = 1.35 * max([1e-12, *far])
+    # Of the region next to the leading multiplier, all of it.
+    regions = [min(np.abs(x - leading).max() for x in region) for region in borders.values()]
+    reach = 1.35 * max([1e-12, *(np.abs(z - leading) for z in nearest), *regions])
     side = 0.36
     points = (np.concatenate([true, *series.values()]) / ax.get_xlim()[1] + 1 + 1j) / 2
     places = [0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j]
-    place = max(places, key=lambda c: _largest_part(points - c).min())
+    place = max(places, key=lambda c: np.abs(points - c).min())
     inset = ax.inset_axes(
         (place.real - side / 2, place.imag - side / 2, side, side),
-        xlim=(leading.real - reach, leading.real + reach),
-        ylim=(leading.imag - reach, leading.imag + reach),
+        xlim=leading.real + np.array([-reach, reach]),
+        ylim=leading.imag + np.array([-reach, reach]),
+        aspect="equal",
     )
-    inset.set_aspect("equal")
     inset.tick_params(labelsize="xx-small", length=2)
-    for spine in inset.spines.values():
-        spine.set(visible=True, color="0.4")
+    inset.spines[:].set(visible=True, color="0.4")
     inset.locator_params(nbins=3)
     ax.indicate_inset_zoom(inset, edgecolor="0.4")
     return inset
-
-
-def _largest_part(z: np.ndarray) -> np.ndarray:
-    return np.maximum(np.abs(np.real(z)), np.abs(np.imag(z)))
 
 
 def _unit_circle(ax: Axes) -> None:

@@ -13,6 +13,7 @@ from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable
 from .._core.progress import working
 from ..errors import ComputationError, DefinitionError
+from .wanted import as_numbers, require_form
 
 
 # Pieces of a call, unless `chunk` is given. Fewer: more is lost with a worker. More: many small
@@ -133,36 +134,21 @@ class Draws:
                 drawn["failed"][i] = 1
                 continue
             drawn["failed"][i] = 0
-            change = self._change(values)
-            if change is not None:
+            other = {*values, "failed"} ^ {*drawn}
+            if other:
                 raise DefinitionError(
-                    "`function` must always give arrays of the same names and shapes, and real or "
-                    f"complex ones only: draw {rows.start + i} has {change}."
+                    f"`function` must always give the same names, but `{min(other)}` only in some "
+                    "draws."
                 )
             for name, x in values.items():
+                require_form(name, x, self.variables[name])
                 drawn[name][i] = x
         return drawn
 
     def _draw(self, i: int) -> dict[str, np.ndarray]:
         stream = np.random.SeedSequence(self.seed, spawn_key=(i,))
         values = self.function(np.random.default_rng(stream))
-        arrays = {}
-        for name, value in (values if isinstance(values, Mapping) else {"value": values}).items():
-            x = np.asarray(value)
-            if x.dtype.kind not in "biufc" or name in ("failed", "draw"):
-                raise DefinitionError(
-                    f"`function` must give numbers, by names other than `failed` and `draw`, not "
-                    f"`{name}`: a {type(value).__name__}."
-                )
-            arrays[name] = x.astype(complex if x.dtype.kind == "c" else float)
-        return arrays
-
-    def _change(self, values: Mapping[str, np.ndarray]) -> str | None:
-        """Return the first difference of a draw from the form of results, in words."""
-        for name, x in values.items():
-            if name not in self.variables or x.shape != self.variables[name].shape:
-                return f"`{name}` of the shape {x.shape}"
-            if x.dtype.kind == "c" and np.dtype(self.variables[name].dtype).kind != "c":
-                return f"`{name}` with complex numbers"
-        missing = [name for name in self.variables if name not in (*values, "failed")]
-        return f"no `{missing[0]}`" if missing else None
+        named = values if isinstance(values, Mapping) else {"value": values}
+        if not named.keys().isdisjoint(("failed", "draw")):
+            raise DefinitionError("results of `function` cannot be named `failed` or `draw`.")
+        return {name: as_numbers(name, value) for name, value in named.items()}

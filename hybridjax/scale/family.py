@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -15,12 +16,7 @@ from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed
 from .._core.boundary.values import Reals
-from .._core.pieces.description import (
-    IndescribableError,
-    digest_of,
-    function_digest,
-    program_digest,
-)
+from .._core.pieces.description import function_digest
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
 from ..engine.describe import describe
@@ -136,9 +132,8 @@ class Family:
         """Return the system at one point."""
         if not isinstance(self.model, HybridSystem):
             return self.model(**values)
-        paths = [name.split(".") for name in self.names]
         return eqx.tree_at(
-            lambda system: [_follow(system, path) for path in paths],
+            lambda system: [reduce(getattr, x.split("."), system) for x in self.names],
             self.model,
             [jnp.asarray(values[name], float) for name in self.names],
         )
@@ -172,24 +167,14 @@ class Family:
                 units[name] = ""
         return units
 
-    def describe(self, system: HybridSystem, values: Mapping[str, float]) -> dict[str, Any]:
+    def describe(self, system: HybridSystem) -> dict[str, Any]:
         """Return JSON from which the model can be told from others, given the system at a point."""
         model = describe(system)
         if isinstance(self.model, HybridSystem):
             for name in self.names:
                 del model["numbers"][name]
             return model
-        return model | {"from parameters": self._of_parameters(values)}
-
-    def _of_parameters(self, values: Mapping[str, float]) -> str:
-        def numbers(values):
-            return jax.tree_util.tree_leaves(eqx.filter(self.system(values), eqx.is_array))
-
-        try:
-            given = {name: jnp.asarray(x) for name, x in values.items()}
-            return digest_of(program_digest(numbers, given))
-        except IndescribableError:
-            return function_digest(self.model)
+        return model | {"from parameters": function_digest(self.model)}
 
 
 def _parameters(model: Any) -> tuple[list[str] | None, list[str]]:
@@ -203,9 +188,3 @@ def _parameters(model: Any) -> tuple[list[str] | None, list[str]]:
         return None, []
     usual = [x for x in parameters if x.kind in (x.POSITIONAL_OR_KEYWORD, x.KEYWORD_ONLY)]
     return [x.name for x in usual], [x.name for x in usual if x.default is x.empty]
-
-
-def _follow(system: Any, path: Sequence[str]) -> Any:
-    for name in path:
-        system = getattr(system, name)
-    return system

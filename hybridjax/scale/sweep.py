@@ -77,11 +77,10 @@ def sweep(
     - `over`: values of each parameter by name, of which all combinations are taken; or
         `hj.Points`.
     - `want`: quantities to keep of each cycle: "period", "state" (at its phase origin, with the
-        chart), "multipliers", "spectral_radius" (their largest modulus), "events" (at most four
-        times as many as cycles of the coarse pass have), "residual"; and functions of a
-        `LimitCycle`, kept under their names, that return a number or an array of always the same
-        shape. NaN where they raise `ComputationError`. The code of the cycle's `Result` is always
-        kept. Default: period and spectral radius.
+        chart), "multipliers", "spectral_radius" (their largest modulus), "residual"; and
+        functions of a `LimitCycle`, kept under their names, that return a number or an array of
+        always the same shape. NaN where they raise `ComputationError`. The code of the cycle's
+        `Result` is always kept. Default: period and spectral radius.
     - `guess`: the cycle of a similar system. Default: that of the model in the middle.
     - `chunk`: largest number of points in a piece. Default: up to 4000, with functions 250.
     - `store`: a folder, or an address for fsspec, of a Zarr group. Points that are in it already
@@ -115,7 +114,7 @@ def sweep(
     description = {
         "kind": "sweep",
         "versions": versions(),
-        "model": family.describe(system, middle),
+        "model": family.describe(system),
         "over": {name: array_digest(x) for name, x in space.axes.items()},
         "form": list(space.dims),
         "want": list(wanted.names),
@@ -129,11 +128,8 @@ def sweep(
 
 def _axes(over: Axes) -> dict[str, np.ndarray]:
     axes = {name: np.asarray(x, float) for name, x in over.items()}
-    if not axes:
-        raise DefinitionError("`over` must name at least one parameter.")
-    for name, x in axes.items():
-        if not len(x):
-            raise DefinitionError(f"the axis `{name}` is empty: give it at least one value.")
+    if not axes or not all(map(len, axes.values())):
+        raise DefinitionError("`over` must name at least one parameter, each with a value or more.")
     return axes
 
 

@@ -15,12 +15,8 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 
 
-Want = Literal["period", "state", "multipliers", "spectral_radius", "events", "residual"]
+Want = Literal["period", "state", "multipliers", "spectral_radius", "residual"]
 Measure = Callable[[LimitCycle], Any]
-
-# Events of a cycle that are kept, for each event of the longest cycle of the coarse pass. Fewer:
-# the last events of longer cycles are lost. More: files are larger.
-_MORE_EVENTS = 4
 
 
 class Wanted:
@@ -43,23 +39,20 @@ class Wanted:
         self._charts, self._time_unit = tuple(s.names), str(system.time_unit or "")
         self._states = [tuple(s.states(a)) for a in range(len(s.charts))]
         self._all_states = list(dict.fromkeys(x for names in self._states for x in names))
-        self._events = [t.name for t in s.transitions]
 
     def variables(self, cycles: LimitCycles) -> dict[str, Variable]:
         """Return the form of results, given some cycles.
 
         **Raises:** `ComputationError` if a function succeeds on none of them.
         """
-        width = _MORE_EVENTS * cycles.codes.shape[1]
-        values = self._values(cycles, width)
+        values = self._values(cycles)
         for name, measure in self.measures.items():
             values[name] = self._first(cycles, name, measure)[None]
-        dims = {"state": "state_name", "multipliers": "multiplier", "events": "event"}
+        dims = {"state": "state_name", "multipliers": "multiplier"}
         attributes = {
             "result": _flags([x.name.lower() for x in Result], [int(x) for x in Result]),
             "period": {"units": self._time_unit} if self._time_unit else {},
             "chart": _flags(self._charts),
-            "events": _flags(self._events),
         }
         return {
             name: Variable(
@@ -86,16 +79,14 @@ class Wanted:
         self, cycles: LimitCycles, variables: Mapping[str, Variable]
     ) -> dict[str, np.ndarray]:
         """Return the results of some cycles."""
-        width = variables["events"].shape[0] if "events" in variables else 0
-        values = self._values(cycles, width)
+        values = self._values(cycles)
         for name, measure in self.measures.items():
             values[name] = self._measured(cycles, name, measure, variables[name])
         return values
 
-    def _values(self, cycles: LimitCycles, width: int) -> dict[str, np.ndarray]:
-        """Return the quantities with a name, with `width` events of each cycle."""
-        ok, size = cycles.ok, np.abs(cycles.multipliers)
-        codes = np.where(ok[:, None], cycles.codes, -1)[:, :width].astype(int)
+    def _values(self, cycles: LimitCycles) -> dict[str, np.ndarray]:
+        """Return the quantities with a name."""
+        ok = cycles.ok
         q, chart = np.asarray(cycles.anchor.q)[..., 0], np.asarray(cycles.anchor.chart)[:, 0]
         state = np.full((len(ok), len(self._all_states)), np.nan)
         for a, names in enumerate(self._states):
@@ -106,8 +97,7 @@ class Wanted:
             "period": np.where(ok, cycles.period, np.nan),
             "state": state,
             "multipliers": cycles.multipliers,
-            "spectral_radius": size.max(axis=1),
-            "events": np.pad(codes, ((0, 0), (0, width - codes.shape[1])), constant_values=-1),
+            "spectral_radius": np.abs(cycles.multipliers).max(axis=1),
             "residual": np.asarray(cycles.residual),
         }
         values: dict[str, np.ndarray] = {"result": np.asarray(cycles.result, int)}
@@ -121,7 +111,7 @@ class Wanted:
         error = None
         for i in np.flatnonzero(cycles.ok):
             try:
-                return _numbers(name, measure(cycles[i]))
+                return as_numbers(name, measure(cycles[i]))
             except ComputationError as failure:
                 error = failure
         raise ComputationError(
@@ -133,28 +123,29 @@ class Wanted:
         out = np.full((len(cycles), *variable.shape), variable.fill, variable.dtype)
         for i in np.flatnonzero(cycles.ok):
             try:
-                values = _numbers(name, measure(cycles[i]))
+                values = as_numbers(name, measure(cycles[i]))
             except ComputationError:
                 continue
-            if values.shape != variable.shape:
-                raise DefinitionError(
-                    f"`{name}` must give arrays of one shape, not {variable.shape} and "
-                    f"{values.shape}."
-                )
-            if values.dtype.kind == "c" and out.dtype.kind != "c":
-                raise DefinitionError(
-                    f"`{name}` must give real numbers or complex ones, not both: let it always "
-                    "return complex ones."
-                )
+            require_form(name, values, variable)
             out[i] = values
         return out
 
 
-def _numbers(name: str, values: Any) -> np.ndarray:
+def as_numbers(name: str, values: Any) -> np.ndarray:
+    """Return what a user's function gives as an array of real or complex numbers."""
     array = np.asarray(values)
     if array.dtype.kind not in "biufc":
         raise DefinitionError(f"`{name}` must give numbers, not a {type(values).__name__}.")
     return array.astype(complex if array.dtype.kind == "c" else float)
+
+
+def require_form(name: str, values: np.ndarray, variable: Variable) -> None:
+    """**Raises:** `DefinitionError` for another shape, and for complex numbers after real ones."""
+    if values.shape != variable.shape or not np.can_cast(values.dtype, variable.dtype):
+        raise DefinitionError(
+            f"`{name}` must always give real or always complex arrays of one shape: first "
+            f"{variable.dtype} {variable.shape}, then {values.dtype.str} {values.shape}."
+        )
 
 
 def _flags(names: Sequence[str], values: Sequence[int] | None = None) -> dict[str, Any]:

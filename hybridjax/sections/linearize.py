@@ -18,8 +18,8 @@ from ..engine.move import tape_jacobian
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
-from ..systems.output import Output, OutputNames
 from ..systems.structure import Structure
+from ..systems.system import Output, OutputNames
 from .place import as_placed
 from .placed import PlacedSections, SectionsLike
 

@@ -17,9 +17,8 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.cubic import interpolate
-from ..engine.lanes import Lanes, for_each_chart, only
+from ..engine.lanes import IDLE, Lanes, for_each_chart, only
 from ..engine.move import Options, move
-from ..engine.tape import IDLE
 from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError

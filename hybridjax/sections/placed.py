@@ -13,12 +13,11 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
 from ..engine import kernels
-from ..engine.lanes import Lanes, for_each_chart, needed, only
-from ..engine.tape import Tape
+from ..engine.lanes import Lanes, Tape, for_each_chart, needed, only
 from ..engine.target import Target
 from ..orbits.cycle import LimitCycle, orbit_picture
-from ..systems.output import Output, OutputNames
 from ..systems.structure import Outputs, Structure
+from ..systems.system import Output, OutputNames
 from .families import AbstractSections, BoundSections, FamilyLike
 
 

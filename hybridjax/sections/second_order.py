@@ -13,8 +13,8 @@ from .._core.executor import from_host, to_host
 from ..engine.replay import replay
 from ..linear.time_response import monodromy, periodic_states
 from ..orbits.cycle import LimitCycle
-from ..systems.output import Output
 from ..systems.structure import Structure
+from ..systems.system import Output
 from .families import FamilyLike
 from .linearize import inputs_of
 from .place import as_placed
@@ -157,11 +157,6 @@ def _pairs(bend, first, second) -> Complex[np.ndarray, "N rows some both"]:
     return both.reshape(N, rows, count, -1)
 
 
-# Second derivatives in units of the states' sizes, relative to the first ones, that are rounding
-# errors. Larger: small curvature is lost. Smaller: rounding counts.
-_ROUNDING = 1e-11
-
-
 def second_order(
     cycle: LimitCycle, sections: FamilyLike, outputs: tuple[str, ...], inputs: tuple[str, ...]
 ) -> Quadratic:
@@ -183,17 +178,9 @@ def second_order(
     first, second = to_host(_derivatives(from_host(placed), tuple(z.items)))
     n = 1 + s.d
     kept = np.r_[:n, n + columns]
-    size = _sizes(to_host(placed), s, first[:, :n])[:, kept]
     first, second = first[:, :, kept], second[:, :, kept][..., kept]
     if not cycle.clocked:
         first[:, 0], second[:, 0] = 0.0, 0.0
-    after = np.roll(size[:, :n], -1, axis=0)
-    unit = np.abs(first[:, :n] * size[:, None]).max(axis=2) / after
-    largest = after * np.maximum(unit.max(axis=1, keepdims=True), 1.0)
-    shown = np.abs(first[:, n:] * size[:, None]).max(axis=2)
-    least = _ROUNDING * np.concatenate([largest, shown], axis=1)
-    bend = second * size[:, None, :, None] * size[:, None, None, :]
-    second = np.where(np.abs(bend) > least[:, :, None, None], second, 0.0)
     return Quadratic(first[:, :n], second[:, :n], first[:, n:], second[:, n:])
 
 
@@ -226,14 +213,3 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
     place = np.zeros((m, m), int)
     place[i, j] = place[j, i] = np.arange(len(i))
     return first[place[:, -1]].transpose(2, 1, 0), second[place].transpose(3, 2, 0, 1)
-
-
-def _sizes(placed: PlacedSections, s: Structure, step) -> np.ndarray:
-    """Sizes (N, m) of time, states and inputs at each section; an input of size one moves some
-    state by its size."""
-    scale = np.asarray(placed.cycle.settings.scale)[placed.lanes.chart]
-    sizes = np.concatenate([np.full((len(scale), 1), placed.cycle.period), scale], axis=1)
-    moved = np.abs(step[:, :, sizes.shape[1] :]) / np.roll(sizes, -1, axis=0)[:, :, None]
-    most = moved.max(axis=(0, 1))
-    of_inputs = 1 / np.where(most > 0, most, 1.0)
-    return np.concatenate([sizes, np.broadcast_to(of_inputs, (len(sizes), s.nu))], axis=1)

@@ -1,5 +1,6 @@
 """Systems modulo a symmetry: legs that are relabeled, a position that has no effect."""
 
+import functools as ft
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -13,9 +14,8 @@ from .._core.boundary.kinds import SignalNames
 from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import DerivedChart
-from .output import Output
 from .structure import as_vector
-from .system import Derived, Guess, HybridSystem
+from .system import Derived, Guess, HybridSystem, Output
 from .transition import Scheduled, Transition
 
 
@@ -161,40 +161,35 @@ class Quotient(Derived):
         """The statements of the symmetry: a sentence for its failure, and two functions of
         (t, q, u) that are equal. The first numbers of q are the state without translations."""
         charts, events = self.system.charts(), self.system.transitions()
+        kept_of = {name: name for name in charts} | {b: a for a, b in self.swap.items()}
 
-        def full(name, q, shift=0.0):
-            chart = self._reduced(name)
-            return chart.full(q[: len(chart.kept)], shift)
+        def functions(name, shift=0.0):
+            """All functions of a chart, with rates mirrored back if it is left out."""
+            kept = kept_of[name]
+            back = lambda x: x if name == kept else self._mirrored(kept, x, back=True)  # noqa: E731
+            field = lambda *point: back(as_vector(charts[name].field(*point)))  # noqa: E731
+            named = [(f"transition '{x.name}'", self._event(x)) for x in events if x.source == name]
+            for what, function in [(f"field of chart '{name}'", field), *named]:
+                yield what, ft.partial(of_kept, function, name, shift)
 
-        if self.translation:
-            fields = [(f"field of chart '{name}'", name, x.field) for name, x in charts.items()]
-            steps = [(f"transition '{x.name}'", x.source, self._event(x)) for x in events]
-            for what, name, f in fields + steps:
-                before, after = (
-                    lambda t, q, u, f=f, name=name, shift=shift: f(t, full(name, q, shift), u)
-                    for shift in (0.0, 0.7)
-                )
+        def of_kept(function, name, shift, t, q, u):
+            kept = kept_of[name]
+            chart = self._reduced(kept)
+            state = chart.full(q[: len(chart.kept)], shift)
+            return function(t, state if name == kept else self._mirrored(kept, state), u)
+
+        for name in charts if self.translation else ():
+            for (what, before), (_, after) in zip(
+                functions(name), functions(name, 0.7), strict=True
+            ):
                 yield f"the {what} changes under the translation", before, after
         for kept, other in self.swap.items():
-
-            def still(f, kept=kept):
-                return lambda t, q, u: f(t, full(kept, q), u)
-
-            def image(f, kept=kept):
-                return lambda t, q, u: f(t, self._mirrored(kept, full(kept, q)), u)
-
-            def back(f, kept=kept):
-                return lambda t, q, u: self._mirrored(kept, as_vector(f(t, q, u)), back=True)
-
-            sentence = f"the field of chart '{other}' is not the mirror image of that of '{kept}'"
-            yield sentence, still(charts[kept].field), back(image(charts[other].field))
-            of_kept, of_other = ([x for x in events if x.source == name] for name in (kept, other))
-            if len(of_kept) != len(of_other):
+            ours, images = list(functions(kept)), list(functions(other))
+            if len(ours) != len(images):
                 sentence = f"'{kept}' and '{other}' have different numbers of transitions"
-                yield sentence, lambda t, q, u: [0.0], lambda t, q, u: [1.0]
-            for x, y in zip(of_kept, of_other, strict=False):
-                sentence = f"the transition '{y.name}' is not the mirror image of '{x.name}'"
-                yield sentence, still(self._event(x)), image(self._event(y))
+                yield sentence, lambda *_: 0.0, lambda *_: 1.0
+            for (what, function), (name, image) in zip(ours, images, strict=False):
+                yield f"the {name} is not the mirror image of the {what}", function, image
 
     def _reduced(self, name: str) -> "_Reduced":
         return _Reduced(self.system.charts()[name], self.translation)

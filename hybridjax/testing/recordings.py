@@ -17,11 +17,11 @@ from .._core.limits import PERIODS, SECTIONS
 from .._core.signal import unit_of
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
-from ..experiments.response_function import ResponseFunction, response_function
+from ..experiments.response import ResponseFunction, response_function
 from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording, Trial
 from ..sections.families import ClockPhase
-from ..systems.output import OutputNames
+from ..systems.system import OutputNames
 
 
 # Longest step of `simulate_beats`, in cycles. Longer: events are late by more than the noise of

@@ -26,11 +26,11 @@ def pack(path, members, **options):
             archive.writestr(name, content)
 
 
-def saved(path, static, **arrays):
+def saved(path, static):
     """A design, with other static fields than it was saved with."""
     hj.save(path, hj.multisine(n_sections=4, periods=4, band=(0.25, 0.5)))
     with np.load(path) as file:
-        content = dict(file) | arrays
+        content = dict(file)
     header = json.loads(str(content.pop("header")))
     header["static"] |= static
     np.savez(path, header=np.array(json.dumps(header)), **content)
@@ -74,7 +74,6 @@ DECLARED = {
     "sections": (dict(n_sections=10**12), "n_sections is 1000000000000"),
     "experiments that are not there": (dict(experiments=10**6), "at least one frequency"),
     "a window": (dict(n_sections=10**5, periods=10**6), "more samples than an experiment"),
-    "a fraction": (dict(n_sections=4.5), "n_sections is 4.5"),
     "a name that is none": (dict(input_names=[["u"]]), "input_names is"),
 }
 
@@ -108,12 +107,6 @@ def test_hostile_headers(tmp_path, static, says):
     refused(hj.load, path, says)
 
 
-def test_entries_of_experiments_that_do_not_exist(tmp_path):
-    path = tmp_path / "hostile.npz"
-    saved(path, {}, experiment=np.array([10**12]))
-    refused(hj.load, path, "at least one frequency")
-
-
 def test_headers_are_nested_and_long(tmp_path, monkeypatch):
     path = tmp_path / "hostile.npz"
     np.savez(path, header=np.array("[" * 100_000))
@@ -131,12 +124,4 @@ def test_a_parquet_file_that_declares_more_than_it_holds(tmp_path):
     values = pyarrow.DictionaryArray.from_arrays(np.zeros(2**24, np.int8), [0.0])
     parquet.write_table(pyarrow.table({"time": values}), path)
     assert path.stat().st_size < 2**20
-    refused(hj.read_recording, path, "declares 16777216 rows")
-
-
-def test_compressed_recordings_are_read(tmp_path):
-    path = tmp_path / "x.npz"
-    time = np.arange(2000.0)
-    np.savez_compressed(path, time=time, x=np.sin(time), still=np.zeros(2000))
-    (trial,) = hj.read_recording(path).trials
-    np.testing.assert_array_equal(trial.values[:, 0], np.sin(time))
+    refused(hj.read_recording, path, "it declares .*, and is not that large|declares 16777216 rows")

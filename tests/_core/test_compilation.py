@@ -1,7 +1,6 @@
 """Which executable runs, where it may be used, and what is kept on disk."""
 
 import gc
-import json
 import os
 import pathlib
 import subprocess
@@ -17,13 +16,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core import compilation
-from hybridjax._core.compilation import (
-    TwoTiers,
-    in_turn,
-    is_left_to_lapack,
-    kernel,
-    quick_jit,
-)
+from hybridjax._core.compilation import TwoTiers, in_turn, is_left_to_lapack, kernel, quick_jit
 from hybridjax._core.executor import is_inside_program
 from hybridjax._core.lanes import by_lane
 
@@ -126,17 +119,6 @@ def test_functions_that_are_written_anew_share_a_program(tiers):
     assert len(tiers) == 4
 
 
-def test_threads_share_one_program(tiers):
-    job, results = TwoTiers(total, large=False), []
-    work = lambda: results.append(job(X, jnp.cos, 0).sum)  # noqa: E731
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(set(map(float, results))) == 1 and tiers == ["quick"]
-
-
 def point(power, tree, x, y):
     return tree["k"] * 3.0 * jnp.sin(x) ** power + y
 
@@ -237,17 +219,6 @@ try:
 except hj.ComputationError as error:
     print(os.environ.get("XLA_FLAGS"), error)
 """
-EARLY = """
-import json, os, numpy as np, hybridjax as hj
-hj.enable_loop_kernels()
-hj.enable_loop_kernels()
-hj.enable_x64()
-flags = os.environ["XLA_FLAGS"]
-cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-u = 0.01 * np.random.default_rng(0).standard_normal((40, 64, 1))
-data = hj.run_experiments(cycle, hj.ClockPhase(32), u, ("yM", "vM"), discard=0)
-print(json.dumps([flags, data.y.tolist()]))
-"""
 LAPACK = """
 import equinox as eqx, jax.numpy as jnp, numpy as np, hybridjax as hj
 hj.enable_x64()
@@ -295,16 +266,6 @@ def test_loop_kernels_that_come_too_late_are_refused():
     if printed.strip() == "done True":
         pytest.skip("this XLA makes single kernels of loops by default")
     assert printed.startswith("None ") and "before JAX computes anything" in printed
-
-
-@pytest.mark.slow
-def test_loop_kernels_give_the_same_experiments(hopper_cycle):
-    u = 0.01 * np.random.default_rng(0).standard_normal((40, 64, 1))
-    data = hj.run_experiments(hopper_cycle, hj.ClockPhase(32), u, ("yM", "vM"), discard=0)
-    flags, y = json.loads(run(EARLY, XLA_FLAGS="--xla_cpu_enable_fast_math=false"))
-    assert flags.startswith("--xla_cpu_enable_fast_math=false --xla_backend_extra_options=")
-    assert len(flags.split()) == 2
-    np.testing.assert_allclose(y, data.y, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow

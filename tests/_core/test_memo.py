@@ -1,5 +1,4 @@
 import gc
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -28,11 +27,6 @@ def test_it_is_computed_once_and_leaves_the_structure_as_it_is():
     before = jax.tree_util.tree_structure(box)
     assert box.double == 6 and box.double == 6 and len(calls) == 1
     assert jax.tree_util.tree_structure(box) == before
-
-
-def test_copies_with_other_values_have_their_own():
-    box = Box(jnp.asarray(3.0))
-    assert box.double == 6
     assert eqx.tree_at(lambda x: x.value, box, jnp.asarray(4.0)).double == 8
 
 
@@ -48,29 +42,12 @@ def test_it_is_forgotten_with_its_object():
     assert len(values) == size
 
 
-def test_threads_get_one_value():
-    """All that ask for it, whoever was first; `make` may ask for other values."""
-    memory, together = Memory(), threading.Barrier(8)
-    boxes = [Box(jnp.asarray(float(k))) for k in range(50)]
-
-    def ask(_):
-        together.wait()
-        made = lambda box: memory.recall(box, "inner", object)  # noqa: E731
-        return [memory.recall(box, "key", lambda box=box: (made(box), object())) for box in boxes]
-
-    with ThreadPoolExecutor(8) as pool:
-        answers = list(pool.map(ask, range(8)))
-    assert all(x is y for answer in answers for x, y in zip(answer, answers[0], strict=True))
-    assert len(memory) == len(boxes)
-    assert len({id(x) for x in answers[0]}) == len(boxes)
-
-
 def test_objects_that_come_and_go_in_threads():
     """Ids are used again; each object sees its own value only."""
     memory = Memory()
 
     def work(seed):
-        for k in range(2000):
+        for k in range(500):
             box = Box(seed + k)
             assert memory.recall(box, "key", lambda box=box: box.value) == seed + k
 

@@ -32,18 +32,6 @@ def test_definitions_may_be_built_before_the_switch(define):
         assert a == b if isinstance(a, str) else a.dtype == b.dtype == float and (a == b).all()
 
 
-def test_a_cycle_of_an_early_definition_is_that_of_a_late_one(hopper_cycle):
-    with jax.enable_x64(False):
-        early = (
-            hj.models.VerticalHopper(),
-            hj.models.VerticalHopper().guess(),
-            hj.Settings(rtol=1e-12, atol=1e-12),
-        )
-    system, guess, settings = early
-    cycle = hj.find_limit_cycle(system, guess, settings=settings)
-    np.testing.assert_allclose(cycle.anchor.q, hopper_cycle.anchor.q, rtol=1e-14)
-
-
 def test_arrays_that_have_lost_their_digits_are_refused():
     with jax.enable_x64(False):
         k = jnp.asarray(10.1)

@@ -20,51 +20,6 @@ from hybridjax._core.vector_math.rewrite import vectorized
 hj.enable_x64()
 
 
-def plain(x, y):
-    return jnp.stack([jnp.sin(x) * y**3, jnp.arctan2(y, x) + jnp.cos(x), jnp.exp(x) * x**-2])
-
-
-@jax.jit
-def inner(x):
-    return jnp.tan(x) + jax.jit(jnp.cos)(x)
-
-
-def jitted(x, y):
-    return inner(x) * inner(y) * inner(x)
-
-
-def looped(x, y):
-    z = jax.lax.fori_loop(0, 3, lambda _, z: jnp.sin(z) + y, x)
-    return jax.lax.while_loop(lambda z: jnp.cos(z) > 2, lambda z: z + 1, z)
-
-
-FUNCTIONS = [plain, jitted, looped]
-TRANSFORMATIONS = {
-    "jit": lambda f: f,
-    "vmap of jit": lambda f: jax.vmap(jax.jit(f), in_axes=-1, out_axes=-1),
-    "vmap of jvp": lambda f: jax.vmap(lambda x, y: jax.jvp(f, (x, y), (y, x))),
-    "vjp": lambda f: jax.jacrev(f, (0, 1)),
-    "second": lambda f: jax.vmap(jax.jacfwd(jax.jacrev(f, (0, 1)), (0, 1))),
-    "checkpoint": lambda f: jax.jacrev(jax.checkpoint(f)),
-}
-
-
-@pytest.mark.parametrize("transformation", TRANSFORMATIONS)
-def test_vectorized_agrees_under_transformations(transformation):
-    transform = TRANSFORMATIONS[transformation]
-    reverse = transformation in ("vjp", "second", "checkpoint")
-    functions = [f for f in FUNCTIONS if not (reverse and f is looped)]  # JAX reverses no `while`
-    x, y = jnp.array([0.3, 1.1, -2.0]), jnp.array([0.7, 2.0, 0.4])
-    if "vmap" not in transformation and transformation != "second":
-        x, y = x[0], y[0]
-    ours, truth = jax.jit(
-        lambda *xs: [[transform(wrap(f))(*xs) for f in functions] for wrap in (vectorized, same)]
-    )(x, y)
-    assert jax.tree.structure(ours) == jax.tree.structure(truth)
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(truth), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
-
-
 def same(function):
     return function
 
@@ -75,9 +30,14 @@ def left(function, *xs):
     return set(re.findall(r"= (sin|cos|tan|atan2?|asin|acos)[ \[]", program))
 
 
-@pytest.mark.parametrize("function", FUNCTIONS)
-def test_vectorized_replaces_everything(function):
-    assert left(function, 0.3, 0.7) and not left(vectorized(function), 0.3, 0.7)
+def looped(x, y):
+    z = jax.lax.fori_loop(0, 3, lambda _, z: jnp.sin(z) + y, x)
+    return jax.lax.while_loop(lambda z: jnp.cos(z) > 2, lambda z: jax.jit(jnp.tan)(z) + 1, z)
+
+
+def test_vectorized_replaces_everything():
+    assert left(looped, 0.3, 0.7) and not left(vectorized(looped), 0.3, 0.7)
+    np.testing.assert_allclose(vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13)
 
 
 def test_other_types_and_requested_accuracies_stay():
@@ -130,17 +90,9 @@ def test_every_call_sees_the_present_parameters_and_traces_once():
     assert function(0.5) == 2 * first and len(traces) == 2
 
 
-def test_errors_of_the_function_come_through():
-    def wrong(x):
-        raise KeyError("mine")
-
-    with pytest.raises(KeyError, match="mine"):
-        vectorized(wrong)(1.0)
-
-
 def test_off_away_from_cpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert left(vectorized(plain), 0.3, 0.7) == left(plain, 0.3, 0.7)
+    assert left(vectorized(looped), 0.3, 0.7) == left(looped, 0.3, 0.7)
 
 
 def test_vectors_of_several_functions_are_put_together_row_by_row():

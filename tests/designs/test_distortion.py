@@ -8,7 +8,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.designs.candidates import Candidates
-from hybridjax.designs.distortion import products
+from hybridjax.designs.limits import products
 from hybridjax.sections.second_order import second_order
 
 from ..conftest import APEX, OUTPUTS

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from hybridjax._core.executor import from_host
-from hybridjax.engine.chain import chain
 from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import Options, move
+from hybridjax.engine.replay import chain
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure

@@ -8,10 +8,9 @@ import hybridjax as hj
 from hybridjax._core import compilation
 from hybridjax._core.compilation import quick_jit
 from hybridjax._core.executor import from_host, on_host, to_host
-from hybridjax.engine.lanes import start_lanes
+from hybridjax.engine.lanes import IDLE, start_lanes
 from hybridjax.engine.move import Options, move
 from hybridjax.engine.settings import Settings
-from hybridjax.engine.tape import IDLE
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 

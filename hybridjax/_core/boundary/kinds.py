@@ -18,18 +18,19 @@ import numpy as np
 
 from .. import limits
 from ..arguments import Numbers
-from .containers import Either, Function, Having, Instance, Items, Names, Table, Tuple
+from .containers import Either, Having, Instance, Items, Names, Table, Tuple
 from .values import (
+    FUNCTION,
+    NOTHING,
+    TEXT,
     Complexes,
     ComplexNumber,
     Integers,
     Kind,
-    Nothing,
     Number,
     OneOf,
     Reals,
     Switch,
-    Text,
     Whole,
 )
 
@@ -78,8 +79,8 @@ _PLAIN = {
     int: Whole(),
     float: Number(),
     complex: ComplexNumber(),
-    str: Text(),
-    type(None): Nothing(),
+    str: TEXT,
+    type(None): NOTHING,
     typing.SupportsIndex: Whole(),
 }
 _SEQUENCES: dict[Any, dict[str, Any]] = {
@@ -110,7 +111,7 @@ def kind_of(hint: Any) -> Kind | None:
     if origin in (Union, types.UnionType):
         return _either(arguments)
     if hint is collections.abc.Callable or origin is collections.abc.Callable:
-        return Function()
+        return FUNCTION
     if origin is tuple:
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             return Items(kind_of(arguments[0]), form=tuple)
@@ -136,7 +137,7 @@ def _either(arguments: tuple[Any, ...]) -> Kind | None:
     narrow = [kind for kind in kinds if kind is not None]
     if len(narrow) < len(kinds):
         return None
-    return Either(*sorted(narrow, key=lambda kind: isinstance(kind, Nothing)))
+    return Either(*sorted(narrow, key=lambda kind: kind is NOTHING))
 
 
 def _of_class(cls: type) -> Kind:

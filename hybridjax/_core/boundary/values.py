@@ -105,8 +105,8 @@ class Kind:
             return value
         raise self.refused(value)
 
-    def fits(self, value: Any) -> bool:
-        raise NotImplementedError
+    fits: Callable[[Any], bool]
+    """Whether a value is allowed, for kinds that hand it on as it is."""
 
     def __repr__(self) -> str:
         return self.allowed  # (as `help` shows it)
@@ -217,22 +217,16 @@ class OneOf(Kind):
         return any(value is x or (type(value) is type(x) and value == x) for x in self.words)
 
 
-class Text(Kind):
-    """A string."""
+class Plain(Kind):
+    """What passes a test."""
 
-    allowed = "a string"
-
-    def fits(self, value):
-        return isinstance(value, str)
+    def __init__(self, allowed: str, fits: Callable[[Any], bool]):
+        self.allowed, self.fits = allowed, fits
 
 
-class Nothing(Kind):
-    """None."""
-
-    allowed = "None"
-
-    def fits(self, value):
-        return value is None
+TEXT = Plain("a string", lambda value: isinstance(value, str))
+NOTHING = Plain("None", lambda value: value is None)
+FUNCTION = Plain("a function", callable)
 
 
 def _plain(value: Any, allowed: str) -> Any:

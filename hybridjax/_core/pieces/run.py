@@ -1,41 +1,10 @@
 """Work in independent pieces, done by this process or by the workers of Dask."""
 
-from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
-
-import numpy as np
 
 from ..arguments import package
 from ..progress import counted
-from .store import Layout, ZarrStore, absolute, make_store, open_store
-
-
-@runtime_checkable
-class Job(Protocol):
-    """Work in pieces whose results do not depend on who computes them, and in which order. Workers
-    get it pickled."""
-
-    @property
-    def description(self) -> Mapping[str, Any]:
-        """JSON from which the results can be told from those of other jobs."""
-        ...
-
-    def begin(self) -> tuple["Job", Layout]:
-        """Return the job with what is computed before the first piece, and the form of its
-        results."""
-        ...
-
-    def arrays(self) -> list[np.ndarray]:
-        """Return the arrays that `begin` computed."""
-        ...
-
-    def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "Job":
-        """Return the job with the arrays that another process computed."""
-        ...
-
-    def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
-        """Compute piece k with so many threads. Default: all cores."""
-        ...
+from .store import ZarrStore, absolute, make_store, open_store
 
 
 @runtime_checkable
@@ -47,11 +16,18 @@ class DaskClient(Protocol):
     def register_plugin(self, plugin: Any, name: str) -> Any: ...
 
 
-def fill(job: Job, address: Any = None, client: DaskClient | None = None) -> ZarrStore:
+def fill(job: Any, address: Any = None, client: DaskClient | None = None) -> ZarrStore:
     """Compute the pieces of a job that are missing, and return the results.
 
-    **Arguments:** `address` of a store; None: memory. `client`: a Dask client. Default: this
-    process computes all pieces.
+    **Arguments:**
+
+    - `job`: an object that can be pickled, and whose results do not depend on who computes them, in
+      which order. `description`: JSON from which the results can be told from those of other jobs;
+      `begin()`: the job with what is computed before the first piece, and the `Layout` of its
+      results; `arrays()`: what `begin` computed; `resume(layout, arrays)`: the job with the arrays
+      that another process computed; `run(k, workers)`: piece k, with so many threads.
+    - `address` of a store; None: memory. `client`: a Dask client. Default: this process computes
+      all pieces.
 
     **Raises:** `DefinitionError` for a store that holds other results or cannot be written, and for
     a client whose workers cannot do the work; `ComputationError` if the cluster is lost; otherwise

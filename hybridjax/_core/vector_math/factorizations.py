@@ -4,9 +4,9 @@ XLA on CPU hands `jnp.linalg.solve` and its relatives to LAPACK, one matrix afte
 150 ns for 3 equations, where the operations themselves, for several lanes at once, take 9 (for 7
 equations 310 and 60; if the matrix is symmetric and positive, 4 and 16). Programs that call LAPACK
 may also wait for each other for ever if they run in several threads. The functions below do the
-same in additions, multiplications, divisions and selections: unrolled for a few rows, in loops over
-columns for more. `rewrite.vectorized` puts them into functions that were written with `jnp`. QR
-factorizations, eigenvalues and singular values are left to LAPACK.
+same in additions, multiplications, divisions and selections: unrolled, but for LU factors.
+`rewrite.vectorized` puts them into functions that were written with `jnp`. QR factorizations,
+eigenvalues, singular values and matrices of more than 12 rows are left to LAPACK.
 
 Matrices stand on the last two axes. Where LAPACK would report a failure, results are NaN or
 infinite. Derivatives are those of the operations. G. H. Golub, C. F. Van Loan, Matrix Computations,
@@ -22,11 +22,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 
-# Rows up to which factorizations are unrolled, without and with pivoting. Fewer: loops over columns
-# run slower. Two more: XLA compiles for twice as long, seconds.
-UNROLLED, UNROLLED_PIVOTED = 12, 7
-# Rows and columns up to which loops over columns are used. Twice as many: LAPACK is as fast.
-IN_LOOPS = 32
+# Rows up to which matrices are factorized here, and up to which elimination with pivoting is
+# unrolled. Fewer: LAPACK, and loops over columns, run slower. Two more: XLA compiles for twice as
+# long, seconds, and at 16 rows LAPACK is as fast.
+MOST_ROWS, UNROLLED_PIVOTED = 12, 7
 
 
 @jax.jit
@@ -98,8 +97,6 @@ def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     """Return L in `matrix = L @ L.T`, with zeros above the diagonal; of the matrix the lower
     triangle is read. NaN if it is not positive definite."""
     n = matrix.shape[-1]
-    if n > UNROLLED:
-        return _cholesky_in_loop(matrix)
     lower = _square(n, jnp.zeros_like(matrix[..., 0, 0]))
     for j in range(n):
         for i in range(j, n):
@@ -108,19 +105,6 @@ def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
                 root = jnp.sqrt(jnp.where(x > 0, x, jnp.nan))
             lower[i][j] = root if i == j else x / root
     return jnp.stack([jnp.stack(row, axis=-1) for row in lower], axis=-2)
-
-
-def _cholesky_in_loop(matrix):
-    n = matrix.shape[-1]
-    index = jnp.arange(n)
-
-    def eliminate(k, lower):
-        column = _column(matrix, k) - jnp.sum(lower * _row(lower, k)[..., None, :], axis=-1)
-        pivot = _row(column[..., None], k)
-        column = jnp.where(index >= k, column / jnp.sqrt(jnp.where(pivot > 0, pivot, jnp.nan)), 0.0)
-        return jnp.where(index == k, column[..., :, None], lower)
-
-    return jax.lax.fori_loop(0, n, eliminate, jnp.zeros_like(matrix))
 
 
 @ft.partial(jax.jit, static_argnames=("left_side", "lower", "transpose_a", "unit_diagonal"))
@@ -138,33 +122,14 @@ def triangular_solve(
     if not left_side:  # the transpose of the first form
         right, transpose_a = jnp.swapaxes(right, -1, -2), not transpose_a
     op = jnp.swapaxes(matrix, -1, -2) if transpose_a else matrix
-    substitute = _substituted if matrix.shape[-1] <= UNROLLED else _substituted_in_loop
-    X = substitute(op, right, lower != transpose_a, unit_diagonal)
-    return X if left_side else jnp.swapaxes(X, -1, -2)
-
-
-def _substituted(op, right, downwards, unit_diagonal):
+    downwards = lower != transpose_a
     n = op.shape[-1]
     X: dict[int, Array] = {}
     for i in range(n) if downwards else reversed(range(n)):
         x = _less(right[..., i, :], [(op[..., i, k][..., None], X[k]) for k in X])
         X[i] = x if unit_diagonal else x / op[..., i, i][..., None]
-    return jnp.stack([X[i] for i in range(n)], axis=-2)
-
-
-def _substituted_in_loop(op, right, downwards, unit_diagonal):
-    n = op.shape[-1]
-    index = jnp.arange(n)
-    off_diagonal = jnp.where(index == index[:, None], 0.0, op)
-
-    def substitute(k, X):
-        i = k if downwards else n - 1 - k
-        x = _row(right, i) - jnp.sum(_row(off_diagonal, i)[..., :, None] * X, axis=-2)
-        if not unit_diagonal:
-            x = x / _row(_column(op, i)[..., None], i)
-        return jnp.where((index == i)[:, None], x[..., None, :], X)
-
-    return jax.lax.fori_loop(0, n, substitute, jnp.zeros_like(right))
+    solution = jnp.stack([X[i] for i in range(n)], axis=-2)
+    return solution if left_side else jnp.swapaxes(solution, -1, -2)
 
 
 @jax.jit

@@ -10,7 +10,7 @@ slow as it would be without.
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import jax
@@ -135,8 +135,7 @@ def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
         behind |= dict.fromkeys(eqn.outvars, functions)
         vector = eqn.primitive.name in ("stack", "concatenate") and len(_shape(eqn.outvars[0])) == 1
         if vector and len(functions) > 1:
-            rows = _equation(_rows, tuple(v.aval for v in eqn.invars))
-            eqn = rows.replace(invars=eqn.invars, outvars=eqn.outvars, source_info=eqn.source_info)
+            eqn = _in_place_of(eqn, _rows, tuple(v.aval for v in eqn.invars))
         eqns.append(eqn)
     return jaxpr.replace(eqns=eqns)
 
@@ -169,13 +168,8 @@ def _replaced(jaxpr: jex.Jaxpr, trigonometry: bool) -> jex.Jaxpr:
 
 
 def _replaced_equation(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn:
-    if eqn.primitive in _FACTORIZATIONS:
-        ours = _factorization(eqn)
-    else:
-        ours = _trigonometric(eqn) if trigonometry else None
-    if ours is not None:
-        new = _equation(*ours)
-        return new.replace(invars=eqn.invars, outvars=eqn.outvars, source_info=eqn.source_info)
+    if (ours := _ours(eqn, trigonometry)) is not None:
+        return ours
     if eqn.primitive.name in _OUTER:
         params = {k: _replaced_parameter(x, trigonometry) for k, x in eqn.params.items()}
         if any(params[name] is not value for name, value in eqn.params.items()):
@@ -187,11 +181,8 @@ def _solved(eqn: jex.JaxprEqn, factors: dict) -> jex.JaxprEqn | None:
     """Our equation in place of the solution of a linear system by factors L and U, if it is one."""
     if eqn.primitive is not primitives.linear_solve_p:
         return None
-    times, lengths, (matrix, *_, right) = (
-        eqn.params["jaxprs"].matvec,
-        eqn.params["const_lengths"],
-        eqn.invars,
-    )
+    times, lengths = eqn.params["jaxprs"].matvec, eqn.params["const_lengths"]
+    matrix, *_, right = eqn.invars
     constants = eqn.invars[lengths.matvec + lengths.vecmat :][: lengths.solve]
     by_factors = bool(constants) and all(v in factors for v in constants if isinstance(v, jex.Var))
     product = times.jaxpr.eqns[0]
@@ -204,44 +195,38 @@ def _solved(eqn: jex.JaxprEqn, factors: dict) -> jex.JaxprEqn | None:
         return None
     if product.invars != times.jaxpr.invars:
         return None
-    new = _equation(factorizations.solve, (matrix.aval, right.aval))
-    return new.replace(invars=[matrix, right], outvars=eqn.outvars, source_info=eqn.source_info)
+    both = [matrix, right]
+    return _in_place_of(eqn, factorizations.solve, (matrix.aval, right.aval), invars=both)
 
 
-class _Ours(NamedTuple):
-    """Our function in place of an equation, the types of its arguments, and options."""
-
-    function: Callable
-    avals: tuple
-    options: tuple = ()
-
-
-def _trigonometric(eqn: jex.JaxprEqn) -> _Ours | None:
-    if eqn.primitive not in _TRIGONOMETRY or eqn.params.get("accuracy") is not None:
+def _ours(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn | None:
+    """Our equation in place of one of JAX, if we have one for its types."""
+    avals: Any = tuple(v.aval for v in eqn.invars)
+    if eqn.primitive in _FACTORIZATIONS:
+        rows, columns = avals[0].shape[-2:]
+        square = rows == columns and 0 < rows <= factorizations.MOST_ROWS
+        if not square or not jnp.issubdtype(avals[0].dtype, jnp.floating):
+            return None
+        names = {"left_side", "lower", "transpose_a", "unit_diagonal"} & set(eqn.params)
+        options = tuple((name, eqn.params[name]) for name in sorted(names))
+        return _in_place_of(eqn, _FACTORIZATIONS[eqn.primitive], avals, options)
+    if not trigonometry or eqn.primitive not in _TRIGONOMETRY:
         return None
-    avals = _avals(eqn)
-    ours = are_double(*(aval.dtype for aval in avals))
-    return _Ours(_TRIGONOMETRY[eqn.primitive], avals) if ours else None
+    if eqn.params.get("accuracy") is not None or not are_double(*(x.dtype for x in avals)):
+        return None
+    return _in_place_of(eqn, _TRIGONOMETRY[eqn.primitive], avals)
 
 
-def _factorization(eqn: jex.JaxprEqn) -> _Ours | None:
-    avals, given = _avals(eqn), eqn.params
-    rows, columns = avals[0].shape[-2:]
-    if not jnp.issubdtype(avals[0].dtype, jnp.floating) or not 0 < rows <= factorizations.IN_LOOPS:
-        return None
-    if rows != columns:
-        return None
-    names = ("left_side", "lower", "transpose_a", "unit_diagonal")
-    options = tuple((name, given[name]) for name in names if name in given)
-    return _Ours(_FACTORIZATIONS[eqn.primitive], avals, options)
+def _in_place_of(
+    eqn: jex.JaxprEqn, function: Callable, avals: tuple, options: tuple = (), invars: Any = None
+) -> jex.JaxprEqn:
+    """The equation of one of our functions with the variables of another one."""
+    new, invars = _equation(function, avals, options), invars or eqn.invars
+    return new.replace(invars=invars, outvars=eqn.outvars, source_info=eqn.source_info)
 
 
 def _shape(v: Any) -> tuple[int, ...]:
     return v.aval.shape
-
-
-def _avals(eqn: jex.JaxprEqn) -> tuple:
-    return tuple(v.aval for v in eqn.invars)
 
 
 def _replaced_parameter(value: Any, trigonometry: bool) -> Any:

@@ -6,8 +6,7 @@ from ..._core.executor import cond, namespace, put
 from ..._core.results import Result, update_result
 from ..arrays import Array, Index, Mask, Times
 from ..events import INSTANT, SAME_TIME, apply_resets, enabled, keep_pace, rearm, width
-from ..lanes import Lanes
-from ..tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape
+from ..lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Lanes, Tape
 from ..watch import Watch, watch
 from .accept import Verdict, accept, next_step, of_row, step_length
 from .attempt import SLOW, deviation

@@ -12,9 +12,8 @@ from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..arrays import Index, Inputs, Mask, Times
 from ..events import SAME_TIME, arm, next_schedule
-from ..lanes import Lanes, for_each_chart, only
+from ..lanes import Lanes, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
-from ..tape import blank_tape, write_row
 from ..target import Target
 from ..watch import chart_field, watch
 from .accept import uneventful

@@ -8,9 +8,8 @@ from ..._core.executor import namespace
 from ..._core.results import Result
 from ...systems.structure import Structure
 from ..arrays import Array, Index, Inputs, Mask, Padded, Times
-from ..lanes import Lanes
+from ..lanes import Lanes, Tape
 from ..settings import Settings
-from ..tape import Tape
 from ..target import Target
 from ..watch import Watch
 

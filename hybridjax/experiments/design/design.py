@@ -26,7 +26,7 @@ from ..._core.boundary.kinds import (
 )
 from ..._core.boundary.values import Integers
 from ...errors import DefinitionError
-from .partition import check_sharing, is_real, needs_two_phases, regular
+from .partition import SINGULAR, check_sharing, is_real, needs_two_phases, regular
 
 
 InputNames = Count | SignalNames
@@ -35,12 +35,6 @@ InputNames = Count | SignalNames
 # Cycles that are discarded by default after a start on the limit cycle, as in the paper. Fewer: the
 # transient biases estimates. More: strides are wasted.
 DISCARD = 20
-# Phases of a line count as equal if the mean of exp(2i phase) is this close to 1 in modulus.
-# Smaller: rounding makes a singular design. Larger: phases that differ are refused.
-_SAME_PHASES = 1e-6
-# A cosine at 0 or N/2 vanishes if the cosine of its phase is below this. Smaller: estimates divide
-# by almost zero. Larger: weak signals are refused.
-_VANISHING = 1e-3
 # Frequencies and edges of a band may miss multiples of 1/P by this, in lines. Smaller: rounding of
 # f is refused. Larger: a wrong frequency is moved without an error.
 OFF_LINE = 1e-6
@@ -181,13 +175,13 @@ class Design(eqx.Module):
         re, im = np.bincount(group, np.real(square)), np.bincount(group, np.imag(square))
         alike = np.hypot(re, im) / power
         self._refuse(
-            (needs_two_phases(self.line, P, N) & (alike > 1 - _SAME_PHASES)[group]),
+            (needs_two_phases(self.line, P, N) & (alike > 1 - SINGULAR)[group]),
             "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
             "experiments with phases 90 degrees apart (multisine(lines='two-phase') does so), or "
             "leave it out",
         )
         self._refuse(
-            is_real(self.line, P, N) & (np.abs(np.cos(self.phase)) < _VANISHING),
+            is_real(self.line, P, N) & (np.cos(self.phase) ** 2 < SINGULAR),
             "is zero at every section with this phase: give it the phase 0",
         )
 

@@ -137,15 +137,10 @@ def _number(j: np.ndarray, periods: int, nu: int, experiments: int | None) -> in
     fewest = fewest_experiments(j, periods) * nu
     if experiments is None:
         return fewest
-    if experiments < fewest:
+    if not fewest <= experiments <= len(j) * nu:
         raise DefinitionError(
-            f"{experiments} experiments are too few: these {len(np.unique(j))} frequencies "
-            f"need at least {fewest}" + (f" for {nu} inputs." if nu > 1 else ".")
-        )
-    if experiments > len(j) * nu:
-        raise DefinitionError(
-            f"{experiments} experiments are more than the {len(j) * nu} cosines that there are to "
-            "distribute."
+            f"{len(np.unique(j))} frequencies of {nu} inputs need at least {fewest} experiments "
+            f"and at most {len(j) * nu}, not {experiments}."
         )
     return experiments
 
@@ -175,10 +170,9 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
     if lines == "odd":
         j = j[j % 2 == 1]
     if len(j) == 0:
-        which = f"{'odd ' * (lines == 'odd')}multiple of 1/{periods}"
-        but = "" if lines == "two-phase" else " other than those of 1/2"
         raise DefinitionError(
-            f"no {which}{but} lies between {f_min} and {f_max}: take more periods or a wider band."
+            f"no line of lines='{lines}', a multiple of 1/{periods}, lies between {f_min} and "
+            f"{f_max}: take more periods or a wider band."
         )
     return j
 

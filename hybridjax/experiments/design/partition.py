@@ -20,9 +20,11 @@ from ...errors import DefinitionError
 
 
 # Normal equations are singular if, with unknowns scaled to magnitude 1, the least eigenvalue is
-# below this, or if one magnitude is below this part of another. Smaller: inputs that only rounding
-# separates are accepted. Larger: good experiments with unequal inputs are refused.
-_SINGULAR = 1e-6
+# below this, or if one magnitude is below this part of another; so are two phases of a line whose
+# mean of exp(2i phase) is this close to 1, and a cosine at 0 or N/2 with this part of its power.
+# Smaller: inputs that only rounding separates are accepted. Larger: good experiments with unequal
+# inputs are refused.
+SINGULAR = 1e-6
 
 
 def line_class(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
@@ -51,10 +53,10 @@ def needs_two_phases(
 def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
     """Return whether normal equations can be solved, for unknowns of any magnitude."""
     size = np.sqrt(np.einsum("kii->ki", gram).real)
-    even = size.min(axis=1) > _SINGULAR * size.max(axis=1)
+    even = size.min(axis=1) > SINGULAR * size.max(axis=1)
     size = np.where(even[:, None], size, 1.0)
     least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
-    return even & (least > _SINGULAR)
+    return even & (least > SINGULAR)
 
 
 def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
@@ -174,18 +176,13 @@ def check_sharing(
     clash = (e[1:] == e[:-1]) & (c[1:] == c[:-1])
     if clash.any():
         k = int(np.argmax(clash))
-        _refuse(int(j[k]), int(j[k + 1]), int(e[k + 1]), periods, hint)
-
-
-def _refuse(low: int, high: int, number: int, periods: int, hint: Callable[[int], str]) -> None:
-    a, b = low / periods, high / periods
-    if low == high:
-        reason = f"f = {a:.10g} is excited twice"
-    elif (high - low) % periods == 0:
-        reason = f"f = {a:.10g} and {b:.10g} differ by an integer"
-    else:
-        reason = f"f = {a:.10g} and {b:.10g} add up to an integer"
-    raise DefinitionError(
-        f"experiment {number}: {reason}, so their responses fall on the same frequencies; "
-        f"move one of them to another experiment{hint(number)}."
-    )
+        low, high, number = int(j[k]), int(j[k + 1]), int(e[k + 1])
+        f = f"f = {low / periods:.10g}"
+        reason = f"{f} is excited twice"
+        if low < high:
+            relation = "add up to" if (high - low) % periods else "differ by"
+            reason = f"{f} and {high / periods:.10g} {relation} an integer"
+        raise DefinitionError(
+            f"experiment {number}: {reason}, so their responses fall on the same frequencies; "
+            f"move one of them to another experiment{hint(number)}."
+        )

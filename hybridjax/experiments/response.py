@@ -2,29 +2,36 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.kinds import Numbers
+from .._core.boundary.values import Reals
+from .._core.precision import require_x64
 from .._core.results import Result, update_result
+from .._core.text import listed
 from ..engine.lanes import Lanes
 from ..engine.move import Options, move
-from ..engine.settings import Settings
+from ..engine.settings import EXPERIMENT, Settings
 from ..errors import DefinitionError
+from ..orbits.cycle import LimitCycle
 from ..sections.families import BoundSections
-from ..sections.placed import PlacedSections, observe, section_target
-from ..systems.output import Output
+from ..sections.place import as_placed
+from ..sections.placed import PlacedSections, SectionsLike, observe, section_target
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem
-from .plan import Plan
+from ..systems.system import HybridSystem, Output, OutputNames
+from .plan import ROUNDING, Accuracy, Plan, Stepping, plan_flow
 
 
-# Rounding error at a section, relative to the states' scales. Smaller: error estimates near 1e-13
-# are exceeded. Larger: accuracies near 1e-13 are not reported.
-_LEAST_ERROR = 1e-13
+# Steps that a derivative may use between two of as many sections, and its square in a period of the
+# cycle. Fewer: experiments far from the cycle fail at the limit on steps. More: derivatives need
+# more memory.
+_STEPS = 32
 
 
 class Response(NamedTuple):
@@ -127,6 +134,97 @@ def flow_batch(
     (lanes, result), (y, ok, shares) = jax.lax.scan(section, begin, xs)
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
-    error = _LEAST_ERROR + jnp.max(each_turn, axis=0)
+    error = ROUNDING + jnp.max(each_turn, axis=0)
     end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
     return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T)
+
+
+@checked_methods
+class ResponseFunction(eqx.Module):
+    """A map from inputs that are held between sections to outputs at the sections; see
+    `response_function`.
+
+    **Fields:** `placed`: the sections. `stepping`: tolerances and step schedule. `outputs`.
+    """
+
+    placed: PlacedSections
+    stepping: Stepping
+    outputs: tuple[str | Output, ...]
+
+    def __repr__(self):
+        s = self.placed.structure()
+        names = s.resolve_outputs(self.outputs).names
+        return (
+            f"ResponseFunction({type(s.system).__name__}: {listed(s.inputs)} -> {listed(names)}; "
+            f"{self.placed.n_sections} sections; accuracy {self.stepping.accuracy:g})"
+        )
+
+    def __call__(
+        self,
+        u: Annotated[Numbers, Reals("S n nu")],
+        start: Float[Array, "m S"] | None = None,
+        system: HybridSystem | None = None,
+    ) -> Response:
+        """Return the response of S experiments.
+
+        **Arguments:**
+
+        - `u`: inputs, held from sample to sample, with n a multiple of the N sections.
+        - `start`: times and states (padded with zeros) on section 0. Default: those of the cycle.
+        - `system`: a system with other parameter values. The sections do not move with it.
+
+        **Returns:** a `Response`: outputs `y` (S, n, ny) (not deviations), `result` (S,) codes,
+        `failed_at` (S,), error estimates `error` (S,), and final states `end` (S, m). Experiments
+        that fail raise no error.
+
+        **Raises:** `DefinitionError` for inputs of another shape.
+        """
+        require_x64(system)
+        u, placed = jnp.asarray(u, float), self.placed
+        require_shape(u.shape, placed.n_sections, len(placed.cycle.system.inputs))
+        if system is not None:
+            placed = eqx.tree_at(lambda x: x.cycle.system, placed, system)
+        if start is None:
+            start = jnp.tile(placed.section_zero[:, None], len(u))
+        return flow_batch(
+            course(placed, self.outputs), self.stepping.plan, start, u, self.stepping.settings
+        )
+
+
+@checked
+def response_function(
+    cycle: LimitCycle,
+    sections: SectionsLike,
+    outputs: OutputNames,
+    *,
+    accuracy: Accuracy = EXPERIMENT,
+) -> ResponseFunction:
+    """Return the computation of `run_experiments` as a function for `jit`, `vmap`, `grad` and
+    `jacfwd`.
+
+    ```python
+    response = hj.response_function(cycle, sections, ("yM", "vM"))
+
+    @eqx.filter_jit
+    @eqx.filter_grad
+    def gradient(system):
+        return jnp.sum((response(u, system=system).y - measured) ** 2)
+    ```
+
+    It has exact derivatives with respect to inputs, start and parameters, in both modes. Reverse
+    mode stores the states at the sections and recomputes the flow between them, so its memory grows
+    by a few hundred bytes per sample. Outputs of an experiment are NaN after it failed: select
+    experiments by `result` before you average.
+
+    **Arguments:** as for `run_experiments`. The cycle may be unstable if experiments are short.
+
+    **Raises:** `DefinitionError` for outputs or sections that do not exist, or an accuracy out of
+    range.
+    """
+    placed = as_placed(cycle, sections)
+    z = placed.structure().resolve_outputs(outputs)
+    stepping = plan_flow(placed, accuracy)
+    steps = max(_STEPS, _STEPS**2 // placed.n_sections)
+    settings = dataclasses.replace(stepping.settings, max_steps=steps)
+    stepping = dataclasses.replace(stepping, settings=settings)
+    return ResponseFunction(placed, stepping, tuple(z.items))
