@@ -139,7 +139,7 @@ class _Walk:
             self.digest.update(values.tobytes())
 
     def _function(self, x: types.FunctionType) -> None:
-        is_installed = _is_of_package(x.__code__.co_filename)
+        is_installed = is_of_package(x.__code__.co_filename)
         if is_installed:
             self.note(x.__code__.co_filename, x.__qualname__)
         else:
@@ -234,10 +234,10 @@ def _is_installed(module: str | None) -> bool:
         return False
     root = name.partition(".")[0]
     path = getattr(sys.modules.get(root), "__file__", None)
-    return root in sys.stdlib_module_names or (path is not None and _is_of_package(path))
+    return root in sys.stdlib_module_names or (path is not None and is_of_package(path))
 
 
 @ft.cache
-def _is_of_package(path: str) -> bool:
+def is_of_package(path: str) -> bool:
     """Test whether a file belongs to Python or to a package, `hybridjax.models` excepted."""
     return path.startswith(_FOLDERS) and not path.startswith(_MODELS)
