@@ -22,6 +22,7 @@ CASES = {
     "recordings": ("recordings.py", 30, "multipliers from recordings, clean and corrupted"),
     "designs": ("designs.py --draws 40", 25, "strides that optimal designs save"),
     "parameters": ("fitting.py --seeds 10 --draws 40", 10, "physical parameters from data"),
+    "second-order": ("second_order.py", 2, "second-order products on lines, and draws without"),
     "scale": ("scale.py", 30, "sweeps and experiments on several processes"),
     "boundary": ("boundary.py", 1, "the cost of checking arguments"),
     "truth-chain": ("chain_truth.py", 1, "ground truth, independent of the package"),

@@ -1,7 +1,7 @@
 """Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, cost.
 
 python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size] [bag]
-[coverage] [quiet] [short] [losses] [real]
+[coverage] [quiet] [short] [real]
 
 does all of these by default. The systems are simulated and their multipliers known. Beside
 `fit_series` stands plain ARX: least squares on the same section data.
@@ -355,24 +355,6 @@ def short(draws=400, strides=200):
         coverage_of(label, *system, noise, draws, strides)
 
 
-NOISES_OF_LOSSES = {
-    "normal": lambda rng, n: 0.1 * rng.normal(size=n),
-    "Student's of 3 degrees": lambda rng, n: 0.1 * rng.standard_t(3, size=n),
-    "1 % off by 20": lambda rng, n: (
-        0.1 * rng.normal(size=n) + 20 * rng.choice([-1, 0, 1], n, p=[0.005, 0.99, 0.005])
-    ),
-}
-
-
-def losses(draws=200, strides=200):
-    print(f"\nLosses of fit_series: {draws} draws, {strides} strides, 8 sections")
-    system = LINEAR["a complex pair"]
-    for label, noise in NOISES_OF_LOSSES.items():
-        for loss in ("squares", "huber"):
-            about = dict(loss=loss)
-            coverage_of(f"{label}, {loss}", *system, noise, draws, strides, **about)
-
-
 def walker(draws=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
@@ -529,7 +511,7 @@ def write_trials(files, minutes, rate):
 
 ALL = (
     "errors", "parts", "dirt", "mishaps", "spikes", "walker", "size", "bag", "coverage",
-    "quiet", "short", "losses", "real",
+    "quiet", "short", "real",
 )  # fmt: skip
 
 if __name__ == "__main__":

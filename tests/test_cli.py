@@ -96,7 +96,7 @@ SECOND_PROCESS = "hybridjax.apps.second_process.second_process"
     [
         ("--param q=1", "no parameter 'q'; parameters are m, M"),
         ("--param M=nan", "VerticalHopper: `M` must be a finite number"),
-        ("--experiments 10", "10 experiments are too few"),
+        ("--experiments 10", "need at least 20 experiments"),
         ("--quick --keep 36", "leaves no cycle to discard"),
         ("--out /dev/null/x", "cannot write to '/dev/null/x'"),
     ],

@@ -1,8 +1,5 @@
 """Other libraries get the same numbers, and give them back."""
 
-import warnings
-
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -10,7 +7,7 @@ import pytest
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
 
-from .sessions import blocks, same_output
+from .linear.test_variances import htf as htf
 
 
 convert = hj.convert
@@ -77,14 +74,6 @@ def test_the_lifted_system_is_the_periodic_one(model):
         np.testing.assert_allclose(found, H[m], rtol=0, atol=1e-12)
 
 
-def test_lifting_can_be_compiled_and_differentiated(model):
-    def power(scale):
-        return (convert.to_lti(eqx.tree_at(lambda m: m.B, model, scale * model.B)).B ** 2).sum()
-
-    value, slope = eqx.filter_jit(jax.value_and_grad(power))(2.0)
-    np.testing.assert_allclose(value, slope, rtol=1e-12)  # 4 c and 2 * 2 c
-
-
 def test_python_control(model):
     control = pytest.importorskip("control")
     f = np.linspace(0.01, 0.49, 7)
@@ -99,23 +88,6 @@ def test_python_control(model):
     np.testing.assert_array_equal(data(1j * data.omega)[1], np.asarray(H[-1])[:, 0].T)
     np.testing.assert_allclose(data.omega, np.pi * f)
     assert isinstance(data, control.FrequencyResponseData)
-
-
-def test_nyquist_plots_and_controllers_of_python_control():
-    """From the lifted system in a line each: the response is that of the transfer functions, to
-    1e-10, and a controller moves the multipliers of the periodic system to where it says."""
-    control = pytest.importorskip("control")
-    model = _model([2] * N, nu=1)
-    system, lti = convert.to_control(model), convert.to_lti(model)
-    with warnings.catch_warnings(action="ignore"):  # (of python-control, about its own NumPy)
-        nyquist = control.nyquist_response(system[0, 0])
-    f = np.angle(nyquist.contour) / (2 * np.pi)
-    assert len(f) > 100
-    np.testing.assert_allclose(nyquist.response, lti.htf(f).H[0][:, 0, 0], rtol=0, atol=1e-10)
-    gain, _, poles = control.dlqr(system, np.eye(2), np.eye(N))
-    closed = np.linalg.eigvals(np.asarray(lti.A[0] - lti.B[0] @ gain))
-    np.testing.assert_allclose(np.sort_complex(closed), np.sort_complex(poles), atol=1e-10)
-    assert abs(closed).max() < abs(model.multipliers).max()
 
 
 def test_the_norm_of_the_lifted_system_is_that_of_the_transfer_functions():
@@ -261,10 +233,13 @@ def test_what_is_refused(model, monkeypatch):
             call(model)
 
 
-def test_the_session_of_the_page_prints_what_it_shows(capsys):
-    for name in ("control", "xarray", "pandas"):
-        pytest.importorskip(name)
-    (code,) = (text for kind, text in blocks(PAGE) if kind == "python")
-    (shown,) = (text for kind, text in blocks(PAGE) if kind == "text")
-    exec(compile(code, PAGE, "exec"), {"__name__": "session"})
-    assert same_output(shown, capsys.readouterr().out)
+def test_scatter_is_kept(htf, tmp_path):
+    """In files, datasets, and by transformations of JAX."""
+    hj.save(tmp_path / "htf.npz", htf)
+    radius = htf.confidence_radius()
+    dataset = hj.convert.to_xarray(htf)
+    assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
+    for other in (hj.load(tmp_path / "htf.npz"), hj.convert.from_xarray(dataset)):
+        assert jax.tree.structure(other) == jax.tree.structure(htf)
+        np.testing.assert_array_equal(other.confidence_radius(), radius)
+    np.testing.assert_allclose(jax.jit(lambda x: x.confidence_radius())(htf), radius)

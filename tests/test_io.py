@@ -79,17 +79,6 @@ def test_failed_experiments_and_cycle_outputs(folder):
     assert back.summary() == data.summary() and type(back.periods) is int
 
 
-def test_a_file_can_be_read_without_the_package(folder, things):
-    path = folder / "thing.npz"
-    hj.save(path, things[2])
-    with np.load(path) as file:
-        header = json.loads(str(file["header"]))
-        np.testing.assert_array_equal(file["H"], things[2].H)
-    assert header["kind"] == "HTF" and header["package_version"] == hj.__version__
-    assert header["static"]["outputs"] == ["y"]
-    assert "evaluated at the input frequency" in header["conventions"]
-
-
 @settings(max_examples=15)
 @given(st.data())
 def test_round_trip_of_any_htf(folder, data):

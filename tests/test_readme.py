@@ -1,7 +1,9 @@
-"""The README's python blocks run, one after the other, and print what it shows."""
+"""Sessions of the README and of pages run and print what is shown."""
 
 import re
 import shlex
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -98,3 +100,37 @@ def test_there_is_one_test_command_for_ci_to_find():
 def test_claims_name_tests_that_exist():
     for path, name in re.findall(r"`(?:[^`]* )?(tests/\S+?\.py)(?:::(\w+))?`", CLAIMS.read_text()):
         assert f"def {name}" in (ROOT / path).read_text(), f"there is no {path}::{name}"
+
+
+PAGES = ["docs/index.md", "docs/experiments.md", "docs/interop.md"]
+PAGES += [f"docs/how-to/{p.name}" for p in (ROOT / "docs/how-to").glob("*.md")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", sorted(PAGES))
+def test_the_page_runs_and_prints_what_it_shows(page, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    session, printed = Session(page, monkeypatch), ""
+    for language, text in blocks(page):
+        if language == "python":
+            session.run(text)
+            printed = capsys.readouterr().out
+        elif language == "text":
+            assert same_output(text, printed), f"{page} shows\n{text}\nbut prints\n{printed}"
+    pyplot.close("all")
+
+
+@pytest.mark.slow
+def test_the_example_runs_in_processes_of_its_own(tmp_path):
+    *_, script = (text for kind, text in blocks("docs/how-to/scale.md") if kind == "python")
+    (tmp_path / "script.py").write_text(script)
+    run = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    scatter, mean = (
+        [complex(z) for z in part.strip(" []\n").split()] for part in run.stdout.split("around")
+    )
+    true = (0.6 + 0.5j) ** 4
+    np.testing.assert_allclose(mean, [true, true.conjugate()], atol=1e-3)
+    assert 0 < abs(scatter[0]) < 2e-3

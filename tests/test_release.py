@@ -1,6 +1,10 @@
-"""What is said twice, for pip and for conda, is the same."""
+"""What is said twice is the same, and builds of jax that compute wrong numbers are seen."""
 
+import os
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
 
 import pytest
@@ -29,3 +33,37 @@ def test_the_conda_recipe_has_the_version_and_renders():
     (rendered,) = recipe.render(rattler.VariantConfig(variants), rattler.RenderConfig())
     made = rendered.recipe
     assert (made.package.name, str(made.package.version)) == ("hybridjax", PROJECT["version"])
+
+
+def test_the_tables_are_those_of_the_baseline(tmp_path):
+    page = ROOT / "docs" / "benchmarks.md"
+    copy = tmp_path / page.name
+    shutil.copy(page, copy)
+    code = (
+        "import json, pathlib, sys; from tables import fill; "
+        "fill(pathlib.Path(sys.argv[1]), json.loads(pathlib.Path('baseline.json').read_text()))"
+    )
+    subprocess.run([sys.executable, "-c", code, str(copy)], cwd=ROOT / "benchmarks", check=True)
+    assert copy.read_text() == page.read_text()
+
+
+# In a process of its own, since tests are compiled with other options than users' programs.
+PRODUCTS = """
+import jax, jax.numpy as jnp, numpy as np
+n = 16385
+rows = np.zeros((n, 3))
+rows[:, 0] = np.arange(n)
+lengths = lambda rows: jax.vmap(lambda row: jnp.sum((jnp.eye(3) @ row) ** 2))(rows)
+np.testing.assert_array_equal(lengths(rows), np.arange(n) ** 2.0)
+np.testing.assert_array_equal(jax.jit(lengths)(rows), np.arange(n) ** 2.0)
+"""
+
+
+def test_batched_products_followed_by_a_reduction():
+    """jax issue 39103: on CPU, jax 0.10.2 silently returns 267911424 for the last of these."""
+    kept = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    environment = kept | {"JAX_ENABLE_X64": "1"}
+    run = subprocess.run(
+        [sys.executable, "-c", PRODUCTS], env=environment, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr

@@ -14,7 +14,6 @@ import truth
 from peers import contest
 
 import hybridjax as hj
-from hybridjax.sections.linearize import _section_jacobians
 
 from .problems import ALL, Problem, first_and_later, problem
 
@@ -24,12 +23,12 @@ RTOL = (1e-10, 1e-12)
 
 @eqx.filter_jit
 def _program(placed):
-    return _section_jacobians(placed)
+    return placed.flow_jacobians
 
 
 @eqx.filter_jit
 def _placing(cycle, family):
-    return _section_jacobians(hj.place_sections(cycle, family))
+    return hj.place_sections(cycle, family).flow_jacobians
 
 
 def run(show, options) -> None:

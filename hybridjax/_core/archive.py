@@ -35,10 +35,8 @@ _FORMAT, _VERSION = "hybridjax", 2
 _HEADER = "header"
 
 
-def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
+def write_module(path: Path, thing: eqx.Module) -> None:
     """Write a module whose fields are arrays, modules, `None`, or static values of JSON.
-
-    `part`: which part of a larger whole it is.
 
     **Raises:** `DefinitionError` if a field is not what its annotation says, or the file cannot be
     written.
@@ -52,7 +50,6 @@ def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
         "format_version": _VERSION,
         "package_version": __version__,
         "kind": kind,
-        "part": part,
         "static": static,
         "units": {str(name): name.unit for name in signals_in(static)},
         "arrays": {name: f"{array.dtype}{list(array.shape)}" for name, array in arrays.items()},
@@ -65,8 +62,8 @@ def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
         os.fsync(file.fileno())
 
 
-def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) -> Any:
-    """Read a module of one of these kinds; `part`: as it was written with, if that matters.
+def read_module(path: Path, kinds: Mapping[str, type]) -> Any:
+    """Read a module of one of these kinds.
 
     **Raises:** `DefinitionError` if the file cannot be read; `FileFormatError` if it is damaged, of
     another format or version, or holds something else.
@@ -77,10 +74,6 @@ def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) 
         raise DefinitionError(f"cannot read '{path}': {error.strerror}.") from error
     header = _read_header(path, members.pop(_HEADER, None), kinds)
     kind = kinds[header["kind"]]
-    if part is not None and part != header.get("part"):
-        raise FileFormatError(
-            f"'{path}' was replaced by another file: delete it, and make it again."
-        )
     static = restored(header["static"], header["units"])
     if set(header["arrays"]) != set(members):
         raise damaged(path, "its arrays are not those that its header lists")
@@ -219,12 +212,6 @@ def _matches(value: Any, hint: Any) -> bool:
     return isinstance(value, hint)
 
 
-_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
-
-
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays by name. Members are read whole, so that their checksums are checked.
 
@@ -257,10 +244,9 @@ def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(member) as stream:
-        version = np.lib.format.read_magic(stream)
-        if version not in _HEADERS:
-            raise ValueError(f"an array is of version {version}")
-        shape, _, dtype = _HEADERS[version](stream)
+        major, minor = np.lib.format.read_magic(stream)
+        read_header = getattr(np.lib.format, f"read_array_header_{major}_{minor}")
+        shape, _, dtype = read_header(stream)
         declared = stream.tell() + math.prod(shape) * dtype.itemsize
     if dtype.hasobject:
         raise ValueError(f"'{member.filename}' holds Python objects")

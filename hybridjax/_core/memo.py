@@ -3,10 +3,9 @@
 import functools
 import weakref
 from collections.abc import Callable, Hashable
-from typing import Any, Generic, TypeVar, cast, overload
+from typing import Any, TypeVar, cast
 
 
-Owner = TypeVar("Owner")
 Value = TypeVar("Value")
 
 
@@ -43,20 +42,14 @@ class Memory:
         return values.setdefault(key, make())
 
 
-class remembered(Generic[Owner, Value]):  # noqa: N801 (a decorator, as `property` is)
+class remembered:  # noqa: N801 (a decorator, as `property` is)
     """A property that is computed once for each object."""
 
-    def __init__(self, function: Callable[[Owner], Value]):
+    def __init__(self, function: Callable[[Any], Any]):
         self._function, self.memory = function, Memory()
         functools.update_wrapper(cast(Callable, self), function)
 
-    @overload
-    def __get__(self, instance: None, owner: Any = None) -> "remembered[Owner, Value]": ...
-
-    @overload
-    def __get__(self, instance: Owner, owner: Any = None) -> Value: ...
-
-    def __get__(self, instance: Owner | None, owner: Any = None) -> Any:
+    def __get__(self, instance: Any, owner: Any = None) -> Any:
         if instance is None:
             return self
         return self.memory.recall(instance, None, lambda: self._function(instance))

@@ -26,7 +26,7 @@ def require_x64(*trees: Any) -> None:
     **Raises:** `PrecisionError` if JAX runs in 32-bit mode, or if a floating-point leaf of one
     of `trees` is of less than 64 bits (an array of JAX that was made before `enable_x64()`).
     """
-    if not _is_double():
+    if not jax.config.read("jax_enable_x64"):
         raise PrecisionError(
             "JAX is in 32-bit mode, too coarse for limit cycles and their derivatives: call "
             "`hybridjax.enable_x64()` first."
@@ -54,7 +54,3 @@ def real(x: Any) -> jax.Array:
         return jnp.asarray(x, float)
     with jax.enable_x64(True):  # (No program is compiled for numbers of Python and NumPy.)
         return jax.device_put(np.asarray(x, float))
-
-
-def _is_double() -> bool:
-    return jax.config.read("jax_enable_x64")

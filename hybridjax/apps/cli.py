@@ -274,7 +274,7 @@ def _reproduce(options) -> int:
         options.parser.error("--param gives a parameter twice")
     from .second_process import second_process
 
-    with second_process("hybridjax.apps.reproduce", "hybridjax.apps.paper_figures") as process:
+    with second_process("hybridjax.apps.reproduce", "hybridjax.plot.plane") as process:
         from .reproduce import Protocol, reproduce
 
         sizes = {

@@ -23,7 +23,7 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
         "limit_cycle": {
             "period": float(cycle.period),
             "residual": float(cycle.residual),
-            "multipliers": _complex(true),
+            "multipliers": complex_pairs(true),
         },
         "families": {},
     }
@@ -37,26 +37,23 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
                 family.structured.result == Result.OK
                 and np.all(family.rational.result == Result.OK)
             ),
-            "multipliers_from_linearization": _complex(family.ldtp.multipliers),
-            "multipliers_fit_structured": _complex(family.structured.multipliers),
+            "multipliers_from_linearization": complex_pairs(family.ldtp.multipliers),
+            "multipliers_fit_structured": complex_pairs(family.structured.multipliers),
             "multipliers_fit_structured_error": family.structured.compare(true).max_error,
             "multipliers_fit_2p1z": {
                 output: {
                     "form": f"{family.rational.form}, {family.rational.weighting} weights",
-                    "multipliers": _complex(family.rational.multipliers[k]),
+                    "multipliers": complex_pairs(family.rational.multipliers[k]),
                     "error": family.rational.compare(true, k).max_error,
                     "error_of_the_same_fit_to_the_exact_htf": biases[k],
-                    "poles": _complex(family.rational.poles[k]),
-                    "zeros": _complex(family.rational.zeros[k]),
+                    "poles": complex_pairs(family.rational.poles[k]),
+                    "zeros": complex_pairs(family.rational.zeros[k]),
                 }
                 for k, output in enumerate(OUTPUTS)
             },
             "htf_error_of_max_H_0": {
                 output: {f"H_{m}": float(errors[at[m], k]) for m in (-2, -1, 0, 1, 2) if m in at}
                 for k, output in enumerate(OUTPUTS)
-            },
-            "largest_htf_error_of_max_H_0": {
-                output: float(np.max(errors[:, k])) for k, output in enumerate(OUTPUTS)
             },
         }
     summary["observations"] = _observations(families)
@@ -166,7 +163,8 @@ def table(summary: dict) -> str:
     return "\n".join([*rows, "", f"Time: {summary['seconds']:.1f} s", ""])
 
 
-def _complex(values) -> list[list[float]]:
+def complex_pairs(values) -> list[list[float]]:
+    """Return real and imaginary parts, as JSON holds them."""
     return [[float(z.real), float(z.imag)] for z in np.asarray(values).ravel()]
 
 

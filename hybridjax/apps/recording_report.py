@@ -22,6 +22,7 @@ from ..io import save
 from ..linear.htf import HTF
 from ..plot import look
 from ..recordings.identification import Identification
+from .paper_report import complex_pairs
 
 
 PAGE = "report.html"
@@ -153,19 +154,15 @@ def summarize(found: Identification) -> dict[str, Any]:
         "period": data.period,
         "period_jitter": found.phase.jitter,
         "period_drift_per_cycle": found.phase.drift,
-        "multipliers": _pairs(fit.multipliers),
+        "multipliers": complex_pairs(fit.multipliers),
         "standard_errors": fit.standard_errors.tolist(),
         "covariance_of_coefficients": fit.covariance.tolist(),
-        "multipliers_of_plain_regression": _pairs(found.advice.plain),
-        "multipliers_of_held_out_fit": _pairs(held.fit.multipliers),
+        "multipliers_of_plain_regression": complex_pairs(found.advice.plain),
+        "multipliers_of_held_out_fit": complex_pairs(held.fit.multipliers),
         "held_out_fit_percent": held.validation.fit.tolist(),
         "input_band": list(found.advice.band),
         "warnings": list(map(repr, found.advice.warnings)),
     }
-
-
-def _pairs(values: np.ndarray) -> list[list[float]]:
-    return [[z.real, z.imag] for z in values]
 
 
 def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -39,6 +39,9 @@ from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
 from ..systems.system import own_fields
 from .paper_report import OUTPUTS, summarize, table
+
+
+_SYMBOLS = {"yM": "$y_M$", "vM": r"$\dot y_M$"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,9 +123,9 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process
     families = {first: _identify(first, cycle, design, protocol, begin)}
     perturbed = _perturbed(cycle)
     families |= {name: task.result() for name, task in zip(second, tasks, strict=True)}
-    drawing = process.submit(_draw, "comparisons", (cycle, families), out, formats, begin)
+    drawing = process.submit(_draw, _comparisons, (cycle, families), out, formats, begin)
     placed = {name: family.placed for name, family in families.items()}
-    _draw("cycles", (placed, perturbed), out, formats, begin)
+    _draw(_cycles, (placed, perturbed), out, formats, begin)
     summary = summarize(protocol, cycle, families)
     _write_results(out / "results.npz", protocol, cycle, families)
     drawing.result()
@@ -206,16 +209,44 @@ def _identify(
     return Family(placed, ldtp, exact, experiments, estimate, rational, rational_exact, structured)
 
 
-def _draw(kind: str, results: tuple, out: Path, formats: Sequence[Format], begin: float) -> None:
-    """Write the figures of one kind."""
+def _draw(
+    figures: Callable, results: tuple, out: Path, formats: Sequence[Format], begin: float
+) -> None:
+    """Write the figures that a generator yields with their names."""
     import matplotlib  # here, since it is heavy
 
     matplotlib.use("Agg")  # files only: no window is opened, and none is needed
-    from . import paper_figures
+    from matplotlib import pyplot
+
+    from .. import plot
 
     _set_up()
-    for name in paper_figures.save(out, formats, getattr(paper_figures, kind)(*results)):
+    for name, drawn in figures(plot, *results):
+        plot.save(out / name, drawn, formats)
+        pyplot.close(drawn.figure)
         _log(begin, name)
+
+
+def _cycles(plot: Any, placed: Mapping[str, PlacedSections], perturbed: Trajectory) -> Iterator:
+    """Fig. 1, for each family of sections."""
+    options = {"perturbed": perturbed, "labels": _SYMBOLS}
+    for name, sections in placed.items():
+        drawn = plot.cycle(sections.cycle, *OUTPUTS, sections=sections, **options)
+        yield f"fig1_cycle_{name}", drawn
+
+
+def _comparisons(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -> Iterator:
+    """Figs. 3 and 4, multipliers, poles and zeros: all families in each."""
+    pairs = {name: (family.estimate, family.exact) for name, family in families.items()}
+    rational = {name: family.rational for name, family in families.items()}
+    estimates: dict[str, Any] = {}
+    for name, family in families.items():
+        estimates |= {f"2p1z, {name}": family.rational, f"structured, {name}": family.structured}
+    deviations = {name: rf"$\delta$ {symbol}" for name, symbol in _SYMBOLS.items()}
+    yield "fig3_harmonics", plot.harmonics(pairs, labels=deviations)
+    yield "fig4_bode", plot.bodes(pairs, fits=rational, labels=deviations)
+    yield "multipliers", plot.multipliers(cycle, estimates, labels=_SYMBOLS)
+    yield "poles_zeros", plot.poles_zeros(rational, labels=_SYMBOLS)
 
 
 def _perturbed(cycle: LimitCycle) -> Trajectory:

@@ -14,7 +14,7 @@ from ..errors import DefinitionError
 from ..identify.htf_errors import check_values, error_weights
 from ..identify.joint.frequency import transfer, transfer_slopes
 from ..identify.joint.model import LocalCoordinates, PeriodicModel, local_coordinates
-from ..identify.joint.realization import SHORTEST_HORIZON, realize
+from ..identify.joint.realization import default_horizon, realize
 from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
@@ -83,7 +83,7 @@ def ldtp_matrices(
             "a goal of `fit_ldtp` needs a model with matrices: an `LDTP`, such as `fit.model` of "
             "`fit_ldtp` or a result of `hj.identify.realize`."
         )
-    lags = 2 * max(2 * model.n_sections, SHORTEST_HORIZON) + 1
+    lags = 2 * default_horizon(model.n_sections) + 1
     response = np.asarray(model.impulse_response(lags))[:, :, noise.outputs]
     htfs = list(measured_htfs(model, cosines, harmonics, noise))
     scale = np.sqrt(np.mean([check_values(measured.htf) ** 2 for measured in htfs], axis=0))

@@ -44,7 +44,7 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     each = []
     for s in np.flatnonzero(data.ok):
         u, y = data.u[s : s + 1], data.y[s : s + 1]
-        single = dataclasses.replace(data, u=u, y=y, result=None, simulated=None)
+        single = dataclasses.replace(data, u=u, y=y, result=data.result[s : s + 1], simulated=None)
         each.append(spectral_sums(single, goal.fitted_harmonics, repeats=repeats))
     if not each:
         raise DefinitionError(f"no experiment ran well: {data.summary()}.")

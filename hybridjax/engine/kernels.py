@@ -29,10 +29,9 @@ Expanded = Float[Array, "rows columns L"]
 Some = Bool[Array, " L"] | None
 Items = tuple[str | Output, ...]
 
-# Lanes of programs that are called for many points at once, and of those that are called for single
-# points as well. Higher: single points wait for lanes that nobody needs. Lower: many points take
-# more calls.
-_MANY_POINTS, _POINTS = 16, 4
+# Lanes of programs that are called for many points at once. Higher: single points wait for lanes
+# that nobody needs. Lower: many points take more calls.
+_POINTS = 4
 
 
 def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
@@ -64,7 +63,7 @@ def divergence(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -
     """The divergence of the field of chart a, integrated over steps."""
     method = s.method(a)
     form = _ByMethod(_divergence, method if method.implicit else as_method(Radau()))
-    return s.kernel(_field, form, a, lanes=_MANY_POINTS)(t, q, u, h)
+    return s.kernel(_field, form, a, lanes=_POINTS)(t, q, u, h)
 
 
 def watched(
@@ -82,8 +81,8 @@ def watched(
     if not on_host(q):
         of_lanes = s.by_lane(_columns(ft.partial(watched_at, *static)), levels)
         return of_lanes(t, q, u, index)
-    # (A program for many points is worth its compilation from four calls on.)
-    lanes = 1 if q.shape[-1] < 4 * _MANY_POINTS else _MANY_POINTS
+    # (A program for many points is worth its compilation from sixteen calls on.)
+    lanes = 1 if q.shape[-1] < 16 * _POINTS else _POINTS
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
@@ -110,17 +109,11 @@ def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) 
     return s.kernel(_outputs, _expanded, a, trees=(items,), lanes=_POINTS)(t, q, u)
 
 
-def values(s: Structure, a: int, items: Items, t: Times, q: States) -> Float[Array, "ny L"]:
-    """Outputs in chart a without input, without derivatives."""
-    u = np.zeros((s.nu, 1))
-    return s.kernel(_outputs, by_lane, a, trees=(items,), lanes=_MANY_POINTS)(t, q, u)
-
-
 def levels(
     s: Structure, a: int, levels: AbstractLevels, n_sections: int, t: Times, q: States
 ) -> Float[Array, "N 2 L"]:
     """The levels of all sections in chart a, and their rates along the flow."""
-    of_all = s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=_MANY_POINTS)
+    of_all = s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=_POINTS)
     return of_all(t, q)
 
 

@@ -24,9 +24,6 @@ LaneField = Callable[[Array, Array], Array]
 # Stages are always unrolled from this number of lanes on. Higher: large batches run up to twice as
 # long. Lower: small batches compile for twice as long.
 _UNROLLED_LANES = 128
-# Eliminations are unrolled up to this number of columns. Higher: they compile for longer. Lower: a
-# loop for each small system.
-_UNROLLED_COLUMNS = 4
 
 
 class Step(NamedTuple):
@@ -124,8 +121,8 @@ def short_step(field: LaneField, t: Times, q: States, f: States, h: Times) -> tu
 # for together, by Newton's method with the Jacobian J of the field at the start of the step. Its
 # linear systems (1 - h A x J) dw = r are decoupled as by E. Hairer and G. Wanner, Solving Ordinary
 # Differential Equations II, section IV.8: with A = T R T^-1 and R triangular, they need inverses of
-# 1 - h g J for the diagonal entries g of R only, real or complex. All of it is unrolled for small
-# matrices: LAPACK would be called once for each lane.
+# 1 - h g J for the diagonal entries g of R only, real or complex. Lanes are eliminated together:
+# LAPACK would be called once for each lane.
 
 
 class _Decoupled(NamedTuple):
@@ -263,9 +260,4 @@ def inverse(matrix: Inexact[Array, "n n L"]) -> Inexact[Array, "n n L"]:
 
     eye = jnp.broadcast_to(jnp.eye(n, dtype=matrix.dtype)[..., None], matrix.shape)
     X = jnp.concatenate([matrix, eye], axis=1)
-    if n <= _UNROLLED_COLUMNS:
-        for k in range(n):
-            X = eliminate(k, X)
-    else:
-        X = jax.lax.fori_loop(0, n, eliminate, X)
-    return X[:, n:]
+    return jax.lax.fori_loop(0, n, eliminate, X)[:, n:]

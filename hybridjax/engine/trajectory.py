@@ -108,7 +108,8 @@ class Trajectory(eqx.Module):
         values = np.full((len(names), t.shape[0]), np.nan)
         for a in np.unique(chart):
             at = chart == a
-            values[:, at] = kernels.values(s, int(a), items, t[at], q[at, : s.dims[a]].T)
+            point = t[at], q[at, : s.dims[a]].T, np.zeros((s.nu, 1))
+            values[:, at] = kernels.outputs(s, int(a), items, *point)[:, 0]
         return (t, *values)
 
     def __repr__(self):

@@ -1,7 +1,6 @@
 """Experiments in a Zarr store: more than memory holds, run by any number of processes."""
 
 import dataclasses
-import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -79,7 +78,7 @@ class StoredExperiments:
             outputs=tuple(Signal(*named) for named in about["outputs"]),
             result=x["result"],
             simulated=Simulated(x["failed_at"], x["error"], about["label"]),
-            cycle_outputs=self._cycle_outputs,
+            cycle_outputs=self._store.array("cycle_outputs"),
         )
 
     def __iter__(self) -> Iterator[ExperimentData]:
@@ -104,10 +103,6 @@ class StoredExperiments:
         result, failed_at = (self._store.array(name) for name in ("result", "failed_at"))
         assert result is not None and failed_at is not None
         return summary(result, failed_at, self.n_sections, limit)
-
-    @functools.cached_property
-    def _cycle_outputs(self) -> np.ndarray | None:
-        return self._store.array("cycle_outputs")
 
     def __repr__(self) -> str:
         ready = len(self) - len(self.missing())

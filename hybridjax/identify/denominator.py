@@ -20,8 +20,6 @@ _FORGOTTEN = 0.1
 # Largest modulus of a multiplier that is assumed before a fit: 0.99 takes 230 cycles. Larger:
 # simulations from starts overflow; smaller: slow modes start far from their minimum.
 SLOWEST = 0.99
-# Share of a record that lags may take. Larger: sums over fewer pairs, which scatter more.
-_LARGEST_SHARE = 0.25
 # Smallest share of its errors that a fit leaves to a block or line. Smaller: blocks that alone
 # determine a coefficient dominate the covariance; larger: covariances are too small.
 _SMALLEST_REMAINDER = 0.1
@@ -94,7 +92,7 @@ def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> in
     """
     slowest = np.clip(np.abs(multipliers).max(), _FORGOTTEN, SLOWEST)
     needed = np.ceil(np.log(_FORGOTTEN) / np.log(slowest))
-    return int(min(needed, int(cycles * _LARGEST_SHARE)))
+    return int(min(needed, cycles // 4))  # (sums over fewer pairs scatter more)
 
 
 def fading(c: Coefficients) -> Coefficients:

@@ -20,9 +20,6 @@ from .variable_projection import HTFGroup, misfit_of
 # Smallest error that an HTF is supposed to have, relative to the rms of its output: that of
 # rounding. Smaller: infinite weights; larger: exact outputs count too little beside noisy ones.
 SMALLEST_ERROR = 1e-15
-# Alternations between the factors of frequency and of harmonic. Fewer: weights that are no product
-# yet; more: the same to 6 digits.
-_SMOOTHING_SWEEPS = 20
 
 
 def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
@@ -86,7 +83,7 @@ def _product_of_factors(
     _, same = np.unique(np.abs(harmonics), return_inverse=True)
     share = freedom / freedom.sum()
     size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
-    for _ in range(_SMOOTHING_SWEEPS):
+    for _ in range(20):  # more sweeps change nothing in 6 digits
         by_line = (variance / size[same]).mean(axis=0)
         by_harmonic = np.tensordot(share, variance / by_line, axes=(0, 1))
         size = np.stack([by_harmonic[same == k].mean(axis=0) for k in range(len(size))])[:, None]

@@ -15,10 +15,6 @@ from .descent import ROUNDING
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
 
 
-# Part of the power of a line by which |sum of U^2| may fall short of the sum of |U|^2 where all
-# phases are the same. Smaller: the scatter of recorded repetitions counts as distortion; larger:
-# random phases that happen to be close are refused.
-_SAME_PHASES = 1e-6
 # Realizations of a line up to which the shape of their scatter is estimated. Fewer: regions for
 # errors of constant size are too small; the mean of more is normally distributed.
 _FEW_REALIZATIONS = 16
@@ -120,8 +116,6 @@ class _LineEstimates(NamedTuple):
     """Least-squares estimates at F lines."""
 
     H: Complex[np.ndarray, "M F ny nu"]
-    residual: Float[np.ndarray, "F M ny"]
-    """Sum of squares over experiments."""
     realizations: Int[np.ndarray, " F"]
     """Experiments beyond those that the unknowns need: degrees of freedom of the residual."""
     total: Float[np.ndarray, "M F ny nu"]
@@ -160,7 +154,7 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
     mean = residual / np.maximum(realizations, 1)[:, None, None]
     mean[realizations < 1] = np.inf
     noise = variance(sums.noise[rows] / count[:, None, None]) if sums.repeats > 1 else None
-    return _LineEstimates(H.transpose(2, 0, 3, 1), residual, realizations, variance(mean), noise)
+    return _LineEstimates(H.transpose(2, 0, 3, 1), realizations, variance(mean), noise)
 
 
 def _roundness(
@@ -208,7 +202,8 @@ def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
     gram = sums.gram[rows]
     power, square = (np.einsum("kii->k", x) for x in (gram[:, :nu, :nu], gram[:, nu:, :nu]))
     several = sums.count[rows] > nu
-    alike = several & (np.abs(square) > (1 - _SAME_PHASES) * power.real)
+    # |sum of U^2| is the sum of |U|^2 where all phases are the same.
+    alike = several & (np.abs(square) > (1 - SILENT_LINE) * power.real)
     tested, low = sums.crest_factors
     if several.any() and alike.sum() > several.sum() / 2:
         return (

@@ -26,11 +26,10 @@ from .multiplier_estimate import (
 # Iterations of Sanathanan and Koerner from which descents start. Fewer: other minima are found for
 # some forms and weightings; more: the same result in longer time.
 _STARTS = (0, 1, 4, 29)
-# Part of the residual, relative to H, that a step may still explain at the end. Smaller: descents
-# on exact data stall in rounding; larger: coefficients that are off by as much.
+# Part of the residual, relative to H, that a step may still explain at the end, and by which equal
+# costs differ (a converged fit is then preferred). Smaller: descents on exact data stall in
+# rounding; larger: coefficients that are off by as much.
 _ACCURACY = 1e-8
-# Relative difference of costs that are equal: a converged fit is then preferred.
-_EQUAL_COST = 1e-9
 
 
 class RationalFit(eqx.Module):
@@ -191,7 +190,7 @@ def fit_rational(
         cost[~np.isfinite(cost)] = np.inf
         if not np.isfinite(cost).any():
             raise ComputationError(f"no start led to a finite fit of {name}: try fewer poles.")
-        lowest = cost <= cost.min() * (1 + _EQUAL_COST)
+        lowest = cost <= cost.min() * (1 + _ACCURACY)
         best = int(np.argmax(lowest * [1 + end.converged for end in ends]))
         a, converged = ends[best]
         result = Result.OK if converged else Result.NOT_CONVERGED

@@ -66,7 +66,7 @@ def _simulate_fit(fit: SeriesFit, record: Record, free_start: bool) -> Float[np.
         forced = lagged_inputs(v, n, R, fit.lead) @ fit.numerators[n, :, i].reshape(R * nu, 1)
         starts = start_responses(fit.coefficients, grid.first[:, n], T, free)
         unknown, none = np.concatenate([starts, grid.drift], axis=2), grid.drift[:, :, :0]
-        regression = SectionRegression.make(forced, unknown, none, grid.weight[:, :, n, i])
+        regression = SectionRegression.make(forced, unknown, none, grid.sampled[:, :, n, i])
         y, sampled = grid.y[:, :, n, i], grid.sampled[:, :, n, i]
         error = regression.residual(np.ones(1), y).reshape(y.shape)
         out[:, n, i] = np.where(sampled, y - error, regression.response(np.ones(1), y))[0]

@@ -26,8 +26,6 @@ from .spectral_sums import SILENT_LINE
 # The largest number of multipliers that is tried. Larger: records need 8 more cycles for each one
 # to be separated from all that repeats; smaller: slow modes of larger systems are missed.
 _LARGEST_ORDER = 4
-# Change of the input after P periods, relative to its largest value, that is rounding.
-_REPEATS = 1e-6
 
 
 class TransientFit(eqx.Module):
@@ -136,7 +134,7 @@ def _require_periodic(data: ExperimentData) -> None:
     u = data.u[data.ok]
     change = np.abs(u[:, length:] - u[:, :-length]).max(axis=(1, 2))
     worst = int(np.argmax(change))
-    if change[worst] > _REPEATS * np.abs(u[worst]).max():
+    if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
         raise DefinitionError(
             f"experiment {np.flatnonzero(data.ok)[worst]}: the input does not repeat after P = "
             f"{data.periods} periods over all of the record, so that response and transient cannot "

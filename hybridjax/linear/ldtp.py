@@ -126,37 +126,27 @@ class LDTP(eqx.Module):
 
         **Raises:** `DefinitionError`, naming the matrix that does not fit.
         """
-        n_sections = len(A)
-        for name, given in (("B", B), ("C", C), ("D", D)):
-            if given is not None and len(given) != n_sections or n_sections == 0:
-                raise DefinitionError(
-                    f"`A` has {n_sections} matrices, `{name}` {len(given or ())}."
-                )
-        blocks = {
-            name: [jnp.asarray(block) for block in given]
-            for name, given in (("A", A), ("B", B), ("C", C), ("D", D))
-            if given is not None
-        }
-        dims = [block.shape[1] for block in blocks["A"]]
-        d, ny, nu = max(dims), blocks["C"][0].shape[0], blocks["B"][0].shape[1]
+        given = {"A": A, "B": B, "C": C} | ({} if D is None else {"D": D})
+        for name, blocks in given.items():
+            if len(blocks) != len(A) or len(A) == 0:
+                raise DefinitionError(f"`A` has {len(A)} matrices, `{name}` {len(blocks)}.")
+        dims = [np.shape(block)[1] for block in A]
+        after, d = [*dims[1:], dims[0]], max(dims)
+        ny, nu = np.shape(C[0])[0], np.shape(B[0])[1]
         padded = {}
-        for name, full in (("A", (d, d)), ("B", (d, nu)), ("C", (ny, d)), ("D", (ny, nu))):
-            for n, block in enumerate(blocks.get(name, ())):
-                rows = dims[(n + 1) % n_sections] if name in "AB" else ny
-                columns = dims[n] if name in "AC" else nu
-                if block.shape != (rows, columns):
+        for name, blocks in given.items():
+            full, padded[name] = (d if name in "AB" else ny, d if name in "AC" else nu), []
+            for n, block in enumerate(map(jnp.asarray, blocks)):
+                shape = after[n] if name in "AB" else ny, dims[n] if name in "AC" else nu
+                if block.shape != shape:
                     raise DefinitionError(
                         f"`{name}[{n}]` has shape {block.shape}, but x[{n}] has {dims[n]} and "
-                        f"x[{(n + 1) % n_sections}] {dims[(n + 1) % n_sections]} coordinates, with "
-                        f"{nu} inputs and {ny} outputs: it should be {(rows, columns)}."
+                        f"x[{(n + 1) % len(A)}] {after[n]} coordinates, with {nu} inputs and {ny} "
+                        f"outputs: it should be {shape}."
                     )
-            if name in blocks:
-                padded[name] = jnp.stack(
-                    [
-                        jnp.pad(b, [(0, p - q) for p, q in zip(full, b.shape, strict=True)])
-                        for b in blocks[name]
-                    ]
-                )
+                sizes = zip(full, shape, strict=True)
+                padded[name].append(jnp.pad(block, [(0, p - q) for p, q in sizes]))
+        padded = {name: jnp.stack(blocks) for name, blocks in padded.items()}
         return cls(**padded, dims=dims, inputs=inputs, outputs=outputs, coordinates=coordinates)
 
     @property
@@ -313,15 +303,12 @@ class LDTP(eqx.Module):
         if x0 is None:
             return jnp.zeros(d)
         x0 = jnp.asarray(x0)
-        true = (
-            d
-            if is_traced(self.dims)
-            else int(np.asarray(self.dims)[first_section % self.n_sections])
-        )
+        n = first_section % self.n_sections
+        true = d if is_traced(self.dims) else int(np.asarray(self.dims)[n])
         if x0.shape[0] not in (d, true):
             raise DefinitionError(
-                f"`x0` has {x0.shape[0]} entries, but section {first_section % self.n_sections} "
-                f"has {true} coordinates ({d} with padding)."
+                f"`x0` has {x0.shape[0]} entries, but section {n} has {true} coordinates "
+                f"({d} with padding)."
             )
         return jnp.pad(x0, (0, d - x0.shape[0]))
 

@@ -15,8 +15,6 @@ from ..errors import ComputationError
 
 Matrix = Float[np.ndarray, "_ _"]
 
-# Rounds of balancing. Fewer: units that differ by much remain. More: nothing changes any more.
-_BALANCING = 8
 # QR sweeps for one eigenvalue; two or three are usual. Fewer: rare ones fail. More: failure takes
 # longer.
 _MOST_SWEEPS = 60
@@ -65,7 +63,7 @@ def _balanced(factors):
     factors = [np.array(factor, float) for factor in factors]
     if not all(np.all(np.isfinite(factor)) for factor in factors):
         return factors
-    for _ in range(_BALANCING):
+    for _ in range(8):  # more rounds change nothing
         for n in range(len(factors)):
             incoming = np.linalg.norm(factors[n - 1], axis=1)
             outgoing = np.linalg.norm(factors[n], axis=0)

@@ -152,15 +152,11 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     """The outputs that are conserved near the cycle, with their values: their gradients are left
     eigenvectors of the monodromy."""
     cycle = to_host(cycle)
-    s, t = cycle.structure, cycle.anchor.t
-    a = int(cycle.anchor.chart[0])
-    n = s.dims[a]
-    returned, sizes = monodromy(cycle.factors)[:n, :n], cycle.return_map.scale[a, :n]
-    items = tuple(s.resolve_outputs(names).items)
-    rows = kernels.outputs(s, a, items, t, cycle.anchor.q[:n], np.zeros((s.nu, 1)))[..., 0]
-    values, gradients = rows[:, 0], rows[:, 2 : 2 + n]
-    changes = np.abs((gradients @ returned - gradients) * sizes).max(axis=1)
-    kept = changes <= SAME * np.abs(gradients * sizes).max(axis=1)
+    map = cycle.return_map
+    values, gradients = map.outputs(cycle.anchor.q[:, 0], names)
+    changes = gradients @ monodromy(cycle.factors) - gradients
+    changes = np.abs(changes * map.sizes).max(axis=1)
+    kept = changes <= SAME * np.abs(gradients * map.sizes).max(axis=1)
     return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
 
 

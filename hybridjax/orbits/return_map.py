@@ -199,16 +199,10 @@ class ReturnMap(eqx.Module):
             jacobian, moved, tape = flow_jacobian(
                 s, lanes, target, self.settings, h, result, new_input=False, wanted=wanted
             )
-
-            def end(step):
-                other = along(step)
-                grown = other.expected / self.expected
-                time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
-                begin = lanes._replace(t=lanes.t * grown)
-                to = dataclasses.replace(target, time=time)
-                return replay(other.structure, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
-
-            moves = None if along is None else _derivative(end)
+            moves = None
+            if along is not None:
+                other = along  # (known to be a function in the function below, too)
+                moves = _derivative(lambda step: self._end(other(step), lanes, target, tape))
             return moved, (lanes, jacobian[0, 1:], moves, tape.code, tape.t)
 
         end, (legs, factors, moves, codes, times) = self.travel(q, flow)
@@ -229,6 +223,14 @@ class ReturnMap(eqx.Module):
             end.residual, jacobian, legs, factors, codes, times[..., 0],
             end.period, xp.max(defect / self.sizes), end.result, self._meetings(legs, codes),
         )  # fmt: skip
+
+    def _end(self, other: "ReturnMap", lanes: Lanes, target: Target, tape) -> Float[Array, " d"]:
+        """The end of a recorded piece of a turn, by another map at the same phases of its clock."""
+        grown = other.expected / self.expected
+        time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
+        begin, to = lanes._replace(t=lanes.t * grown), dataclasses.replace(target, time=time)
+        u = jnp.zeros((self.structure.nu, 1))
+        return replay(other.structure, begin, u, to, tape)[1][:, 0]
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
@@ -259,27 +261,29 @@ class ReturnMap(eqx.Module):
         xp, sizes = namespace(q), self.sizes
         if not self.conserved:
             return xp.zeros_like(q), xp.zeros((len(q), len(q)))
-        excess, gradient = self._excess(q)
+        values, gradient = self.outputs(q, tuple(self.conserved))
+        excess = values - xp.stack(list(self.conserved.values()))
         steep = xp.linalg.norm(gradient * sizes, axis=1, keepdims=True)
         steep = xp.where(steep > 0, steep, 1.0)
         back = sizes[:, None] * xp.linalg.pinv(gradient * sizes / steep) / steep.T
         back = stop_gradient(back)
         return back @ excess, back @ gradient
 
-    def _excess(self, q: Float[Array, " d"]) -> tuple[Float[Array, " c"], Float[Array, "c d"]]:
-        """Conserved quantities less their values, and the derivative."""
-        s, names, t = self.structure, tuple(self.conserved), self.anchor.t[0]
-        values = namespace(q).stack(list(self.conserved.values()))
+    def outputs(
+        self, q: Float[Array, " d"], names: tuple[str, ...]
+    ) -> tuple[Float[Array, " c"], Float[Array, "c d"]]:
+        """Outputs at the anchor's time in its chart, and their derivatives by the state."""
+        s, t = self.structure, self.anchor.t[0]
         if on_host(q):
             a = int(self.anchor.chart[0])
             n = s.dims[a]
             point = t[None], q[:n, None], np.zeros((s.nu, 1))
             rows = kernels.outputs(s, a, names, *point)[..., 0]
-            return rows[:, 0] - values, np.pad(rows[:, 2 : 2 + n], [(0, 0), (0, s.d - n)])
+            return rows[:, 0], np.pad(rows[:, 2 : 2 + n], [(0, 0), (0, s.d - n)])
         outputs, u = s.resolve_outputs(names), jnp.zeros(s.nu)
         branches = [lambda q, a=a: outputs(a, t, q[: s.dims[a]], u) for a in range(len(s.charts))]
-        excess = lambda q: jax.lax.switch(self.anchor.chart[0], branches, q) - values  # noqa: E731
-        return excess(q), jax.jacfwd(excess)(q)
+        values = lambda q: jax.lax.switch(self.anchor.chart[0], branches, q)  # noqa: E731
+        return values(q), jax.jacfwd(values)(q)
 
     def travel(self, q: Float[Array, " d"], flow: Callable) -> tuple[Return, Any]:
         """One turn, piece by piece, each computed by `flow`, and the other results of `flow`.

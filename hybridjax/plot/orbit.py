@@ -169,12 +169,12 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit) -> N
     for i, (point, along) in enumerate(_meetings(s, placed, names, unit)):
         bars.append(np.stack([point - _BAR * along, point + _BAR * along]))
         if i % step == 0:
-            beside = np.stack([point - 2 * _BAR * along, point + 2 * _BAR * along]) / unit
-            room = np.linalg.norm(beside[:, None] - taken, axis=2).min(axis=1)
+            ends = np.stack([point - 2 * _BAR * along, point + 2 * _BAR * along]) / unit
+            room = np.linalg.norm(ends[:, None] - taken, axis=2).min(axis=1)
             if room.max() > _BAR:
-                at = beside[np.argmax(room)]
-                ax.text(unit[0] * at[0], unit[1] * at[1], str(i), **_NUMBER)
-                taken = np.concatenate([taken, at[None]])
+                end = ends[np.argmax(room)]
+                ax.text(unit[0] * end[0], unit[1] * end[1], str(i), **_NUMBER)
+                taken = np.concatenate([taken, end[None]])
     bars = np.stack(bars)
     gaps = np.full((len(bars), 1), np.nan)
     flat = [np.hstack([bars[..., k], gaps]).ravel() for k in (0, 1)]

@@ -9,7 +9,7 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.signal import Signal
 from ..errors import DefinitionError
-from ..orbits.branch import KINDS, Branch
+from ..orbits.continuation import KINDS, Branch
 from ..systems.system import unit_of_parameter
 from .look import COLORS, CYCLE, AxesLike, Plot, axis_of, panels
 

@@ -75,20 +75,9 @@ def advise(
     of an inspection, which come first. `curve`: the phase response curve of events alone, whose
     warnings come last. Default: None.
     """
-    return collect_advice(data, PreparedRecords(data), fit, validation, findings, curve)
-
-
-def collect_advice(
-    data: SectionData,
-    records: PreparedRecords,
-    fit: SeriesFit,
-    validation: Validation | None,
-    findings: Sequence[Finding],
-    curve: PhaseResponse | None,
-) -> Advice:
-    """Collect the advice on a fit to the data; `records`: those of the data."""
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
+    records = PreparedRecords(data)
     problem = OutputErrorProblem.from_data(records, d, R - 1 - fit.lead - d * N, free_start=True)
     delayed, grid = delayed_outputs(problem, d), records.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())
@@ -135,23 +124,18 @@ def collect_advice(
 def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> Iterator[Finding]:
     f, power = input_spectrum(data)
     for name, edge, strength in zip(fit.inputs, band, power.T, strict=True):
-        for z in fit.multipliers[fit.multipliers.imag >= 0]:
+        for z in (x for x in fit.multipliers if x.imag >= 0):
             at = abs(np.angle(z)) / (2 * np.pi)
             near = np.abs((f[:, None] - [at, -at] + 0.5) % 1 - 0.5).min(axis=1) < 0.1
             if strength[near].max(initial=0) < LEAST_POWER * strength.max():
                 text = f"{name} has next to no power at the frequencies {at:.2f} + k cycles per "
                 text += f"period, where the multiplier {z:.3g} is seen."
                 yield Finding("weak excitation", text)
-        if edge < 1:
-            text = f"{name} has power only up to {edge:.2g} cycles per period, so that responses "
-            yield Finding(
-                "narrow excitation", f"{text}at different phases can hardly be told apart."
-            )
-        elif edge < WHOLE_BAND * fit.n_sections / 2:
-            text = (
-                f"transfer functions are determined up to f = {edge:.3g} cycles per period only, "
-            )
-            yield Finding("band", f"{text}where the power of {name} ends.")
+        if edge < WHOLE_BAND * fit.n_sections / 2:
+            text = f"transfer functions are determined up to {edge:.3g} cycles per period, where "
+            text += f"the power of {name} ends."
+            text += " Responses at different phases can hardly be told apart." * (edge < 1)
+            yield Finding("narrow excitation" if edge < 1 else "band", text)
 
 
 def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
@@ -164,28 +148,19 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
         size = np.sqrt(np.prod((both**2).sum(axis=1), axis=0))
         correlation = np.abs(np.prod(both, axis=0).sum(axis=0)) / np.maximum(size, 1e-300)
         if np.median(correlation) > _SAME_OUTPUTS:
-            yield Finding(
-                "outputs",
-                f"where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are two sides "
-                "of one number, as signals are whose angle is the phase. Cycles from crossing to "
-                "crossing (a `Crossing` as the phase, `--crossing`) may make the standard errors "
-                "of multipliers much smaller.",
-            )
+            text = f"where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} carry the "
+            text += "same information, as signals are whose angle is the phase: cycles from "
+            yield Finding("outputs", f"{text}crossing to crossing may have smaller errors.")
 
 
 def _about_residuals(validation: Validation) -> Iterator[Finding]:
+    text = "residuals of the held-out strides "
     if not validation.white:
-        yield Finding(
-            "left over",
-            "residuals of the held-out strides are correlated in time "
-            f"({p_value(validation.whiteness.min())}), as by smoothing and disturbances of the "
-            "state, which standard errors allow for; if the multipliers change with another "
-            "`bandwidth` or `order`, the model lacks something.",
-        )
+        of_time = f"{text}are correlated in time ({p_value(validation.whiteness.min())}), as by "
+        of_time += "smoothing and disturbances of the state, which standard errors allow for; if "
+        of_time += "multipliers change with the `bandwidth` or `order`, the model lacks something."
+        yield Finding("left over", of_time)
     if not validation.independent:
-        yield Finding(
-            "left over",
-            "residuals of the held-out strides depend on the input "
-            f"({p_value(validation.independence.min())}), as with few strides or pushes beyond the "
-            "linear range: record more, or push less; if it remains, raise the `order`.",
-        )
+        of_input = f"{text}depend on the input ({p_value(validation.independence.min())}), as with "
+        of_input += "few strides or pushes beyond the linear range: record more, or push less; if "
+        yield Finding("left over", f"{of_input}it remains, raise the `order`.")

@@ -84,21 +84,19 @@ def add_command(recording: Recording, phase: Phase, path: str | os.PathLike) -> 
     if (count != count[0]).any() or (np.diff(experiment) < 0).any():
         raise FileFormatError(f"'{path}' has experiments of different lengths, or out of order.")
     if len(count) != len(recording.trials):
-        raise DefinitionError(
-            f"there are {len(recording.trials)} trials, but the table has {len(count)} experiments."
-        )
-    command = {k: v.reshape(len(count), -1) for k, v in columns.items() if k not in _BY_PHASE}
+        text = f"{len(recording.trials)} trials, but the table has {len(count)} experiments."
+        raise DefinitionError(f"there are {text}")
+    names = [k for k in columns if k not in _BY_PHASE]
+    command = np.stack([columns[k].reshape(len(count), -1) for k in names], axis=2)
+    command = np.pad(command, ((0, 0), (1, 1), (0, 0)))  # zero before and after the experiment
     trials = []
     for s, (trial, stretches) in enumerate(phase.by_trial(recording)):
-        added = np.full((len(trial.time), len(command)), np.nan)
+        added = np.full((len(trial.time), len(names)), np.nan)
         for w in stretches[:1]:
             now = w.at(trial.time)
             during = np.isfinite(now)
             k = np.floor((now[during] - np.ceil(w.phase[0])) * N).astype(int)
-            for i, values in enumerate(command.values()):
-                row = np.pad(values[s], (1, 1))  # zero before and after the experiment
-                added[during, i] = row[np.clip(k + 1, 0, len(row) - 1)]
-        signals = dict(zip(command, added.T, strict=True))
-        told = Recording(trial.time, signals, name=trial.name)
+            added[during] = command[s][np.clip(k + 1, 0, command.shape[1] - 1)]
+        told = Recording(trial.time, dict(zip(names, added.T, strict=True)), name=trial.name)
         trials.append(Recording.beside([recording.with_trials([trial]), told]))
     return Recording.join(trials)

@@ -60,10 +60,8 @@ class Split(NamedTuple):
                 break
             fits, ends = [*fits, fit], long
         if not fits:
-            raise DefinitionError(
-                f"{self.early.cycles} cycles are too few for one multiplier with {N} sections: "
-                "record more, or take fewer sections."
-            )
+            text = f"{self.early.cycles} cycles are too few for one multiplier with {N} sections"
+            raise DefinitionError(f"{text}: record more, or take fewer sections.")
         misfits = []
         for fit in fits:
             error = [simulate_record(fit, r, free_start=True) - r.y for r in ends]

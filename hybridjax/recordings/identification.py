@@ -6,12 +6,10 @@ import equinox as eqx
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
-from .._core.html import card, text
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from ..identify.series.fit import SeriesFit, fit_records
-from ..identify.series.records import PreparedRecords
-from .advice import Advice, collect_advice
+from ..identify.series.fit import SeriesFit, fit_series
+from .advice import Advice, advise
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import Finding, refuse
@@ -47,11 +45,6 @@ class Identification(eqx.Module):
     def __repr__(self) -> str:
         parts = (self.phase, self.data, self.fit, self.held_out.validation, self.advice)
         return "\n".join(map(repr, parts))
-
-    def _repr_html_(self) -> str:
-        parts = (x._repr_html_() for x in (self.data, self.fit, self.held_out.validation))
-        first = card("Identification", "", text(repr(self.phase)))
-        return first + "".join(parts) + card("Advice", "", text(repr(self.advice)))
 
 
 @checked
@@ -107,24 +100,16 @@ def identify_recording(
     findings = (*inspection.findings, *inspect_cycles(recording, phase, data))
     refuse(findings)
     say("order")
-    parts, records = split(data), PreparedRecords(data)
+    parts = split(data)
     order = parts.best_order() if order is None else order
     say("fit to the first three quarters")
     held = parts.fit(order)
     say("fit to all")
-    fit = fit_records(records, order, check=False)
+    fit = fit_series(data, order, check=False)
     curve = None
     of_events = all(w.linear for parts in phase.stretches for w in parts)
     if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:
         curve = phase_response(recording, phase, input=data.inputs[0])
-    return Identification(
-        recording=recording,
-        findings=findings,
-        phase=phase,
-        data=data,
-        fit=fit,
-        held_out=held,
-        responses=impulse_responses(fit, data),
-        curve=curve,
-        advice=collect_advice(data, records, fit, held.validation, findings, curve),
-    )
+    responses = impulse_responses(fit, data)
+    advice = advise(data, fit, held.validation, findings, curve)
+    return Identification(recording, findings, phase, data, fit, held, responses, curve, advice)

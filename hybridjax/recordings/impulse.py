@@ -10,7 +10,6 @@ from scipy import ndimage, signal
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.values import Number
-from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit
 from .data import WHOLE_BAND, SectionData, input_band
@@ -48,12 +47,6 @@ class ImpulseResponses(eqx.Module):
     period: float = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
-
-    def __repr__(self) -> str:
-        return (
-            f"ImpulseResponses({len(self.phase)} phases, {self.lag[-1]:.3g} cycles, width "
-            f"{self.width:.2g}; {listed(self.inputs)} -> {listed(self.outputs)})"
-        )
 
 
 ResponseCycles = Annotated[float, Number("a number above 0, up to 10000", above=0, high=1e4)]
@@ -105,13 +98,13 @@ def impulse_responses(
     def pushed(x: Float[np.ndarray, "r ..."]) -> Float[np.ndarray, "lags ..."]:
         """Return responses to a push, which begins some sections before its middle."""
         x = np.pad(x, [(0, longest - len(x))] + [(0, 0)] * (x.ndim - 1))
-        x = signal.lfilter([1.0], recursion, x, axis=0)
+        x = np.asarray(signal.lfilter([1.0], recursion, x, axis=0))
         x = ndimage.correlate1d(x, weights / weights.sum(), axis=0, mode="constant")
         return x[fit.lead : fit.lead + lags]
 
     h = fit.numerators.swapaxes(0, 1)
     whole = np.pad(h, [(0, longest - R), (0, 0), (0, 0), (0, 0)])
-    whole = signal.lfilter([1.0], recursion, whole, axis=0)
+    whole = np.asarray(signal.lfilter([1.0], recursion, whole, axis=0))
     slope = np.zeros((longest, len(fit.coefficients), *h.shape[1:]))
     slope[:R] = fit.slopes.transpose(2, 0, 1, 3, 4)
     for j in range(slope.shape[1]):
@@ -119,17 +112,10 @@ def impulse_responses(
     slope, root = pushed(slope), pushed(fit.roots.transpose(2, 0, 1, 3, 4))
     by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
     errors = np.sqrt((root**2).sum(axis=4) * fit.noise[:, None] ** 2 + by_coefficients)
-    step = data.period / N
     # From the section of the response to that of the push.
     m, r = np.arange(N)[:, None], np.arange(lags)
-    place = (r, (m + r) % N)
+    values, errors = (x[r, (m + r) % N] / (data.period / N) for x in (pushed(h), errors))
+    phase, lag, period = np.arange(N) / N, np.arange(lags) / N, data.period
     return ImpulseResponses(
-        values=pushed(h)[place] / step,
-        errors=errors[place] / step,
-        phase=np.arange(N) / N,
-        lag=np.arange(lags) / N,
-        width=float(width),
-        period=data.period,
-        inputs=fit.inputs,
-        outputs=fit.outputs,
+        values, errors, phase, lag, float(width), period, fit.inputs, fit.outputs
     )

@@ -148,15 +148,9 @@ def natural_multipliers(
     plain = _multipliers(forward @ np.linalg.inv(state))
     explained = cross[0] @ np.linalg.solve(square[0], np.swapaxes(cross[0], 1, 2))
     shares = np.trace(explained, axis1=1, axis2=2) / np.trace(state[0], axis1=1, axis2=2)
+    draws, plain_draws, strength = by_instruments[1:], plain[1:], float(shares.mean())
     return NaturalMultipliers(
-        multipliers=by_instruments[0],
-        plain=plain[0],
-        draws=by_instruments[1:],
-        plain_draws=plain[1:],
-        strength=float(shares.mean()),
-        cycles=K,
-        records=len(counts),
-        block=block,
+        by_instruments[0], plain[0], draws, plain_draws, strength, K, len(counts), block
     )
 
 
@@ -197,10 +191,8 @@ def _moments(data: SectionData, order: int) -> _Moments:
     names, cycle = np.unique(rows[:, :2], axis=0, return_inverse=True)
     K, needed = len(names), 2 * (_EACH * order + 2)
     if K < needed:
-        raise DefinitionError(
-            f"{K} cycles that are followed by another one are too few for {order} multipliers: "
-            f"{needed} are needed at least."
-        )
+        text = f"{K} cycles that are followed by another one are too few for {order} multipliers"
+        raise DefinitionError(f"{text}: {needed} are needed at least.")
 
     def values(shift: int, count: int) -> Float[np.ndarray, "rows k"]:
         return np.array([y[s][k - shift - np.arange(count)].ravel() for s, _, _, k in rows])
@@ -285,11 +277,8 @@ def _resampled(
 def _warnings(result: NaturalMultipliers) -> Iterator[Finding]:
     low, high = result.interval()[0]
     modulus, plain = abs(result.multipliers[0]), abs(result.plain[0])
-    yield Finding(
-        "width",
-        f"the largest modulus lies between {low:.2f} and {high:.2f} (95 %), from {result.cycles} "
-        "cycles; four times as many would halve that.",
-    )
+    text = f"the largest modulus lies between {low:.2f} and {high:.2f} (95 %), from {result.cycles}"
+    yield Finding("width", f"{text} cycles; four times as many would halve that.")
     each = result.cycles / result.records
     if each < _FEW:
         bias = f"a bias of about {(1 + 3 * modulus) / each:.2f} was corrected to first order only."

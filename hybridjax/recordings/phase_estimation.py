@@ -1,7 +1,6 @@
 """From a definition of phase to the phase of a recording: angles that wind, events, crossings."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -83,17 +82,15 @@ def signals_of(definition: PhaseDefinition) -> set[str]:
     return set()
 
 
-class _Angle(NamedTuple):
-    """An angle of one trial in rad, modulo whole turns; section 0 lies at 0."""
-
-    time: Series
-    angle: Series
+_Angle = tuple[Series, Series]
+"""Times, and an angle of one trial in rad, modulo whole turns; section 0 lies at 0."""
 
 
 def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
     """Return the phase of all trials: their angles in the sense in which they turn."""
     rate = _turns_per_time(angles)
-    backwards, total, stretches = 0, 0, []
+    backwards, total = 0, 0
+    stretches: list[list[Winding]] = []
     for time, angle in angles:
         stretches.append([])
         edges = np.flatnonzero(np.diff(time) > LONGEST_GAP / abs(rate)) + 1
@@ -124,16 +121,14 @@ def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | Non
         signals = _at_common_times(trial.time, np.stack(columns, axis=1))
         both = np.isfinite(signals).all(axis=1)
         if both.sum() < FEWEST:
-            raise DefinitionError(
-                f"trial '{trial.name}' has {int(both.sum())} samples of {names[0]} and "
-                f"{names[1]}: too few for a phase."
-            )
+            text = f"{int(both.sum())} samples of {' and '.join(names)}: too few for a phase."
+            raise DefinitionError(f"trial '{trial.name}' has {text}")
         samples.append((trial.time[both], (signals[both] - center) / scale))
     anchor = family.anchor
     turn = 1.0 if isinstance(anchor, Crossing) else np.exp(-1j * float(anchor))
 
     def angle_of(time: np.ndarray, z: np.ndarray) -> _Angle:
-        return _Angle(time, np.angle((z[:, 0] + 1j * z[:, 1]) * turn))
+        return time, np.angle((z[:, 0] + 1j * z[:, 1]) * turn)
 
     rate = abs(_turns_per_time([angle_of(*sample) for sample in samples]))
     bandwidth = bandwidth or HARMONICS * rate
@@ -143,7 +138,7 @@ def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | Non
         angles.append(angle_of(time, np.stack(smooth, axis=1)))
     if isinstance(anchor, Crossing):
         first = _angle_at(recording, anchor, bandwidth, angles)
-        angles = [_Angle(time, np.angle(np.exp(1j * (angle - first)))) for time, angle in angles]
+        angles = [(time, np.angle(np.exp(1j * (angle - first)))) for time, angle in angles]
     return angles
 
 
@@ -191,10 +186,8 @@ def _angle_at(
         crossed.append(np.interp(at, time, np.unwrap(angle)))
     mean = np.exp(1j * np.concatenate(crossed)).mean()
     if not abs(mean) > 0.5:
-        raise DefinitionError(
-            f"{name}, the anchor of section 0, happens all around the cycle: choose a crossing "
-            "that comes once in each."
-        )
+        text = "happens all around the cycle: choose a crossing that comes once in each."
+        raise DefinitionError(f"{name}, the anchor of section 0, {text}")
     return float(np.angle(mean))
 
 
@@ -203,9 +196,9 @@ def _turns_per_time(angles: Sequence[_Angle]) -> float:
     turns = sum(float(np.unwrap(a)[-1] - a[0]) for _, a in angles) / (2 * np.pi)
     duration = sum(float(t[-1] - t[0]) for t, _ in angles)
     if abs(turns) < 2:
+        text = "the center must lie within the loop of the signals, and two cycles are needed."
         raise DefinitionError(
-            f"the phase does not wind: {abs(turns):.2g} turns in {duration:.4g}; the center must "
-            "lie within the loop of the two signals, and two cycles or more are needed."
+            f"the phase does not wind: {turns:.2g} turns in {duration:.4g}; {text}"
         )
     return turns / duration
 
@@ -215,10 +208,8 @@ def _from_events(recording: Recording, name: str) -> Phase:
     times = []
     for trial in recording.trials:
         if name not in trial.events:
-            present = ", ".join(trial.events) or "none"
-            raise DefinitionError(
-                f"trial '{trial.name}' has no event '{name}'; its events are: {present}."
-            )
+            text = f"no event '{name}'; its events are: {', '.join(trial.events) or 'none'}."
+            raise DefinitionError(f"trial '{trial.name}' has {text}")
         times.append(trial.events[name])
         check_events(f"trial '{trial.name}'", name, times[-1], trial.time)
     intervals = np.concatenate([np.diff(t) for t in times])

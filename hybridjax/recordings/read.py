@@ -98,7 +98,8 @@ def read_tables(path: Path, wanted: Wanted) -> list[Columns]:
 
 
 def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
-    parts, names = [], []
+    parts: list[Recording] = []
+    names: list[str] = []
     events: dict[str, np.ndarray] = {}
     for columns in read_tables(path, wanted):
         table = parse_table(f"'{path}'", columns, wanted.time)
@@ -108,9 +109,9 @@ def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
         events |= table.events
         names += table.signals
         signals = {x: values for x, values in table.signals.items() if wanted.includes(x)}
-        known = {x: unit for x, unit in table.units.items() if x in signals}
+        given = {x: unit for x, unit in table.units.items() if x in signals}
         if signals:
-            parts.append(Recording(table.time, signals, units=known, name=path.stem, notes=notes))
+            parts.append(Recording(table.time, signals, units=given, name=path.stem, notes=notes))
     wanted.require(path, names)
     if not parts:
         raise DefinitionError(f"'{path}' has no signals.")

@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from .._core import limits
 from .._core.boundary.checked import checked
-from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import with_unit
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
@@ -33,10 +32,6 @@ class Trial(eqx.Module):
     values: Float[np.ndarray, "n k"]
     events: dict[str, Float[np.ndarray, " _"]]
     name: str = eqx.field(static=True)
-
-    def __repr__(self) -> str:
-        n, k = self.values.shape
-        return f"Trial({self.name}: {n} samples of {k} signals, {len(self.events)} kinds of events)"
 
 
 @checked
@@ -85,15 +80,12 @@ class Recording(eqx.Module):
         happened = {key: numbers(where, key, values) for key, values in (events or {}).items()}
         for key, values in columns.items():
             if len(values) != len(time):
-                raise DefinitionError(
-                    f"{where}: {key} has {len(values)} samples, but time has {len(time)}."
-                )
+                text = f"{key} has {len(values)} samples, but time has {len(time)}."
+                raise DefinitionError(f"{where}: {text}")
         for key, values in (happened | columns).items():
             if np.isinf(values).any():
-                bad = int(np.argmax(np.isinf(values)))
-                raise DefinitionError(
-                    f"{where}: {key} is infinite at sample {bad}; put NaN where a sample is bad."
-                )
+                text = f"{key} is infinite at sample {int(np.argmax(np.isinf(values)))}"
+                raise DefinitionError(f"{where}: {text}; put NaN where a sample is bad.")
         if len(time) < 2:
             raise DefinitionError(f"{where} has {len(time)} samples: nothing was recorded.")
         if not (np.diff(time) > 0).all() or np.isinf(time).any():
@@ -104,10 +96,8 @@ class Recording(eqx.Module):
                 "digits, or make a trial of each part."
             )
         if unknown := set(units) - set(columns):
-            raise DefinitionError(
-                f"{where}: there is a unit for '{min(unknown)}', but the signals are "
-                f"{', '.join(columns)}."
-            )
+            text = f"there is a unit for '{min(unknown)}', but the signals are "
+            raise DefinitionError(f"{where}: {text}{', '.join(columns)}.")
         happened = {key: np.sort(values[~np.isnan(values)]) for key, values in happened.items()}
         self.trials = (Trial(time, np.stack(list(columns.values()), axis=1), happened, name),)
         self.signals = tuple(columns)
@@ -134,7 +124,7 @@ class Recording(eqx.Module):
         as `Recording`; `FileFormatError` for two columns of one name.
         """
         keys = getattr(frame, "column_names", None) or getattr(frame, "keys", list)()
-        columns = Columns({str(key): np.asarray(frame[key]) for key in keys})
+        columns = Columns({str(key): frame[key] for key in keys})
         table = parse_table(f"trial '{name}'", columns, time)
         events, units = table.events | dict(events or {}), table.units | dict(units or {})
         return cls(table.time, table.signals, events=events, units=units, name=name)
@@ -154,16 +144,12 @@ class Recording(eqx.Module):
         for other in recordings:
             a, b = first.trials[0].name, other.trials[0].name
             if set(other.signals) != set(units):
-                raise DefinitionError(
-                    f"trials '{a}' and '{b}' have different signals: {', '.join(units)}, and "
-                    f"{', '.join(other.signals)}."
-                )
+                text = f"{', '.join(units)}, and {', '.join(other.signals)}."
+                raise DefinitionError(f"trials '{a}' and '{b}' have different signals: {text}")
             for key, unit in units.items():
                 if other.unit(key) != unit:
-                    raise DefinitionError(
-                        f"{key} is in '{unit}' in trial '{a}', but in '{other.unit(key)}' in trial "
-                        f"'{b}': convert one of them."
-                    )
+                    text = f"in trial '{a}', but in '{other.unit(key)}' in '{b}': convert one."
+                    raise DefinitionError(f"{key} is in '{unit}' {text}")
             order = list(map(other.column, units))
             if order == sorted(order):
                 trials += other.trials
@@ -200,13 +186,12 @@ class Recording(eqx.Module):
             name = trials[0].name
             time = np.unique(np.concatenate([t.time for t in trials]))
             if len(time) * len(names) > limits.RECORDED:
-                raise DefinitionError(
-                    f"trial '{name}': {len(names)} signals at {len(time)} times are too many "
-                    "together: choose `signals`."
-                )
+                text = f"{len(names)} signals at {len(time)} times are too many together"
+                raise DefinitionError(f"trial '{name}': {text}: choose `signals`.")
             if any(len(t.time) < len(time) for t in trials):
                 notes.append("signals have different rates or clocks: they are missing in between")
-            values, events = [], {}
+            values: list[np.ndarray] = []
+            events: dict[str, np.ndarray] = {}
             for t in trials:
                 values.append(np.full((len(time), t.values.shape[1]), np.nan))
                 values[-1][np.searchsorted(time, t.time)] = t.values
@@ -241,10 +226,8 @@ class Recording(eqx.Module):
             longest = bridgeable(t, np.isfinite(t), 0.5 / bandwidth)
             at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & (np.diff(t) <= longest))
             if not len(at):
-                raise DefinitionError(
-                    f"trial '{trial.name}': {signal} is never seen to cross {level:g}, "
-                    f"{crossing.direction}."
-                )
+                text = f"{signal} is never seen to cross {level:g}, {crossing.direction}."
+                raise DefinitionError(f"trial '{trial.name}': {text}")
             low, high = t[at], t[at + 1]
             for _ in range(50):  # bisections: to rounding
                 middle = (low + high) / 2
@@ -263,9 +246,8 @@ class Recording(eqx.Module):
         **Raises:** `DefinitionError` if there is none of that name.
         """
         if name not in self.signals:
-            raise DefinitionError(
-                f"there is no signal '{name}'; the recording has {', '.join(self.signals)}."
-            )
+            text = f"the recording has {', '.join(self.signals)}."
+            raise DefinitionError(f"there is no signal '{name}'; {text}")
         return self.signals.index(name)
 
     def samples(self, name: str) -> list[tuple[Trial, Series]]:
@@ -290,22 +272,7 @@ class Recording(eqx.Module):
                 + (f", {missing} with gaps" if missing else "")
                 + "".join(f", {len(at)} {name}" for name, at in t.events.items())
             )
-        first = self.trials[0]
-        steps = [np.diff(first.time[np.isfinite(x)]) for x in first.values.T]
-        rates = [f"{1 / np.median(x):.2g} Hz" if len(x) else "0 Hz" for x in steps]
-        if len(set(rates)) > 1:
-            each = map(" ".join, zip(self.signals, rates, strict=True))
-            lines.append(f"  sampled at {', '.join(each)}")
         return "\n".join([*lines, *(f"  ({note})" for note in self.notes)])
-
-    def _repr_html_(self) -> str:
-        first, drawn = self.trials[0], []
-        names = map(with_unit, self.signals, self.units)
-        for name, color, values in list(zip(names, COLORS, first.values.T, strict=False))[:4]:
-            rows = np.flatnonzero(np.isfinite(values[:600]))
-            curve = Curve(first.time[rows], values[rows], color=color)
-            drawn.append(picture([curve], "time (s)", name))
-        return card("Recording", f"{len(self.trials)} trials", text(repr(self)), *drawn)
 
 
 def signal_of(crossing: Crossing) -> str:

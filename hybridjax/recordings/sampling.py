@@ -13,24 +13,12 @@ from .._core.boundary.values import Number
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record
+from . import smoothing
 from .data import SectionData
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
 from .phase_estimation import PhaseDefinition, estimate_phase
 from .recording import Recording, Trial
-from .smoothing import (
-    FEWEST,
-    Bandwidth,
-    Series,
-    bridgeable,
-    gaps,
-    input_spikes,
-    inside,
-    means,
-    recurring,
-    spike_heights,
-    spline,
-    without_spikes,
-)
+from .smoothing import FEWEST, Bandwidth, Series, bridgeable, gaps, inside, means, spline
 
 
 DriftCycles = Annotated[float, Number("four cycles or more", low=4, infinite=True)]
@@ -95,10 +83,8 @@ def section_data(
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
     if None not in (n_sections, phase.n_sections) and n_sections != phase.n_sections:
-        raise DefinitionError(
-            f"n_sections is {n_sections}, but the phase is that of a family of {phase.n_sections} "
-            "sections: give it once."
-        )
+        text = f"but the phase is that of a family of {phase.n_sections} sections: give it once."
+        raise DefinitionError(f"n_sections is {n_sections}, {text}")
     N = n_sections or phase.n_sections or HARMONICS
     bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
     nu, columns = len(inputs), [recording.column(x) for x in (*inputs, *outputs)]
@@ -108,12 +94,9 @@ def section_data(
         spikes += struck
         for name, count in zip((*inputs, *outputs), np.isfinite(signals).sum(axis=0), strict=True):
             if count < FEWEST:
-                raise DefinitionError(
-                    f"trial '{trial.name}' has {count} samples of {name}: leave the trial out."
-                )
-        sampler = _Sampler(trial.time, signals, nu, bandwidth, sampled)
-        sampled_parts = (sampler(w, N, phase.period) for w in stretches)
-        sections = [x for x in sampled_parts if x is not None]
+                text = f"trial '{trial.name}' has {count} samples of {name}: leave the trial out."
+                raise DefinitionError(text)
+        sections = _sample(trial.time, signals, nu, stretches, N, phase.period, bandwidth, sampled)
         if timing is not None:
             sections = _with_times(sections, N, phase.period, timing)
         mean = _average(sections, N)
@@ -122,11 +105,9 @@ def section_data(
         cycles += [mean] * len(sections)
     if not parts:
         raise DefinitionError("the recording holds no whole cycle to sample.")
-    u_names, y_names = (
-        tuple(Signal(x, recording.unit(x)) for x in names) for names in (inputs, outputs)
-    )
+    names = [Signal(x, recording.unit(x)) for x in (*inputs, *outputs)]
     if timing is not None:
-        y_names += (Signal({"clock": "time", "duration": "duration"}[timing], "s"),)
+        names.append(Signal("time" if timing == "clock" else "duration", "s"))
         spikes = np.append(spikes, 0)
     # A smoothing spline averages over neighbors on both sides.
     lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
@@ -136,8 +117,8 @@ def section_data(
             x.values[:, nu:],
             n_sections=N,
             first_section=int(x.k[0]) % N,
-            inputs=u_names,
-            outputs=y_names,
+            inputs=tuple(names[:nu]),
+            outputs=tuple(names[nu:]),
             lead=lead,
             drift=np.inf,
         )
@@ -168,11 +149,11 @@ def _without_spikes(
         cycle = np.ceil(phases[-1][-1])
     time_of, phase = np.concatenate(times), np.concatenate(phases)
     for i, x in enumerate(signals.T):
-        heights = (input_spikes if i < nu else spike_heights)(x)
+        heights = (smoothing.input_spikes if i < nu else smoothing.spike_heights)(x)
         at = np.flatnonzero(heights)
         if len(at) and len(time_of):
             phase_there = np.interp(time[at], time_of, phase)
-            at = at[~recurring(heights[at], phase_there, np.ptp(phase))]
+            at = at[~smoothing.recurring(heights[at], phase_there, np.ptp(phase))]
         x[at] = np.nan
         counts.append(len(at))
     return signals, np.array(counts)
@@ -187,47 +168,45 @@ class _Sections(NamedTuple):
     values: Float[np.ndarray, "n nuy"]
 
 
-class _Sampler:
-    """The signals of a trial (nu inputs, then outputs) as functions of time."""
-
-    def __init__(
-        self,
-        time: Series,
-        signals: Float[np.ndarray, "n nuy"],
-        nu: int,
-        bandwidth: float,
-        sampled: Literal["mean", "middle"],
-    ):
-        self.time, self.signals, self.nu, self.sampled = time, signals.T, nu, sampled
-        self.curves = [spline(time, x, bandwidth) for x in self.signals[nu:]]
-
-    def __call__(self, winding: Winding, n_sections: int, period: float) -> _Sections | None:
-        """Sample one stretch, if it holds a whole cycle; NaN in gaps."""
-        first, last = winding.phase[[0, -1]] * n_sections
+def _sample(
+    time: Series,
+    signals: Float[np.ndarray, "n nuy"],
+    nu: int,
+    stretches: Sequence[Winding],
+    N: int,
+    period: float,
+    bandwidth: float,
+    sampled: Literal["mean", "middle"],
+) -> list[_Sections]:
+    """Sample a trial (nu inputs, then outputs) in stretches of a whole cycle; NaN in gaps."""
+    curves = [spline(time, x, bandwidth) for x in signals.T[nu:]]
+    sections = []
+    for w in stretches:
+        first, last = w.phase[[0, -1]] * N
         k = np.arange(np.ceil(first - 1e-9), np.floor(last + 1e-9) + 1).astype(int)  # rounding
-        if len(k) <= n_sections:
-            return None
-        t = np.clip(winding.when(k / n_sections), *winding.time[[0, -1]])
+        if len(k) <= N:
+            continue
+        t = np.clip(w.when(k / N), *w.time[[0, -1]])
         start, end = t[:-1], t[1:]
-        section = period / n_sections
-        unobserved = winding.gaps[np.diff(winding.gaps, axis=1)[:, 0] > section]
+        unobserved = w.gaps[np.diff(w.gaps, axis=1)[:, 0] > period / N]
         observed = ~inside(unobserved, start, start)
-        values = np.zeros((len(start), len(self.signals)))
-        for i, x in enumerate(self.signals):
+        values = np.zeros((len(start), signals.shape[1]))
+        for i, x in enumerate(signals.T):
             finite = np.isfinite(x)
-            holes = gaps(self.time, finite, bridgeable(self.time, finite, section))
-            if i >= self.nu:
-                values[:, i] = self.curves[i - self.nu](start)
-                values[inside(holes, start, start) | ~observed, i] = np.nan
-                continue
-            if self.sampled == "middle":
-                time = self.time[finite]
-                nearest = np.searchsorted((time[:-1] + time[1:]) / 2, (start + end) / 2)
-                values[:, i] = x[finite][nearest]
+            holes = gaps(time, finite, bridgeable(time, finite, period / N))
+            lost = inside(holes, start, end)
+            if i >= nu:
+                values[:, i] = curves[i - nu](start)
+                lost = inside(holes, start, start) | ~observed
+            elif sampled == "mean":
+                values[:, i] = means(time, x, t)
             else:
-                values[:, i] = means(self.time, x, t)
-            values[inside(holes, start, end), i] = np.nan
-        return _Sections(k[:-1], start, observed, values)
+                at = time[finite]
+                nearest = np.searchsorted((at[:-1] + at[1:]) / 2, (start + end) / 2)
+                values[:, i] = x[finite][nearest]
+            values[lost, i] = np.nan
+        sections.append(_Sections(k[:-1], start, observed, values))
+    return sections
 
 
 def _with_times(
@@ -261,16 +240,12 @@ def _with_times(
 
 def _average(parts: list[_Sections], N: int) -> Float[np.ndarray, "N nuy"]:
     """Return the average cycle of a trial; NaN where nothing was sampled."""
-    if not parts:
-        return np.zeros((N, 0))
-    section = np.concatenate([p.k % N for p in parts])
-    values = np.concatenate([p.values for p in parts])
-    mean = np.full((N, values.shape[1]), np.nan)
-    for n, i in np.ndindex(mean.shape):
-        x = values[section == n, i]
-        if np.isfinite(x).any():
-            mean[n, i] = np.nanmean(x)
-    return mean
+    total, count = np.zeros((2, N, max((p.values.shape[1] for p in parts), default=0)))
+    for p in parts:
+        np.add.at(total, p.k % N, np.nan_to_num(p.values))
+        np.add.at(count, p.k % N, np.isfinite(p.values))
+    with np.errstate(invalid="ignore"):
+        return total / count
 
 
 @checked
@@ -291,7 +266,7 @@ def without_drift(
         values = trial.values.copy()
         for k in columns:
             middle, level = cycle_means(
-                trial, without_spikes(values[:, k]), stretches, phase.period
+                trial, smoothing.without_spikes(values[:, k]), stretches, phase.period
             )
             if len(middle) >= FEWEST:
                 slow = spline(middle, level - level.mean(), 0.5 / (cycles * phase.period))

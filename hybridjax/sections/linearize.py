@@ -7,14 +7,12 @@ from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
-from .._core.compilation import at_ease, host_first
-from .._core.executor import Array, is_inside_program, is_traced, namespace, on_host, to_host
+from .._core.compilation import host_first
+from .._core.executor import Array, is_traced, namespace, on_host
 from .._core.lanes import by_lane
 from .._core.progress import working
-from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import for_each_chart, only
-from ..engine.move import tape_jacobian
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
@@ -62,11 +60,7 @@ def linearize(
     for a in charts if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
     names, columns = inputs_of(s, inputs)
-    if traced or is_inside_program():
-        A, B = _section_jacobians(s, placed)
-    else:
-        with at_ease():
-            A, B = _section_jacobians(s, to_host(placed))
+    A, B = placed.flow_jacobians
     C, D = _output_jacobians(placed, tuple(z.items))
     d = s.d + 1
     if not traced:
@@ -75,7 +69,7 @@ def linearize(
     return LDTP(
         A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
         inputs=names, outputs=z.names,
-        coordinates=None if traced else to_host(placed).coordinates(),
+        coordinates=None if traced else placed.coordinates(),
     )  # fmt: skip
 
 
@@ -89,26 +83,6 @@ def inputs_of(
             raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(s.inputs)}.")
     columns = np.array([s.inputs.index(n) for n in names], int)
     return tuple(s.inputs[k] for k in columns), columns
-
-
-def _section_jacobians(
-    s: Structure, placed: PlacedSections
-) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
-    """A and B, padded; NaN if the flow failed.
-
-    (On the host, the direction of an autonomous flow does not drown strong contraction.)
-    """
-    n = 1 + placed.lanes.q.shape[0]
-    following, _, target = placed.onwards()
-    across = None
-    if on_host(placed.lanes.t) and not placed.cycle.clocked and np.isinf(placed.bound.time).all():
-        across = placed.cycle.settings.scale
-    jacobian, _ = tape_jacobian(s, placed.lanes, target, placed.tape, across=across)
-    xp = namespace(jacobian)
-    jacobian = xp.where((placed.result == Result.OK)[:, None, None], jacobian, xp.nan)
-    embed, select = placed.frames()
-    after = select[following]
-    return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
 
 
 @host_first

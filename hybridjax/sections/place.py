@@ -214,12 +214,9 @@ def _check(placed: PlacedSections, first: int) -> None:
         hint = " Give them to the search for the cycle, or place more sections."
         return f"{Result(code).message}.{hint if code == Result.STEP_LIMIT else ''}"
 
-    if first != Result.OK and isinstance(anchor, Crossing):
-        raise ComputationError(
-            f"the cycle has no point where {anchor} (the anchor of section 0): {reason(first)}"
-        )
     if first != Result.OK:
-        raise ComputationError(f"{name(0)} is not reached on the cycle: {reason(first)}")
+        place = f"point where {anchor}" if isinstance(anchor, Crossing) else "point at its anchor"
+        raise ComputationError(f"the cycle has no {place}, for {name(0)}: {reason(first)}")
     for i, code in enumerate(np.asarray(placed.result).tolist()):
         if code != Result.OK:
             hint = " Does it lie on an event of the cycle? Then move it a little."

@@ -6,14 +6,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked_methods
-from .._core.compilation import host_first
-from .._core.executor import Array, is_traced, namespace, on_host, to_host
+from .._core.compilation import at_ease, host_first
+from .._core.executor import Array, is_inside_program, is_traced, namespace, on_host, to_host
 from .._core.html import card, facts
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
 from ..engine import kernels
 from ..engine.lanes import Lanes, Tape, for_each_chart, needed, only
+from ..engine.move import tape_jacobian
 from ..engine.target import Target
 from ..orbits.cycle import LimitCycle, orbit_picture
 from ..systems.structure import Outputs, Structure
@@ -64,11 +65,8 @@ class PlacedSections(eqx.Module):
         head = f"PlacedSections({self.n_sections} sections of a {family} on a cycle of {system}"
         if is_traced(self):
             return f"{head}, traced)"
-        lines = self._facts()
-        low, high = lines["dimension"].split(" to ")
-        dimension = low if low == high else f"{low} to {high}"
-        start = lines["section 0 at t"]
-        return f"{head}: {lines['sections']}; dimension {dimension}; section 0 at t = {start})"
+        sections, dimension, start, _ = self._facts().values()
+        return f"{head}: {sections}; dimension {dimension}; section 0 at t = {start})"
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
@@ -85,7 +83,7 @@ class PlacedSections(eqx.Module):
         inside = (f"{np.sum(charts == a)} in {names[a]}" for a in dict.fromkeys(charts.tolist()))
         return {
             "sections": ", ".join(inside),
-            "dimension": f"{np.min(dims)} to {np.max(dims)}",
+            "dimension": " to ".join(str(n) for n in np.unique([np.min(dims), np.max(dims)])),
             "section 0 at t": number(t[0], unit=unit),
             "from one to the next": (
                 f"{np.min(durations):.4g} to {number(np.max(durations), 4, unit)}"
@@ -134,11 +132,31 @@ class PlacedSections(eqx.Module):
         along = xp.where((k == drop)[:, :, None] & drops[:, None], slope[:, None, :], 0.0)
         return (xp.eye(n) + along) @ xp.swapaxes(select, 1, 2), select
 
+    @property
+    def flow_jacobians(self) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
+        """A and B of the flow from each section to the next, padded; NaN if it failed.
+
+        (On the host, the direction of an autonomous flow does not drown strong contraction.)
+        """
+        placed = self if is_traced(self) or is_inside_program() else to_host(self)
+        lanes, n, across = placed.lanes, 1 + placed.lanes.q.shape[0], None
+        if on_host(lanes.t) and not self.cycle.clocked and np.isinf(placed.bound.time).all():
+            across = placed.cycle.settings.scale
+        following, _, target = placed.onwards()
+        with at_ease():
+            jacobian, _ = tape_jacobian(self.structure(), lanes, target, placed.tape, across=across)
+        xp = namespace(jacobian)
+        jacobian = xp.where((placed.result == Result.OK)[:, None, None], jacobian, xp.nan)
+        embed, select = placed.frames()
+        after = select[following]
+        return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
+
     def coordinates(self) -> tuple[tuple[str, ...], ...]:
         """Names of the coordinates on each section: deviations of the time of crossing (`t`) and
         of the chart's states, less the one that the section determines."""
         charts, names = self.structure().charts, []
-        for a, drop, timed in np.stack([self.lanes.chart, self.drop, self.time_is_state], axis=1):
+        drops = to_host((self.lanes.chart, self.drop, self.time_is_state))
+        for a, drop, timed in np.stack(drops, axis=1):
             entries = enumerate(("t", *charts[a].states))
             names.append(tuple(x for k, x in entries if k != drop and (k or timed)))
         return tuple(names)

@@ -122,6 +122,12 @@ def stacked(parts: Sequence[jax.Array]) -> jax.Array:
     return jnp.concatenate([jnp.atleast_1d(x) for x in parts])
 
 
+def _index(what: str, name: str, names: Sequence[str]) -> int:
+    if name not in names:
+        raise DefinitionError(f"there is no {what} '{name}'; {what}s are {quoted(names)}.")
+    return names.index(name)
+
+
 _kinds = Memory()
 
 
@@ -215,15 +221,10 @@ class Structure:
         return made
 
     def chart_index(self, name: str) -> int:
-        if name not in self.names:
-            raise DefinitionError(f"there is no chart '{name}'; charts are {quoted(self.names)}.")
-        return self.names.index(name)
+        return _index("chart", name, self.names)
 
     def transition_index(self, name: str) -> int:
-        names = [t.name for t in self.transitions]
-        if name not in names:
-            raise DefinitionError(f"there is no event '{name}'; events are {quoted(names)}.")
-        return names.index(name)
+        return _index("event", name, [t.name for t in self.transitions])
 
     def method(self, a: int) -> Method:
         """The method by which chart a is integrated: that of the system, of the chart, or the
@@ -292,10 +293,6 @@ class Structure:
     def guards(self, a: int) -> list[int]:
         """Indices of the state-dependent transitions out of chart a, by kind."""
         return [g for kind in self.guard_kinds(a) for g in kind]
-
-    @property
-    def has_schedules(self) -> bool:
-        return any(isinstance(tr.guard, Scheduled) for tr in self.transitions)
 
     def schedules(self, a: int) -> list[int]:
         """Indices of the scheduled transitions out of chart a."""

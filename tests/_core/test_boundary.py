@@ -5,7 +5,7 @@ import dataclasses
 import inspect
 import pickle
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 import hybridjax as hj
 from hybridjax._core.boundary.checked import checked
 from hybridjax._core.boundary.containers import Names
-from hybridjax._core.boundary.kinds import Count, Numbers, Positive, Scalar, SignalNames, kind_of
-from hybridjax._core.boundary.values import Complexes, Integers, Misfit, Number, Reals
+from hybridjax._core.boundary.kinds import Count, Numbers, Positive, Scalar, SignalNames
+from hybridjax._core.boundary.values import Complexes, Integers, Number, Reals
 
 
 NAN, INF = float("nan"), float("inf")
@@ -29,18 +29,15 @@ GAPS = Annotated[Numbers, Reals("n", missing=True)]
 TAKEN = [
     (int, 3, 3),
     (int, np.int32(3), 3),
-    (int, np.array(3), 3),
     (Count | None, None, None),
     (float, 3, 3.0),
     (float, jnp.array(0.5), 0.5),
     (Annotated[float, Number("no bound or a positive number", above=0, infinite=True)], INF, INF),
     (complex, 2, 2 + 0j),
     (bool, np.True_, True),
-    (Any, 3, 3),
     (Literal["a", "b"], "b", "b"),
     (Sequence[int], np.arange(2), [0, 1]),
     (Iterable[str], iter("ab"), ("a", "b")),
-    (tuple[int, ...], [1, np.int64(2)], (1, 2)),
     (tuple[float, float], [1, 2], (1.0, 2.0)),
     (Mapping[str, float], {"a": 1}, {"a": 1.0}),
     (SignalNames, "a", ("a",)),
@@ -52,7 +49,6 @@ TAKEN = [
 REFUSED = [
     (int, 8.5, "must be an integer, not 8.5"),
     (int, True, "must be an integer, not True"),
-    (int, np.array([3]), "must be an integer, not an array of int64 with shape (1,)"),
     (Count, 0, "must be an integer from 1 to 1000000000, not 0"),
     (float, NAN, "must be a finite number, not nan"),
     (float, 10**400, "must be a finite number, not 1000"),
@@ -61,21 +57,17 @@ REFUSED = [
     (Literal["a", "b"], "c", "must be 'a' or 'b', not 'c'"),
     (int | str | None, 0.5, "must be an integer, a string or None, not 0.5"),
     (Sequence[str], "ab", "must be a sequence (each item a string), not 'ab'"),
-    (Sequence[int], [1, "b"], "`x[1]` must be an integer, not 'b'"),
     (tuple[float, float], (1.0,), "must be a tuple of 2 (a finite number, a finite number)"),
     (Mapping[str, Positive], {"a": -1}, "`x['a']` must be a positive number, not -1"),
     (Mapping[str, int], {1: 2}, "has the key 1, but keys must be a string"),
     (SignalNames, ["a", "a"], "must name each only once, not ('a', 'a')"),
-    (SignalNames, ["a", 3], "a sequence of distinct names, not ['a', 3]"),
     (hj.Output, 3, "must be an Output, not 3"),
     (hj.HybridSystem, hj.models.VerticalHopper, "not the class itself: write VerticalHopper(...)"),
     (MATRIX, [1.0], "must be of shape (N, d), not of shape (1,)"),
     (MATRIX, [[1], [1, 2]], "must be a rectangular array, but its rows differ in length"),
-    (MATRIX, [[True]], "must hold real numbers, not bool"),
     (MATRIX, np.zeros((2, 2), complex), "must be real, not an array of complex128"),
     (MATRIX, "x", "must be an array of real numbers with shape (N, d), not 'x'"),
     (MATRIX, [[0, 1], [NAN, 0]], "must be finite, but is nan at index (1, 0)"),
-    (Scalar, NAN, "must be a finite number, not nan"),
     (GAPS, [0, INF], "must be finite, but is inf at index 1"),
     (Annotated[Numbers, Reals("n", sign="positive")], [1, 0], "must be positive, but is 0 at"),
     (Annotated[Numbers, Reals("n", sign="nonnegative")], [1, -2], "must be zero or positive, but"),
@@ -124,14 +116,6 @@ def test_arrays_arrive_as_arrays(kind, given, expected):
     found = kind.take(given)
     assert type(found) is type(expected) and found.dtype == expected.dtype
     np.testing.assert_array_equal(found, expected)
-
-
-def test_other_objects_may_stand_among_names():
-    output = hj.Output("z", lambda t, q, u: q[0])
-    assert Names(hj.Output).take(["a", output]) == ("a", output)
-    assert Names(hj.Output).take(output) == (output,)
-    with pytest.raises(Misfit, match="or an Output in place of one"):
-        Names(hj.Output).take(["a", 3])
 
 
 @checked
@@ -265,8 +249,3 @@ def test_where_values_are_needed_a_sentence_says_so(transform):
         with pytest.raises(hj.DefinitionError, match=f"^{name} needs values, but JAX traces them"):
             transform(function)(x)
     assert eqx.filter_jit(lambda n: several(1, n))(2) == (1, 2, (), "x", {})
-
-
-def test_annotations_without_a_kind_are_an_error():
-    with pytest.raises(TypeError, match="no kind for the annotation"):
-        kind_of(Literal)

@@ -17,7 +17,6 @@ import pytest
 import hybridjax as hj
 from hybridjax._core import compilation
 from hybridjax._core.compilation import TwoTiers, in_turn, is_left_to_lapack, kernel, quick_jit
-from hybridjax._core.executor import is_inside_program
 from hybridjax._core.lanes import by_lane
 
 
@@ -53,15 +52,6 @@ def test_errors_of_the_function_come_through():
         with pytest.raises(ValueError, match="not to blame"):
             call(X)
     assert gc.isenabled()
-
-
-def test_inside_of_a_program():
-    inside = []
-    look = lambda: inside.append(is_inside_program())  # noqa: E731
-    look()
-    jax.jit(look)()
-    jax.vmap(lambda x: (look(), x)[1])(X)
-    assert inside == [False, True, False]
 
 
 class Pair(NamedTuple):
@@ -101,12 +91,6 @@ def test_later_jobs_take_the_optimized_program(tiers, monkeypatch):
     later = TwoTiers(total, large=False)
     np.testing.assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
     assert [x[1] for x in later._chosen.values()] == [program._full] and len(tiers) == 2
-
-
-def test_a_large_job_waits_for_the_optimized_program(tiers):
-    TwoTiers(total, large=False)(X, jnp.sin, 1)
-    TwoTiers(total, large=True)(X, jnp.sin, 1)
-    assert tiers == ["quick", "full"]
 
 
 def test_functions_that_are_written_anew_share_a_program(tiers):

@@ -7,7 +7,6 @@ import time
 import jax.numpy as jnp
 import pytest
 
-import hybridjax as hj
 from hybridjax._core import progress
 
 
@@ -69,13 +68,6 @@ def test_the_line_is_wiped_when_a_call_ends_or_fails(capsys, shown):
     *_, last, end = capsys.readouterr().err.split("\r")
     assert last.strip() == "" and len(last) >= len("call, 00:00") and end == ""
     assert progress._running == []
-
-
-def test_users_say_where_it_is_shown(capsys, monkeypatch, shown):
-    hj.enable_progress(False)
-    with progress.working("call"):
-        time.sleep(0.05)
-    assert capsys.readouterr().err == ""
 
 
 def test_programs_are_said_to_be_compiled_while_they_are():

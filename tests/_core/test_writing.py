@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import hybridjax as hj
-from hybridjax._core.writing import made_folder, results_folder
+from hybridjax._core.writing import results_folder
 
 
 LIST = ".hybridjax-report.json"
@@ -163,19 +163,6 @@ def test_places_that_cannot_be_written(folder):
     with pytest.raises(hj.DefinitionError, match=f"cannot write to '{folder}'"):
         with results_folder(pathlib.Path(folder), "report"):
             pytest.fail("too late")
-
-
-def test_a_place_that_cannot_hold_compiled_programs():
-    with pytest.raises(hj.DefinitionError, match="give another folder"):
-        hj.enable_compilation_cache("/dev/null/new")
-
-
-def test_a_folder_that_was_made_stays_where_something_is_in_it(tmp_path):
-    with pytest.raises(ValueError):
-        with made_folder(tmp_path / "a" / "b"):
-            (tmp_path / "a" / "mine.txt").write_text("mine")
-            raise ValueError
-    assert tree(tmp_path) == {"a": None, "a/mine.txt": "mine"}
 
 
 DESIGN = hj.multisine(n_sections=4, periods=4, band=(0.25, 0.5))

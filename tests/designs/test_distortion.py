@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -27,28 +26,21 @@ GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
 
 
 class Quadratic(hj.HybridSystem):
-    """x[p+1] = 0.6 x[p] + u + b x[p]^2 once a period, at t = p, and constant in between.
-
-    In other units: `size` of the state, `force` of the input.
-    """
+    """x[p+1] = 0.6 x[p] + u + b x[p]^2 once a period, at t = p, and constant in between."""
 
     b: hj.Parameter = hj.parameter(0.7)
-    size: hj.Parameter = hj.parameter(1.0)
-    force: hj.Parameter = hj.parameter(1.0)
 
     def charts(self):
         return {"rest": Field(("x",), lambda t, q, u: (0.0 * q[0],))}
 
     def transitions(self):
         def reset(t, q, u):
-            x = q[0] / self.size
-            return (self.size * (0.6 * x + u[0] / self.force + self.b * x**2),)
+            return (0.6 * q[0] + u[0] + self.b * q[0] ** 2,)
 
         return (hj.Transition("tick", "rest", "rest", hj.Scheduled(1.0), reset=reset),)
 
     def outputs(self):
-        shown = lambda t, q, u: q[0] / self.size + (u[0] / self.force) ** 2  # noqa: E731
-        return (hj.Output("z", shown),)
+        return (hj.Output("z", lambda t, q, u: q[0] + u[0] ** 2),)
 
     def period(self):
         return 1.0
@@ -92,7 +84,7 @@ SHORT = hj.multisine(4, periods=8, inputs=("push", "pull")).scaled(1e-3)
 
 def about(system):
     guess = hj.Guess("rest", (0.0,), time=0.5)
-    cycle = hj.find_limit_cycle(system, guess, scale={"x": float(system.size)})
+    cycle = hj.find_limit_cycle(system, guess, scale={"x": 1.0})
     sections = hj.ClockPhase(4)
     return cycle, sections, hj.linearize(cycle, sections, "x")
 
@@ -153,52 +145,23 @@ def test_two_inputs(two, inputs):
     assert np.abs(even - quadratic.second_order(u)).max() < 1e-5 * np.abs(even).max()
 
 
-def test_the_expected_size_with_two_inputs(two):
-    """Over draws of the phases."""
-    cosines = Candidates.of(SHORT)
+@pytest.mark.parametrize("gaussian", [False, True])
+def test_the_expected_size_with_two_inputs(two, gaussian):
+    """Over draws of the phases; and of amplitudes, too, which makes the inputs Gaussian."""
+    count, cosines = 400, Candidates.of(SHORT)
     limit = Distortion(*two[:2], {"x": 1.0, "z": 1.0})
-    found = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
-    drawn = [found.rms(SHORT.realizations(1, seed=k), phases=True) ** 2 for k in range(300)]
-    error = np.std(drawn, axis=0) / np.sqrt(300)
-    assert (np.abs(np.mean(drawn, axis=0) - found.rms(SHORT) ** 2) < 3.5 * error).all()
-    assert (error < 0.02 * found.rms(SHORT) ** 2).all()
-
-
-def test_the_expected_size_of_gaussian_inputs(two):
-    """Lines whose amplitudes are random, too."""
-    cosines = Candidates.of(SHORT)
-    quadratic = second_order(*two[:2], ("x", "z"), two[2].inputs)
-    form = quadratic.products(cosines.f, cosines.channel).gaussian()
-    limit = Distortion(*two[:2], {"x": 1.0, "z": 1.0})
-    found = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
-    power, rng, drawn = found.cosines.powers_in(SHORT), np.random.default_rng(0), []
-    expected = np.mean([form @ p @ p for p in power], axis=0)
-    for k in range(500):
-        one = SHORT.realizations(1, seed=k)
-        size = np.sqrt(rng.exponential(size=len(one.amplitude)))
-        one = dataclasses.replace(one, amplitude=one.amplitude * size)
-        drawn.append(found.rms(one, phases=True) ** 2)
-    error = np.std(drawn, axis=0) / np.sqrt(500)
-    assert (np.abs(np.mean(drawn, axis=0) - expected) < 3.5 * error).all()
-    assert (error < 0.05 * expected).all()
-
-
-def test_products_in_parts_and_of_a_design(two, monkeypatch):
-    """Pairs of cosines a few at a time; the form of the mean powers of lines in experiments."""
-    cosines = Candidates.of(SHORT)
-    quadratic = second_order(*two[:2], ("x", "z"), two[2].inputs)
-    whole = quadratic.products(cosines.f, cosines.channel)
-    monkeypatch.setattr("hybridjax.sections.second_order._NUMBERS", 2**10)
-    for a, b in zip(whole, quadratic.products(cosines.f, cosines.channel), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(a).max())
-    limit = Distortion(*two[:2], {"x": 0.5, "z": 2.0})
-    found = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
-    each = found.cosines.powers_in(SHORT)
-    power = each.mean(axis=0)
-    kept = np.flatnonzero(power)
-    form = found.divided(kept, each[:, kept] / power[kept])
-    share = form @ power[kept] @ power[kept]
-    np.testing.assert_allclose(share, (found.rms(SHORT) / found.level) ** 2, rtol=1e-12)
+    form = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
+    drawn, expected = SHORT.realizations(count), form.rms(SHORT) ** 2
+    if gaussian:
+        size = np.sqrt(np.random.default_rng(0).exponential(size=len(drawn.line)))
+        drawn = dataclasses.replace(drawn, amplitude=drawn.amplitude * size)
+        matrix = form.quadratic.products(cosines.f, cosines.channel).gaussian()
+        expected = np.mean([matrix @ p @ p for p in cosines.powers_in(SHORT)], axis=0)
+    squares = np.mean(form.quadratic.second_order(drawn.inputs()) ** 2, axis=1)
+    each = squares.reshape(count, -1, 2).mean(axis=1)
+    error = np.std(each, axis=0) / np.sqrt(count)
+    assert (np.abs(np.mean(each, axis=0) - expected) < 3.5 * error).all()
+    assert (error < (0.05 if gaussian else 0.02) * expected).all()
 
 
 @pytest.mark.parametrize("f", [0.125, 0.375])
@@ -247,24 +210,6 @@ def test_designs_within_a_distortion(hopper_cycle):
     np.testing.assert_allclose(seen, said, rtol=0.1)
 
 
-def test_units(toy):
-    """Other units of states and inputs change nothing but numbers."""
-    usual = hj.multisine(4, periods=16).scaled(0.01)
-    one = hj.optimal_design(
-        toy[2], usual, limit=Limits(distortion=Distortion(*toy[:2], {"x": 1e-4})),
-        noise={"x": 1e-4}, goal=GOAL,
-    )  # fmt: skip
-    system = dataclasses.replace(Quadratic(), size=jnp.array(1e6), force=jnp.array(1e-5))
-    cycle, sections, model = about(system)
-    other = hj.optimal_design(
-        model, usual.scaled(1e-7), limit=Limits(distortion=Distortion(cycle, sections, {"x": 1e2})),
-        noise={"x": 1e2}, goal=GOAL,
-    )  # fmt: skip
-    assert other.saved == pytest.approx(one.saved, rel=1e-6)
-    assert other.certificate == pytest.approx(one.certificate, rel=1e-6)
-    np.testing.assert_allclose(other.power * 1e10, one.power, rtol=1e-5, atol=1e-12)
-
-
 def test_beside_other_limits(toy):
     """Peaks, with the distortion of the phases that these get; several models."""
     cycle, sections, model = toy
@@ -300,27 +245,19 @@ def test_without_distortion(toy):
     assert plan.criterion == pytest.approx(alone.criterion, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    "rms, family, message",
-    [
-        ({"y": 1.0}, hj.ClockPhase(4), "there is no output 'y'"),
-        ({"x": 1.0}, hj.ClockPhase(8), "between 8 sections, the model has 4"),
-    ],
-)
-def test_bad_distortions(toy, rms, family, message):
-    usual = hj.multisine(4, periods=16)
-    limit = Limits(distortion=Distortion(toy[0], family, rms))
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.optimal_design(toy[2], usual, limit=limit)
-
-
-def test_bad_uses(toy):
+def test_bad_distortions(toy):
+    cycle, sections, model = toy
     with pytest.raises(hj.DefinitionError, match="limits nothing: name an output"):
-        Distortion(*toy[:2], {})
-    other = hj.LDTP(toy[2].A, toy[2].B, toy[2].C, inputs="push", outputs="x")
-    limit = Limits(distortion=Distortion(*toy[:2], {"x": 1.0}))
-    with pytest.raises(hj.DefinitionError, match="there is no input 'push'"):
-        hj.optimal_design(other, hj.multisine(4, periods=16, inputs="push"), limit=limit)
-    twice = hj.LDTP(toy[2].A, 2 * toy[2].B, toy[2].C, outputs="x")
-    with pytest.raises(hj.DefinitionError, match="another system .* to x differs by 50%"):
-        hj.optimal_design(twice, hj.multisine(4, periods=16), limit=limit)
+        Distortion(cycle, sections, {})
+    other = hj.LDTP(model.A, model.B, model.C, inputs="push", outputs="x")
+    twice = hj.LDTP(model.A, 2 * model.B, model.C, outputs="x")
+    for system, family, rms, message in (
+        (model, sections, {"y": 1.0}, "there is no output 'y'"),
+        (model, hj.ClockPhase(8), {"x": 1.0}, "between 8 sections, the model has 4"),
+        (other, sections, {"x": 1.0}, "there is no input 'push'"),
+        (twice, sections, {"x": 1.0}, "another system .* to x differs by 50%"),
+    ):
+        usual = hj.multisine(4, periods=16, inputs=system.inputs)
+        with pytest.raises(hj.DefinitionError, match=message):
+            limit = Limits(distortion=Distortion(cycle, family, rms))
+            hj.optimal_design(system, usual, limit=limit)

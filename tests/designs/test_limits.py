@@ -91,20 +91,3 @@ def test_noise_that_differs_between_harmonics(two, optimal_two):
     bound = hj.identify.multiplier_bound(two, htf)
     total = np.trace(bound.multiplier_covariances[0])
     assert plan.usual_criterion == pytest.approx(total, rel=1e-6)
-
-
-def test_amplitudes_at_which_distortion_is_allowed(two, optimal_two):
-    """A part of second order in the inputs: relative to the output it grows as they do."""
-
-    def run(u):
-        y = np.stack([two.simulate(x) + 0.5 * x[:, :1] ** 2 for x in u])
-        return hj.ExperimentData(u, y, n_sections=6, periods=32, outputs=two.outputs)
-
-    plan = optimal_two()
-    sweep = hj.identify.amplitude_sweep(run, two, plan.design.inputs(64), (0.01, 0.1, 1))
-    allowed = sweep.misfit[-1].max() / 20
-    share = sweep.limit(allowed)
-    weaker = optimal_two(limit={name: share * plan.rms[name] for name in plan.limited})
-    again = hj.identify.amplitude_sweep(run, two, weaker.design.inputs(64), (1.0,))
-    assert again.misfit.max() == pytest.approx(allowed, rel=0.05)
-    assert weaker.strides_for(1e-3) == pytest.approx(400 * plan.strides_for(1e-3), rel=0.05)

@@ -115,9 +115,7 @@ def test_units_and_estimates(isochron_ldtp, usual):
     [
         (dict(noise={"z": 1.0}), "`noise` names 'z'; the outputs are yM, vM"),
         (dict(design=hj.multisine(8)), "the design has 8 sections"),
-        (dict(design=hj.multisine(periods=32, inputs=("F",))), "inputs F, the model 32 and u"),
         (dict(design=hj.multisine(lines="two-phase", periods=4)), "is a multiple of 1/2"),
-        (dict(limit={"u": 0.0}), "positive"),
     ],
 )
 def test_bad_input(isochron_ldtp, usual, change, message):

@@ -47,7 +47,7 @@ def test_no_operation_outside_of_programs_compiles_one(monkeypatch):
     with compiled() as names:
         cycle = hj.find_limit_cycle(hj.models.VerticalHopper(k=10.5))
         model = hj.linearize(cycle, FAMILY, OUTPUTS)
-        for start in ("cycle", "periodic", "steady"):
+        for start in ("cycle", "periodic"):
             data = hj.run_experiments(cycle, FAMILY, u, OUTPUTS, start=start, discard=0)
         trajectory = cycle.trajectory()
         trajectory(*OUTPUTS)

@@ -147,20 +147,6 @@ def test_section_map_in_closed_form(relay_map):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "second",
-    [
-        lambda f: jax.jacrev(jax.jacrev(f)),
-        lambda f: jax.jacfwd(jax.jit(jax.jacrev(f))),
-    ],
-    ids=["reverse over reverse", "forward over a jit of reverse"],
-)
-def test_second_derivatives_in_closed_form(relay_map, second):
-    found = compiled(second(lambda v: relay(relay_map, v)))(V)
-    assert_equal_derivatives(found, jax.hessian(exact)(V), 1e-9)
-
-
-@pytest.mark.slow
 def test_third_derivatives_in_closed_form(relay_map):
     """Two corrections onto the event are right to third order."""
     direction = W - V

@@ -62,6 +62,31 @@ def test_reverse_mode_and_second_derivatives_have_a_closed_form():
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
 
 
+def juggler(x):
+    """Ball and paddle, x = (y0, v0, A, restitution, input, end): guard and reset change in time."""
+    system = hj.models.PaddleJuggler(A=x[2], restitution=x[3])
+    return flow(system, "fall", x[:2], x[4:5], jnp.asarray(0.56), x[5])[0]
+
+
+def juggler_exact(x):
+    y, v, A, a, u, end = x
+    fall = lambda y, v, t: (y + v * t - 9.81 * t**2 / 2, v - 9.81 * t)  # noqa: E731
+    table = lambda t: A * jnp.sin(2 * jnp.pi * (t + 0.56))  # noqa: E731
+    t = jnp.asarray(0.5)
+    for _ in range(8):
+        height, rate = jax.jvp(lambda t: fall(y, v, t)[0] - table(t), (t,), (1.0,))
+        t = t - height / rate
+    y, v = fall(y, v, t)
+    return jnp.stack(fall(y, -a * v + (1 + a) * (jax.grad(table)(t) + u), end - 0.56 - t))
+
+
+def test_reverse_mode_through_an_impact_on_a_moving_paddle():
+    x = jnp.array([1.3, 0.1, 0.15, 0.7, 0.05, 1.3])
+    found, value = compiled(jax.jacrev(lambda x: (juggler(x),) * 2, has_aux=True))(x)
+    np.testing.assert_allclose(value, juggler_exact(x), rtol=1e-12)
+    np.testing.assert_allclose(found, jax.jacfwd(juggler_exact)(x), rtol=1e-10, atol=1e-11)
+
+
 def hopper(x):
     """Body of the lossy hopper after a touchdown; x = (q, input, retention, stiffness, end)."""
     system = hj.models.VerticalHopper(retention=x[5], k=x[6])
@@ -78,6 +103,7 @@ def differences(f, x, e=1e-4):
     return (4 * np.stack(step, -1) - np.stack(wide, -1)) / 3
 
 
+@pytest.mark.slow
 def test_derivatives_through_a_touchdown_that_loses_speed():
     found = compiled(jax.jacrev(hopper))(H)
     np.testing.assert_allclose(found, differences(compiled(hopper), H), atol=2e-9)

@@ -4,7 +4,6 @@ A room is heated until its sensor shows 0.7, and cools until it shows 0.3. The s
 once while the room is heated, and slowly while it cools.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,10 +11,6 @@ import pytest
 from scipy.optimize import brentq
 
 import hybridjax as hj
-from hybridjax.engine.lanes import start_lanes
-from hybridjax.engine.move import move
-from hybridjax.engine.target import until
-from hybridjax.systems.structure import Structure
 
 
 class Room(hj.Chart):
@@ -114,37 +109,3 @@ def test_experiments(cycle, start):
     np.testing.assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
     there = hj.section_map(cycle, placed, 0, 1)(placed.lanes.q[:, 0])
     np.testing.assert_allclose(there.q, placed.lanes.q[:, 1], rtol=1e-10)
-
-
-class Counted(Thermostat):
-    """Says whenever the field of the stiff chart is evaluated."""
-
-    say: object = eqx.field(static=True, default=None)
-
-    def charts(self):
-        said = self.say
-
-        class Loud(Heated):
-            def field(self, t, q, u):
-                jax.debug.callback(said)
-                return super().field(t, q, u)
-
-        return {"on": Loud(1.0, self.fast), "off": Room(0.0, self.slow)}
-
-
-@pytest.mark.slow
-def test_a_stiff_chart_costs_only_where_lanes_are():
-    count = []
-    s = Structure(Counted(say=lambda: count.append(1)))
-
-    @jax.jit
-    def run(chart):
-        q, t = jnp.array([[0.6, 0.65], [0.5, 0.55]]), jnp.zeros(2)
-        lanes = start_lanes(s, t, chart, q)
-        settings = hj.Settings(1e-6, 1e-6, scale=np.ones((2, 2)))
-        return move(s, lanes, jnp.zeros((1, 2)), until(t + 0.05), settings).moved.result
-
-    for chart, visited in ((1, False), (0, True)):
-        np.testing.assert_array_equal(run(np.full(2, chart, np.int32)), 0)
-        jax.effects_barrier()
-        assert bool(count) == visited

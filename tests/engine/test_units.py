@@ -92,7 +92,6 @@ CHAIN = lambda t, q, u: (*q[1:], jnp.cos(t))  # noqa: E731
     "function, start, end",
     [
         pytest.param(lambda t, q, u: (q[1], -q[0]), (0.0, 0.0), (0.0, 0.0), id="zero"),
-        pytest.param(lambda t, q, u: (-q[0], 0.0), (1.0, 0.0), (np.exp(-10), 0), id="a counter"),
         pytest.param(
             SPRING, (0.1 + 9.81 / 100.3, 0.0), (0.1 + 9.81 / 100.3, 0.0), id="rest up to rounding"
         ),

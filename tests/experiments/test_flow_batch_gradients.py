@@ -83,21 +83,6 @@ def test_reverse_and_forward_mode_agree_with_differences(experiment, parameters)
 
 
 @pytest.mark.slow
-def test_second_derivatives_agree_with_differences(experiment, parameters):
-    """A product with the Hessian, forward over reverse, and a number of it forward twice."""
-    u, v = inputs(1), jnp.array([0.1, 0.2, -0.3, 0.1, 0.05, 0.2, -0.1])
-    f = lambda x: loss(experiment, x, u)[0]  # noqa: E731
-    push = lambda f: lambda x: jax.jvp(f, (x,), (v,))  # noqa: E731
-    both = compiled(push(jax.grad(f)))
-    product = both(parameters)[1]
-    e = 1e-4
-    true = (both(parameters + e * v)[0] - both(parameters - e * v)[0]) / (2 * e)
-    np.testing.assert_allclose(product, true, atol=1e-6 * np.abs(true).max())
-    twice = compiled(push(lambda x: push(f)(x)[1]))(parameters)[1]
-    np.testing.assert_allclose(twice, v @ product, rtol=1e-9)
-
-
-@pytest.mark.slow
 def test_reverse_mode_stores_the_states_at_the_sections(experiment, parameters):
     f = jax.grad(lambda x, u: loss(experiment, x, u)[0])
 

@@ -17,12 +17,11 @@ KINEMATIC = hj.KinematicPhase(
 )
 PLANE = hj.KinematicPhase(7, position="x", velocity="v")
 FAMILIES = {"VanDerPol": PLANE, "VerticalHopper": KINEMATIC}
-SLOW = ("VerticalHopper", "BuckConverter", "CompassGait", "PaddleJuggler")
+MODELS = ("VanDerPol", "VerticalHopper", "BuckConverter", "CompassGait", "PaddleJuggler")
 
 
-@pytest.mark.parametrize(
-    "name", ["VanDerPol", *(pytest.param(x, marks=pytest.mark.slow) for x in SLOW)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODELS)
 def test_host_and_program_try_the_same_ways(name, monkeypatch):
     cycle = hj.find_limit_cycle(getattr(hj.models, name)())
     placed = hj.place_sections(cycle, FAMILIES.get(name, hj.ClockPhase(7)))

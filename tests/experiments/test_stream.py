@@ -1,30 +1,53 @@
-"""Many experiments: chunk by chunk, in batches, by threads.
+"""Many experiments: chunk by chunk, in batches, by threads, in stores. One program is compiled."""
 
-All runs have batches of 40 experiments of 84 cycles, as in `test_run`: one program is compiled.
-"""
+import shutil
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.experiments.run import Options, divide
+from hybridjax.experiments import Options, StoredExperiments
+from hybridjax.experiments.run import divide
+from hybridjax.experiments.stored import experiment_job
 
-from ..conftest import OUTPUTS, no_compilation
+from ..conftest import no_compilation
 
 
-COUNT = 100
-DESIGN = hj.multisine(experiments=COUNT)
-BATCH = dict(execution=hj.Execution(batch=40))
+pytest.importorskip("zarr")
+
+COUNT = 12
+DESIGN = hj.multisine(8, 8, (0, 4.0), 0.001, experiments=COUNT)
+OUTPUTS = ("x", "v")
+BATCH = {"execution": hj.Execution(batch=5)}
+NOISE = {"process_noise": hj.experiments.ProcessNoise(1e-3)}
+stream = hj.experiments.stream_experiments
 
 
 @pytest.fixture(scope="module")
-def arguments(hopper_cycle, placed_isochrons):
-    return hopper_cycle, placed_isochrons, DESIGN, OUTPUTS
+def arguments():
+    cycle = hj.find_limit_cycle(hj.models.Duffing())
+    family = hj.ClockPhase(8, anchor=hj.Crossing("x", "falling"))
+    return cycle, hj.place_sections(cycle, family), DESIGN, OUTPUTS
 
 
 @pytest.fixture(scope="module")
 def whole(arguments):
     return hj.run_experiments(*arguments, **BATCH)
+
+
+@pytest.fixture(scope="module")
+def made(arguments, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stores") / "records.zarr"
+    return stream(*arguments, Options(**BATCH), store=folder, chunk=5)
+
+
+@pytest.fixture
+def stored(made, tmp_path):
+    """A store of experiments in three chunks, for one test."""
+    shutil.copytree(made.address, tmp_path / "records.zarr")
+    return StoredExperiments(tmp_path / "records.zarr")
 
 
 def records(parts):
@@ -33,7 +56,7 @@ def records(parts):
 
 def test_parts_of_a_design_have_the_inputs_of_the_whole():
     u = DESIGN.inputs(9)
-    parts = [DESIGN.inputs(9, slice(k, k + 30)) for k in range(0, COUNT, 30)]
+    parts = [DESIGN.inputs(9, slice(k, k + 5)) for k in range(0, COUNT, 5)]
     np.testing.assert_array_equal(np.concatenate(parts), u)
     for wrong in (slice(3, 3), slice(0, 9, 2), slice(COUNT, None)):
         with pytest.raises(hj.DefinitionError, match="no consecutive experiments"):
@@ -41,27 +64,26 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
 
 
 def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, whole):
-    parts = list(hj.experiments.stream_experiments(*arguments, Options(**BATCH), chunk=40))
-    assert [len(part.u) for part in parts] == [40, 40, 20]
+    parts = list(stream(*arguments, Options(**BATCH), chunk=5))
+    assert [len(part.u) for part in parts] == [5, 5, 2]
     np.testing.assert_array_equal(records(parts), whole.y)
-    estimate = hj.estimate_htf(part for part in parts)
-    expected = hj.estimate_htf(whole)
+    estimate, expected = hj.estimate_htf(part for part in parts), hj.estimate_htf(whole)
     np.testing.assert_array_equal(estimate.f, expected.f)
-    np.testing.assert_allclose(estimate.H, expected.H, rtol=1e-12)
-
-
-def test_process_noise_does_not_depend_on_the_chunks(arguments):
-    noise = {"process_noise": hj.experiments.ProcessNoise(1e-3)}
-    whole = hj.run_experiments(*arguments, **BATCH, **noise)
-    parts = hj.experiments.stream_experiments(*arguments, Options(**BATCH, **noise), chunk=40)
-    np.testing.assert_array_equal(records(parts), whole.y)
+    np.testing.assert_allclose(estimate.H, expected.H, rtol=1e-9)
+    noisy = hj.run_experiments(*arguments, **BATCH, **NOISE)
+    parts = stream(*arguments, Options(**BATCH, **NOISE), chunk=5)
+    np.testing.assert_array_equal(records(parts), noisy.y)
+    assert (noisy.y != whole.y).any()
 
 
 def test_workers_and_batches_change_nothing(arguments, whole):
-    with no_compilation(after=lambda: hj.run_experiments(*arguments, **BATCH)):
+    def run(workers=1):
+        execution = hj.Execution(batch=5, workers=workers)
+        return hj.run_experiments(*arguments, execution=execution)
+
+    with no_compilation(after=run):
         for workers in (1, 3):
-            execution = hj.Execution(batch=40, workers=workers)
-            data = hj.run_experiments(*arguments, execution=execution)
+            data = run(workers)
             np.testing.assert_array_equal(data.y, whole.y)
             np.testing.assert_array_equal(data.error, whole.error)
 
@@ -80,19 +102,88 @@ def test_batches_are_alike_and_keep_all_workers_busy():
     assert divide(80, hj.Execution(workers=2)) == hj.Execution(40, 2)
 
 
-def test_estimates_of_parts_that_do_not_fit_together(whole):
-    other = hj.ExperimentData(whole.u, whole.y, n_sections=32, periods=32)
-    with pytest.raises(hj.DefinitionError, match="do not belong together"):
-        hj.estimate_htf([whole, other])
-    with pytest.raises(hj.DefinitionError, match="no experiments"):
-        hj.estimate_htf([])
+def test_stored_experiments_are_those_of_the_whole(made, whole):
+    assert len(made) == 3 and made.experiments == COUNT and made.missing() == []
+    np.testing.assert_array_equal(records(made), whole.y)
+    np.testing.assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
+    np.testing.assert_array_equal(np.concatenate([part.error for part in made]), whole.error)
+    np.testing.assert_array_equal(made[0].cycle_outputs, whole.cycle_outputs)
+    assert made[0].outputs[0].unit == "m"
+    assert made.summary() == whole.summary() == "12/12 ok"
+    assert "12 experiments, 3 of 3 chunks" in repr(StoredExperiments(made.address))
+    assert made.dataset.y.dims == ("experiment", "sample", "output")
+    np.testing.assert_array_equal(made.dataset.y.sel(output="v"), whole.y[..., 1])
+    np.testing.assert_allclose(hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9)
 
 
-def test_parts_name_the_experiment_in_which_lines_meet():
-    u = np.cos(2 * np.pi * np.arange(64) / 64 * 3)[None, :, None]
-    good = hj.ExperimentData(u, u, n_sections=4, periods=16)
+def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):
+    (tmp_path / "records.zarr/y/c/1/0/0").unlink()
+    assert stored.missing() == [1]
+    with pytest.raises(hj.DefinitionError, match="1 of 3 chunks .* missing, the first is 1"):
+        hj.estimate_htf(stored)
+    rotten = tmp_path / "records.zarr/u/c/2/0/0"
+    content = bytearray(rotten.read_bytes())
+    content[100] ^= 1
+    rotten.write_bytes(content)
+    with pytest.raises(hj.errors.FileFormatError, match="piece 2 .* is damaged in `u`"):
+        stored[2]
+    before = (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns
+    again = stream(*arguments, Options(**BATCH), store=stored.address, chunk=5)
+    np.testing.assert_array_equal(records(again), whole.y)
+    assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
+
+
+def test_other_experiments_are_refused(made, arguments):
+    cycle, placed, _, _ = arguments
+    other = eqx.tree_at(lambda p: p.cycle.system.damping, placed, jnp.asarray(0.11, float))
+    velocity = hj.Output("v", lambda t, q, u: -q[1], "m/s")
+    cases = (
+        (dict(design=hj.multisine(8, 8, (0, 4.0), experiments=COUNT, seed=1)), "`design"),
+        (dict(design=DESIGN.inputs(28), discard=20), "`design"),
+        (dict(outputs="x"), "`data.outputs"),
+        (dict(outputs=("x", velocity)), "`outputs"),
+        (dict(sections=hj.ClockPhase(8, anchor=hj.Crossing("v", "rising"))), "`family"),
+        (dict(chunk=4), "`batch"),
+        (dict(accuracy=1e-8), "`accuracy"),
+        (NOISE, "`process_noise"),
+        (dict(cycle=other.cycle, sections=other), "`model.numbers.damping` is 0.1, not 0.11"),
+    )
+    names = ("cycle", "sections", "design", "outputs")
+    for change, difference in cases:
+        call = dict(zip(names, arguments, strict=True)) | dict(chunk=5) | BATCH | change
+        options = {name: call.pop(name) for name in [*call] if hasattr(Options, name)}
+        with pytest.raises(hj.DefinitionError, match=f"holds other results: .*{difference}"):
+            stream(**call, options=Options(**options), store=made.address)
+
+
+@pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
+def test_another_process_can_run_a_piece(arguments, start):
+    """It gets all but what is compiled, and gives the same records."""
+    cloudpickle = pytest.importorskip("cloudpickle")
+    options = Options(start=start, discard=8)
+    job = experiment_job(*arguments, options, 2)
+    _, layout = job.begin()
+    sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
+    mine, theirs = job.run(0, None), sent.run(0, 1)
+    assert mine.keys() == theirs.keys()
+    for name, values in mine.items():
+        np.testing.assert_array_equal(theirs[name], values)
+
+
+def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(whole, arguments, tmp_path):
+    other = hj.ExperimentData(whole.u, whole.y, n_sections=8, periods=4)
     n = np.arange(64)[None, :, None]
-    both = np.cos(2 * np.pi * n / 64 * 3) + np.cos(2 * np.pi * n / 64 * 19)
-    bad = hj.ExperimentData(both, both, n_sections=4, periods=16)
-    with pytest.raises(hj.DefinitionError, match="experiment 2: f = "):
-        hj.estimate_htf([good, good, bad])
+    good, high = np.cos(2 * np.pi * n / 64 * 3), np.cos(2 * np.pi * n / 64 * 19)
+    good, bad = (hj.ExperimentData(u, u, n_sections=4, periods=16) for u in (good, good + high))
+    for parts, message in (
+        ([whole, other], "do not belong together"),
+        ([], "no experiments"),
+        ([good, good, bad], "experiment 2: f = "),
+    ):
+        with pytest.raises(hj.DefinitionError, match=message):
+            hj.estimate_htf(parts)
+    with pytest.raises(hj.DefinitionError, match="holds no experiments"):
+        StoredExperiments(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(hj.DefinitionError, match="file"):
+        stream(*arguments, store=tmp_path / "file")

@@ -64,19 +64,6 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     assert len(one.guesses) == 1
 
 
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"free": "mass"}, "no parameter of Oscillator"),
-        ({"data": ()}, "one or more"),
-    ],
-)
-def test_bad_arguments_are_refused(oscillation, options, message):
-    options = {"data": observed(oscillation), "free": ("p", "w"), **options}
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.fit_model(oscillation.system, guess=oscillation, **options)
-
-
 @pytest.mark.slow
 def test_htfs_of_the_hopper_see_neither_its_leg_nor_actuator_and_gravity_apart(seen_in_htf):
     assert seen_in_htf.rank == 5

@@ -40,7 +40,6 @@ def test_bad_data_are_refused(make, message):
 
 
 def test_names_that_the_system_does_not_know_are_refused(hopper_cycle):
-    system = hopper_cycle.system
     force = hj.HTF(F, H, 0, 8, inputs="force", outputs="yM")
     height = hj.HTF(F, H, 0, 8, inputs="u", outputs="height")
     for data, message in (
@@ -49,4 +48,4 @@ def test_names_that_the_system_does_not_know_are_refused(hopper_cycle):
         (hj.ObservedSeries(records(inputs="force", outputs="yM"), SECTIONS), "force"),
     ):
         with pytest.raises(hj.DefinitionError, match=message):
-            hj.identifiability(system, data, "k", guess=hopper_cycle)
+            data.prepare(hopper_cycle)

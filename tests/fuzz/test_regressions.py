@@ -15,7 +15,6 @@ from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 
 from ..toys import Field
-from .campaign import check
 
 
 SETTINGS = Settings(1e-10, 1e-10)
@@ -88,7 +87,3 @@ def across(x, time, duration):
     u = jnp.zeros((1, 1))
     moved = move(s, lanes, u, until(t + duration), SETTINGS).moved
     return moved.result[0], moved.lanes.events[0]
-
-
-def test_an_event_is_where_its_guard_falls():
-    assert not check("dips", [28], seed=5, accuracy=1e-10).failures

@@ -51,10 +51,8 @@ def systems(t):
     yield hj.enable_compilation_cache, dict(folder=None)
     yield hj.Execution, {}
     yield hj.Settings, dict(rtol=1e-09, atol=1e-09)
-    yield (
-        hj.simulate,
-        dict(system=t.system, chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0),
-    )
+    begin = dict(chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0)
+    yield hj.simulate, dict(system=t.system) | begin
     yield t.trajectory, {}
     yield t.trajectory.dense, {}
 
@@ -102,19 +100,9 @@ def linear(t):
     yield t.model.rank, {}
     f, H = (np.asarray(t.estimate.f), np.asarray(t.estimate.H))
     size = np.ones(H.shape)
-    yield (
-        hj.HTF,
-        dict(
-            f=f,
-            H=H,
-            harmonics=(-1, 0, 1),
-            n_sections=6,
-            variance=size,
-            noise_variance=size,
-            scatter=hj.Scatter(np.ones(len(f)), size),
-        ),
-    )
     scatter = hj.Scatter(f, size)
+    errors = dict(variance=size, noise_variance=size, scatter=hj.Scatter(np.ones(len(f)), size))
+    yield hj.HTF, dict(f=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors
     yield hj.Scatter, dict(freedom=f, roundness=size)
     yield scatter.quantile, dict(level=0.9)
     htf = t.estimate
@@ -133,10 +121,8 @@ def designs(t):
     lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
     yield hj.paper_design, lines | dict(experiments=8)
-    yield (
-        hj.Design.from_lines,
-        dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0, n_sections=6, periods=16),
-    )
+    cosines = dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0)
+    yield hj.Design.from_lines, cosines | dict(n_sections=6, periods=16)
     good = {name: getattr(t.one_input, name) for name in t.one_input.__dataclass_fields__}
     yield hj.Design, good
     yield t.design.inputs, {}
@@ -208,11 +194,8 @@ def fitting(t):
     yield hj.spectral_radius, dict(model=t.model)
     yield hj.ObservedHTF, dict(htf=t.htf, sections=PHASE)
     yield hj.ObservedSeries, dict(data=t.series, sections=PHASE)
-    values = np.ones((4, 2))
-    yield (
-        hj.ObservedCycle,
-        dict(sections=PHASE, outputs=STATES, values=values, times=np.arange(4.0), period=1.0),
-    )
+    seen = dict(outputs=STATES, values=np.ones((4, 2)), times=np.arange(4.0), period=1.0)
+    yield hj.ObservedCycle, dict(sections=PHASE) | seen
     yield hj.ObservedCycle.of, dict(cycle=t.cycle, sections=PHASE, outputs=STATES)
     for name in ("ObservedCycle", "ObservedHTF"):
         made = t.observed if name == "ObservedCycle" else hj.ObservedHTF(t.htf, PHASE)
@@ -233,10 +216,8 @@ def designs_data(t):
     yield hj.designs.Distortion, dict(cycle=t.cycle, sections=PHASE, rms={"x": 1.0})
     yield hj.designs.Study, dict(first=t.one_input, order=1, standard_error=1.0)
     yield t.study.add, dict(data=t.block)
-    yield (
-        hj.designs.information_map,
-        dict(model=t.decaying, design=t.one_input, noise={"y": 1.0}, goal=t.study.goal),
-    )
+    question = dict(noise={"y": 1.0}, goal=t.study.goal)
+    yield hj.designs.information_map, dict(model=t.decaying, design=t.one_input) | question
     yield hj.designs.draws, dict(fit=t.joint, count=1)
     yield t.plan.strides_for, dict(standard_error=1.0)
 
@@ -263,10 +244,7 @@ def recordings(t):
     yield hj.recordings.choose_order, dict(data=t.section_data)
     yield hj.recordings.hold_out, dict(data=t.section_data, order=1)
     yield hj.recordings.impulse_responses, dict(fit=t.found.fit, data=t.found.data)
-    yield (
-        without_drift,
-        dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0),
-    )
+    yield without_drift, dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0)
     table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
     yield hj.recordings.add_command, table
     yield hj.recordings.write_design, dict(path="missing/d.csv", design=t.one_input)
@@ -338,21 +316,6 @@ def rhythms(t):
 
 
 PARTS = (
-    scale,
-    systems,
-    sections,
-    cycles,
-    linear,
-    designs,
-    experiments,
-    estimates,
-    series,
-    fitting,
-    designs_data,
-    recordings,
-    testing,
-    files,
-    conversions,
-    plots,
-    rhythms,
-)
+    scale, systems, sections, cycles, linear, designs, experiments, estimates, series, fitting,
+    designs_data, recordings, testing, files, conversions, plots, rhythms,
+)  # fmt: skip

@@ -173,16 +173,3 @@ def test_with_one_section_the_bound_is_that_of_free_numerators():
     free = hj.identify.multiplier_bound(one, htf, overhang=0)
     joint = hj.identify.ldtp_bound(one, htf)
     np.testing.assert_allclose(joint.covariance, free.covariance, rtol=1e-8)
-
-
-def test_bad_arguments(model, exact):
-    with pytest.raises(hj.DefinitionError, match="guess and data have different inputs"):
-        hj.fit_ldtp(exact, hj.LDTP(model.A, model.B, model.C, inputs=("a", "b")))
-    with pytest.raises(hj.DefinitionError, match="too few for"):
-        few = model.htf(F[:2], (0,))
-        hj.fit_ldtp(few, model)
-    hidden = eqx.tree_at(lambda m: m.C, model, jnp.zeros_like(model.C))
-    with pytest.raises(hj.DefinitionError, match="never seen in the outputs"):
-        hj.fit_ldtp(exact, hidden)
-    with pytest.raises(hj.DefinitionError, match="a bound needs the variances"):
-        hj.identify.ldtp_bound(model, model.htf(F))

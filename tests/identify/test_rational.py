@@ -1,7 +1,5 @@
 """The paper's parametric fit: its known bias, global optimum, bad input."""
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
@@ -72,26 +70,3 @@ def test_a_rational_function_is_found_exactly(form):
     # More poles than there are: the fit stays good and the true ones are among them.
     more = hj.fit_rational(hj.HTF(f, h[None, :, None, None], 0, 5), poles=4, zeros=3, form=form)
     assert np.all(np.abs(more.poles[0] - poles[:, None]).min(axis=1) < 1e-4)
-
-
-@pytest.mark.parametrize(
-    "message, arguments",
-    {
-        "there is no output 'xM'; the outputs are yM, vM": dict(output="xM"),
-        "Harmonic 40|not stored": dict(harmonic=2),
-        "too many for 3 frequencies": dict(poles=4, zeros=3),
-    }.items(),
-)
-def test_bad_arguments(message, arguments, exact):
-    few = hj.HTF(exact.f[:3], exact.H[16:17, :3], 0, 32, "u", ("yM", "vM"))
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.fit_rational(few, **arguments)
-
-
-def test_bad_values():
-    f, H = np.linspace(0.1, 0.9, 9), np.ones((1, 9, 1, 1), complex)
-    H[0, 3] = 0
-    with pytest.raises(hj.DefinitionError, match="zero at a frequency"):
-        hj.fit_rational(hj.HTF(f, H, 0, 4), weighting="relative")
-    with pytest.raises(hj.DefinitionError, match="H_0 of y holds NaN"):
-        hj.fit_rational(eqx.tree_at(lambda h: h.H, hj.HTF(f, H, 0, 4), jnp.asarray(np.nan * H)))

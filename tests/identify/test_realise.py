@@ -1,7 +1,6 @@
 """State-space models from responses: exact and minimal on exact data, sensible on noisy data."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
@@ -75,16 +74,3 @@ def test_from_noisy_htfs(exact, hopper, multipliers):
     model = hj.identify.realize(noisy, order=2)
     assert np.all(np.asarray(model.dims) <= MINIMAL)
     assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3
-
-
-def test_bad_requests(hopper, exact):
-    markov = np.asarray(hopper.impulse_response(30))
-    with pytest.raises(hj.DefinitionError, match="30 lags are too few for a horizon of 20"):
-        hj.identify.realize(markov, horizon=20)
-    with pytest.raises(hj.DefinitionError, match="one for each of 32 sections"):
-        hj.identify.realize(markov, [2, 2])
-    with pytest.raises(hj.DefinitionError, match="section 0 would have 9 dimensions"):
-        hj.identify.realize(markov, 9, horizon=4)
-    few = hj.HTF(exact.f[:3], exact.H[:, :3], exact.harmonics, 32)
-    with pytest.raises(hj.DefinitionError, match="3 frequencies are too few"):
-        hj.identify.realize(few, horizon=8)

@@ -1,6 +1,5 @@
 """The structured fit: exact on exact data, robust on measured data, bad input."""
 
-import equinox as eqx
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -58,28 +57,6 @@ def test_random_systems(shape, seed):
     np.testing.assert_allclose(fit.coefficients, polynomial[1:], atol=1e-8)
     assert fit.htf(htf.f).error(htf).max() < 1e-8
     assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)
-
-
-@pytest.mark.parametrize(
-    "message, arguments",
-    {
-        "50 frequencies are too few .* 97 coefficients and 2 multipliers: 98": dict(
-            order=2, harmonics=1
-        ),
-    }.items(),
-)
-def test_bad_arguments(message, arguments, exact):
-    few = hj.HTF(exact.f[:50], exact.H[:, :50], exact.harmonics, 32)
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.fit_multipliers(few, **arguments)
-
-
-def test_bad_values(exact):
-    with pytest.raises(hj.DefinitionError, match="NaN or infinity"):
-        hj.fit_multipliers(eqx.tree_at(lambda h: h.H, exact, exact.H * np.nan), 2)
-    H = np.asarray(exact.H) * np.array([1.0, 0.0])[:, None]
-    with pytest.raises(hj.DefinitionError, match="the HTFs of y1 are zero"):
-        hj.fit_multipliers(hj.HTF(exact.f, H, exact.harmonics, 32), 2)
 
 
 def test_pairs_are_matched_by_distance():

@@ -100,6 +100,7 @@ def test_without_variances_the_misfit_tells(small):
     assert blind.contains(model.multipliers, 0.999).all()
 
 
+@pytest.mark.slow
 def test_errors_with_the_poles_of_the_system_are_weighted_without_variances(small):
     """Those of process noise: nearly as accurate as with their variances, and regions hold."""
     model, htf = small
@@ -171,21 +172,3 @@ def test_first_order_covariances_and_regions(pair_and_real):
         MultiplierEstimate(true, draw, estimate.covariance, np.inf).contains(true) for draw in draws
     ]
     assert np.all([covered(n, 2000) for n in np.sum(held, axis=0)])
-
-
-def test_bad_requests(pair_and_real, small, variance):
-    estimate, _ = pair_and_real
-    with pytest.raises(hj.DefinitionError, match="no multiplier 3: the fit has 3"):
-        estimate.ellipse(3)
-    model, htf = small
-    with pytest.raises(hj.DefinitionError, match="these have none: take 'residuals'"):
-        hj.fit_multipliers(htf, 2, errors="variance")
-    wrong = variance.copy()
-    wrong[0, 3, 1] = np.inf
-    with pytest.raises(hj.DefinitionError, match="variance of H_-2 of y1 at f = 0.08.* is not"):
-        hj.fit_multipliers(with_variance(htf, htf.H, wrong), 2)
-    with pytest.raises(hj.DefinitionError, match="needs the variances"):
-        hj.identify.multiplier_bound(model, htf)
-    other = hj.HTF(htf.f, htf.H, htf.harmonics, 4, "u", ("a", "b"), variance=variance)
-    with pytest.raises(hj.DefinitionError, match="different outputs"):
-        hj.identify.multiplier_bound(model, other)

@@ -52,7 +52,7 @@ def test_a_wrong_model_is_refused(small):
 
 def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
     """White noise, and a response to the inputs of the last samples that the model lacks."""
-    noticed, runs, N = 0, 40, 4
+    noticed, runs, N = 0, 25, 4
     for seed in range(runs):
         data = record(small, N * 80, seed, 0.5)
         rng = np.random.default_rng(1000 + seed)
@@ -63,8 +63,8 @@ def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
         noticed += hj.validate(small, data).independence[1] < found.level / 2
     assert covered(noticed, runs, 0.8)
     assert "noticed in four of five such data: " in repr(found)
-    more = hj.validate(small, record(small, N * 320, 0, 0.5)).visible
-    np.testing.assert_allclose(more / found.visible, 0.5, rtol=0.15)
+    few, more = (hj.validate(small, record(small, N * n, 0, 0.5)).visible for n in (80, 320))
+    np.testing.assert_allclose(more / few, 0.5, rtol=0.15)
 
 
 def test_process_noise_is_correlated_in_time_only(small):
@@ -116,16 +116,6 @@ def test_amplitudes(small):
     assert repr(sweep).splitlines()[-1].split()[-1] == "1"
     with pytest.raises(hj.DefinitionError, match="must be positive"):
         hj.identify.amplitude_sweep(run, small, u, [0.0, 1.0])
-
-
-def test_bad_requests(small):
-    data = record(small, 4 * 50)
-    with pytest.raises(hj.DefinitionError, match="different n_sections: 6 and 4"):
-        hj.validate(hj.testing.synthetic_ldtp(), data)
-    with pytest.raises(hj.DefinitionError, match="sampled 5 times only"):
-        hj.validate(small, record(small, 20))
-    with pytest.raises(hj.DefinitionError, match="output y0 is constant or missing"):
-        hj.validate(small, hj.Record(data.u, data.y * [0, 1], n_sections=4))
 
 
 def test_records_shorter_than_the_lags(small):

@@ -1,6 +1,5 @@
 """Variances of HTFs: carried along, and what they say about an interval."""
 
-import jax
 import numpy as np
 import pytest
 from scipy import stats
@@ -51,19 +50,6 @@ def test_variances_go_along(htf):
     np.testing.assert_allclose(between.scatter.freedom, 4.0)
     np.testing.assert_allclose(between.scatter.roundness, between.noise_variance)
     assert an_htf().interpolate([0.1]).variance is None
-
-
-def test_scatter_is_kept(htf, tmp_path):
-    """In files, datasets, and by transformations of JAX."""
-    hj.save(tmp_path / "htf.npz", htf)
-    radius = htf.confidence_radius()
-    dataset = hj.convert.to_xarray(htf)
-    assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
-    for other in (hj.load(tmp_path / "htf.npz"), hj.convert.from_xarray(dataset)):
-        assert jax.tree.structure(other) == jax.tree.structure(htf)
-        np.testing.assert_array_equal(other.confidence_radius(), radius)
-    np.testing.assert_allclose(jax.jit(lambda x: x.confidence_radius())(htf), radius)
-    assert "scatter.roundness" in hj.convert.to_pandas(htf).columns
 
 
 def test_some_frequencies(htf):

@@ -31,11 +31,3 @@ def test_each_order_of_the_feet_has_its_derivative(cycle):
             whole = np.eye(4)
             whole[1::2, ::2] = expected * np.array([[1, sign], [1, 1]])
             np.testing.assert_allclose(derivative, whole, atol=1e-6)
-
-
-def test_the_cycle_itself_is_right(cycle):
-    np.testing.assert_allclose(
-        [cycle.state["y"], cycle.state["v"]], [0.415225379756, -1.054310796997], rtol=1e-10
-    )
-    with pytest.raises(hj.ComputationError, match=r"coincide.*coincidences"):
-        hj.find_limit_cycle(cycle.system, cycle)

@@ -102,20 +102,15 @@ def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
 
 def test_bad_input(juggling):
     follow = hj.continuation
-    bad = {"two or more": (0.2,), "ascending": (0.1, 0.3, 0.2), "finite": (0.1, np.nan)}
-    for words, values in (bad | {"outside of the values": (0.2, 0.3)}).items():
+    for words, values in {"ascending": (0.1, 0.3, 0.2), "outside of the": (0.2, 0.3)}.items():
         with pytest.raises(hj.DefinitionError, match=words):
             follow(juggling, "A", values)
     with pytest.raises(hj.DefinitionError, match="no parameter 'B'; parameters are A, T, g, rest"):
         follow(juggling, "B", (0.1, 0.2))
     with pytest.raises(hj.DefinitionError, match="no single floating-point number"):
         follow(juggling, "period", (0.1, 0.2))
-    with pytest.raises(hj.DefinitionError, match="`step` must be"):
-        follow(juggling, "A", (0.1, 0.2), step=0.0)
     with pytest.raises(hj.DefinitionError, match="outside of JAX transformations"):
         eqx.filter_jit(lambda c: follow(c, "A", (0.1, 0.2)).values)(juggling)
-    with pytest.raises(hj.DefinitionError, match="`multiplicity` must be an integer from 1"):
-        hj.find_limit_cycle(juggling.system, multiplicity=0)
     with pytest.raises(hj.DefinitionError, match="has multiplicity 1, not 2"):
         hj.find_limit_cycle(juggling.system, juggling, multiplicity=2)
 
@@ -151,9 +146,6 @@ def test_a_parameter_of_a_part():
     truth = np.exp(2 * np.pi * rate)
     truth = truth.real + 1j * np.abs(truth.imag)
     np.testing.assert_allclose(branch.multipliers[:, 0], truth, atol=1e-10)
-    x = [float(branch[k].anchor.q[0, 0]) for k in (0, -1)]
-    k = branch.values[[0, -1]]
-    np.testing.assert_allclose(x, (k - 1) / ((k - 1) ** 2 + 0.04), rtol=1e-10)
 
 
 @pytest.mark.slow

@@ -30,14 +30,9 @@ def test_one_cycle_of_a_family(running):
     assert "(1: conserved energy)" in repr(running)
 
 
-@pytest.mark.parametrize(
-    "conserved, words",
-    [({"y": 0.94}, "'y' is not conserved"), ({"energy": np.nan}, "one finite number"),
-     ({"momentum": 1.0}, "no output 'momentum'")],
-)  # fmt: skip
-def test_what_is_not_conserved_is_refused(conserved, words):
-    with pytest.raises(hj.DefinitionError, match=words):
-        hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX, conserved=conserved)
+def test_what_is_not_conserved_is_refused():
+    with pytest.raises(hj.DefinitionError, match="'y' is not conserved"):
+        hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX, conserved={"y": 0.94})
 
 
 def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):

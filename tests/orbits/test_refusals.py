@@ -38,19 +38,6 @@ def test_a_schedule_that_does_not_fit_the_clock():
         hj.find_limit_cycle(Kicked(beat=2.0, schedule=3.0), hj.Guess("a", (0.3,)))
 
 
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"section": hj.Crossing("yM", "falling")}, "returns to itself after its clock's period"),
-        ({"settle": 1.0}, "leave out `settle` and `max_period`"),
-        ({"multiplicity": 2}, "has multiplicity 1, not 2"),
-    ],
-)
-def test_a_cycle_as_the_guess(hopper_cycle, options, message):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, **options)
-
-
 def test_a_cycle_as_the_guess_begins_at_the_same_phase(hopper_cycle):
     """Of the clock of the other system."""
     slower = hj.models.VerticalHopper(omega=2 * jnp.pi / 1.05)

@@ -29,14 +29,6 @@ def test_magnitude_draws_the_values(estimate, exact):
     assert ax.get_ylabel() == "$|H_m|$, vM"
 
 
-def test_exact_lies_under_the_estimate_in_any_order(estimate, exact):
-    for htfs in ((estimate, exact), (exact, estimate)):
-        ax = hj.plot.magnitude(*htfs, harmonics=(0,)).ax
-        wide, thin = (x for x in ax.get_lines() if len(x.get_xdata()))
-        assert wide.get_zorder() < thin.get_zorder() and wide.get_linewidth() > 2
-        np.testing.assert_array_equal(thin.get_ydata(), np.abs(estimate[0][:, 0, 0]))
-
-
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
     figure = hj.plot.harmonics(
         {"isochron": (estimate, exact), "again": exact}, labels={"vM": r"$\dot y_M$"}

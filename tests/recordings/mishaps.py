@@ -1,5 +1,6 @@
 """What goes wrong in laboratories, by name: one table, and `mishandle`, which runs its rows."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -47,12 +48,11 @@ SECOND = (1,)
 def trials(change, only=None):
     """A mishap that replaces trials (default: all) by `change(trial, scene)`."""
 
-    def mishap(recording, input, outputs, event, rng):
+    def mishap(recording, *names):
         return [
-            change(t, Scene(recording, t, input, outputs, event, rng))
-            if only is None or k in only else t
+            change(t, Scene(recording, t, *names)) if only is None or k in only else t
             for k, t in enumerate(recording.trials)
-        ]  # fmt: skip
+        ]
 
     return mishap
 
@@ -61,34 +61,32 @@ def signals(which, change, only=None):
     """A mishap that replaces values x of signals by `change(x, scene)`: of the input "u", of the
     outputs "y", or of both "uy"; "y0": of the first output."""
 
-    def changed(trial, scene):
-        names = {"u": [scene.input], "y": scene.outputs, "uy": [scene.input, *scene.outputs]}
+    def changed(trial, s):
+        names = {"u": [s.input], "y": s.outputs, "uy": [s.input, *s.outputs]}
         values = np.array(trial.values)
-        for name in names.get(which) or [scene.outputs[int(which[1:])]]:
-            k = scene.recording.column(name)
-            values[:, k] = change(values[:, k], scene)
-        return Trial(trial.time, values, trial.events, trial.name)
+        for name in names.get(which) or [s.outputs[int(which[1:])]]:
+            k = s.recording.column(name)
+            values[:, k] = change(values[:, k], s)
+        return replace(trial, values=values)
 
     return trials(changed, only)
 
 
-def whole(change):
-    """A mishap of the list of trials."""
-    return lambda recording, *_: change(list(recording.trials))
-
-
-def kept(trial, rows, name=None):
+def kept(trial, rows):
     """Some of the samples, and the events between them."""
     t = trial.time[rows]
     events = {k: at[(at >= t[0]) & (at <= t[-1])] for k, at in trial.events.items()}
-    return Trial(t, trial.values[rows], events, name or trial.name)
+    return Trial(t, trial.values[rows], events, trial.name)
 
 
 def clock(change, only=None):
     """A mishap of the clock: all times t become `change(t, scene)`."""
-    return trials(lambda trial, s: Trial(
-        change(trial.time, s), trial.values,
-        {k: change(at, s) for k, at in trial.events.items()}, trial.name), only)  # fmt: skip
+
+    def changed(trial, s):
+        events = {k: change(at, s) for k, at in trial.events.items()}
+        return replace(trial, time=change(trial.time, s), events=events)
+
+    return trials(changed, only)
 
 
 def clipped(which, low, high):
@@ -96,11 +94,8 @@ def clipped(which, low, high):
 
 
 def struck(which, share):
-    def hit(x, s):
-        where = s.rng.random(len(x)) < share
-        return x + where * 20.0 * x.std() * s.rng.choice([-1.0, 1.0], len(x))
-
-    return signals(which, hit)
+    return signals(which, lambda x, s: x + (s.rng.random(len(x)) < share) * (
+        20.0 * x.std() * s.rng.choice([-1.0, 1.0], len(x))))  # fmt: skip
 
 
 def placeholder(value, cycles):
@@ -114,8 +109,8 @@ def placeholder(value, cycles):
 def frozen(which, share):
     def freeze(x, s):
         first = int((1 - share) / 2 * len(x))
-        last = first + round(share * len(x))
-        return np.concatenate([x[:first], np.full(last - first, x[first]), x[last:]])
+        rows = np.arange(len(x))
+        return np.where((rows >= first) & (rows < first + round(share * len(x))), x[first], x)
 
     return signals(which, freeze, SECOND)
 
@@ -140,31 +135,27 @@ def hidden_events(trial, s):
     middles = s.rng.choice(trial.events[s.event], 5, replace=False)
     away = np.abs(trial.time[:, None] - middles).min(axis=1) < 0.075 * s.period
     values[np.ix_(away, [s.recording.column(x) for x in s.outputs])] = np.nan
-    return Trial(trial.time, values, trial.events, trial.name)
+    return replace(trial, values=values)
 
 
 def swapped(trial, s):
     values, places = trial.values.copy(), [s.recording.column(x) for x in s.outputs[:2]]
     values[:, places] = values[:, places[::-1]]
-    return Trial(trial.time, values, trial.events, trial.name)
+    return replace(trial, values=values)
 
 
 def pause(trial, s):
-    def away(t):
-        return np.abs(t - trial.time.mean()) > 2.2 * s.period
-
-    events = {k: t[away(t)] for k, t in trial.events.items()}
-    return Trial(trial.time[away(trial.time)], trial.values[away(trial.time)], events, trial.name)
+    events = {k: t[np.abs(t - trial.time.mean()) > 2.2 * s.period] for k, t in trial.events.items()}
+    return replace(kept(trial, s.from_middle > 2.2), events=events)
 
 
 def late(samples, only=None):
     def shift(trial, s):
-        n, k = len(trial.time) - abs(samples), s.recording.column(s.input)
-        first, start = max(samples, 0), max(-samples, 0)
-        moved = kept(trial, slice(first, first + n))
-        values = moved.values.copy()
-        values[:, k] = trial.values[start : start + n, k]
-        return Trial(moved.time, values, moved.events, trial.name)
+        k = s.recording.column(s.input)
+        values = trial.values.copy()
+        values[:, k] = np.roll(values[:, k], samples)
+        rows = slice(samples, None) if samples > 0 else slice(None, samples)
+        return kept(replace(trial, values=values), rows)
 
     return trials(shift, only)
 
@@ -184,13 +175,19 @@ def misjudged(lost=0.0, doubled=0.0, off=0.0):
         again = order[n : n + round(doubled * len(at))]
         at = np.concatenate([np.delete(at, order[:n]), at[again] + 0.05 * s.period])
         at = np.sort(at + off * s.period * s.rng.normal(size=len(at)))
-        return Trial(trial.time, trial.values, trial.events | {s.event: at}, trial.name)
+        return replace(trial, events=trial.events | {s.event: at})
 
     return trials(misjudge)
 
 
-def thrice(x):
-    return [x[0], *(kept(x[0], slice(None), f"{x[0].name} ({k})") for k in (2, 3)), *x[1:]]
+def with_copies(recording, *_):
+    first, *more = recording.trials
+    return [first, *(replace(first, name=f"{first.name} ({k})") for k in (2, 3)), *more]
+
+
+def with_end(recording, *_):
+    end = kept(recording.trials[0], slice(len(recording.trials[0].time) // 2, None))
+    return [*recording.trials, replace(end, name="end")]
 
 
 # Sizes are in standard deviations of each signal.
@@ -249,17 +246,15 @@ MISHAPS = {
     "push unrelated in all": signals("u", lambda x, s: np.roll(x, len(x) // 2)),
     "push switched on late": signals("u", lambda x, s: np.where(s.cycles < 10.0, 0.0, x)),
     "push not plugged in": signals("u", lambda x, s: 0 * x),
-    "the same trial thrice": whole(thrice),
-    "overlapping trials": whole(lambda x: [
-        *x, kept(x[0], slice(len(x[0].time) // 2, None), f"{x[0].name}, end")]),
+    "the same trial thrice": with_copies,
+    "overlapping trials": with_end,
     # clocks
     "a third of the samples not there": trials(
         lambda trial, s: kept(trial, s.rng.random(len(trial.time)) > 1 / 3)
     ),
     "few samples": trials(lambda trial, s: kept(trial, slice(0, None, 8))),
-    "jitter of the time stamps": trials(lambda trial, s: Trial(
-        trial.time + 0.05 * np.median(np.diff(trial.time)) * s.rng.uniform(-1, 1, len(trial.time)),
-        trial.values, trial.events, trial.name)),
+    "jitter of the time stamps": trials(lambda trial, s: replace(trial, time=trial.time + (
+        0.05 * np.median(np.diff(trial.time)) * s.rng.uniform(-1, 1, len(trial.time))))),
     "a pause": trials(pause),
     "clock slows down": clock(lambda t, s: t + 0.05 * (t - s.trial.time[0]) ** 2 / (
         2 * np.ptp(s.trial.time))),
@@ -277,9 +272,8 @@ MISHAPS = {
 EVENT_MISHAPS = {
     "events lost and doubled": misjudged(lost=0.05, doubled=0.05),
     "events inexact": misjudged(off=0.0005),
-    "another event in one trial": trials(lambda trial, s: Trial(
-        trial.time, trial.values,
-        trial.events | {s.event: trial.events[s.event] + 0.4 * s.period}, trial.name), SECOND),
+    "another event in one trial": trials(lambda trial, s: replace(
+        trial, events={s.event: trial.events[s.event] + 0.4 * s.period}), SECOND),
 }  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """Files of each kind, written by the library of their kind, and what is refused in one sentence."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -84,20 +86,13 @@ def test_matlab(tmp_path, write):
     assert set(found.signals) == {"force.f", "x", "pair.0", "pair.1"}
     np.testing.assert_array_equal(samples(found, "pair.1")[1], 2 * X)
     np.testing.assert_array_equal(found.trials[0].events["strike"], [0.05, 0.1])
+    write(tmp_path / "y.mat", {"time": SLOW, "x": X, "f": F})
+    refused("'f' has .*190.* numbers, but its times 'time' 20", tmp_path / "y.mat")
+    refused("no times 't' for '[ftx]", tmp_path / "y.mat", time="t", kind=hj.DefinitionError)
     only = hj.read_recording(tmp_path / "x.mat", signals="pair", units={"pair.0": "m"})
     assert only.signals == ("pair.0", "pair.1") and only.unit("pair.0") == "m"
     assert len(only.trials[0].time) == len(SLOW)
     refused("no signal 'y'; it has ", tmp_path / "x.mat", signals="y", kind=hj.DefinitionError)
-
-
-@pytest.mark.parametrize("write", [write_v5, write_v73])
-def test_two_clocks_without_groups(tmp_path, write):
-    write(tmp_path / "x.mat", {"time": SLOW, "x": X, "f": F})
-    refused("'f' has .*190.* numbers, but its times 'time' 20", tmp_path / "x.mat")
-    assert hj.read_recording(tmp_path / "x.mat", signals=["x"]).signals == ("x",)
-    write(tmp_path / "y.mat", {"t": SLOW, "x": X})
-    refused("no times 'time' for '[tx]'", tmp_path / "y.mat", kind=hj.DefinitionError)
-    assert hj.read_recording(tmp_path / "y.mat", time="t").signals == ("x",)
 
 
 def test_arrays_of_structs(tmp_path):
@@ -239,91 +234,67 @@ def test_c3d(tmp_path):
     refused("no signal 'EMG1'; it has LASI.x", path, signals="EMG1", kind=hj.DefinitionError)
     path.write_bytes(path.read_bytes()[:2500])
     refused("frames, but its header says 20", path)
-    path.write_bytes(b"no")
-    refused("no C3D file, or damaged", path)
-
-
-def test_events_outside_of_the_recording(tmp_path):
-    path = tmp_path / "walk.c3d"
-    write_c3d(path, first=10)
-    found = hj.read_recording(path)
-    assert found.trials[0].time[0] == 0.1
+    write_c3d(tmp_path / "late.c3d", first=10)
+    found = hj.read_recording(tmp_path / "late.c3d")
     np.testing.assert_allclose(found.trials[0].events["Left Strike"], [0.1], atol=1e-7)
     assert "1 events 'Left Strike' outside of the recording were left out" in found.notes
-    write_c3d(path, first=50)
-    refused("all events 'Left Strike' .* are outside of", path, kind=hj.DefinitionError)
+    write_c3d(tmp_path / "late.c3d", first=50)
+    refused("all events 'Left Strike' .* are", tmp_path / "late.c3d", kind=hj.DefinitionError)
+    path.write_bytes(b"no")
+    refused("no C3D file, or damaged", path)
 
 
 # ROS
 
 
 def write_bag(path, version):
-    """Two topics with stamps that are not the times of arrival, one without, one of images."""
+    """A topic with stamps that are not the times of arrival, one without, one of images."""
     pytest.importorskip("rosbags")
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS1_NOETIC if version == "bag" else Stores.ROS2_HUMBLE)
-    kinds = store.types
-    second, late = 10**9, 30_000_000
-
-    def header(t):
-        stamp = kinds["builtin_interfaces/msg/Time"](5 + int(t), round(t % 1 * second))
-        extra = {"seq": 0} if version == "bag" else {}
-        return kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="", **extra)
-
-    vector = kinds["geometry_msgs/msg/Vector3"]
+    is_1 = version == "bag"
+    store = get_typestore(Stores.ROS1_NOETIC if is_1 else Stores.ROS2_HUMBLE)
+    kinds, seq = store.types, {"seq": 0} if is_1 else {}
+    time, header = kinds["builtin_interfaces/msg/Time"], kinds["std_msgs/msg/Header"]
+    point, stamped = kinds["geometry_msgs/msg/Point"], kinds["geometry_msgs/msg/PointStamped"]
+    layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
+    image = kinds["std_msgs/msg/UInt8MultiArray"](layout, np.zeros(1000, np.uint8))
     messages = []
     for t, x in zip(SLOW, X, strict=True):
-        point = kinds["geometry_msgs/msg/PointStamped"](
-            header(t), kinds["geometry_msgs/msg/Point"](x, 2 * x, 0.0)
-        )
-        messages.append((t, "/body", point))
-    for t, f in zip(FAST, F, strict=True):
-        wrench = kinds["geometry_msgs/msg/Wrench"](vector(f, 0.0, 0.0), vector(0.0, 0.0, 0.0))
-        messages.append((t, "/plate", kinds["geometry_msgs/msg/WrenchStamped"](header(t), wrench)))
-    for t in SLOW:
+        head = header(stamp=time(5 + int(t), round(t % 1 * 1e9)), frame_id="", **seq)
+        messages.append((t, "/body", stamped(head, point(x, 2 * x, 0.0))))
         messages.append((t, "/count", kinds["std_msgs/msg/Float64"](t)))
-        layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
-        image = kinds["std_msgs/msg/UInt8MultiArray"](layout, np.zeros(1000, np.uint8))
         messages.append((t, "/image", image))
-    if version == "bag":
-        writer = rosbag1.Writer(path)
+    if is_1:
+        writer, pack = rosbag1.Writer(path), store.serialize_ros1
     else:
         plugin = rosbag2.StoragePlugin[version.upper()]
-        writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        writer, pack = rosbag2.Writer(path, version=9, storage_plugin=plugin), store.serialize_cdr
     with writer:
-        connections = {}
-        for t, topic, message in messages:
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            pack = store.serialize_ros1 if version == "bag" else store.serialize_cdr
-            arrival = round((5 + t) * second) + late
-            writer.write(connections[topic], arrival, pack(message, kind))
+        topics = {topic: x.__msgtype__ for _, topic, x in messages}
+        connections = {x: writer.add_connection(x, k, typestore=store) for x, k in topics.items()}
+        for t, topic, x in messages:
+            arrival = round((5 + t) * 1e9) + 30_000_000
+            writer.write(connections[topic], arrival, pack(x, topics[topic]))
 
 
-@pytest.mark.parametrize("version", ["bag", "mcap", "sqlite3"])
+@pytest.mark.parametrize("version", ["bag", "mcap"])
 def test_bags(tmp_path, version):
     path = tmp_path / ("x.bag" if version == "bag" else "x")
     write_bag(path, version)
-    found = hj.read_recording(path, signals=["body.point", "plate.wrench.force.x", "count"])
-    assert found.signals == (
-        "body.point.x", "body.point.y", "body.point.z", "plate.wrench.force.x", "count.data",
-    )  # fmt: skip
-    shift = 0.03  # of arrival, from which times count
-    t, f = samples(found, "plate.wrench.force.x")
-    np.testing.assert_allclose(t, FAST - shift, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(f, F)
-    np.testing.assert_allclose(samples(found, "body.point.y"), [SLOW - shift, 2 * X], atol=1e-12)
+    found = hj.read_recording(path, signals=["body.point", "count"])
+    assert found.signals == ("body.point.x", "body.point.y", "body.point.z", "count.data")
+    stamps = SLOW - 0.03  # of arrival, from which times count
+    np.testing.assert_allclose(samples(found, "body.point.y"), [stamps, 2 * X], atol=1e-12)
     np.testing.assert_allclose(samples(found, "count.data"), [SLOW, SLOW], atol=1e-12)
     assert any("times of count are those of arrival" in note for note in found.notes)
+    assert "image.data.0" not in hj.read_recording(path).signals
     refused("no signal 'imu.x'; it has body, count", path, signals="imu.x", kind=hj.DefinitionError)
-    refused("no signal 'body.pose'; it has", path, signals="body.pose", kind=hj.DefinitionError)
     if version != "bag":
         (single,) = (x for x in path.iterdir() if x.suffix != ".yaml")
-        alone = hj.read_recording(single, signals="plate.wrench.force.x")
-        np.testing.assert_array_equal(samples(alone, "plate.wrench.force.x")[1], F)
+        alone = hj.read_recording(single, signals="body")
+        np.testing.assert_array_equal(samples(alone, "body.point.x")[1], X)
     else:
         path.write_bytes(path.read_bytes()[:500])
         refused("no bag of ROS, or damaged", path)
@@ -332,21 +303,17 @@ def test_bags(tmp_path, version):
 # All of them
 
 
-@pytest.mark.parametrize(
-    ("suffix", "library", "extra"),
-    [
+def test_libraries_that_are_not_there(tmp_path, monkeypatch):
+    for suffix, library, extra in [
         (".c3d", "ezc3d", "c3d"),
         (".h5", "h5py", "mat"),
-        (".xlsx", "openpyxl", "tables"),
         (".feather", "pyarrow.dataset", "tables"),
         (".mcap", "rosbags.highlevel", "ros"),
-    ],
-)
-def test_libraries_that_are_not_there(tmp_path, monkeypatch, suffix, library, extra):
-    monkeypatch.setitem(__import__("sys").modules, library, None)
-    (tmp_path / f"x{suffix}").write_bytes(b"x")
-    with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{extra}\]'"):
-        hj.read_recording(tmp_path / f"x{suffix}")
+    ]:
+        monkeypatch.setitem(sys.modules, library, None)
+        (tmp_path / f"x{suffix}").write_bytes(b"x")
+        with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{extra}\]'"):
+            hj.read_recording(tmp_path / f"x{suffix}")
 
 
 def test_files_that_declare_more_than_they_hold(tmp_path, monkeypatch):
@@ -362,15 +329,3 @@ def test_files_that_declare_more_than_they_hold(tmp_path, monkeypatch):
     parts = [hj.Recording(SLOW, {"x": X}), hj.Recording(FAST, {"f": F})]
     with pytest.raises(hj.DefinitionError, match="2 signals at 191 times are too many"):
         hj.Recording.beside(parts)
-
-
-def test_recordings_beside_each_other():
-    x, f = hj.Recording(SLOW, {"x": X}, units={"x": "m"}), hj.Recording(FAST + 5e-4, {"f": F})
-    both = hj.Recording.beside([x, f])
-    np.testing.assert_array_equal(samples(both, "x"), [SLOW, X])
-    np.testing.assert_array_equal(samples(both, "f"), [FAST + 5e-4, F])
-    assert both.unit("x") == "m" and "different rates or clocks" in both.notes[0]
-    with pytest.raises(hj.DefinitionError, match="two of the recordings have a signal 'x'"):
-        hj.Recording.beside([x, x])
-    with pytest.raises(hj.DefinitionError, match="same number of trials"):
-        hj.Recording.beside([x, hj.Recording.join([f, f])])

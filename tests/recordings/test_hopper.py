@@ -1,11 +1,11 @@
 """From a recording to multipliers, where the truth is known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import hybridjax as hj
-
-from .mishaps import mishandle
 
 
 def spoil(recording, signals=("yM", "vM"), **dirt):
@@ -36,87 +36,6 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     assert not any(w.cause == "outputs" for w in hj.recordings.advise(data[1], fits[1]).warnings)
 
 
-def test_slow_change_of_the_period(hopper_recording, hopper_cycle, angle):
-    """Everything goes slower and slower: multipliers stay what they are, and phase says by how
-    much."""
-    names = {"input": "u", "outputs": ("yM", "vM"), "event": ""}
-    slower = mishandle(spoil(hopper_recording, noise=1e-4), "clock slows down", **names)
-    phase = hj.recordings.estimate_phase(slower, angle)
-    assert phase.drift * phase.cycles == pytest.approx(0.05, rel=0.1)
-    data = hj.recordings.section_data(
-        slower, phase, inputs="u", outputs=("yM", "vM"), n_sections=16
-    )
-    fit = hj.fit_series(data.records, order=2)
-    assert fit.compare(hopper_cycle.multipliers).max_error < 3e-3
-    assert fit.contains(hopper_cycle.multipliers, 0.999).all()
-
-
-def test_van_der_pol_without_a_clock():
-    system = hj.models.VanDerPol(mu=0.1)
-    cycle = hj.find_limit_cycle(system)
-    period = float(cycle.period)
-    rate = 64 / period
-    force = np.stack(
-        [hj.testing.random_force(100 * period, rate, 2 / period, rms=0.02, seed=k) for k in (0, 1)]
-    )
-    made = hj.testing.simulate_recording(cycle, force, ("x", "v"), rate=rate, steps=1)
-    noisy = spoil(made, ("x", "v"), noise=1e-4)
-    data = hj.recordings.section_data(
-        noisy,
-        hj.KinematicPhase(8, position="x", velocity="v"),
-        inputs="u",
-        outputs=("x", "v"),
-        n_sections=8,
-        timing="duration",
-    )
-    fit = hj.fit_series(data.records, order=1)
-    assert fit.compare(cycle.multipliers[:1]).max_error < 5e-3
-    assert fit.contains(cycle.multipliers[:1], 0.999).all()
-
-
-@pytest.mark.slow
-def test_compass_gait_by_events():
-    """Its third multiplier, 0.13, is small enough for the overhang."""
-    cycle = hj.find_limit_cycle(hj.models.CompassGait(), section=hj.AtEvent("heelstrike"))
-    period, outputs = float(cycle.period), ("n", "s", "vn", "vs")
-    rate = 200 / period
-    force = [
-        hj.testing.random_force(100 * period, rate, 8 / period, rms=0.05, seed=k) for k in range(5)
-    ]
-    made = hj.testing.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
-    noisy = spoil(made, outputs, noise=1e-4)
-    marked = noisy.mark("middle", hj.Crossing("s", "falling"), bandwidth=20 / period)
-    data = hj.recordings.section_data(
-        marked, hj.AtEvent("middle"), inputs="u", outputs=outputs, n_sections=16, timing="duration"
-    )
-    fit = hj.fit_series(data.records, order=2, overhang=32)
-    assert fit.compare(cycle.multipliers[:2]).max_error < 1e-2
-    assert fit.contains(cycle.multipliers[:2], 0.999).all()
-
-
-@pytest.mark.slow
-def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
-    """Against the exact linearization, averaged over the push."""
-    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
-    data = hj.recordings.section_data(hopper_recording, angle, **options)
-    fit = hj.fit_series(data.records, order=2)
-    found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
-    sections = hj.KinematicPhase(
-        16, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
-        anchor=hj.Crossing("vM", "falling"),
-    )  # fmt: skip
-    exact = hj.linearize(hopper_cycle, sections, ("yM", "vM")).impulse_response(64)
-    reach, step = 4, found.period / 16
-    k = np.arange(-reach, reach + 1)
-    push = np.exp(-0.5 * (k / (16 * found.width)) ** 2)
-    for m in (0, 5, 11):
-        for r in (8, 20, 31):
-            n = (m + r) % 16
-            value = sum(w * exact[n, r - j] for w, j in zip(push / push.sum(), k, strict=True))
-            miss = np.abs(found.values[m, r, :, 0] - value[:, 0] / step)
-            assert (miss < 0.03 * np.abs(found.values[..., 0]).max(axis=(0, 1))).all()
-
-
 @pytest.mark.slow
 def test_order_and_advice(hopper_recording, angle):
     noisy = spoil(hopper_recording, noise=1e-3)
@@ -142,3 +61,38 @@ def test_order_and_advice(hopper_recording, angle):
     poor = hj.recordings.section_data(slow, angle, **options)
     said = hj.recordings.advise(poor, hj.fit_series(poor.records, order=2, **fast)).warnings
     assert any(w.cause == "narrow excitation" for w in said)
+
+
+def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycle):
+    """Sixteen sections of four samples each, spikes in one per cent of force and outputs."""
+    clean = spoil(hopper_recording, noise=1e-4)
+    fits, data, apex = [], [], hj.Crossing("vM", "falling")
+    dirty = spoil(clean, ("u", "yM", "vM"), spikes=1e-2, seed=1)
+    for recording in (clean, dirty):
+        options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
+        data.append(hj.recordings.section_data(recording, apex, **options))
+        fits.append(hj.fit_series(data[-1], order=2))
+    changed = (clean.trials[0].values != dirty.trials[0].values).sum(axis=0)
+    assert np.abs(data[1].spikes - changed).max() <= 0.05 * max(changed) + 1
+    assert fits[1].standard_errors[0] < 2 * fits[0].standard_errors[0]
+    assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
+    assert any(w.cause == "spikes" for w in hj.recordings.advise(data[1], fits[1]).warnings)
+
+
+@pytest.mark.slow
+def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
+    """Against the exact linearization, averaged over the push."""
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
+    data = hj.recordings.section_data(hopper_recording, angle, **options)
+    fit = hj.fit_series(data.records, order=2)
+    found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
+    sections = dataclasses.replace(angle, anchor=hj.Crossing("vM", "falling"))
+    exact = hj.linearize(hopper_cycle, sections, ("yM", "vM")).impulse_response(64)
+    reach, step = 4, found.period / 16
+    k = np.arange(-reach, reach + 1)
+    push = np.exp(-0.5 * (k / (16 * found.width)) ** 2)
+    for m, r in [(0, 8), (5, 20), (11, 31)]:
+        n = (m + r) % 16
+        value = sum(w * exact[n, r - j] for w, j in zip(push / push.sum(), k, strict=True))
+        miss = np.abs(found.values[m, r, :, 0] - value[:, 0] / step)
+        assert (miss < 0.03 * np.abs(found.values[..., 0]).max(axis=(0, 1))).all()

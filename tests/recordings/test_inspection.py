@@ -1,4 +1,4 @@
-"""What is wrong with recordings is recognized, and nothing is where nothing is wrong."""
+"""Faults of recordings are named, and nothing is found where there is none."""
 
 import functools
 
@@ -49,72 +49,64 @@ def causes(recording, phase=TOP):
     return {f.cause for f in findings(recording, phase)}
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("force", "noise"), [(0.1, 1e-3), (0.3, 0.0)])
 def test_nothing_is_found_where_nothing_is_wrong(seed, force, noise):
     assert findings(made_up(seed, force, noise)) == ()
 
 
-SAID = {
-    "slow drift": "drift",
-    "the zero wanders": "drift",
-    "clipped at the top": "clipped",
-    "clipped at both ends": "clipped",
-    "push clipped": "clipped",
-    "integers overflow": "overflow",
-    "-9999 for no value": "no value",
-    "0 for no value": "frozen",
-    "output frozen for a while": "frozen",
-    "output frozen": "an empty trial",
-    "push frozen for a while": "frozen",
-    "millimeters in one trial": "another unit",
-    "kilonewtons in one trial": "another unit",
-    "sign of an output in one trial": "another sign",
-    "sign of the push in one trial": "another sign",
-    "other zero in one trial": "another zero",
-    "sensor slips in one trial": "drift",
-    "columns swapped in one trial": "swapped columns",
-    "an output twice": "a signal twice",
-    "push of another trial": "foreign input",
-    "push unrelated in all": "no answer",
-    "push switched on late": "disturbed",
-    "the same trial thrice": "a trial twice",
-    "overlapping trials": "a trial twice",
-    "a pause": "jump of the clock",
-    "clock set forward": "jump of the clock",
-    "milliseconds in one trial": "another unit of time",
-    "slow clock in one trial": "another period",
-    "push late in one trial": "foreign input",
-    "another event in one trial": "another event",
-}
+CAUSES = {
+    "drift": ["slow drift", "the zero wanders", "sensor slips in one trial"],
+    "clipped": ["clipped at the top", "clipped at both ends", "push clipped"],
+    "overflow": ["integers overflow"],
+    "no value": ["-9999 for no value"],
+    "frozen": ["0 for no value", "output frozen for a while", "push frozen for a while"],
+    "an empty trial": ["output frozen"],
+    "another unit": ["millimeters in one trial", "kilonewtons in one trial"],
+    "another sign": ["sign of an output in one trial", "sign of the push in one trial"],
+    "another zero": ["other zero in one trial"],
+    "swapped columns": ["columns swapped in one trial"],
+    "a signal twice": ["an output twice"],
+    "foreign input": ["push of another trial", "push late in one trial"],
+    "no answer": ["push unrelated in all"],
+    "disturbed": ["push switched on late"],
+    "a trial twice": ["the same trial thrice", "overlapping trials"],
+    "jump of the clock": ["a pause", "clock set forward"],
+    "another unit of time": ["milliseconds in one trial"],
+    "another period": ["slow clock in one trial"],
+    "another event": ["another event in one trial"],
+    "": [
+        "rounded to 12 bits", "slow sensors", "sensor saturates softly", "1 % of the samples lost",
+        "gap of five cycles", "gap of the push", "a third of the samples not there", "few samples",
+        "clock slows down", "push late", "push early", "events lost and doubled",
+    ],
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("mishap", SAID)
-def test_causes_are_named(mishap):
+@pytest.mark.parametrize(("cause", "mishap"), [(c, x) for c in CAUSES for x in CAUSES[c]])
+def test_causes_are_named(cause, mishap):
     phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
-    assert SAID[mishap] in causes(mishandle(made_up(0), mishap, **NAMES), phase)
+    named = causes(mishandle(made_up(0), mishap, **NAMES), phase)
+    assert cause in named if cause else not named
 
 
-HARMLESS = sorted({
-    "rounded to 12 bits", "slow sensors", "sensor saturates softly", "1 % of the samples lost",
-    "gap of five cycles", "gap of the push", "a third of the samples not there", "few samples",
-    "clock slows down", "push late", "push early", "events lost and doubled",
-})  # fmt: skip
+APEX = hj.Crossing("vM", "falling")
 
 
-@pytest.mark.parametrize("mishap", HARMLESS)
-def test_nothing_is_said_of_what_does_no_harm(mishap):
-    phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
-    assert not causes(mishandle(made_up(0), mishap, **NAMES), phase)
-
-
-def test_all_mishaps_are_tried():
-    """Here, or (where noise is all that happens) by `python benchmarks/recordings.py mishaps`."""
-    noisy = {
-        "white noise", "hum of the mains", "push leaks into outputs", "jitter of the time stamps",
-        "other gain in one trial", "0.1 % spikes", "1 % spikes", "0.1 % spikes of the push",
-        "gaps over the crossing", "events inexact", "clock of the push is fast",
-    }  # fmt: skip
-    refused = {"push not plugged in", "clock set back"}
-    assert {*SAID, *HARMLESS, *noisy, *refused} == {*MISHAPS, *EVENT_MISHAPS}
-    assert len(MISHAPS | EVENT_MISHAPS) >= 40
+@pytest.mark.slow
+@pytest.mark.parametrize("mishap", [*MISHAPS, *EVENT_MISHAPS])
+def test_none_is_silently_wrong(hopper_cycle, mishap):
+    """Four trials of 75 strides, with noise, in which each apex is an event."""
+    force = [hj.testing.random_force(75, 128, 8, rms=0.02, seed=k) for k in range(4)]
+    outputs = ("yM", "vM")
+    made = hj.testing.simulate_recording(hopper_cycle, np.stack(force), outputs, rate=128, steps=1)
+    trials = hj.testing.spoil(made, outputs, noise=1e-4).mark("apex", APEX, bandwidth=16)
+    phase = hj.AtEvent("apex") if mishap in EVENT_MISHAPS else APEX
+    try:
+        dirty = mishandle(trials, mishap, input="u", outputs=outputs, event="apex")
+        found = hj.identify_recording(
+            dirty, phase, inputs="u", outputs=outputs, n_sections=16, order=2
+        )
+    except hj.DefinitionError:
+        return
+    assert found.findings or found.fit.contains(hopper_cycle.multipliers, 0.999).all()

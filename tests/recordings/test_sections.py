@@ -1,6 +1,5 @@
 """Section data against closed forms, its masks, tables of designs, and the command."""
 
-import functools
 import html
 import json
 import re
@@ -11,7 +10,6 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
-from hybridjax.identify.series.fit import fit_records
 from hybridjax.recordings.sampling import without_drift
 
 from .conftest import MULTIPLIER
@@ -39,6 +37,10 @@ def test_a_circle(wave):
         np.diff(area) / 3 / np.diff(times), atol=2e-3,
     )  # fmt: skip
     assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
+    timed = sample(wave, timing="clock")
+    assert timed.outputs == ("x", "v", "time") and timed.rms()[1][2] < 1e-4
+    with pytest.raises(hj.DefinitionError, match="n_sections is 16, but .* family of 8"):
+        sample(wave, n_sections=16)
     assert "SectionData(19.75 cycles of 8 sections in 1 records; period 1;" in repr(data)
 
 
@@ -55,35 +57,6 @@ def test_gaps_are_masked_and_cut(wave):
         end = np.append(times[1:], times[-1] + 0.125)
         np.testing.assert_array_equal(np.isnan(record.u[:, 0]), (end > 9.11) & (times < 9.29))
     assert 0 < data.missing < 0.1
-
-
-def test_nothing_is_made_up_before_and_after_a_signal(wave):
-    """A signal that begins later than the events that are the phase, and ends earlier."""
-    t, (f, x, _) = wave.trials[0].time, wave.trials[0].values.T
-    late, early = np.where(t < 3.3, np.nan, x), np.where(t > 17.3, np.nan, f)
-    recording = hj.Recording(t, {"f": early, "x": late}, events={"top": np.arange(-1.0, 25)})
-    data = sample(recording, hj.AtEvent("top"), outputs="x", n_sections=8)
-    (record,), (times,) = data.records, data.times
-    assert times[0] == 0.0 and times[-1] < 20.0
-    np.testing.assert_array_equal(np.isnan(record.y[:, 0]), times < 3.29)
-    np.testing.assert_array_equal(np.isnan(record.u[:, 0]), times + 1 / 8 > 17.31)
-
-
-def test_a_gap_in_the_signals_of_the_phase_masks_all_outputs(wave):
-    """Where the phase was not seen, sections are not known to be sections, nor their times."""
-    t, (f, x, v) = wave.trials[0].time, wave.trials[0].values.T
-    hidden = np.where((t > 4.3) & (t < 4.5), np.nan, v)
-    recording = hj.Recording(t, {"f": f, "x": x, "v": hidden, "w": np.cos(4 * np.pi * t)})
-    for timing, late in (("clock", 0), ("duration", 1 / 8)):
-        data = sample(recording, outputs=("x", "w"), timing=timing)
-        (record,), (times,) = data.records, data.times
-        lost = (times > 4.3) & (times < 4.5)
-        assert lost.sum() == 2
-        np.testing.assert_array_equal(np.isnan(record.y[:, :2]).all(axis=1), lost)
-        after = (times > 4.3) & (times < 4.5 + late)
-        after[0] = timing == "duration"
-        np.testing.assert_array_equal(np.isnan(record.y[:, 2]), after)
-        assert not np.isnan(record.u).any()
 
 
 def test_short_stretches_between_missed_events_and_a_pause(rhythm):
@@ -148,22 +121,6 @@ def test_slow_drift_is_taken_out(wave):
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
             without_drift(wave, phase, "x", cycles)
-
-
-def test_times_of_crossings(wave):
-    data = sample(wave, timing="clock")
-    assert data.outputs == ("x", "v", "time") and data.rms()[1][2] < 1e-4
-    assert sample(wave, timing="duration").outputs[2] == "duration"
-
-
-def test_bad_arguments(wave):
-    for options, message in [
-        ({"inputs": "g"}, "no signal 'g'"),
-        ({"n_sections": 16}, "n_sections is 16, but the phase is that of a family of 8"),
-        ({"n_sections": 0}, "`n_sections` must be an integer"),
-    ]:
-        with pytest.raises(hj.DefinitionError, match=message):
-            sample(wave, **options)
 
 
 def test_designs_as_tables(tmp_path, wave):
@@ -241,38 +198,6 @@ def test_the_command(files, tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.slow
-def test_the_command_says_what_has_not_converged(files, tmp_path, monkeypatch, capsys):
-    short = functools.partial(fit_records, max_steps=1)
-    monkeypatch.setattr("hybridjax.recordings.identification.fit_records", short)
-    assert identify(files, tmp_path / "out", "--order", "2") == 1
-    assert "a fit did not converge" in capsys.readouterr().err
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert "<code>order</code>" in page and "`" not in page
-
-
-@pytest.mark.parametrize("text", ["x:up", "x:rising:high", "x:rising:0:1"])
-def test_the_command_says_how_crossings_are_written(files, tmp_path, text, capsys):
-    options = ["--input", "force", "--outputs", "x,v", "--crossing", text, "--out", str(tmp_path)]
-    with pytest.raises(SystemExit):
-        main(["identify", str(files / "trial0.csv"), *options])
-    assert "is not a signal, a direction and a value" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--outputs", "x,q"], "no signal 'q'"),
-        (["--time", "t"], "no column 't'"),
-    ],
-)
-def test_the_command_writes_nothing_half(files, tmp_path, more, message):
-    with pytest.raises(SystemExit, match=message) as error:
-        identify(files, tmp_path / "out", *more)
-    assert "\n" not in str(error.value)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("name", ["summary.json", "figures/bode.png"])
 def test_the_command_computes_nothing_where_a_file_is_in_the_way(files, tmp_path, name, capsys):
     (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -281,18 +206,6 @@ def test_the_command_computes_nothing_where_a_file_is_in_the_way(files, tmp_path
         identify(files, tmp_path)
     assert not capsys.readouterr().out
     assert [p.read_text() for p in tmp_path.rglob("*") if p.is_file()] == ["mine"]
-
-
-def test_a_trial_without_a_signal(wave):
-    t, values = wave.trials[0].time, wave.trials[0].values
-    for column, name in ((0, "f"), (1, "x")):
-        hidden = values.copy()
-        hidden[4:, column] = np.nan
-        one = hj.Recording(t, dict(zip("fxv", hidden.T, strict=True)), name="second")
-        both = hj.Recording.join([wave, one])
-        clock = [eqx.tree_at(lambda t: t.events, t, {"s": np.arange(21.0)}) for t in both.trials]
-        with pytest.raises(hj.DefinitionError, match=f"trial 'second' has 4 samples of {name}"):
-            sample(both.with_trials(clock), hj.AtEvent("s"))
 
 
 def test_signals_with_clocks_of_their_own(rhythm):
@@ -305,10 +218,9 @@ def test_signals_with_clocks_of_their_own(rhythm):
             hj.Recording(t[1::2], {"v": v[1::2]}),
         ]
     )
-    angle = hj.KinematicPhase(16, position="x", velocity="v", center=(0.0, 0.0), scale=(1.0, 1.0))
-    for phase in (hj.Crossing("v", "falling"), angle):
-        data = [sample(r, phase, outputs=("x", "v"), inputs="force") for r in (rhythm, own)]
-        assert data[1].missing == 0 and data[1].cycles == data[0].cycles
-        together, apart = (hj.fit_series(d, order=1).multipliers for d in data)
-        np.testing.assert_allclose(apart, together, rtol=0, atol=1e-5)
-        np.testing.assert_allclose(apart, MULTIPLIER, rtol=0, atol=1e-3)
+    angle = hj.KinematicPhase(16, position="x", velocity="v", center=(0, 0), scale=(1, 1))
+    data = [sample(r, angle, inputs="force") for r in (rhythm, own)]
+    assert data[1].missing == 0 and data[1].cycles == data[0].cycles
+    together, apart = (hj.fit_series(d, order=1).multipliers for d in data)
+    np.testing.assert_allclose(apart, together, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(apart, MULTIPLIER, rtol=0, atol=1e-3)

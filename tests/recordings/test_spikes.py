@@ -15,7 +15,7 @@ def noisy(x, noise=1e-3, seed=0):
     return x + noise * np.random.default_rng(seed).normal(size=len(x))
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-1])
+@pytest.mark.parametrize("noise", [0.0, 1e-1])
 def test_all_spikes_are_found_and_little_else(noise):
     """Two per cent of all samples, so that many are neighbors."""
     rng = np.random.default_rng(1)
@@ -58,11 +58,7 @@ RINGING = np.exp(-40 * (T % 1)) * np.where(np.arange(len(T)) % 2, 1, -1)
         np.zeros(len(T)),
         np.arange(5.0),
     ],
-    ids=[
-        "wave", "bounce", "sawtooth", "steps", "quantized", "noisy-quantized", "pulses",
-        "short-pulses", "ringing", "noise", "nothing", "few",
-    ],
-)  # fmt: skip
+)
 def test_what_is_no_spike(x):
     for values in (x, x + 1e-5 * np.random.default_rng(3).normal(size=len(x))):
         assert not spike_heights(values).any()
@@ -100,25 +96,3 @@ def test_impacts_are_part_of_the_motion(wave):
     assert both.spikes == (0, 3, 0) and "; spikes left out: x 3)" in repr(both)
     np.testing.assert_allclose(both.cycle_outputs, sampled(impact).cycle_outputs, atol=5e-3)
     assert np.ptp(both.cycle_outputs[:, 0] - sampled(0 * t).cycle_outputs[:, 0]) > 0.05
-
-
-@pytest.mark.parametrize("share, most", [(1e-3, 1.3), (1e-2, 2.0)])
-def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycle, share, most):
-    """Sixteen sections of four samples each, spikes in force and outputs."""
-    spoil = hj.testing.spoil
-    clean = spoil(hopper_recording, ("yM", "vM"), noise=1e-4)
-    dirty = spoil(clean, ("u", "yM", "vM"), spikes=share, seed=1)
-    fits = []
-    for recording in (clean, dirty):
-        data = hj.recordings.section_data(
-            recording, hj.Crossing("vM", "falling"), inputs="u", outputs=("yM", "vM"),
-            n_sections=16,
-        )  # fmt: skip
-        fits.append(hj.fit_series(data, order=2))
-    struck = [int((a != b).sum()) for a, b in zip(
-        clean.trials[0].values.T, dirty.trials[0].values.T, strict=True)]  # fmt: skip
-    assert np.abs(np.subtract(data.spikes, struck)).max() <= 0.05 * max(struck) + 1
-    assert fits[1].standard_errors[0] < most * fits[0].standard_errors[0]
-    assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
-    said = hj.recordings.advise(data, fits[1]).warnings
-    assert any(w.cause == "spikes" for w in said)

@@ -1,7 +1,6 @@
 """Multipliers from natural variability, and inputs that are feedback."""
 
 import numpy as np
-import pytest
 
 import hybridjax as hj
 from hybridjax.recordings.inspection.inspect import feedback
@@ -54,16 +53,6 @@ def test_intervals_of_few_blocks_are_wider_than_percentiles():
     found = hj.recordings.natural_multipliers(variable(0.3, strides=(39, 40)))
     plain = np.ptp(np.quantile(np.abs(found.draws[:, 0]), [0.025, 0.975]))
     assert 1.05 < np.ptp(found.interval()[0]) / plain < 1.2
-
-
-def test_what_is_refused():
-    data = variable(0.1, strides=(6,))
-    with pytest.raises(hj.DefinitionError, match="too few for 3 multipliers"):
-        hj.recordings.natural_multipliers(data, 3)
-    with pytest.raises(hj.DefinitionError, match="the state at a section has 6 numbers"):
-        hj.recordings.natural_multipliers(data, 7)
-    with pytest.raises(hj.DefinitionError, match="holds no input"):
-        hj.fit_series(data, 1)
 
 
 def test_an_input_that_repeats_with_the_rhythm_is_named(rhythm):

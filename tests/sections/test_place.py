@@ -105,19 +105,6 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
         hj.place_sections(hopper_cycle, Crossing(twice, "falling"))
 
 
-@pytest.mark.parametrize(
-    "sections, message",
-    [
-        ([AtEvent("bounce")], "there is no event 'bounce'"),
-        ([Crossing("y", "falling")], "there is no output 'y'; outputs are 'x', 'v'"),
-        (hj.KinematicPhase(4, position="x", velocity="w"), "there is no output 'w'"),
-    ],
-)
-def test_families_that_do_not_fit_the_system(sections, message, vanderpol_cycle):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.place_sections(vanderpol_cycle, sections)
-
-
 def test_sections_of_another_cycle(placed_isochrons, lossy_cycle):
     with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
         hj.linearize(lossy_cycle, placed_isochrons)
@@ -130,11 +117,7 @@ def test_sections_that_move_on_an_autonomous_cycle(vanderpol_cycle):
         hj.place_sections(vanderpol_cycle, [moving])
 
 
-def test_bad_inputs_and_outputs(vanderpol_cycle, hopper_cycle, placed_isochrons):
-    with pytest.raises(hj.DefinitionError, match="there is no input 'force'; inputs are u"):
-        hj.linearize(vanderpol_cycle, hj.ClockPhase(8), inputs="force")
-    with pytest.raises(hj.DefinitionError, match="there is no output 'y'"):
-        hj.linearize(vanderpol_cycle, hj.ClockPhase(8), "y")
+def test_an_output_that_a_chart_does_not_define(hopper_cycle, placed_isochrons):
     foot = hj.Output("foot", {"flight": lambda t, q, u: q[2]})
     with pytest.raises(hj.DefinitionError, match="'foot' is not defined in chart 'stance'"):
         hj.linearize(hopper_cycle, placed_isochrons, foot)

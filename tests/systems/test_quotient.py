@@ -79,21 +79,23 @@ MIRROR = {
 }
 
 
-def test_a_step_modulo_the_symmetry_and_a_stride():
+def test_a_step_modulo_the_symmetry():
     walker = hj.Quotient(Full(), **MIRROR, translation=("x",))
     lands = hj.AtEvent("right lands")
     step = hj.find_limit_cycle(walker, section=lands)
     expected = [LONG_GAIT, np.conj(LONG_GAIT)]
     np.testing.assert_allclose(step.multipliers, expected, rtol=1e-9)
     np.testing.assert_allclose(step.period, 3.88246375285137, rtol=1e-10)
-    stride = hj.find_limit_cycle(walker, walker.guess(), section=lands, multiplicity=2)
-    np.testing.assert_allclose(stride.period, 2 * step.period, rtol=1e-10)
-    squares = np.array(expected) ** 2
-    np.testing.assert_allclose(
-        stride.multipliers[np.argsort(stride.multipliers.imag)],
-        squares[np.argsort(squares.imag)],
-        rtol=1e-8,
-    )
+
+
+@pytest.mark.slow
+def test_a_stride_is_two_steps():
+    walker, lands = hj.Quotient(Full(), **MIRROR, translation=("x",)), hj.AtEvent("right lands")
+    stride = hj.find_limit_cycle(walker, section=lands, multiplicity=2)
+    np.testing.assert_allclose(stride.period, 2 * 3.88246375285137, rtol=1e-10)
+    squares = np.array([LONG_GAIT, np.conj(LONG_GAIT)]) ** 2
+    squares, found = (x[np.argsort(x.imag)] for x in (squares, stride.multipliers))
+    np.testing.assert_allclose(found, squares, rtol=1e-8)
 
 
 @pytest.mark.parametrize(

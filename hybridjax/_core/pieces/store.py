@@ -176,7 +176,7 @@ class ZarrStore:
                 self.read(k)
             except FileFormatError:
                 for x in self._arrays.values():
-                    _sync(x.store.delete(self._chunk(x, k)))
+                    package("zarr.core.sync").sync(x.store.delete(self._chunk(x, k)))
 
     def dataset(self) -> Any:
         """Return all results as `xarray.Dataset`; on disk, values are read when they are used."""
@@ -198,7 +198,9 @@ class ZarrStore:
         async def listed() -> list[str]:
             return [key async for key in array.store.list_prefix(prefix)]
 
-        places = (key.removeprefix(prefix).split("/") for key in _sync(listed()))
+        places = (
+            key.removeprefix(prefix).split("/") for key in package("zarr.core.sync").sync(listed())
+        )
         return {
             int(np.ravel_multi_index(tuple(map(int, x[: len(blocks.shape)])), blocks.counts))
             for x in places
@@ -295,12 +297,6 @@ def absolute(address: Any) -> str:
 
 def _group(address: Any, mode: Any) -> Any:
     return package("zarr").open_group(address, mode=mode)
-
-
-def _sync(coroutine: Any) -> Any:
-    from zarr.core.sync import sync
-
-    return sync(coroutine)
 
 
 @contextlib.contextmanager

@@ -28,7 +28,7 @@ _AIM_WITHIN = 0.7
 # The first step, as a part of the time in which the state changes by its size (for errors of 1e-2;
 # the default method has order 7), and at most as a part of the time allowed. Higher: first steps
 # are rejected. Lower: steps are taken until they have grown.
-_FIRST_STEP, _FIRST_STEP_OF_SPAN = 0.1, 0.01
+_FIRST_STEP = 0.1
 # Where sizes of states are not known, a state that begins near zero changes by its own size at
 # once: the first step is no shorter than this part of the time allowed. Higher: stiff systems
 # reject it. Lower: more steps until they have grown.
@@ -123,11 +123,9 @@ def take_aim(state: State, task: Task) -> Aim:
     s, lanes, approach, target = task.s, state.lanes, state.approach, task.target
     xp = namespace(lanes.t)
     # Known times: the step is cut so that it ends on them exactly, in equal pieces.
-    due, schedule = target.time, xp.full_like(lanes.chart, -1)
-    if s.has_schedules:
-        scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time)
-        due = xp.minimum(target.time, scheduled)
-        schedule = xp.where(scheduled <= target.time, which, -1)
+    scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time)
+    due = xp.minimum(target.time, scheduled)
+    schedule = xp.where(scheduled <= target.time, which, -1)
     left = xp.maximum(due - lanes.t, 0.0)
     steps = xp.where(xp.isfinite(left), left / state.h, 2.0)
     pieces = xp.ceil(steps - SAME_TIME)
@@ -165,11 +163,11 @@ def initial_step(s: Structure, lanes: Lanes, u: Inputs, span: Times, settings: S
         rate = xp.max(xp.where(xp.isfinite(rates), rates, 0.0), axis=0, initial=0.0)
         time = xp.where(rate > 0, 1 / rate, xp.inf)
         part = _FIRST_STEP * (rtol / 1e-2) ** (1 / 7)
-        first = xp.minimum(part * time, _FIRST_STEP_OF_SPAN * span)
+        first = xp.minimum(part * time, _FIRST_STEP * span)
         first = first if scaled else xp.maximum(first, _SHORTEST * span)
         return xp.where(here, first, out)
 
     assert settings.rtol is not None
     xp, rtol = namespace(lanes.t), settings.rtol
     everywhere = xp.ones(lanes.t.shape[0], bool)
-    return for_each_chart(s, lanes.chart, everywhere, work, _FIRST_STEP_OF_SPAN * span)
+    return for_each_chart(s, lanes.chart, everywhere, work, _FIRST_STEP * span)

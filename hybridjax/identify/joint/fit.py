@@ -4,7 +4,7 @@ from typing import Annotated, Literal, cast
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from ..._core.arguments import Numbers, require_same
 from ..._core.boundary.checked import checked
@@ -29,13 +29,9 @@ from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .noise import Predictor, noise_model, noise_spectrum
 from .prediction import SeriesPart, SeriesProblem
-from .realization import given_dims, realize
+from .realization import default_horizon, given_dims, realize
 from .subspace import subspace_model
 
-
-# Periods of the impulse response from which a minimal model is made, and lags at least. Fewer:
-# states that appear late are missed.
-_PERIODS, _LAGS = 4, 17
 
 Guess = LDTP | Order | Annotated[Numbers, Integers("N", sign="positive")]
 
@@ -64,10 +60,6 @@ class LDTPFit(MultiplierEstimate):
     """
 
     model: LDTP
-    multipliers: Complex[np.ndarray, " d"]
-    coefficients: Float[np.ndarray, " d"]
-    covariance: Float[np.ndarray, "d d"]
-    covariance_freedom: float = eqx.field(static=True)
     cost: float = eqx.field(static=True)
     freedom: int = eqx.field(static=True)
     result: int = eqx.field(static=True)
@@ -147,9 +139,6 @@ class LDTPFit(MultiplierEstimate):
             K=[K / size.T if K.shape[1] else K for K in model.K],
         )
         return Predictor(model, D @ D.swapaxes(1, 2), self.inputs, self.outputs)
-
-    def __repr__(self) -> str:
-        return f"LDTPFit(multipliers {self.show_multipliers()}; {self._about()})"
 
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
@@ -294,9 +283,13 @@ def _fit_to_series(
             model = model._replace(K=[np.zeros((len(A), len(C))) for A, C in columns])
     model = _without_direct(model, direct)
     unknowns = local_coordinates(model, direct).size
-    freedom = numbers - unknowns
-    if free_start:
-        freedom -= sum(model.dims[n] for n in first)
+    starts = sum(model.dims[n] for n in first) if free_start else 0
+    freedom = numbers - unknowns - starts
+    if 3 * starts > numbers:  # errors would be smaller, and regions with them
+        raise DefinitionError(
+            f"{starts} coordinates of the states at the start of {len(first)} records are to be "
+            f"found from {numbers} numbers: leave out records shorter than a cycle."
+        )
     fewest = records.sampled.min()
     if freedom < 1 or fewest <= ny + unknowns / (N * ny):
         raise DefinitionError(
@@ -371,7 +364,7 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
     """
     exact = exact_htf(model, htf)
-    lags = max(_PERIODS * model.n_sections, _LAGS - 1) + 1
+    lags = 2 * default_horizon(model.n_sections) + 1
     minimal = realize(np.asarray(model.impulse_response(lags)))
     scale = check_values(exact)
     problem = FrequencyProblem.of(exact, error_weights(exact, scale), scale)

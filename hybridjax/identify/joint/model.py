@@ -25,8 +25,6 @@ Blocks = list[Float[np.ndarray, "rows columns"]]
 # Largest modulus of a multiplier of rho A. At 1 the form does not exist; near 0 the coordinates
 # weight the first period only.
 _LARGEST_MODULUS = 0.5
-# Doublings of the periods that are summed up: the remainder is 0.5^(2^6), rounding.
-_DOUBLINGS = 6
 
 
 class PeriodicModel(NamedTuple):
@@ -167,7 +165,7 @@ def _gramians(model: PeriodicModel, rho: float) -> Blocks:
 
     d = model.dims[0]
     P, phi = around(np.zeros((d, d)))[0], rho**model.n_sections * model.monodromy()
-    for _ in range(_DOUBLINGS):
+    for _ in range(6):  # periods are doubled until the remainder, 0.5^(2^6), is rounding
         P, phi = P + phi.T @ P @ phi, phi @ phi
     return around(P)
 

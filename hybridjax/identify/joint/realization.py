@@ -27,7 +27,7 @@ Names = tuple[str, ...] | None
 # Larger: weak states are missed; smaller: noise makes states.
 _NOISE_MARGIN = 1.1
 # Sections in which a state is observed, at least, by default. Smaller: less averaging.
-SHORTEST_HORIZON = 8
+_SHORTEST_HORIZON = 8
 
 
 @checked
@@ -77,13 +77,13 @@ def realize(
     if isinstance(source, SeriesFit):
         N, R = source.numerators.shape[:2]
         outputs, inputs = source.outputs, source.inputs
-        p = _horizon(horizon, N)
+        p = horizon or default_horizon(N)
         markov = source.impulse_response(2 * p + 1)
         spread = np.sqrt((source.roots**2).sum(axis=4).mean(axis=(0, 2, 3))) * source.noise
     else:
         markov = np.asarray(source)
         N, lags = markov.shape[:2]
-        p = _horizon(horizon, N) if horizon is not None else min(_horizon(None, N), (lags - 1) // 2)
+        p = horizon or min(default_horizon(N), (lags - 1) // 2)
         if p < 1 or lags < 2 * p + 1:
             raise DefinitionError(
                 f"{lags} lags are too few for a horizon of {p} sections: {2 * p + 1} are needed."
@@ -107,8 +107,9 @@ def realize(
     return LDTP.from_blocks(A, B, C, D, inputs, outputs)
 
 
-def _horizon(horizon: int | None, N: int) -> int:
-    return max(SHORTEST_HORIZON, 2 * N) if horizon is None else horizon
+def default_horizon(N: int) -> int:
+    """Return the number of sections in which a state is observed; twice as many lags are needed."""
+    return max(_SHORTEST_HORIZON, 2 * N)
 
 
 def _scale(scale: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
@@ -159,7 +160,7 @@ def _from_htf(htf: HTF, dims: Any, order: int, horizon: int | None) -> LDTP:
     if not np.isfinite(htf.H).all():
         raise DefinitionError("the HTFs hold NaN or infinity.")
     F, ny, nu = htf.H.shape[1:]
-    p = min(_horizon(horizon, N), F - 1) if horizon is None else _horizon(horizon, N)
+    p = horizon or min(default_horizon(N), F - 1)
     if 2 * F <= p + 1:
         raise DefinitionError(
             f"{F} frequencies are too few for a horizon of {p} sections: more than "

@@ -9,12 +9,12 @@ from ...errors import DefinitionError
 from ..denominator import SLOWEST
 from .model import PeriodicModel
 from .prediction import SeriesPart
-from .realization import SHORTEST_HORIZON
+from .realization import default_horizon
 
 
-# Samples of a section for each coefficient of the regression on its past, and periods of the past
-# at most. Larger: a short past, which states outlast; smaller: noise.
-_ROWS, _PERIODS = 3, 2
+# Samples of a section for each coefficient of the regression on its past. Larger: a short past,
+# which states outlast; smaller: noise.
+_ROWS = 3
 # Part by which the squared length of every regressor is enlarged. Larger: bias; smaller: noise in
 # combinations that are hardly excited.
 _SHRINKAGE = 1e-6
@@ -37,7 +37,7 @@ def subspace_model(
     columns = z.shape[2]
     sections = [_Section(z, y, inside, n, N) for n in range(N)]
     samples = min(len(section.y) for section in sections)
-    past = min(samples // (_ROWS * columns), max(_PERIODS * N, SHORTEST_HORIZON))
+    past = min(samples // (_ROWS * columns), default_horizon(N))
     needed = -(-most // columns) + 1
     if past < needed:
         raise DefinitionError(
@@ -46,7 +46,7 @@ def subspace_model(
             "`hj.identify.realize(hj.fit_series(...))`."
         )
     rules = [section.regression(past) for section in sections]
-    horizon = max(-(-most // ny) + 1, min(past, N, SHORTEST_HORIZON))
+    horizon = max(-(-most // ny) + 1, min(past, N, default_horizon(0)))
     to_state = []
     for n, section in enumerate(sections):
         # The effect of rows that are older by i samples.

@@ -19,7 +19,6 @@ from ..htf_errors import amounts
 from .linearization import Linearization, each_fit, linearize, measured_outputs
 from .output_error import OutputErrorProblem
 from .records import CycleGrid, divide_by_chi
-from .robust import Loss, efficiency
 
 
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered
@@ -31,20 +30,18 @@ def coefficient_covariance(
     problem: OutputErrorProblem,
     solution: Linearization,
     errors: Literal["residuals", "white"],
-    loss: Loss,
 ) -> Covariance:
     """Return the covariance of c; with "residuals" errors may depend on each other and on u."""
-    price = efficiency(problem, solution, loss)
 
     def draws(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         sampled = part.sampled[:, :, n, :, None]
         white = np.random.default_rng((k, n)).standard_normal((*sampled.shape[:3], _WHITE_DRAWS))
-        return white * sampled * price.noise[:, None]
+        return white * sampled
 
     noise = linearize(problem, solution.c, draws).curvature / _WHITE_DRAWS
-    curvature = np.einsum("aij,a->ij", solution.curvature - noise, price.curvature)
-    if errors == "white" or not np.linalg.eigvalsh(solution.curvature.sum(axis=0))[0] > 0:
-        return sandwich(curvature, np.einsum("aij,a->ij", solution.curvature, price.variance))
+    curvature, whole = (solution.curvature - noise).sum(axis=0), solution.curvature.sum(axis=0)
+    if errors == "white" or not np.linalg.eigvalsh(whole)[0] > 0:
+        return sandwich(curvature, whole)
     lags = correlated_cycles(multipliers_of(solution.c), problem.records.cycles)
     gradient = gradient_covariance(problem, solution, lags + 1)
     return sandwich(curvature, gradient.matrix)._replace(freedom=gradient.freedom)
@@ -74,10 +71,10 @@ def gradient_covariance(
 
     def section(k, part, n, fit, regression):
         count = max(1, part.y.shape[1] // cycles)
-        weight = part.weight[:, :, n, fit.outputs, None]
+        sampled = part.sampled[:, :, n, fit.outputs, None]
 
         def backward(x):  # its product with white noise is that of x with filtered noise
-            return divide_by_chi(memory, (weight * x)[:, ::-1])
+            return divide_by_chi(memory, (sampled * x)[:, ::-1])
 
         bases = regression.input_basis(fit.root), regression.basis
         inputs, starts = (in_blocks(basis, count) for basis in bases)

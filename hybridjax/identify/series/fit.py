@@ -4,7 +4,7 @@ from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, StepCount, Vector
@@ -26,7 +26,6 @@ from .covariance import coefficient_covariance
 from .linearization import Linearization, minimize
 from .output_error import OutputErrorProblem
 from .records import PreparedRecords
-from .robust import Loss, efficiency, minimize_robust, misfit, rms_of, without_outliers
 
 
 class SeriesFit(MultiplierEstimate):
@@ -52,14 +51,10 @@ class SeriesFit(MultiplierEstimate):
       by the records.
     """
 
-    multipliers: Complex[np.ndarray, " d"]
-    coefficients: Float[np.ndarray, " d"]
-    covariance: Float[np.ndarray, "d d"]
     numerators: Float[np.ndarray, "N R ny nu"]
     slopes: Float[np.ndarray, "d N R ny nu"]
     roots: Float[np.ndarray, "N ny R nu r"]
     noise: Float[np.ndarray, " ny"]
-    covariance_freedom: float = eqx.field(static=True)
     result: int = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -110,9 +105,6 @@ class SeriesFit(MultiplierEstimate):
         variance = np.where(np.isnan(variance), np.inf, variance)
         return HTF(f, H, harmonics, N, self.inputs, self.outputs, "series fit", variance=variance)
 
-    def __repr__(self) -> str:
-        return f"SeriesFit(multipliers {self.show_multipliers()}; {self._about()})"
-
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         noise = ", ".join(
@@ -129,7 +121,6 @@ def fit_series(
     *,
     overhang: Index | None = None,
     start: Literal["free", "cycle"] = "free",
-    loss: Loss = "squares",
     errors: Literal["residuals", "white"] = "residuals",
     check: bool = True,
     max_steps: StepCount = 50,
@@ -150,10 +141,6 @@ def fit_series(
     - `overhang`: number of lags of the numerators beyond d N. Default: N.
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
       no input before. Default: "free".
-    - `loss`: function of the errors that is minimized. "squares" is the most accurate for Gaussian
-      errors. "huber" is for outliers: squares up to 1.345 standard deviations and linear beyond
-      (iteratively reweighted, standard deviations from the median). `noise` is then the standard
-      deviation of Gaussian errors for which squares are as accurate. Default: "squares".
     - `errors`: source of the covariance. "residuals": the residuals of blocks of successive cycles,
       which allows for errors that depend on each other (process noise) and on the inputs (nonlinear
       distortion). "white": the variance of the residuals alone. Default: "residuals".
@@ -166,7 +153,7 @@ def fit_series(
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
     records = PreparedRecords(data)
-    return fit_records(records, order, overhang, start, loss, errors, check, max_steps)
+    return fit_records(records, order, overhang, start, errors, check, max_steps)
 
 
 @one_blas_thread()
@@ -175,7 +162,6 @@ def fit_records(
     order: int,
     overhang: int | None = None,
     start: Literal["free", "cycle"] = "free",
-    loss: Loss = "squares",
     errors: Literal["residuals", "white"] = "residuals",
     check: bool = True,
     max_steps: int = 50,
@@ -183,30 +169,20 @@ def fit_records(
     """Fit records that are prepared; see `fit_series`."""
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
-    usual = problem if loss == "squares" else without_outliers(problem)
-    delayed = delayed_outputs(usual, order)
-    c = total_least_squares(delayed)
-    if loss == "squares":
-        c, solution, _ = minimize(problem, c, max_steps)
-        _require_freedom(problem, solution)
-        problem = problem.rescale(_noise(solution))  # the weights that the residuals suggest
-        c, solution, converged = minimize(problem, c, max_steps)
-        noise = _noise(solution) * problem.scale
-    else:
-        problem, c, solution, converged = minimize_robust(problem, c, max_steps)
-        _require_freedom(problem, solution)
-        noise = rms_of(usual, misfit(problem, solution)) * problem.scale
+    delayed = delayed_outputs(problem, order)
+    c, solution, _ = minimize(problem, total_least_squares(delayed), max_steps)
+    _require_freedom(problem, solution)
+    noise = _noise(solution)  # the weights that the residuals suggest
+    problem = problem._replace(scale=problem.scale * noise)
+    c, solution, converged = minimize(problem, c, max_steps)
     if check:
-        refuse_order(delayed, noise / usual.scale)
-    covariance = coefficient_covariance(problem, solution, errors, loss)
-    return assemble(problem, solution, Denominator(c, covariance, converged), loss)
+        refuse_order(delayed, noise * _noise(solution))
+    covariance = coefficient_covariance(problem, solution, errors)
+    return assemble(problem, solution, Denominator(c, covariance, converged))
 
 
 def assemble(
-    problem: OutputErrorProblem,
-    solution: Linearization,
-    denominator: Denominator,
-    loss: Loss = "squares",
+    problem: OutputErrorProblem, solution: Linearization, denominator: Denominator
 ) -> SeriesFit:
     """Return the fit with this denominator, in the units of the data."""
     N, nu, ny = problem.shape
@@ -215,9 +191,6 @@ def assemble(
         b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
         return np.swapaxes(b, -1, -2)
 
-    noise = _noise(solution)
-    if loss != "squares":
-        noise = efficiency(problem, solution, loss).noise
     widest = max(root.shape[1] for row in solution.roots for root in row)
     roots = np.zeros((N, ny, problem.lags * nu, widest))
     for n, row in enumerate(solution.roots):
@@ -230,7 +203,7 @@ def assemble(
         numerators=by_input(solution.numerators),
         slopes=by_input(solution.slope),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
-        noise=noise * problem.scale,
+        noise=_noise(solution) * problem.scale,
         covariance_freedom=denominator.covariance.freedom,
         result=Result.OK if denominator.converged else Result.NOT_CONVERGED,
         n_sections=N,

@@ -8,7 +8,6 @@ where g is free in the first cycles of each record: it represents inputs and out
 record. For given c every section is a linear regression of its own, in b and g.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +35,7 @@ class SectionRegression(NamedTuple):
     starts: Float[np.ndarray, "S T K"]
     """Responses to unknown initial conditions."""
     weight: Float[np.ndarray, "S T 1"]
-    """Factors of the rows."""
+    """One for a sample, zero where there is none."""
     basis: Float[np.ndarray, "S T k"]
     """Orthonormal basis of the weighted rows of initial conditions and drift, by record."""
     to_starts: Float[np.ndarray, "S k K"]
@@ -72,10 +71,6 @@ class SectionRegression(NamedTuple):
         """Return the rows of this grid in an orthonormal basis of the inputs' rows of all grids."""
         return (self.remainder @ root).reshape(*self.basis.shape[:2], -1)
 
-    def leverage(self, root: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "S T"]:
-        """Return the share of its own error that the fit takes from each sample."""
-        return (self.basis**2).sum(axis=2) + (self.input_basis(root) ** 2).sum(axis=2)
-
     def reduced(self, x: Float[np.ndarray, "S T *columns"]) -> Float[np.ndarray, "rows *columns"]:
         """Return outputs, weighted, without the part in the basis."""
         left = self.weight * x.reshape(*x.shape[:2], -1)
@@ -107,8 +102,6 @@ class OutputErrorProblem(NamedTuple):
     """The parts of the problem that do not depend on c."""
 
     records: PreparedRecords
-    weights: list[Float[np.ndarray, "_ _ N ny"]] | None
-    """Weights of the samples of each grid; None: those of the records."""
     lags: int
     """R: numerators have the lags -lead, ..., R - 1 - lead."""
     free: int
@@ -144,9 +137,8 @@ class OutputErrorProblem(NamedTuple):
                 equal[:, i] &= (grid.sampled == grid.sampled[..., [i]]).all(axis=(0, 1))
             triangles = _with_rows(triangles, grid, lags, records.lead, free)
         alike = [[np.flatnonzero(x).tolist() for x in np.unique(e, axis=0)[::-1]] for e in equal]
-        return cls(
-            records, None, lags, free, on_all_cores(_independent, triangles), alike, records.scale
-        )
+        to_lags = on_all_cores(_independent, triangles)
+        return cls(records, lags, free, to_lags, alike, records.scale)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -154,21 +146,8 @@ class OutputErrorProblem(NamedTuple):
         return self.records.n_sections, len(self.records.inputs), len(self.records.outputs)
 
     def parts(self) -> list[CycleGrid]:
-        """Return all grids, with the outputs in units of `scale` and these weights."""
-        weights = self.weights or [grid.weight for grid in self.records.grids]
-        return [
-            grid._replace(y=grid.y / self.scale, weight=weight)
-            for grid, weight in zip(self.records.grids, weights, strict=True)
-        ]
-
-    def rescale(self, noise: Float[np.ndarray, " ny"]) -> "OutputErrorProblem":
-        """Return the problem with outputs in units of their noise, given in the present units."""
-        return self._replace(scale=self.scale * noise)
-
-    def weighed(self, weights: Sequence[Float[np.ndarray, "S T N ny"]]) -> "OutputErrorProblem":
-        """Return the problem with other weights of samples."""
-        N, _, ny = self.shape
-        return self._replace(weights=list(weights), alike=[[[i] for i in range(ny)]] * N)
+        """Return all grids, with the outputs in units of `scale`."""
+        return [grid._replace(y=grid.y / self.scale) for grid in self.records.grids]
 
     def regression(
         self,
@@ -185,7 +164,7 @@ class OutputErrorProblem(NamedTuple):
         inputs = lagged_inputs(v, n, self.lags, self.records.lead) @ self.to_lags[n]
         T = part.y.shape[1]
         starts = start_responses(c, part.first[:, n], T, min(self.free, T))
-        return SectionRegression.make(inputs, starts, part.drift, part.weight[:, :, n, output])
+        return SectionRegression.make(inputs, starts, part.drift, part.sampled[:, :, n, output])
 
 
 def _with_rows(

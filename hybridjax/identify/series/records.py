@@ -12,14 +12,13 @@ from ...experiments.record import Record, RecordedData, uninterrupted_records
 
 
 class CycleGrid(NamedTuple):
-    """S records of T cycles. Samples outside of a record and in its gaps have the weight zero."""
+    """S records of T cycles. Samples are missing outside of a record and in its gaps."""
 
     u: Float[np.ndarray, "S T N nu"]
     """Inputs; zero outside of a record."""
     y: Float[np.ndarray, "S T N ny"]
     """Outputs; zero where there is no sample."""
-    weight: Float[np.ndarray, "S T N ny"]
-    """Factor of each sample's equation: 1, less for outliers, zero where there is no sample."""
+    sampled: Bool[np.ndarray, "S T N ny"]
     inside: Bool[np.ndarray, "S T N"]
     """Whether a sample lies between the first and the last of its record."""
     drift: Float[np.ndarray, "S T K"]
@@ -41,11 +40,7 @@ class CycleGrid(NamedTuple):
         y = y.reshape(S, T, N, ny)
         sampled = np.isfinite(y)
         u, y = u.reshape(S, T, N, nu), np.where(sampled, y, 0.0)
-        return cls(u, y, sampled.astype(float), inside.reshape(S, T, N), drift)
-
-    @property
-    def sampled(self) -> Bool[np.ndarray, "S T N ny"]:
-        return self.weight > 0
+        return cls(u, y, sampled, inside.reshape(S, T, N), drift)
 
     @property
     def first(self) -> Int[np.ndarray, "S N"]:

@@ -77,39 +77,35 @@ def fit_curve(intervals: Intervals, waves: int, start: CurveFit | None = None) -
     Intervals whose forecast is off by half a cycle or more were miscounted, and not used.
     `start`: a fit with as many half waves or fewer.
     """
-    a, jitter, used = np.zeros(waves + 1), 0.0, np.ones(len(intervals.start), bool)
-    if start is None:
-        rates = intervals.sums(1.0 * used) / intervals.sums(intervals.duration)
-    else:
-        a[: len(start.coefficients)], rates = start.coefficients, start.rates
-        jitter, used = start.jitter, start.counted()
     flat = Smoothness(np.zeros(waves + 1), 0.0, 1.0, 0.0)
-    smooth, same = flat, False
+    if start is None:
+        used = np.ones(len(intervals.start), bool)
+        rates = intervals.sums(1.0 * used) / intervals.sums(intervals.duration)
+        ahead = Forecast(0.0 * used, 0.0 * used, np.zeros((len(used), waves + 2)))
+        fit = CurveFit(np.zeros(waves + 1), rates, 0.0, used, ahead.rate, ahead, flat, True)
+    else:
+        a = np.pad(start.coefficients, (0, waves + 1 - len(start.coefficients)))
+        fit = start._replace(coefficients=a, used=start.counted(), smoothness=flat)
     for _ in range(_ROUNDS):
-        table, before = tabulated(waves, jitter), smooth.penalty[-1]
+        table, before = tabulated(waves, fit.jitter), fit
         if waves:
-            smooth = _smoothness(intervals, _look(intervals, table, a, rates, used, flat))
-        fit = _minimize(intervals, table, _look(intervals, table, a, rates, used, smooth))
-        a, rates, counted = fit.coefficients, fit.rates, fit.counted()
-        now = float((fit.residual * fit.forecast.rate)[counted].std())
-        same = (counted == used).all() and abs(now - jitter) < _SAME * now
-        jitter, used = now, counted
-        if same and abs(before - smooth.penalty[-1]) <= 10 * _SAME * smooth.penalty[-1]:
+            rough = _look(intervals, table, fit._replace(smoothness=flat))
+            fit = fit._replace(smoothness=_smoothness(intervals, rough))
+        fit = _minimize(intervals, table, _look(intervals, table, fit))
+        used = fit.counted()
+        fit = fit._replace(jitter=float((fit.residual * fit.forecast.rate)[used].std()), used=used)
+        same = abs(fit.jitter - before.jitter) < _SAME * fit.jitter
+        change = abs(before.penalty[-1] - fit.penalty[-1])
+        if same and (used == before.used).all() and change <= 10 * _SAME * fit.penalty[-1]:
             break
-    return fit._replace(jitter=jitter, used=used)
+    return fit
 
 
-def _look(
-    intervals: Intervals,
-    table: Table,
-    a: Float[np.ndarray, " p"],
-    rates: Float[np.ndarray, " trials"],
-    used: Bool[np.ndarray, " L"],
-    smooth: Smoothness,
-) -> CurveFit:
+def _look(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
     """Return a curve and rates with their residuals."""
-    ahead = forecast(intervals, table, a, rates)
-    return CurveFit(a, rates, 0.0, used, intervals.duration - ahead.duration, ahead, smooth, True)
+    ahead = forecast(intervals, table, fit.coefficients, fit.rates)
+    residual = intervals.duration - ahead.duration
+    return fit._replace(residual=residual, forecast=ahead, converged=True)
 
 
 def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
@@ -127,8 +123,8 @@ def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
         faster = along @ np.append(1.0, -step)
         for k in range(_ROUNDS):
             rates = np.maximum(fit.rates + faster / 2**k, fit.rates / 2)  # (never zero)
-            a = fit.coefficients + step / 2**k
-            new = _look(intervals, table, a, rates, fit.used, fit.smoothness)
+            new = fit._replace(coefficients=fit.coefficients + step / 2**k, rates=rates)
+            new = _look(intervals, table, new)
             if cost_of(new) < cost_of(fit):
                 break
         else:
@@ -155,7 +151,7 @@ def projected(
 
 def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
     """Return the blocks whose errors count as independent."""
-    if len(intervals.names) >= _BLOCKS:
+    if int(intervals.trial[-1]) + 1 >= _BLOCKS:
         return intervals.trial
     return intervals.blocks(max(_SHORTEST_BLOCK, len(intervals.start) // (2 * _BLOCKS)))
 
@@ -169,7 +165,7 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     curvature, pull = across.T @ across, across.T @ residual
     # Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
     noise_only = residual - across @ np.linalg.lstsq(curvature, pull)[0]
-    freedom = max(int(fit.used.sum()) - len(intervals.names) - p, 1)
+    freedom = max(int(fit.used.sum()) - len(fit.rates) - p, 1)
     variance = float(noise_only @ noise_only) / freedom
     block = _blocks(intervals)
     sums = np.stack([np.bincount(block, x * noise_only) for x in across.T], axis=1)
@@ -200,18 +196,9 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     return Smoothness(penalty, noise, excess, max(-float(top.fun), 0.0))
 
 
-class Accuracy(NamedTuple):
-    """Accuracy of a curve."""
-
-    covariance: Covariance
-    left_out: Float[np.ndarray, " blocks"]
-    """Sums of squared errors of each block, forecast by a fit to the others."""
-    detail: float
-    """Number of coefficients that the data determine: the trace of their share in the curvature."""
-
-
-def accuracy_of(intervals: Intervals, fit: CurveFit) -> Accuracy:
-    """Estimate the accuracy from blocks of intervals whose errors may depend on each other.
+def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float, float]:
+    """Return the covariance of a curve, the sum of squared errors of intervals forecast by fits to
+    other blocks, and the number of coefficients that the data determine.
 
     The errors of each block are those of a forecast by a curve fitted to the other blocks, to first
     order (the jackknife that deletes blocks: Bell and McCaffrey 2002). Smoothness makes a bias,
@@ -231,7 +218,8 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> Accuracy:
         score[k], left_out[k] = x.T @ error, error @ error
     meat = score.T @ score + fit.smoothness.noise * smooth
     covariance = sandwich(curvature, meat, shares + smooth / count)
-    return Accuracy(covariance, left_out, float(np.trace(np.linalg.lstsq(curvature, data)[0])))
+    detail = float(np.trace(np.linalg.lstsq(curvature, data)[0]))
+    return covariance, float(left_out.sum()), detail
 
 
 def plain_curve(intervals: Intervals, fit: CurveFit) -> Float[np.ndarray, " p"]:

@@ -29,18 +29,17 @@ from ..smoothing import bridgeable, gaps, inside
 # Integration steps in a median interval of a trial. More: time. Fewer: errors of durations approach
 # the jitter of fast curves.
 _STEPS = 32
-# Length, in longest intervals of the trial, over which the input is kept. Longer: memory. Shorter:
-# slow models are extrapolated at their own rate.
-_REACH = 1.5
 # Intervals that are integrated together. More: memory. Fewer: more calls of NumPy.
 _CHUNK = 4096
 # Points per cycle at which curves are tabulated, up to 1.5 cycles (the step in which an interval
-# ends goes beyond 1); linear in between. More: memory. Fewer: errors of the finest half wave (1e-5
-# of it at 1024).
+# ends goes beyond 1; inputs are kept for 1.5 of the longest interval), linear in between. More:
+# memory. Fewer: errors of the finest half wave (1e-5 of it at 1024).
 _POINTS = 1024
 
 
 Lanes = Float[np.ndarray, " l"]
+Curve = Float[np.ndarray, " _"]
+Nodes = Float[np.ndarray, "nodes l"]
 Table = Float[np.ndarray, "M p"]
 """A basis of curves at equal steps of the phase from 0 on."""
 
@@ -53,8 +52,6 @@ class Intervals(NamedTuple):
     duration: Float[np.ndarray, " L"]
     trial: Int[np.ndarray, " L"]
     """Index among the trials that have intervals."""
-    names: tuple[str, ...]
-    """Names of these trials."""
     step: Float[np.ndarray, " L"]
     """Step of integration, in s."""
     inputs: Float[np.ndarray, "nodes L"]
@@ -62,7 +59,7 @@ class Intervals(NamedTuple):
 
     def sums(self, values: Float[np.ndarray, " L"]) -> Float[np.ndarray, " trials"]:
         """Return sums over each trial."""
-        return np.bincount(self.trial, values, len(self.names))
+        return np.bincount(self.trial, values)
 
     def blocks(self, length: int) -> Int[np.ndarray, " L"]:
         """Return the block of each interval: successive intervals of one trial."""
@@ -84,7 +81,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
         raise DefinitionError(
             "`phase` must be one of events (`AtEvent`) or crossings: an angle has no intervals."
         )
-    starts, durations, steps, inputs, names = [], [], [], [], []
+    starts, durations, steps, inputs = [], [], [], []
     for (trial, x), (_, parts) in zip(samples, pairs, strict=True):
         finite = np.isfinite(x)
         if finite.sum() < 2:
@@ -98,21 +95,20 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
             continue
         start, duration = start[used], duration[used]
         step = float(np.median(duration)) / _STEPS
-        nodes = np.arange(2 * int(np.ceil(_REACH * duration.max() / step)) + 1) / 2
+        nodes = np.arange(2 * int(np.ceil(1.5 * duration.max() / step)) + 1) / 2
         inputs.append(np.interp(start + nodes[:, None] * step, trial.time[finite], x[finite]))
         starts.append(start)
         durations.append(duration)
         steps.append(np.full(len(start), step))
-        names.append(trial.name)
-    if not names:
+    if not starts:
         raise DefinitionError(f"no interval between events lies where {name} was recorded.")
     if not any(np.ptp(x) > 0 for x in inputs):
         raise DefinitionError(f"the input {name} is constant in all trials.")
     longest = max(map(len, inputs))
     inputs = [np.pad(x, ((0, longest - len(x)), (0, 0)), "edge") for x in inputs]
-    trial = np.repeat(np.arange(len(names)), list(map(len, starts)))
+    trial = np.repeat(np.arange(len(starts)), list(map(len, starts)))
     start, duration, step = map(np.concatenate, (starts, durations, steps))
-    return Intervals(start, duration, trial, tuple(names), step, np.concatenate(inputs, axis=1))
+    return Intervals(start, duration, trial, step, np.concatenate(inputs, axis=1))
 
 
 def basis(
@@ -140,12 +136,7 @@ class Forecast(NamedTuple):
     without input."""
 
 
-def forecast(
-    intervals: Intervals,
-    table: Table,
-    coefficients: Float[np.ndarray, " p"],
-    rates: Float[np.ndarray, " trials"],
-) -> Forecast:
+def forecast(intervals: Intervals, table: Table, coefficients: Curve, rates: Curve) -> Forecast:
     """Return durations of all intervals, and their derivatives."""
     curve, rate = table @ coefficients, rates[intervals.trial]
 
@@ -157,13 +148,7 @@ def forecast(
     return Forecast(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _integrate(
-    inputs: Float[np.ndarray, "nodes L"],
-    h: Float[np.ndarray, " L"],
-    w: Float[np.ndarray, " L"],
-    curve: Float[np.ndarray, " M"],
-    table: Table,
-) -> Forecast:
+def _integrate(inputs: Nodes, h: Lanes, w: Lanes, curve: Curve, table: Table) -> Forecast:
     """Integrate by the classical Runge-Kutta method, and derivatives by the trapezoidal rule."""
     L, p = len(h), table.shape[1] + 1
     result, rows = Forecast(np.zeros(L), np.zeros(L), np.zeros((L, p))), np.arange(L)

@@ -12,7 +12,6 @@ from ..._core.arguments import Numbers
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability
 from ..._core.boundary.values import Reals
-from ..._core.html import COLORS, Curve, card, picture, text
 from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.signal import Signal, unit_of, with_unit
@@ -51,11 +50,11 @@ class PhaseResponse(eqx.Module):
     - `phase` (P,), `values` (P,), `errors` (P,): the curve and its standard errors. `plain` (P,):
       the curve by regression of durations on the input at phases that grow linearly from event to
       event, which is biased.
-    - `rates` (trials,): w, in cycles per second. `trials`: their names.
+    - `rates` (trials,): w, in cycles per second.
     - `jitter`: standard deviation of the phase at the end of a cycle, in cycles.
     - `left_out`: fraction of the variance of durations within trials (R2) that is forecast in
       blocks of intervals to which the curve was not fitted, by fits to the others to first order.
-      `left_out_flat`: the same for a flat curve. `r2`: the same for the fit to all intervals.
+      `left_out_flat`: the same for a flat curve.
     - `p_flat`: probability of so much shape if the curve is flat (likelihood ratio; Self and Liang
       1987).
     - `excess`: variance of sums of residuals over blocks relative to that of independent errors.
@@ -74,11 +73,9 @@ class PhaseResponse(eqx.Module):
     errors: Float[np.ndarray, " P"]
     plain: Float[np.ndarray, " P"]
     rates: Float[np.ndarray, " trials"]
-    trials: tuple[str, ...] = eqx.field(static=True)
     jitter: float = eqx.field(static=True)
     left_out: float = eqx.field(static=True)
     left_out_flat: float = eqx.field(static=True)
-    r2: float = eqx.field(static=True)
     p_flat: float = eqx.field(static=True)
     excess: float = eqx.field(static=True)
     intervals: int = eqx.field(static=True)
@@ -108,22 +105,11 @@ class PhaseResponse(eqx.Module):
     def _waves(self, phase: Phases) -> Float[np.ndarray, "n p"]:
         return basis(np.asarray(phase, float) % 1.0, len(self.coefficients) - 1)
 
-    def _repr_html_(self) -> str:
-        low, high = self.interval(self.phase)
-        drawn = [
-            Curve(self.phase, low, color=COLORS[-1]),
-            Curve(self.phase, high, "95 %", COLORS[-1]),
-            Curve(self.phase, self.plain, "plain regression", COLORS[1]),
-            Curve(self.phase, self.values, "estimated", COLORS[0]),
-        ]
-        shown = picture(drawn, "phase (cycles)", with_unit("Z", curve_unit(self.input)))
-        return card("PhaseResponse", "", shown, text(repr(self)))
-
     def __repr__(self) -> str:
         mean, error = self.coefficients[0], np.sqrt(self.covariance[0, 0])
         return (
             f"PhaseResponse(detail of {self.detail:.1f} numbers, {self.intervals} intervals of "
-            f"{len(self.trials)} trials, {self.miscounted} of them miscounted)\n"
+            f"{len(self.rates)} trials, {self.miscounted} of them miscounted)\n"
             f"  mean {with_unit('Z', curve_unit(self.input))}  {mean:.4g} +- {error:.2g}; from "
             f"{self.values.min():.4g} to {self.values.max():.4g}\n"
             f"  rates        {self.rates.min():.4g} to {self.rates.max():.4g} cycles/s, jitter "
@@ -169,34 +155,30 @@ def phase_response(
         phase = estimate_phase(recording, phase)
     intervals = intervals_of(recording, phase, input)
     total = len(intervals.start)
-    if total < 2 * (10 + len(intervals.names)):  # half of them for errors
-        raise DefinitionError(
-            f"{total} intervals are too few for a curve and the rates of {len(intervals.names)} "
-            "trials: record more."
-        )
+    if total < 2 * (11 + intervals.trial[-1]):  # half of them for errors
+        text = f"{total} intervals are too few for a curve and the rates of their trials"
+        raise DefinitionError(f"{text}: record more.")
     say("flat")
     flat = fit_curve(intervals, 0)
     say("smooth")
     fit = fit_curve(intervals, WAVES, flat)
-    accuracy = accuracy_of(intervals, fit)
-    matrix = accuracy.covariance.matrix
+    covariance, left_out, detail = accuracy_of(intervals, fit)
+    matrix = covariance.matrix
     x = np.arange(200) / 200
     waves = basis(x, WAVES)
     return PhaseResponse(
         coefficients=fit.coefficients,
         covariance=matrix,
-        freedom=max(accuracy.covariance.freedom, 1.0),
-        detail=accuracy.detail,
+        freedom=max(covariance.freedom, 1.0),
+        detail=detail,
         phase=x,
         values=waves @ fit.coefficients,
         errors=np.sqrt(np.einsum("ni,ij,nj->n", waves, matrix, waves)),
         plain=waves @ plain_curve(intervals, fit),
         rates=fit.rates,
-        trials=intervals.names,
         jitter=fit.jitter,
-        left_out=_explained(intervals, fit, accuracy.left_out.sum()),
-        left_out_flat=_explained(intervals, flat, accuracy_of(intervals, flat).left_out.sum()),
-        r2=_explained(intervals, fit, (fit.residual[fit.used] ** 2).sum()),
+        left_out=_explained(intervals, fit, left_out),
+        left_out_flat=_explained(intervals, flat, accuracy_of(intervals, flat)[1]),
         p_flat=float(stats.chi2.sf(fit.smoothness.evidence, 1) / 2),
         excess=fit.smoothness.excess,
         intervals=total,
@@ -240,24 +222,14 @@ def _warnings(r: PhaseResponse) -> Iterator[Finding]:
         yield Finding("wide", f"{text}either side, more than half of the mean.")
     off = np.sqrt(np.mean((r.plain - r.values) ** 2))
     if off > np.sqrt(np.mean(r.errors**2)):
-        yield Finding(
-            "plain regression",
-            f"at phases that grow linearly it would be off by {off:.2g} (rms, of a mean of "
-            f"{mean:.2g}); do not use it here.",
-        )
+        text = f"at phases that grow linearly it would be off by {off:.2g} (rms, of a mean of "
+        yield Finding("plain regression", f"{text}{mean:.2g}); do not use it here.")
     finest = max(1, round(1 / (np.pi * max(r.jitter, 1e-6))))
-    yield Finding(
-        "resolution",
-        f"the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than harmonic "
-        f"{finest} at the end of a cycle.",
-    )
+    text = f"the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than harmonic "
+    yield Finding("resolution", f"{text}{finest} at the end of a cycle.")
     if r.excess > 2:
-        yield Finding(
-            "misfit",
-            f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
-            "independent errors: the phase model lacks something. Errors of the curve by that are "
-            "not in the intervals.",
-        )
+        text = f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
+        yield Finding("misfit", f"{text}independent errors: the phase model lacks something.")
     if abs(r.memory) > _MEMORY:
         text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the phase"
         yield Finding("memory", f"{text} is not all of the state. Standard errors allow for it.")

@@ -111,10 +111,8 @@ def _read_tree(
             continue
         around = next((place[:k] for k in range(len(place), -1, -1) if place[:k] in clocks), None)
         if around is None:
-            raise DefinitionError(
-                f"'{path}' has no times '{wanted.time}' for '{name}' in its group or one around "
-                "it: name the array that holds them by `time`, or choose `signals`."
-            )
+            text = "in its group or one around it: name them by `time`, or choose `signals`."
+            raise DefinitionError(f"'{path}' has no times '{wanted.time}' for '{name}' {text}")
         if around not in tables:
             clock = leaves[clocks[around]]
             times = np.atleast_1d(np.squeeze(clock.array[()]))
@@ -146,10 +144,8 @@ def _columns(
 
 def _refuse_structs(path: Path, name: str, wanted: Wanted) -> None:
     if wanted.reaches(name):
-        raise FileFormatError(
-            f"'{path}': '{name}' is an array of structs: save each of them in a file of its own, "
-            "or choose other `signals`."
-        )
+        text = "is an array of structs: save each in its own file, or choose other `signals`."
+        raise FileFormatError(f"'{path}': '{name}' {text}")
 
 
 def read_arrow(path: Path, wanted: Wanted) -> list[Columns]:

@@ -44,16 +44,14 @@ class _Topic:
     """The numbers of one topic, message by message."""
 
     def __init__(self, name: str):
-        self.name, self.names = name, ()
+        self.name, self.names = name, tuple[str, ...]()
         self.values, self.stamps, self.arrivals = array("d"), array("q"), array("q")
 
     def add(self, path: Path, message: Any, arrival: int, wanted: Wanted) -> None:
         numbers = {x: v for x, v in _numbers(message, self.name) if wanted.includes(x)}
         if self.arrivals and tuple(numbers) != self.names:
-            raise FileFormatError(
-                f"'{path}': arrays in messages of '{self.name}' differ in length: choose other "
-                "`signals`."
-            )
+            text = f"arrays in messages of '{self.name}' differ in length: choose other `signals`."
+            raise FileFormatError(f"'{path}': {text}")
         self.names = tuple(numbers)
         self.values.extend(numbers.values())
         self.arrivals.append(arrival)

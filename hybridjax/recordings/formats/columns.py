@@ -76,7 +76,8 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
     scale = _seconds(where, clock)
     times = scale * numbers(where, clock, columns.values[clock])
     events = {name: at * scale for name, at in columns.events.items()}
-    signals, units = {}, {}
+    signals: dict[str, Any] = {}
+    units: dict[str, str] = {}
     for header, (name, unit) in headers.items():
         if header == clock:
             continue

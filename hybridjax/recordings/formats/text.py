@@ -5,6 +5,7 @@ import csv
 import re
 import warnings
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -40,17 +41,13 @@ def read_lines(path: Path) -> list[str]:
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
-def _is_comment(line: str) -> bool:
-    return line.lstrip().startswith(_COMMENTS)
-
-
 def read_plain(path: Path, lines: list[str]) -> Columns:
     """Read names in the first line that is no comment, perhaps units below, then numbers.
 
     **Raises:** `FileFormatError` if there is no table, with the line.
     """
     filled = [k for k, x in enumerate(lines) if x.strip(" \t,;")]
-    content = [k for k in filled if not _is_comment(lines[k])]
+    content = [k for k in filled if not lines[k].lstrip().startswith(_COMMENTS)]
     if not content:
         raise FileFormatError(f"'{path}' has no line with the names of its columns.")
     first = content[0]
@@ -63,37 +60,22 @@ def read_plain(path: Path, lines: list[str]) -> Columns:
         separator = _separator(before[-1], lines[first]) if before else separator
         width, names = len(names), split_names(before[-1], separator) if before else []
         if len(names) != width or any(to_number(x) is not None for x in names):
-            raise FileFormatError(
-                f"'{path}' begins with numbers: its first line must name the columns."
-            )
+            raise FileFormatError(f"'{path}' begins with numbers: its first line must be names.")
         return read_table(path, names, lines, first, separator)
-    if len(names) == 1 and max(len(split_line(below, x)) for x in ",;\t") > 1:
-        raise FileFormatError(
-            f"'{path}', line {first + 1}: '{lines[first].strip()[:40]}' names one column, but "
-            "there are more below it: begin lines before the names of the columns with '#'."
-        )
     start, fields = first + 1, split_line(below, separator)
     units = [x for x in fields if x]
     if units and all(map(is_unit, units)) and any(to_number(x) is None for x in fields):
-        padded = [split_header(x)[1] or x for x in fields] + [""] * len(names)
-        names = [
-            x if not x or split_header(x)[1] else with_unit(x, unit)
-            for x, unit in zip(names, padded, strict=False)
-        ]
+        below_names = zip_longest(names, fields[: len(names)], fillvalue="")
+        names = [with_unit(x, split_header(y)[1] or y) if x else "" for x, y in below_names]
         start = content[1] + 1
     return read_table(path, names, lines, start, separator)
 
 
 def _separator(names: str, below: str) -> str:
     """Return what separates names and numbers alike, or else is most frequent between the names."""
-    counts = {x: len(split_line(names, x)) for x in "\t;,"}
+    counts = {x: len(split_line(names, x)) for x in ("\t", ";", ",", "")}
     alike = [x for x, n in counts.items() if n > 1 and n == len(split_line(below, x))]
-    if alike:
-        return alike[0]
-    if max(counts.values()) > 1:
-        return max(counts, key=lambda x: counts[x])
-    blanks = len(split_line(names, ""))
-    return "" if blanks > 1 and blanks == len(split_line(below, "")) else ","
+    return alike[0] if alike else max("\t;,"[::-1], key=lambda x: counts[x])
 
 
 def split_line(line: str, separator: str) -> list[str]:
@@ -137,15 +119,13 @@ def read_table(
     """
     two_columns(path, [x for x in headers if x])
     notes = []
-    lines = ["" if _is_comment(x) else x for x in lines[start:]]
+    lines = ["" if x.lstrip().startswith(_COMMENTS) else x for x in lines[start:]]
     if separator != "," and any("," in x for x in lines):
         notes.append("decimal commas were read as such")
         mixed = next((k for k, x in enumerate(lines) if "." in x), None)
         if mixed is not None:
-            raise FileFormatError(
-                f"'{path}', line {start + mixed + 1}: there are points beside decimal "
-                "commas; export numbers with one of the two, and no separators of thousands."
-            )
+            text = f"'{path}', line {start + mixed + 1}: there are points beside decimal commas; "
+            raise FileFormatError(f"{text}export one of the two, and no separators of thousands.")
         lines = [x.replace(",", ".") for x in lines]
     values = None
     try:  # a number in every field
@@ -176,18 +156,12 @@ def _by_line(
         if not any(fields):
             continue
         if len(fields) < count or any(fields[count:]):
-            raise FileFormatError(
-                f"'{path}', line {number}: {len(fields)} fields, but the header names "
-                f"{count} columns."
-                + " Decimal commas need another separator, such as semicolons."
-                * (len(fields) > count and separator == ",")
-            )
+            text = f"'{path}', line {number}: {len(fields)} fields, but the header names {count} "
+            raise FileFormatError(f"{text}columns (decimal commas need another separator).")
         row = [to_number(x) for x in fields[:count]]
         if None in row:
             k = row.index(None)
-            raise FileFormatError(
-                f"'{path}', line {number}: column '{headers[k]}' holds '{fields[k][:40]}', which "
-                "is not a number."
-            )
+            text = f"column '{headers[k]}' holds '{fields[k][:40]}', which is not a number."
+            raise FileFormatError(f"'{path}', line {number}: {text}")
         rows.append(row)
     return np.array(rows, float).reshape(-1, count)

@@ -9,15 +9,12 @@ from jaxtyping import Bool, Float, Int
 from scipy import fft
 
 from ..findings import CLEAR, Finding, listed, places
-from ..phase import Phase
+from ..phase import HARMONICS, Phase
 from ..recording import Recording
 from ..sampling import cycle_means
 from ..smoothing import RANGES, Series
 
 
-# Plateaus per cycle from which on they belong to the rhythm, as those of a foot on the ground.
-# More: the rests of a limb are left out. Fewer: a sensor that fails now and then is believed.
-_BELONGS = 0.3
 # Shortest failure of a sensor: in cycles, in samples, and (where plateaus belong to the rhythm) in
 # plateaus. Longer: failures pass. Shorter: slow phases of the motion are left out.
 _FROZEN = 0.25, 10, 4
@@ -42,13 +39,14 @@ _ALIKE = 1.2
 _OFF = 10.0
 # Least correlation of average cycles that are alike, each of so many values. Larger: noisy cycles
 # differ. Smaller: other events and swapped signals pass.
-_CORRELATED, _PHASES = 0.8, 16
+_CORRELATED, _PHASES = 0.8, HARMONICS // 2
 # Relative difference of periods of trials. Larger: other speeds pass. Smaller: jitter is reported.
 _OTHER_PERIOD = 0.02
 # Drift: number of cosines over a trial, and the ratio of the mean power of the slowest quarter to
 # that of the others. Larger: drift passes. A ratio below 14: a multiplier of 0.9 is reported.
 _COSINES, _RATIO = 24, 20.0
 
+Cycles = Float[np.ndarray, "k P"]
 Rows = Bool[np.ndarray, " n"]
 
 
@@ -65,9 +63,8 @@ def placeholders(x: Series, period: float, is_input: bool) -> Rows:
 def _is_placeholder(size: float) -> bool:
     """Return whether programs write this number for "no value": 999, 8888, 32768, 1e20, ..."""
     digits = f"{size:.0f}"
-    if len(digits) >= 3 and set(digits) in ({"9"}, {"8"}):
-        return True
-    return size in (2.0**15, 2.0**15 - 1, 2.0**16 - 1, 2.0**31, 2.0**31 - 1) or size >= 1e15
+    full = size in {2.0**15, 2.0**15 - 1, 2.0**16 - 1, 2.0**31, 2.0**31 - 1}
+    return full or size >= 1e15 or (len(digits) >= 3 and set(digits) in ({"9"}, {"8"}))
 
 
 def frozen(x: Series, period: float, is_input: bool) -> Rows:
@@ -79,7 +76,7 @@ def frozen(x: Series, period: float, is_input: bool) -> Rows:
     first, length = _runs(x)
     plateaus = length[length >= 3]
     limit = max(_FROZEN[0] * period, _FROZEN[1])
-    if len(plateaus) > _BELONGS * len(x) / period:
+    if len(plateaus) > 0.5 * len(x) / period:  # as those of a foot on the ground
         limit = np.inf if is_input else max(limit, _FROZEN[2] * float(np.median(plateaus)))
     return np.repeat((length > limit) & ~(is_input & (x[first] == 0)), length)
 
@@ -257,7 +254,7 @@ def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
     finite = np.flatnonzero(np.isfinite(mean).all(axis=(0, 2))) if outputs else np.zeros(0, int)
     for s in finite if len(finite) > 1 else ():
         usual = np.median(mean[:, finite[finite != s]], axis=1)
-        yield from _difference(mean[:, s], usual, names[s], outputs)
+        yield from _difference(mean[:, s], usual, names[s], list(outputs))
 
 
 def _average_cycles(recording: Recording, phase: Phase, name: str) -> Float[np.ndarray, "S P"]:
@@ -277,12 +274,7 @@ def _average_cycles(recording: Recording, phase: Phase, name: str) -> Float[np.n
     return np.array(cycles)
 
 
-def _difference(
-    mean: Float[np.ndarray, "k P"],
-    usual: Float[np.ndarray, "k P"],
-    name: str,
-    outputs: tuple[str, ...],
-) -> Iterator[Finding]:
+def _difference(mean: Cycles, usual: Cycles, name: str, outputs: list[str]) -> Iterator[Finding]:
     """Find the cause of a low correlation of the average cycles of a trial with those of others."""
 
     def correlations(x):

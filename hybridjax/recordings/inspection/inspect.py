@@ -155,19 +155,6 @@ class _Part(NamedTuple):
     """Outputs of the predicted cycle."""
 
 
-class _Answer(NamedTuple):
-    """The response of a part to an input: `gain` times as learned from other parts."""
-
-    part: _Part
-    gain: float
-    error: float
-    """Standard error of the gain."""
-    left: float
-    """Mean square of the residual of the prediction."""
-    explained: float
-    """Mean square of the predicted response to the input."""
-
-
 def unanswered(data: SectionData, names: Sequence[str]) -> Iterator[Finding]:
     """Find inputs that the outputs do not answer, in all trials or in parts of them.
 
@@ -183,20 +170,21 @@ def unanswered(data: SectionData, names: Sequence[str]) -> Iterator[Finding]:
             parts = [p for r in range(len(data.records)) for p in _parts(data, r, sections)]
             size = [float(p.inputs[i].std()) for p in parts]
             pushed = [p for p, x in zip(parts, size, strict=True) if x > 0.1 * np.median(size)]
-            if answers := _answers(pushed, i):
-                yield from _odd(name, answers, names)
+            answers = _answers(pushed, i)
+            if len(answers):
+                where = [place(names[p.trial], p.time) for p in pushed]
+                yield from _odd(name, answers, where)
                 break
 
 
-def _odd(name: str, answers: list[_Answer], names: Sequence[str]) -> Iterator[Finding]:
-    """Find odd gains of an input."""
-    gain, error = np.array([(a.gain, a.error) for a in answers]).T
+def _odd(name: str, answers: Float[np.ndarray, "n 4"], where: list[str]) -> Iterator[Finding]:
+    """Find odd gains of an input; `where`: places of the parts."""
+    gain, error, left, explained = answers.T
     usual = float(np.median(gain))
     together = abs(error**-2.0 @ gain) / np.sqrt((error**-2.0).sum())
     if together < CLEAR and np.mean((gain / error) ** 2) < CLEAR:
         yield Finding("no answer", f"the outputs do not answer {name}: was it recorded with them?")
         return
-    left = np.median([a.left for a in answers])
     texts = {
         "another sign": "the outputs answer {} with the other sign ({}): turn it.",
         "foreign input": "the outputs do not answer {} as elsewhere ({}): it belongs to another "
@@ -206,19 +194,20 @@ def _odd(name: str, answers: list[_Answer], names: Sequence[str]) -> Iterator[Fi
     odd = {
         "another sign": gain < -np.maximum(usual / 2, CLEAR * error),
         "foreign input": (gain < usual / 2) & (gain + CLEAR * error < usual),
-        "disturbed": [a.left > max(_DISTURBED * left, a.explained / 4) for a in answers],
+        "disturbed": left > np.maximum(_DISTURBED * np.median(left), explained / 4),
     }
-    for k, (cause, parts) in enumerate(odd.items()):
-        parts = np.asarray(parts) & ~np.any([*odd.values()][:k], axis=0)
-        if parts.any():
-            spans = [place(names[answers[n].part.trial], answers[n].part.time) for n in
-                     np.flatnonzero(parts)]  # fmt: skip
-            action = "refused" if cause == "another sign" else "warned"
-            yield Finding(cause, texts[cause].format(name, listed(spans)), action)
+    left_over = np.ones(len(gain), bool)
+    for cause, parts in odd.items():
+        spans = [where[k] for k in np.flatnonzero(parts & left_over)]
+        left_over &= ~parts
+        if spans:
+            text = texts[cause].format(name, listed(spans))
+            yield Finding(cause, text, "refused" if cause == "another sign" else "warned")
 
 
-def _answers(parts: list[_Part], i: int) -> list[_Answer]:
-    """Return the answer of each part, learned from other trials; none if there are too few."""
+def _answers(parts: list[_Part], i: int) -> Float[np.ndarray, "n 4"]:
+    """Return for each part the gain of its response relative to that learned from other trials, its
+    standard error, and mean squares of residuals and of the learned response. Too few: none."""
     regressors = [np.concatenate([p.before, *p.inputs], axis=1) for p in parts]
     squares = [x.T @ x for x in regressors]
     products = [x.T @ p.outputs for x, p in zip(regressors, parts, strict=True)]
@@ -228,7 +217,7 @@ def _answers(parts: list[_Part], i: int) -> list[_Answer]:
         training = training or [k for k in range(len(parts)) if k != n]
         unknowns = x.shape[1]
         if sum(len(regressors[k]) for k in training) < _ENOUGH * unknowns:
-            return []
+            return np.zeros((0, 4))
         square = np.sum([squares[k] for k in training], axis=0)
         square += 1e-4 * np.trace(square) / unknowns * np.eye(unknowns)  # of collinear inputs
         b = np.linalg.solve(square, np.sum([products[k] for k in training], axis=0))
@@ -240,8 +229,8 @@ def _answers(parts: list[_Part], i: int) -> list[_Answer]:
         each = ((response - gain * predicted) * predicted).sum(axis=1)
         error = float(np.sqrt((each**2).sum())) / power
         left = float(((response - predicted) ** 2).mean())
-        answers.append(_Answer(part, gain, error, left, float((predicted**2).mean())))
-    return answers
+        answers.append((gain, error, left, float((predicted**2).mean())))
+    return np.array(answers).reshape(-1, 4)
 
 
 def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
@@ -255,7 +244,7 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
     at = np.linspace(0, N, sections, endpoint=False).astype(int)
     cycles = (len(record.u) - first) // N
     number = min(_PARTS, cycles // _SHORTEST)
-    edges = np.linspace(0, cycles, number + 1).astype(int) if number else []
+    edges = np.linspace(0, cycles, number + 1).astype(int)[: number and None]
     for a, b in zip(edges[:-1], edges[1:], strict=True):
         where = slice(first + a * N, first + b * N)
         u = (record.u[where] / size_u).reshape(b - a, N, -1)
@@ -265,13 +254,13 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
         u = np.stack(means, axis=1)
         rows = np.arange(1, b - a - ahead)
         inputs = np.stack([u[rows + c] for c in range(-1, ahead + 1)], axis=1)
-        known = np.isfinite(inputs).all(axis=(1, 2, 3))
-        known &= np.isfinite(y[rows - 1]).all(axis=1) & np.isfinite(y[rows]).all(axis=1)
-        if known.sum() >= _SHORTEST / 2:
-            rows, inputs = rows[known], inputs[known]
+        usable = np.isfinite(inputs).all(axis=(1, 2, 3))
+        usable &= np.isfinite(y[rows - 1]).all(axis=1) & np.isfinite(y[rows]).all(axis=1)
+        if usable.sum() >= _SHORTEST / 2:
+            rows, inputs = rows[usable], inputs[usable]
             each = [_centered(inputs[..., i].reshape(len(rows), -1)) for i in range(u.shape[2])]
-            outputs = [_centered(y[rows - 1]), each, _centered(y[rows])]
-            yield _Part(data.trials[r], data.times[r][where], *outputs)
+            before, outputs = _centered(y[rows - 1]), _centered(y[rows])
+            yield _Part(data.trials[r], data.times[r][where], before, each, outputs)
 
 
 def _centered(x: Float[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
@@ -293,8 +282,6 @@ def feedback(data: SectionData) -> Iterator[Finding]:
         repeated = float(np.nanvar(data.cycle_inputs[:, i]))
         share = repeated / max(repeated + float(deviations[i]) ** 2, np.finfo(float).tiny)
         if share > 0.5:
-            yield Finding(
-                "feedback",
-                f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: it is not "
-                "exogenous, and fits are biased. Add a perturbation, and name that as the input.",
-            )
+            text = f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: fits "
+            text += "are biased. Add a perturbation, and name it as the input."
+            yield Finding("feedback", text)
