@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..errors import DefinitionError
@@ -131,7 +132,8 @@ class _Walk:
     def _array(self, x: Any) -> None:
         if isinstance(x, jax.core.Tracer):
             return self.note(str(x.aval))
-        values = np.asarray(x)
+        is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        values = np.asarray(jax.random.key_data(x) if is_key else x)
         self.note(values.dtype.str, values.shape)
         if values.dtype.hasobject:
             self.visit_all(values.ravel().tolist())
@@ -141,7 +143,7 @@ class _Walk:
     def _function(self, x: types.FunctionType) -> None:
         is_installed = is_of_package(x.__code__.co_filename)
         if is_installed:
-            self.note(x.__code__.co_filename, x.__qualname__)
+            self.note(x.__module__, x.__qualname__)
         else:
             self.visit(x.__code__)
             self._globals(x)

@@ -17,7 +17,6 @@ from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, 
 from .._core.progress import working
 from .._core.results import Result
 from .._core.signal import Signal, unit_of
-from ..engine.describe import describe
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle, rough
 from ..sections.placed import SectionsLike

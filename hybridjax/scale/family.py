@@ -19,7 +19,6 @@ from .._core.boundary.values import Reals
 from .._core.pieces.description import function_digest
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
-from ..engine.describe import describe
 from ..errors import DefinitionError
 from ..orbits.checks import check_periodic
 from ..systems.system import HybridSystem, unit_of_parameter

@@ -71,6 +71,15 @@ def unit_of_parameter(system: Any, path: str) -> str:
     return type(system).__dataclass_fields__[name].metadata.get("unit", "")
 
 
+def describe(system: "HybridSystem") -> dict[str, Any]:
+    """The class of a system, its numbers by name, and a digest of its code, for stored results."""
+    numbers = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
+        name = ".".join(str(getattr(x, "name", x)) for x in path)
+        numbers[name] = float(leaf) if np.ndim(leaf) == 0 else array_digest(leaf)
+    return {"class": type(system).__qualname__, "numbers": numbers, "code": code_digest(system)}
+
+
 def own_fields(system: Any) -> tuple[dataclasses.Field, ...]:
     """The fields of a system or its class that its author wrote: its parameters."""
     return tuple(x for x in dataclasses.fields(system) if x.name not in ("solver", "code_digest"))
