@@ -20,7 +20,7 @@ from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle, rough
 from ..sections.placed import SectionsLike
-from ..systems.system import OutputNames
+from ..systems.system import OutputNames, describe
 from .data import ExperimentData, Simulated, summary
 from .design.design import Design
 from .run import CHUNK, Campaign, DesignLike, Options, prepare

@@ -21,7 +21,7 @@ from .._core.pieces.store import Constant
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..orbits.checks import check_periodic
-from ..systems.system import HybridSystem, unit_of_parameter
+from ..systems.system import HybridSystem, describe, unit_of_parameter
 
 
 Axes = Mapping[str, Annotated[Numbers, Reals("n")]]

@@ -7,12 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import Scalar, Vector
 from .._core.executor import Definition
+from .._core.meaning import code_digest
+from .._core.pieces.description import array_digest
 from .._core.precision import real
 from .._core.text import columns, fields, value
 from .chart import Chart, attribute_of
