@@ -232,9 +232,9 @@ def optimal_design(
 
     **Arguments:**
 
-    - `model`: the system, exact or estimated; a `StructuredFit` also does, whose deviations are
-      those of the fitted harmonics. Several models (`hj.designs.draws` of an estimate) make the
-      design robust, see `robust`; the limits hold for each.
+    - `model`: the system, exact or estimated; or a `StructuredFit`, from whose fitted harmonics the
+      deviations of outputs are computed. Several models (`hj.designs.draws` of an estimate) make
+      the design robust, see `robust`; the limits hold for each.
     - `design`: the design to improve. Lines that are not in it are forbidden; inputs, periods and
       the number of experiments are kept. Default: `multisine` with all lines.
     - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
@@ -243,10 +243,10 @@ def optimal_design(
       over all experiments: `{"u": 0.01}`; `"input"` or `"output"`: rms values of these as in
       `design`; or `hj.designs.Limits`, also of peaks, rates, strides and distortion.
       Default: `"input"`.
-    - `noise`: of each measured output, by name: the standard deviation of white noise, or a
-      function that returns it by the frequency of the output (0 to N/2 cycles per period), the root
-      of a spectrum. Default: all outputs are measured, with white noise 20 dB below their rms
-      deviation in `design` within the limits.
+    - `noise`: noise of each measured output by name: the standard deviation of white noise, or the
+      root of a spectrum, a function of the frequency of the output (0 to N/2 cycles per period).
+      Default: all outputs are measured, with white noise 20 dB below their rms deviation in
+      `design` within the limits.
     - `seed` of phases and division. Default: 0.
     - `robust`: with several models, minimize the mean of their criteria, or the worst one (a mean
       of 16th powers, which is slightly smaller). Default: `"mean"`.

@@ -143,8 +143,8 @@ def simulate(
     - `chart`, `state`, `time`: the start. A guard that is zero there is not an event.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
-    - `settings`: accuracy of the flow. Without a `scale`, errors are judged against the size that
-        each state has in the step at hand, whatever its unit. Default: 1e-10.
+    - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of
+        each state in the current step, in any unit. Default: 1e-10.
     - `max_steps`: bound on the number of steps, rounded up to a multiple of that of the settings.
         Default: 100 000.
     - `throw`: raise an error if the trajectory ends early. Default: True; with False, its `result`

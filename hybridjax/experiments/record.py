@@ -26,18 +26,18 @@ class Record(eqx.Module):
 
     **Fields**, on the host:
 
-    - `u` (n, nu): inputs, held from sample i to i + 1. NaN where not known: the record is then
-      cut there, and the state after it is unknown. Without any (nu = 0) nothing can be fitted to
-      inputs.
+    - `u` (n, nu): inputs, constant from sample i to i + 1. NaN where unknown: the record is then
+      split, and the state after the gap is unknown. Without inputs (nu = 0) there is nothing to fit
+      responses to.
     - `y` (n, ny): outputs minus those on the limit cycle, sampled before `u[i]` acts. NaN where a
       sample is missing or bad.
     - `n_sections`: N. `first_section`: the section of sample 0. `inputs`, `outputs`: names, or
       units by name.
-    - `lead`: y[i] may depend on inputs up to `u[i + lead]`: smoothing, or sections that were placed
-      by what came later.
-    - `drift`: the outputs at each section also hold an unknown part that changes more slowly than
-      in so many cycles; infinite: a constant, as where an average cycle was subtracted. None: they
-      hold nothing but the response.
+    - `lead`: y[i] may depend on inputs up to `u[i + lead]`, because of smoothing or of sections
+      that depend on later events.
+    - `drift`: number of cycles. The outputs at each section may also contain an unknown part that
+      changes more slowly. Infinite: a constant, such as an error of the subtracted average cycle.
+      None: only the response.
     """
 
     u: Float[np.ndarray, "n nu"]

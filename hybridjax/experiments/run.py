@@ -86,16 +86,15 @@ def run_experiments(
 ) -> ExperimentData:
     """Excite the system around its limit cycle and record its outputs at the sections.
 
-    All experiments of a batch run side by side in one compiled call, and batches on all cores.
-    An experiment that fails (a section missed, events in another order, ...) stops there; the
-    others go on. `hj.experiments.stream_experiments` runs experiments whose records do not fit into
-    memory.
+    The experiments of a batch run in one compiled call, and the batches on all cores. An experiment
+    that fails (a section missed, events in another order, ...) stops there; the others go on.
+    `hj.experiments.stream_experiments` runs experiments whose records do not fit into memory.
 
     **Arguments:**
 
     - `sections`: a family, or `PlacedSections`.
-    - `design`: a `Design`, or inputs (S, n, nu) that are held from section to section. n must be a
-        whole number of periods. All periods after the discarded ones are for estimation.
+    - `design`: a `Design`, or inputs (S, n, nu) that are constant from section to section. n must
+        be a whole number of periods. All periods after the discarded ones are used for estimation.
     - `outputs`: names or `Output`s, recorded at each section before the new input acts.
     - `start`: initial condition. "cycle" is a state on the limit cycle. "periodic" is a state on
         the periodic response that the linearization predicts, which leaves a transient of second
@@ -105,8 +104,8 @@ def run_experiments(
         20 from the cycle (as in the paper), 0 from a periodic or steady start.
     - `process_noise`: a random input beside the excitation, which is not recorded.
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
-        every section, relative to their sizes (`LimitCycle.scale`). `data.error` estimates the
-        error of each experiment. Default: 1e-9.
+        every section, relative to their characteristic magnitudes (`LimitCycle.scale`).
+        `data.error` estimates the error of each experiment. Default: 1e-9.
     - `execution`: batches and threads.
 
     **Returns:** `ExperimentData`. `data.summary()` lists failures with their causes.
@@ -149,7 +148,7 @@ class Campaign:
 
     - `placed`: the sections on the limit cycle. `outputs`: recorded there.
     - `inputs`: source of the inputs. `start`: the kind of initial condition. `model`: the
-      linearization that predicts it, except for starts on the cycle.
+        linearization that predicts it, except for starts on the cycle.
     - `stepping`: tolerances and step schedule between sections.
     - `process_noise`: as in `run_experiments`.
     - `execution`: batch size and number of threads.

@@ -71,8 +71,8 @@ def fit_model(
     - `data`: an `ObservedHTF`, `ObservedSeries` or `ObservedCycle`, or several of them; or a
         subclass of `AbstractObservation` for data of another type.
     - `free`: names of parameters, which keep their signs, or `{name: (low, high)}` with bounds
-        (infinite where there are none, `None` for the sign of the value). Names may have dots.
-    - `guess`: of the limit cycle of `system`, or the cycle of a similar system; see
+        (infinite where there are none), or `{name: None}` without bounds. Names may have dots.
+    - `guess`: guess of the limit cycle of `system`, or the cycle of a similar system; see
         `find_limit_cycle`.
     - `guesses`: largest number of guesses of the parameters: those of `system`, then random ones
         with factors between exp(-0.2) and exp(0.2). Once one has converged to a cost that the data

@@ -32,30 +32,32 @@ def estimate_htf(
 ) -> HTF:
     """Estimate all harmonic transfer functions at all frequencies that the inputs excite.
 
-    `H_l(w_k) = Y[k + l P] / U[k]`, both DFTs over the same window of the last P whole periods.
-    The excited lines k are found from U itself, so any experiments that obey the rules of a
-    `Design` will do. Where a frequency was measured more than once the
-    estimate is the least-squares one. On multiples of 1/2 (other than 0 and N/2) the line
-    coincides with its own mirror image, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`;
-    both unknowns are solved for, from two or more experiments with different phases. Inputs that
-    excite one line together need as many experiments to be separated. Failed experiments are left
-    out, and with several inputs only frequencies that were measured from each of them are kept.
+    `H_l(w_k) = Y[k + l P] / U[k]`, both DFTs over the same window of the last P whole periods. The
+    excited lines k are found from U itself, so that any experiments that obey the rules of a
+    `Design` can be used. Where a frequency was measured more than once the estimate is the
+    least-squares one. A line on a multiple of 1/2 (other than 0 and N/2) aliases with its own
+    conjugate, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`; two or more experiments with
+    different phases determine both unknowns. If m inputs excite the same line, at least m
+    experiments are needed to separate their responses. Failed experiments are left out, and with
+    several inputs only frequencies that were measured from each of them are kept.
 
     The estimate is that of the best linear approximation for signals of the class that was applied
-    (Pintelon and Schoukens 2012, ch. 3), with its `variance`. Frequencies that
-    were measured in several realizations of random phases scatter by noise and by nonlinear
-    distortion together; with `repeats` the scatter between windows is that of noise alone, the
-    `noise_variance`. Without realizations, `variance` itself is that of noise alone.
+    (Pintelon and Schoukens 2012, ch. 3), with its `variance`. From several realizations of random
+    phases, `variance` contains noise and nonlinear distortion; from several windows (`repeats`),
+    `noise_variance` contains noise alone. Without realizations, `variance` itself is that of noise
+    alone.
 
     **Arguments:**
 
-    - `data`: the experiments; or parts of them one after the other, as `stream_experiments` and
-      `StoredExperiments` return them, of which only sums over experiments are kept.
+    - `data`: the experiments, or an iterable of parts of them, as `stream_experiments` and
+      `StoredExperiments` return; only sums over experiments are kept in memory.
     - `harmonics`: the harmonics to estimate. Default: all N.
     - `repeats`: number of the last windows of P periods that are averaged. Default: 1.
-    - `variance`: "auto", the default, is the variance that the experiments allow; "noise", from
-      the repeats alone, and "total", from realizations, raise errors where they are not available.
-    - `half_integers`: "error", the default, or "skip" multiples of 1/2 measured with one phase.
+    - `variance`: "noise" is computed from the repeats, "total" from the realizations; each raises
+      an error if it is not available. "auto" is "total" if available, else "noise". Default:
+      "auto".
+    - `half_integers`: treatment of multiples of 1/2 that were measured with a single phase, "error"
+      or "skip". Default: "error".
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
 

@@ -135,23 +135,23 @@ def fit_multipliers(
 
     **Arguments:**
 
-    - `htf`: exact or estimated. Without variances each output counts relative to its misfit, which
-      is modeled as white noise and noise that has passed the system.
+    - `htf`: exact or estimated. Without variances each output is weighted by its residuals, whose
+      spectrum is modeled as white noise plus noise filtered by the system.
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model whose rank it is.
       `select_order` helps to find it.
     - `harmonics`: the harmonics to fit. Default: all of `htf`.
     - `overhang`: degree of the numerators beyond d N. Default: N.
-    - `errors`: source of the covariance. `"residuals"`, the default: the misfit
-      at each frequency, so that it holds also where the errors of different harmonics are
-      dependent (process noise, distortion) or the variances are only roughly known (White 1980).
-      `"variance"`: the variances, which must then be right.
-    - `check`: whether to raise an error if the data do not carry so many multipliers (a rank test
-      at the level of 1 %): the others would be fitted to noise. Default: True.
+    - `errors`: source of the covariance. `"residuals"`: the residuals at each frequency. This
+      remains valid if the errors of different harmonics are dependent (process noise, distortion)
+      or the variances are only approximate (White 1980). `"variance"`: the variances, which must
+      then be correct. Default: `"residuals"`.
+    - `check`: whether to raise an error if the data do not support so many multipliers (a rank test
+      at the level of 1 %): the surplus multipliers would only fit noise. Default: True.
     - `max_steps`: largest number of Gauss-Newton steps. Default: 50.
 
     **Raises:** `DefinitionError` for an order below 1, NaN in the HTFs, variances that are not
-    positive, a harmonic that `htf` does not hold, too few frequencies for so many coefficients
-    (the message gives the number needed), or an order that the data do not carry.
+    positive, a harmonic that `htf` does not hold, too few frequencies for so many coefficients (the
+    message gives the number needed), or an order that the data do not support.
     """
     order = order.rank() if isinstance(order, LDTP) else order
     N = htf.n_sections

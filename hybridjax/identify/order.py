@@ -99,9 +99,9 @@ def select_order(
 
     *Rank*: the part of $H, z^{-N} H, \ldots, z^{-DN} H$ that numerators do not explain has as many
     independent components as there are multipliers (D at most), and otherwise only noise, whose
-    covariance is known up to a factor. The generalized singular values are compared with
-    those of noise alone, from the smallest on.
-    *MDL*: a criterion of fits of every order, with numerators of the degree that belongs to it.
+    covariance is known up to a factor. The generalized singular values are compared with those of
+    noise alone, from the smallest on. *MDL*: Rissanen's criterion for a fit of each order, with
+    numerators of the degree that belongs to this order.
 
     **Arguments:** as in `fit_multipliers`. Without variances the misfit of the largest order is
     taken for noise, so that `max_order` must be no smaller than the number of multipliers; errors

@@ -137,17 +137,18 @@ def validate(
 ) -> Validation:
     r"""Simulate a model on data and test the residuals.
 
-    Both tests are made for each section of the period and then summed up, since the statistics of
-    a periodic system's residuals are periodic themselves. *Whiteness*: the sums of squared
-    correlations with earlier residuals, chi-squared (the portmanteau test of Box and Pierce, for
-    periodic models McLeod 1994): of their means over the sections and of the differences from
-    these, of which the smaller p-value is taken, corrected for the choice. *Independence*: the
-    part of the residuals that lagged inputs explain, compared with the rest (an F ratio for each
-    section), for any spectrum of the input; its level holds for residuals that are white.
+    Both tests are made for each section of the period and then summed up, since the statistics of a
+    periodic system's residuals are periodic themselves. *Whiteness*: sums of squared correlations
+    with earlier residuals are chi-squared (the portmanteau test of Box and Pierce; for periodic
+    models McLeod 1994). The means of the correlations over the sections, and the deviations from
+    these means, are tested separately; the p-value is the smaller one, corrected for the choice.
+    *Independence*: the part of the residuals that lagged inputs explain, compared with the rest (an
+    F ratio for each section), for any spectrum of the input; its level holds for residuals that are
+    white.
 
     For a fit of `fit_ldtp` to series, the errors of predictions one step ahead are tested (Ljung
     1999): they are white for a true model with any noise that drives the system, if that noise is
-    described. All fields are then those of the predictions.
+    described. All fields of the result then refer to these predictions.
 
     Records with three samples or fewer for each unknown of their initial condition and drift are
     left out: they agree with any model.
@@ -155,11 +156,9 @@ def validate(
     **Arguments:**
 
     - `model`: identified or exact; a `SeriesFit` is simulated as it is.
-    - `data`: as for `fit_series`, best those that the model was not fitted to; the data of the fit
-      always fit too well.
-    - `start`: "free", the default, estimates the state at the start of each record from it;
-      "cycle" takes it as zero. A drift that the records announce is estimated from them in either
-      case.
+    - `data`: as for `fit_series`, preferably not the data of the fit, which always agree too well.
+    - `start`: "free", the default, estimates the state at the start of each record from it; "cycle"
+      takes it as zero. Declared drift of the records is estimated in either case.
     - `lags`: number of lags that are tested. Default: one period, less for few cycles.
     - `level`: significance level of the tests. Default: 0.01.
 

@@ -108,12 +108,12 @@ class HTF(eqx.Module):
     - `n_sections`: `N`, the number of sections (samples) in one period.
     - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`.
     - `source`: a label, "exact" or "estimate".
-    - `variance` (M, F, ny, nu): of estimates, E|dH|^2 of the complex error dH, which is circular
-      (real and imaginary part each have half of it). Everything random that the experiments let
-      be seen; None where they do not.
-    - `noise_variance` (M, F, ny, nu): the part of it that is noise, from repeated periods. The
-      rest is nonlinear distortion, which random phases make random. None where it was not split.
-    - `scatter`: how well `variance` is known; None where it is known exactly.
+    - `variance` (M, F, ny, nu): E|dH|^2 of the complex error dH of estimates, which is circular
+      (real and imaginary part each have half of it). It contains all random errors that the
+      experiments reveal. None if it is unknown.
+    - `noise_variance` (M, F, ny, nu): the part of `variance` that is noise, from repeated periods.
+      The remainder is nonlinear distortion, which random phases make random. None if it is unknown.
+    - `scatter`: degrees of freedom of `variance`; None if the variance is exact.
 
     **Raises:** `DefinitionError` if these do not fit together.
     """

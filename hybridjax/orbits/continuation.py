@@ -167,9 +167,9 @@ def continuation(
 ) -> Branch:
     """Continue a limit cycle in a parameter, and mark changes of its stability.
 
-    The branch is computed from the cycle both ways, until the first and the last of the values, by
-    pseudo-arclength: it may turn back in between. Points at which a multiplier crosses the unit
-    circle are located to rounding errors. The cycle may be unstable.
+    Pseudo-arclength continuation computes the branch in both directions from the cycle, to the
+    first and the last of the values, around folds in between. Points at which a multiplier crosses
+    the unit circle are located to rounding errors. The cycle may be unstable.
 
     ```python
     branch = hj.continuation(hj.find_limit_cycle(buck), "Vin", (20.0, 26.0))
@@ -179,17 +179,18 @@ def continuation(
     **Arguments:**
 
     - `cycle`: the first cycle. Its own value of the parameter lies within the values.
-    - `parameter`: the name of a parameter of the system; a part of a part has a path with dots,
-        such as `"leg.k"`.
+    - `parameter`: the name of a parameter of the system, or of a part of the system with dots, such
+        as `"leg.k"`.
     - `values`: two or more numbers, ascending or descending. The branch ends at the first and the
-        last, has a cycle at each of them, as often as it passes it, and others in between.
-    - `step`: the longest step, as a part of the range of values and of the size of the states.
-        Default: 0.05.
+        last. It has a cycle at each value, every time that it passes the value, and others in
+        between.
+    - `step`: the longest step, as a fraction of the range of values and of the magnitudes of the
+        states. Default: 0.05.
     - `max_points`: largest number of cycles each way. Default: 1000.
 
-    **Returns:** a `Branch`. Nothing is raised if it ends before the values do: `ends` has the
-    reason (an event that grazes, is lost or comes out of order; no convergence even in the
-    shortest step; an equilibrium in place of a cycle).
+    **Returns:** a `Branch`. No error is raised if it ends earlier: `ends` has the reason (an event
+    that grazes, is lost or comes out of order; no convergence even in the shortest step; an
+    equilibrium in place of a cycle).
 
     **Raises:** `DefinitionError` for a parameter that does not exist, values without order, or a
     cycle that was not found or lies outside of them.

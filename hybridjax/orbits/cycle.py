@@ -48,19 +48,19 @@ class LimitCycle(eqx.Module):
 
     **Fields:**
 
-    - `period`: in the system's unit of time; that of all rounds of its `multiplicity`.
-    - `anchor`: the lane at which it begins, on the section `base` (a clock section at `anchor.t`
-        if `base` is `None`).
-    - `legs`: states at the beginnings of the K pieces into which the turn is cut.
+    - `period`: in the system's unit of time, for all `multiplicity` rounds together.
+    - `anchor`: the point (a lane) at which the cycle begins, on the section `base` (a clock section
+        at `anchor.t` if `base` is `None`).
+    - `legs`: states at the beginnings of the K pieces into which the cycle is divided.
     - `factors`: Jacobians of the flow over the pieces, padded with zeros. The valid block of
         `factors[n]` is [:dims[n+1], :dims[n]].
-    - `residual`: largest distance between `anchor` and the end of one period, in sizes of the
-        states.
+    - `residual`: largest distance between `anchor` and the end of one period, relative to the
+        magnitudes of the states.
     - `iterations`: number of Newton steps.
     - `result`: a `Result` code.
-    - `event_sequence`: transitions of one turn, by index, in order from the anchor.
-    - `settings`: accuracy of the flow, with the sizes of the states.
-    - `conserved`: values of conserved quantities that were asked for, by name.
+    - `event_sequence`: indices of the transitions of one period, in order from the anchor.
+    - `settings`: accuracy of the flow, with the magnitudes of the states.
+    - `conserved`: requested values of conserved quantities, by name.
     - `multiplicity`: periods of the clock, or crossings of the section, in one period of the
         cycle.
     """

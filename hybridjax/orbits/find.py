@@ -80,12 +80,12 @@ def find_limit_cycle(
     - `max_period`: for autonomous systems, the time after which the search for a return to the
         section is given up. Default: 1000 times the time scale of the states at the guess (in
         charts with an implicit method, that of the slowest mode).
-    - `scale`: sizes of states by name, such as `{"y": 1e-6}`; errors are judged relative to them.
-        Default: each state's largest modulus on the cycle, so that results do not depend on units
-        (under a JAX transformation, those of the guess).
-    - `settings`: accuracy of the flow (Default: 1e-12), the largest number of its steps, which
-        `linearize` uses too, and its `solver`; "auto" takes an implicit method in those charts
-        that are stiff on the cycle.
+    - `scale`: characteristic magnitudes of states by name, such as `{"y": 1e-6}`; errors are
+        relative to these. Default: each state's largest modulus on the cycle, so that results do
+        not depend on units (under a JAX transformation, those of the guess).
+    - `settings`: accuracy of the integration (default: 1e-12), largest number of steps (also of
+        `linearize`), and `solver`; "auto" uses an implicit method in the charts that are stiff on
+        the cycle.
     - `throw`: raise an error on failure; otherwise the cycle's `result` holds the reason.
         Default: True.
 

@@ -145,9 +145,9 @@ def find_limit_cycles(
 ) -> LimitCycles:
     """Find the limit cycles of many systems that differ in their parameters.
 
-    Newton's method starts from the guess for a few of them, side by side, then for as many again
-    from the cycles of their neighbors, until all are done. Systems for which it fails are simulated
-    for 40 periods, and Newton's method starts again from the end.
+    Newton's method first solves a few of them in parallel, from the guess. Each further call solves
+    as many as are done, from the cycles of their neighbors. Systems for which it fails are
+    simulated for 40 periods, and Newton's method starts again from the end.
 
     **Arguments:**
 
@@ -155,7 +155,7 @@ def find_limit_cycles(
         axis, as `equinox.filter_vmap` makes it:
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
-    - `scale`: sizes of states by name. Default: those of the guess.
+    - `scale`: characteristic magnitudes of states by name. Default: those of the guess.
     - `settings`: accuracy of the flow (Default: 1e-9 per step) and its `solver`.
     - `execution`: systems per compiled call (`batch`, Default: 250) and threads (`workers`).
 

@@ -67,11 +67,11 @@ def identify_recording(
     **Arguments:** those of `section_data`, and
 
     - `order`: the number of multipliers. Default: the result of `choose_order`.
-    - `drift`: changes that take longer than so many cycles are no response to the inputs: they are
+    - `drift`: number of cycles. Slower changes are not treated as responses to the inputs: they are
       removed from the outputs, and from the signals that define the phase, before the phase is
-      estimated; the fit allows for the rest. Default: None.
+      estimated, and the fit allows for the remainder. Default: None.
 
-    **Raises:** `DefinitionError` for what the inspection refuses, and as `estimate_phase`,
+    **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
     `section_data` and `fit_series`; `PrecisionError` in single precision.
     """
     require_x64()

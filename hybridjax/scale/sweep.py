@@ -64,11 +64,11 @@ def sweep(
     map.spectral_radius.plot()
     ```
 
-    A coarse pass finds cycles at points all over the space. Pieces of neighboring points then start
-    from these cycles, and points of a piece from each other. A piece does not depend on which
-    process computes it, nor when: results are the same to the last bit for any number of processes
-    and interruptions (on machines of one kind). A point at which the search fails is tried again
-    from the nearest point that succeeded, and after a burn-in.
+    A coarse pass finds cycles at points all over the space. A piece of neighboring points then
+    starts from these cycles, and continues from its own solved points. A piece does not depend on
+    which process computes it, nor when: results are the same to the last bit for any number of
+    processes and interruptions (on machines of one kind). A point at which the search fails is
+    tried again from the nearest point that succeeded, and after a burn-in.
 
     **Arguments:**
 
@@ -93,8 +93,8 @@ def sweep(
 
     **Raises:** `DefinitionError` for a parameter that does not exist, for quantities that do not
     exist or change their shape, if the store holds another sweep (with the difference) or cannot be
-    written, and for a client whose workers cannot do it; `ComputationError` if there is no cycle in
-    the middle, or the cluster is lost.
+    written, and for a client whose workers cannot run the job; `ComputationError` if there is no
+    cycle in the middle, or the cluster is lost.
     """
     require_x64()
     space = Space(over.values, False) if isinstance(over, Points) else Space(_axes(over), True)

@@ -211,7 +211,7 @@ class KinematicPhase(_Anchored):
 
     The same definition gives the phase of a recording (`hj.recordings.estimate_phase`). At its
     sections the two signals are functions of one number: as outputs they carry less information
-    than at those of a phase that goes from one `Crossing` to the next.
+    than at sections of a phase that is defined by a `Crossing`.
 
     **Fields:**
 
@@ -219,8 +219,9 @@ class KinematicPhase(_Anchored):
     - `position`, `velocity`: names of states, outputs or recorded signals.
     - `center` (o_p, o_v) and `scale` (s_p, s_v), in the units of the two. Default: the origin and 1
       on a model; the middle of each signal's range and half its width in a recording.
-    - `anchor`: the position of section 0: a `Crossing` on the cycle, or an angle in radians. At 0
-      the velocity is that of the center, and the position is beyond it. Default: 0.
+    - `anchor`: the position of section 0: a `Crossing` on the cycle, or an angle in radians. At
+      angle 0 the velocity is that of the center, and the position is larger than that of the
+      center. Default: 0.
     """
 
     label: ClassVar[str] = "kinematic"

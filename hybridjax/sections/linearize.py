@@ -32,15 +32,15 @@ def linearize(
 ) -> LDTP:
     """Linearize the flow between consecutive sections, eqs. (5) and (6).
 
-    A[n] (d', d) and B[n] (d', nu) map deviations at section n, and the input held until section
-    n+1, to deviations at section n+1: exactly, through all events in between, also if the
-    interval's end depends on the state. C[n] (ny, d) and D[n] (ny, nu) give the deviations of the
-    outputs at section n.
+    A[n] (d', d) and B[n] (d', nu) map deviations at section n, and the constant input until section
+    n+1, to deviations at section n+1. They are exact, through all events in between, also if the
+    end of the interval depends on the state. C[n] (ny, d) and D[n] (ny, nu) give the deviations of
+    the outputs at section n.
 
-    The coordinates on a section are deviations of the chart's states; on a state-based section of
-    a clocked system the time of crossing comes first. On a section given by a level function, the
-    coordinate is left out that changes fastest along the flow, relative to the level.
-    `ldtp.coordinates` lists them.
+    The coordinates on a section are deviations of the chart's states; on a state-based section of a
+    clocked system the time of crossing comes first. On a section given by a level function, the
+    state that the flow changes fastest across the section is left out. `ldtp.coordinates` lists
+    them.
 
     **Arguments:**
 

@@ -40,14 +40,15 @@ class Chart(eqx.Module):
     Class attributes:
 
     - `states`: the names of the states, in the order in which they stand in `q`.
-    - `units`: their units, in the same order, for figures and prints; none, or one for each.
+    - `units`: units of the states, in the same order, for figures and printed summaries; none, or
+        one for each.
     - `inputs`: the names of the system's inputs that this chart uses, in the order in which they
-        stand in `u` (the map g_a of the paper: the others are thrown away). `None` means all.
+        stand in `u` (the map g_a of the paper: the others are ignored). `None` means all.
     - `solver`: how the chart is integrated: a Runge-Kutta method of diffrax with an error estimate,
         or `hj.Radau()`. `None` means the explicit pair of order 7, which is best where nothing is
-        stiff. A `solver` of the system goes before it.
-    - `absent`: values of states that this chart does not carry although outputs and sections may
-        ask for them there, e.g. `{"ym": 0.0, "vm": 0.0}` for a foot at rest on the ground.
+        stiff. A `solver` of the system overrides it.
+    - `absent`: values of states that this chart lacks but outputs and sections may use, e.g.
+        `{"ym": 0.0, "vm": 0.0}` for a foot at rest on the ground.
     """
 
     states: AbstractClassVar[tuple[str, ...]]

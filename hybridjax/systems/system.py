@@ -97,8 +97,8 @@ def _number(x: Scalar) -> Array:
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time.
 
-    `after` names an event that has just led there: in an autonomous system, the search then takes
-    the return map right after that event, if no other section is asked for.
+    `after` names the event that has just led to this state. For an autonomous system, the return
+    map is then taken right after this event, unless a section is given.
     """
 
     chart: str = eqx.field(static=True)
@@ -131,12 +131,12 @@ class HybridSystem(Definition):
             )
     ```
 
-    `charts` (and where there are events, `transitions`) are written by every system; `period`,
-    `outputs` and `guess` where they apply. The class attribute `inputs` names the exogenous
-    inputs û; `inputs = ()` for a system without. `input_units` gives their units in the same order
-    (none, or one for each), and `time_unit` that of time. `solver`, a keyword of every constructor,
-    says how charts are integrated: all of them, or some by name (`{"stance": hj.Radau()}`); it goes
-    before what the charts say themselves (`Chart.solver`).
+    Every system defines `charts`, and `transitions` if it has events; `period`, `outputs` and
+    `guess` are optional. The class attribute `inputs` names the exogenous inputs û; `inputs = ()`
+    for a system without. `input_units` gives their units in the same order (none, or one for each),
+    and `time_unit` that of time. `solver`, a keyword of every constructor, is the method of
+    integration of all charts, or of some by name (`{"stance": hj.Radau()}`); it overrides
+    `Chart.solver`.
     """
 
     inputs: ClassVar[tuple[str, ...]] = ("u",)

@@ -65,27 +65,26 @@ def multisine(
       Default: 64.
     - `band`: the lowest and the highest frequency in cycles per period, both included. Default:
       0 to 10 as in the paper, or to N/2 if that is less.
-    - `amplitude`: of each cosine, or a function of an array of f that returns it. `Design.scaled`
-      sets the rms value of the signals. Default: 0.01.
+    - `amplitude`: amplitude of each cosine, or a function that returns it for an array of f.
+      `Design.scaled` sets the rms value of the signals. Default: 0.01.
     - `seed`: of the phases and the division. Default: 0.
     - `lines`: the excited frequencies. `"all"` are all but multiples of 1/2, as in the paper.
       `"odd"` are those with odd j (P must be even). Distortion of even order then falls between the
       excited frequencies; at small amplitudes, where it is the largest, this costs half of the
-      frequencies and gains one to two digits. `"two-phase"` are all and the multiples of 1/2 as
-      well, these in two experiments each with phases 90 degrees apart (0 and N/2 in one). Default:
-      "all".
+      frequencies and gains one to two digits. `"two-phase"` adds the multiples of 1/2, each in two
+      experiments with phases 90 degrees apart (0 and N/2 in one). Default: "all".
     - `division`: the division of frequencies among experiments. `"random"` has no further rule.
       `"sum-free"` keeps the products f_i + f_j and f_i - f_j of an experiment, where quadratic
       distortion falls, off its own frequencies; this needs many experiments with few frequencies
-      each, for example 80 instead of 20. Several inputs are excited one per experiment, but with
-      `"disjoint"` all of them on different frequencies, and with `"orthogonal"` all of them on all
-      frequencies, with phases that differ from one experiment to the next, so that nu experiments
-      separate nu inputs with nu times the power per frequency. Default: "random".
-    - `experiments`: their number for all inputs together. With more than the fewest, signals are
-      weaker and have fewer cosines each, and so less distortion. With the fewest for all
+      each, for example 80 instead of 20. With these two, an experiment excites a single input.
+      `"disjoint"` excites all inputs, on different frequencies. `"orthogonal"` excites all inputs
+      on all frequencies, with phases such that nu experiments separate nu inputs, with nu times the
+      power per frequency. Default: "random".
+    - `experiments`: number of experiments for all inputs together. With more than the fewest,
+      signals are weaker, have fewer cosines, and cause less distortion. With the fewest for all
       frequencies, every second-order product falls on a frequency of the same experiment, so
       amplitudes must be small. Default: the fewest possible.
-    - `inputs`: their number or names. Default: 1.
+    - `inputs`: number or names of the inputs. Default: 1.
 
     **Raises:** `DefinitionError` for a band that holds no frequency or exceeds N/2, for too few
     experiments (the message has the minimum), and for choices that exclude each other.

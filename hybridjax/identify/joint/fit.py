@@ -168,7 +168,7 @@ def fit_ldtp(
 ) -> LDTPFit:
     r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model by maximum likelihood.
 
-    *HTFs*, with independent, circular, Gaussian errors of the variances given:
+    For *HTFs* with independent, circular, Gaussian errors of the given variances, the fit minimizes
 
     $$V(A, B, C, D) = \sum \frac{2}{v}\, | H_m(\omega) - \hat H_m(\omega; A, B, C, D) |^2$$
 
@@ -176,18 +176,18 @@ def fit_ldtp(
     transfer functions a numerator of its own; here they follow from fewer unknowns, and the
     standard errors of multipliers are smaller (`hj.identify.ldtp_bound` returns them).
 
-    *Time series*, with Gaussian errors e of predictions one step ahead:
+    For *time series*, with Gaussian one-step prediction errors e,
 
     $$x[n+1] = A[n] x[n] + B[n] u[n] + K[n] e[n], \qquad y[n] = C[n] x[n] + D[n] u[n] + e[n]$$
 
-    $V = \sum_n T_n \log \det S[n]$ with S[n] the covariance of the $T_n$ errors at section n
-    (Ljung, *System Identification*, 1999, for each section). With `noise="output"` K is zero and S
-    the same at all sections: white noise of sensors. With "innovations" the noise is any periodic
-    process of the states: process noise (every such system has this form, by Kalman's filter),
-    and, with more states, colored noise.
+    it minimizes $V = \sum_n T_n \log \det S[n]$ with S[n] the covariance of the $T_n$ errors at
+    section n (Ljung, *System Identification*, 1999, for each section). With `noise="output"` K is
+    zero and S the same at all sections: white noise of sensors. With "innovations" the noise is any
+    periodic process of the states: process noise (every such system has this form, by Kalman's
+    filter), and, with more states, colored noise.
 
-    The iteration is Levenberg-Marquardt's, with exact derivatives, in local coordinates in which
-    the choice of states does not count (McKelvey, Helmersson and Ribarits 2004).
+    The iteration is Levenberg-Marquardt's, with exact derivatives, in local coordinates that leave
+    out changes of the state coordinates (McKelvey, Helmersson and Ribarits 2004).
 
     ```python
     fit = hj.fit_ldtp(estimate, dims)
@@ -198,11 +198,11 @@ def fit_ldtp(
     - `data`: estimated HTFs, with as many harmonics as possible: few harmonics determine few
       entries of the matrices. Without variances each output is weighted by its residuals. Or time
       series, as for `fit_series`.
-    - `guess`: dimension of the state, at each section or at all. The fit then starts from
-      `hj.identify.realize` for HTFs, and from a subspace method for time series. Or an observable
-      model with these dimensions to start from. Too few dimensions bias the multipliers: compare
-      `cost` with `freedom` where variances are known, and use `hj.validate` for time series. The
-      iteration finds the nearest minimum; the same numbers show whether it is the lowest.
+    - `guess`: dimensions of the state at each section (or one for all): the fit starts from
+      `hj.identify.realize` for HTFs, and from a subspace method for time series. Alternatively, an
+      observable initial model with these dimensions. Too few dimensions bias the multipliers:
+      compare `cost` with `freedom` where variances are known, and use `hj.validate` for time
+      series. The iteration finds a local minimum; the same checks reveal a poor one.
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
