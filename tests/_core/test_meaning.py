@@ -1,5 +1,6 @@
 """Whatever changes what a function computes changes its digest; what does not, leaves it."""
 
+import time
 import types
 
 import pytest
@@ -115,6 +116,12 @@ WAYS = {
         "import functools\nK = 1\n@functools.lru_cache\ndef f(x): return K * x",
         "K = 2",
     ),
+    "a random key": ("import jax\nK = jax.random.key(1)\ndef f(x): return K", "K = jax.random.key(2)"),
+    "the rule of a derivative": (
+        "import jax\nK = 1\n@jax.custom_jvp\ndef f(x): return x\n"
+        "f.defjvps(lambda dx, _, x: K * dx)",
+        "K = 2",
+    ),
     "an attribute of a module": ("def f(x): return other.K * x", "other.K = 2"),
     "an attribute of a module, by a word": ("def f(x): return getattr(other, 'K')", "other.K = 2"),
     "a function of a module": ("def f(x): return other.h(x)", "other.h = lambda x: 3 * x"),
@@ -144,3 +151,13 @@ def test_names_that_code_makes_are_refused():
     exec("K = 1\ndef f(x): return eval('K') * x", space)
     with pytest.raises(DefinitionError, match="calls `eval`"):
         meaning(space["f"])
+
+
+def test_functions_that_call_each_other_are_visited_once():
+    """Sixty of them, each calling the ten before."""
+    lines = [" + ".join(f"g{j}(x)" for j in range(max(i - 10, 0), i)) or "x" for i in range(60)]
+    space = {"__name__": "users_module"}
+    exec("\n".join(f"def g{i}(x): return {line}" for i, line in enumerate(lines)), space)
+    before = time.process_time()
+    meaning(space["g59"])
+    assert time.process_time() - before < 1.0
