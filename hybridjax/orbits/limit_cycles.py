@@ -27,6 +27,7 @@ from .checks import check_periodic
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
+from .jumps import check_jumps
 from .return_map import ReturnMap, turn_product
 from .scale import given_sizes, scale_of
 
@@ -196,12 +197,17 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
         turn.distance, rounds.steps, rounds.result, rounds.codes, map.settings, map.conserved,
         map.multiplicity,
     )  # fmt: skip
-    return without_coincidences(cycles, rounds.together)
+    return examined(cycles, rounds.together)
 
 
-def without_coincidences(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
+def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
     """The cycles, with the result `COINCIDENCE` if events coincide (`together`) that do not
-    commute."""
+    commute.
+
+    **Raises:** `DefinitionError` if the field jumps on the first or the last cycle.
+    """
+    for i in np.flatnonzero(cycles.ok)[[0, -1]] if cycles.ok.any() else ():
+        check_jumps(cycles[int(i)])
     rows = np.flatnonzero(together & cycles.ok)
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
     if all(commutes(cycles[i]) for i in few):

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -53,7 +52,6 @@ def test_a_jump_is_refused(further):
 @pytest.mark.parametrize(
     ("further", "same"),
     [
-        (lambda x: 0.1 * jax.nn.relu(x), lambda x: jnp.maximum(0.1 * x, 0.0)),
         (lambda x: jnp.where(x > 0, 0.1 * x, 0.0), lambda x: jnp.maximum(0.1 * x, 0.0)),
         (
             lambda x: jnp.where(x != 0, jnp.sin(x) / jnp.where(x != 0, x, 1.0), 1.0),
@@ -64,3 +62,19 @@ def test_a_jump_is_refused(further):
 def test_a_continuous_field_is_not(further, same):
     a, b = (hj.find_limit_cycle(Turns(f), section=RISES) for f in (further, same))
     np.testing.assert_allclose(a.multipliers, b.multipliers, rtol=1e-6)
+
+
+class Switched(Turns):
+    """A relay of a height that is zero in the first system."""
+
+    height: hj.Parameter = hj.parameter(0.0)
+
+    def charts(self):
+        return {"on": Turning(lambda x: self.height * jnp.mod(x, 1.0))}
+
+
+@pytest.mark.slow
+def test_a_jump_beside_a_cycle_without_one_is_refused():
+    first = hj.find_limit_cycle(Switched(None), section=RISES)
+    with pytest.raises(hj.DefinitionError, match="jumps by .*test_jumps.py"):
+        hj.continuation(first, "height", (0.0, 0.01))
