@@ -13,6 +13,7 @@ from jaxtyping import Float
 from .._core.meaning import is_of_package
 from ..errors import DefinitionError
 from ..systems.structure import Structure
+from .coincidence import SAME
 from .cycle import LimitCycle
 
 
@@ -38,11 +39,14 @@ def check_jumps(cycle: LimitCycle) -> None:
     deciding = {a: x for a, x in programs.items() if any(True for _ in _decisions(x.jaxpr))}
     if not deciding:
         return
-    t, chart, q = cycle.trajectory().dense(_PER_STEP)
+    path = cycle.trajectory(1.25)  # beyond its end, which may be where the field jumps
+    t, chart, q = path.dense(_PER_STEP)
+    events = path.t[path.event >= 0]
     for a, program in deciding.items():
         k = np.flatnonzero((chart[1:] == a) & (chart[:-1] == a) & (np.diff(t) > 0))
         n = s.dims[a]
-        if (jump := _first_jump(program, (t[k], q[k, :n]), (t[k + 1], q[k + 1, :n]), s.nu)) is None:
+        jump = _jump(program, (t[k], q[k, :n]), (t[k + 1], q[k + 1, :n]), s.nu, events)
+        if jump is None:
             continue
         time, size, decision = jump
         equation = next(itertools.islice(_decisions(program.jaxpr), decision, None))
@@ -54,11 +58,11 @@ def check_jumps(cycle: LimitCycle) -> None:
         )
 
 
-def _first_jump(
-    program: Any, low: Points, high: Points, nu: int
+def _jump(
+    program: Any, low: Points, high: Points, nu: int, events: Float[np.ndarray, " e"]
 ) -> tuple[float, float, int] | None:
-    """Return the time and the size of a jump between two neighboring points of an orbit, and the
-    index of the decision that makes it; `None` if the field is continuous."""
+    """Return the time and the size of the largest jump between neighboring points of an orbit that
+    is no event, and the index of the decision that makes it; `None` if there is none."""
     u = jnp.zeros(nu)
     run = jax.jit(jax.vmap(lambda t, q: _evaluate(program.jaxpr, program.consts, t, q, u)))
     if not len(low[0]):
@@ -75,6 +79,8 @@ def _first_jump(
         q0, q1 = np.where(same[:, None], q, q0), np.where(same[:, None], q1, q)
     (left, _), (right, last) = run(t0, q0), run(t1, q1)
     jumps = np.abs(np.asarray(right - left)).max(axis=1)
+    distance = np.abs(t0[:, None] - events).min(axis=1, initial=np.inf)
+    jumps[distance <= SAME * np.ptp(high[0])] = 0.0
     at = int(np.argmax(jumps))
     if jumps[at] <= _JUMP * np.abs(left).max():
         return None

@@ -51,7 +51,7 @@ def test_a_forgotten_period_of_the_field():
     [
         (
             Unclocked(),
-            r"guard of transition 'impact' .* depends on t, but Unclocked states no period",
+            r"guard .*'impact' .* depends on t, but Unclocked states no period",
         ),
         (WrongPaddle(), "guard of 'impact' does not have the period 1.1"),
     ],
