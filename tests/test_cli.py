@@ -118,23 +118,18 @@ WRONG = {
         "--out x --experiments 1000000000000": "--experiments: '1000000000000' is not a whole",
         "--out x --seed -1": "--seed: '-1' is not a whole number from 0 on",
         "--out x --formats gif": "--formats: 'gif' is not one or more of png, pdf, svg",
-        "--out x --formats png,png": "--formats: 'png,png' is not one or more of png",
         "--out x --amplitude 0": "--amplitude: '0' is not a positive number",
     },
     "identify x.csv --out x --input u --outputs y": {
         "": "one of the arguments --phase --crossing --event is required",
         "--phase y,v --event e": "not allowed with argument --phase",
         "--phase y": "--phase: 'y' is not two names with a comma in between",
-        "--event e --outputs y,,v": "--outputs: 'y,,v' is not a list of different names",
         "--event e --center 1,2": "--center and --scale are of the angle of --phase",
         "--phase y,v --center 1": "--center: '1' is not two numbers",
-        "--phase y,v --center 1,x": "--center: '1,x' is not two numbers",
         "--phase y,v --scale 1,-2": "--scale: '1,-2' is not two positive numbers",
         "--event e --sections 8.5": "--sections: '8.5' is not a whole number from 1 to",
         "--crossing y:up": "'y:up' is not a signal, a direction and a value",
         "--crossing y:rising:nan": "'y:rising:nan' is not a signal, a direction and a value",
-        "--crossing :rising": "':rising' is not a signal, a direction and a value",
-        "--crossing y:rising:0:1": "'y:rising:0:1' is not a signal, a direction and a value",
     },
     "": {"": "required: COMMAND", "fly": "invalid choice: 'fly'"},
 }
@@ -224,10 +219,8 @@ def test_sweep_draws_a_map(tmp_path, capsys):
     assert (tmp_path / "map-spectral_radius.png").stat().st_size > 5_000
     for wrong, says in (
         ([model, "--over", "slop=0:1:2"], "`slop` is no parameter of the model"),
-        ([model.replace("Mine", "Yours"), *axes], "has no 'Yours'"),
         ([model.replace("my_", "no_"), *axes], "there is no file"),
         ([model, *axes, *axes], "has two axes"),
-        ([model, *axes, "--want", "speed"], r"`want\[0\]` must be .* not 'speed'"),
         ([model, *axes, "--want", "period"], "holds other results: its `want`"),
     ):
         with pytest.raises(SystemExit, match=says):

@@ -221,9 +221,6 @@ def test_what_is_refused(model, monkeypatch):
     pytest.importorskip("xarray")
     with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray({"a": 1})
-    dataset = convert.to_xarray(model)
-    with pytest.raises(hj.DefinitionError, match="the dataset is no LDTP"):
-        convert.from_xarray(dataset.drop_vars("A"))
     clash = hj.Recording([0.0, 1.0], {"trial": [0.0, 1.0]})
     with pytest.raises(hj.DefinitionError, match="'trial' is called like a coordinate"):
         convert.to_xarray(clash)

@@ -146,28 +146,3 @@ class Dip(hj.HybridSystem):
 
     def start(self):
         return 1.0 - float(self.depth), 0.0
-
-
-class Paddle(hj.HybridSystem):
-    """A ball on a paddle at A sin(w t): the juggler of Holmes (J. Sound Vib. 84, 1982)."""
-
-    A: Float[Array, ""] = hj.parameter(0.15)
-    a: Float[Array, ""] = hj.parameter(0.7)
-    g: Float[Array, ""] = hj.parameter(9.81)
-
-    def charts(self):
-        return {"air": Field(("y", "v"), lambda t, q, u: (q[1], -self.g))}
-
-    def transitions(self):
-        w = 2 * jnp.pi
-
-        def guard(t, q, u):
-            return q[0] - self.A * jnp.sin(w * t)
-
-        def reset(t, q, u):
-            return q[0], -self.a * q[1] + (1 + self.a) * self.A * w * jnp.cos(w * t)
-
-        return (hj.Transition("impact", "air", "air", guard, reset=reset),)
-
-    def period(self):
-        return 1.0

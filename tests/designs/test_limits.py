@@ -45,22 +45,6 @@ def test_strides(optimal_two, two_usual):
     assert all(plan.rms[f"u{i}"] <= power[i] * (1 + 1e-9) for i in (0, 1))
 
 
-@pytest.mark.parametrize(
-    "limit, message",
-    [
-        (Limits(), "limits nothing"),
-        ({"z": 1.0}, "has 'z'; rms values can be limited of u0, u1, y0, y1"),
-        (Limits(peak={"y0": 1.0}), "has the peak of 'y0'; the inputs are u0, u1"),
-        (Limits(rms={"rate of u0": 1.0}), "has 'rate of u0'; rms values"),
-        (Limits(peak={"u0": 1.0}), "limit the input, too"),
-        (Limits(rms=RMS, strides=31), "allows 31 strides, but one experiment has 32"),
-    ],
-)
-def test_bad_limits(optimal_two, limit, message):
-    with pytest.raises(hj.DefinitionError, match=message):
-        optimal_two(limit=limit)
-
-
 def test_noise_by_frequency(optimal_two):
     """A spectrum that is constant is white noise; less noise at a frequency attracts power."""
     limit = {"u0": 0.1, "u1": 0.1}

@@ -113,21 +113,6 @@ def test_repeated_windows_count(model, first):
     assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
 
 
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        (dict(first=hj.multisine(inputs=("a", "b"))), "inputs a, b: study one at a time"),
-        (dict(goal=hj.designs.Multipliers(estimator="fit_ldtp")), "no other estimator"),
-        (dict(limit=hj.designs.Limits(strides=3)), "ends at a precision"),
-        (dict(goal=hj.designs.Multipliers(4)), "no multiplier 4, the order is 2"),
-        (dict(limit=hj.designs.Limits(peak={"x": 1.0})), "the peak of 'x'; the inputs are u"),
-    ],
-)
-def test_bad_arguments(first, arguments, message):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.designs.Study(**(dict(first=first, order=2, standard_error=1e-4) | arguments))
-
-
 def test_bad_data(model, first):
     study, data = hj.designs.Study(first, 2, 1e-4), measured(model, first)
     for change, message in (

@@ -57,17 +57,6 @@ def test_radau_is_a_collocation_method(stages):
     assert abs(error @ c**stages) > 1e-5
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [diffrax.Euler(), diffrax.SemiImplicitEuler(), diffrax.KenCarp4(), diffrax.ReversibleHeun()],
-)
-def test_solvers_that_do_not_fit(solver):
-    with pytest.raises(
-        hj.DefinitionError, match=f"error estimate.* not an? {type(solver).__name__}"
-    ):
-        as_method(solver)
-
-
 @pytest.mark.parametrize("solver", [hj.Radau(3), hj.Radau(5), diffrax.Kvaerno3()])
 def test_estimates_are_of_the_size_of_errors(solver):
     """Of a step whose end is known, one of its modes stiff."""

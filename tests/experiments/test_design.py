@@ -212,21 +212,3 @@ def test_expected_variance_is_that_of_the_estimate():
     estimate = hj.estimate_htf(hj.ExperimentData(u, y, n_sections=4, periods=8), 0)
     expected = design.expected_variance()[:, 0] / 400
     np.testing.assert_allclose(np.mean(estimate.variance), expected.mean(), rtol=0.02)
-
-
-@pytest.mark.parametrize(
-    "message, arguments",
-    {
-        "the band from 3.0 to 2.0 must lie in": dict(band=(3.0, 2.0)),
-        "`amplitude` must be a positive number": dict(amplitude=0.0),
-        "at most 620, not 621": dict(experiments=621),
-        "2 inputs need at least 40": dict(experiments=39, inputs=2),
-        "no line of lines='odd', a multiple of 1/64, lies": dict(band=(0, 0.01), lines="odd"),
-        "`division` must be 'random', 'sum-free', .*, not 'fair'": dict(division="fair"),
-        "goes with division='random' or": dict(division="disjoint", lines="two-phase"),
-        "an even number of periods, not 63": dict(lines="odd", periods=63),
-    }.items(),
-)
-def test_bad_arguments_of_multisine(message, arguments):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.multisine(**arguments)

@@ -7,7 +7,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..toys import Field, Paddle
+from ..toys import Field
 
 
 class Oscillator(hj.HybridSystem):
@@ -27,12 +27,12 @@ class Oscillator(hj.HybridSystem):
         return self.beat
 
 
-class Unclocked(Paddle):
+class Unclocked(hj.models.PaddleJuggler):
     def period(self):
         return None
 
 
-class WrongPaddle(Paddle):
+class WrongPaddle(hj.models.PaddleJuggler):
     def period(self):
         return 1.1
 
@@ -58,7 +58,7 @@ def test_a_forgotten_period_of_the_field():
 )
 def test_guards(system, message):
     with pytest.raises(hj.DefinitionError, match=message):
-        hj.find_limit_cycle(system, hj.Guess("air", (0.1, 4.7), 0.1))
+        hj.find_limit_cycle(system, hj.Guess("fall", (0.1, 4.7), 0.1))
 
 
 def test_a_force_that_jumps_with_the_clock():

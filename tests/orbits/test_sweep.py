@@ -85,10 +85,3 @@ def test_a_guess_with_too_long_a_period(wheel):
     cycle = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.16), wheel)
     assert cycle.event_sequence == (0,) and cycle.period < 0.7 * wheel.period
     np.testing.assert_allclose(cycle.multipliers, [0.5], rtol=1e-9)
-
-
-def test_bad_arguments(hopper_cycle):
-    with pytest.raises(hj.DefinitionError, match="the same leading axis"):
-        hj.find_limit_cycles(hj.models.VerticalHopper(), hopper_cycle)
-    with pytest.raises(hj.DefinitionError, match="all of the same class"):
-        hj.find_limit_cycles([hj.models.VerticalHopper(), hj.models.VanDerPol()], hopper_cycle)

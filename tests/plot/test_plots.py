@@ -64,18 +64,6 @@ def test_bodes(estimate, exact, rational):
         hj.plot.bodes(families, fits={"c": rational})
 
 
-def test_bad_input_of_transfer_functions(estimate, hopper):
-    with pytest.raises(hj.DefinitionError, match="no 2 among yM, vM"):
-        hj.plot.magnitude(estimate, output=2)
-    with pytest.raises(hj.DefinitionError, match="no 'force' among u"):
-        hj.plot.bode(estimate, input="force")
-    with pytest.raises(hj.DefinitionError, match="at least one HTF"):
-        hj.plot.harmonics({})
-    other = hj.HTF(estimate.f, estimate.H[:, :, :1], estimate.harmonics, 32)
-    with pytest.raises(hj.DefinitionError, match="the same outputs"):
-        hj.plot.harmonics({"a": estimate, "b": other})
-
-
 # The complex plane
 
 

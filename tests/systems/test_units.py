@@ -37,7 +37,7 @@ def test_what_has_other_units_is_not_compared():
 
 class Chart(hj.Chart):
     states = ("y", "v")
-    units = ("m",)
+    units = ("m", "m/s")
 
     def field(self, t, q, u):
         return q[1], -q[0]
@@ -47,30 +47,11 @@ class Other(Chart):
     units = ("mm", "m/s")
 
 
-class Right(Chart):
-    units = ("m", "m/s")
-
-
 class System(hj.HybridSystem):
-    kinds: tuple = ()
-
     def charts(self):
-        return {kind.__name__: kind() for kind in self.kinds}
+        return {"a": Chart(), "b": Other()}
 
 
-class TwoUnits(System):
-    input_units = ("N", "N")
-
-
-@pytest.mark.parametrize(
-    "system, words",
-    [
-        (System((Chart,)), "has the states 'y', 'v', but 1 units"),
-        (System((Right, Other)), "give a state different units: 'y' (m), 'v' (m/s), 'y' (mm)"),
-        (TwoUnits((Right,)), "TwoUnits has the inputs 'u', but 2 units"),
-    ],
-)
-def test_units_that_do_not_fit_are_refused(system, words):
-    with pytest.raises(hj.DefinitionError) as error:
-        hj.simulate(system, "Right", (1.0, 0.0), 1.0)
-    assert words in str(error.value)
+def test_units_that_do_not_fit_are_refused():
+    with pytest.raises(hj.DefinitionError, match=r"different units: 'y' \(m\), .*'y' \(mm\)"):
+        hj.simulate(System(), "a", (1.0, 0.0), 1.0)
