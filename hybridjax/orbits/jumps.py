@@ -63,7 +63,7 @@ def _jump(
 ) -> tuple[float, float, int] | None:
     """Return the time and the size of the largest jump between neighboring points of an orbit that
     is no event, and the index of the decision that makes it; `None` if there is none."""
-    u = jnp.zeros(nu)
+    u = np.zeros(nu)
     run = jax.jit(jax.vmap(lambda t, q: _evaluate(program.jaxpr, program.consts, t, q, u)))
     if not len(low[0]):
         return None
@@ -88,7 +88,8 @@ def _jump(
 
 
 def _program(s: Structure, a: int) -> Any:
-    point = jnp.zeros(()), jnp.zeros(s.dims[a]), jnp.zeros(s.nu)
+    shapes = (), (s.dims[a],), (s.nu,)
+    point = [jax.ShapeDtypeStruct(x, jnp.result_type(float)) for x in shapes]
     return jax.make_jaxpr(lambda t, q, u: s.field(a, t, q, u))(*point)
 
 
