@@ -43,8 +43,7 @@ from .fitting.observations import (
 from .fitting.stability import spectral_radius as spectral_radius
 from .identify.htf_estimate import estimate_htf as estimate_htf
 from .identify.joint.fit import fit_ldtp as fit_ldtp
-from .identify.multipliers import fit_multipliers as fit_multipliers
-from .identify.order import select_order as select_order
+from .identify.multipliers import fit_multipliers as fit_multipliers, select_order as select_order
 from .identify.rational import fit_rational as fit_rational
 from .identify.series.fit import fit_series as fit_series
 from .identify.validate import validate as validate

@@ -61,7 +61,6 @@ def toward(
     time: Float[Array, " L"],
     event: int,
     limit: Float[Array, " L"] | Float[Array, ""],
-    index: int = 0,
 ) -> Target:
     """The target of lanes that end at times, or where `time` is infinite, at an event (or at a
     level that is filled in later), giving up at `limit`."""
@@ -69,7 +68,7 @@ def toward(
     later = xp.nextafter(stop_gradient(time), xp.inf)
     return Target(
         time,
-        xp.full(L, index, xp.int32),
+        xp.zeros(L, xp.int32),
         xp.full(L, event, xp.int32),
         xp.where(xp.isfinite(time), later, limit),
         None,

@@ -71,7 +71,8 @@ def fit_model(
     - `data`: an `ObservedHTF`, `ObservedSeries` or `ObservedCycle`, or several of them; or a
         subclass of `AbstractObservation` for data of another type.
     - `free`: names of parameters, which keep their signs, or `{name: (low, high)}` with bounds
-        (infinite where there are none), or `{name: None}` without bounds. Names may have dots.
+        (infinite where there are none; `None` in place of both keeps the sign). Names may have
+        dots.
     - `guess`: guess of the limit cycle of `system`, or the cycle of a similar system; see
         `find_limit_cycle`.
     - `guesses`: largest number of guesses of the parameters: those of `system`, then random ones
@@ -97,11 +98,12 @@ def fit_model(
         ends.append(_descend(problem, system, start, near))
         if ends[-1].explains(problem.weighted):
             break
-    best = min(ends, key=lambda end: end.cost)
+    best = min(ends, key=lambda end: (end.cost, -end.residuals))
     if best.cost == np.inf:
+        why = "its residuals are not finite" if best.residuals else Result(best.result).message
         raise ComputationError(
             f"none of {guesses} guesses has a limit cycle on which the data can be observed "
-            f"({Result(best.result).message}): give another system, or more `guesses`."
+            f"({why}): give another system, or more `guesses`."
         )
     return _summary(problem, system, near, ends, best)
 

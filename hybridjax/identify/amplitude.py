@@ -14,7 +14,7 @@ from .._core.boundary.values import Reals
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..linear.ldtp import LDTP
-from .record_simulation import simulate_record
+from .validate import simulate_record
 
 
 class AmplitudeSweep(eqx.Module):

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Inexact
 
 
 Coefficients = Float[np.ndarray, " d"]
@@ -136,3 +136,61 @@ class _Squares(Point):
 
     def stalled(self, step: Coefficients, gain: float) -> bool:
         return bool(gain <= _STALLED_GAIN * self.cost)
+
+
+class NormalEquations:
+    """Linearized least squares for residuals r with the derivatives -J.
+
+    **Arguments:** `gram` (P, P), $J^T J$. `gradient` (P,), $J^T r$.
+    """
+
+    def __init__(self, gram: Float[np.ndarray, "P P"], gradient: Float[np.ndarray, " P"]):
+        self.gradient = gradient
+        size = np.sqrt(np.maximum(np.diag(gram), 0))
+        self._size = np.where(size > 0, size, 1.0)
+        self._values, self._vectors = np.linalg.eigh(gram / self._size / self._size[:, None])
+        self._slope = self._vectors.T @ (gradient / self._size)
+        self._shown = self._values > ROUNDING * self._values[-1]
+
+    def step(self, damping: float) -> tuple[Float[np.ndarray, " P"], float]:
+        """Return a Levenberg-Marquardt step and the decrease of the cost expected from it.
+
+        Without damping the step leaves undetermined combinations as they are.
+        """
+        values = np.maximum(self._values, 0) + damping
+        if not damping:
+            values = np.where(self._shown, values, np.inf)
+        part = self._slope / values
+        return self._vectors @ part / self._size, float(part @ self._slope)
+
+    def spread(self, unit: float = 1.0) -> "Spread":
+        """Return the uncertainty of the solution, for errors of this variance."""
+        vectors, least = self._vectors / self._size[:, None], ROUNDING * self._values[-1]
+        root = vectors * np.sqrt(unit / np.maximum(self._values, least))
+        return Spread(root[:, self._shown], root[:, ~self._shown])
+
+
+class Spread(NamedTuple):
+    """The uncertainty of combinations of unknowns."""
+
+    root: Float[np.ndarray, "P r"]
+    """R with $R R^T = v (J^T J)^+$, without undetermined combinations."""
+    hidden: Float[np.ndarray, "P h"]
+    """The same for undetermined combinations, with the smallest eigenvalue above rounding: a lower
+    bound."""
+
+    def variance(self, slopes: Inexact[np.ndarray, "P *rest"]) -> Float[np.ndarray, "*rest"]:
+        """Return the variance of numbers with these derivatives; infinite if undetermined."""
+        shown, hidden = (
+            (np.abs(np.tensordot(x.T, slopes, 1)) ** 2).sum(axis=0)
+            for x in (self.root, self.hidden)
+        )
+        return np.where(hidden > shown, np.inf, shown)
+
+    def covariance(self, slopes: Float[np.ndarray, "d P"]) -> Float[np.ndarray, "d d"]:
+        """Return the covariance of numbers with these derivatives; all of it is infinite if one
+        variance is."""
+        if np.isinf(self.variance(slopes.T)).any():
+            return np.full((len(slopes), len(slopes)), np.inf)
+        half = slopes @ self.root
+        return half @ half.T

@@ -1,10 +1,12 @@
 """Is an identified model good enough? Simulation of data that it was not fitted to."""
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from scipy import special, stats
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
@@ -13,12 +15,179 @@ from .._core.html import COLORS, Curve, card, picture, table, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import p_value
 from ..errors import DefinitionError
-from ..experiments.record import RecordedData, uninterrupted_records
+from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
 from .joint.fit import LDTPFit
-from .record_simulation import can_be_compared, simulate_record
-from .residual_tests import FEWEST_SAMPLES, Samples, independence_test, whiteness_test
+from .joint.model import PeriodicModel
+from .joint.prediction import Predictor
 from .series.fit import SeriesFit
+from .series.output_error import RANK, SectionRegression
+from .series.records import CycleGrid, divide_by_chi, drift_waves, lagged_inputs, start_responses
+
+
+# Samples for each unknown of its initial condition and drift, which a record must exceed. Fewer:
+# short records agree with any model; more: records that could be compared are left out.
+_SAMPLES_PER_UNKNOWN = 3
+
+
+def can_be_compared(model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool) -> bool:
+    """Test whether a record has samples beyond those that fit its initial condition and drift."""
+    N, ny = record.n_sections, record.y.shape[1]
+    unknown = N * ny * drift_waves(record).shape[1]
+    if free_start:
+        unknown += (
+            N * ny * _free_cycles(model)
+            if isinstance(model, SeriesFit)
+            else int(model.dims[record.first_section])
+        )
+    return int(np.isfinite(record.y).sum()) > _SAMPLES_PER_UNKNOWN * unknown
+
+
+def simulate_record(
+    model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool
+) -> Float[np.ndarray, "n ny"]:
+    """Return the outputs of a model: a `Predictor` one step ahead, others from inputs alone.
+
+    **Arguments:** `record`, without unknown inputs. `free_start`: from the state that fits the
+    record best, or from zero. A drift that the record announces is estimated in either case.
+    """
+    if isinstance(model, SeriesFit):
+        return _simulate_fit(model, record, free_start)
+    if isinstance(model, LDTP):
+        # Outputs in units of their size, so that none is neglected.
+        square = np.ma.masked_invalid(record.y**2).mean(axis=0).filled(0.0)
+        S = np.diag(np.where(square > 0, square, 1.0))
+        plain = PeriodicModel.of(model, np.ones(len(S)))
+        model = Predictor(plain, np.stack([S] * model.n_sections), model.inputs, model.outputs)
+    return model.predict(record, free_start)
+
+
+def _simulate_fit(fit: SeriesFit, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:
+    N, R, ny, nu = fit.numerators.shape
+    grid = CycleGrid.from_records([record])
+    v, T = divide_by_chi(fit.coefficients, grid.u), grid.u.shape[1]
+    # As in the fit, earlier inputs act on so many cycles without a model.
+    free = min(_free_cycles(fit), T) if free_start else 0
+    out = np.zeros((T, N, ny))
+    for n, i in np.ndindex(N, ny):
+        forced = lagged_inputs(v, n, R, fit.lead) @ fit.numerators[n, :, i].reshape(R * nu, 1)
+        starts = start_responses(fit.coefficients, grid.first[:, n], T, free)
+        unknown, none = np.concatenate([starts, grid.drift], axis=2), grid.drift[:, :, :0]
+        regression = SectionRegression.make(forced, unknown, none, grid.sampled[:, :, n, i])
+        y, sampled = grid.y[:, :, n, i], grid.sampled[:, :, n, i]
+        error = regression.residual(np.ones(1), y).reshape(y.shape)
+        out[:, n, i] = np.where(sampled, y - error, regression.response(np.ones(1), y))[0]
+    return out.reshape(T * N, ny)[record.first_section :][: len(record.u)]
+
+
+def _free_cycles(fit: SeriesFit) -> int:
+    """Return the cycles at the start of a record on which earlier inputs act without a model."""
+    N, R = fit.numerators.shape[:2]
+    d = len(fit.coefficients)
+    return d + -(-(R - 1 - fit.lead - d * N) // N)
+
+
+# Samples of a section, below which its correlations are not tested. Fewer: their distribution is
+# not normal; more: short records cannot be validated.
+FEWEST_SAMPLES = 8
+# Probability with which a misfit that counts as visible is detected. Larger: models are called
+# better tested than they are; smaller: misfits that are detected as a rule count as invisible.
+_POWER = 0.8
+
+
+class Samples(NamedTuple):
+    """The samples of S records, one after the other."""
+
+    n_sections: int
+    section: Int[np.ndarray, " n"]
+    before: Int[np.ndarray, " n"]
+    """The number of earlier samples in the same record."""
+    u: Float[np.ndarray, "n nu"]
+
+    @classmethod
+    def of(cls, records: Sequence[Record]) -> "Samples":
+        N, before = records[0].n_sections, [np.arange(len(r.u)) for r in records]
+        section = [(r.first_section + k) % N for r, k in zip(records, before, strict=True)]
+        u = np.concatenate([r.u for r in records])
+        return cls(N, np.concatenate(section), np.concatenate(before), u)
+
+    def at(self, lags: int) -> list[Int[np.ndarray, " k"]]:
+        """Return the samples at each section with so many samples before them."""
+        late = self.before >= lags
+        return [np.flatnonzero(late & (self.section == n)) for n in range(self.n_sections)]
+
+    def count(  # type: ignore[override]  # (of tuples)
+        self, present: Bool[np.ndarray, "n ny"], lags: int
+    ) -> Int[np.ndarray, "N ny"]:
+        """Return how often each section was sampled with so many samples before it."""
+        return np.stack([present[rows].sum(axis=0) for rows in self.at(lags)])
+
+
+def whiteness_test(
+    samples: Samples,
+    error: Float[np.ndarray, "n ny"],
+    size: Float[np.ndarray, "N ny"],
+    lags: int,
+) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
+    """Return correlations of residuals with earlier ones, section by section, and p-values.
+
+    **Arguments:** `size`: rms of the residuals at each section.
+    """
+    scale, N = np.where(size > 0, size, 1.0), samples.n_sections
+    z, tested = np.zeros((N, lags, size.shape[1])), np.zeros((N, lags, size.shape[1]), bool)
+    for k in range(lags):
+        for n, rows in enumerate(samples.at(k + 1)):
+            product = error[rows] * error[rows - k - 1] / scale[n] / scale[(n - k - 1) % N]
+            count = np.isfinite(product).sum(axis=0)
+            z[n, k] = np.nansum(product, axis=0) / np.sqrt(np.maximum(count, 1))
+            tested[n, k] = count >= FEWEST_SAMPLES
+    # The mean over the sections of each lag, and the deviations from it: independent.
+    z = z * tested
+    count = tested.sum(axis=0)
+    pooled = z.sum(axis=0) ** 2 / np.maximum(count, 1)
+    deviations = (z**2).sum(axis=(0, 1)) - pooled.sum(axis=0)
+    degrees = (count > 0).sum(axis=0)
+    p = stats.chi2.sf(pooled.sum(axis=0), degrees)
+    if N > 1:
+        p = np.minimum(p, stats.chi2.sf(deviations, count.sum(axis=0) - degrees))
+        p = -np.expm1(2 * np.log1p(-p))
+    return z, p
+
+
+def independence_test(
+    samples: Samples, error: Float[np.ndarray, "n ny"], lags: int, level: float
+) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
+    """Test the part of residuals that present and past inputs explain, section by section.
+
+    **Returns:** the correlations with the inputs, the p-values, and the smallest visible misfits,
+    in standard deviations of the noise, for tests of this level. A misfit of rms r times the noise
+    makes F ratios of n samples noncentral, by $n r^2$. The power is that of one F ratio with the
+    degrees of freedom of all sections, which is 1 to 4 % too optimistic.
+    """
+    N, ny, nu = samples.n_sections, error.shape[1], samples.u.shape[1]
+    z, deviates, tested = np.zeros((N, lags, ny, nu)), np.zeros(ny), np.zeros(ny)
+    degrees = np.zeros((2, ny))
+    for n, rows in enumerate(samples.at(lags - 1)):
+        past = samples.u[rows[:, None] - np.arange(lags)].reshape(len(rows), -1)
+        for i in range(ny):
+            present = np.isfinite(error[rows, i])
+            U, r, count = past[present], error[rows, i][present], int(present.sum())
+            if count < FEWEST_SAMPLES or not r.any():
+                continue
+            size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
+            z[n, :, i] = (U.T @ r / np.where(size > 0, size, 1.0)).reshape(lags, nu)
+            left, s, _ = np.linalg.svd(U, full_matrices=False)
+            left = left[:, s > RANK * s[0]][:, : count // 2]
+            # Explained against unexplained part: an F ratio, as its Gaussian deviate.
+            a, b = left.shape[1], count - left.shape[1]
+            inside = ((left.T @ r) ** 2).sum()
+            p = stats.f.sf((inside / a) / ((r @ r - inside) / b), a, b)
+            deviates[i] += stats.norm.isf(np.clip(p, 1e-300, 1 - 1e-16))
+            degrees[:, i] += a, b
+            tested[i] += 1
+    p = stats.norm.sf(deviates / np.sqrt(np.maximum(tested, 1)))
+    shift = special.ncfdtrinc(*degrees, 1 - _POWER, special.fdtri(*degrees, 1 - level))
+    return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
 
 
 # Cycles that a notebook draws. More: they are harder to see.

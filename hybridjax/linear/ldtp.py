@@ -1,7 +1,7 @@
 """Linear discrete-time periodic systems whose state dimension may vary over the period."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -133,7 +133,7 @@ class LDTP(eqx.Module):
         dims = [np.shape(block)[1] for block in A]
         after, d = [*dims[1:], dims[0]], max(dims)
         ny, nu = np.shape(C[0])[0], np.shape(B[0])[1]
-        padded = {}
+        padded: dict[str, Any] = {}
         for name, blocks in given.items():
             full, padded[name] = (d if name in "AB" else ny, d if name in "AC" else nu), []
             for n, block in enumerate(map(jnp.asarray, blocks)):

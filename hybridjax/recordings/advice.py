@@ -12,8 +12,7 @@ from .._core.results import Result
 from .._core.text import p_value
 from ..errors import DefinitionError
 from ..identify.multiplier_estimate import compare_multipliers
-from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refuse_order
-from ..identify.series.fit import SeriesFit
+from ..identify.series.fit import SeriesFit, delayed_outputs, ordinary_least_squares, refuse_order
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validate import Validation

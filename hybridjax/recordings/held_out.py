@@ -9,13 +9,17 @@ from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Denominator
-from ..identify.record_simulation import can_be_compared, simulate_record
-from ..identify.series.arx import delayed_outputs, total_least_squares
-from ..identify.series.fit import SeriesFit, assemble, fit_records
+from ..identify.series.fit import (
+    SeriesFit,
+    assemble,
+    delayed_outputs,
+    fit_records,
+    total_least_squares,
+)
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import PreparedRecords
-from ..identify.validate import Validation, validate
+from ..identify.validate import Validation, can_be_compared, simulate_record, validate
 from .data import SectionData
 
 

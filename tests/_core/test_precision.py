@@ -7,7 +7,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..conftest import APEX, ISOCHRONS, OUTPUTS
+from ..conftest import ISOCHRONS, OUTPUTS
 
 
 DEFINITIONS = {
@@ -48,15 +48,13 @@ def late(hopper_cycle, placed_isochrons, isochron_ldtp):
     cycle, placed, ldtp = hopper_cycle, placed_isochrons, isochron_ldtp
     hopper, design, u = cycle.system, hj.multisine(), np.zeros((1, 32, 1))
     response = hj.response_function(cycle, placed, OUTPUTS)
-    map, trajectory, htf = hj.section_map(cycle, placed, 0, 1), cycle.trajectory(), ldtp.htf([0.1])
+    map, htf = hj.section_map(cycle, placed, 0, 1), ldtp.htf([0.1])
     return {
         "simulate": lambda: hj.simulate(hopper, "stance", (2.0, 1.9), 1.0),
         "find_limit_cycle": lambda: hj.find_limit_cycle(hopper, cycle),
         "continuation": lambda: hj.continuation(cycle, "M", (1.9, 2.0)),
-        "trajectory": lambda: trajectory("yM"),
         "place_sections": lambda: hj.place_sections(cycle, ISOCHRONS),
         "linearize": lambda: hj.linearize(cycle, placed),
-        "a section": lambda: hj.linearize(cycle, APEX),
         "section_map": lambda: map(map.fixed_point),
         "observe": lambda: placed.observe(OUTPUTS),
         "run_experiments": lambda: hj.run_experiments(cycle, placed, design, OUTPUTS),
@@ -64,8 +62,6 @@ def late(hopper_cycle, placed_isochrons, isochron_ldtp):
         "LDTP": lambda: hj.LDTP(ldtp.A, ldtp.B, ldtp.C),
         "LDTP.simulate": lambda: ldtp.simulate(u[0]),
         "LDTP.htf": lambda: ldtp.htf([0.1]),
-        "LDTP.impulse_response": lambda: ldtp.impulse_response(3),
-        "LDTP.monodromy": lambda: ldtp.monodromy(),
         "HTF": lambda: hj.HTF([0.1], np.ones((1, 1, 1, 1)), [0], 4),
         "HTF.error": lambda: htf.error(htf),
     }

@@ -10,10 +10,6 @@ import pytest
 from hybridjax._core import progress
 
 
-def lines(text):
-    return [line.strip() for line in text.split("\r") if line.strip()]
-
-
 @pytest.fixture
 def shown(monkeypatch):
     monkeypatch.setattr(progress, "_DELAY", 0.01)
@@ -59,15 +55,6 @@ def test_the_outermost_call_has_the_line_and_parts_say_what_they_do(capsys, show
                 progress.say("something else")
                 wait_for(capsys, "something else")
     assert "inner" not in capsys.readouterr().err
-
-
-def test_the_line_is_wiped_when_a_call_ends_or_fails(capsys, shown):
-    with pytest.raises(ZeroDivisionError), progress.working("call"):
-        wait_for(capsys, "call")
-        _ = 1 / 0
-    *_, last, end = capsys.readouterr().err.split("\r")
-    assert last.strip() == "" and len(last) >= len("call, 00:00") and end == ""
-    assert progress._running == []
 
 
 def test_programs_are_said_to_be_compiled_while_they_are():

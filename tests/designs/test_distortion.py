@@ -247,17 +247,11 @@ def test_without_distortion(toy):
 
 def test_bad_distortions(toy):
     cycle, sections, model = toy
-    with pytest.raises(hj.DefinitionError, match="limits nothing: name an output"):
-        Distortion(cycle, sections, {})
-    other = hj.LDTP(model.A, model.B, model.C, inputs="push", outputs="x")
     twice = hj.LDTP(model.A, 2 * model.B, model.C, outputs="x")
-    for system, family, rms, message in (
-        (model, sections, {"y": 1.0}, "there is no output 'y'"),
-        (model, hj.ClockPhase(8), {"x": 1.0}, "between 8 sections, the model has 4"),
-        (other, sections, {"x": 1.0}, "there is no input 'push'"),
-        (twice, sections, {"x": 1.0}, "another system .* to x differs by 50%"),
+    for family, message in (
+        (hj.ClockPhase(8), "between 8 sections, the model has 4"),
+        (sections, "another system .* to x differs by 50%"),
     ):
-        usual = hj.multisine(4, periods=16, inputs=system.inputs)
+        limit = Limits(distortion=Distortion(cycle, family, {"x": 1.0}))
         with pytest.raises(hj.DefinitionError, match=message):
-            limit = Limits(distortion=Distortion(cycle, family, rms))
-            hj.optimal_design(system, usual, limit=limit)
+            hj.optimal_design(twice, hj.multisine(4, periods=16), limit=limit)

@@ -108,16 +108,3 @@ def test_units_and_estimates(isochron_ldtp, usual):
     for goal in ("multipliers", hj.designs.Multipliers(0, "modulus")):
         estimated = hj.optimal_design(fit, usual, goal=goal, noise=NOISE)
         assert estimated.saved > 5 and estimated.certificate < 1.1
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        (dict(noise={"z": 1.0}), "`noise` names 'z'; the outputs are yM, vM"),
-        (dict(design=hj.multisine(8)), "the design has 8 sections"),
-        (dict(design=hj.multisine(lines="two-phase", periods=4)), "is a multiple of 1/2"),
-    ],
-)
-def test_bad_input(isochron_ldtp, usual, change, message):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.optimal_design(isochron_ldtp, **({"design": usual} | change))

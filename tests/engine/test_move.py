@@ -1,7 +1,5 @@
 """The flow under the transformations of JAX: exact derivatives through events, in both modes."""
 
-import functools as ft
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,10 +15,6 @@ from hybridjax.systems.structure import Structure
 
 from ..conftest import no_compilation
 from ..toys import Field
-
-
-# Compiled in half the time, to slower programs.
-compiled = ft.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def tight(s):
@@ -57,7 +51,7 @@ X = jnp.array([1.0, 0.3, 9.81, 0.7, 0.2, 0.9])  # one bounce
 
 
 def test_reverse_mode_and_second_derivatives_have_a_closed_form():
-    found, first = compiled(jax.jacfwd(lambda x: (jax.jacrev(ball)(x),) * 2, has_aux=True))(X)
+    found, first = jax.jit(jax.jacfwd(lambda x: (jax.jacrev(ball)(x),) * 2, has_aux=True))(X)
     np.testing.assert_allclose(first, jax.jacfwd(ball_exact)(X), rtol=1e-11, atol=1e-12)
     exact = jax.hessian(ball_exact)(X)
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
@@ -91,7 +85,7 @@ def juggler_exact(x):
 
 def test_reverse_mode_through_an_impact_on_a_moving_paddle():
     x = jnp.array([1.3, 0.1, 0.15, 0.7, 0.05, 1.3])
-    found, value = compiled(jax.jacrev(lambda x: (juggler(x),) * 2, has_aux=True))(x)
+    found, value = jax.jit(jax.jacrev(lambda x: (juggler(x),) * 2, has_aux=True))(x)
     np.testing.assert_allclose(value, juggler_exact(x), rtol=1e-12)
     np.testing.assert_allclose(found, jax.jacfwd(juggler_exact)(x), rtol=1e-10, atol=1e-11)
 
@@ -122,14 +116,14 @@ def test_a_section_map_in_closed_form():
         return jax.jacfwd(jax.jacfwd(jax.jacfwd(line)))(0.0)
 
     x = jnp.array([[1.3, 0.1, 0.15, 0.7, 0.05, 0.56], [1.25, 0.0, 0.16, 0.72, 0.02, 0.58]])
-    values = compiled(lambda: (jax.vmap(arrival)(x), *jax.vmap(both(arrival))(x), thrice(arrival)))
+    values = jax.jit(lambda: (jax.vmap(arrival)(x), *jax.vmap(both(arrival))(x), thrice(arrival)))
     truth = (jax.vmap(exact)(x), *jax.vmap(both(exact))(x), thrice(exact))
     for value, true, rtol in zip(values(), truth, (1e-12, 1e-9, 1e-11, 1e-8), strict=True):
         np.testing.assert_allclose(value, true, atol=rtol * np.abs(true).max())
     lost = jnp.array([-3.0, 0.0])
     with pytest.raises(hj.ComputationError, match="not reached from section 0"):
         P(lost)
-    _, slope = compiled(lambda q: jax.jvp(lambda q: P(q).q, (q,), (q,)))(lost)
+    _, slope = jax.jit(lambda q: jax.jvp(lambda q: P(q).q, (q,), (q,)))(lost)
     assert np.isnan(slope).all()
 
 
@@ -151,15 +145,15 @@ def differences(f, x, e=1e-4):
 
 @pytest.mark.slow
 def test_derivatives_through_a_touchdown_that_loses_speed():
-    found = compiled(jax.jacrev(hopper))(H)
-    np.testing.assert_allclose(found, differences(compiled(hopper), H), atol=2e-9)
+    found = jax.jit(jax.jacrev(hopper))(H)
+    np.testing.assert_allclose(found, differences(jax.jit(hopper), H), atol=2e-9)
 
 
 @pytest.mark.slow
 def test_second_derivatives_through_a_touchdown_that_loses_speed():
-    first = compiled(jax.jacfwd(hopper))
-    np.testing.assert_allclose(first(H), compiled(jax.jacrev(hopper))(H), rtol=1e-12, atol=1e-13)
-    hessian = compiled(jax.jacfwd(jax.jacfwd(hopper)))(H)
+    first = jax.jit(jax.jacfwd(hopper))
+    np.testing.assert_allclose(first(H), jax.jit(jax.jacrev(hopper))(H), rtol=1e-12, atol=1e-13)
+    hessian = jax.jit(jax.jacfwd(jax.jacfwd(hopper)))(H)
     np.testing.assert_allclose(hessian, differences(first, H), atol=1e-7)
 
 
@@ -213,6 +207,6 @@ def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywher
     exact = lambda x, a: (1 + (2 - (x + 1) / a) / 2) ** 2  # noqa: E731
     x, a = jnp.array([-0.5, 0.2]), 1.3
     loss = lambda f: lambda x, a: jnp.sum(jax.vmap(f, (0, None))(x, a) ** 2)  # noqa: E731
-    gradient = compiled(jax.grad(loss(end), argnums=(0, 1)))(x, a)
+    gradient = jax.jit(jax.grad(loss(end), argnums=(0, 1)))(x, a)
     for value, true in zip(gradient, jax.grad(loss(exact), argnums=(0, 1))(x, a), strict=True):
         np.testing.assert_allclose(value, true, rtol=1e-10)

@@ -49,24 +49,3 @@ def test_failed_experiments_are_named():
     result[:8] = hj.Result.BLOW_UP
     data = hj.ExperimentData(np.ones_like(y), y, **usual)
     assert data.summary().endswith("and 4 more")
-
-
-GOOD = dict(u=np.ones((3, 12, 1)), y=np.ones((3, 12, 2)), n_sections=4, periods=3)
-HOLE = np.where(np.arange(12) == 7, np.nan, np.ones((3, 12)))[..., None]
-
-
-@pytest.mark.parametrize(
-    "message, change",
-    {
-        "13 samples, not a multiple of N = 4": dict(u=np.ones((3, 13, 1)), y=np.ones((3, 13, 2))),
-        "longer than the record, 3 periods": dict(periods=4),
-        r"not \(3, 12, 1\) and \(2, 12, 2\)": dict(y=np.ones((2, 12, 2))),
-        "experiment 0: u is NaN or infinite at sample 7": dict(u=HOLE),
-        "result, failed_at and error": dict(result=[0, 0]),
-        "cycle_outputs must have the shape": dict(cycle_outputs=np.ones((4, 1))),
-    }.items(),
-)
-def test_bad_records(message, change):
-    hj.ExperimentData(**GOOD)
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.ExperimentData(**(GOOD | change))

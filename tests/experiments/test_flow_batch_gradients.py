@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation import compiler_options
 from hybridjax.engine.settings import Settings
 from hybridjax.experiments.plan import make_plan
 from hybridjax.experiments.response import course, flow_batch
@@ -17,9 +16,6 @@ from hybridjax.experiments.response import course, flow_batch
 from ..conftest import APEX, OUTPUTS
 
 
-# Compiled in a third of the time, to slower programs.
-QUICK = compiler_options()
-compiled = ft.partial(jax.jit, compiler_options=QUICK)
 PARAMETERS = ("m", "M", "k", "b", "l0", "a", "g")
 SETTINGS = Settings(1e-12, 1e-12, 1024, np.ones((2, 4)))
 N = 4
@@ -71,10 +67,10 @@ def central(f, x, e=1e-4):
 def test_reverse_and_forward_mode_agree_with_differences(experiment, parameters):
     u = inputs(3)
     f = ft.partial(loss, experiment)
-    value = compiled(f)
+    value = jax.jit(f)
     assert value(parameters, u)[1] == hj.Result.OK
-    (by_x, by_u), _ = compiled(jax.grad(f, argnums=(0, 1), has_aux=True))(parameters, u)
-    forward, _ = compiled(jax.jacfwd(f, has_aux=True))(parameters, u)
+    (by_x, by_u), _ = jax.jit(jax.grad(f, argnums=(0, 1), has_aux=True))(parameters, u)
+    forward, _ = jax.jit(jax.jacfwd(f, has_aux=True))(parameters, u)
     np.testing.assert_allclose(forward, by_x, rtol=1e-9)
     true = central(lambda x: value(x, u)[0], parameters)
     np.testing.assert_allclose(by_x, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
@@ -87,7 +83,7 @@ def test_reverse_mode_stores_the_states_at_the_sections(experiment, parameters):
     f = jax.grad(lambda x, u: loss(experiment, x, u)[0])
 
     def memory(cycles):
-        program = compiled(f).lower(parameters, inputs(cycles)).compile()
+        program = jax.jit(f).lower(parameters, inputs(cycles)).compile()
         return program.memory_analysis().temp_size_in_bytes
 
     short, long = memory(4), memory(16)

@@ -53,13 +53,3 @@ def data():
 def test_measurement_noise_has_the_color_that_it_says(data, std, memory):
     noisy = hj.experiments.add_noise(data, std=std, memory=memory, seed=3)
     require_color(noisy.y, std, memory)
-
-
-def test_other_numbers_of_sections_are_refused(data):
-    model = hj.LDTP(*(np.ones((8, 1, 1)) * x for x in (0.5, 1.0, 1.0)))
-    with pytest.raises(hj.DefinitionError, match="for each of 3 sections, but the"):
-        hj.experiments.simulate_experiments(
-            model, hj.multisine(N, 4, (0, 4.0)), process_noise=ProcessNoise([1.0] * 3)
-        )
-    with pytest.raises(hj.DefinitionError, match=r"or of shape \(8, 2\)"):
-        hj.experiments.add_noise(data, std=np.ones((3, 2)))

@@ -139,12 +139,8 @@ def test_other_experiments_are_refused(made, arguments):
     velocity = hj.Output("v", lambda t, q, u: -q[1], "m/s")
     cases = (
         (dict(design=hj.multisine(8, 8, (0, 4.0), experiments=COUNT, seed=1)), "`design"),
-        (dict(design=DESIGN.inputs(28), discard=20), "`design"),
-        (dict(outputs="x"), "`data.outputs"),
         (dict(outputs=("x", velocity)), "`outputs"),
         (dict(sections=hj.ClockPhase(8, anchor=hj.Crossing("v", "rising"))), "`family"),
-        (dict(chunk=4), "`batch"),
-        (dict(accuracy=1e-8), "`accuracy"),
         (NOISE, "`process_noise"),
         (dict(cycle=other.cycle, sections=other), "`model.numbers.damping` is 0.1, not 0.11"),
     )

@@ -1,5 +1,6 @@
 """Parameters come back from data, with errors that are what they are said to be."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -46,6 +47,9 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     assert abs(fit.chi_square(fit.system)) < 1e-6
     with pytest.raises(hj.DefinitionError, match="no true value of 'w'"):
         fit.contains({"p": 0.5, "q": 2.0})
+    unseen = eqx.tree_at(lambda o: o.measured[1], data, np.nan * data.measured[1])
+    with pytest.raises(hj.ComputationError, match="residuals are not finite"):
+        hj.fit_model(oscillation.system, unseen, ("p", "q", "w"), guess=oscillation)
 
 
 def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):

@@ -37,15 +37,3 @@ def records(**options):
 def test_bad_data_are_refused(make, message):
     with pytest.raises(hj.DefinitionError, match=message):
         make()
-
-
-def test_names_that_the_system_does_not_know_are_refused(hopper_cycle):
-    force = hj.HTF(F, H, 0, 8, inputs="force", outputs="yM")
-    height = hj.HTF(F, H, 0, 8, inputs="u", outputs="height")
-    for data, message in (
-        (hj.ObservedHTF(force, SECTIONS), "input 'force'"),
-        (hj.ObservedHTF(height, SECTIONS), "height"),
-        (hj.ObservedSeries(records(inputs="force", outputs="yM"), SECTIONS), "force"),
-    ):
-        with pytest.raises(hj.DefinitionError, match=message):
-            data.prepare(hopper_cycle)

@@ -1,6 +1,8 @@
-"""Random systems through hybridjax and through scipy, compared."""
+"""Random hybrid systems, hybridjax against scipy: `python -m tests.fuzz.campaign`."""
 
+import argparse
 import dataclasses
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -42,10 +44,9 @@ class Report:
     """Systems that are not compared, by reason."""
     failures: dict[int, str] = dataclasses.field(default_factory=dict)
     """What went wrong, by system."""
-    time_error: float = 0.0
-    """Largest difference of event times, relative to 1 + their size."""
-    state_error: float = 0.0
-    """Largest difference of states after events and at the end, relative to 1 + their size."""
+    error: tuple[float, float] = (0.0, 0.0)
+    """Largest differences of event times, and of states after events and at the end, relative to
+    1 + their size."""
 
     @property
     def compared(self) -> int:
@@ -54,7 +55,7 @@ class Report:
     def __str__(self):
         lines = [
             f"{self.name}: {self.compared} of {self.systems} compared, {self.events} events; "
-            f"errors {self.time_error:.1e} in time, {self.state_error:.1e} in state"
+            "errors {:.1e} in time, {:.1e} in state".format(*self.error)
         ]
         lines += [f"excluded, {reason}: {numbers}" for reason, numbers in self.excluded.items()]
         return "\n".join(lines + [f"FAILED {self.name}:{k}: {x}" for k, x in self.failures.items()])
@@ -87,8 +88,7 @@ def check(name: str, numbers, seed: int = 0, accuracy: float = ACCURACY) -> Repo
             report.failures[k] = f"events {order(trial)}, but {order(run)} by scipy"
         else:
             error = difference(trial, run, end=not full)
-            report.time_error = max(report.time_error, error[0])
-            report.state_error = max(report.state_error, error[1])
+            report.error = tuple(map(max, report.error, error))
             if not max(error) <= TOLERANCE:
                 report.failures[k] = "errors {:.1e} in time, {:.1e} in state".format(*error)
     return report
@@ -170,3 +170,24 @@ def _flow(plan: Plan, many: Sample, ends, accuracy):
         return moved.result[0], happens.sum(), events, end.t[0], end.chart[0], end.q[:, 0]
 
     return jax.vmap(one)(many, ends)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz.campaign")
+    parser.add_argument("--systems", type=int, default=1000, help="number, over all structures")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--accuracy", type=float, default=ACCURACY, help="tolerances of hybridjax")
+    arguments = parser.parse_args()
+    hj.enable_x64()
+    reports = []
+    for name, numbers in shares(arguments.systems).items():
+        if numbers:
+            reports.append(check(name, numbers, arguments.seed, arguments.accuracy))
+            print(reports[-1], flush=True)
+    excluded = sum(r.systems - r.compared for r in reports) / sum(r.systems for r in reports)
+    print(f"excluded {excluded:.2%} (by scipy alone)")
+    return int(any(r.failures for r in reports))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.identify.joint.noise import noise_spectrum
+from hybridjax.identify.joint.prediction import noise_spectrum
 from hybridjax.recordings.sampling import without_drift
 
 from .things import APEX, NAMES as STATES, PHASE

@@ -1,6 +1,6 @@
 """Hostile calls: each argument of each public function is replaced by what nobody should pass.
 
-`python -m tests.hostile.run [--all] [NAME ...]` prints as JSON, for each function, the calls that
+`python -m tests.hostile.run [--all]` prints as JSON, for each function, the calls that
 neither return nor are refused by one sentence of this package that names what is wrong. It runs
 without pytest, whose check of types would hide holes. Without `--all` an argument gets every fifth
 of the values.
@@ -152,7 +152,6 @@ def refused_by(kind, value) -> bool:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.hostile.run", description=__doc__)
     parser.add_argument("--all", action="store_true", help="all values of all arguments")
-    parser.add_argument("names", nargs="*", help="functions; by default all")
     options = parser.parse_args()
     hj.enable_x64()
     matplotlib.use("agg")
@@ -162,8 +161,6 @@ def main() -> None:
         os.chdir(folder)
         for function, good in (call for part in PARTS for call in part(things)):
             name = name_of(function)
-            if options.names and name not in options.names:
-                continue
             wrong.setdefault(name, [])
             kinds = kinds_of(function)
             for argument, parameter in inspect.signature(function).parameters.items():

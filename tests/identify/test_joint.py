@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.joint.descent import minimize
+from hybridjax.identify.joint.fit import minimize
 from hybridjax.identify.joint.frequency import FrequencyProblem, transfer, transfer_slopes
 from hybridjax.identify.joint.model import PeriodicModel, characteristic_slopes, local_coordinates
 from hybridjax.linear.frequency_response import harmonic_transfer
@@ -131,15 +131,6 @@ def test_a_step_that_damping_makes_small_is_not_the_last(model):
     beside = minimum.coordinates.moved(root[:, np.argmax((root**2).sum(axis=0))] * 3.0)
     again, converged = minimize(problem, beside, True, 500)
     assert converged and again.cost < minimum.cost + 0.01 * again.coordinates.size
-
-
-def test_no_direct_term_stays_zero(model):
-    silent = eqx.tree_at(lambda m: m.D, model, jnp.zeros_like(model.D))
-    htf = silent.htf(F)
-    fit = hj.fit_ldtp(htf, shaken(silent, np.random.default_rng(2)), direct=False)
-    assert not np.asarray(fit.model.D).any()
-    assert fit.compare(model.multipliers).max_error < 1e-8
-    assert fit.unknowns == hj.fit_ldtp(htf, silent).unknowns - 6 * 4
 
 
 def test_errors_are_as_small_as_the_bound(model, exact):

@@ -99,14 +99,6 @@ def test_failed_experiments_are_left_out(paper_data, paper_estimate):
         hj.estimate_htf(failed(data, np.arange(80)))
 
 
-def test_a_lost_phase_loses_the_frequency(hopper):
-    phases = [[0.0], [0.0], [np.pi / 2]]
-    design = hj.Design.from_lines([[0.25], [1.5], [1.5]], phases=phases, n_sections=32, periods=4)
-    data = hj.experiments.simulate_experiments(hopper, design, start="periodic")
-    half = failed(data, [2])
-    np.testing.assert_array_equal(hj.estimate_htf(half).f, [0.25])
-
-
 def record(*cosines, n_sections=8, periods=8, cycles=8):
     """One experiment per argument, a list of (f, phase); the output repeats the input."""
     n = np.arange(n_sections * cycles)
@@ -126,23 +118,3 @@ def test_half_integers_need_two_phases():
     uneven = hj.estimate_htf(record([(1.5, 0.3)], [(1.5, 0.9)], [(1.5, 2.0)]))
     np.testing.assert_allclose(uneven[0], 1.0, atol=1e-13)
     np.testing.assert_allclose(uneven[-3], 0.0, atol=1e-13)
-
-
-@pytest.mark.parametrize(
-    "message, data",
-    {
-        "experiment 1: f = 0.25 and 2.25 differ by an integer": [
-            [(1.125, 0)],
-            [(2.25, 0), (0.25, 0)],
-        ],
-        "experiment 0: f = 0.25 and 0.75 add up to an integer": [[(0.25, 0), (0.75, 1)]],
-        "is the input periodic over the last P = 8 periods": [[(0.27, 0)]],
-        "the inputs are zero": [[(1.0, np.pi / 2)], [(0.0, np.pi / 2)]],
-    }.items(),
-)
-def test_bad_inputs_are_named(message, data):
-    data = record(*data)
-    if "zero" in message:
-        data = hj.ExperimentData(0 * data.u, data.y, n_sections=8, periods=8)
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.estimate_htf(data)

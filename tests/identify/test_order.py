@@ -22,11 +22,6 @@ def test_two_multipliers_are_two(size, small, variance):
     assert "by rank: 2" in repr(found) and len(repr(found).splitlines()) == 7
 
 
-def test_without_noise(exact):
-    found = hj.select_order(exact.select((-1, 0, 1)), 3)
-    assert (found.by_rank, found.by_mdl, found.order) == (2, 2, 2)
-
-
 def test_the_level_of_the_rank_test(small, variance):
     """In 1 % of cases noise looks like one more multiplier, which fits refuse in the others."""
     _, htf = small

@@ -145,34 +145,6 @@ def test_pairs_cancel_even_distortion(model):
     assert estimate.error(model.htf(estimate.f)).max() < 1e-12
     with pytest.raises(hj.DefinitionError, match="experiments 0 and 1 are no pair"):
         realized(model, 2).odd_part()
-    with pytest.raises(hj.DefinitionError, match="one has no partner"):
-        hj.ExperimentData(data.u[:3], data.y[:3], n_sections=N, periods=P).odd_part()
-
-
-@pytest.mark.parametrize(
-    "message, arguments",
-    {
-        "3 windows of P = 16 periods need 48 cycles": dict(repeats=3),
-        "needs two windows or more": dict(variance="noise"),
-    }.items(),
-)
-def test_variances_that_cannot_be_had(model, message, arguments):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.estimate_htf(realized(model, 1, 2), **arguments)
-
-
-def test_repeated_phases_show_no_distortion(model):
-    data = realized(model, 1, noise=0.1)
-    twice = [np.concatenate([x, x + 1e-3 * k]) for k, x in ((0, data.u), (1, data.y))]
-    with pytest.raises(hj.DefinitionError, match="repeat the same phases"):
-        hj.estimate_htf(hj.ExperimentData(*twice, n_sections=N, periods=P), variance="total")
-
-
-def test_inputs_that_do_not_repeat(model):
-    data = realized(model, 1, 2)
-    u = data.u * np.linspace(1, 2, data.u.shape[1])[:, None]
-    with pytest.raises(hj.DefinitionError, match="the input does not repeat"):
-        hj.estimate_htf(hj.ExperimentData(u, data.y, n_sections=N, periods=P), repeats=2)
 
 
 def test_noise_by_its_ratio(model):
@@ -180,13 +152,13 @@ def test_noise_by_its_ratio(model):
     noisy = hj.experiments.add_noise(data, snr=20, seed=3)
     ratio = np.var(noisy.y - data.y, axis=(0, 1)) / np.mean(data.y**2, axis=(0, 1))
     np.testing.assert_allclose(ratio, 0.01, rtol=0.2)
-    for bad in (dict(), dict(std=1.0, snr=20), dict(std=-1.0), dict(std=np.nan)):
-        with pytest.raises(hj.DefinitionError):
-            hj.experiments.add_noise(data, **bad)
-    with pytest.raises(
-        hj.DefinitionError, match="ProcessNoise: `std` must be a nonnegative number"
-    ):
-        realized(model, 1, process_noise=-1.0)
+
+
+def test_repeated_phases_show_no_distortion(model):
+    data = realized(model, 1, noise=0.1)
+    twice = [np.concatenate([x, x + 1e-3 * k]) for k, x in ((0, data.u), (1, data.y))]
+    with pytest.raises(hj.DefinitionError, match="repeat the same phases"):
+        hj.estimate_htf(hj.ExperimentData(*twice, n_sections=N, periods=P), variance="total")
 
 
 @settings(max_examples=25)

@@ -22,24 +22,6 @@ def test_the_paper_protocol(paper_estimate, multipliers):
     assert narrow.compare(multipliers).max_error < 2e-5
 
 
-def test_noise_of_a_tenth_of_the_output(paper_data, multipliers):
-    noise = np.random.default_rng(0).normal(size=paper_data.y.shape)
-    y = paper_data.y + 0.1 * np.std(paper_data.y, axis=(0, 1)) * noise
-    data = hj.ExperimentData(paper_data.u, y, n_sections=32, periods=64)
-    fit = hj.fit_multipliers(hj.estimate_htf(data), 2)
-    assert fit.compare(multipliers).max_error < 1e-3
-
-
-def test_evaluation_between_the_lines(exact, hopper):
-    fit = hj.fit_multipliers(exact, 2)
-    f = np.linspace(0.02, 9.9, 57)
-    assert fit.htf(f).error(hopper.htf(f)).max() < 1e-10
-    one = fit.htf(f, 1)
-    assert one.harmonics == (1,) and one.source == "structured fit"
-    with pytest.raises(hj.DefinitionError, match="harmonic 2 was not fitted"):
-        hj.fit_multipliers(exact, 2, (0, 1)).htf(f, (0, 2))
-
-
 SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 
 

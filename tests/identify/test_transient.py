@@ -55,22 +55,3 @@ def test_failed_experiments_stay_out(hopper, full):
     assert np.isnan(fit.removed[2]).all() and np.isfinite(fit.removed[3]).all()
     estimate = hj.estimate_htf(fit.data, 0)
     assert np.abs(estimate[0] - hopper.htf(estimate.f, 0)[0]).max() < 1e-9
-
-
-def test_what_is_refused(hopper, full):
-    data = hj.experiments.simulate_experiments(hopper, full, discard=4)
-
-    def cut(n, **more):
-        return hj.ExperimentData(data.u[:, :n], data.y[:, :n], n_sections=32, periods=12, **more)
-
-    for message, data_, arguments in (
-        ("must hold the window of P = 12", cut(32 * 12), dict()),
-        ("nothing to tell the transient", cut(32 * 14), dict(order=2)),
-        ("no experiment ran well", cut(32 * 14, result=np.full(len(data.u), 2)), dict()),
-    ):
-        with pytest.raises(hj.DefinitionError, match=message):
-            hj.identify.remove_transient(data_, **arguments)
-    u = data.u.copy()
-    u[1, -1] += 1e-3
-    with pytest.raises(hj.DefinitionError, match="experiment 1: the input does not repeat"):
-        hj.identify.remove_transient(hj.ExperimentData(u, data.y, n_sections=32, periods=12))

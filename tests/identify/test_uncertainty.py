@@ -100,25 +100,6 @@ def test_without_variances_the_misfit_tells(small):
     assert blind.contains(model.multipliers, 0.999).all()
 
 
-@pytest.mark.slow
-def test_errors_with_the_poles_of_the_system_are_weighted_without_variances(small):
-    """Those of process noise: nearly as accurate as with their variances, and regions hold."""
-    model, htf = small
-    true, runs = model.multipliers, 25
-    chi = np.polyval(np.poly(true).real[::-1], np.exp(-2j * np.pi * htf.f))
-    by_line = (1e-3 + 1e-2 / np.abs(chi) ** 2)[:, None, None]
-    variance = np.broadcast_to(by_line, htf.H.shape)
-    square, held = np.zeros(2), 0
-    for seed in range(runs):
-        H = noisy(htf, variance, np.random.default_rng(seed)).H
-        told = hj.fit_multipliers(with_variance(htf, H, variance), 2)
-        blind = hj.fit_multipliers(with_variance(htf, H, None), 2)
-        held += blind.contains(true).all()
-        square += [fit.compare(true).error[0] ** 2 for fit in (told, blind)]
-    assert covered(held, runs)
-    assert square[1] < 1.1 * square[0]
-
-
 def test_the_spectrum_of_errors_is_found(small):
     """On average, of each output and at each frequency, whatever it was supposed to be."""
     model, htf = small

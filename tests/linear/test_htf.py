@@ -144,15 +144,6 @@ def test_interpolation_fills_the_gaps(hopper):
     assert np.max(at_grid.error(hopper.htf(f[[3, 77]], (0, 1)))) < 1e-12
 
 
-def test_repr(exact, synthetic):
-    assert repr(exact) == (
-        "HTF(exact; harmonics -16 to 15; 620 frequencies 0.01562 to 9.984 cycles/period; "
-        "32 sections: u -> yM, vM)"
-    )
-    assert "harmonics -3, 0;" in repr(synthetic.htf([0.1], (0, -3)))
-    jax.jit(lambda htf: repr(htf) and 0)(exact)
-
-
 def test_a_multiplier_on_the_unit_circle_is_named():
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
     ldtp = hj.LDTP.from_blocks([turn] * 3, [np.ones((2, 1))] * 3, [np.ones((1, 2))] * 3)
@@ -165,22 +156,15 @@ def test_a_multiplier_on_the_unit_circle_is_named():
         integrator.htf([0.3, 2.0, 0.7])
 
 
-def test_bad_use(synthetic, hopper):
+def test_bad_use(synthetic):
     htf = synthetic.htf([0.25, 0.75], harmonics=(-1, 0, 1))
     u = np.cos(2 * np.pi * 0.25 * np.arange(24) / 6)[:, None] * np.ones(2)
     cases = [
-        (lambda: htf[2], "Harmonic 2 is not stored"),
-        (lambda: htf.predict(u[:23]), "multiple of 6 samples"),
         (lambda: htf.predict(u**2), "f = 0 cycles per period, where"),
         (lambda: htf.select((0, 1)).predict(u), "symmetric about 0"),
         (lambda: htf.interpolate([2.0]), "f = 2 cycles per period is too far"),
-        (lambda: synthetic.htf(0.25).interpolate([0.3]), "at least two"),
         (lambda: htf.error(htf.select((0, 1))), "different harmonics"),
-        (lambda: htf.error(hopper.htf([0.25, 0.75], (-1, 0, 1))), "different n_sections"),
-        (lambda: jax.jit(lambda u: htf.predict(u))(u), "outside of jit"),
     ]
     for call, message in cases:
         with pytest.raises(hj.DefinitionError, match=message):
             call()
-    assert htf.select((-1, 0)).harmonics == (-1, 0)
-    np.testing.assert_array_equal(htf.predict(0 * u), 0)

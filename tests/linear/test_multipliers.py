@@ -153,6 +153,12 @@ def test_hopper(hopper, reference):
     np.testing.assert_allclose(hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14)
 
 
+def test_the_synthetic_system(synthetic):
+    assert list(synthetic.dims) == [3, 2, 3, 2, 3, 2]
+    pair = 0.3270675 + 0.0596405918293070j
+    np.testing.assert_allclose(synthetic.multipliers, [pair, pair.conjugate()], rtol=1e-13)
+
+
 def test_characteristic_polynomial(synthetic, hopper):
     for ldtp in (synthetic, hopper):
         r = len(ldtp.multipliers)

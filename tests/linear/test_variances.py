@@ -60,14 +60,3 @@ def test_some_frequencies(htf):
     np.testing.assert_array_equal(some.scatter.roundness, htf.scatter.roundness[:, [5, 1]])
     with pytest.raises(hj.DefinitionError, match="f = 0.12 was not excited .* nearest one is 0.1 "):
         htf.at(0.12)
-
-
-def test_bad_variances(htf):
-    with pytest.raises(hj.DefinitionError, match="have no variance"):
-        an_htf().confidence_radius()
-    with pytest.raises(hj.DefinitionError, match="`scatter.freedom` must have the shape"):
-        an_htf(scatter=hj.Scatter(np.ones(3)))
-    with pytest.raises(hj.DefinitionError, match="`scatter.roundness` must have the shape"):
-        an_htf(scatter=hj.Scatter(np.ones(len(F)), np.ones((3, len(F), 1, 1))))
-    with pytest.raises(hj.DefinitionError, match="`roundness` must be at most 3"):
-        hj.Scatter(np.ones(1), np.full((1, 1, 1, 1), 4.0))

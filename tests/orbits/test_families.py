@@ -1,6 +1,7 @@
-"""Cycles of the SLIP runner, one for each energy.
+"""Cycles of a family, chosen by a quantity that the system conserves.
 
-Numbers were computed apart from this package, with DOP853 and mpmath to 34 digits.
+Numbers of the SLIP runner were computed apart from this package, with DOP853 and mpmath to 34
+digits.
 """
 
 import equinox as eqx
@@ -11,8 +12,9 @@ import pytest
 
 import hybridjax as hj
 
+from ..toys import Field
 
-pytestmark = pytest.mark.slow
+
 APEX = hj.Crossing("vy", "falling")
 
 
@@ -21,6 +23,7 @@ def running():
     return hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX, conserved={"energy": 1784.8})
 
 
+@pytest.mark.slow
 def test_one_cycle_of_a_family(running):
     state = [running.state["y"], running.state["vx"]]
     np.testing.assert_allclose(state, [0.940267144379607, 5.11585365577165], rtol=1e-12)
@@ -30,11 +33,13 @@ def test_one_cycle_of_a_family(running):
     assert "(1: conserved energy)" in repr(running)
 
 
+@pytest.mark.slow
 def test_what_is_not_conserved_is_refused():
     with pytest.raises(hj.DefinitionError, match="'y' is not conserved"):
         hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX, conserved={"y": 0.94})
 
 
+@pytest.mark.slow
 def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):
     def height(k, energy):
         runner = eqx.tree_at(lambda x: x.k, running.system, k)
@@ -46,3 +51,32 @@ def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):
     for exact, step in ((by_k, (4.0, 0.0)), (by_energy, (0.0, 0.05))):
         ends = [height(at[0] + s * step[0], at[1] + s * step[1]) for s in (-1, 1)]
         np.testing.assert_allclose(exact, (ends[1] - ends[0]) / 2 / max(step), rtol=1e-5)
+
+
+class Oscillator(hj.HybridSystem):
+    """x'' = -x, whose cycles are circles."""
+
+    def charts(self):
+        return {"a": Field(("x", "v"), lambda t, q, u: (q[1], -q[0]))}
+
+    def outputs(self):
+        energy = lambda t, q, u: (q[0] ** 2 + q[1] ** 2) / 2  # noqa: E731
+        return (hj.Output("energy", energy),)
+
+
+def find(**conserved):
+    section = hj.Crossing("x", "rising")
+    guess = hj.Guess("a", (0.0, 1.1))
+    return hj.find_limit_cycle(Oscillator(), guess, section=section, conserved=conserved)
+
+
+def test_the_circle_of_an_energy():
+    cycle = find(energy=2.0)
+    np.testing.assert_allclose(cycle.state["v"], 2.0, rtol=1e-10)
+    np.testing.assert_allclose(float(cycle.period), 2 * np.pi, rtol=1e-10)
+    np.testing.assert_array_equal(cycle.multipliers, [1.0])
+
+
+def test_what_could_be_given_is_said():
+    with pytest.raises(hj.ComputationError, match=r"conserved=\{'energy': 0\.605"):
+        find()

@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation import compiler_options
 
 from ..conftest import APEX
-
-
-# Compiled in a third of the time, to slower programs.
-QUICK = compiler_options()
 
 
 @pytest.mark.slow
@@ -24,7 +19,7 @@ def test_the_period_of_van_der_pol_by_its_parameter(vanderpol_cycle, order):
         return hj.find_limit_cycle(system, vanderpol_cycle).period
 
     slope = jax.jacfwd(period) if order == 1 else jax.jacfwd(jax.jacfwd(period))
-    found = jax.jit(slope, compiler_options=QUICK)(jnp.asarray(1.0))
+    found = jax.jit(slope)(jnp.asarray(1.0))
     e = 1e-2
     at = [float(period(jnp.asarray(1.0 + k * e))) for k in range(-2, 3)]
     weights = {1: np.array([1, -8, 0, 8, -1]) / e, 2: np.array([-1, 16, -30, 16, -1]) / e**2}
@@ -54,3 +49,23 @@ def test_the_multipliers_of_the_hopper_by_its_parameters(hopper_cycle):
     slopes = eqx.filter_jit(eqx.filter_jacfwd(multiplier))(hopper_cycle.system)
     for name, value in true.items():
         assert complex(*np.asarray(getattr(slopes, name))) == pytest.approx(value, abs=1e-9), name
+
+
+@pytest.mark.slow
+def test_the_trace_of_the_jugglers_monodromy():
+    """Beside the gradient of its closed form (Holmes 1982)."""
+    juggler = hj.models.PaddleJuggler()
+    cycle = hj.find_limit_cycle(juggler)
+
+    def trace(system):
+        found = hj.find_limit_cycle(system, cycle)
+        return jnp.trace(hj.linearize(found, hj.ClockPhase(2)).monodromy())
+
+    def exact(system):
+        return jnp.sum(system.exact()[3]).real
+
+    gradient = eqx.filter_jit(eqx.filter_grad(trace))(juggler)
+    expected = eqx.filter_grad(exact)(juggler)
+    for name in ("A", "T", "g", "restitution"):
+        slope, true = getattr(gradient, name), getattr(expected, name)
+        np.testing.assert_allclose(slope, true, rtol=1e-9, err_msg=name)

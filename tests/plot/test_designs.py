@@ -6,33 +6,21 @@ import pytest
 import hybridjax as hj
 
 
-NOISE = {"y": 1e-3}
+MODEL = hj.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+USUAL = hj.multisine(4, 16, band=(0, 2.0))
+GOAL = hj.designs.Multipliers(harmonics=0)
+ASKED = dict(noise={"y": 1e-3}, goal=GOAL)
 
 
 @pytest.fixture(scope="module")
-def model():
-    return hj.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+def plan():
+    return hj.optimal_design(MODEL, USUAL, **ASKED)
 
 
-@pytest.fixture(scope="module")
-def goal():
-    return hj.designs.Multipliers(harmonics=0)
-
-
-@pytest.fixture(scope="module")
-def usual():
-    return hj.multisine(4, 16, band=(0, 2.0))
-
-
-@pytest.fixture(scope="module")
-def plan(model, usual, goal):
-    return hj.optimal_design(model, usual, noise=NOISE, goal=goal)
-
-
-def test_the_spectrum_of_a_design(plan, model):
-    above, below = hj.plot.spectrum(plan, model).axes[:, 0]
+def test_the_spectrum_of_a_design(plan):
+    above, below = hj.plot.spectrum(plan, MODEL).axes[:, 0]
     f = np.unique(plan.frequencies)
-    H = np.abs(np.asarray(model.htf(f, 0).H)[0, :, 0, 0])
+    H = np.abs(np.asarray(MODEL.htf(f, 0).H)[0, :, 0, 0])
     np.testing.assert_allclose(above.get_lines()[0].get_ydata(), H / H.max())
     usual, optimal = below.get_lines()
     np.testing.assert_allclose(np.sum(np.square(optimal.get_ydata()) / 2), plan.power.sum())
@@ -43,8 +31,8 @@ def test_the_spectrum_of_a_design(plan, model):
         hj.plot.spectrum(plan, hj.testing.synthetic_ldtp())
 
 
-def test_where_one_learns(model, usual, goal):
-    found = hj.designs.information_map(model, usual, noise=NOISE, goal=goal)
+def test_where_one_learns():
+    found = hj.designs.information_map(MODEL, USUAL, **ASKED)
     chart, side = hj.plot.information(found).axes[0]
     image = np.asarray(chart.collections[0].get_array())
     assert image.shape[0] == 4 and image.mean() == pytest.approx(1)
@@ -53,9 +41,9 @@ def test_where_one_learns(model, usual, goal):
     assert "f$ (cycles/period)" in chart.get_xlabel() and chart.get_ylabel() == "phase (cycles)"
 
 
-def test_what_strides_buy(plan, model, usual, goal):
-    study = hj.designs.Study(usual, 1, 1e-9, goal=goal)
-    data = hj.experiments.simulate_experiments(model, usual, start="periodic")
+def test_what_strides_buy(plan):
+    study = hj.designs.Study(USUAL, 1, 1e-9, goal=GOAL)
+    data = hj.experiments.simulate_experiments(MODEL, USUAL, start="periodic")
     studied = study.add(hj.experiments.add_noise(data, std=1e-3))
     # (More of them than there are colors.)
     others = {f"there {k}": studied for k in range(8)}
@@ -64,7 +52,7 @@ def test_what_strides_buy(plan, model, usual, goal):
     assert lines["here"].get_xdata() == studied.strides
     assert lines["here"].get_ydata() == np.linalg.norm(studied.standard_errors)
     equal = lines["equal amplitudes"]
-    at = np.interp(np.log(usual.cycles(0)), np.log(equal.get_xdata()), np.log(equal.get_ydata()))
+    at = np.interp(np.log(USUAL.cycles(0)), np.log(equal.get_xdata()), np.log(equal.get_ydata()))
     assert np.exp(at) == pytest.approx(np.linalg.norm(plan.usual_standard_errors))
     with pytest.raises(hj.DefinitionError, match="without a block"):
         hj.plot.strides(plan, {"here": study})

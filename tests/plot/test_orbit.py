@@ -1,11 +1,8 @@
 import numpy as np
-import pytest
 
 import hybridjax as hj
 
-
-def labeled(ax):
-    return {line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"}
+from .test_plots import labeled
 
 
 def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kinematic):
@@ -43,12 +40,3 @@ def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("v", "x")
     bars = labeled(ax)["sections (6)"].get_xydata().reshape(6, 3, 2)
     np.testing.assert_allclose(bars[:, :2].mean(axis=1).T, placed.lanes.q[::-1], atol=1e-9)
-
-
-def test_bad_input(hopper_cycle, vanderpol_cycle, placed_kinematic):
-    with pytest.raises(hj.DefinitionError, match="no output 'yN'; outputs are 'yM'"):
-        hj.plot.cycle(hopper_cycle, "yN")
-    with pytest.raises(hj.DefinitionError, match="belong to different systems"):
-        hj.plot.cycle(vanderpol_cycle, sections=placed_kinematic)
-    with pytest.raises(hj.DefinitionError, match="belong to different systems"):
-        hj.plot.cycle(hopper_cycle, perturbed=vanderpol_cycle.trajectory())

@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation import compiler_options
 
 from ..conftest import APEX
 
 
-# Compiled in a third of the time, to slower programs.
-QUICK = compiler_options()
-compiled = ft.partial(jax.jit, compiler_options=QUICK)
 SECTIONS = hj.ClockPhase(4, anchor=APEX)
 STIFFNESS = jnp.array([[9.8, 10.0], [10.1, 10.3]])
 
@@ -42,8 +38,8 @@ def analyze(lossy_cycle, k):
 def test_many_systems_side_by_side(lossy_cycle):
     """Nested maps over systems equal a loop over them."""
     one = ft.partial(analyze, lossy_cycle)
-    loop = compiled(one)
-    mapped = compiled(jax.vmap(jax.vmap(one)))(STIFFNESS)
+    loop = jax.jit(one)
+    mapped = jax.jit(jax.vmap(jax.vmap(one)))(STIFFNESS)
     for index in np.ndindex(*STIFFNESS.shape):
         alone = loop(STIFFNESS[index])
         assert alone["result"] == hj.Result.OK

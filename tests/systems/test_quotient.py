@@ -108,8 +108,6 @@ def test_a_stride_is_two_steps():
             MIRROR,
             "transition 'left lands' is not the mirror image of .* 'right lands'",
         ),
-        (Full(), {"swap": {"left stands": "right"}}, "no chart 'right'"),
-        (Full(), {"translation": ("y",)}, "no state 'y'"),
     ],
 )
 def test_what_is_no_symmetry_is_refused(system, symmetry, message):

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ...linear.htf import HTF
-from .descent import NormalEquations
+from ..descent import NormalEquations
 from .model import LocalCoordinates, PeriodicModel
 
 
