@@ -151,12 +151,12 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
     def run(count, seed):
         return family.run(design.realizations(count, seed), start="periodic", discard=32)
 
-    truth = hj.estimate_htf((run(100, seed + k) for k in range(20)), (-1, 0, 1)).at(chosen)
+    truth = hj.estimate_htf((run(100, seed + k) for k in range(20)), (-1, 0, 1)).interpolate(chosen)
 
     def draw(rng):
         phases, noise = rng.integers(2**31, size=2).tolist()
         noisy = hj.experiments.add_noise(run(each, phases), snr=20, seed=noise)
-        estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).at(chosen)
+        estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).interpolate(chosen)
         error = np.abs(np.asarray(estimate.H) - np.asarray(truth.H))
         return {
             "disc": error <= np.asarray(estimate.confidence_radius()),

@@ -75,7 +75,7 @@ def numbers(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | 
         "multiplier error": float(np.max(np.abs(multipliers - truth), initial=0.0) / size),
         "source": case.source,
         "channel": f"{case.push} to {case.output}",
-        "largest H_0": float(np.max(np.abs(exact.harmonic(0)))),
+        "largest H_0": float(np.max(np.abs(exact[0]))),
         "HTF error": None if estimate is None else float(estimate.error(exact)[0]),
     }
 

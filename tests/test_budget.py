@@ -24,19 +24,18 @@ PRONOUNS = set(
     "found own known one seen here some there these those it them others rest thing things".split()
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
-# a change that needs less lowers it. The aims: 24 000 lines of code, 300 thresholds, 12 places that
-# construct a `Structure`, 16 000 lines of tests.
+# a change that needs less lowers it. The aim: 24 000 lines of code.
 LIMITS = {
-    "code": 26_600,
-    "files": 250,
+    "code": 24_300,
+    "files": 220,
     "longest": 500,
     "public_names": 170,
     "many_parameters": 8,
-    "thresholds": 360,
-    "structure": 14,
+    "thresholds": 300,
+    "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 19_000,
+    "test_lines": 16_000,
     "doc_words": 36_000,
 }
 

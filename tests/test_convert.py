@@ -11,7 +11,6 @@ from .linear.test_variances import htf as htf
 
 
 convert = hj.convert
-PAGE = "docs/how-to/other-libraries.md"
 N = 5
 
 

@@ -11,9 +11,13 @@ from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
 from ..identify.denominator import chi, multipliers_of
-from ..identify.htf_errors import check_values, error_weights, require_frequencies
 from ..identify.joint.model import characteristic_slopes
-from ..identify.variable_projection import powers_basis
+from ..identify.variable_projection import (
+    check_values,
+    error_weights,
+    powers_basis,
+    require_frequencies,
+)
 from ..linear.htf import HTF
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
 from .criterion import Channel, Criterion, LinearCriterion

@@ -7,8 +7,14 @@ from jaxtyping import Complex, Float
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
-from ..identify.htf_errors import check_values, error_weights, require_frequencies
-from ..identify.variable_projection import HTFGroup, group_htf, misfit_of
+from ..identify.variable_projection import (
+    HTFGroup,
+    check_values,
+    error_weights,
+    group_htf,
+    misfit_of,
+    require_frequencies,
+)
 from ..linear.htf import HTF
 from .candidates import Model, NoiseLike, make_noise, with_variance
 from .criteria import coefficients, require_symmetric, wanted_parts

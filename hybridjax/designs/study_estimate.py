@@ -8,10 +8,17 @@ from jaxtyping import Complex, Float
 
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..identify.htf_errors import check_values, error_weights, require_frequencies
 from ..identify.multipliers import StructuredFit, fit_multipliers, require_order
 from ..identify.spectral_sums import spectral_sums
-from ..identify.variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of
+from ..identify.variable_projection import (
+    HTFGroup,
+    check_values,
+    error_weights,
+    group_htf,
+    maximum_likelihood,
+    misfit_of,
+    require_frequencies,
+)
 from ..linear.htf import HTF
 from .allocation import ENOUGH
 from .criteria import coefficients

@@ -24,7 +24,6 @@ from .problem import (
     Parameters,
     evaluate,
     free_parameters,
-    levenberg_marquardt,
 )
 
 
@@ -135,17 +134,13 @@ def _prepare(
 ) -> tuple[FitProblem, LimitCycle]:
     """Return the problem, and a limit cycle near which to search for others."""
     parameters = free_parameters(system, free)
-    observations = _several(data)
+    observations = [data] if isinstance(data, AbstractObservation) else data
     if not observations:
         raise DefinitionError("`data` holds no observation, but one or more are needed.")
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
     near = _anchored(near)
     prepared = tuple(observation.prepare(near) for observation in observations)
     return FitProblem(parameters, prepared), near
-
-
-def _several(data: Data) -> tuple[AbstractObservation, ...]:
-    return (data,) if isinstance(data, AbstractObservation) else tuple(data)
 
 
 def _anchored(cycle: LimitCycle) -> LimitCycle:
@@ -213,7 +208,7 @@ def _descend(
     cycle = _cycle_at(problem, system, start, near)
     if cycle.result != Result.OK:
         return End(start, start, np.inf, 0, 0, int(cycle.result))
-    end = levenberg_marquardt(problem, jnp.asarray(start), cycle)
+    end = evaluate(problem, jnp.asarray(start), cycle, descend=True)
     r, steps = np.asarray(end.residuals), int(end.steps)
     if not np.isfinite(r).all():  # there is a cycle, but no observation on it
         return End(start, start, np.inf, len(r), steps, int(Result.NOT_CONVERGED))

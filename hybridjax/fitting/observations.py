@@ -15,13 +15,13 @@ from .._core.boundary.checked import checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar
 from .._core.boundary.values import Reals
-from .._core.text import fields, listed, value
+from .._core.text import fields
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.plan import Plan
 from ..experiments.response import course, flow_batch, response_function
-from ..identify.htf_errors import check_values, error_weights
+from ..identify.variable_projection import check_values, error_weights
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections, FamilyLike, as_family
@@ -119,11 +119,6 @@ class ObservedHTF(AbstractObservation):
         self.weights = jnp.asarray(error_weights(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
 
-    def __repr__(self):
-        M, F = self.H.shape[:2]
-        signals = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        return _shown(self, f"{M} harmonics at {F} frequencies: {signals}", self.sections)
-
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         model = linearize(cycle, self.sections, self.outputs, self.inputs)
         error = (model.htf(self.f, self.harmonics).H - self.H) * self.weights
@@ -174,29 +169,15 @@ class ObservedSeries(AbstractObservation):
             )
         if not data.ok.any():
             raise DefinitionError("no experiment ran well, so there is nothing to fit to.")
-        self.inputs, self.outputs, ny = data.inputs, data.outputs, len(data.outputs)
+        self.inputs, self.outputs = data.inputs, data.outputs
         y = data.y[data.ok]
-        scale = np.sqrt(np.mean(y**2, axis=(0, 1))) if std is None else np.asarray(std, float)
-        if scale.shape not in ((), (ny,)):
-            raise DefinitionError(
-                f"`std` must be one number or one for each of {ny} outputs, not {scale.shape}."
-            )
-        if not np.all(scale > 0):
-            raise DefinitionError(
-                "an output does not move in any experiment: leave it out, or give `std`."
-            )
-        self.scale = jnp.broadcast_to(scale, (ny,))
+        self.scale = _scale("outputs", std, jnp.asarray(y.reshape(-1, y.shape[2])))
         self.weighted = jnp.asarray(std is not None)
         self.absolute = data.cycle_outputs is not None
         if data.cycle_outputs is not None:
             y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.n_sections, 1))
         self.u, self.y = jnp.asarray(data.u[data.ok]), jnp.asarray(y)
         self.flow = None
-
-    def __repr__(self):
-        S, n, _ = self.y.shape
-        signals = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        return _shown(self, f"{S} experiments of {n} samples: {signals}", self.sections)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         placed = place_sections(cycle, self.sections)
@@ -293,11 +274,6 @@ class ObservedCycle(AbstractObservation):
         times = _times(placed) if np.any(_times(placed)) else None
         return cls(placed.family, outputs, values, times=times, period=cycle.period)
 
-    def __repr__(self):
-        values = (f"{name} {value(x)}" for name, x in zip(self.which, self.measured, strict=True))
-        outputs = f"{listed(self.outputs)}: " if self.outputs else ""
-        return _shown(self, outputs + "; ".join(values), self.sections)
-
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         placed = place_sections(cycle, self.sections)
         parts = []
@@ -319,11 +295,6 @@ class ObservedCycle(AbstractObservation):
         return self
 
 
-def _shown(observation: AbstractObservation, what: str, sections: AbstractSections) -> str:
-    family = f"{sections.n_sections} sections of a {type(sections).__name__}"
-    return f"{type(observation).__name__}({what}; {family})"
-
-
 def _times(placed: PlacedSections) -> Float[Array, " N"]:
     t = placed.lanes.t
     return t if placed.cycle.clocked else t - t[0]
@@ -341,8 +312,8 @@ def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
         size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))  # of the shape seen.shape[1:]
         if not jnp.all(size > 0):
             raise DefinitionError(
-                f"`{name}` are zero at all sections, so they have no size: leave them out, or give "
-                "their standard deviation."
+                f"`{name}` are zero throughout and have no size: leave them out, or give their "
+                "standard deviation."
             )
         return size
     std = jnp.asarray(std, float)

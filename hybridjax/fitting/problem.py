@@ -217,14 +217,12 @@ def _iterate(problem: FitProblem, x, guess, free) -> Evaluation:
     return Evaluation(solution.value, residuals, jacobian, solution.stats["num_steps"], done)
 
 
-def levenberg_marquardt(
-    problem: FitProblem, x: Float[Array, " p"], guess: LimitCycle
+def evaluate(
+    problem: FitProblem, x: Float[Array, " p"], guess: LimitCycle, descend: bool = False
 ) -> Evaluation:
-    """Return parameters that minimize the residuals, from one guess."""
-    return _iterate(problem, x, guess, jnp.asarray(1.0))
+    """Return residuals and Jacobian at x, or at the minimum to which the iteration descends.
 
-
-def evaluate(problem: FitProblem, x: Float[Array, " p"], guess: LimitCycle) -> Evaluation:
-    """Return residuals and Jacobian at x. This is the compiled function of the iteration, since
-    another would compile for as long: derivatives of zero move nothing."""
-    return _iterate(problem, x, guess, jnp.asarray(0.0))
+    Both are one compiled function, since another would compile for as long: derivatives of zero
+    move nothing.
+    """
+    return _iterate(problem, x, guess, jnp.asarray(float(descend)))

@@ -39,16 +39,13 @@ class AmplitudeSweep(eqx.Module):
         **Raises:** `DefinitionError` if the smallest amplitude tried has a larger misfit.
         """
         worst = np.where(np.isnan(self.misfit), np.inf, self.misfit).max(axis=1)
-        beyond = np.flatnonzero(worst > misfit)
-        if len(beyond) == 0:
-            return float(self.amplitudes[-1])
-        k = beyond[0]
+        k = int(np.argmax(np.append(worst > misfit, True)))
         if k == 0:
             raise DefinitionError(
                 f"the smallest amplitude tried has a misfit of {worst[0]:.2g} already: try smaller "
                 "ones, or allow more."
             )
-        if np.isinf(worst[k]) or worst[k - 1] == 0:
+        if k == len(worst) or np.isinf(worst[k]) or worst[k - 1] == 0:
             return float(self.amplitudes[k - 1])
         x, y = np.log(self.amplitudes[k - 1 : k + 1]), np.log(worst[k - 1 : k + 1])
         return float(np.exp(np.interp(np.log(misfit), y, x)))

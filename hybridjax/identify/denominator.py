@@ -56,10 +56,6 @@ class Denominator(NamedTuple):
     covariance: Covariance
     converged: bool
 
-    @classmethod
-    def of_unknown_accuracy(cls, coefficients: Coefficients) -> "Denominator":
-        return cls(coefficients, Covariance.unknown(len(coefficients)), False)
-
 
 def sandwich(
     curvature: Float[np.ndarray, "d d"],

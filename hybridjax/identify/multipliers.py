@@ -13,28 +13,26 @@ from .._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
 from .._core.execution import one_blas_thread
 from .._core.results import Result
 from ..errors import DefinitionError
-from ..linear.frequency_response import Harmonics, check_harmonics
+from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from .denominator import chi, multipliers_of
 from .descent import ROUNDING
-from .htf_errors import (
-    SMALLEST_ERROR,
-    check_values,
-    error_spectrum,
-    error_weights,
-    require_frequencies,
-    weights_of,
-)
 from .multiplier_estimate import MultiplierEstimate
 from .variable_projection import (
+    SMALLEST_ERROR,
     HTFGroup,
+    check_values,
     delayed_responses,
+    error_spectrum,
+    error_weights,
     group_htf,
     maximum_likelihood,
     misfit_of,
     numerators_of,
+    require_frequencies,
     summarize,
+    weights_of,
 )
 
 
@@ -84,18 +82,10 @@ class StructuredFit(MultiplierEstimate):
 
         **Raises:** `DefinitionError` for a harmonic that was not fitted.
         """
-        f = np.atleast_1d(np.asarray(f, float))
-        chosen = (
-            self.harmonics if harmonics is None else check_harmonics(harmonics, self.n_sections)
-        )
-        absent = [m for m in chosen if m not in self.harmonics]
-        if absent:
-            raise DefinitionError(
-                f"harmonic {absent[0]} was not fitted; the harmonics are {self.harmonics}."
-            )
-        rows = [self.harmonics.index(m) for m in chosen]
-        H = _evaluate(self.numerators[rows], self.coefficients, f, self.n_sections)
-        return HTF(f, H, chosen, self.n_sections, self.inputs, self.outputs, "structured fit")
+        f, N = np.atleast_1d(np.asarray(f, float)), self.n_sections
+        H = _evaluate(self.numerators, self.coefficients, f, N)
+        htf = HTF(f, H, self.harmonics, N, self.inputs, self.outputs, "structured fit")
+        return htf if harmonics is None else htf.select(harmonics)
 
     def _about(self) -> str:
         misfit = ", ".join(
@@ -396,8 +386,8 @@ def _noise_ratios(groups: list[HTFGroup], order: int) -> tuple[Float[np.ndarray,
     They ascend, in units of the noise (1 where only noise is left); then the standard deviation of
     each where it is noise.
     """
-    white = delayed_responses(groups, np.zeros(order)).whitened()
-    values = np.linalg.svd(white, compute_uv=False)[::-1] ** 2
+    whitened, _ = delayed_responses(groups, np.zeros(order))
+    values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2
     return values, float(np.sqrt(2 / sum(group.freedom * group.size for group in groups)))
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Order, Scalar, Vector
-from .._core.html import card, complex_number, table, unit_circle
+from .._core.html import card, text, unit_circle
 from .._core.precision import require_x64
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
@@ -109,16 +109,7 @@ class RationalFit(eqx.Module):
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        rows = [
-            (name, *map(complex_number, (pole, multiplier)), f"{residual:.2e}")
-            for name, poles, multipliers, residual in zip(
-                self.outputs, self.poles, self.multipliers, self.residual, strict=True
-            )
-            for pole, multiplier in zip(poles, multipliers, strict=True)
-        ]
-        of = repr(self).splitlines()[0].removeprefix("RationalFit(").removesuffix(")")
-        head = ("output", "pole", "multiplier", "residual")
-        return card("RationalFit", of, table(head, rows), unit_circle(self.multipliers.ravel()))
+        return card("RationalFit", "", text(repr(self)), unit_circle(self.multipliers.ravel()))
 
 
 @checked
@@ -160,17 +151,15 @@ def fit_rational(
     column, rows = channel_index("input", input, htf.inputs), range(len(htf.outputs))
     if output is not None:
         rows = [channel_index("output", output, htf.outputs)]
-    H = np.asarray(htf.harmonic(harmonic))[:, :, column]
+    H = np.asarray(htf[harmonic])[:, :, column]
     if 2 * len(H) < poles + zeros + 1:
         raise DefinitionError(
             f"{poles} poles and {zeros} zeros have {poles + zeros + 1} coefficients, too many for "
             f"{len(H)} frequencies."
         )
     w = np.exp(-2j * np.pi * np.asarray(htf.f) / htf.n_sections)[:, None]
-    powers_b, powers_a = (
-        w ** (int(form == "delayed") + np.arange(zeros + 1)),
-        w ** (1 + np.arange(poles)),
-    )
+    powers_b = w ** (int(form == "delayed") + np.arange(zeros + 1))
+    powers_a = w ** (1 + np.arange(poles))
     fits = []
     for row in rows:
         h = H[:, row]

@@ -90,7 +90,14 @@ def remove_transient(
         )
     if not data.ok.any():
         raise DefinitionError(f"no experiment ran well: {data.summary()}.")
-    _require_periodic(data)
+    change = np.abs(data.u[data.ok, N * P :] - data.u[data.ok, : -N * P]).max(axis=(1, 2))
+    worst = int(np.argmax(change))
+    if change[worst] > SILENT_LINE * np.abs(data.u[data.ok][worst]).max():
+        raise DefinitionError(
+            f"experiment {np.flatnonzero(data.ok)[worst]}: the input does not repeat after P = "
+            f"{P} periods over all of the record, so that response and transient cannot be told "
+            "apart."
+        )
 
     size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
     good = np.flatnonzero(data.ok).tolist()
@@ -127,19 +134,6 @@ def remove_transient(
     simulated = None if data.simulated is None else Simulated(failed_at, data.error)
     data = dataclasses.replace(data, u=data.u[:, skip * N :], y=clean, simulated=simulated)
     return TransientFit(data, multipliers_of(c), removed)
-
-
-def _require_periodic(data: ExperimentData) -> None:
-    length = data.n_sections * data.periods
-    u = data.u[data.ok]
-    change = np.abs(u[:, length:] - u[:, :-length]).max(axis=(1, 2))
-    worst = int(np.argmax(change))
-    if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
-        raise DefinitionError(
-            f"experiment {np.flatnonzero(data.ok)[worst]}: the input does not repeat after P = "
-            f"{data.periods} periods over all of the record, so that response and transient cannot "
-            "be told apart."
-        )
 
 
 def _classes(data: ExperimentData, s: int) -> np.ndarray:

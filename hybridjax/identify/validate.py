@@ -11,7 +11,7 @@ from scipy import special, stats
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Probability
-from .._core.html import COLORS, Curve, card, picture, table, text
+from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import p_value
 from ..errors import DefinitionError
@@ -273,26 +273,14 @@ class Validation(eqx.Module):
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        names = [with_unit(y, unit_of(y)) for y in self.outputs]
-        rows = [
-            (names[i], f"{self.fit[i]:.4g} %", f"{self.noise[i]:.3g}",
-             p_value(self.whiteness[i]), p_value(self.independence[i]))
-            for i in range(len(names))
-        ]  # fmt: skip
         k = slice(0, _DRAWN * self.n_sections)
         t = (self.first_section + np.arange(len(self.measured[k]))) / self.n_sections
         curves = [
             Curve(t, self.measured[k, 0], "measured", COLORS[-1]),
             Curve(t, self.simulated[k, 0], "simulated"),
         ]
-        verdict = "\n".join(repr(self).splitlines()[1 + len(names) :])
-        return card(
-            "Validation",
-            "",
-            table(("output", "fit", "rms left", "white", "independent"), rows),
-            picture(curves, "cycles", names[0]),
-            text(verdict),
-        )
+        name = with_unit(self.outputs[0], unit_of(self.outputs[0]))
+        return card("Validation", "", picture(curves, "cycles", name), text(repr(self)))
 
 
 @checked

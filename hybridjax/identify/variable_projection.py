@@ -8,11 +8,13 @@ depends on c alone (variable projection: Golub and Pereyra 1973).
 Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\varepsilon|^2}$.
 """
 
+from itertools import count
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Inexact, Int
 
+from ..errors import DefinitionError
 from ..linear.htf import HTF
 from .denominator import Covariance, chi, inverse_of_remainder, sandwich
 from .descent import NO_LEADING_COEFFICIENT, ROUNDING, Coefficients, Minimum, least_squares
@@ -131,25 +133,15 @@ def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     return Misfit(residual, np.reshape(slopes, (d, *residual.shape)), by_noise, group.leverage(q))
 
 
-class DelayedResponses(NamedTuple):
-    """The residuals of $z^{-jN} H$, j = 0, ..., d, less numerators, weighted by $1/|\\chi|$."""
+def delayed_responses(
+    groups: list[HTFGroup], c: Coefficients
+) -> tuple[Float[np.ndarray, "d1 r"], Float[np.ndarray, "d1 d1"]]:
+    r"""Return roots of two Gram matrices of $z^{-jN} H$, j = 0, ..., d, less numerators.
 
-    columns: Float[np.ndarray, "rows d1"]
-    """One for each j, over all entries."""
-    noise_gram: Float[np.ndarray, "d1 d1"]
-    """The part of their Gram matrix that is expected from errors of variance 1."""
-
-    def whitened(self) -> Float[np.ndarray, "d1 r"]:
-        """Return a root of the columns' Gram matrix, in units of that of errors alone.
-
-        (The Gram matrix itself would lose half of the digits.)
-        """
-        _, triangle = np.linalg.qr(self.columns)
-        return np.linalg.solve(np.linalg.cholesky(self.noise_gram), triangle.T)
-
-
-def delayed_responses(groups: list[HTFGroup], c: Coefficients) -> DelayedResponses:
-    """Return those of all groups. The coefficients of chi combine the columns to errors alone."""
+    The responses of all groups are weighted by $1/|\chi|$; the coefficients of chi combine them to
+    errors alone. The first root is in units of the second, which is that of the Gram matrix that is
+    expected from errors of variance 1. (The Gram matrix itself would lose half of the digits.)
+    """
     delays, columns, noise_gram = np.arange(len(c) + 1), [], 0.0
     for group in groups:
         q, _ = group.numerator_space(c)
@@ -159,7 +151,9 @@ def delayed_responses(groups: list[HTFGroup], c: Coefficients) -> DelayedRespons
         left = (2 - group.leverage(q).sum(axis=0)) / np.abs(chi(group.period_delay, c)) ** 2
         by_delay = (left * (group.period_delay ** delays[:, None]).real).sum(axis=1)
         noise_gram = noise_gram + by_delay[np.abs(delays[:, None] - delays)] * group.size
-    return DelayedResponses(np.concatenate(columns), np.asarray(noise_gram))
+    noise = np.linalg.cholesky(noise_gram)
+    _, triangle = np.linalg.qr(np.concatenate(columns))
+    return np.linalg.solve(noise, triangle.T), noise
 
 
 def maximum_likelihood(
@@ -188,9 +182,9 @@ def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
     """
     c = np.zeros(order)
     for _ in range(_MAX_REWEIGHTINGS):
-        responses = delayed_responses(groups, c)
-        vectors, _, _ = np.linalg.svd(responses.whitened())
-        null = np.linalg.solve(np.linalg.cholesky(responses.noise_gram).T, vectors[:, -1])
+        whitened, noise = delayed_responses(groups, c)
+        vectors, _, _ = np.linalg.svd(whitened)
+        null = np.linalg.solve(noise.T, vectors[:, -1])
         if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
             break
         c, last = null[1:] / null[0], c
@@ -199,20 +193,13 @@ def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
     return c
 
 
-class Summary(NamedTuple):
-    """The covariance of the coefficients at the minimum, and how large the misfit is."""
-
-    covariance: Covariance
-    cost: float
-    """Sum of squares of the misfit, in units of the errors supposed."""
-    freedom: int
-    """The real equations that the numerators leave: the expected cost."""
-
-
 def summarize(
     groups: list[HTFGroup], c: Coefficients, errors: Literal["residuals", "variance"]
-) -> Summary:
-    r"""Return the covariance of the coefficients, and how large the misfit is.
+) -> tuple[Covariance, float, int]:
+    r"""Return the covariance of the coefficients, the cost, and its expected value.
+
+    The cost is the sum of squares of the misfit in units of the errors supposed; its expected value
+    is the number of real equations that the numerators leave.
 
     With the residuals r, their Jacobian J and its part Q that errors make,
     $\mathrm{Cov}(c) = (J^T J - Q)^{-1} M (J^T J - Q)^{-1}$, where M is the covariance of the
@@ -236,7 +223,7 @@ def summarize(
         np.add.at(shares, group.line, products)
     square = shares.sum(axis=0)
     if errors == "variance":
-        return Summary(sandwich(square - noise, square), cost, freedom)
+        return sandwich(square - noise, square), cost, freedom
     try:
         root = np.linalg.cholesky(square)
         half = np.linalg.inv(root)
@@ -244,7 +231,7 @@ def summarize(
         score = np.einsum("lij,lj->li", left, score @ half.T) @ root.T
     except np.linalg.LinAlgError:  # some combination of coefficients is unknown
         pass
-    return Summary(sandwich(square - noise, score.T @ score, shares), cost, freedom)
+    return sandwich(square - noise, score.T @ score, shares), cost, freedom
 
 
 def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"]:
@@ -337,3 +324,158 @@ def powers_basis(
     u, s, vh = np.linalg.svd(powers, full_matrices=False)
     kept = s > 0.1 * ROUNDING * s[0]  # one combination less would change bounds by 0.3 %
     return u[:, kept], vh[kept].conj().T / s[kept]
+
+
+# Smallest error that an HTF is supposed to have, relative to the rms of its output: that of
+# rounding. Smaller: infinite weights; larger: exact outputs count too little beside noisy ones.
+SMALLEST_ERROR = 1e-15
+
+
+def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
+    """Return the rms of each output's HTFs.
+
+    **Raises:** `DefinitionError` for NaN, an output that is zero, or variances that are no
+    positive numbers.
+    """
+    H = np.asarray(htf.H)
+    if not np.isfinite(H).all():
+        raise DefinitionError("the HTFs hold NaN or infinity.")
+    rms = np.sqrt(np.mean(np.abs(H) ** 2, axis=(0, 1, 3)))
+    if (rms == 0).any():
+        name = htf.outputs[int(np.argmin(rms))]
+        raise DefinitionError(f"the HTFs of {name} are zero: leave this output out.")
+    if htf.variance is not None:
+        bad = np.argwhere(~(np.isfinite(htf.variance) & (np.asarray(htf.variance) >= 0)))
+        if len(bad):
+            m, k, i, _ = (int(x) for x in bad[0])
+            raise DefinitionError(
+                f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = "
+                f"{float(htf.f[k]):g} is not a positive number; leave this frequency out, or give "
+                "HTFs without variances."
+            )
+    return rms
+
+
+def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, "M F ny nu"]:
+    """Return one over the standard deviation of real and imaginary part, known or supposed.
+
+    Variances that were estimated with few degrees of freedom are poor weights: they are replaced
+    by the nearest product of a factor for each frequency and one for each harmonic, up to its
+    sign (which is the form for white noise and any spectrum of the input).
+
+    **Arguments:** `rms`: errors are taken as equal parts of it where there are no variances.
+    """
+    if htf.variance is None:
+        return np.broadcast_to(1 / rms[:, None], htf.H.shape)
+    variance = np.asarray(htf.variance)
+    if htf.scatter is not None:
+        freedom = np.asarray(htf.scatter.freedom)
+        variance = _product_of_factors(variance, np.asarray(htf.harmonics), freedom)
+    return weights_of(variance, rms)
+
+
+def weights_of(
+    variance: Float[np.ndarray, "... ny _"], rms: Float[np.ndarray, " ny"]
+) -> Float[np.ndarray, "... ny _"]:
+    """Return one over the standard deviation of real and imaginary part of these variances."""
+    return np.sqrt(2 / np.maximum(variance, (SMALLEST_ERROR * rms[:, None]) ** 2))
+
+
+def _product_of_factors(
+    variance: Float[np.ndarray, "M F ny nu"],
+    harmonics: Int[np.ndarray, " M"],
+    freedom: Float[np.ndarray, " F"],
+) -> Float[np.ndarray, "M F ny nu"]:
+    """Return the product of factors of frequency and harmonic with the same sums."""
+    if not variance.all():
+        return variance
+    _, same = np.unique(np.abs(harmonics), return_inverse=True)
+    share = freedom / freedom.sum()
+    size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
+    for _ in range(20):  # more sweeps change nothing in 6 digits
+        by_line = (variance / size[same]).mean(axis=0)
+        by_harmonic = np.tensordot(share, variance / by_line, axes=(0, 1))
+        size = np.stack([by_harmonic[same == k].mean(axis=0) for k in range(len(size))])[:, None]
+    return size[same] * by_line
+
+
+def require_frequencies(htf: HTF, order: int, size: int) -> None:
+    """Check that the frequencies determine numerators of `size` coefficients and the multipliers.
+
+    **Raises:** `DefinitionError` for too few.
+    """
+    harmonics = {m % htf.n_sections for m in htf.harmonics}
+    # Half of a pair, or a harmonic that is its own mirror image, has half as many coefficients.
+    unknown = [size if -m % htf.n_sections in harmonics else 2 * size for m in harmonics]
+    entries = len(htf.outputs) * len(htf.inputs)
+
+    def enough(frequencies: int) -> bool:
+        return sum(max(2 * frequencies - k, 0) for k in unknown) * entries >= order
+
+    if not enough(len(htf.f)):
+        raise DefinitionError(
+            f"{len(htf.f)} frequencies are too few for numerators of {size} coefficients and "
+            f"{order} multipliers: {next(filter(enough, count()))} or more are needed. Measure "
+            "more, or lower `order` or `overhang`."
+        )
+
+
+def error_spectrum(
+    groups: list[HTFGroup], c: Coefficients, f: Float[np.ndarray, " F"], outputs: int
+) -> Float[np.ndarray, "F ny"]:
+    r"""Return the variance of the errors of each output, zero where the residual is zero.
+
+    Noise of the sensors is taken for white; noise that drives the system has the system's poles,
+    at all harmonics. The variance of an output is therefore modeled as $a + b / |\chi|^2$.
+
+    This is a step of scoring towards the largest restricted likelihood (Patterson and Thompson
+    1971), from the weights of the groups, which accounts for the fitted numerators.
+    """
+    square, expected = np.zeros((outputs, 2)), np.zeros((outputs, 2, 2))
+    for group in groups:
+        parts = _components(group.period_delay, c) * group.weight**2
+        size = group.scale**2 / 2
+        residual = (misfit_of(group, c).residual ** 2).sum(axis=0)
+        products = _expected_products(group, c, parts)
+        for k, i in enumerate(group.channel[:, 0]):
+            square[i] += size[k] * (parts @ residual[:, k])
+            expected[i] += size[k] ** 2 * products
+    sizes = np.stack([amounts(*pair) for pair in zip(expected, square, strict=True)])
+    return (sizes @ _components(np.exp(-2j * np.pi * f), c)).T
+
+
+def _components(
+    period_delay: Complex[np.ndarray, " E"], c: Coefficients
+) -> Float[np.ndarray, "2 E"]:
+    """Return the spectra of white noise and of noise that passes the system."""
+    return np.stack([np.ones(len(period_delay)), 1 / np.abs(chi(period_delay, c)) ** 2])
+
+
+def _expected_products(
+    group: HTFGroup, c: Coefficients, parts: Float[np.ndarray, "2 E"]
+) -> Float[np.ndarray, "2 2"]:
+    """Return tr(G_k R G_l R), where R subtracts the best numerators.
+
+    It is the mean of `parts[k]` times the squares of the residuals, for errors with the variances
+    `parts[l]`.
+    """
+    q, _ = group.numerator_space(c)
+    rows = np.concatenate([parts, parts], axis=1)[:, : len(q)]
+    taken = (np.abs(q) ** 2).sum(axis=1)
+    along = [q.conj().T @ (row[:, None] * q) for row in rows]
+    both = np.array([[np.vdot(a, b).real for a in along] for b in along])
+    return (1 if group.real else 2) * (rows * (1 - 2 * taken) @ rows.T + both)
+
+
+def amounts(
+    expected: Float[np.ndarray, "2 2"], square: Float[np.ndarray, " 2"]
+) -> Float[np.ndarray, " 2"]:
+    """Return the amounts of two kinds of noise, none of them negative, from two sums of squares.
+
+    **Arguments:** `expected`: the mean contribution of each kind (columns) to each sum.
+    """
+    both = np.linalg.lstsq(expected, square)[0]
+    if both.min() >= 0:
+        return both
+    only = int(both.argmax())
+    return np.where(np.arange(2) == only, square[only] / expected[only, only], 0.0)

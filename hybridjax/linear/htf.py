@@ -20,10 +20,6 @@ from ..errors import DefinitionError
 from .frequency_response import Frequencies, Harmonics, check_harmonics
 
 
-# The largest roundness: that of three realizations that scatter evenly.
-_ROUNDEST = 3
-
-
 @checked
 class Scatter(eqx.Module):
     r"""What is known of the scatter that `HTF.variance` was estimated from.
@@ -35,7 +31,7 @@ class Scatter(eqx.Module):
       the realizations, relative to its mean for Gaussian errors: 0 where all lie on a line. None,
       and ones, are scatter that says nothing but its size.
 
-    **Raises:** `DefinitionError` for freedom that is not positive, or roundness beyond 0 to 3.
+    **Raises:** `DefinitionError` for freedom that is not positive, or negative roundness.
     """
 
     freedom: Float[Array, " F"]
@@ -49,12 +45,6 @@ class Scatter(eqx.Module):
         require_x64()
         self.freedom = jnp.asarray(freedom)
         self.roundness = None if roundness is None else jnp.asarray(roundness)
-        if (
-            roundness is not None
-            and not is_traced(roundness)
-            and np.max(roundness, initial=0) > _ROUNDEST
-        ):
-            raise DefinitionError(f"`roundness` must be at most {_ROUNDEST}.")
 
     def quantile(self, level: Probability) -> Float[Array, "*M F ny nu"]:
         r"""Quantile of $|\delta H|^2 / v$ at this probability.
@@ -202,39 +192,18 @@ class HTF(eqx.Module):
         of = f"({self.source}): {repr(self).partition('; ')[2].removesuffix(')')}"
         return card("HTF", of, *drawn, table(("output", "", "largest modulus", "at f"), rows))
 
-    def harmonic(self, m: int) -> Complex[Array, "F ny nu"]:
+    def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]:
         """`H_m`; `m` counts modulo `N`.
 
         **Raises:** `DefinitionError` if it is not among the harmonics stored.
         """
         return self.H[self._index(m)]
 
-    def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]:
-        return self.harmonic(m)
-
     def select(self, harmonics: Harmonics) -> "HTF":
         """The same with fewer harmonics."""
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
         return self._with(self.f, lambda x: x[rows], harmonics)
-
-    def at(self, f: Frequencies) -> "HTF":
-        """The same at fewer frequencies (F,), in this order (host side).
-
-        **Raises:** `DefinitionError` for a frequency that was not measured.
-        """
-        if is_traced(self.f, f):
-            raise DefinitionError("`at` must know `f`: call it outside of jit.")
-        wanted, measured = np.atleast_1d(np.asarray(f, float)), np.asarray(self.f)
-        distance = np.abs(measured - wanted[:, None])
-        nearest = np.argmin(distance, axis=1)
-        lost = ~(distance.min(axis=1) < _SAME_FREQUENCY)
-        if lost.any():
-            raise DefinitionError(
-                f"f = {wanted[lost][0]:.10g} was not excited or not measured; the nearest one is "
-                f"{measured[nearest[lost][0]]:.10g} (`interpolate` goes between them)."
-            )
-        return self._with(self.f[nearest], lambda x: x[:, nearest], self.harmonics)
 
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
@@ -367,7 +336,7 @@ class HTF(eqx.Module):
             is_traced(self.f, other.f) or np.allclose(self.f, other.f, rtol=0, atol=_SAME_FREQUENCY)
         ):
             raise DefinitionError("Two HTFs at different frequencies cannot be compared.")
-        scale = jnp.max(jnp.abs(other.harmonic(0)), axis=(0, 2))
+        scale = jnp.max(jnp.abs(other[0]), axis=(0, 2))
         return jnp.max(jnp.abs(self.H - other.H), axis=(1, 3)) / scale
 
     def error(self, other: "HTF") -> Float[Array, " ny"]:

@@ -52,7 +52,6 @@ class AdExNeuron(DrivenNeuron):
     """
 
     input_units = ("pA",)
-    time_unit = "ms"
 
     C: Parameter = parameter(281.0, unit="pF", doc="capacitance")
     gL: Parameter = parameter(30.0, unit="nS", doc="leak")
@@ -94,7 +93,6 @@ class IzhikevichNeuron(DrivenNeuron):
     """
 
     input_units = ("mV/ms",)
-    time_unit = "ms"
 
     a: Parameter = parameter(0.02, unit="1/ms", doc="rate of the recovery")
     b: Parameter = parameter(0.2, unit="1/ms", doc="how recovery follows the potential")

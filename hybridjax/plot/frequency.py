@@ -238,7 +238,7 @@ def _values(
     """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
     hold the true values; None without a variance."""
     order, at = np.argsort(htf.f), (_index(htf.outputs, output), _index(htf.inputs, input))
-    values, radius = np.asarray(htf.harmonic(m))[(order, *at)], None
+    values, radius = np.asarray(htf[m])[(order, *at)], None
     if htf.variance is not None:
         radius = np.asarray(htf.select(m).confidence_radius())[(0, order, *at)]
     return np.asarray(htf.f)[order], values, radius

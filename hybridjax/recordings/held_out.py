@@ -8,7 +8,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
-from ..identify.denominator import Denominator
+from ..identify.denominator import Covariance, Denominator
 from ..identify.series.fit import (
     SeriesFit,
     assemble,
@@ -58,7 +58,7 @@ class Split(NamedTuple):
             solution = linearize(problem, c)
             if (solution.freedom <= 2 * d).any():
                 break
-            fit = assemble(problem, solution, Denominator.of_unknown_accuracy(c))
+            fit = assemble(problem, solution, Denominator(c, Covariance.unknown(d), False))
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
             if not long:
                 break

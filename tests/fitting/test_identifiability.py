@@ -34,15 +34,6 @@ def test_directions_are_said_in_words(rows, words):
     assert all(f"not seen: {text}" in repr(found) for text in words)
 
 
-def test_everything_seen_and_nothing_seen():
-    full = diagnose(("a", "b"), np.eye(3)[:, :2])
-    assert full.complete and full.rank == 2 and full.unseen.shape == (0, 2)
-    none = diagnose(("a", "b"), np.zeros((3, 2)))
-    assert none.rank == 0 and sorted(none.descriptions()) == ["a", "b"]
-    few = diagnose(("a", "b"), np.array([[1.0, 1.0]]))
-    assert few.descriptions() == ["a and b apart, only their product"]
-
-
 @given(st.lists(st.lists(st.integers(-3, 3), min_size=5, max_size=5), min_size=1, max_size=3))
 def test_the_basis_spans_what_is_not_seen(rows):
     rows = np.array(rows, float)

@@ -49,10 +49,3 @@ def test_its_derivative_tends_to_that_of_the_radius():
 
     errors = [abs(float(jax.grad(radius)(0.0, eps)) - 0.8) for eps in (1e-2, 1e-4, 1e-6)]
     assert errors[1] < 0.05 * errors[0] and errors[2] < 0.05 * errors[1] and errors[2] < 1e-4
-
-
-def test_a_cycle_and_its_sections_agree_as_far_as_the_bias_allows(hopper_cycle, isochron_ldtp):
-    true = np.abs(hopper_cycle.multipliers).max()
-    for which in (hopper_cycle, isochron_ldtp):
-        errors = [float(hj.spectral_radius(which, eps)) / true - 1 for eps in (1e-2, 1e-4, 1e-6)]
-        assert errors[0] > errors[1] > errors[2] > 0 and errors[2] < 1e-4

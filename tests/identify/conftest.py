@@ -3,7 +3,21 @@ import pytest
 
 import hybridjax as hj
 
-from ..linear.conftest import hopper as hopper
+from ..linear.conftest import blocks_at_random, hopper as hopper
+
+
+def scaled(seed, dims, ny, nu, modulus=0.7):
+    """A random system whose largest multiplier has this modulus."""
+    A, B, C, D = blocks_at_random(seed, dims, ny, nu)
+    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers[0])
+    factor = (modulus / size) ** (1 / len(dims))
+    return hj.LDTP.from_blocks([a * factor for a in A], B, C, D)
+
+
+@pytest.fixture(scope="session")
+def small():
+    """Four sections, two multipliers of modulus 0.7, states that die soon."""
+    return scaled(3, (2, 3, 4, 2), 2, 1)
 
 
 @pytest.fixture(scope="session")

@@ -8,12 +8,11 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.joint.fit import minimize
-from hybridjax.identify.joint.frequency import FrequencyProblem, transfer, transfer_slopes
+from hybridjax.identify.joint.frequency import transfer, transfer_slopes
 from hybridjax.identify.joint.model import PeriodicModel, characteristic_slopes, local_coordinates
 from hybridjax.linear.frequency_response import harmonic_transfer
 
-from .test_series import scaled
+from .conftest import scaled
 
 
 F = np.linspace(0.03, 2.9, 40)
@@ -118,19 +117,6 @@ def test_undetermined_responses_have_infinite_variance():
     variance = fit.htf(f, (-2, -1, 0, 1)).variance
     assert np.isinf(variance[0]).all() and variance[1:].max() < 1e-6
     assert fit.contains(small.multipliers[:2], 0.999).all()
-
-
-def test_a_step_that_damping_makes_small_is_not_the_last(model):
-    """Beside the minimum, along what the data show worst, by a standard deviation."""
-    htf = model.htf(F, (0, 1))
-    draw = noisy(with_values(htf, htf.H, 4e-4), np.random.default_rng(5))
-    problem = FrequencyProblem.of(draw, np.sqrt(2 / draw.variance), ONE)
-    minimum, converged = minimize(problem, PeriodicModel.of(model, ONE), True, 500)
-    assert converged
-    root = minimum.equations.spread().root
-    beside = minimum.coordinates.moved(root[:, np.argmax((root**2).sum(axis=0))] * 3.0)
-    again, converged = minimize(problem, beside, True, 500)
-    assert converged and again.cost < minimum.cost + 0.01 * again.coordinates.size
 
 
 def test_errors_are_as_small_as_the_bound(model, exact):

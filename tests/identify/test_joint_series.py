@@ -10,16 +10,11 @@ from hybridjax.identify.joint.model import PeriodicModel, local_coordinates
 from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem, noise_spectrum
 from hybridjax.identify.series.records import CycleGrid
 
-from .test_series import record, scaled
+from .test_series import record
 from .test_uncertainty import covered
 
 
 ONE = np.ones(2)
-
-
-@pytest.fixture(scope="module")
-def small():
-    return scaled(3, (2, 3, 4, 2), 2, 1)
 
 
 def driven(model, size, sensor=0.1):

@@ -5,7 +5,8 @@ from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 
-from .test_series import record, scaled
+from .conftest import scaled
+from .test_series import record
 
 
 # Reachable and observable: the states of the hopper that its two outputs tell apart.

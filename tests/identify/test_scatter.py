@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 import hybridjax as hj
@@ -159,18 +158,3 @@ def test_repeated_phases_show_no_distortion(model):
     twice = [np.concatenate([x, x + 1e-3 * k]) for k, x in ((0, data.u), (1, data.y))]
     with pytest.raises(hj.DefinitionError, match="repeat the same phases"):
         hj.estimate_htf(hj.ExperimentData(*twice, n_sections=N, periods=P), variance="total")
-
-
-@settings(max_examples=25)
-@given(st.integers(1, 3), st.integers(1, 40), st.integers(0, 70), st.integers(1, 3))
-def test_any_record_is_estimated_or_refused(model, sections, periods, samples, repeats):
-    """Whatever N and P are said to be: a number for every line, or a sentence."""
-    rng = np.random.default_rng(samples)
-    u, y = rng.normal(size=(2, samples, 1)), rng.normal(size=(2, samples, 1))
-    try:
-        data = hj.ExperimentData(u, y, n_sections=sections, periods=periods)
-        estimate = hj.estimate_htf(data, repeats=repeats, half_integers="skip")
-    except hj.DefinitionError as error:
-        assert str(error).endswith(".") and len(str(error)) > 20
-    else:
-        assert np.isfinite(estimate.H).all()

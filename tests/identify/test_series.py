@@ -5,26 +5,13 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
-from hybridjax.identify.series.covariance import gradient_covariance
+from hybridjax.identify.series.fit import gradient_covariance
 from hybridjax.identify.series.linearization import each_fit, linearize
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.records import PreparedRecords
 
-from ..linear.conftest import blocks_at_random
+from .conftest import scaled
 from .test_uncertainty import covered
-
-
-def scaled(seed, dims, ny, nu, modulus=0.7):
-    """A random system whose largest multiplier has this modulus."""
-    A, B, C, D = blocks_at_random(seed, dims, ny, nu)
-    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers[0])
-    factor = (modulus / size) ** (1 / len(dims))
-    return hj.LDTP.from_blocks([a * factor for a in A], B, C, D)
-
-
-@pytest.fixture(scope="module")
-def small():
-    return scaled(3, (2, 3, 4, 2), 2, 1)
 
 
 def record(model, samples, seed=0, noise=0.0, first_section=0, x0=None, **about):

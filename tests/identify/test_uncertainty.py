@@ -5,11 +5,10 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.htf_errors import error_spectrum, weights_of
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
-from hybridjax.identify.variable_projection import group_htf
+from hybridjax.identify.variable_projection import error_spectrum, group_htf, weights_of
 
-from ..linear.conftest import blocks_at_random
+from .conftest import scaled
 
 
 def noisy(htf, variance, rng, correlation=0.0):
@@ -29,10 +28,8 @@ def with_variance(htf, H, variance, freedom=None):
 
 @pytest.fixture(scope="module")
 def small():
-    """Four sections, two multipliers of modulus 0.7, states that die soon; its HTFs."""
-    A, B, C, D = blocks_at_random(3, (2, 3, 4, 2), 2, 1)
-    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers[0])
-    model = hj.LDTP.from_blocks([a * (0.7 / size) ** 0.25 for a in A], B, C, D)
+    """The small system and its HTFs."""
+    model = scaled(3, (2, 3, 4, 2), 2, 1)
     return model, model.htf(np.linspace(0.01, 1.99, 80))
 
 

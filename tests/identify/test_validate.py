@@ -6,13 +6,8 @@ from scipy import stats
 
 import hybridjax as hj
 
-from .test_series import record, scaled
+from .test_series import record
 from .test_uncertainty import covered
-
-
-@pytest.fixture(scope="module")
-def small():
-    return scaled(3, (2, 3, 4, 2), 2, 1)
 
 
 def test_the_true_model_leaves_white_noise(small):

@@ -50,13 +50,3 @@ def test_variances_go_along(htf):
     np.testing.assert_allclose(between.scatter.freedom, 4.0)
     np.testing.assert_allclose(between.scatter.roundness, between.noise_variance)
     assert an_htf().interpolate([0.1]).variance is None
-
-
-def test_some_frequencies(htf):
-    some = htf.at([0.3, 0.1])
-    np.testing.assert_array_equal(some.f, [0.3, 0.1])
-    np.testing.assert_array_equal(some.H, htf.H[:, [5, 1]])
-    np.testing.assert_array_equal(some.variance, htf.variance[:, [5, 1]])
-    np.testing.assert_array_equal(some.scatter.roundness, htf.scatter.roundness[:, [5, 1]])
-    with pytest.raises(hj.DefinitionError, match="f = 0.12 was not excited .* nearest one is 0.1 "):
-        htf.at(0.12)

@@ -22,10 +22,10 @@ from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..denominator import multipliers_of
 from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
-from ..htf_errors import SMALLEST_ERROR, check_values, error_weights
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
+from ..variable_projection import SMALLEST_ERROR, check_values, error_weights
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
@@ -259,9 +259,7 @@ def _fit_to_htf(htf: HTF, guess: Guess, direct: bool, max_steps: int) -> LDTPFit
         weight = problem.weight / np.maximum(np.sqrt(square / 2), SMALLEST_ERROR)[:, None]
         problem = problem._replace(weight=weight)
         point, converged = minimize(problem, point.model, direct, max_steps)
-    model = point.coordinates.model.to_ldtp(scale, htf.inputs, htf.outputs)
-    known = htf.variance is not None
-    return _finished(point, converged, model, scale, htf.harmonics, freedom, known)
+    return _finished(point, converged, htf, scale, freedom)
 
 
 def _fit_to_series(
@@ -310,11 +308,7 @@ def _fit_to_series(
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the predictions of the guess grow beyond all numbers.")
     point, converged = minimize(problem.reweighted(model), model, direct, max_steps)
-    model = point.coordinates.model
-    sources = noise_model(model, cast(SeriesProblem, point.problem).S, scale, records.outputs)
-    fitted = model.to_ldtp(scale, records.inputs, records.outputs)
-    harmonics = all_harmonics(N)
-    return _finished(point, converged, fitted, scale, harmonics, freedom, False, sources)
+    return _finished(point, converged, records, scale, freedom)
 
 
 class ModelPoint(Point):
@@ -381,22 +375,21 @@ def _without_direct(model: PeriodicModel, direct: bool) -> PeriodicModel:
 def _finished(
     point: ModelPoint,
     converged: bool,
-    model: LDTP,
+    data: HTF | PreparedRecords,
     scale: Float[np.ndarray, " ny"],
-    harmonics: tuple[int, ...],
     freedom: int,
-    known: bool,
-    noise: LDTP | None = None,
 ) -> LDTPFit:
-    """Return the fit at a minimum.
-
-    **Arguments:** `model`: with the outputs in their own units, which are `scale`. `known`: whether
-    the variances of the errors were given.
-    """
+    """Return the fit at a minimum, with the outputs in their own units, which are `scale`."""
+    model, known, noise = point.coordinates.model, False, None
+    harmonics = all_harmonics(data.n_sections)
+    if isinstance(data, HTF):
+        known, harmonics = data.variance is not None, data.harmonics
+    else:
+        noise = noise_model(model, cast(SeriesProblem, point.problem).S, scale, data.outputs)
     c, slopes = characteristic_slopes(point.coordinates)
     spread = point.equations.spread(1.0 if known else point.cost / freedom)
     return LDTPFit(
-        model=model,
+        model=model.to_ldtp(scale, data.inputs, data.outputs),
         multipliers=multipliers_of(c),
         coefficients=c,
         covariance=spread.covariance(slopes),

@@ -22,9 +22,9 @@ from ...experiments.record import Record
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.ldtp import LDTP
 from ..descent import NormalEquations
-from ..htf_errors import SMALLEST_ERROR
 from ..series.output_error import RANK
 from ..series.records import CycleGrid
+from ..variable_projection import SMALLEST_ERROR
 from .frequency import adjoints
 from .model import LocalCoordinates, PeriodicModel
 

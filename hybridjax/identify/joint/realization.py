@@ -8,7 +8,7 @@ from jaxtyping import Bool, Complex, Float
 
 from ..._core.arguments import Numbers, names
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Count, Order, SignalNames
+from ..._core.boundary.kinds import Order, SignalNames
 from ..._core.boundary.values import Integers, Reals
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
@@ -17,8 +17,8 @@ from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..denominator import SLOWEST
 from ..descent import ROUNDING
-from ..htf_errors import SMALLEST_ERROR
 from ..series.fit import SeriesFit
+from ..variable_projection import SMALLEST_ERROR
 from .frequency import FrequencyProblem
 from .model import PeriodicModel
 from .prediction import SeriesPart
@@ -39,7 +39,6 @@ def realize(
     dims: Order | Annotated[Numbers, Integers("N", sign="positive")] | None = None,
     *,
     order: Order = 1,
-    horizon: Count | None = None,
     outputs: SignalNames | None = None,
     inputs: SignalNames | None = None,
 ) -> LDTP:
@@ -58,7 +57,8 @@ def realize(
       responses, McKelvey, Akcay and Ljung 1996, at each section; Uyanik et al. 2019 treat
       periodic systems by lifting). Given A and C, B and D are a linear least-squares problem.
 
-    A[n] takes $O_{n}$, shifted by one section, to $O_{n+1}$.
+    A[n] takes $O_{n}$, shifted by one section, to $O_{n+1}$. The horizon p is two periods, at least
+    8 sections, or as long as the source allows.
 
     **Arguments:**
 
@@ -66,31 +66,27 @@ def realize(
     - `dims`: dimension of the state at all sections, or at each. Default: the number of singular
       values above rounding errors or, if the source has variances, above noise.
     - `order`: the number of multipliers expected, a lower bound of dimensions. Default: 1.
-    - `horizon`: p, the number of sections in which a state is observed. A longer horizon averages
-      more noise. Default: two periods, at least 8, if the source is that long.
     - `outputs`, `inputs`: names, for an array.
 
-    **Raises:** `DefinitionError` for too few lags or frequencies for the horizon, or more
-    dimensions than the horizon supports.
+    **Raises:** `DefinitionError` for too few lags or frequencies, or more dimensions than these
+    support.
     """
     require_x64()
     if isinstance(source, HTF):
-        return _from_htf(source, dims, order, horizon)
+        return _from_htf(source, dims, order)
     spread = None
     if isinstance(source, SeriesFit):
         N, R = source.numerators.shape[:2]
         outputs, inputs = source.outputs, source.inputs
-        p = horizon or default_horizon(N)
+        p = default_horizon(N)
         markov = source.impulse_response(2 * p + 1)
         spread = np.sqrt((source.roots**2).sum(axis=4).mean(axis=(0, 2, 3))) * source.noise
     else:
         markov = np.asarray(source)
         N, lags = markov.shape[:2]
-        p = horizon or min(default_horizon(N), (lags - 1) // 2)
-        if p < 1 or lags < 2 * p + 1:
-            raise DefinitionError(
-                f"{lags} lags are too few for a horizon of {p} sections: {2 * p + 1} are needed."
-            )
+        p = min(default_horizon(N), (lags - 1) // 2)
+        if p < 1:
+            raise DefinitionError(f"{lags} lags are too few: 3 or more are needed.")
         outputs = names("outputs", cast(Names, outputs), markov.shape[2])
         inputs = names("inputs", cast(Names, inputs), markov.shape[3])
     ny, nu = markov.shape[2:]
@@ -144,8 +140,8 @@ def _bases(
         d = max(order, rank, 1) if dims is None else dims[n]
         if d > most:
             raise DefinitionError(
-                f"section {n} would have {d} dimensions, but the horizon and the data show {most} "
-                "at most: take a longer horizon, or give `dims`."
+                f"section {n} would have {d} dimensions, but the data show {most} at most: give "
+                "more lags or frequencies, or smaller `dims`."
             )
         bases.append(left[:, :d])
     return bases
@@ -158,17 +154,14 @@ def _shifted(bases: list[np.ndarray], ny: int) -> tuple[list[np.ndarray], list[n
     return A, [O[:ny] for O in bases]
 
 
-def _from_htf(htf: HTF, dims: Any, order: int, horizon: int | None) -> LDTP:
+def _from_htf(htf: HTF, dims: Any, order: int) -> LDTP:
     f, N = np.asarray(htf.f), htf.n_sections
     if not np.isfinite(htf.H).all():
         raise DefinitionError("the HTFs hold NaN or infinity.")
     F, ny, nu = htf.H.shape[1:]
-    p = horizon or min(default_horizon(N), F - 1)
-    if 2 * F <= p + 1:
-        raise DefinitionError(
-            f"{F} frequencies are too few for a horizon of {p} sections: more than "
-            f"{(p + 1) // 2} are needed."
-        )
+    p = min(default_horizon(N), F - 1)
+    if p < 1:
+        raise DefinitionError("one frequency is too few: 2 or more are needed.")
     m = np.array(all_harmonics(N))
     H = np.zeros((N, F, ny, nu), complex)
     H[np.isin(m, htf.harmonics)] = htf.H
