@@ -18,6 +18,7 @@ import pathlib
 import stat
 import threading
 import time
+import warnings
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
@@ -61,39 +62,33 @@ _KEPT = 1024
 
 
 @checked
-def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path:
+def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path | None:
     """Keep compiled programs on disk (JAX's persistent compilation cache), so that the next process
     starts faster.
 
     From then on XLA prints no messages about programs that it loads.
 
-    **Arguments:** `folder`: where programs are kept. Loading a program executes it, so the folder
-    must belong to this user, and other users must not be able to write to it. Default:
-    `$HYBRIDJAX_CACHE`, or `hybridjax` in the user's cache folder (`$XDG_CACHE_HOME` or `~/.cache`).
+    **Arguments:** `folder`: programs are kept in its subfolder `programs`. Loading a program
+    executes it, so a subfolder that belongs or is open to other users, or is a link, is not used.
+    Default: `$HYBRIDJAX_CACHE`, or `hybridjax` in the user's cache folder
+    (`$XDG_CACHE_HOME` or `~/.cache`).
 
-    **Returns:** the folder in use.
+    **Returns:** the subfolder; `None`, with a warning, if the user's cache folder cannot be used.
+    Then nothing is kept.
 
-    **Raises:** `DefinitionError` if the folder cannot be made, or other users can write to it.
+    **Raises:** `DefinitionError` if a folder that is given, by argument or by `$HYBRIDJAX_CACHE`,
+    cannot be used.
     """
-    if folder is None:
-        base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-        folder = os.environ.get("HYBRIDJAX_CACHE") or pathlib.Path(base) / "hybridjax"
-    folder = pathlib.Path(folder)
+    given = folder or os.environ.get("HYBRIDJAX_CACHE")
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        about = folder.stat()
-    except OSError as error:
-        raise DefinitionError(
-            f"cannot keep compiled programs in '{folder}' ({error.strerror}): set HYBRIDJAX_CACHE "
-            "to another folder."
-        ) from error
-    foreign = hasattr(os, "geteuid") and about.st_uid != os.geteuid()
-    if foreign or about.st_mode & stat.S_IWOTH:
-        raise DefinitionError(
-            f"cannot keep compiled programs in '{folder}', because other users can write to it and "
-            "loading a program executes it: set HYBRIDJAX_CACHE to a folder of your own."
-        )
-    jax.config.update("jax_compilation_cache_dir", str(folder))
+        programs = _private_folder(given)
+    except (OSError, RuntimeError) as error:
+        problem = f"cannot keep compiled programs ({error})"
+        if given:
+            raise DefinitionError(f"{problem}: give another folder.") from error
+        warnings.warn(f"{problem}; nothing is kept.", stacklevel=2)
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(programs))
     # Also the smallest programs: those of users' functions are the first that a process needs.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     # XLA prints two errors, a page each, for each program that it loads on a processor with
@@ -101,7 +96,24 @@ def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path:
     level = getattr(jax.config, "jax_logging_level")  # noqa: B009 (JAX does not declare it)
     jax.config.update("jax_logging_level", "CRITICAL")
     jax.config.update("jax_logging_level", level)
-    return folder
+    return programs
+
+
+def _private_folder(given: str | pathlib.Path | None) -> pathlib.Path:
+    """Make the subfolder of programs in a folder, or in the user's cache folder.
+
+    **Raises:** `OSError` if it cannot be made, or other users can write to it; `RuntimeError` for a
+    user without a home.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    programs = pathlib.Path(given or pathlib.Path(base, "hybridjax")).absolute() / "programs"
+    programs.mkdir(mode=0o700, parents=True, exist_ok=True)
+    about = programs.lstat()
+    is_open = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    if hasattr(os, "geteuid"):
+        if not stat.S_ISDIR(about.st_mode) or is_open or about.st_uid != os.geteuid():
+            raise PermissionError(f"other users can write to '{programs}'")
+    return programs
 
 
 def enable_loop_kernels() -> None:

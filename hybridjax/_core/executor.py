@@ -29,7 +29,13 @@ else:
 
 class Definition(eqx.Module):
     """What users write: functions, and numbers that they compute with. Its arrays are always JAX's,
-    whoever runs the code around it."""
+    whoever runs the code around it.
+
+    `code_digest` is set where a public function takes the object (`meaning.current`), so that
+    compiled programs belong to the code as it was then.
+    """
+
+    code_digest: str = eqx.field(static=True, default="", init=False, repr=False)
 
 
 class OutOfTimeError(Exception):

@@ -13,7 +13,7 @@ from .._core.boundary.kinds import Index
 from .._core.boundary.values import Reals
 from .._core.compilation import TwoTiers
 from .._core.execution import Execution, in_threads
-from .._core.executor import from_host, on_cpu
+from .._core.executor import from_host, on_cpu, to_host
 from .._core.memo import Memory, remembered
 from .._core.progress import counted, working
 from .._core.results import Result
@@ -217,7 +217,7 @@ class Campaign:
         **Raises:** `ComputationError` if a periodic response is not found near the predicted one.
         """
         if self.model is None:
-            return np.tile(np.asarray(self.placed.section_zero)[:, None], len(u))
+            return np.tile(to_host(self.placed).section_zero[:, None], len(u))
         stepping, periods = self.stepping, self.inputs.periods
         window = u[:, : periods * self.placed.n_sections]
         predicted = periodic_start(self.placed, self.model, window)

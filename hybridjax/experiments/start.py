@@ -46,7 +46,7 @@ def periodic_start(
     that repeat the `window`."""
     embed = to_host(placed).frames()[0][0, :, : model.A.shape[1]]
     x0 = model.periodic_states(window, window.shape[1] // placed.n_sections)
-    return np.asarray(placed.section_zero)[:, None] + embed @ np.asarray(x0).T
+    return to_host(placed).section_zero[:, None] + embed @ np.asarray(x0).T
 
 
 class Prediction(NamedTuple):

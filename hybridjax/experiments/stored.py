@@ -17,11 +17,10 @@ from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, 
 from .._core.progress import working
 from .._core.results import Result
 from .._core.signal import Signal, unit_of
-from ..engine.describe import describe
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle, rough
 from ..sections.placed import SectionsLike
-from ..systems.system import OutputNames
+from ..systems.system import OutputNames, describe
 from .data import ExperimentData, Simulated, summary
 from .design.design import Design
 from .run import CHUNK, Campaign, DesignLike, Options, prepare

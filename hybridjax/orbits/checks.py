@@ -13,7 +13,9 @@ from ..engine import kernels
 from ..engine.trajectory import simulate
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
+from ..systems.check import check_system
 from ..systems.structure import Structure
+from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled
 from .coincidence import SAME, coincident, events_of
 from .cycle import LimitCycle
@@ -21,9 +23,20 @@ from .return_map import Turn
 from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 
 
-# Times at which functions are compared, after that of each point, in parts of the period: fields
-# that jump with a clock do not jump there, and no shift is a multiple of another.
-_BASE, _LATER = 0.0729, np.array([0.1459, 0.3820, 0.6180, 1.4142])
+# The time at which functions are compared with those a period later, in parts of the period after
+# each point: fields that jump with a clock do not jump there.
+_BASE = 0.0729
+
+
+def check_periodic(system: HybridSystem) -> None:
+    """Check a system of which limit cycles are wanted.
+
+    **Raises:** `DefinitionError` for one that is not well formed, or uses the time although it
+    states no period.
+    """
+    clocked = check_system(system)
+    if clocked and system.period() is None:
+        raise DefinitionError(_no_period(Structure(system), f"the {clocked[0]} depends on t"))
 
 
 def check_clock(s: Structure) -> None:
@@ -65,31 +78,33 @@ def check_times(
     scale: Float[Array, "A d"],
     time: float,
 ) -> None:
-    """Compare fields, guards, resets, predicates and outputs at different times, at K points.
+    """Compare fields, guards, resets, predicates and outputs with those one period of the clock
+    later, at K points.
 
     **Arguments:** `scale`, sizes of the states by chart; `time`, a rough period.
 
-    **Raises:** `DefinitionError` if they do not have the period that the system states, or depend
-    on time although it states none; NaN is passed over.
+    **Raises:** `DefinitionError` if they do not have the period that the system states; NaN is
+    passed over.
     """
-    period, sizes = s.system.period(), np.asarray(scale)
-    later = time * _LATER if period is None else np.array([float(period)])
+    if s.system.period() is None:
+        return
+    period, sizes = float(s.system.period()), np.asarray(scale)
     for a in np.unique(chart):
         n, rows = s.dims[a], np.flatnonzero(chart == a)
         first, states = t[rows] + _BASE * time, q[:n, rows]
         for name, function in _functions(s, int(a)):
-            values = function(first, states)
+            now, later = function(first, states), function(first + period, states)
             size = np.concatenate([[time], sizes[a, :n]])[:, None]
-            slope = np.sum(np.abs(values[:, 1 : 2 + n]) * size, axis=1)
-            same = SAME * np.abs(values[:, 0]) + ROUNDING * slope
-            for shift in later:
-                if np.any(np.abs(function(first + shift, states)[:, 0] - values[:, 0]) > same):
-                    if period is None:
-                        raise DefinitionError(_no_period(s, f"{name} depends on t"))
-                    raise DefinitionError(
-                        f"{name} does not have the period {float(period):.6g} that "
-                        f"{type(s.system).__name__}.period() states."
-                    )
+            slope = np.sum(np.abs(now[:, 1 : 2 + n]) * size, axis=1)
+            differs = np.abs(later - now)[:, 0] > SAME * np.abs(now[:, 0]) + ROUNDING * slope
+            gains = slice(2 + n, None)  # derivatives by inputs
+            if np.any(differs) or np.any(
+                np.abs(later - now)[:, gains] > SAME * np.abs(now)[:, gains].max(initial=0.0)
+            ):
+                raise DefinitionError(
+                    f"{name} does not have the period {period:.6g} that "
+                    f"{type(s.system).__name__}.period() states."
+                )
 
 
 def _functions(s: Structure, a: int) -> Iterator:

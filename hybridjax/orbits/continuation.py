@@ -27,7 +27,7 @@ from .batches import front
 from .coincidence import SAME, coincident
 from .curve import Curve, Point
 from .cycle import LimitCycle
-from .limit_cycles import LimitCycles, without_coincidences
+from .limit_cycles import LimitCycles, examined
 from .newton import USUAL_STEPS
 from .return_map import SINGULAR
 
@@ -229,6 +229,7 @@ def _check(cycle, values) -> np.ndarray:
             "JAX transformations, and differentiate `find_limit_cycle` at its points."
         )
     require_x64(cycle)
+    cycle.require_current()
     if int(cycle.result) != Result.OK:
         raise DefinitionError(
             f"the cycle to follow was not found: {Result(int(cycle.result)).message}."
@@ -346,4 +347,4 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
         cycle.multiplicity,
     )  # fmt: skip
     together = [coincident(cycle.return_map, p.turn) is not None for p in points]
-    return without_coincidences(cycles, np.array(together))
+    return examined(cycles, np.array(together))

@@ -12,6 +12,7 @@ from .._core.boundary.kinds import Positive
 from .._core.compilation import at_ease
 from .._core.executor import is_traced, to_host
 from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, unit_circle
+from .._core.meaning import code_digest
 from .._core.memo import remembered
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
@@ -21,6 +22,7 @@ from ..engine.move import Options, move
 from ..engine.replay import Link, divergence, links
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
+from ..errors import DefinitionError
 from ..linear.multipliers import product_eigenvalues
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
@@ -84,6 +86,18 @@ class LimitCycle(eqx.Module):
             self.system, self.settings, self.anchor, self.base, self.period, self.conserved,
             self.multiplicity,
         )  # fmt: skip
+
+    def require_current(self) -> None:
+        """**Raises:** `DefinitionError` if the system's code has changed since the cycle was
+        found."""
+        if not self._is_current():
+            raise DefinitionError(
+                f"the functions of {type(self.system).__name__}, or values that they read, have "
+                "changed since this limit cycle was found: find it again."
+            )
+
+    def _is_current(self) -> bool:
+        return self.system.code_digest == code_digest(self.system)
 
     @property
     def structure(self) -> Structure:
@@ -172,8 +186,12 @@ class LimitCycle(eqx.Module):
         return dict(zip(chart.states, anchor.q[:, 0].tolist(), strict=False))
 
     def trajectory(self, periods: Positive = 1.0) -> Trajectory:
-        """The orbit from `anchor` on, with its events, dense enough to plot."""
+        """The orbit from `anchor` on, with its events, dense enough to plot.
+
+        **Raises:** `DefinitionError` if the system's code has changed since the cycle was found.
+        """
         _require_values(self, "trajectory")
+        self.require_current()
         s, anchor = self.structure, to_host(self.anchor)
         a = int(anchor.chart[0])
         return simulate(
@@ -197,7 +215,7 @@ class LimitCycle(eqx.Module):
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
-        if self.result != Result.OK:
+        if self.result != Result.OK or not self._is_current():
             return card("LimitCycle", self._title(), facts(self._facts()))
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
         orbit = orbit_picture(self.trajectory())

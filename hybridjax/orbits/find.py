@@ -15,15 +15,15 @@ from .._core.progress import say, working
 from .._core.results import Result
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..errors import ComputationError, DefinitionError
-from ..systems.check import check_system
 from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, integrated
-from .checks import check_clock, check_conserved, check_times, explain
+from .checks import check_clock, check_conserved, check_periodic, check_times, explain
 from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
 from .guess import return_map_near
+from .jumps import check_jumps
 from .newton import Solution, search, solve
 from .return_map import PATIENCE, ReturnMap
 from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_on, stiff_charts
@@ -109,7 +109,7 @@ def find_limit_cycle(
     traced = is_traced((system, conserved))
     if not traced:
         require_x64(system, guess, section, settings)
-        check_system(system)
+        check_periodic(system)
     s = Structure(system)
     settings = settings.filled(LIMIT_CYCLE)
     if has_implicit(s):
@@ -159,6 +159,7 @@ def find_limit_cycle(
     check_times(s, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
         check_begin(cycle.return_map)
+        check_jumps(cycle)
         if conserved:
             check_conserved(cycle)
     if throw and code != Result.OK:

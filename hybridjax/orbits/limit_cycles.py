@@ -21,12 +21,13 @@ from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
-from ..systems.check import check_system
 from ..systems.system import HybridSystem
 from .batches import Rounds, Tiles
+from .checks import check_periodic
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
+from .jumps import check_jumps
 from .return_map import ReturnMap, turn_product
 from .scale import given_sizes, scale_of
 
@@ -171,7 +172,7 @@ def find_limit_cycles(
     systems = settings.system(systems)
     arrays, static = eqx.partition(systems, eqx.is_array)
     S = len(jax.tree_util.tree_leaves(arrays)[0])
-    check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
+    check_periodic(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
     map = map_for_sweep(guess, scale, settings)
     size = min(execution.batch or BATCH, S)
     tiles = Tiles(systems, map, size, execution.threads, S > SMALL)
@@ -196,12 +197,17 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
         turn.distance, rounds.steps, rounds.result, rounds.codes, map.settings, map.conserved,
         map.multiplicity,
     )  # fmt: skip
-    return without_coincidences(cycles, rounds.together)
+    return examined(cycles, rounds.together)
 
 
-def without_coincidences(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
+def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
     """The cycles, with the result `COINCIDENCE` if events coincide (`together`) that do not
-    commute."""
+    commute.
+
+    **Raises:** `DefinitionError` if the field jumps on the first or the last cycle.
+    """
+    for i in np.flatnonzero(cycles.ok)[[0, -1]] if cycles.ok.any() else ():
+        check_jumps(cycles[int(i)])
     rows = np.flatnonzero(together & cycles.ok)
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
     if all(commutes(cycles[i]) for i in few):

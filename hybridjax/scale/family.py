@@ -19,10 +19,9 @@ from .._core.boundary.values import Reals
 from .._core.pieces.description import function_digest
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
-from ..engine.describe import describe
 from ..errors import DefinitionError
-from ..systems.check import check_system
-from ..systems.system import HybridSystem, unit_of_parameter
+from ..orbits.checks import check_periodic
+from ..systems.system import HybridSystem, describe, unit_of_parameter
 
 
 Axes = Mapping[str, Annotated[Numbers, Reals("n")]]
@@ -154,7 +153,7 @@ class Family:
                 f"{type(system).__name__}."
             )
         require_x64(system)
-        check_system(system)
+        check_periodic(system)
         return system
 
     def units(self, system: HybridSystem) -> dict[str, str]:

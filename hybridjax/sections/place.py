@@ -57,6 +57,7 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     """
     family = as_family(sections)
     require_x64(cycle, family)
+    cycle.require_current()
     for placed in list(_recent):
         if placed.cycle is cycle and placed.family is family:
             return placed
@@ -81,6 +82,7 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
     if not isinstance(sections, PlacedSections):
         return place_sections(cycle, sections)
     require_x64(cycle)
+    cycle.require_current()
     if sections.cycle is cycle:
         return sections
     both = [(c.system, c.anchor, c.period) for c in (cycle, sections.cycle)]

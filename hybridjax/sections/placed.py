@@ -1,7 +1,6 @@
 """A section family that was placed on a limit cycle."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -58,7 +57,7 @@ class PlacedSections(eqx.Module):
     @property
     def section_zero(self) -> Float[Array, " n"]:
         """Time and padded state at which the cycle meets section 0."""
-        return jnp.append(self.lanes.t[0], self.lanes.q[:, 0])
+        return namespace(self.lanes.t).append(self.lanes.t[0], self.lanes.q[:, 0])
 
     def __repr__(self):
         system, family = type(self.cycle.system).__name__, type(self.family).__name__
@@ -91,7 +90,11 @@ class PlacedSections(eqx.Module):
         }
 
     def structure(self) -> Structure:
-        """The system by the indices of its charts and transitions, made anew."""
+        """The system by the indices of its charts and transitions, made anew.
+
+        **Raises:** `DefinitionError` if the system's code has changed since the cycle was found.
+        """
+        self.cycle.require_current()
         return self.cycle.structure
 
     def observe(self, outputs: OutputNames) -> Float[Array, "N ny"]:
@@ -151,8 +154,9 @@ class PlacedSections(eqx.Module):
         """Names of the coordinates on each section: deviations of the time of crossing (`t`) and
         of the chart's states, less the one that the section determines."""
         charts, names = self.structure().charts, []
-        drops = to_host((self.lanes.chart, self.drop, self.time_is_state))
-        for a, drop, timed in np.stack(drops, axis=1):
+        placed = to_host(self)
+        columns = placed.lanes.chart, placed.drop, placed.time_is_state
+        for a, drop, timed in np.stack(columns, axis=1):
             entries = enumerate(("t", *charts[a].states))
             names.append(tuple(x for k, x in entries if k != drop and (k or timed)))
         return tuple(names)

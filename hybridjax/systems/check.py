@@ -1,11 +1,12 @@
 """Checks of a system: names, shapes of every function, finite parameters."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from .._core.executor import is_traced
 from ..errors import DefinitionError
@@ -18,11 +19,13 @@ from .transition import Scheduled
 
 # Systems that have passed, but for their numbers. (A `Memory` forgets with its object, and each
 # value of a parameter makes a new one.)
-_passed: set[Hashable] = set()
+_passed: dict[Hashable, tuple[str, ...]] = {}
 
 
-def check_system(system: HybridSystem) -> None:
+def check_system(system: HybridSystem) -> tuple[str, ...]:
     """Check that a system is well formed: names, shapes of every function, finite parameters.
+
+    **Returns:** the functions that use the time, for messages.
 
     **Raises:** `DefinitionError`, naming the chart, transition or parameter that is wrong.
     """
@@ -34,12 +37,14 @@ def check_system(system: HybridSystem) -> None:
                 f"{np.asarray(leaf)}; every parameter must be finite."
             )
     form = _form(system)
-    if form is None or form not in _passed:
-        _check_functions(Structure(system))
+    clocked = _passed.get(form) if form is not None else None
+    if clocked is None:
+        clocked = tuple(_check_functions(Structure(system)))
         if form is not None:
-            _passed.add(form)
+            _passed[form] = clocked
     if isinstance(system, Quotient):
         system.check()
+    return clocked
 
 
 def _form(system: HybridSystem) -> Hashable:
@@ -53,7 +58,8 @@ def _form(system: HybridSystem) -> Hashable:
     return form
 
 
-def _check_functions(s: Structure) -> None:
+def _check_functions(s: Structure) -> Iterator[str]:
+    """Check all functions; yield the names of those that use the time."""
     system, kind = s.system, type(s.system).__name__
     if not s.charts:
         raise DefinitionError(f"{kind} has no charts.")
@@ -72,7 +78,7 @@ def _check_functions(s: Structure) -> None:
         s.method(a)
         states = f"the chart has the {s.dims[a]} states {quoted(chart.states)}"
         field = lambda *x, a=a: s.field(a, *x)  # noqa: E731
-        _check_shape(s, a, f"field of chart '{name}'", field, (s.dims[a],), states)
+        yield from _check_shape(s, a, f"field of chart '{name}'", field, (s.dims[a],), states)
     if len(set(map(str, s.state_names()))) < len(s.state_names()):
         raise DefinitionError(
             f"charts of {kind} give a state different units: {quoted(s.state_names())}."
@@ -83,42 +89,49 @@ def _check_functions(s: Structure) -> None:
             raise DefinitionError(f"two transitions are called '{name}'; give each its own name.")
     # Transitions of one kind are one program; the first and the last may index beyond the states.
     for g in sorted({g for kind in s.kinds for g in (kind[0], kind[-1])}):
-        _check_transition(s, g)
+        yield from _check_transition(s, g)
     for output in system.outputs():
         values = s.resolve_outputs(output)
         for a, name in enumerate(s.names):
             if values.defined(a):
                 what = f"output '{output.name}' in chart '{name}'"
-                _check_shape(s, a, what, lambda *x, a=a, z=values: z(a, *x), (1,), "")
+                yield from _check_shape(s, a, what, lambda *x, a=a, z=values: z(a, *x), (1,), "")
 
 
-def _check_transition(s: Structure, g: int) -> None:
+def _check_transition(s: Structure, g: int) -> Iterator[str]:
     tr = s.transitions[g]
     a, b = s.chart_index(tr.source), s.chart_index(tr.target)
     of = f"of transition '{tr.name}' ({tr.source} -> {tr.target})"
     if not isinstance(tr.guard, Scheduled):
-        _check_shape(s, a, f"guard {of}", lambda *x: s.guard(g, *x), (), "it must be one number")
+        yield from _check_shape(
+            s, a, f"guard {of}", lambda *x: s.guard(g, *x), (), "it must be one number"
+        )
     holds = lambda *x: s.enabled(g, *x)  # noqa: E731
-    _check_shape(s, a, f"`enabled` {of}", holds, (), "it must be one truth value")
+    yield from _check_shape(s, a, f"`enabled` {of}", holds, (), "it must be one truth value")
     states = f"chart '{tr.target}' has the {s.dims[b]} states {quoted(s.charts[b].states)}"
-    _check_shape(s, a, f"reset {of}", lambda *x: s.reset(g, *x), (s.dims[b],), states)
+    yield from _check_shape(s, a, f"reset {of}", lambda *x: s.reset(g, *x), (s.dims[b],), states)
 
 
 def _check_shape(
     s: Structure, a: int, what: str, function: Callable, shape: tuple[int, ...], reason: str
-) -> None:
-    """Check the shape of a function of (t, q, u) in chart a. `reason`: why it must be this one."""
+) -> Iterator[str]:
+    """Check the shape of a function of (t, q, u) in chart a. `reason`: why it must be this one.
+    Yield its name, `what`, if it uses t."""
     shapes = (), (s.dims[a],), (s.nu,)
     try:
         points = [jax.ShapeDtypeStruct(x, jnp.result_type(float)) for x in shapes]
-        actual = jax.eval_shape(function, *points).shape
+        program = jax.make_jaxpr(function)(*points)
         _check_indices(function, *(np.full(x, 0.5) for x in shapes))
     except DefinitionError:
         raise
     except Exception as error:
         raise DefinitionError(f"the {what} cannot be evaluated: {error}") from error
+    (actual,) = (x.shape for x in program.out_avals)
     if actual != shape:
         raise DefinitionError(f"the {what} returns shape {actual}, but {reason}.")
+    _, (uses_time, *_) = dce_jaxpr(program.jaxpr, [True])
+    if uses_time:
+        yield what
 
 
 def _check_indices(function: Callable, *point: np.ndarray) -> None:

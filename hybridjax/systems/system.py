@@ -7,12 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import Scalar, Vector
 from .._core.executor import Definition
+from .._core.meaning import code_digest
+from .._core.pieces.description import array_digest
 from .._core.precision import real
 from .._core.text import columns, fields, value
 from .chart import Chart, attribute_of
@@ -71,9 +75,18 @@ def unit_of_parameter(system: Any, path: str) -> str:
     return type(system).__dataclass_fields__[name].metadata.get("unit", "")
 
 
+def describe(system: "HybridSystem") -> dict[str, Any]:
+    """The class of a system, its numbers by name, and a digest of its code, for stored results."""
+    numbers = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
+        name = ".".join(str(getattr(x, "name", x)) for x in path)
+        numbers[name] = float(leaf) if np.ndim(leaf) == 0 else array_digest(leaf)
+    return {"class": type(system).__qualname__, "numbers": numbers, "code": code_digest(system)}
+
+
 def own_fields(system: Any) -> tuple[dataclasses.Field, ...]:
     """The fields of a system or its class that its author wrote: its parameters."""
-    return tuple(x for x in dataclasses.fields(system) if x.name != "solver")
+    return tuple(x for x in dataclasses.fields(system) if x.name not in ("solver", "code_digest"))
 
 
 def _number(x: Scalar) -> Array:

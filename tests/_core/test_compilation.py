@@ -2,6 +2,7 @@
 
 import gc
 import os
+import pathlib
 import subprocess
 import sys
 import threading
@@ -146,17 +147,50 @@ def test_programs_that_call_lapack_take_turns():
     assert counts == [1] * 200
 
 
-def test_a_cache_that_others_can_write_to_is_refused(tmp_path):
+@pytest.fixture
+def cache_setting():
     before = jax.config.jax_compilation_cache_dir
-    try:
-        assert hj.enable_compilation_cache(tmp_path / "mine") == tmp_path / "mine"
-        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "mine")
-        assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o700
-        (tmp_path / "mine").chmod(0o777)
-        with pytest.raises(hj.DefinitionError, match="other users can write to it"):
-            hj.enable_compilation_cache(tmp_path / "mine")
-    finally:
-        hj.enable_compilation_cache(before)
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_the_cache_is_a_folder_of_its_own(tmp_path, monkeypatch, cache_setting):
+    """Nothing in the folder that is given is read or changed."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "shared").mkdir(0o777)
+    (tmp_path / "shared/jit_f-cache").write_bytes(b"a colleague's")
+    folder = hj.enable_compilation_cache("shared")
+    assert folder == tmp_path / "shared/programs"
+    assert jax.config.jax_compilation_cache_dir == str(folder)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert (tmp_path / "shared/jit_f-cache").read_bytes() == b"a colleague's"
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o770, None])
+def test_a_cache_of_others_is_refused(tmp_path, mode, cache_setting):
+    (tmp_path / "elsewhere").mkdir(0o700)
+    if mode is None:
+        (tmp_path / "programs").symlink_to(tmp_path / "elsewhere")
+    else:
+        (tmp_path / "programs").mkdir()
+        (tmp_path / "programs").chmod(mode)
+    with pytest.raises(hj.DefinitionError, match="other users can write"):
+        hj.enable_compilation_cache(tmp_path)
+
+
+def test_without_a_home_nothing_is_kept(monkeypatch, cache_setting):
+    for name in ("HYBRIDJAX_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for has_home in (True, False):
+        if not has_home:
+            monkeypatch.setattr(pathlib.Path, "home", raise_no_home)
+        monkeypatch.setenv("HOME", "/dev/null")
+        with pytest.warns(UserWarning, match="nothing is kept"):
+            assert hj.enable_compilation_cache() is None
+
+
+def raise_no_home():
+    raise RuntimeError("Could not determine home directory.")
 
 
 LATE = """

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from ..executor import is_tracer
+from ..meaning import current
 from ..signal import Signal
 from .values import TEXT, Kind, Misfit, listed, refuse_traced, show, with_article
 
@@ -38,7 +39,7 @@ class Instance(Kind):
 
     def take(self, value):
         if isinstance(value, self.cls):
-            return value
+            return current(value)
         if isinstance(value, type) and issubclass(value, self.cls):
             raise Misfit(
                 f"must be {self.allowed}, not the class itself: write {value.__name__}(...)",
@@ -148,7 +149,7 @@ class Names(Kind):
             raise self.refused(value)
         if not all(map(self._fits, value)) or not (len(value) or self.empty):
             raise self.refused(value)
-        given = tuple(str(x) if isinstance(x, np.str_) else x for x in value)
+        given = tuple(str(x) if isinstance(x, np.str_) else current(x) for x in value)
         names = [x for x in given if isinstance(x, str)]
         if len(set(names)) < len(names):
             raise Misfit(f"must name each only once, not {show(given)}", near=True)

@@ -1,0 +1,163 @@
+"""Whatever changes what a function computes changes its digest; what does not, leaves it."""
+
+import time
+import types
+
+import pytest
+
+from hybridjax._core.meaning import meaning
+from hybridjax.errors import DefinitionError
+
+
+# What a function computes, before and after one statement.
+WAYS = {
+    "a global": ("K = 1.0\ndef f(x): return K * x", "K = 2.0"),
+    "a global that is read in a helper": (
+        "K = 1.0\ndef h(x): return K * x\ndef f(x): return h(x)",
+        "K = 2.0",
+    ),
+    "a global in a comprehension": ("K = 1\ndef f(x): return [K * y for y in x]", "K = 2"),
+    "a global in an inner function": ("K = 1\ndef f(x): return (lambda y: K * y)(x)", "K = 2"),
+    "a helper written anew": (
+        "def h(x): return x\ndef f(x): return h(x)",
+        "def h(x): return 2 * x",
+    ),
+    "an entry of a list": ("K = [1.0]\ndef f(x): return K[0] * x", "K[0] = 2.0"),
+    "an entry of a dict": ("K = {'k': [1.0]}\ndef f(x): return K['k'][0]", "K['k'][0] = 2.0"),
+    "an array in place": (
+        "import numpy as np\nK = np.ones(3)\ndef f(x): return K * x",
+        "K[1] = 2",
+    ),
+    "an array of objects": (
+        "import numpy as np\nK = np.array([{'k': 1}, None])\ndef f(x): return K[0]['k'] * x",
+        "K[0]['k'] = 2",
+    ),
+    "a deque": (
+        "import collections\nK = collections.deque([1])\ndef f(x): return K[0]",
+        "K[0] = 2",
+    ),
+    "a set": ("K = {1}\ndef f(x): return x in K", "K.add(2)"),
+    "a bytearray": ("K = bytearray(2)\ndef f(x): return K[0]", "K[0] = 2"),
+    "the cell of a closure": (
+        "def make():\n    k = 1\n    def f(x): return k * x\n    def set(y):\n        nonlocal k\n"
+        "        k = y\n    return f, set\nf, set = make()",
+        "set(2)",
+    ),
+    "a default": ("def f(x, k=1): return k * x", "f.__defaults__ = (2,)"),
+    "a default by name": ("def f(x, *, k=1): return k * x", "f.__kwdefaults__['k'] = 2"),
+    "a default that is a list": ("def f(x, k=[1]): return k[0] * x", "f.__defaults__[0][0] = 2"),
+    "the code": ("def f(x): return x\ndef g(x): return 2 * x", "f.__code__ = g.__code__"),
+    "an attribute of a function": ("def f(x): return f.k * x\nf.k = 1", "f.k = 2"),
+    "a constant of a partial": (
+        "import functools\nK = [1]\nf = functools.partial(lambda k, x: k[0] * x, K)",
+        "K[0] = 2",
+    ),
+    "a method": (
+        "class A:\n    def h(self, x): return x\n    def f(self, x): return self.h(x)\nf = A().f",
+        "A.h = lambda self, x: 2 * x",
+    ),
+    "a method of a base class": (
+        "class B:\n    def h(self): return 1\nclass A(B):\n    i = 0\n"
+        "a = A()\ndef f(x): return a.h()",
+        "B.h = lambda self: 2",
+    ),
+    "an attribute of a base class": (
+        "class B:\n    k = 1\nclass A(B):\n    pass\na = A()\ndef f(x): return a.k * x",
+        "B.k = 2",
+    ),
+    "a property": (
+        "class A:\n    @property\n    def k(self): return 1\na = A()\ndef f(x): return a.k * x",
+        "A.k = property(lambda self: 2)",
+    ),
+    "a static method": (
+        "class A:\n    @staticmethod\n    def h(x): return x\ndef f(x): return A.h(x)",
+        "A.h = staticmethod(lambda x: 2 * x)",
+    ),
+    "a class method": (
+        "class A:\n    k = 1\n    @classmethod\n    def h(cls, x): return cls.k\nf = A.h",
+        "A.k = 2",
+    ),
+    "what is called as a function": (
+        "class A:\n    def __call__(self, x): return x\nf = A()",
+        "A.__call__ = lambda self, x: 2 * x",
+    ),
+    "an attribute of an object": (
+        "class A:\n    pass\na = A()\na.k = 1\ndef f(x): return a.k * x",
+        "a.k = 2",
+    ),
+    "a slot": (
+        "class A:\n    __slots__ = ('k',)\na = A()\na.k = 1\ndef f(x): return a.k * x",
+        "a.k = 2",
+    ),
+    "a field that is not compared": (
+        "import dataclasses\n@dataclasses.dataclass\nclass A:\n"
+        "    k: float = dataclasses.field(default=1.0, compare=False)\n"
+        "a = A()\ndef f(x): return a.k * x",
+        "a.k = 2.0",
+    ),
+    "an environment variable": (
+        "import os\ndef f(x): return float(os.environ.get('K', 1)) * x",
+        "os.environ['K'] = '2'",
+    ),
+    "True for 1": ("K = 1\ndef f(x): return K + x", "K = True"),
+    "1.0 for 1": ("K = 1\ndef f(x): return K + x", "K = 1.0"),
+    "-0.0 for 0.0": ("K = 0.0\ndef f(x): return K + x", "K = -0.0"),
+    "another type of array": (
+        "import numpy as np\nK = np.ones(2)\ndef f(x): return K",
+        "K = np.ones(2, 'f4')",
+    ),
+    "a decorated function": (
+        "import functools\nK = 1\ndef twice(g):\n    @functools.wraps(g)\n"
+        "    def h(x): return 2 * g(x)\n    return h\n@twice\ndef f(x): return K * x",
+        "K = 2",
+    ),
+    "a function of jax.jit": ("import jax\nK = 1\n@jax.jit\ndef f(x): return K * x", "K = 2"),
+    "a function with a memory": (
+        "import functools\nK = 1\n@functools.lru_cache\ndef f(x): return K * x",
+        "K = 2",
+    ),
+    "a random key": ("import jax\nK = jax.random.key(1)\ndef f(x): return K", "K = jax.random.key(2)"),
+    "the rule of a derivative": (
+        "import jax\nK = 1\n@jax.custom_jvp\ndef f(x): return x\n"
+        "f.defjvps(lambda dx, _, x: K * dx)",
+        "K = 2",
+    ),
+    "an attribute of a module": ("def f(x): return other.K * x", "other.K = 2"),
+    "an attribute of a module, by a word": ("def f(x): return getattr(other, 'K')", "other.K = 2"),
+    "a function of a module": ("def f(x): return other.h(x)", "other.h = lambda x: 3 * x"),
+    "a module of a package": ("def f(x): return other.inner.K * x", "other.inner.K = 2"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_change_is_noticed(way, monkeypatch):
+    monkeypatch.setenv("K", "1")
+    before, change = WAYS[way]
+    space = {"__name__": "users_module", "other": types.ModuleType("users_other")}
+    space["other"].K, space["other"].h = 1, lambda x: x
+    space["other"].inner = types.ModuleType("users_inner")
+    space["other"].inner.K = 1
+    exec(before, space)
+    digest = meaning(space["f"])
+    assert meaning(space["f"]) == digest
+    exec("unused = 3\n" + before.replace("\n", "\n\n"), dict(space))
+    assert meaning(space["f"]) == digest
+    exec(change, space)
+    assert meaning(space["f"]) != digest
+
+
+def test_names_that_code_makes_are_refused():
+    space = {"__name__": "users_module"}
+    exec("K = 1\ndef f(x): return eval('K') * x", space)
+    with pytest.raises(DefinitionError, match="calls `eval`"):
+        meaning(space["f"])
+
+
+def test_functions_that_call_each_other_are_visited_once():
+    """Sixty of them, each calling the ten before."""
+    lines = [" + ".join(f"g{j}(x)" for j in range(max(i - 10, 0), i)) or "x" for i in range(60)]
+    space = {"__name__": "users_module"}
+    exec("\n".join(f"def g{i}(x): return {line}" for i, line in enumerate(lines)), space)
+    before = time.process_time()
+    meaning(space["g59"])
+    assert time.process_time() - before < 1.0

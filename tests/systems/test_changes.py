@@ -1,0 +1,122 @@
+"""Answers follow the code that a notebook has now, and a function that uses the time is found."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+hj.enable_x64()
+DRAG = 0.7
+SECTIONS, DESIGN = hj.ClockPhase(2), hj.multisine(2, periods=4).scaled(rms=0.01)
+TURN = hj.Crossing("v", "falling")
+
+
+class Slowing(hj.Chart):
+    states = ("x",)
+
+    def field(self, t, q, u):
+        return (-DRAG * q[0] + jnp.cos(2 * jnp.pi * t) + u[0],)
+
+
+class Slowed(hj.HybridSystem):
+    wind: hj.Parameter = hj.parameter(0.0)
+
+    def period(self):
+        return 1.0
+
+    def charts(self):
+        return {"air": Slowing()}
+
+    def guess(self):
+        return hj.Guess("air", (0.1,))
+
+
+def test_a_constant_of_the_notebook_is_changed(monkeypatch):
+    for drag in (0.7, 1.3, 0.7):
+        monkeypatch.setitem(globals(), "DRAG", drag)
+        cycle = hj.find_limit_cycle(Slowed())
+        model = hj.linearize(cycle, SECTIONS, "x")
+        for multipliers in (cycle.multipliers, model.multipliers):
+            np.testing.assert_allclose(multipliers, [np.exp(-drag)], rtol=1e-9)
+        end = hj.simulate(Slowed(), "air", (1.0,), 1.0).after[-1]
+        start = hj.simulate(Slowed(), "air", (0.0,), 1.0).after[-1]
+        np.testing.assert_allclose(end - start, np.exp(-drag), rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda cycle: hj.linearize(cycle, SECTIONS, "x"),
+        lambda cycle: hj.place_sections(cycle, SECTIONS),
+        lambda cycle: hj.run_experiments(cycle, SECTIONS, DESIGN, "x"),
+        lambda cycle: hj.continuation(cycle, "wind", (0.0, 0.1)),
+        lambda cycle: hj.section_map(cycle, SECTIONS, 0, 1),
+        lambda cycle: hj.response_function(cycle, SECTIONS, "x"),
+        lambda cycle: cycle.trajectory(),
+    ],
+)
+def test_a_cycle_belongs_to_the_code_as_it_was(use, monkeypatch):
+    cycle = hj.find_limit_cycle(Slowed())
+    monkeypatch.setitem(globals(), "DRAG", 1.3)
+    with pytest.raises(hj.DefinitionError, match="have changed since this limit cycle was found"):
+        use(cycle)
+    assert hj.find_limit_cycle(Slowed(), cycle).stable  # (as a guess it will do)
+
+
+class Turning(hj.Chart):
+    states = ("x", "v")
+    push: hj.Parameter
+    gain: hj.Parameter
+
+    def field(self, t, q, u):
+        x, v = q
+        pulse = jnp.exp(-(((t % 5.0 - 2.5) / 0.004) ** 2))
+        return v, (1 - x**2) * v - x + self.push * pulse + (1 + self.gain * pulse) * u[0]
+
+
+class Turns(hj.HybridSystem):
+    """Van der Pol's oscillator, pushed by a pulse that 16 samples of a period miss."""
+
+    push: hj.Parameter = hj.parameter(0.0)
+    gain: hj.Parameter = hj.parameter(0.0)
+
+    def charts(self):
+        return {"on": Turning(self.push, self.gain)}
+
+    def guess(self):
+        return hj.Guess("on", (2.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "search",
+    [
+        lambda guess: hj.find_limit_cycle(Turns(gain=0.1), section=TURN),
+        lambda guess: hj.find_limit_cycles([Turns(push=0.1), Turns(push=0.2)], guess=guess),
+        lambda guess: hj.sweep(Turns(), {"push": [0.1, 0.2]}, guess=guess),
+    ],
+)
+def test_time_without_a_period_is_refused(search, vanderpol_cycle):
+    with pytest.raises(hj.DefinitionError, match=r"depends on t, but Turns states no period"):
+        search(vanderpol_cycle)
+
+
+class Pushed(Slowed):
+    """The input acts with another period than the clock's."""
+
+    def charts(self):
+        field = lambda t, q, u: (-q[0] + u[0] * jnp.cos(1.3 * t),)  # noqa: E731
+
+        class Chart(hj.Chart):
+            states = ("x",)
+
+            def field(self, t, q, u):
+                return field(t, q, u)
+
+        return {"air": Chart()}
+
+
+def test_the_gain_of_an_input_has_the_clocks_period():
+    with pytest.raises(hj.DefinitionError, match=r"does not have the period 1 that Pushed.period"):
+        hj.find_limit_cycle(Pushed())
