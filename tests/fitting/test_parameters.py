@@ -1,4 +1,4 @@
-"""Coordinates of free parameters: they keep to bounds and come back."""
+"""Coordinates of free parameters keep to bounds and come back; data that do not fit are refused."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +7,8 @@ from hypothesis import given, strategies as st
 
 import hybridjax as hj
 from hybridjax.fitting.problem import free_parameters
+
+from .conftest import SECTIONS
 
 
 HOPPER = hj.models.VerticalHopper
@@ -33,16 +35,32 @@ def test_a_parameter_keeps_its_sign_by_default():
     np.testing.assert_array_equal([moved.k, moved.b, moved.g], far)
 
 
+H = np.ones((1, 3, 1, 1), complex)
+F = np.array([0.1, 0.2, 0.3])
+
+
+def records(**options):
+    y = np.random.default_rng(0).normal(size=(2, 16, 1))
+    return hj.ExperimentData(
+        np.zeros((2, 16, 1)), options.pop("y", y), n_sections=8, periods=2, **options
+    )
+
+
 @pytest.mark.parametrize(
-    "free, message",
+    "make, message",
     [
-        ((), "at least one"),
-        (("k", "k"), "each once"),
-        (("stiffness",), "'stiffness' is no parameter of VerticalHopper"),
-        (("leg",), "those are m, M, k"),
-        ({"k": (11.0, 20.0)}, "enclose the value"),
+        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS), "16 sections, the family has 8"),
+        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS), "variance"),
+        (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "8 sections, the family 4"),
+        (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
+        (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), "one for each output"),
+        (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "zero throughout"),
+        (lambda: hj.ObservedCycle(SECTIONS), "`times`, or the `period`"),
+        (lambda: hj.ObservedCycle(SECTIONS, "yM"), "`outputs` with their `values`"),
+        (lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))), r"the shape \(8, 1\)"),
+        (lambda: hj.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))), "zero throughout"),
     ],
 )
-def test_bad_names_and_bounds_are_refused(free, message):
+def test_bad_data_are_refused(make, message):
     with pytest.raises(hj.DefinitionError, match=message):
-        free_parameters(HOPPER(), free)
+        make()

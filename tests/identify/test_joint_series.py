@@ -173,14 +173,3 @@ def test_the_spectrum_of_noise(small):
     for row, m in zip(found, (-1, 1), strict=True):
         H = [noise.htf(f + m - k, (k,)).H[0] for k in range(-2, 2)]
         np.testing.assert_allclose(row, (np.abs(H) ** 2).sum(axis=(0, 3)), rtol=1e-9)
-
-
-def test_bad_input_is_refused_in_a_sentence(small):
-    data = record(small, 4 * 40, 0, 0.1)
-    with pytest.raises(hj.DefinitionError, match="depend on inputs up to 2 samples later"):
-        hj.fit_ldtp(hj.Record(data.u, data.y, n_sections=4, lead=2), small)
-    with pytest.raises(hj.DefinitionError, match="too few for 60 unknowns"):
-        hj.fit_ldtp(record(small, 4 * 8, 0, 0.1), small, noise="innovations")
-    short = [record(small, 3, k, 0.1, first_section=k % 4) for k in range(60)]
-    with pytest.raises(hj.DefinitionError, match="leave out records shorter than a cycle"):
-        hj.fit_ldtp(short, small)

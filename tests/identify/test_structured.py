@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
-from hybridjax.identify.multiplier_estimate import compare_multipliers
 
 from ..linear.conftest import blocks_at_random
 
@@ -39,12 +38,3 @@ def test_random_systems(shape, seed):
     np.testing.assert_allclose(fit.coefficients, polynomial[1:], atol=1e-8)
     assert fit.htf(htf.f).error(htf).max() < 1e-8
     assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)
-
-
-def test_pairs_are_matched_by_distance():
-    comparison = compare_multipliers(np.array([0.1, -0.5 - 0.2j, -0.5 + 0.21j]), [-0.5 + 0.2j, 0.1])
-    np.testing.assert_array_equal(comparison.true, [-0.5 + 0.2j, 0.1])
-    np.testing.assert_allclose(comparison.error, [0.01, 0.0], atol=1e-15)
-    assert "-0.500000000 +0.210000000i" in repr(comparison)
-    with pytest.raises(hj.DefinitionError, match="no multiplier to compare"):
-        compare_multipliers(np.zeros(0), [1.0])

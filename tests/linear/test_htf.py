@@ -154,17 +154,3 @@ def test_a_multiplier_on_the_unit_circle_is_named():
     integrator = hj.LDTP(np.ones((4, 1, 1)), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
     with pytest.raises(hj.DefinitionError, match="f = 2 cycles per period is unbounded"):
         integrator.htf([0.3, 2.0, 0.7])
-
-
-def test_bad_use(synthetic):
-    htf = synthetic.htf([0.25, 0.75], harmonics=(-1, 0, 1))
-    u = np.cos(2 * np.pi * 0.25 * np.arange(24) / 6)[:, None] * np.ones(2)
-    cases = [
-        (lambda: htf.predict(u**2), "f = 0 cycles per period, where"),
-        (lambda: htf.select((0, 1)).predict(u), "symmetric about 0"),
-        (lambda: htf.interpolate([2.0]), "f = 2 cycles per period is too far"),
-        (lambda: htf.error(htf.select((0, 1))), "different harmonics"),
-    ]
-    for call, message in cases:
-        with pytest.raises(hj.DefinitionError, match=message):
-            call()
