@@ -25,7 +25,7 @@ from ..identify.variable_projection import check_values, error_weights
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections, FamilyLike, as_family
-from ..sections.linearize import linearize
+from ..sections.linearize import inputs_of, linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
 
@@ -126,12 +126,7 @@ class ObservedHTF(AbstractObservation):
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
         cycle.structure.resolve_outputs(self.outputs)
-        unknown = [name for name in self.inputs if name not in cycle.system.inputs]
-        if unknown:
-            raise DefinitionError(
-                f"the HTFs have the input '{unknown[0]}'; those of the system are "
-                f"{', '.join(cycle.system.inputs)}."
-            )
+        inputs_of(cycle.structure, self.inputs)
         place_sections(cycle, self.sections)
         return self
 

@@ -12,7 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
 from .._core.boundary.values import Complexes, Reals
 from .._core.executor import from_host, is_traced
-from .._core.html import COLORS, Curve, card, picture, table
+from .._core.html import COLORS, Curve, card, picture
 from .._core.precision import require_x64
 from .._core.signal import ratio, with_unit
 from .._core.text import listed
@@ -175,9 +175,8 @@ class HTF(eqx.Module):
             return None
         f, H = np.asarray(self.f), np.abs(np.asarray(self.H))[..., 0]
         order = np.argsort(f)
-        u, peaks = self.inputs[0], np.nanmax(H, axis=1)
-        largest = np.argsort(-np.nanmax(peaks, axis=1), kind="stable")[:_SHOWN]
-        drawn, rows = [], []
+        u, drawn = self.inputs[0], []
+        largest = np.argsort(-np.nanmax(H, axis=(1, 2)), kind="stable")[:_SHOWN]
         for j, y in enumerate(self.outputs[:_SHOWN]):
             curves = [
                 Curve(f[order], H[k, order, j], f"H_{self.harmonics[k]}", COLORS[i])
@@ -185,12 +184,8 @@ class HTF(eqx.Module):
             ]
             name = with_unit(f"|H|, {u} to {y}", ratio(y, u))
             drawn.append(picture(curves, "f (cycles/period)", name, log=True))
-            rows += [
-                (y, f"H_{self.harmonics[k]}", f"{peaks[k, j]:.4g}", f"{f[H[k, :, j].argmax()]:.4g}")
-                for k in np.sort(largest)
-            ]
         of = f"({self.source}): {repr(self).partition('; ')[2].removesuffix(')')}"
-        return card("HTF", of, *drawn, table(("output", "", "largest modulus", "at f"), rows))
+        return card("HTF", of, *drawn)
 
     def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]:
         """`H_m`; `m` counts modulo `N`.

@@ -315,8 +315,9 @@ class ModelPoint(Point):
     """A model of a descent."""
 
     def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
-        self.problem, self.direct = problem, direct
-        self.model = problem.refined(model, direct)
+        self.problem, self.direct, self.model = problem, direct, model
+        if isinstance(problem, FrequencyProblem):  # of series, this costs as much as a step
+            self.model = problem.refined(model, direct)
         self.cost = problem.cost(self.model)
 
     @cached_property
@@ -340,9 +341,9 @@ class ModelPoint(Point):
         cost with the old weights raises the likelihood, where no sample is missing. With gaps the
         covariance is that of the pairs that are sampled, which is nearly the likelihood's.
         """
-        problem = self.problem.reweighted(self.model)
-        if problem is not self.problem:
-            self.problem, self.cost = problem, problem.cost(self.model)
+        if isinstance(self.problem, SeriesProblem):
+            self.problem = self.problem.reweighted(self.model)
+            self.cost = self.problem.cost(self.model)
         return self
 
     def settled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:

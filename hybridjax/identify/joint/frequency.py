@@ -69,10 +69,6 @@ class FrequencyProblem(NamedTuple):
             return np.inf
         return cost if np.isfinite(cost) else np.inf
 
-    def reweighted(self, model: PeriodicModel) -> "FrequencyProblem":
-        """Return the problem itself: its weights are known."""
-        return self
-
     def refined(self, model: PeriodicModel, direct: bool) -> PeriodicModel:
         """Return the model with the best B (and D, if free), in which the HTFs are linear.
 

@@ -121,10 +121,6 @@ class SeriesProblem(NamedTuple):
                 cost += sum(float((_times(w, e) ** 2).sum()) for w, e in pairs)
         return cost if np.isfinite(cost) else np.inf
 
-    def refined(self, model: PeriodicModel, direct: bool) -> PeriodicModel:
-        """Return the model itself: elimination of unknowns costs as much as a step."""
-        return model
-
     def reweighted(self, model: PeriodicModel) -> "SeriesProblem":
         """Return the problem with the covariance of the errors of a model."""
         square, count = np.zeros(self.S.shape), np.zeros(self.S.shape)
