@@ -102,7 +102,7 @@ def test_claims_name_tests_that_exist():
         assert f"def {name}" in (ROOT / path).read_text(), f"there is no {path}::{name}"
 
 
-PAGES = ["docs/index.md", "docs/experiments.md", "docs/interop.md"]
+PAGES = ["docs/index.md", "docs/experiments.md"]
 PAGES += [f"docs/how-to/{p.name}" for p in (ROOT / "docs/how-to").glob("*.md")]
 
 

@@ -67,7 +67,8 @@ def number(x: Any, digits: int = 6, unit: str = "") -> str:
 
 def fields(module: Any) -> str:
     """A module by its fields, without those that are None."""
-    named = ((field.name, getattr(module, field.name)) for field in dataclasses.fields(module))
+    shown_fields = (field for field in dataclasses.fields(module) if field.repr)
+    named = ((field.name, getattr(module, field.name)) for field in shown_fields)
     shown = [f"{name}={value(x)}" for name, x in named if x is not None]
     kind, line = type(module).__name__, ", ".join(shown)
     if len(kind) + len(line) + 2 <= _WIDTH:
