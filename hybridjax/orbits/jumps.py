@@ -104,9 +104,10 @@ def _inner(equation: Any) -> Any:
 
 def _decides(equation: Any) -> bool:
     """Test for decisions that depend on real numbers."""
-    x, y = equation.invars[0].aval, equation.outvars[0].aval
-    is_cast = equation.primitive.name != "convert_element_type" or not _is_real(y)
-    return equation.primitive.name in _DECISIONS and _is_real(x) and is_cast
+    name = equation.primitive.name
+    if name not in _DECISIONS or not _is_real(equation.invars[0].aval):
+        return False
+    return name != "convert_element_type" or not _is_real(equation.outvars[0].aval)
 
 
 def _is_real(aval: Any) -> bool:

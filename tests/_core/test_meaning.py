@@ -24,10 +24,7 @@ WAYS = {
     ),
     "an entry of a list": ("K = [1.0]\ndef f(x): return K[0] * x", "K[0] = 2.0"),
     "an entry of a dict": ("K = {'k': [1.0]}\ndef f(x): return K['k'][0]", "K['k'][0] = 2.0"),
-    "an array in place": (
-        "import numpy as np\nK = np.ones(3)\ndef f(x): return K * x",
-        "K[1] = 2",
-    ),
+    "an array in place": ("import numpy as np\nK = np.ones(3)\ndef f(x): return K * x", "K[1] = 2"),
     "an array of objects": (
         "import numpy as np\nK = np.array([{'k': 1}, None])\ndef f(x): return K[0]['k'] * x",
         "K[0]['k'] = 2",
@@ -116,7 +113,10 @@ WAYS = {
         "import functools\nK = 1\n@functools.lru_cache\ndef f(x): return K * x",
         "K = 2",
     ),
-    "a random key": ("import jax\nK = jax.random.key(1)\ndef f(x): return K", "K = jax.random.key(2)"),
+    "a random key": (
+        "import jax\nK = jax.random.key(1)\ndef f(x): return K",
+        "K = jax.random.key(2)",
+    ),
     "the rule of a derivative": (
         "import jax\nK = 1\n@jax.custom_jvp\ndef f(x): return x\n"
         "f.defjvps(lambda dx, _, x: K * dx)",
