@@ -1,4 +1,3 @@
-from .amplitude import amplitude_sweep as amplitude_sweep
 from .joint.fit import ldtp_bound as ldtp_bound
 from .joint.realization import realize as realize
 from .multipliers import multiplier_bound as multiplier_bound

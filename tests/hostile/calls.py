@@ -182,9 +182,6 @@ def series(t):
     yield t.fit.impulse_response, dict(n_lags=3)
     yield t.fit.htf, dict(f=np.array([0.1, 0.2]))
     yield hj.validate, dict(model=t.fit, data=t.record)
-    u = t.data.u
-    yield hj.identify.amplitude_sweep, dict(run=t.run, model=t.model, u=u, amplitudes=[1.0, 2.0])
-    yield t.sweep.limit, dict(misfit=1.0)
 
 
 def fitting(t):

@@ -90,7 +90,6 @@ MAKE = {
     "fit": lambda t: hj.fit_series(t.record, 2),
     "validation": lambda t: hj.validate(t.fit, t.record),
     "run": lambda t: lambda u: run(t, u),
-    "sweep": lambda t: hj.identify.amplitude_sweep(t.run, t.model, t.data.u, [1.0, 2.0]),
     "recording": recording,
     "phase": lambda t: hj.recordings.estimate_phase(t.recording, RISES),
     "section_data": lambda t: section_data(t, "f", timing="clock"),

@@ -91,28 +91,6 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     assert not hj.validate(small, unsaid, start=start).white
 
 
-def test_amplitudes(small):
-    """A cubic nonlinearity: the misfit grows with the square of the amplitude."""
-
-    def run(u):
-        y = np.stack([np.asarray(small.simulate(x + 0.01 * x**3)) for x in u])
-        result = [0] if np.abs(u).max() < 30 else [hj.Result.BLOW_UP]
-        return hj.ExperimentData(u, y, n_sections=4, periods=9, outputs=("y0", "y1"), result=result)
-
-    u = np.random.default_rng(0).normal(size=(1, 400, 1))
-    sweep = hj.identify.amplitude_sweep(run, small, u, [0.1, 1.0, 3.0, 100.0])
-    np.testing.assert_allclose(sweep.misfit[1] / sweep.misfit[0], 100, rtol=0.1)
-    assert sweep.failed[-1] == 1 and np.isnan(sweep.misfit[-1]).all()
-    worst = sweep.misfit[0].max()
-    np.testing.assert_allclose(sweep.limit(4 * worst), 0.2, rtol=0.05)
-    assert sweep.limit(1e9) == 3.0
-    with pytest.raises(hj.DefinitionError, match="smallest amplitude tried has a misfit"):
-        sweep.limit(worst / 2)
-    assert repr(sweep).splitlines()[-1].split()[-1] == "1"
-    with pytest.raises(hj.DefinitionError, match="must be positive"):
-        hj.identify.amplitude_sweep(run, small, u, [0.0, 1.0])
-
-
 def test_records_shorter_than_the_lags(small):
     """Short pieces count where they can: not where an unknown start explains all of them."""
     whole = record(small, 4 * 100, 0, 0.3)
