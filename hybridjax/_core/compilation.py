@@ -99,7 +99,7 @@ def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path | None:
     return programs
 
 
-def _private_folder(given: str | pathlib.Path | None) -> pathlib.Path:
+def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
     """Make the subfolder of programs in a folder, or in the user's cache folder.
 
     **Raises:** `OSError` if it cannot be made, or other users can write to it; `RuntimeError` for a

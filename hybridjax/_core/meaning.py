@@ -14,7 +14,7 @@ import sys
 import sysconfig
 import types
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import DefinitionError
-from .executor import Definition
+from .executor import Definition, is_tracer
 from .memo import Memory
 
 
@@ -44,11 +44,11 @@ def current(x: Thing) -> Thing:
     """
     if not isinstance(x, Definition):
         return x
-    digest = code_digest(x)
-    return x if x.code_digest == digest else _marked.recall(x, digest, lambda: _mark(x, digest))
+    digest, thing = code_digest(x), cast(Any, x)
+    return thing if x.code_digest == digest else _marked.recall(x, digest, lambda: _mark(x, digest))
 
 
-def _mark(x: Definition, digest: str) -> Definition:
+def _mark(x: Any, digest: str) -> Any:
     leaves, structure = jax.tree_util.tree_flatten(x)
     marked = jax.tree_util.tree_unflatten(structure, leaves)
     object.__setattr__(marked, "code_digest", digest)
@@ -130,7 +130,7 @@ class _Walk:
                 self._object(x)
 
     def _array(self, x: Any) -> None:
-        if isinstance(x, jax.core.Tracer):
+        if is_tracer(x):
             return self.note(str(x.aval))
         is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
         values = np.asarray(jax.random.key_data(x) if is_key else x)

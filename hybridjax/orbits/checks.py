@@ -86,9 +86,10 @@ def check_times(
     **Raises:** `DefinitionError` if they do not have the period that the system states; NaN is
     passed over.
     """
-    if s.system.period() is None:
+    clock = s.system.period()
+    if clock is None:
         return
-    period, sizes = float(s.system.period()), np.asarray(scale)
+    period, sizes = float(clock), np.asarray(scale)
     for a in np.unique(chart):
         n, rows = s.dims[a], np.flatnonzero(chart == a)
         first, states = t[rows] + _BASE * time, q[:n, rows]

@@ -1,6 +1,7 @@
 """From a definition of phase to the phase of a recording: angles that wind, events, crossings."""
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +15,7 @@ from .recording import Recording, check_events, signal_of
 from .smoothing import FEWEST, Bandwidth, Series, bridgeable, gaps, inside, spline, without_spikes
 
 
-PhaseDefinition = KinematicPhase | Crossing | AtEvent
+PhaseDefinition: TypeAlias = KinematicPhase | Crossing | AtEvent
 """Definition of the phase of a recording; see `estimate_phase`."""
 
 # Number of intervals from which the rhythm of a trial is estimated alone. More: long trials are

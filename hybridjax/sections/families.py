@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable, Iterable, Sequence
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -339,7 +339,7 @@ class SectionList(AbstractSections):
         return f"section {i} ({self.items[i]})"
 
 
-FamilyLike = AbstractSections | Crossing | AtEvent | Sequence[Crossing | AtEvent]
+FamilyLike: TypeAlias = AbstractSections | Crossing | AtEvent | Sequence[Crossing | AtEvent]
 """A family, a single section, or a list of sections."""
 
 

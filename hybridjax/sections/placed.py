@@ -1,5 +1,7 @@
 """A section family that was placed on a limit cycle."""
 
+from typing import TypeAlias
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -191,7 +193,7 @@ def section_target(
     return Target(time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED)
 
 
-SectionsLike = FamilyLike | PlacedSections
+SectionsLike: TypeAlias = FamilyLike | PlacedSections
 """A family, a single section, a list of sections, or a family that was placed on the cycle."""
 
 
