@@ -106,7 +106,6 @@ def linear(t):
     yield hj.Scatter, dict(freedom=f, roundness=size)
     yield scatter.quantile, dict(level=0.9)
     htf = t.estimate
-    yield htf.harmonic, dict(m=0)
     yield htf.__getitem__, dict(m=0)
     yield htf.select, dict(harmonics=0)
     yield htf.at, dict(f=f[:2])
