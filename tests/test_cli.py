@@ -45,6 +45,7 @@ def results(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_reproduce_writes_its_results(results):
     summary = json.loads((results / "summary.json").read_text())
     assert summary["limit_cycle"]["period"] == pytest.approx(1.0)

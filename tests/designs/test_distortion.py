@@ -133,6 +133,7 @@ def test_without_a_clock(vanderpol_cycle):
     assert np.abs(even - quadratic.second_order(u)).max() < 1e-4 * np.abs(even).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inputs", [("pull", "push"), ("pull",)])
 def test_two_inputs(two, inputs):
     """Inputs in any order; charts with one and two states; outputs that depend on the inputs."""

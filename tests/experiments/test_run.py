@@ -166,6 +166,7 @@ def test_sections_that_are_too_far_apart_for_the_steps_allowed(hopper_cycle, mon
         hj.run_experiments(cycle, hj.ClockPhase(3), np.zeros((1, 6, 1)), "yM", discard=0)
 
 
+@pytest.mark.slow
 def test_clock_sections_of_an_autonomous_system(vanderpol_cycle):
     family = hj.ClockPhase(8, anchor=hj.Crossing("v", "falling"))
     design = hj.multisine(n_sections=8, periods=4, band=(0, 2.0))

@@ -26,6 +26,7 @@ def observed(cycle, noise=0.0):
     return hj.ObservedCycle(PHASES, ("x", "v"), values, period=period + drawn[8], **STD)
 
 
+@pytest.mark.slow
 def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     wrong = Oscillator(p=0.6, q=2.1, w=0.9)
     fit = hj.fit_model(wrong, observed(oscillation), ("p", "q", "w"), guess=oscillation)

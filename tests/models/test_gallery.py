@@ -114,6 +114,7 @@ def test_cycle_and_multipliers(name):
     )
 
 
+@pytest.mark.slow
 def test_where_no_section_is_met_again_one_is_asked_for():
     wheel = m.RimlessWheel()
     after_impact = hj.Guess("swing", (float(wheel.slope - wheel.alpha), 0.45))

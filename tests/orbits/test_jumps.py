@@ -52,7 +52,11 @@ def test_a_jump_is_refused(further):
 @pytest.mark.parametrize(
     ("further", "same"),
     [
-        (lambda x: jnp.where(x > 0, 0.1 * x, 0.0), lambda x: jnp.maximum(0.1 * x, 0.0)),
+        pytest.param(
+            lambda x: jnp.where(x > 0, 0.1 * x, 0.0),
+            lambda x: jnp.maximum(0.1 * x, 0.0),
+            marks=pytest.mark.slow,
+        ),
         (
             lambda x: jnp.where(x != 0, jnp.sin(x) / jnp.where(x != 0, x, 1.0), 1.0),
             lambda x: jnp.sinc(x / jnp.pi),

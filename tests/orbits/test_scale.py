@@ -8,6 +8,7 @@ import pytest
 import hybridjax as hj
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [100.0, 0.5])
 def test_a_cycle_is_as_accurate_from_other_sizes(factor):
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())

@@ -26,6 +26,7 @@ class Decaying(hj.HybridSystem):
         return 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rates, sections",
     [((0.5, 20.0, 45.0), 8), pytest.param((0.5, 45.0, 250.0), 40, marks=pytest.mark.slow)],

@@ -26,6 +26,7 @@ def found(hoppers, hopper_cycle):
     return hj.find_limit_cycles(hoppers, hopper_cycle)
 
 
+@pytest.mark.slow
 def test_each_is_the_cycle_that_is_found_alone(found):
     for i in range(4):
         cycle = found[i]

@@ -97,6 +97,7 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
         np.testing.assert_allclose(theirs[:, :, k] * back, mine, atol=1e-9 * np.abs(mine).max())
 
 
+@pytest.mark.slow
 @units
 def test_an_oscillator_without_a_clock(relaxation, unit):
     """The plane through the guess, its time to return, and the flow out of the multipliers."""

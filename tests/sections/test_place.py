@@ -105,6 +105,7 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
         hj.place_sections(hopper_cycle, Crossing(twice, "falling"))
 
 
+@pytest.mark.slow
 def test_sections_of_another_cycle(placed_isochrons, lossy_cycle):
     with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
         hj.linearize(lossy_cycle, placed_isochrons)
