@@ -106,11 +106,13 @@ def _advance(
         t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
         flow = ChartFlow(system, a, u0, goal)
         still = ChartFlow(constant(system), a, constant(u0), goal)
+        # (The charts, which may hold traced values, are made here, and not within a branch.)
+        method = flow.method
         crossing = jnp.where(here, which, -1)
         # (A branch of its own, lest XLA masks the states again in every stage.)
         step = jax.lax.cond(
             here.any(),
-            lambda: take_step(flow.method, flow.field, t0, q0, h0, unroll, still.field),
+            lambda: take_step(method, flow.field, t0, q0, h0, unroll, still.field),
             lambda: Step(q0, q0, q0, q0),
         )
         q1, t1 = step.q, t0 + h0
