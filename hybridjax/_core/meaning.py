@@ -5,9 +5,11 @@ traces it once, and does not notice that one of these has changed. A digest of a
 """
 
 import contextlib
+import dis
 import functools as ft
 import hashlib
 import inspect
+import itertools
 import os
 import pathlib
 import sys
@@ -35,6 +37,7 @@ _FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib"
 
 
 Thing = TypeVar("Thing")
+Names = tuple[str, ...]
 
 
 def current(x: Thing) -> Thing:
@@ -156,10 +159,11 @@ class _Walk:
 
     def _globals(self, x: types.FunctionType) -> None:
         """Visit what a function, and the functions written in it, read of their module."""
-        names = _names(x.__code__)
-        for name in names:
-            local = f"{x.__globals__.get('__package__')}.{name}"  # imported in the function
-            value = x.__globals__.get(name, sys.modules.get(name, sys.modules.get(local)))
+        read, imported, names = _names(x.__code__)
+        package = x.__globals__.get("__package__")
+        modules = {x: sys.modules.get(x, sys.modules.get(f"{package}.{x}")) for x in imported}
+        for name in (*read, *imported):
+            value = modules[name] if name in modules else x.__globals__.get(name)
             if value is not None:
                 self.note(name)
                 self.visit(value)
@@ -171,7 +175,7 @@ class _Walk:
                     "reads cannot be noticed: read them by their names."
                 )
 
-    def _attributes(self, module: types.ModuleType, names: tuple[str, ...]) -> None:
+    def _attributes(self, module: types.ModuleType, names: Names) -> None:
         """Visit the attributes of a module that a function names."""
         for name in names:
             if name not in vars(module) and name not in _lazy_names(module):
@@ -212,11 +216,17 @@ class _Walk:
 
 
 @ft.lru_cache(4096)
-def _names(code: types.CodeType) -> tuple[str, ...]:
-    """Names and words in code, and in functions that are written in it."""
-    inner = [name for x in code.co_consts if isinstance(x, types.CodeType) for name in _names(x)]
+def _names(code: types.CodeType) -> tuple[Names, Names, Names]:
+    """Global names that code reads, modules that it imports, and all names and words in it, with
+    those of the functions that are written in it."""
+    steps = [(step.opname, step.argval) for step in dis.get_instructions(code)]
+    read = [x for name, x in steps if name == "LOAD_NAME" or name.startswith("LOAD_GLOBAL")]
+    imported = [x for name, x in steps if name == "IMPORT_NAME"]
     words = [x for x in code.co_consts if isinstance(x, str) and x.isidentifier()]
-    return tuple(dict.fromkeys([*code.co_names, *words, *inner]))
+    inner = [_names(x) for x in code.co_consts if isinstance(x, types.CodeType)]
+    every = zip((read, imported, [*code.co_names, *words]), *inner, strict=True)
+    read, imported, names = (tuple(dict.fromkeys(itertools.chain(*x))) for x in every)
+    return read, imported, names
 
 
 def _is_description(name: str, value: Any) -> bool:

@@ -1,5 +1,6 @@
 """Whatever changes what a function computes changes its digest; what does not, leaves it."""
 
+import sys
 import time
 import types
 
@@ -122,6 +123,16 @@ WAYS = {
         "f.defjvps(lambda dx, _, x: K * dx)",
         "K = 2",
     ),
+    "a module that a function imports": (
+        "import sys\nsys.modules['users_third'] = other.inner\n"
+        "def f(x):\n    import users_third as third\n    return third.K",
+        "other.inner.K = 2",
+    ),
+    "a name of a module that a function imports": (
+        "import sys\nsys.modules['users_third'] = other.inner\n"
+        "def f(x):\n    from users_third import K\n    return K",
+        "other.inner.K = 2",
+    ),
     "an attribute of a module": ("def f(x): return other.K * x", "other.K = 2"),
     "an attribute of a module, by a word": ("def f(x): return getattr(other, 'K')", "other.K = 2"),
     "a function of a module": ("def f(x): return other.h(x)", "other.h = lambda x: 3 * x"),
@@ -144,6 +155,17 @@ def test_a_change_is_noticed(way, monkeypatch):
     assert meaning(space["f"]) == digest
     exec(change, space)
     assert meaning(space["f"]) != digest
+    sys.modules.pop("users_third", None)
+
+
+def test_what_is_not_read_is_not_noticed(monkeypatch):
+    """A global, or a module of Python, that has the name of an attribute."""
+    space = {"__name__": "users_module", "m": 1.0}
+    exec("class A:\n    m = 1\na = A()\ndef f(x): return a.m * x", space)
+    digest = meaning(space["f"])
+    space["m"] = 2.0
+    monkeypatch.setitem(sys.modules, "m", types.ModuleType("m"))
+    assert meaning(space["f"]) == digest
 
 
 def test_names_that_code_makes_are_refused():
