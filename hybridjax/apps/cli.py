@@ -217,7 +217,7 @@ def _begin(*, cache: bool) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    from .._core.compilation import enable_compilation_cache
+    from .._core.cache import enable_compilation_cache
     from .._core.precision import enable_x64
 
     enable_x64()
