@@ -15,7 +15,7 @@ import jax
 
 from ..errors import DefinitionError
 from .boundary.checked import checked
-from .boundary.kinds import Path
+from .boundary.kinds import FilePath
 
 
 # A larger file in the folder, in bytes, is no program. Smaller: the largest programs (1e8) are
@@ -25,7 +25,7 @@ _MARK = "made-here-"
 
 
 @checked
-def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path | None:
+def enable_compilation_cache(folder: FilePath | None = None) -> pathlib.Path | None:
     """Keep compiled programs on disk (JAX's persistent compilation cache), so that the next process
     starts faster.
 
