@@ -1,4 +1,7 @@
-"""The search for a limit cycle, by Newton's method on the return map with its exact Jacobian."""
+"""The search for a limit cycle, by Newton's method on the return map with its exact Jacobian.
+
+If Newton's method fails, `newton.search` makes further attempts.
+"""
 
 import dataclasses
 from collections.abc import Mapping
