@@ -131,6 +131,7 @@ WRONG = {
         "--out x --experiments 1000000000000": "--experiments: '1000000000000' is not a whole",
         "--out x --seed -1": "--seed: '-1' is not a whole number from 0 on",
         "--out x --formats gif": "--formats: 'gif' is not one or more of png, pdf, svg",
+        "--out=": "--out: '' is not a name",
         "--out x --amplitude 0": "--amplitude: '0' is not a positive number",
     },
     "identify x.csv --out x --input u --outputs y": {
