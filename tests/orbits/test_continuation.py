@@ -145,25 +145,6 @@ def test_a_parameter_of_a_part():
 
 
 @pytest.mark.slow
-def test_period_doubling_of_the_buck_converter():
-    """Numbers as in tests/models/test_gallery.py."""
-    cycle = hj.find_limit_cycle(m.BuckConverter())
-    branch = hj.continuation(cycle, "Vin", (20.0, 25.0, 26.0))
-    (flip,) = branch.find("flip")
-    np.testing.assert_allclose(flip.value, 24.5165728285634, rtol=1e-12)
-    np.testing.assert_allclose(flip.multipliers, [-1, -0.679194871126936], rtol=1e-9)
-    state = branch[flip.index].state
-    np.testing.assert_allclose(
-        [state["v"], state["i"]], [12.0277089452064, 0.608084287838342], rtol=1e-10
-    )
-    (k,) = np.flatnonzero(branch.values == 25.0)
-    np.testing.assert_allclose(
-        branch.multipliers[k], [-1.09293543528951, -0.621440982876560], rtol=1e-9
-    )
-    assert branch.stable[: flip.index].all() and not branch.stable[flip.index + 1 :].any()
-
-
-@pytest.mark.slow
 def test_period_2_of_the_buck_converter():
     """It ends in the flip of the cycle of period 1, where the two halves change places."""
     buck = m.BuckConverter(Vin=25.0)

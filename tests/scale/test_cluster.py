@@ -18,7 +18,7 @@ import hybridjax as hj
 distributed = pytest.importorskip("distributed")
 pytest.importorskip("zarr")
 
-DRAWS = 40
+DRAWS = 24
 
 
 class Plane(hj.Chart):
@@ -40,7 +40,7 @@ class Driven(hj.HybridSystem):
 
 def walk(rng):
     """A random computation that takes a while."""
-    time.sleep(0.05)
+    time.sleep(0.02)
     steps = rng.normal(size=(100, 2)).cumsum(axis=0)
     return {"end": steps[-1], "far": np.abs(steps).max()}
 
