@@ -17,7 +17,7 @@ from jaxtyping import Complex, Float, Inexact, Int
 from ..errors import DefinitionError
 from ..linear.htf import HTF
 from .denominator import Covariance, chi, inverse_of_remainder, sandwich
-from .descent import NO_LEADING_COEFFICIENT, ROUNDING, Coefficients, Minimum, least_squares
+from .descent import NO_LEADING_COEFFICIENT, ROUNDING, Coefficients, least_squares
 
 
 # Decimal digits to which weights must agree (up to a factor) to be solved for together. More: a
@@ -157,9 +157,9 @@ def delayed_responses(
 
 
 def maximum_likelihood(
-    groups: list[HTFGroup], order: int, max_steps: int, start: Coefficients | None = None
-) -> Minimum:
-    """Return the coefficients with the smallest misfit.
+    groups: list[HTFGroup], order: int, start: Coefficients | None = None
+) -> tuple[Coefficients, bool]:
+    """Return the coefficients with the smallest misfit, and whether they are a minimum.
 
     **Arguments:** `start`: where the descent starts. Default: the solution of the linearized
     problem.
@@ -170,9 +170,7 @@ def maximum_likelihood(
         jacobian = np.concatenate([p.jacobian.reshape(order, -1) for p in parts], axis=1)
         return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
 
-    return least_squares(
-        linearize, _linearized(groups, order) if start is None else start, max_steps
-    )
+    return least_squares(linearize, _linearized(groups, order) if start is None else start)
 
 
 def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
@@ -239,6 +237,12 @@ def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"
     q, triangle = group.numerator_space(c)
     target = group.weighted(c, chi(group.period_delay, c)[:, None] * group.data)
     return group.to_powers @ np.linalg.solve(triangle, q.conj().T @ target) / group.scale
+
+
+def grouped(htf: HTF, order: int, overhang: int | None) -> list[HTFGroup]:
+    """Group all entries of the HTFs, weighted by their variances, for so many multipliers."""
+    size = numerator_size(htf, order, overhang)
+    return group_htf(htf, error_weights(htf, check_values(htf)), size)
 
 
 def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> list[HTFGroup]:
@@ -408,14 +412,16 @@ def _product_of_factors(
     return size[same] * by_line
 
 
-def require_frequencies(htf: HTF, order: int, size: int) -> None:
-    """Check that the frequencies determine numerators of `size` coefficients and the multipliers.
+def numerator_size(htf: HTF, order: int, overhang: int | None) -> int:
+    """Return how many coefficients each numerator has; `overhang` as of `fit_multipliers`.
 
-    **Raises:** `DefinitionError` for too few.
+    **Raises:** `DefinitionError` for too few frequencies to determine them and the multipliers.
     """
-    harmonics = {m % htf.n_sections for m in htf.harmonics}
+    N = htf.n_sections
+    size = order * N + (N if overhang is None else overhang) + 1
+    harmonics = {m % N for m in htf.harmonics}
     # Half of a pair, or a harmonic that is its own mirror image, has half as many coefficients.
-    unknown = [size if -m % htf.n_sections in harmonics else 2 * size for m in harmonics]
+    unknown = [size if -m % N in harmonics else 2 * size for m in harmonics]
     entries = len(htf.outputs) * len(htf.inputs)
 
     def enough(frequencies: int) -> bool:
@@ -427,6 +433,7 @@ def require_frequencies(htf: HTF, order: int, size: int) -> None:
             f"{order} multipliers: {next(filter(enough, count()))} or more are needed. Measure "
             "more, or lower `order` or `overhang`."
         )
+    return size
 
 
 def error_spectrum(
