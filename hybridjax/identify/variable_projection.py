@@ -253,12 +253,13 @@ def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> li
     """
     row_of = {m % htf.n_sections: row for row, m in enumerate(htf.harmonics)}
     opposite = {row: row_of.get(-m % htf.n_sections) for m, row in row_of.items()}
-    real = [row for row, other in opposite.items() if other == row]
-    pairs = [(other, row) for row, other in opposite.items() if other is not None and row < other]
-    single = [row for row, other in opposite.items() if other is None]
-    groups = _groups(htf, weight, size, real, None, real=True)
-    groups += _groups(htf, weight, size, [p for p, _ in pairs], [n for _, n in pairs], real=False)
-    return groups + _groups(htf, weight, size, single, None, real=False)
+    pairs = {other: row for row, other in opposite.items() if other is not None and row < other}
+    kinds = (
+        ([row for row, other in opposite.items() if other == row], None, True),
+        (list(pairs), list(pairs.values()), False),
+        ([row for row, other in opposite.items() if other is None], None, False),
+    )
+    return [group for kind in kinds if kind[0] for group in _groups(htf, weight, size, *kind)]
 
 
 def _groups(
@@ -270,8 +271,6 @@ def _groups(
     real: bool,
 ) -> list[HTFGroup]:
     """Return harmonics whose numerators solve the same problem, one group for each weight."""
-    if not rows:
-        return []
     f = np.asarray(htf.f)
     F, ny, nu = len(f), len(htf.outputs), len(htf.inputs)
 
@@ -284,10 +283,8 @@ def _groups(
 
     powers = np.exp(-2j * np.pi / htf.n_sections * f[:, None] * np.arange(size))
     powers, delay = both(powers, powers.conj()), np.exp(-2j * np.pi * f)
-    basis, to_powers = powers_basis(
-        np.concatenate([np.real(powers), np.imag(powers)]) if real else powers
-    )
-
+    powers = np.concatenate([np.real(powers), np.imag(powers)]) if real else powers
+    basis, to_powers = powers_basis(powers)
     weights, data = entries(weight), entries(np.asarray(htf.H))
     scale = weights[0]
     shape = weights / scale
@@ -390,7 +387,7 @@ def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
 def weights_of(
     variance: Float[np.ndarray, "... ny _"], rms: Float[np.ndarray, " ny"]
 ) -> Float[np.ndarray, "... ny _"]:
-    """Return one over the standard deviation of real and imaginary part of these variances."""
+    """Return one over the standard deviation of real and imaginary part."""
     return np.sqrt(2 / np.maximum(variance, (SMALLEST_ERROR * rms[:, None]) ** 2))
 
 
