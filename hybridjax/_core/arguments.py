@@ -32,6 +32,19 @@ def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ..
     return tuple(given)
 
 
+def input_and_output_names(
+    inputs: Collection[str] | None, outputs: Collection[str] | None, nu: int, ny: int
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """`names` of nu inputs and of ny outputs.
+
+    **Raises:** `DefinitionError` as `names`, and for an output that is an input.
+    """
+    u, y = names("inputs", inputs, nu), names("outputs", outputs, ny)
+    if shared := [name for name in y if name in u]:
+        raise DefinitionError(f"'{shared[0]}' is in `inputs` and in `outputs`: rename one of them.")
+    return u, y
+
+
 def require_same(
     what: str, a: Any, b: Any, fields: Iterable[str] = ("n_sections", "inputs", "outputs")
 ) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Order, Positive, Seed
+from .._core.boundary.kinds import Count, OptionalNames, Order, Positive, Seed
 from .._core.execution import one_blas_thread
 from .._core.html import card, multiplier_table, table, text
 from .._core.progress import working
@@ -85,6 +85,7 @@ class Study(eqx.Module):
       the expected squared distance from the true one).
     - `goal`: the multipliers of interest, estimated by `fit_multipliers`. Default: all.
     - `limit`: as in `optimal_design`, relative to `first`. Default: rms of the input as in `first`.
+    - `outputs`: names of outputs that will be recorded and that `limit` names. Default: none.
     - `seed`: of phases and division of all blocks but the first. Default: 0.
 
     **Raises:** `DefinitionError` for several inputs, other estimators, and a limit of strides.
@@ -106,6 +107,7 @@ class Study(eqx.Module):
         *,
         goal: Multipliers | None = None,
         limit: Limit = "input",
+        outputs: OptionalNames = (),
         seed: Seed = 0,
     ):
         if len(first.input_names) > 1:
@@ -128,6 +130,13 @@ class Study(eqx.Module):
                 "`limit` limits the strides, but a study ends at a precision: end it yourself."
             )
         limits.require_inputs(first.input_names)
+        signals = (*first.input_names, *outputs)
+        named = () if isinstance(limits.rms, str) else limits.rms
+        if unknown := [n for n in named if n not in signals]:
+            raise DefinitionError(
+                f"`limit` has '{unknown[0]}', but the signals are {', '.join(signals)}: if it is "
+                "an output that will be recorded, name it in `outputs`."
+            )
         Candidates.of(first)
         self.first, self.order, self.standard_error = first, order, standard_error
         self.goal, self.limit, self.seed = goal, limit, seed

@@ -1,8 +1,10 @@
 """The estimate of the multipliers from all blocks of a study, whose noise is unknown."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -59,8 +61,14 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     H = np.concatenate([sums.along[:, 0] for sums in each], axis=0).swapaxes(0, 1) / power
     variance = np.broadcast_to((N * P / repeats / power)[..., None], (*H.shape, 1))
     names = data.inputs, data.outputs
-    htf = HTF(f / P, H[..., None], each[0].harmonics, N, *names, variance=variance)
+    htf = _repeated(f / P, H[..., None], each[0].harmonics, N, *names, variance=variance)
     return Block(htf, data.u.shape[0] * data.u.shape[1] // N)
+
+
+def _repeated(f: Float[np.ndarray, " F"], *about: Any, variance: Any) -> HTF:
+    """Return HTFs in which frequencies occur several times, measured each time on their own."""
+    htf = HTF(np.arange(len(f)), *about, variance=variance)
+    return eqx.tree_at(lambda htf: htf.f, htf, jnp.asarray(f))
 
 
 class Estimate(NamedTuple):
@@ -101,7 +109,7 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     def grouped() -> tuple[HTF, list[HTFGroup]]:
         """Return all lines of all blocks, one after the other, with their variances."""
         each = [htf.variance * std[:, None] ** 2 for htf, std in zip(htfs, noise, strict=True)]
-        htf = HTF(
+        htf = _repeated(
             f, H, first.harmonics, first.n_sections, first.inputs, first.outputs,
             variance=np.concatenate(each, axis=1),
         )  # fmt: skip

@@ -27,6 +27,7 @@ from .variable_projection import (
     error_spectrum,
     error_weights,
     group_htf,
+    line_variances,
     maximum_likelihood,
     misfit_of,
     numerators_of,
@@ -130,7 +131,8 @@ def fit_multipliers(
     **Arguments:**
 
     - `htf`: exact or estimated. Without variances each output is weighted by its residuals, whose
-      spectrum is modeled as white noise plus noise filtered by the system.
+      spectrum is modeled as white noise plus noise filtered by the system, and frequencies by the
+      power of their inputs (`htf.power`).
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model whose rank it is.
       `select_order` helps to find it.
     - `harmonics`: the harmonics to fit. Default: all of `htf`.
@@ -164,7 +166,7 @@ def fit_multipliers(
     c, converged = maximum_likelihood(groups, order, max_steps)
     if htf.variance is None:
         for _ in range(_REWEIGHTINGS):
-            variance = error_spectrum(groups, c, f, len(rms))[..., None]
+            variance = error_spectrum(groups, c, f, line_variances(htf), len(rms))
             groups = group_htf(htf, np.broadcast_to(weights_of(variance, rms), H.shape), size)
             c, converged = maximum_likelihood(groups, order, max_steps, c)
     covariance, cost, freedom = summarize(groups, c, errors)

@@ -350,8 +350,8 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
             m, k, i, _ = (int(x) for x in bad[0])
             raise DefinitionError(
                 f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = "
-                f"{float(htf.f[k]):g} is not a positive number; leave this frequency out, or give "
-                "HTFs without variances."
+                f"{float(htf.f[k]):g} is not a positive number: estimate it from several "
+                "realizations (`Design.realizations`) or windows (`repeats` of estimate_htf)."
             )
     return rms
 
@@ -363,15 +363,24 @@ def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, 
     by the nearest product of a factor for each frequency and one for each harmonic, up to its
     sign (which is the form for white noise and any spectrum of the input).
 
-    **Arguments:** `rms`: errors are taken as equal parts of it where there are no variances.
+    **Arguments:** `rms`: where there are no variances, errors are taken as equal parts of it, but
+    for the power of the inputs.
     """
     if htf.variance is None:
-        return np.broadcast_to(1 / rms[:, None], htf.H.shape)
+        return np.broadcast_to(1 / (rms[:, None] * np.sqrt(line_variances(htf))), htf.H.shape)
     variance = np.asarray(htf.variance)
     if htf.scatter is not None:
         freedom = np.asarray(htf.scatter.freedom)
         variance = _product_of_factors(variance, np.asarray(htf.harmonics), freedom)
     return weights_of(variance, rms)
+
+
+def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
+    """Return variances of each frequency and input by white noise, relative to their mean."""
+    if htf.power is None:
+        return np.ones((len(htf.f), 1, len(htf.inputs)))
+    variance = 1 / np.asarray(htf.power)[:, None]
+    return variance / variance.mean()
 
 
 def weights_of(
@@ -421,27 +430,33 @@ def require_frequencies(htf: HTF, order: int, size: int) -> None:
 
 
 def error_spectrum(
-    groups: list[HTFGroup], c: Coefficients, f: Float[np.ndarray, " F"], outputs: int
-) -> Float[np.ndarray, "F ny"]:
+    groups: list[HTFGroup],
+    c: Coefficients,
+    f: Float[np.ndarray, " F"],
+    lines: Float[np.ndarray, "F 1 nu"],
+    outputs: int,
+) -> Float[np.ndarray, "F ny nu"]:
     r"""Return the variance of the errors of each output, zero where the residual is zero.
 
     Noise of the sensors is taken for white; noise that drives the system has the system's poles,
-    at all harmonics. The variance of an output is therefore modeled as $a + b / |\chi|^2$.
+    at all harmonics. The variance of an output is therefore modeled as $a + b / |\chi|^2$, times
+    the variances `lines` of frequencies and inputs.
 
     This is a step of scoring towards the largest restricted likelihood (Patterson and Thompson
     1971), from the weights of the groups, which accounts for the fitted numerators.
     """
     square, expected = np.zeros((outputs, 2)), np.zeros((outputs, 2, 2))
     for group in groups:
-        parts = _components(group.period_delay, c) * group.weight**2
-        size = group.scale**2 / 2
+        relative = lines[:, 0, group.channel[:, 1]]  # (F, K), columns alike but for factors
+        parts = _components(group.period_delay, c) * group.weight**2 * relative[group.line, 0]
+        size = group.scale**2 / 2 * relative[0] / relative[0, 0]
         residual = (misfit_of(group, c).residual ** 2).sum(axis=0)
         products = _expected_products(group, c, parts)
         for k, i in enumerate(group.channel[:, 0]):
             square[i] += size[k] * (parts @ residual[:, k])
             expected[i] += size[k] ** 2 * products
     sizes = np.stack([amounts(*pair) for pair in zip(expected, square, strict=True)])
-    return (sizes @ _components(np.exp(-2j * np.pi * f), c)).T
+    return (sizes @ _components(np.exp(-2j * np.pi * f), c)).T[..., None] * lines
 
 
 def _components(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .._core.arguments import Numbers, names, require_same
+from .._core.arguments import Numbers, input_and_output_names, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
 from .._core.boundary.values import Complexes, Reals
@@ -104,6 +104,8 @@ class HTF(eqx.Module):
     - `noise_variance` (M, F, ny, nu): the part of `variance` that is noise, from repeated periods.
       The remainder is nonlinear distortion, which random phases make random. None if it is unknown.
     - `scatter`: degrees of freedom of `variance`; None if the variance is exact.
+    - `power` (F, nu): excitation of each frequency, in any unit. Fits take errors as inversely
+      proportional to it where `variance` is None. Default: the same for all.
 
     **Raises:** `DefinitionError` if these do not fit together.
     """
@@ -113,6 +115,7 @@ class HTF(eqx.Module):
     variance: Float[Array, "M F ny nu"] | None
     noise_variance: Float[Array, "M F ny nu"] | None
     scatter: Scatter | None
+    power: Float[Array, "F nu"] | None
     harmonics: tuple[int, ...] = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -132,6 +135,7 @@ class HTF(eqx.Module):
         variance: Variance | None = None,
         noise_variance: Variance | None = None,
         scatter: Scatter | None = None,
+        power: Annotated[Numbers, Reals("F nu", sign="positive")] | None = None,
     ):
         require_x64()
         self.f, self.H = from_host((f, H.astype(complex)))
@@ -142,15 +146,17 @@ class HTF(eqx.Module):
                 f"`H` has shape {shape}, but there are {len(self.harmonics)} harmonics and "
                 f"{self.f.shape[0]} frequencies (its first two axes)."
             )
+        if not is_traced(f):
+            require_distinct(np.asarray(f))
         if tuple(np.ravel(np.asarray(harmonics))) != self.harmonics:
             raise DefinitionError(f"`harmonics` must be ascending, but is {harmonics}.")
         self.n_sections = n_sections
-        self.outputs = names("outputs", outputs, shape[2])
-        self.inputs = names("inputs", inputs, shape[3])
+        self.inputs, self.outputs = input_and_output_names(inputs, outputs, shape[3], shape[2])
         self.source = source
         self.variance = _optional("variance", variance, shape)
         self.noise_variance = _optional("noise_variance", noise_variance, shape)
         self.scatter = scatter
+        self.power = _optional("power", power, (shape[1], shape[3]))
         if scatter is not None:
             _optional("scatter.freedom", scatter.freedom, self.f.shape)
             _optional("scatter.roundness", scatter.roundness, shape)
@@ -348,9 +354,12 @@ class HTF(eqx.Module):
         variance, noise = (
             None if v is None else change(v) for v in (self.variance, self.noise_variance)
         )
+        power = self.power
+        if power is not None:
+            power = change(jnp.broadcast_to(power[:, None], self.H.shape))[0, :, 0]
         return HTF(
             f, change(self.H), harmonics, self.n_sections, self.inputs, self.outputs, self.source,
-            variance=variance, noise_variance=noise, scatter=scatter,
+            variance=variance, noise_variance=noise, scatter=scatter, power=power,
         )  # fmt: skip
 
     def _circle(self, f):
@@ -382,6 +391,13 @@ class HTF(eqx.Module):
         f, H = f[order], H[:, order]
         turns = np.concatenate([f - self.n_sections, f, f + self.n_sections])
         return turns, np.tile(H, (1, 3, 1, 1))
+
+
+def require_distinct(f: Float[np.ndarray, " F"]) -> None:
+    """**Raises:** `DefinitionError` for a frequency that occurs twice."""
+    f = np.sort(f)
+    if len(again := np.flatnonzero(np.diff(f) < _SAME_FREQUENCY)):
+        raise DefinitionError(f"`f` holds {f[again[0]]:.10g} cycles per period twice: keep one.")
 
 
 def _optional(name: str, value: Numbers | None, shape: tuple[int, ...]) -> Array | None:

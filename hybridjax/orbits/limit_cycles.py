@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Positive
 from .._core.execution import Execution
+from .._core.executor import from_host
 from .._core.html import Curve, card, picture, table, thinned
 from .._core.memo import remembered
 from .._core.precision import require_x64
@@ -74,7 +75,8 @@ class LimitCycles(eqx.Module):
 
     def __getitem__(self, i: SupportsIndex) -> LimitCycle:
         """The cycle of system i, found or not (see its `result`)."""
-        pick = lambda tree: jax.tree_util.tree_map(lambda x: jnp.asarray(x[i]), tree)  # noqa: E731
+        take = lambda x: np.asarray(x)[i]  # (JAX compiles a program for each shape)  # noqa: E731
+        pick = lambda tree: from_host(jax.tree_util.tree_map(take, tree))  # noqa: E731
         arrays, static = eqx.partition(self.systems, eqx.is_array)
         return LimitCycle(
             eqx.combine(pick(arrays), static), self.base, pick(self.period), pick(self.anchor),

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args
@@ -16,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 
 from .._core.boundary.checked import checked
+from .._core.boundary.kinds import FilePath
 from .._core.boundary.values import Whole
 from .._core.signal import unit_of, with_unit
 from .._core.writing import Format, replacing
@@ -146,7 +146,7 @@ def label_of(name: str, labels: Mapping[str, str] | None) -> str:
     return (labels or {}).get(name, name)
 
 
-def axis_of(name: str, labels: Mapping[str, str] | None, deviation: bool = False) -> str:
+def axis_of(name: str, labels: Mapping[str, str] | None = None, *, deviation: bool = False) -> str:
     """The label of an axis for a signal, or for its deviation from the cycle, with the unit."""
     text = label_of(name, labels)
     return with_unit(rf"$\delta$ {text}" if deviation else text, unit_of(name))
@@ -160,7 +160,7 @@ def letters(axes: Any) -> None:
 
 @checked
 def save(
-    path: str | os.PathLike,
+    path: FilePath,
     plot: Plot | Figure | Axes,
     formats: Sequence[Format] = ("png",),
     dpi: Resolution = 150,

@@ -98,7 +98,11 @@ class Recording(eqx.Module):
         if unknown := set(units) - set(columns):
             text = f"there is a unit for '{min(unknown)}', but the signals are "
             raise DefinitionError(f"{where}: {text}{', '.join(columns)}.")
+        if both := set(happened) & set(columns):
+            raise DefinitionError(f"{where}: '{min(both)}' is a signal and an event: rename one.")
         happened = {key: np.sort(values[~np.isnan(values)]) for key, values in happened.items()}
+        for key, values in happened.items():
+            check_events(where, key, values, time)
         self.trials = (Trial(time, np.stack(list(columns.values()), axis=1), happened, name),)
         self.signals = tuple(columns)
         self.units = tuple(units.get(key, "") for key in columns)

@@ -97,7 +97,12 @@ def simulate_recording(
     **Raises:** `DefinitionError` as `response_function`.
     """
     check_outputs(cycle, outputs)
-    force = np.asarray(force, float)
+    force, inputs = np.asarray(force, float), cycle.structure.inputs
+    if force.shape[1] < 2 or force.shape[2] != len(inputs):
+        raise DefinitionError(
+            f"`force` has shape {force.shape}, but needs two samples or more of {len(inputs)} "
+            f"inputs ({', '.join(inputs)}): its axes are trials, samples, inputs."
+        )
     period = float(cycle.period)
     if not 1 <= rate * period * steps <= SECTIONS:
         raise DefinitionError(

@@ -33,7 +33,7 @@ def test_transfer_functions_in_a_band(model, usual):
     f = 0.2 + 0.6 * (np.arange(200) + 0.5) / 200
     size = (np.abs(model.htf(f, (0, 1)).H) ** 2).mean(axis=1).sum()
     for design, said in ((plan.usual, plan.usual_variances), (plan.design, plan.variances)):
-        fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model, direct=False)
+        fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
         variance = fit.htf(f, (0, 1)).variance.mean(axis=1)[:, 0, 0] / size
         np.testing.assert_allclose(said, variance, rtol=0.02)
 

@@ -45,6 +45,10 @@ _SETTLED_SHIFT = 1e-3
 # rounding explains (slow states multiply it by up to 1e6). Larger: stalled descents count as
 # converged; smaller: minima of exact data do not.
 _STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
+# Least decrease of the cost by the inputs, for each unknown, in units of the errors' variance (1 if
+# errors are white and nothing answers). Smaller: multipliers of noise that is filtered by the
+# system, which looks like a response. Larger: weak responses are refused.
+_ANSWERED = 5.0
 
 
 class LDTPFit(MultiplierEstimate):
@@ -174,7 +178,7 @@ def fit_ldtp(
     *,
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
-    direct: bool = True,
+    check: bool = True,
     max_steps: StepCount = 50,
 ) -> LDTPFit:
     r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model by maximum likelihood.
@@ -211,39 +215,41 @@ def fit_ldtp(
       series, as for `fit_series`.
     - `guess`: dimensions of the state at each section (or one for all): the fit starts from
       `hj.identify.realize` for HTFs, and from a subspace method for time series. Alternatively, an
-      observable initial model with these dimensions. Too few dimensions bias the multipliers:
-      compare `cost` with `freedom` where variances are known, and use `hj.validate` for time
-      series. The iteration finds a local minimum; the same checks reveal a poor one.
+      observable initial model with these dimensions; if its D is zero, D stays zero. Too few
+      dimensions bias the multipliers: compare `cost` with `freedom` where variances are known, and
+      use `hj.validate` for time series. The iteration finds a local minimum; the same checks reveal
+      a poor one.
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
-    - `direct`: whether outputs may depend on the input at their own section; if not, D = 0.
-      Default: True.
+    - `check`: whether to raise an error if outputs do not answer the inputs (not
+      with "innovations"). Default: True.
     - `max_steps`: largest number of steps. Default: 50.
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data
-    than unknowns, or records with `lead`.
+    than unknowns, outputs that do not answer the inputs, or records with `lead`.
     """
     require_x64()
     if not isinstance(data, HTF):
         return _fit_to_series(
-            PreparedRecords(data), guess, noise == "innovations", start == "free", direct, max_steps
+            PreparedRecords(data), guess, noise == "innovations", start == "free", check, max_steps
         )
     if noise == "innovations":
         raise DefinitionError("HTFs tell nothing of innovations: give the series.")
     if start == "cycle":
         raise DefinitionError("HTFs have no start, the response is periodic: leave `start` out.")
-    return _fit_to_htf(data, guess, direct, max_steps)
+    return _fit_to_htf(data, guess, check, max_steps)
 
 
-def _fit_to_htf(htf: HTF, guess: Guess, direct: bool, max_steps: int) -> LDTPFit:
+def _fit_to_htf(htf: HTF, guess: Guess, check: bool, max_steps: int) -> LDTPFit:
     scale = check_values(htf)
+    direct = _is_direct(guess)
     if not isinstance(guess, LDTP):
         guess = realize(htf, np.array(given_dims(guess, htf.n_sections, "guess")))
     require_same("guess and data", guess, htf)
     problem = FrequencyProblem.of(htf, error_weights(htf, scale), scale)
-    model = _without_direct(PeriodicModel.of(guess, scale), direct)
+    model = PeriodicModel.of(guess, scale)
     unknowns = local_coordinates(model, direct).size
     freedom = problem.residuals - unknowns
     if freedom < 1:
@@ -259,6 +265,8 @@ def _fit_to_htf(htf: HTF, guess: Guess, direct: bool, max_steps: int) -> LDTPFit
         weight = problem.weight / np.maximum(np.sqrt(square / 2), SMALLEST_ERROR)[:, None]
         problem = problem._replace(weight=weight)
         point, converged = minimize(problem, point.model, direct, max_steps)
+    if check:
+        _require_answer(point)
     return _finished(point, converged, htf, scale, freedom)
 
 
@@ -267,7 +275,7 @@ def _fit_to_series(
     guess: Guess,
     innovations: bool,
     free_start: bool,
-    direct: bool,
+    check: bool,
     max_steps: int,
 ) -> LDTPFit:
     if records.lead:
@@ -290,7 +298,7 @@ def _fit_to_series(
         if innovations:
             columns = zip(model.A, model.C, strict=True)
             model = model._replace(K=[np.zeros((len(A), len(C))) for A, C in columns])
-    model = _without_direct(model, direct)
+    direct = _is_direct(guess)
     unknowns = local_coordinates(model, direct).size
     starts = sum(model.dims[n] for n in first) if free_start else 0
     freedom = numbers - unknowns - starts
@@ -308,6 +316,8 @@ def _fit_to_series(
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the predictions of the guess grow beyond all numbers.")
     point, converged = minimize(problem.reweighted(model), model, direct, max_steps)
+    if check and not innovations:
+        _require_answer(point)
     return _finished(point, converged, records, scale, freedom)
 
 
@@ -369,8 +379,20 @@ def minimize(
     return descend(ModelPoint(problem, model, direct), max_steps, FIRST_DAMPING)
 
 
-def _without_direct(model: PeriodicModel, direct: bool) -> PeriodicModel:
-    return model if direct else model._replace(D=[0.0 * D for D in model.D])
+def _require_answer(point: ModelPoint) -> None:
+    """**Raises:** `DefinitionError` if the inputs explain no more than unknowns do of noise."""
+    B, D = ([0.0 * x for x in matrices] for matrices in (point.model.B, point.model.D))
+    explained = point.problem.cost(point.model._replace(B=B, D=D)) - point.cost
+    if explained < _ANSWERED * point.coordinates.size:
+        raise DefinitionError(
+            "the outputs do not answer the inputs: they show nothing but noise. Look for inputs "
+            "that were not applied or not recorded with these outputs, or pass check=False."
+        )
+
+
+def _is_direct(guess: Guess) -> bool:
+    """Return whether outputs may depend on the input at their own section."""
+    return not isinstance(guess, LDTP) or bool(np.asarray(guess.D).any())
 
 
 def _finished(
@@ -430,8 +452,7 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     minimal = realize(np.asarray(model.impulse_response(lags)))
     scale = check_values(exact)
     problem = FrequencyProblem.of(exact, error_weights(exact, scale), scale)
-    direct = bool(np.asarray(model.D).any())
-    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
+    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), _is_direct(model))
     c, slopes = characteristic_slopes(coordinates)
     spread = problem.linearize(coordinates).spread()
     return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)
