@@ -19,6 +19,7 @@ from ..engine.lanes import Lanes
 from ..engine.move import Options, move
 from ..engine.settings import EXPERIMENT, Settings
 from ..errors import DefinitionError
+from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..sections.families import BoundSections
 from ..sections.place import as_placed
@@ -222,7 +223,7 @@ def response_function(
     range.
     """
     placed = as_placed(cycle, sections)
-    z = placed.structure().resolve_outputs(outputs)
+    z = check_outputs(cycle, outputs)
     stepping = plan_flow(placed, accuracy)
     steps = max(_STEPS, _STEPS**2 // placed.n_sections)
     settings = dataclasses.replace(stepping.settings, max_steps=steps)
