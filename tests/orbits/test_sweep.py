@@ -40,13 +40,6 @@ def test_each_is_the_cycle_that_is_found_alone(found):
     np.testing.assert_allclose(found.multipliers[:4, 2:], 0.0, atol=1e-9)
 
 
-@pytest.mark.slow
-def test_failures_are_reported_by_index(found):
-    np.testing.assert_array_equal(found.failed, [4])
-    assert np.isnan(found.multipliers[4]).all() and np.isfinite(found.multipliers[:4]).all()
-    assert found.summary().startswith("4/5 found; #4: ")
-
-
 @pytest.fixture(scope="module")
 def wheel():
     return hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.08), section=hj.AtEvent("impact"))
