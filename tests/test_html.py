@@ -12,7 +12,8 @@ import pytest
 import hybridjax as hj
 from hybridjax._core.html import Curve, picture
 from hybridjax.orbits.continuation import Branch, BranchEnd, BranchPoint
-from hybridjax.orbits.limit_cycles import LimitCycles
+
+from .toys import many
 
 
 BYTES = 50_000  # the most that a result may take
@@ -31,18 +32,6 @@ def shown(thing):
 def model(kinematic_ldtp):
     m = kinematic_ldtp
     return hj.LDTP(m.A, m.B, m.C, m.D, m.dims, inputs="<u>", outputs=("yM & co", "vM"))
-
-
-def many(cycle, n):
-    """So many times the same cycle."""
-    arrays, rest = eqx.partition(cycle, eqx.is_array)
-    arrays = jax.tree_util.tree_map(lambda x: np.broadcast_to(x, (n, *x.shape)), arrays)
-    c = eqx.combine(arrays, rest)
-    return LimitCycles(
-        c.system, c.base, c.period, c.anchor, c.legs, c.factors, c.residual, c.iterations,
-        c.result, np.broadcast_to(c.event_sequence, (n, 2)), cycle.settings, c.conserved,
-        c.multiplicity,
-    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -135,7 +135,7 @@ def flow_batch(
     (lanes, result), (y, ok, shares) = jax.lax.scan(section, begin, xs)
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
-    error = ROUNDING + jnp.max(each_turn, axis=0)
+    error = ROUNDING + plan.least + jnp.max(each_turn, axis=0)
     end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
     return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T)
 
