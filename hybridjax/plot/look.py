@@ -146,7 +146,7 @@ def label_of(name: str, labels: Mapping[str, str] | None) -> str:
     return (labels or {}).get(name, name)
 
 
-def axis_of(name: str, labels: Mapping[str, str] | None, deviation: bool = False) -> str:
+def axis_of(name: str, labels: Mapping[str, str] | None = None, *, deviation: bool = False) -> str:
     """The label of an axis for a signal, or for its deviation from the cycle, with the unit."""
     text = label_of(name, labels)
     return with_unit(rf"$\delta$ {text}" if deviation else text, unit_of(name))

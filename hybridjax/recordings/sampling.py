@@ -268,7 +268,7 @@ def without_drift(
             middle, level = cycle_means(
                 trial, smoothing.without_spikes(values[:, k]), stretches, phase.period
             )
-            if len(middle) >= FEWEST:
+            if len(middle) >= FEWEST and cycles < np.inf:  # (a constant drift is the mean)
                 slow = spline(middle, level - level.mean(), 0.5 / (cycles * phase.period))
                 values[:, k] -= slow(np.clip(trial.time, middle[0], middle[-1]))
         trials.append(replace(trial, values=values))

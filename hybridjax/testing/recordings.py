@@ -19,6 +19,7 @@ from .._core.signal import unit_of
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..experiments.response import ResponseFunction, response_function
+from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording
 from ..sections.families import ClockPhase
@@ -96,7 +97,7 @@ def simulate_recording(
 
     **Raises:** `DefinitionError` as `response_function`.
     """
-    cycle.structure.resolve_outputs(outputs)
+    check_outputs(cycle, outputs)
     force, inputs = np.asarray(force, float), cycle.structure.inputs
     if force.shape[1] < 2 or force.shape[2] != len(inputs):
         raise DefinitionError(

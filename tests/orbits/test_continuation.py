@@ -50,8 +50,8 @@ def test_fold_and_flip_of_the_juggler(juggling):
         again = hj.find_limit_cycle(cycle.system, cycle)
         np.testing.assert_allclose(again.anchor.q, cycle.anchor.q, rtol=1e-11)
 
-    ax = hj.plot.branch(branch, output="v", labels={"A": "amplitude"}).ax
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("amplitude (m)", "largest v (m/s)")
+    ax = hj.plot.branch(branch, output="v").ax
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("A (m)", "largest v (m/s)")
     lines = [x for x in ax.get_lines() if len(x.get_xdata()) > 1]
     assert [x.get_linestyle() for x in lines] == ["--", "-", "--"]
     rows = (0, *(x.index for x in branch.points), len(branch) - 1)
