@@ -1,6 +1,7 @@
 """Recordings whose truth is known, to try a method before an animal is measured."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -18,8 +19,9 @@ from .._core.signal import unit_of
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..experiments.response import ResponseFunction, response_function
+from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
-from ..recordings.recording import Recording, Trial
+from ..recordings.recording import Recording
 from ..sections.families import ClockPhase
 from ..systems.system import OutputNames
 
@@ -95,7 +97,7 @@ def simulate_recording(
 
     **Raises:** `DefinitionError` as `response_function`.
     """
-    cycle.structure.resolve_outputs(outputs)
+    check_outputs(cycle, outputs)
     force, inputs = np.asarray(force, float), cycle.structure.inputs
     if force.shape[1] < 2 or force.shape[2] != len(inputs):
         raise DefinitionError(
@@ -176,8 +178,8 @@ def spoil(
         if gap is not None:
             y[(time >= gap[0]) & (time < gap[1])] = np.nan
         values[:, columns] = y
-        trials.append(Trial(time, values, trial.events, trial.name))
-    return eqx.tree_at(lambda r: r.trials, recording, tuple(trials))
+        trials.append(replace(trial, values=values))
+    return recording.with_trials(trials)
 
 
 @checked

@@ -46,6 +46,15 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     assert fit.contains({"p": 0.5, "q": 2.0, "w": 1.0}, level=0.999)
     assert not fit.contains({"p": 0.5, "q": 2.0, "w": 1.1})
     assert abs(fit.chi_square(fit.system)) < 1e-6
+
+    def numbers(**change):
+        cycle = hj.find_limit_cycle(Oscillator(**change), oscillation)
+        return np.concatenate([np.ravel(x) for x in observed(cycle).measured]) / STD["std"]
+
+    usual = numbers()
+    J = np.stack([numbers(p=0.501) - usual, numbers(w=1.001) - usual], axis=1) / 1e-3
+    errors = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    assert fit.standard_errors[2] == pytest.approx(errors[1], rel=0.02)
     with pytest.raises(hj.DefinitionError, match="no true value of 'w'"):
         fit.contains({"p": 0.5, "q": 2.0})
     unseen = eqx.tree_at(lambda o: o.measured[1], data, np.nan * data.measured[1])
