@@ -1,7 +1,8 @@
 """Fields that jump on a limit cycle without an event, so that its multipliers would be wrong."""
 
 import math
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +13,6 @@ from jaxtyping import Float
 
 from .._core.compilation import quick_jit
 from .._core.meaning import is_of_package
-from .._core.vector_math.rewrite import jaxprs
 from ..errors import DefinitionError
 from ..systems.structure import Structure
 from .coincidence import SAME
@@ -21,7 +21,7 @@ from .cycle import LimitCycle
 
 # Operations on real numbers whose results jump. (Others decide if their results are no reals.)
 _DECISIONS = frozenset("sign floor ceil round rem atan2".split())
-_KINKS = _DECISIONS | {"max", "min", "abs", "clamp", "select_n", "cond"}
+_KINKS = re.compile(rf"= ({'|'.join(_DECISIONS)}|max|min|abs|clamp|select_n|cond)\b")
 # Smallest jump, relative to the field. Smaller: rounding is refused. Larger: multipliers may be
 # wrong by as much.
 _JUMP = 1e-9
@@ -70,14 +70,7 @@ def check_jumps(cycle: LimitCycle) -> None:
 
 def has_kinks(s: Structure) -> bool:
     """Test whether a field has operations with kinks or jumps, where many steps are rejected."""
-    return any(not _KINKS.isdisjoint(_names(_program(s, a).jaxpr)) for a in range(len(s.charts)))
-
-
-def _names(program: jex.Jaxpr) -> Iterator[str]:
-    for equation in program.eqns:
-        yield equation.primitive.name
-        for inner in jaxprs(equation.params):
-            yield from _names(inner)
+    return any(_KINKS.search(str(_program(s, a))) for a in range(len(s.charts)))
 
 
 def lines_of_decisions(s: Structure, a: int) -> list[str]:
@@ -116,16 +109,14 @@ def _jumps(s: Structure, a: int, low: Points, high: Points):
     # A decision may change and change back around an extremum of what it depends on.
     k, j = np.nonzero(begin * end < 0)
     if len(k):
-        inner = _bisect(
-            low[k], high[k], lambda x: begin[k, j] * at(x, along[k])[2][np.arange(len(k)), j] > 0
-        )[0]
-        order = np.lexsort([inner[:, 0], k])
-        low, high = np.concatenate([low, inner[order]]), np.concatenate([high, high[k[order]]])
-        start, place = np.append(np.arange(len(along)), k[order]), np.arange(len(low))
-        order = np.lexsort([place, start])
+        pick = np.arange(len(k)), j
+        rises = lambda x: begin[k, j] * at(x, along[k])[2][pick] > 0  # noqa: E731
+        extrema, _ = _bisect(low[k], high[k], rises)
+        low, high = np.concatenate([low, extrema]), np.concatenate([high, high[k]])
+        order = np.argsort(low[:, 0], kind="stable")
         low, high = low[order], high[order]
-        same = start[order][1:] == start[order][:-1]
-        high[:-1][same] = low[1:][same]
+        inside = low[1:, 0] < high[:-1, 0]
+        high[:-1][inside] = low[1:][inside]
     slow = np.abs(low[:, 1:]).max(axis=0) / (high[-1, 0] - low[0, 0])
     slow = np.pad(slow, (0, values.shape[1] - len(slow)))
     limit = _JUMP * np.maximum(np.abs(values).max(axis=0), slow)
@@ -193,10 +184,8 @@ def _step(equation: Any, given: list[Any]) -> tuple[list[Any], list[_Decision]]:
         index = jnp.clip(given[0], 0, len(ends) - 1)
         results = [jnp.stack(x)[index] for x in zip(*(x for x, _ in ends), strict=True)]
         return results, [x for _, decisions in ends for x in decisions]
-    if name == "scan":
-        return _scan(equation, given)
-    if name == "while":
-        return _while(equation, given)
+    if name in ("scan", "while"):
+        return _loop(equation, given)
     inner = next((params[x] for x in ("jaxpr", "call_jaxpr") if params.get(x) is not None), None)
     if inner is not None:
         inner = inner if hasattr(inner, "jaxpr") else jex.ClosedJaxpr(inner, ())
@@ -227,37 +216,32 @@ def _decision(equation: Any, given: list[Any], value: Any) -> _Decision:
     return _Decision(equation, value, argument)
 
 
-def _scan(equation: Any, given: list[Any]) -> tuple[list[Any], list[_Decision]]:
-    params, equations = equation.params, []
-    n, m = params["num_consts"], params["num_consts"] + params["num_carry"]
-
-    def body(carry, xs):
-        results, decisions = _interpret(params["jaxpr"], [*given[:n], *carry, *xs])
-        equations[:] = [x.equation for x in decisions]
-        parts = [(x.value, x.argument) for x in decisions]
-        return results[: m - n], (results[m - n :], parts)
-
-    carry, (ys, parts) = jax.lax.scan(
-        body, given[n:m], given[m:], params["length"], params["reverse"]
-    )
-    return [*carry, *ys], [_Decision(x, *y) for x, y in zip(equations, parts, strict=True)]
-
-
-def _while(equation: Any, given: list[Any]) -> tuple[list[Any], list[_Decision]]:
-    """A loop with one decision: a number that each of its decisions changes."""
+def _loop(equation: Any, given: list[Any]) -> tuple[list[Any], list[_Decision]]:
+    """A loop with one decision: a number that each of its decisions, and each round, changes."""
     params = equation.params
-    n, m = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
 
-    def goes_on(carry):
-        return _interpret(params["cond_jaxpr"], [*given[:n], *carry[0]])[0][0]
-
-    def body(carry):
-        results, decisions = _interpret(params["body_jaxpr"], [*given[n:m], *carry[0]])
+    def once(program, given, total):
+        results, decisions = _interpret(program, given)
         weighed = [jnp.sum(x.value * (1 + jnp.arange(x.value.size))) for x in decisions]
-        return results, 0.7 * carry[1] + 1.0 + sum(weighed)
+        return results, 0.99 * total + 1.0 + sum(weighed)
 
-    results, value = jax.lax.while_loop(goes_on, body, (given[m:], jnp.zeros(())))
-    return results, [_Decision(equation, value, jnp.zeros(()))]
+    if equation.primitive.name == "scan":
+        n, m = params["num_consts"], params["num_consts"] + params["num_carry"]
+
+        def body(carry, xs):
+            results, total = once(params["jaxpr"], [*given[:n], *carry[0], *xs], carry[1])
+            return (results[: m - n], total), results[m - n :]
+
+        begin = given[n:m], jnp.zeros(())
+        options = params["length"], params["reverse"]
+        (carry, total), ys = jax.lax.scan(body, begin, given[m:], *options)
+        results = [*carry, *ys]
+    else:
+        n, m = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+        goes_on: Any = lambda x: _interpret(params["cond_jaxpr"], [*given[:n], *x[0]])[0][0]  # noqa: E731
+        round_: Any = lambda x: once(params["body_jaxpr"], [*given[n:m], *x[0]], x[1])  # noqa: E731
+        results, total = jax.lax.while_loop(goes_on, round_, (given[m:], jnp.zeros(())))
+    return results, [_Decision(equation, total, jnp.zeros(()))]
 
 
 def _is_real(x: Any) -> bool:

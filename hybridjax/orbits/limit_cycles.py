@@ -14,7 +14,6 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Positive
 from .._core.execution import Execution
 from .._core.executor import from_host
-from .._core.html import Curve, card, picture, table, thinned
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import working
@@ -120,20 +119,6 @@ class LimitCycles(eqx.Module):
 
     def __repr__(self):
         return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
-
-    def _repr_html_(self) -> str:
-        k = thinned(len(self))
-        largest = np.abs(_multipliers(np.asarray(self.factors)[k], self.ok[k])[:, 0])
-        shown = {"period": np.asarray(self.period)[k], "largest modulus": largest}
-        rows = [
-            (name, f"{np.nanmin(x):.6g}", f"{np.nanmax(x):.6g}")
-            for name, x in shown.items()
-            if np.isfinite(x).any()
-        ]
-        ranges = table(("", "from", "to"), rows) if rows else ""
-        curve = picture([Curve(k, largest)], "system", "largest modulus of multipliers")
-        of = f"of {type(self.systems).__name__}: {self.summary(1)}"
-        return card("LimitCycles", of, ranges, curve)
 
 
 @checked
