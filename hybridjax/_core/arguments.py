@@ -57,13 +57,14 @@ def require_same(
 
 
 def package(name: str) -> ModuleType:
-    """A library.
+    """A library, or a module of one.
 
-    **Raises:** `DefinitionError` if it is not installed; extras are called like the libraries.
+    **Raises:** `DefinitionError` if it is not installed.
     """
     try:
         return importlib.import_module(name)
     except ImportError as error:
+        name = name.split(".")[0]
         extra = _EXTRAS.get(name, name)
         raise DefinitionError(
             f"this needs the package {name}, which is not installed: "
@@ -72,4 +73,5 @@ def package(name: str) -> ModuleType:
 
 
 # The extra of a library that is not called like it.
-_EXTRAS = {"pandas": "tables", "distributed": "scale", "zarr": "scale"}
+_EXTRAS = {"distributed": "scale", "zarr": "scale", "ezc3d": "c3d", "h5py": "mat", "rosbags": "ros"}
+_EXTRAS |= dict.fromkeys(("pandas", "pyarrow", "openpyxl"), "tables")

@@ -1,8 +1,10 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
+from dataclasses import replace
 from typing import Annotated
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -346,21 +348,15 @@ class HTF(eqx.Module):
 
     def _with(self, f, change, harmonics):
         """The same at other places; `change` does it to each array that is like `H`."""
-        scatter = self.scatter
+        like_H = {"H": self.H, "variance": self.variance, "noise_variance": self.noise_variance}
+        changed, scatter, power = jax.tree.map(change, like_H), self.scatter, self.power
         if scatter is not None:
             freedom = jnp.broadcast_to(scatter.freedom[:, None, None], self.H.shape)
-            roundness = None if scatter.roundness is None else change(scatter.roundness)
-            scatter = Scatter(change(freedom)[0, :, 0, 0], roundness)
-        variance, noise = (
-            None if v is None else change(v) for v in (self.variance, self.noise_variance)
-        )
-        power = self.power
+            freedom, roundness = jax.tree.map(change, (freedom, scatter.roundness))
+            scatter = Scatter(freedom[0, :, 0, 0], roundness)
         if power is not None:
             power = change(jnp.broadcast_to(power[:, None], self.H.shape))[0, :, 0]
-        return HTF(
-            f, change(self.H), harmonics, self.n_sections, self.inputs, self.outputs, self.source,
-            variance=variance, noise_variance=noise, scatter=scatter, power=power,
-        )  # fmt: skip
+        return replace(self, f=f, harmonics=harmonics, scatter=scatter, power=power, **changed)
 
     def _circle(self, f):
         """`f` modulo `N`, between `-N/2` and `N/2`."""

@@ -142,7 +142,9 @@ def natural_multipliers(
     # The first weights are those of all cycles, the others draws.
     drawn = [_resampled(moments.records, block, rng) for _ in range(_DRAWS)]
     weights = np.stack([np.ones(K), *drawn])
-    state, forward, square, cross, ahead = (_summed(weights, x) for x in moments[:5])
+    state, forward, square, cross, ahead = (
+        np.tensordot(weights, products, (1, 1)) for products in moments[:5]
+    )
     first = np.linalg.pinv(square, hermitian=True) @ np.swapaxes(cross, 2, 3)
     by_instruments = _corrected(_multipliers(ahead @ first @ np.linalg.pinv(cross @ first)), length)
     plain = _multipliers(forward @ np.linalg.inv(state))
@@ -212,13 +214,6 @@ def _moments(data: SectionData, order: int) -> _Moments:
         for part, (a, b) in zip(parts, ((x, x), (z, x), (q, q), (x, q), (z, q)), strict=True):
             part[n, cycle[at]] = a[:, :, None] * b[:, None, :]
     return _Moments._make([*parts, names[:, 0]])
-
-
-def _summed(
-    weights: Float[np.ndarray, "B K"], products: Float[np.ndarray, "N K a b"]
-) -> Float[np.ndarray, "B N a b"]:
-    """Sum over cycles, each counted as often as its weight."""
-    return np.tensordot(weights, products, (1, 1))
 
 
 def _principal(

@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize.elementwise import find_root
 
 from .._core import limits
 from .._core.boundary.checked import checked
@@ -227,17 +228,13 @@ class Recording(eqx.Module):
         for trial, x in self.samples(signal):
             curve = spline(trial.time, without_spikes(x), bandwidth)
             t, y = curve.x, sign * (curve(curve.x) - level)
-            longest = bridgeable(t, np.isfinite(t), 0.5 / bandwidth)
+            longest = bridgeable(t, 0.5 / bandwidth)
             at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & (np.diff(t) <= longest))
             if not len(at):
                 text = f"{signal} is never seen to cross {level:g}, {crossing.direction}."
                 raise DefinitionError(f"trial '{trial.name}': {text}")
-            low, high = t[at], t[at + 1]
-            for _ in range(50):  # bisections: to rounding
-                middle = (low + high) / 2
-                below = sign * (curve(middle) - level) < 0
-                low, high = np.where(below, middle, low), np.where(below, high, middle)
-            trials.append(replace(trial, events=trial.events | {event: (low + high) / 2}))
+            crossed = find_root(lambda t, curve=curve: curve(t) - level, (t[at], t[at + 1])).x
+            trials.append(replace(trial, events=trial.events | {event: crossed}))
         return self.with_trials(trials)
 
     def with_trials(self, trials: Iterable[Trial]) -> "Recording":

@@ -1,6 +1,7 @@
 """Recordings whose truth is known, to try a method before an animal is measured."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from ..errors import DefinitionError
 from ..experiments.response import ResponseFunction, response_function
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
-from ..recordings.recording import Recording, Trial
+from ..recordings.recording import Recording
 from ..sections.families import ClockPhase
 from ..systems.system import OutputNames
 
@@ -177,8 +178,8 @@ def spoil(
         if gap is not None:
             y[(time >= gap[0]) & (time < gap[1])] = np.nan
         values[:, columns] = y
-        trials.append(Trial(time, values, trial.events, trial.name))
-    return eqx.tree_at(lambda r: r.trials, recording, tuple(trials))
+        trials.append(replace(trial, values=values))
+    return recording.with_trials(trials)
 
 
 @checked

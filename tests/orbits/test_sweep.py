@@ -72,8 +72,8 @@ def test_systems_that_are_alike_or_undefined(wheel):
 def test_programs_in_threads_factorize_nothing(wheel):
     """XLA's pool would deadlock on LAPACK's calls for many matrices at once."""
     systems = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(wheel.system.slope * ONES)
-    start, period = jax.tree_util.tree_map(lambda x: x[None], (wheel.anchor, wheel.period))
-    start, period = jax.tree_util.tree_map(lambda x: jnp.repeat(x, 2, 0), (start, period))
+    repeat = lambda x: np.repeat(np.asarray(x)[None], 2, 0)  # noqa: E731
+    start, period = jax.tree_util.tree_map(repeat, (wheel.anchor, wheel.period))
     arguments = systems, wheel.return_map, start, period, jnp.array(True)
     assert not is_left_to_lapack(one_tier(batches._turn, False), *arguments)
 

@@ -92,10 +92,7 @@ def split_line(line: str, separator: str) -> list[str]:
 
 def split_names(line: str, separator: str) -> list[str]:
     """Return the fields of a line, without empty ones at its end."""
-    names = split_line(line, separator)
-    while names and not names[-1]:
-        names.pop()
-    return names
+    return split_line(line.rstrip(f"{separator} \t"), separator)
 
 
 def to_number(text: str) -> float | None:
