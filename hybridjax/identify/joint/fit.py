@@ -1,5 +1,6 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
+from contextlib import suppress
 from functools import cached_property
 from typing import Annotated, Literal, cast
 
@@ -9,7 +10,7 @@ from jaxtyping import Float
 
 from ..._core.arguments import Numbers, require_same
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Order, Scalar, StepCount, Vector
+from ..._core.boundary.kinds import Order, Scalar, Vector
 from ..._core.boundary.values import Integers
 from ..._core.precision import require_x64
 from ..._core.results import Result
@@ -130,16 +131,22 @@ class LDTPFit(MultiplierEstimate):
     ) -> Float[np.ndarray, "M F ny"]:
         """Return the spectrum of the fitted noise at the harmonics of frequencies f (F,).
 
-        See `LDTPFit.noise_spectrum`.
+        White noise with the standard deviation sigma has the spectrum sigma^2 for all f and m. The
+        variance of an H_m that is measured with a cosine of amplitude a in P periods is
+        4 S(f + m) / (N P a^2): that of `Design.expected_variance(noise=1)` times the spectrum.
 
-        **Raises:** `DefinitionError` if no noise was fitted.
+        **Arguments:** `harmonics`: Default: all N.
+
+        **Returns:** (M, F, ny), the squared unit of each output.
+
+        **Raises:** `DefinitionError` if no noise was fitted, or if it grows without bound.
         """
         if self.noise is None:
             raise DefinitionError(
                 "no noise was fitted: HTFs tell its variance at their own lines only "
                 "(`HTF.variance`); fit to series."
             )
-        return noise_spectrum(self.noise, f, harmonics)
+        return noise_spectrum(self.noise, np.atleast_1d(np.asarray(f, float)), harmonics)
 
     @property
     def predictor(self) -> Predictor | None:
@@ -179,7 +186,6 @@ def fit_ldtp(
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
     check: bool = True,
-    max_steps: StepCount = 50,
 ) -> LDTPFit:
     r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model by maximum likelihood.
 
@@ -224,7 +230,6 @@ def fit_ldtp(
       none. Default: "free".
     - `check`: whether to raise an error if outputs do not answer the inputs (not
       with "innovations"). Default: True.
-    - `max_steps`: largest number of steps. Default: 50.
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data
@@ -232,17 +237,16 @@ def fit_ldtp(
     """
     require_x64()
     if not isinstance(data, HTF):
-        return _fit_to_series(
-            PreparedRecords(data), guess, noise == "innovations", start == "free", check, max_steps
-        )
+        records, innovations = PreparedRecords(data), noise == "innovations"
+        return _fit_to_series(records, guess, innovations, start == "free", check)
     if noise == "innovations":
         raise DefinitionError("HTFs tell nothing of innovations: give the series.")
     if start == "cycle":
         raise DefinitionError("HTFs have no start, the response is periodic: leave `start` out.")
-    return _fit_to_htf(data, guess, check, max_steps)
+    return _fit_to_htf(data, guess, check)
 
 
-def _fit_to_htf(htf: HTF, guess: Guess, check: bool, max_steps: int) -> LDTPFit:
+def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
     scale = check_values(htf)
     direct = _is_direct(guess)
     if not isinstance(guess, LDTP):
@@ -258,13 +262,13 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool, max_steps: int) -> LDTPFit:
         )
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the guess is resonant at a frequency of the HTFs.")
-    point, converged = minimize(problem, model, direct, max_steps)
+    point, converged = descend(ModelPoint(problem, model, direct), FIRST_DAMPING)
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
         square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
         weight = problem.weight / np.maximum(np.sqrt(square / 2), SMALLEST_ERROR)[:, None]
         problem = problem._replace(weight=weight)
-        point, converged = minimize(problem, point.model, direct, max_steps)
+        point, converged = descend(ModelPoint(problem, point.model, direct), FIRST_DAMPING)
     if check:
         _require_answer(point)
     return _finished(point, converged, htf, scale, freedom)
@@ -276,7 +280,6 @@ def _fit_to_series(
     innovations: bool,
     free_start: bool,
     check: bool,
-    max_steps: int,
 ) -> LDTPFit:
     if records.lead:
         raise DefinitionError(
@@ -291,7 +294,7 @@ def _fit_to_series(
     same = np.tile(np.eye(ny), (N, 1, 1))
     problem = SeriesProblem(parts, same, innovations, free_start, numbers)
     if not isinstance(guess, LDTP):
-        model = subspace_model(parts, given_dims(guess, N, "guess") or [], innovations)
+        model = subspace_model(records, given_dims(guess, N, "guess") or [], innovations)
     else:
         require_same("guess and data", guess, records)
         model = PeriodicModel.of(guess, scale)
@@ -315,7 +318,8 @@ def _fit_to_series(
         )
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the predictions of the guess grow beyond all numbers.")
-    point, converged = minimize(problem.reweighted(model), model, direct, max_steps)
+    start = ModelPoint(problem.reweighted(model), model, direct)
+    point, converged = descend(start, FIRST_DAMPING)
     if check and not innovations:
         _require_answer(point)
     return _finished(point, converged, records, scale, freedom)
@@ -327,7 +331,8 @@ class ModelPoint(Point):
     def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
         self.problem, self.direct, self.model = problem, direct, model
         if isinstance(problem, FrequencyProblem):  # of series, this costs as much as a step
-            self.model = problem.refined(model, direct)
+            with suppress(np.linalg.LinAlgError):  # a resonant model stays as it is
+                self.model = problem.refined(model, direct)
         self.cost = problem.cost(self.model)
 
     @cached_property
@@ -367,16 +372,6 @@ class ModelPoint(Point):
 
     def stalled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
         return bool(gain <= _STALLED_GAIN * self.cost or np.abs(step).max() < _STALLED_STEP)
-
-
-def minimize(
-    problem: Problem, model: PeriodicModel, direct: bool, max_steps: int
-) -> tuple[ModelPoint, bool]:
-    """Return the minimum of the cost from a model on, and whether it was reached.
-
-    **Arguments:** `direct`: whether D is free.
-    """
-    return descend(ModelPoint(problem, model, direct), max_steps, FIRST_DAMPING)
 
 
 def _require_answer(point: ModelPoint) -> None:

@@ -15,8 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Scalar, Vector
 from ...errors import DefinitionError
 from ...experiments.record import Record
 from ...linear.frequency_response import Harmonics, check_harmonics
@@ -291,9 +289,8 @@ def _solve_starts(
     return np.linalg.pinv(gram, RANK, hermitian=True) @ along
 
 
-@checked
 def noise_spectrum(
-    noise: LDTP, f: Scalar | Vector, harmonics: Harmonics | None = None
+    noise: LDTP, f: Float[np.ndarray, " F"], harmonics: Harmonics | None = None
 ) -> Float[np.ndarray, "M F ny"]:
     r"""Return the spectrum of periodic noise at the harmonics of excited frequencies.
 
@@ -311,10 +308,6 @@ def noise_spectrum(
     with the adjoint $\mu[n] = C[n] + z^{-1} \mu[n+1] A[n]$ (the cyclic spectrum at cycle frequency
     zero: Gardner, Napolitano and Paura 2006). The noise of $H_m$ at f is that at f + m.
 
-    White noise with the standard deviation sigma has the spectrum sigma^2 for all f and m. The
-    variance of an H_m that is measured with a cosine of amplitude a in P periods is
-    $4 S(f + m) / (N P a^2)$: that of `Design.expected_variance(noise=1)` times the spectrum.
-
     **Arguments:**
 
     - `noise`: a stable model with any number of white inputs of variance one.
@@ -325,7 +318,6 @@ def noise_spectrum(
     **Raises:** `DefinitionError` for a model with a multiplier of modulus one or more, whose noise
     is not stationary.
     """
-    f = np.atleast_1d(np.asarray(f, float))
     N = noise.n_sections
     harmonics = check_harmonics(harmonics, N)
     if len(noise.multipliers) and np.abs(noise.multipliers[0]) >= 1:
