@@ -41,7 +41,6 @@ from .paper_report import OUTPUTS, summarize, table
 
 # Results of each family that are written: the model, HTFs and fits.
 _SAVED = ("ldtp", "exact", "estimate", "rational", "structured")
-_SYMBOLS = {"yM": "$y_M$", "vM": r"$\dot y_M$"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,9 +231,8 @@ def _draw(
 
 def _cycles(plot: Any, placed: Mapping[str, PlacedSections], perturbed: Trajectory) -> Iterator:
     """Fig. 1, for each family of sections."""
-    options = {"perturbed": perturbed, "labels": _SYMBOLS}
     for name, sections in placed.items():
-        drawn = plot.cycle(sections.cycle, *OUTPUTS, sections=sections, **options)
+        drawn = plot.cycle(sections.cycle, *OUTPUTS, sections=sections, perturbed=perturbed)
         yield f"fig1_cycle_{name}", drawn
 
 
@@ -245,9 +243,8 @@ def _comparisons(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -
     estimates: dict[str, Any] = {}
     for name, family in families.items():
         estimates |= {f"2p1z, {name}": family.rational, f"structured, {name}": family.structured}
-    deviations = {name: rf"$\delta$ {symbol}" for name, symbol in _SYMBOLS.items()}
-    yield "fig3_harmonics", plot.harmonics(pairs, labels=deviations)
-    yield "fig4_bode", plot.bodes(pairs, fits=rational, labels=deviations)
+    yield "fig3_harmonics", plot.harmonics(pairs)
+    yield "fig4_bode", plot.bodes(pairs, fits=rational)
     yield "multipliers", plot.multipliers(cycle, estimates)
     yield "poles_zeros", plot.poles_zeros(rational)
 

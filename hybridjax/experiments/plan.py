@@ -34,7 +34,6 @@ from ..sections.placed import PlacedSections
 # More: plans take longer to make.
 _EQUAL_STEPS = (1, 2, 3, 4, 6, 8)
 _TOLERANCES = (1.0, 1e-2, 1e-4)
-_FINE = (*_TOLERANCES, 1e-6)  # for implicit methods, whose estimates are rougher
 # Deviations, relative to the states' scales, for which steps are tried where inputs excite modes
 # that die out within a step: in charts with implicit methods. The first, larger: steps are shorter
 # than experiments need. Smaller: experiments far from the cycle take more. Between both, a mode is
@@ -187,8 +186,8 @@ def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]
 def _try_ways(placed: PlacedSections, settings: Settings, kicks: Float[Array, "M nu"]) -> _Ways:
     s, xp, N = placed.structure(), namespace(placed.lanes.t), placed.n_sections
     M, implicit = len(kicks), has_implicit(s)
-    equal, tolerances = ((), _FINE) if implicit else (_EQUAL_STEPS, _TOLERANCES)
-    K, most = len(equal) + len(tolerances), _EQUAL_STEPS[-1]
+    equal = () if implicit else _EQUAL_STEPS
+    K, most = len(equal) + len(_TOLERANCES), _EQUAL_STEPS[-1]
     patience = max(settings.max_steps, PATIENCE)
     following, _, target = placed.onwards()
     lead = _lead(placed, target)
@@ -197,8 +196,8 @@ def _try_ways(placed: PlacedSections, settings: Settings, kicks: Float[Array, "M
 
     # A lane for every section in each of K candidates and the reference.
     W = K + 1
-    divide = np.array([*equal, *[most] * len(tolerances), 2])
-    slack = np.array([*[np.inf] * len(equal), *tolerances, 1.0])
+    divide = np.array([*equal, *[most] * len(_TOLERANCES), 2])
+    slack = np.array([*[np.inf] * len(equal), *_TOLERANCES, 1.0])
     by_estimate = np.isfinite(slack) & (np.arange(W) < K)
     rtol = xp.where(by_estimate, settings.rtol, ROUNDING)
 

@@ -105,7 +105,6 @@ def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
     **Raises:** `DefinitionError` for one that does not exist, or is not well formed; and for an
     `Output` that does not have the period of the clock, or depends on time without one.
     """
-    cycle.require_current()
     s = cycle.structure
     z = s.resolve_outputs(outputs)
     given = [outputs] if isinstance(outputs, str | Output) else outputs

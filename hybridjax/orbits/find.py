@@ -35,6 +35,9 @@ from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_o
 # A cycle is computed again, in the sizes of its states, if a rough size was larger by more than
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
+# Steps of a piece of a turn where the default limit, which ends searches that run away, is reached.
+# Fewer: neurons have no cycle. More: vain searches last longer.
+_ENOUGH = 4096
 
 
 @checked
@@ -115,6 +118,7 @@ def find_limit_cycle(
         check_periodic(system)
     s = Structure(system)
     settings = settings.filled(LIMIT_CYCLE)
+    patient = settings.max_steps == Settings().max_steps
     if has_implicit(s) or has_kinks(s):
         settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
@@ -150,7 +154,14 @@ def find_limit_cycle(
     s.resolve_outputs(tuple(map.conserved)).require(int(np.asarray(map.anchor.chart)[0]))
     if isinstance(map.base, AtEvent):
         check_begin(map)
-    map, solution = _in_own_sizes(map, search(map), given)
+    solution = search(map, patient)
+    if patient and int(solution.result) == Result.STEP_LIMIT:
+        say("the same with more steps")
+        map = dataclasses.replace(
+            map, settings=dataclasses.replace(map.settings, max_steps=_ENOUGH)
+        )
+        solution = search(map)
+    map, solution = _in_own_sizes(map, solution, given)
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
     failure = None
     if solution.is_fixed_point and closes_early(cycle):
@@ -183,7 +194,11 @@ def _find_with_auto(system, guess, first: dict, options: dict) -> LimitCycle:
     if cycle.result != Result.OK or len(stiff) == len(cycle.system.charts()):
         return cycle
     fitting = integrated(system, dict.fromkeys(stiff, Radau()))
-    return find_limit_cycle(fitting, cycle, **options)
+    settings = options["settings"]
+    settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
+    options |= dict(settings=settings, throw=False)
+    faster = find_limit_cycle(fitting, cycle, **options)
+    return faster if faster.result == Result.OK else cycle
 
 
 def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[ReturnMap, Solution]:

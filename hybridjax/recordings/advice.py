@@ -39,8 +39,7 @@ class Advice(eqx.Module):
     **Fields:**
 
     - `warnings`: findings about the data and the fit; none if there is no reason for doubt.
-    - `plain` (d,): the multipliers from plain regression (ARX). `bias`: their distance from those
-      of the fit.
+    - `plain` (d,): the multipliers from plain regression (ARX).
     - `band`: for each input the frequency (cycles per period) up to which it had power.
     - `strides`: numbers of strides. `expected` (k, d): the standard errors of the multipliers that
       so many strides like these would give.
@@ -48,7 +47,6 @@ class Advice(eqx.Module):
 
     warnings: tuple[Finding, ...]
     plain: Complex[np.ndarray, " d"]
-    bias: float = eqx.field(static=True)
     band: tuple[float, ...] = eqx.field(static=True)
     strides: tuple[int, ...] = eqx.field(static=True)
     expected: Float[np.ndarray, "k d"]
@@ -120,7 +118,7 @@ def advise(
     later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
     with np.errstate(divide="ignore"):
         expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
-    return Advice(tuple(warnings), plain, bias, tuple(band), strides, expected)
+    return Advice(tuple(warnings), plain, tuple(band), strides, expected)
 
 
 def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:

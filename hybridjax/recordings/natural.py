@@ -258,9 +258,7 @@ def _resampled(
     weights = np.zeros(len(records))
     names, counts = np.unique(records, return_counts=True)
     if block == counts.max():
-        for record in rng.choice(names, len(names)):
-            weights[records == record] += 1.0
-        return weights
+        return 1.0 * (records[:, None] == rng.choice(names, len(names))).sum(axis=1)
     for record, count in zip(names, counts, strict=True):
         length = min(block, count)
         starts = rng.integers(0, count - length + 1, -(-count // length))

@@ -11,7 +11,7 @@ from ..errors import DefinitionError
 from ..orbits.crossing import AtEvent, Crossing
 from ..sections.families import KinematicPhase
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
-from .recording import Recording, check_events, signal_of
+from .recording import Recording, signal_of
 from .smoothing import FEWEST, Bandwidth, Series, bridgeable, gaps, inside, spline, without_spikes
 
 
@@ -212,7 +212,6 @@ def _from_events(recording: Recording, name: str) -> Phase:
             text = f"no event '{name}'; its events are: {', '.join(trial.events) or 'none'}."
             raise DefinitionError(f"trial '{trial.name}' has {text}")
         times.append(trial.events[name])
-        check_events(f"trial '{trial.name}'", name, times[-1], trial.time)
     intervals = np.concatenate([np.diff(t) for t in times])
     if len(intervals) < 2:
         raise DefinitionError(f"there are too few events '{name}' for two cycles.")
@@ -243,11 +242,9 @@ def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
     """
     period = _period(intervals)
     length = np.sort(intervals / period)
-    middle = len(length) // 2
-    above = np.flatnonzero(np.diff(length[middle:]) > 0.25)
-    below = np.flatnonzero(np.diff(length[: middle + 1]) > 0.1)
-    longest = length[middle + above[0]] if len(above) else length[-1]
-    shortest = length[below[-1] + 1] if len(below) else length[0]
+    up, down = length[len(length) // 2 :], length[len(length) // 2 :: -1]
+    longest = up[np.argmax(np.diff(up, append=np.inf) > 0.25)]
+    shortest = down[np.argmax(np.diff(down, append=-np.inf) < -0.1)]
     missed, doubled = max(1.5, 1.01 * float(longest)), min(0.5, 0.99 * float(shortest))
     if (length > missed).mean() > _COMMON:
         missed = np.inf

@@ -156,10 +156,9 @@ class Recording(eqx.Module):
                     text = f"in trial '{a}', but in '{other.unit(key)}' in '{b}': convert one."
                     raise DefinitionError(f"{key} is in '{unit}' {text}")
             order = list(map(other.column, units))
-            if order == sorted(order):
-                trials += other.trials
-            else:
-                trials += [replace(t, values=t.values[:, order]) for t in other.trials]
+            for t in other.trials:  # (signals in the same order are not copied)
+                same = order == sorted(order)
+                trials.append(t if same else replace(t, values=t.values[:, order]))
         notes = dict.fromkeys(note for other in recordings for note in other.notes)
         signals = dict(zip(units, trials[0].values.T, strict=True))
         return Recording(trials[0].time, signals, units=units, notes=[*notes]).with_trials(trials)

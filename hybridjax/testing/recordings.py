@@ -218,13 +218,11 @@ def simulate_beats(
         raise DefinitionError(f"`rhythm` must be one number or {S}, none above `rate`.")
     w = np.broadcast_to(np.asarray(rhythm, float), S)
     steps = int(np.ceil(w.max() / (rate * _STEP)))
-    h, table = 1 / (rate * steps), np.append(table, table[0])
+    h, nodes, table = 1 / (rate * steps), np.arange(n + 1) / n, np.append(table, table[0])
     rng = np.random.default_rng(seed)
 
     def at(phase):
-        place = (phase % 1.0) * n
-        low = np.minimum(place.astype(int), n - 1)
-        return table[low] + (place - low) * (table[low + 1] - table[low])
+        return np.interp(phase % 1.0, nodes, table)
 
     phase: Any = rng.uniform(size=S)
     events: list[list[float]] = [[] for _ in range(S)]

@@ -38,9 +38,9 @@ def run(t, u):
 def recording(t):
     """Sixty turns that a force disturbs a little, by the law of an oscillator."""
     z = [1.0 + 0j]
-    force = np.random.default_rng(0).normal(size=len(TIME))
+    force = np.random.default_rng(0).normal(size=121).repeat(20)[: len(TIME)]
     for f in force[:-1]:
-        z.append(z[-1] * np.exp(2j * np.pi * TIME[1] + 0.01 * (1 - abs(z[-1]) ** 2)) + 0.002 * f)
+        z.append(z[-1] * np.exp(2j * np.pi * TIME[1] + 0.01 * (1 - abs(z[-1]) ** 2)) + 0.004 * f)
     signals = {"f": force, "x": np.real(z), "v": np.imag(z)}
     return hj.Recording(TIME, signals, units={"f": "N"}).mark("strike", RISES)
 

@@ -30,13 +30,11 @@ def test_magnitude_draws_the_values(estimate, exact):
 
 
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
-    figure = hj.plot.harmonics(
-        {"isochron": (estimate, exact), "again": exact}, labels={"vM": r"$\dot y_M$"}
-    ).figure
+    figure = hj.plot.harmonics({"isochron": (estimate, exact), "again": exact}).figure
     assert isinstance(figure, Figure)
     grid = np.reshape(figure.axes, (2, 2))
     assert [ax.get_title() for ax in grid[0]] == ["isochron", "again"]
-    assert [ax.get_ylabel() for ax in grid[:, 0]] == ["$|H_m|$, yM", r"$|H_m|$, $\dot y_M$"]
+    assert [ax.get_ylabel() for ax in grid[:, 0]] == ["$|H_m|$, yM", "$|H_m|$, vM"]
     assert [ax.get_title(loc="left") for ax in grid.ravel()] == list("ABCD")
     assert sum(ax.get_legend() is not None for ax in grid.ravel()) == 1
     assert grid[0, 0].get_ylim() == grid[0, 1].get_ylim()
