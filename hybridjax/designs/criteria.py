@@ -12,6 +12,7 @@ from ..fitting.observations import ObservedHTF
 from ..identify.denominator import chi, multipliers_of
 from ..identify.joint.model import characteristic_slopes
 from ..identify.variable_projection import (
+    EQUAL_WEIGHTS,
     check_values,
     error_weights,
     numerator_size,
@@ -31,9 +32,6 @@ _EXPONENT = {"mean": 1.0, "worst": 16.0}
 # distance at which multipliers of a minimal and of the whole model are the same. Larger: distinct
 # multipliers count as one. Smaller: rounding separates equal ones.
 _SAME = 1e-6
-# Decimal digits to which the errors of two entries must agree (up to a factor) to be treated
-# together. One digit less: fewer channels, with errors that are off by as much.
-_EQUAL_WEIGHTS = 9
 
 
 def criterion_of(
@@ -190,7 +188,7 @@ def _channels(
     def add(basis: np.ndarray, factor: np.ndarray, *entries: tuple[np.ndarray, ...]) -> None:
         # (Only the shape of the factors counts: numerators take any size.)
         shape = factor / factor.max()
-        key = np.round(shape, _EQUAL_WEIGHTS).tobytes()
+        key = np.round(shape, EQUAL_WEIGHTS).tobytes()
         if key not in groups:
             shape = shape / np.tile(size_of_chi, len(shape) // len(f))
             groups[key] = powers_basis(basis)[0] * shape[:, None], []
@@ -205,7 +203,7 @@ def _channels(
                 add(powers, np.tile(w, 2), (h.real, h.imag))
                 continue
             mirror, v = slope[-m][..., i], weight[-m][:, i]
-            if np.allclose(v, w, rtol=10.0**-_EQUAL_WEIGHTS, atol=0):
+            if np.allclose(v, w, rtol=10.0**-EQUAL_WEIGHTS, atol=0):
                 even, odd = (h + mirror.conj()) / 2**0.5, (h - mirror.conj()) / 2**0.5
                 add(powers, np.tile(w, 2), (even.real, odd.imag), (even.imag, -odd.real))
                 continue

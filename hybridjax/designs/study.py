@@ -38,7 +38,6 @@ class History(NamedTuple):
     """The blocks of a study, and the results after each."""
 
     blocks: tuple[Block, ...] = ()
-    strides: Float[np.ndarray, " B"] = np.zeros(0)
     standard_errors: Float[np.ndarray, "B g"] = np.zeros((0, 0))
     estimate: Estimate | None = None
     plan: OptimalDesign | None = None
@@ -149,7 +148,7 @@ class Study(eqx.Module):
     @property
     def strides(self) -> Float[np.ndarray, " B"]:
         """Cycles of all records up to each block, with those that were discarded."""
-        return self._history.strides
+        return np.cumsum([block.strides for block in self._history.blocks]).astype(float)
 
     @property
     def standard_errors(self) -> Float[np.ndarray, "B g"]:
@@ -212,9 +211,9 @@ class Study(eqx.Module):
         errors_so_far = [*self.standard_errors, errors]
         width = max(map(len, errors_so_far))
         padded = [np.append(x, np.full(width - len(x), np.nan)) for x in errors_so_far]
-        strides = np.cumsum([block.strides for block in blocks]).astype(float)
-        plan = None if best.objection else self._next(best, errors, strides[-1], len(blocks))
-        history = History(blocks, strides, np.array(padded), best, plan)
+        strides = sum(block.strides for block in blocks)
+        plan = None if best.objection else self._next(best, errors, strides, len(blocks))
+        history = History(blocks, np.array(padded), best, plan)
         return eqx.tree_at(lambda s: s._history, self, history, is_leaf=lambda x: x is None)
 
     def _next(

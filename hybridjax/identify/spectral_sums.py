@@ -135,14 +135,10 @@ def _sums_of_part(
     lines, index = np.unique(line, return_inverse=True)
     good = data.ok[experiment]
 
-    def total(values, keep):
+    def total(values):
         """Sums over the entries of each line."""
-        values, where = values[keep], index[keep]
-        order = np.argsort(where, kind="stable")
-        begin = np.flatnonzero(np.diff(where[order], prepend=-1))
         out = np.zeros((len(lines), *values.shape[1:]), values.dtype)
-        if len(begin):
-            out[where[order][begin]] = np.add.reduceat(values[order], begin, axis=0)
+        np.add.at(out, index[good], values[good])
         return out
 
     X = np.concatenate([U, U.conj()], axis=1)
@@ -159,14 +155,14 @@ def _sums_of_part(
         harmonics,
         lines,
         needs_two_phases(lines, setup.periods, setup.n_sections),
-        gram=total(products, good),
-        count=total(np.ones(len(U), int), good),
-        along=total(X.conj()[:, :, None, None] * Y[:, None], good),
-        energy=total(np.abs(Y) ** 2, good),
-        present=total(1.0 * (size > 0), good),
-        energies=total(np.abs(turned) ** 2, good),
-        turned=total(turned**2, good),
-        noise=total(noise, good),
+        gram=total(products),
+        count=total(np.ones(len(U), int)),
+        along=total(X.conj()[:, :, None, None] * Y[:, None]),
+        energy=total(np.abs(Y) ** 2),
+        present=total(1.0 * (size > 0)),
+        energies=total(np.abs(turned) ** 2),
+        turned=total(turned**2),
+        noise=total(noise),
         crest_factors=tested,
         repeats=repeats,
         experiments=(len(data.ok), int(data.ok.sum())),

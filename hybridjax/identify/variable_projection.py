@@ -22,7 +22,7 @@ from .descent import NO_LEADING_COEFFICIENT, ROUNDING, Coefficients, least_squar
 
 # Decimal digits to which weights must agree (up to a factor) to be solved for together. More: a
 # group for each entry, which takes longer; fewer: weights that are off by as much.
-_EQUAL_WEIGHTS = 9
+EQUAL_WEIGHTS = 9
 # Weighted solutions of the linearized problem, at most, and the change of c, relative to 1 + |c|,
 # that ends them. More, smaller: a closer start, which the descent does not need.
 _MAX_REWEIGHTINGS, _SETTLED_START = 6, 1e-3
@@ -289,7 +289,7 @@ def _groups(
     scale = weights[0]
     shape = weights / scale
     _, first, which = np.unique(
-        np.round(shape, _EQUAL_WEIGHTS), axis=1, return_index=True, return_inverse=True
+        np.round(shape, EQUAL_WEIGHTS), axis=1, return_index=True, return_inverse=True
     )
     number, i, j = np.unravel_index(np.arange(len(scale)), (len(rows), ny, nu))
     channel, line = np.stack([i, j], axis=1), both(np.arange(F), np.arange(F))
