@@ -66,7 +66,7 @@ def test_linear_models_and_transfer_functions(model):
     assert page.pictures == 2 and {"H_-2", "|H|, <u> to vM"} <= {
         x.split(" (")[0] for x in page.texts
     }
-    assert shown(htf.interpolate(htf.f[:1])).pictures == 2  # of one frequency there is no curve
+    assert shown(model.htf([0.05], (0, 1))).pictures == 2  # of one frequency there is no curve
 
 
 def test_fits():

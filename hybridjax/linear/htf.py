@@ -19,7 +19,7 @@ from .._core.precision import require_x64
 from .._core.signal import ratio, with_unit
 from .._core.text import listed
 from ..errors import DefinitionError
-from .frequency_response import Frequencies, Harmonics, check_harmonics
+from .frequency_response import Harmonics, check_harmonics
 
 
 @checked
@@ -67,9 +67,6 @@ class Scatter(eqx.Module):
 # Distance in cycles per period up to which two frequencies are the same. Smaller: rounding makes
 # them different. Larger: lines of very long designs coincide.
 _SAME_FREQUENCY = 1e-9
-# Widest gap between frequencies that is interpolated, in widest steps between frequencies that were
-# measured. Larger: errors of the spline grow as its fourth power. Smaller: single gaps are refused.
-_WIDEST_GAP = 2
 Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=True)]
 
 # Outputs, and harmonics (the largest ones), that a notebook shows. More: larger pages. Fewer: parts
@@ -206,7 +203,11 @@ class HTF(eqx.Module):
         """The same with fewer harmonics."""
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
-        return self._with(self.f, lambda x: x[rows], harmonics)
+        arrays = {"H": self.H, "variance": self.variance, "noise_variance": self.noise_variance}
+        roundness = None if self.scatter is None else self.scatter.roundness
+        arrays, roundness = jax.tree.map(lambda x: x[rows], (arrays, roundness))
+        scatter = None if self.scatter is None else Scatter(self.scatter.freedom, roundness)
+        return replace(self, harmonics=harmonics, scatter=scatter, **arrays)
 
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
@@ -227,52 +228,6 @@ class HTF(eqx.Module):
         if self.scatter is None:
             return jnp.sqrt(-np.log1p(-level) * self.variance)
         return jnp.sqrt(self.scatter.quantile(level) * self.variance)
-
-    def interpolate(self, f: Frequencies) -> "HTF":
-        """The HTFs at other frequencies, by cubic splines between neighbors (host side).
-
-        If the harmonics are symmetric about 0, the symmetry for real signals adds the negative
-        frequencies as neighbors, so that `f = 0` and `f = N/2` can be had too.
-
-        **Arguments:** `f` (F,), cycles per period.
-
-        Variances are interpolated linearly, which is on the safe side: a spline averages.
-
-        **Raises:** `DefinitionError` if a frequency lies in a gap more than twice as wide as the
-        widest step between the frequencies given (or outside them all).
-        """
-        from scipy.interpolate import CubicSpline, make_interp_spline  # (a quarter of a second)
-
-        if is_traced(self.f, self.H, f):
-            raise DefinitionError("`interpolate` works on the host, not inside jit or derivatives.")
-        wanted = np.atleast_1d(f)
-        knots, values = self._neighbors(self.H)
-        given = np.unique(self.f)
-        if len(given) < 2:
-            raise DefinitionError("Interpolation needs at least two frequencies.")
-        step = np.diff(given)
-        widest = _WIDEST_GAP * step[step > _SAME_FREQUENCY].max() + _SAME_FREQUENCY
-        ends = np.flatnonzero(np.diff(knots) > widest) + 1
-        place = np.mod(wanted, self.n_sections)
-        H = np.full((values.shape[0], len(wanted), *values.shape[2:]), np.nan, complex)
-        for run in np.split(np.arange(len(knots)), ends):
-            first, last = knots[run[[0, -1]]] + [-_SAME_FREQUENCY, _SAME_FREQUENCY]
-            inside = (place >= first) & (place <= last)
-            if len(run) > 1 and np.any(inside):
-                H[:, inside] = CubicSpline(knots[run], values[:, run], axis=1)(place[inside])
-        missing = np.isnan(H[0, :, 0, 0])
-        if np.any(missing):
-            raise DefinitionError(
-                f"f = {wanted[missing][0]:g} cycles per period is too far from the frequencies "
-                f"measured ({given[0]:g} to {given[-1]:g}) to interpolate."
-            )
-
-        def linear(values):
-            line = make_interp_spline(*self._neighbors(values), k=1, axis=1)
-            return line(place)
-
-        htf = self._with(wanted, linear, self.harmonics)
-        return eqx.tree_at(lambda x: x.H, htf, from_host(H))
 
     def predict(self, u: Annotated[Numbers, Reals("n nu")]) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
@@ -346,18 +301,6 @@ class HTF(eqx.Module):
         """The largest of `harmonic_errors`, per output."""
         return jnp.max(self.harmonic_errors(other), axis=0)
 
-    def _with(self, f, change, harmonics):
-        """The same at other places; `change` does it to each array that is like `H`."""
-        like_H = {"H": self.H, "variance": self.variance, "noise_variance": self.noise_variance}
-        changed, scatter, power = jax.tree.map(change, like_H), self.scatter, self.power
-        if scatter is not None:
-            freedom = jnp.broadcast_to(scatter.freedom[:, None, None], self.H.shape)
-            freedom, roundness = jax.tree.map(change, (freedom, scatter.roundness))
-            scatter = Scatter(freedom[0, :, 0, 0], roundness)
-        if power is not None:
-            power = change(jnp.broadcast_to(power[:, None], self.H.shape))[0, :, 0]
-        return replace(self, f=f, harmonics=harmonics, scatter=scatter, power=power, **changed)
-
     def _circle(self, f):
         """`f` modulo `N`, between `-N/2` and `N/2`."""
         return (f + self.n_sections / 2) % self.n_sections - self.n_sections / 2
@@ -373,20 +316,6 @@ class HTF(eqx.Module):
         rows = {m % self.n_sections: row for row, m in enumerate(self.harmonics)}
         mirror = [rows.get(-m % self.n_sections) for m in self.harmonics]
         return None if None in mirror else mirror
-
-    def _neighbors(self, values):
-        """Distinct frequencies on three turns of the circle of length `N`, and values there."""
-        f, H = np.asarray(self.f), np.asarray(values)
-        mirror = self._mirror()
-        if mirror is not None:
-            f, H = np.concatenate([f, -f]), np.concatenate([H, H[np.array(mirror)].conj()], axis=1)
-        f = np.mod(f, self.n_sections)
-        f[self.n_sections - f < _SAME_FREQUENCY] = 0.0
-        order = np.argsort(f, kind="stable")
-        order = order[np.diff(f[order], prepend=-1.0) > _SAME_FREQUENCY]
-        f, H = f[order], H[:, order]
-        turns = np.concatenate([f - self.n_sections, f, f + self.n_sections])
-        return turns, np.tile(H, (1, 3, 1, 1))
 
 
 def require_distinct(f: Float[np.ndarray, " F"]) -> None:

@@ -107,7 +107,6 @@ def linear(t):
     htf = t.estimate
     yield htf.__getitem__, dict(m=0)
     yield htf.select, dict(harmonics=0)
-    yield htf.interpolate, dict(f=f[:2])
     yield htf.confidence_radius, {}
     yield htf.predict, dict(u=u)
     for name in ("error", "harmonic_errors"):

@@ -105,18 +105,6 @@ def test_derivatives(synthetic):
     np.testing.assert_allclose((up - down) / 2e-6, slope, rtol=1e-6)
 
 
-def test_interpolation_fills_the_gaps(hopper):
-    step = 1 / 128
-    f = np.arange(1, 16 / step) * step
-    f = f[(2 * f) % 1 != 0]
-    wanted = np.array([0.0, 0.5, 1.0, 3.3, 16.0, -0.25])
-    sparse = hopper.htf(f).interpolate(wanted)
-    exact = hopper.htf(wanted)
-    assert np.max(sparse.error(exact)) < 1e-5  # the resonance is 0.05 cycles per period wide
-    at_grid = hopper.htf(f, (0, 1)).interpolate(f[[3, 77]])
-    assert np.max(at_grid.error(hopper.htf(f[[3, 77]], (0, 1)))) < 1e-12
-
-
 def test_a_multiplier_on_the_unit_circle_is_named():
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
     ldtp = hj.LDTP.from_blocks([turn] * 3, [np.ones((2, 1))] * 3, [np.ones((1, 2))] * 3)
