@@ -1,5 +1,6 @@
 """The cosines among which power is divided: the signals that they cause, and their measurement."""
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
@@ -195,19 +196,16 @@ def measured_htfs(
         htf = model.htf(cosines.f[members], harmonics)
         spectrum = noise.spectrum(cosines.f[members], htf.harmonics)
         variance = 2 * spectrum[..., None] / (cosines.n_sections * cosines.strides)
-        yield Measured(with_variance(htf, model, noise, variance, int(i)), members, int(i))
+        yield Measured(with_variance(htf, noise, variance, int(i)), members, int(i))
 
 
 def with_variance(
-    htf: HTF, model: Model, noise: Noise, variance: Float[np.ndarray, "M F ny 1"], channel: int
+    htf: HTF, noise: Noise, variance: Float[np.ndarray, "M F ny 1"], channel: int
 ) -> HTF:
     """Return the HTFs from one input to the measured outputs, with these variances."""
     H = np.asarray(htf.H)[:, :, noise.outputs, channel : channel + 1]
-    outputs = tuple(model.outputs[k] for k in noise.outputs)
-    return HTF(
-        htf.f, H, htf.harmonics, htf.n_sections, (model.inputs[channel],), outputs,
-        variance=variance,
-    )  # fmt: skip
+    inputs, outputs = (htf.inputs[channel],), tuple(htf.outputs[k] for k in noise.outputs)
+    return dataclasses.replace(htf, H=H, variance=variance, inputs=inputs, outputs=outputs)
 
 
 @checked

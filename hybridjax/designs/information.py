@@ -74,7 +74,7 @@ def information_map(
     htf = model.htf(design.frequencies, goal.fitted_harmonics)
     require_symmetric(htf.harmonics, htf.n_sections)
     variance = errors.spectrum(design.frequencies, htf.harmonics)[..., None]
-    htf = with_variance(htf, model, errors, variance * design.expected_variance()[:, None], 0)
+    htf = with_variance(htf, errors, variance * design.expected_variance()[:, None], 0)
 
     c = np.poly(np.asarray(model.multipliers)).real[1:]
     N, d = htf.n_sections, len(c)

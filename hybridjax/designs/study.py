@@ -94,43 +94,34 @@ class Study(eqx.Module):
     first: Design
     order: Order = eqx.field(static=True)
     standard_error: Positive = eqx.field(static=True)
-    goal: Multipliers
-    limit: Limit
-    seed: Seed = eqx.field(static=True)
-    _history: History
+    goal: Multipliers = eqx.field(default_factory=Multipliers, kw_only=True)
+    limit: Limit = eqx.field(default="input", kw_only=True)
+    outputs: OptionalNames = eqx.field(static=True, default=(), kw_only=True)
+    seed: Seed = eqx.field(static=True, default=0, kw_only=True)
+    _history: History = eqx.field(default_factory=History, kw_only=True)
 
-    def __init__(
-        self,
-        first: Design,
-        order: Order,
-        standard_error: Positive,
-        *,
-        goal: Multipliers | None = None,
-        limit: Limit = "input",
-        outputs: OptionalNames = (),
-        seed: Seed = 0,
-    ):
+    def __check_init__(self):
+        first, goal = self.first, self.goal
         if len(first.input_names) > 1:
             raise DefinitionError(
                 f"`first` has the inputs {', '.join(first.input_names)}: study one at a time."
             )
-        goal = Multipliers() if goal is None else goal
         if goal.estimator == "fit_ldtp":
             raise DefinitionError(
                 "a study estimates multipliers by fit_multipliers: `goal` may have no other "
                 "estimator."
             )
-        if goal.which is not None and goal.which >= order:
+        if goal.which is not None and goal.which >= self.order:
             raise DefinitionError(
-                f"`goal`: there is no multiplier {goal.which}, the order is {order}."
+                f"`goal`: there is no multiplier {goal.which}, the order is {self.order}."
             )
-        limits = as_limits(limit)
+        limits = as_limits(self.limit)
         if limits.strides is not None:
             raise DefinitionError(
                 "`limit` limits the strides, but a study ends at a precision: end it yourself."
             )
         limits.require_inputs(first.input_names)
-        signals = (*first.input_names, *outputs)
+        signals = (*first.input_names, *self.outputs)
         named = () if isinstance(limits.rms, str) else limits.rms
         if unknown := [n for n in named if n not in signals]:
             raise DefinitionError(
@@ -138,9 +129,6 @@ class Study(eqx.Module):
                 "an output that will be recorded, name it in `outputs`."
             )
         Candidates.of(first)
-        self.first, self.order, self.standard_error = first, order, standard_error
-        self.goal, self.limit, self.seed = goal, limit, seed
-        self._history = History()
 
     @property
     def blocks(self) -> int:
@@ -173,9 +161,7 @@ class Study(eqx.Module):
     def noise(self) -> dict[str, float]:
         """Standard deviation of each output's noise (and distortion) in the last block, by name."""
         estimate = self._history.estimate
-        if estimate is None:
-            return {}
-        return dict(zip(estimate.fit.outputs, estimate.noise[-1].tolist(), strict=True))
+        return {} if estimate is None else estimate.last_noise
 
     @property
     def done(self) -> bool:
@@ -235,11 +221,10 @@ class Study(eqx.Module):
         self, best: Estimate, errors: Float[np.ndarray, " g"], strides: float, blocks: int
     ) -> OptimalDesign:
         """Return the design for the missing strides."""
-        noise = dict(zip(best.fit.outputs, best.noise[-1].tolist(), strict=True))
 
         def planned(limit: Limit) -> OptimalDesign:
             return optimal_design(
-                best.fit, self.first, goal=self.goal, limit=limit, noise=noise,
+                best.fit, self.first, goal=self.goal, limit=limit, noise=best.last_noise,
                 seed=self.seed + blocks,
             )  # fmt: skip
 
@@ -314,7 +299,5 @@ def _student(fit: StructuredFit) -> float:
     """Return the ratio of Student's to Gaussian intervals of the fit."""
     from scipy import special  # (a fifth of a second)
 
-    if np.isinf(fit.covariance_freedom):
-        return 1.0
     tail = (1 + _LEVEL) / 2
     return float(special.stdtrit(fit.covariance_freedom, tail) / special.ndtri(tail))

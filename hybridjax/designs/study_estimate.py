@@ -1,7 +1,7 @@
 """The estimate of the multipliers from all blocks of a study, whose noise is unknown."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -55,14 +55,10 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     H = np.concatenate([sums.along[:, 0] for sums in each], axis=0).swapaxes(0, 1) / power
     variance = np.broadcast_to((N * P / repeats / power)[..., None], (*H.shape, 1))
     names = data.inputs, data.outputs
-    htf = _repeated(f / P, H[..., None], each[0].harmonics, N, *names, variance=variance)
+    htf = HTF(np.arange(len(f)), H[..., None], each[0].harmonics, N, *names, variance=variance)
+    # Frequencies may occur several times, measured each time on their own.
+    htf = eqx.tree_at(lambda htf: htf.f, htf, jnp.asarray(f / P))
     return Block(htf, data.u.shape[0] * data.u.shape[1] // N)
-
-
-def _repeated(f: Float[np.ndarray, " F"], *about: Any, variance: Any) -> HTF:
-    """Return HTFs in which frequencies occur several times, measured each time on their own."""
-    htf = HTF(np.arange(len(f)), *about, variance=variance)
-    return eqx.tree_at(lambda htf: htf.f, htf, jnp.asarray(f))
 
 
 class Estimate(NamedTuple):
@@ -75,6 +71,11 @@ class Estimate(NamedTuple):
     """Standard deviation of each output's noise in each block."""
     objection: str
     """The reason to reject the order; empty if the data support it."""
+
+    @property
+    def last_noise(self) -> dict[str, float]:
+        """The noise in the last block, by the outputs' names."""
+        return dict(zip(self.fit.outputs, self.noise[-1].tolist(), strict=True))
 
 
 def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estimate:

@@ -335,15 +335,13 @@ def select_order(
     if noise.max() < ROUNDING:  # rounding errors differ by orders of magnitude
         values = values / _ROUNDING_VARIES
 
-    costs, freedoms, parameters = [], [], []
+    costs, freedoms = [], []
     for d in range(max_order + 1):
         groups = group_htf(htf, weights, size - (max_order - d) * htf.n_sections)
         c = maximum_likelihood(groups, d)[0] if d else np.zeros(0)
         costs.append(sum(float((misfit_of(g, c).residual ** 2).sum()) for g in groups))
         freedoms.append(sum(g.freedom * g.size for g in groups) - d)
-        parameters.append(sum((2 * len(g.period_delay) - g.freedom) * g.size for g in groups) + d)
-    cost, freedom, count = np.array(costs), np.array(freedoms), np.array(parameters)
-    data = int(freedom[0] + count[0])
+    cost, freedom, data = np.array(costs), np.array(freedoms), 2 * htf.H.size
     level, tails = _estimated_noise(htf, cost[-1] / freedom[-1])
     likelihood = data * np.log(np.maximum(cost, 1e-300)) if htf.variance is None else cost / level
     left = values[::-1] / level
@@ -354,7 +352,7 @@ def select_order(
         threshold=np.array([_largest_of_noise(max_order + 1 - d) for d in range(max_order + 1)]),
         cost=cost,
         freedom=freedom,
-        mdl=likelihood + np.log(data) * count,
+        mdl=likelihood + np.log(data) * (data - freedom),
         variances=htf.variance is not None,
     )
 

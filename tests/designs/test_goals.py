@@ -124,7 +124,7 @@ def test_several_models(robust, exponent):
     limited = hj.optimal_design(models, usual, **about).design
     data = [hj.experiments.simulate_experiments(m, limited, start="periodic").y for m in models]
     assert max(np.sqrt(np.mean(y**2)) for y in data) == pytest.approx(0.1, rel=1e-2)
-    with pytest.raises(hj.DefinitionError, match="model 1 has other n_sections than model 0"):
+    with pytest.raises(hj.DefinitionError, match="model 1 and model 0 have different n_sections"):
         hj.optimal_design([models[0], hj.testing.synthetic_ldtp()], usual)
     with pytest.raises(hj.DefinitionError, match="holds no model"):
         hj.optimal_design([], usual)

@@ -14,8 +14,7 @@ from ..._core.boundary.kinds import Order, Scalar, Vector
 from ..._core.boundary.values import Integers
 from ..._core.precision import require_x64
 from ..._core.results import Result
-from ..._core.signal import unit_of
-from ..._core.text import number
+from ..._core.text import numbers
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, all_harmonics, check_harmonics
@@ -90,17 +89,9 @@ class LDTPFit(MultiplierEstimate):
     def unknowns(self) -> int:
         return self._coordinates.size
 
-    @property
-    def n_sections(self) -> int:
-        return self.model.n_sections
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        return self.model.inputs
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return self.model.outputs
+    n_sections = property(lambda self: self.model.n_sections)
+    inputs = property(lambda self: self.model.inputs)
+    outputs = property(lambda self: self.model.outputs)
 
     @checked
     def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
@@ -160,7 +151,7 @@ class LDTPFit(MultiplierEstimate):
             D=[size * x for x in model.D],
             K=[K / size.T if K.shape[1] else K for K in model.K],
         )
-        return Predictor(model, D @ D.swapaxes(1, 2), self.inputs, self.outputs)
+        return Predictor(model, D @ D.swapaxes(1, 2))
 
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
@@ -172,9 +163,7 @@ class LDTPFit(MultiplierEstimate):
             )
         if self.noise is not None:
             size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
-            each = zip(self.outputs, size, strict=True)
-            shown = ", ".join(f"{name} {number(x, 3, unit_of(name))}" for name, x in each)
-            about = f"errors one step ahead {shown}"
+            about = f"errors one step ahead {numbers(self.outputs, size)}"
         return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
 
 

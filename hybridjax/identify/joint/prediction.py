@@ -362,12 +362,6 @@ class Predictor(NamedTuple):
     model: PeriodicModel
     S: Float[np.ndarray, "N ny ny"]
     """Covariances of the innovations."""
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-
-    @property
-    def n_sections(self) -> int:
-        return self.model.n_sections
 
     @property
     def dims(self) -> list[int]:
@@ -375,7 +369,7 @@ class Predictor(NamedTuple):
 
     def predict(self, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
-        part = SeriesPart.of(CycleGrid.from_records([record]), np.ones(len(self.outputs)))
+        part = SeriesPart.of(CycleGrid.from_records([record]), np.ones(self.S.shape[1]))
         path = SeriesProblem([part], self.S, True, free_start, 0).path(self.model, part)
         expected = [
             x @ C.T + u @ D.T
@@ -383,4 +377,4 @@ class Predictor(NamedTuple):
         ]
         expected = np.where(part.sampled, part.y - np.stack(path.error), np.stack(expected))
         rows = slice(record.first_section, record.first_section + len(record.u))
-        return np.moveaxis(expected[:, 0], 0, 1).reshape(-1, len(self.outputs))[rows]
+        return np.moveaxis(expected[:, 0], 0, 1).reshape(-1, self.S.shape[1])[rows]

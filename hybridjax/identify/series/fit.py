@@ -11,8 +11,7 @@ from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, Vector
 from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
-from ..._core.signal import unit_of
-from ..._core.text import number
+from ..._core.text import numbers
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, check_harmonics
@@ -118,10 +117,7 @@ class SeriesFit(MultiplierEstimate):
 
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
-        noise = ", ".join(
-            f"{name} {number(x, 3, unit_of(name))}"
-            for name, x in zip(self.outputs, self.noise, strict=True)
-        )
+        noise = numbers(self.outputs, self.noise)
         return f"noise {noise}; {self.n_sections} sections, {self.numerators.shape[1]} lags{state}"
 
 
