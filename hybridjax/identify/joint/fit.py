@@ -14,7 +14,7 @@ from ..._core.boundary.kinds import Order, Scalar, Vector
 from ..._core.boundary.values import Integers
 from ..._core.precision import require_x64
 from ..._core.results import Result
-from ..._core.text import numbers
+from ..._core.text import signal_values
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, all_harmonics, check_harmonics
@@ -163,7 +163,7 @@ class LDTPFit(MultiplierEstimate):
             )
         if self.noise is not None:
             size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
-            about = f"errors one step ahead {numbers(self.outputs, size)}"
+            about = f"errors one step ahead {signal_values(self.outputs, size)}"
         return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
 
 
@@ -286,10 +286,7 @@ def _fit_to_series(
         model = subspace_model(records, given_dims(guess, N, "guess") or [], innovations)
     else:
         require_same("guess and data", guess, records)
-        model = PeriodicModel.of(guess, scale)
-        if innovations:
-            columns = zip(model.A, model.C, strict=True)
-            model = model._replace(K=[np.zeros((len(A), len(C))) for A, C in columns])
+        model = PeriodicModel.of(guess, scale, ny if innovations else 0)
     direct = _is_direct(guess)
     unknowns = local_coordinates(model, direct).size
     starts = sum(model.dims[n] for n in first) if free_start else 0

@@ -42,8 +42,8 @@ class PeriodicModel(NamedTuple):
     """(d[n+1], ny), or without columns: then noise does not enter the state."""
 
     @classmethod
-    def of(cls, model: LDTP, scale: Float[np.ndarray, " ny"]) -> "PeriodicModel":
-        """Return an `LDTP` with outputs in units of `scale`, and with K = 0."""
+    def of(cls, model: LDTP, scale: Float[np.ndarray, " ny"], errors: int = 0) -> "PeriodicModel":
+        """Return an `LDTP` with outputs in units of `scale`, and with K = 0 of `errors` columns."""
         dims = [int(d) for d in np.asarray(model.dims)]
         after = [*dims[1:], dims[0]]
         A, B, C, D = (np.asarray(x) for x in (model.A, model.B, model.C, model.D))
@@ -52,7 +52,7 @@ class PeriodicModel(NamedTuple):
             [b[:j] for b, j in zip(B, after, strict=True)],
             [c[:, :i] / scale[:, None] for c, i in zip(C, dims, strict=True)],
             [d / scale[:, None] for d in D],
-            [np.zeros((j, 0)) for j in after],
+            [np.zeros((j, errors)) for j in after],
         )
 
     def to_ldtp(

@@ -11,7 +11,7 @@ from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, Vector
 from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
-from ..._core.text import numbers
+from ..._core.text import signal_values
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, check_harmonics
@@ -117,7 +117,7 @@ class SeriesFit(MultiplierEstimate):
 
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
-        noise = numbers(self.outputs, self.noise)
+        noise = signal_values(self.outputs, self.noise)
         return f"noise {noise}; {self.n_sections} sections, {self.numerators.shape[1]} lags{state}"
 
 
