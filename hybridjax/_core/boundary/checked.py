@@ -43,9 +43,9 @@ def checked(thing: Thing) -> Thing:
     """
     if not isinstance(thing, type):
         return cast(Thing, _wrapped(thing, thing.__qualname__))
-    maker = "__new__" if issubclass(thing, tuple) else "__init__"
-    if maker in vars(thing):
-        setattr(thing, maker, _wrapped(getattr(thing, maker), thing.__name__, thing))
+    for maker in ("__new__",) if issubclass(thing, tuple) else ("__init__", "__check_init__"):
+        if maker in vars(thing):
+            setattr(thing, maker, _wrapped(getattr(thing, maker), thing.__name__, thing))
     return cast(Thing, checked_methods(thing))
 
 
