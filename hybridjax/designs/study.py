@@ -11,6 +11,7 @@ from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, OptionalNames, Order, Positive, Seed
 from .._core.execution import one_blas_thread
+from .._core.executor import is_traced
 from .._core.html import card, multiplier_table, table, text
 from .._core.progress import working
 from ..errors import DefinitionError
@@ -127,7 +128,8 @@ class Study(eqx.Module):
                 f"`limit` has '{unknown[0]}', but the signals are {', '.join(signals)}: if it is "
                 "an output that will be recorded, name it in `outputs`."
             )
-        Candidates.of(first)
+        if not is_traced(first):
+            Candidates.of(first)
 
     @property
     def blocks(self) -> int:

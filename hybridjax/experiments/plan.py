@@ -298,4 +298,5 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
         scales = np.concatenate([time, sizes], axis=1)
         return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
 
-    return _made.recall(placed, accuracy, make)
+    with jax.ensure_compile_time_eval():  # a plan is no part of the program that JAX traces
+        return _made.recall(placed, accuracy, make)
