@@ -9,8 +9,8 @@ from . import (
     recordings as recordings,
     testing as testing,
 )
+from ._core.cache import enable_compilation_cache as enable_compilation_cache
 from ._core.compilation import (
-    enable_compilation_cache as enable_compilation_cache,
     enable_loop_kernels as enable_loop_kernels,
 )
 from ._core.execution import Execution as Execution

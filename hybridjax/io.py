@@ -6,12 +6,12 @@ A file is an ordinary npz archive: one array per array field, named like the fie
 no pickle, and only the kinds listed here are built, by their own checked constructors.
 """
 
-import os
 import typing
 from pathlib import Path
 
 from ._core.archive import read_module, write_module
 from ._core.boundary.checked import checked
+from ._core.boundary.kinds import FilePath
 from ._core.executor import is_traced
 from ._core.precision import require_x64
 from .errors import DefinitionError
@@ -31,7 +31,7 @@ KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)
 
 
 @checked
-def save(path: str | os.PathLike, thing: Saved) -> None:
+def save(path: FilePath, thing: Saved) -> None:
     """Write an object to an npz file; `load` gives back an equal one, bit by bit.
 
     The file appears complete or not at all: an old file of that name stays until then.
@@ -58,7 +58,7 @@ def save(path: str | os.PathLike, thing: Saved) -> None:
 
 
 @checked
-def load(path: str | os.PathLike) -> Saved:
+def load(path: FilePath) -> Saved:
     """Read an object that `save` has written.
 
     **Raises:** `FileFormatError` if the file is damaged, was not written by `save`, or is of

@@ -3,13 +3,14 @@
 import json
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 
 import numpy as np
 import pytest
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
+from hybridjax.apps.reproduce import Protocol, reproduce
 
 
 def _python(*arguments):
@@ -75,18 +76,29 @@ def test_reproduce_writes_its_results(results):
         assert file["harmonics"].tolist() == list(range(-16, 16))
 
 
-def test_reproduce_draws_its_figures(results):
-    names = ["fig1_cycle_isochron", "fig1_cycle_kinematic", "fig3_harmonics", "fig4_bode"]
-    for name in (*names, "multipliers", "poles_zeros"):
-        assert (results / f"{name}.png").stat().st_size > 10_000
-        assert "<svg" in (results / f"{name}.svg").read_text()
-    files = {path.suffix for path in results.iterdir() if not path.name.startswith(".")}
-    assert files == {".json", ".npz", ".png", ".svg"}
+class AtOnce(Executor):
+    """In place of a second process, which takes seconds."""
+
+    def submit(self, function, *arguments):
+        done = Future()
+        done.set_result(function(*arguments))
+        return done
 
 
 def alone(*_):
-    """In place of a second process, which takes seconds."""
-    return ThreadPoolExecutor(1)
+    return AtOnce()
+
+
+def test_reproduce_draws_its_figures(tmp_path):
+    """By a small protocol of one family of sections."""
+    protocol = Protocol(("isochron",), experiments=20, cycles=28, keep=8, n_sections=8)
+    reproduce(tmp_path, protocol, ("png", "svg"), alone())
+    names = ["fig1_cycle_isochron", "fig3_harmonics", "fig4_bode"]
+    for name in (*names, "multipliers", "poles_zeros"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+        assert "<svg" in (tmp_path / f"{name}.svg").read_text()
+    files = {path.suffix for path in tmp_path.iterdir() if not path.name.startswith(".")}
+    assert files == {".json", ".npz", ".png", ".svg"}
 
 
 SECOND_PROCESS = "hybridjax.apps.second_process.second_process"
@@ -119,6 +131,7 @@ WRONG = {
         "--out x --experiments 1000000000000": "--experiments: '1000000000000' is not a whole",
         "--out x --seed -1": "--seed: '-1' is not a whole number from 0 on",
         "--out x --formats gif": "--formats: 'gif' is not one or more of png, pdf, svg",
+        "--out=": "--out: '' is not a name",
         "--out x --amplitude 0": "--amplitude: '0' is not a positive number",
     },
     "identify x.csv --out x --input u --outputs y": {

@@ -5,7 +5,6 @@
 - `TwoTiers` compiles the experiments twice: a quick executable for the first answer, and the fully
   optimized one in a thread beside it.
 - `kernel` compiles single functions of users for code that runs on the host.
-- `enable_compilation_cache` switches JAX's own cache on; nothing else is kept between processes.
 """
 
 import collections
@@ -14,11 +13,8 @@ import functools as ft
 import gc
 import hashlib
 import os
-import pathlib
-import stat
 import threading
 import time
-import warnings
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
@@ -27,9 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import ComputationError, DefinitionError
-from .boundary.checked import checked
-from .boundary.kinds import Path
+from ..errors import ComputationError
 from .executor import (
     OutOfTimeError,
     at_most,
@@ -59,61 +53,6 @@ _WORTH_OPTIMIZING = 8.0
 _LOOP_KERNELS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
 # Programs of either kind that are kept. Fewer: taking turns with many systems compiles again.
 _KEPT = 1024
-
-
-@checked
-def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path | None:
-    """Keep compiled programs on disk (JAX's persistent compilation cache), so that the next process
-    starts faster.
-
-    From then on XLA prints no messages about programs that it loads.
-
-    **Arguments:** `folder`: programs are kept in its subfolder `programs`. Loading a program
-    executes it, so a subfolder that belongs or is open to other users, or is a link, is not used.
-    Default: `$HYBRIDJAX_CACHE`, or `hybridjax` in the user's cache folder
-    (`$XDG_CACHE_HOME` or `~/.cache`).
-
-    **Returns:** the subfolder; `None`, with a warning, if the user's cache folder cannot be used.
-    Then nothing is kept.
-
-    **Raises:** `DefinitionError` if a folder that is given, by argument or by `$HYBRIDJAX_CACHE`,
-    cannot be used.
-    """
-    given = folder or os.environ.get("HYBRIDJAX_CACHE")
-    try:
-        programs = _private_folder(given)
-    except (OSError, RuntimeError) as error:
-        problem = f"cannot keep compiled programs ({error})"
-        if given:
-            raise DefinitionError(f"{problem}: give another folder.") from error
-        warnings.warn(f"{problem}; nothing is kept.", stacklevel=2)
-        return None
-    jax.config.update("jax_compilation_cache_dir", str(programs))
-    # Also the smallest programs: those of users' functions are the first that a process needs.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    # XLA prints two errors, a page each, for each program that it loads on a processor with
-    # AVX-512. Its only switch is the level of all its messages, which JAX ties to that of its own.
-    level = getattr(jax.config, "jax_logging_level")  # noqa: B009 (JAX does not declare it)
-    jax.config.update("jax_logging_level", "CRITICAL")
-    jax.config.update("jax_logging_level", level)
-    return programs
-
-
-def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
-    """Make the subfolder of programs in a folder, or in the user's cache folder.
-
-    **Raises:** `OSError` if it cannot be made, or other users can write to it; `RuntimeError` for a
-    user without a home.
-    """
-    base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    programs = pathlib.Path(given or pathlib.Path(base, "hybridjax")).absolute() / "programs"
-    programs.mkdir(mode=0o700, parents=True, exist_ok=True)
-    about = programs.lstat()
-    is_open = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    if hasattr(os, "geteuid"):
-        if not stat.S_ISDIR(about.st_mode) or is_open or about.st_uid != os.geteuid():
-            raise PermissionError(f"other users can write to '{programs}'")
-    return programs
 
 
 def enable_loop_kernels() -> None:

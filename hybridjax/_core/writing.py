@@ -26,10 +26,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     **Raises:** `DefinitionError` if the file cannot be written, or `path` is a link.
     """
-    if path.is_symlink():
-        raise DefinitionError(
-            f"'{path}' is a link, and nothing is written through links: choose another name."
-        )
+    _refuse_link(path)
     temporary = path.parent / temporary_name()
     try:
         yield temporary
@@ -46,8 +43,9 @@ def made_folder(folder: Path) -> Iterator[None]:
     """A context in which the folder exists and can be written. If it was made for this, and an
     error is raised while it is empty, it is removed, as are those above that were made with it.
 
-    **Raises:** `DefinitionError` if it cannot be made or written.
+    **Raises:** `DefinitionError` if it cannot be made or written, or is a link.
     """
+    _refuse_link(folder)
     new = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
     try:
         try:
@@ -63,6 +61,13 @@ def made_folder(folder: Path) -> Iterator[None]:
             for path in new:
                 path.rmdir()
         raise
+
+
+def _refuse_link(path: Path) -> None:
+    if path.is_symlink():
+        raise DefinitionError(
+            f"'{path}' is a link, and nothing is written through links: choose another name."
+        )
 
 
 def temporary_name() -> str:

@@ -60,6 +60,7 @@ def _option(kind: str, pattern: str, *convert: Callable[[str], Any]) -> Callable
 _COUNT = _between(int, 1, limits.PERIODS)
 _FINITE = _between(float, -sys.float_info.max, sys.float_info.max)
 _POSITIVE = _between(float, math.ulp(0.0), sys.float_info.max)
+_place = _option("a name", "(.+)", str)
 _count = _option(f"a whole number from 1 to {limits.PERIODS}", "(.*)", _COUNT)
 _seed = _option("a whole number from 0 on", "(.*)", _between(int, 0))
 _positive = _option("a positive number", "(.*)", _POSITIVE)
@@ -129,7 +130,8 @@ def _add_reproduce(commands) -> None:
         "hopper: figures, summary.json and results.npz, laid over the exact answer.",
     )
     add = reproduce.add_argument
-    add("--out", required=True, metavar="DIR", help="folder for the results; made if needed")
+    add("--out", required=True, type=_place, metavar="DIR",
+        help="folder for the results; made if needed")  # fmt: skip
     add("--family", choices=("isochron", "kinematic", "both"), default="both",
         help="Poincaré sections (default: %(default)s)")  # fmt: skip
     for name, (metavar, what, paper, quick) in _SIZES.items():
@@ -175,7 +177,8 @@ def _add_identify(commands) -> None:
         help="of the angle of --phase; estimated by default")  # fmt: skip
     add("--scale", type=_two_positive, metavar="X,V",
         help="of the angle of --phase; estimated by default")  # fmt: skip
-    add("--out", required=True, metavar="DIR", help="folder for the results; made if needed")
+    add("--out", required=True, type=_place, metavar="DIR",
+        help="folder for the results; made if needed")  # fmt: skip
     add("--sections", type=_count, default=32, metavar="N",
         help="sections in each cycle (default: %(default)s)")  # fmt: skip
     add("--order", type=_count, metavar="D", help="number of multipliers; found by default")
@@ -206,7 +209,7 @@ def _add_sweep(commands) -> None:
     add("--want", type=_names, default=("spectral_radius", "period"), metavar="NAMES",
         help="period, state, multipliers, spectral_radius, events, residual; with "
         "commas (default: spectral_radius,period)")  # fmt: skip
-    add("--out", required=True, metavar="STORE", help="the Zarr store, e.g. map.zarr")
+    add("--out", required=True, type=_place, metavar="STORE", help="the Zarr store, e.g. map.zarr")
     add("--scheduler", metavar="ADDRESS", help="of a Dask cluster that does the work")
     add("--force", action="store_true", help="also more than 50 million points")
     sweep.set_defaults(run=_sweep, parser=sweep)
@@ -217,7 +220,7 @@ def _begin(*, cache: bool) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    from .._core.compilation import enable_compilation_cache
+    from .._core.cache import enable_compilation_cache
     from .._core.precision import enable_x64
 
     enable_x64()

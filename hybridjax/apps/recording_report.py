@@ -4,7 +4,6 @@ import base64
 import contextlib
 import csv
 import json
-import os
 import re
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -16,6 +15,7 @@ import numpy as np
 from .. import __version__, plot
 from .._core import html
 from .._core.boundary.checked import checked
+from .._core.boundary.kinds import FilePath
 from .._core.text import listed
 from .._core.writing import Format, results_folder
 from ..io import save
@@ -49,7 +49,7 @@ _CAPTIONS = {
 
 @checked
 def write_report(
-    folder: str | os.PathLike, found: Identification, formats: Sequence[Format] = ("png",)
+    folder: FilePath, found: Identification, formats: Sequence[Format] = ("png",)
 ) -> Path:
     """Write all results of a recording into a folder. They appear when all of them are ready.
 
@@ -72,7 +72,7 @@ def write_report(
 
 
 def report_folder(
-    folder: str | os.PathLike, inputs: Sequence[str], formats: Sequence[Format]
+    folder: FilePath, inputs: Sequence[str], formats: Sequence[Format]
 ) -> contextlib.AbstractContextManager[Path]:
     """Return a context with a new folder for the results, which at the end replace those in
     `folder`."""

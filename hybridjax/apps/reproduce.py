@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from .. import __version__
-from .._core.compilation import enable_compilation_cache
+from .._core.cache import enable_compilation_cache
 from .._core.precision import enable_x64
 from .._core.writing import Format, results_folder
 from ..engine.settings import Settings

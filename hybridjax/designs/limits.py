@@ -73,7 +73,7 @@ class Limits(eqx.Module):
     - `rms`: of inputs, or of outputs (their deviation from the cycle), over all experiments.
       `"input"` or `"output"` means that none of these may be larger than in the `design` that is
       improved.
-    - `rate`: rms of the change of an input from one section to the next.
+    - `rate`: rms of the change of an input from one section to the next (not its largest value).
     - `peak`: of an input, in every experiment. Phases are then optimized for a low peak, and
       experiments that still exceed it are scaled down. (Such phases are not random: the scatter of
       realizations does not show nonlinear distortion.)

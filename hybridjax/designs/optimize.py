@@ -217,7 +217,7 @@ def optimal_design(
     seed: Seed = 0,
     robust: Literal["mean", "worst"] = "mean",
 ) -> OptimalDesign:
-    r"""Find the amplitudes with which the fewest strides estimate a quantity of interest.
+    r"""Find the amplitudes with which a quantity of interest is estimated in the fewest strides.
 
     ```python
     plan = hj.optimal_design(model)               # multipliers, the input's power limited
@@ -225,31 +225,31 @@ def optimal_design(
     data = hj.run_experiments(cycle, sections, plan.design, outputs)
     ```
 
-    The variance of the goal is the Cramer-Rao bound. It is a convex function of the cosines'
-    powers, and `certificate` in the result bounds the distance from the optimum. Large components
-    are excited in several experiments, small ones in only one. If variances are to be estimated
+    The minimized variance is the Cramer-Rao bound of the `goal`, a convex function of the powers of
+    the cosines; `certificate` in the result bounds the distance from the optimum. Strong cosines
+    are excited in several experiments, weak ones in only one. If variances are to be estimated
     from the data, run `plan.design.realizations(4)` or record two periods of the multisine.
 
     **Arguments:**
 
-    - `model`: the system, exact or estimated; or a `StructuredFit`, from whose fitted harmonics the
-      deviations of outputs are computed. Several models (`hj.designs.draws` of an estimate) make
-      the design robust, see `robust`; the limits hold for each.
+    - `model`: the system, exact or estimated; or a `StructuredFit`, whose fitted harmonics give the
+      deviations of outputs. Several models (`hj.designs.draws` of an estimate) make the design
+      robust, see `robust`; the limits hold for each.
     - `design`: the design to improve. Lines that are not in it are forbidden; inputs, periods and
       the number of experiments are kept. Default: `multisine` with all lines.
     - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
       `FrequencyResponse`. Default: `"multipliers"`.
-    - `limit`: largest rms values by name, of inputs or outputs (their deviation from the cycle),
-      over all experiments: `{"u": 0.01}`; `"input"` or `"output"`: rms values of these as in
-      `design`; or `hj.designs.Limits`, also of peaks, rates, strides and distortion.
+    - `limit`: largest rms values over all experiments, by name of inputs or outputs (deviations
+      from the cycle): `{"u": 0.01}`; `"input"` or `"output"`: their rms values in `design`; or
+      `hj.designs.Limits`, which also limits peaks, rates, strides and distortion.
       Default: `"input"`.
-    - `noise`: noise of each measured output by name: the standard deviation of white noise, or the
-      root of a spectrum, a function of the frequency of the output (0 to N/2 cycles per period).
-      Default: all outputs are measured, with white noise 20 dB below their rms deviation in
-      `design` within the limits.
-    - `seed` of phases and division. Default: 0.
-    - `robust`: with several models, minimize the mean of their criteria, or the worst one (a mean
-      of 16th powers, which is slightly smaller). Default: `"mean"`.
+    - `noise`: standard deviation of the white noise of each measured output, by name; or a function
+      of the frequency of the output (0 to N/2 cycles per period) that returns that of white noise
+      with the same spectral density. Default: all outputs are measured, with white noise of a tenth
+      of their rms deviation in `design`, scaled to the limits.
+    - `seed`: seed of the phases, and of the division of cosines among experiments. Default: 0.
+    - `robust`: with several models, minimize the `"mean"` of their criteria, or the `"worst"` one
+      (approximately: a power mean with exponent 16). Default: `"mean"`.
 
     **Raises:** `DefinitionError` for limits that nothing satisfies, goals that the data do not
     identify, multipliers that are not simple, and arguments that do not fit together.

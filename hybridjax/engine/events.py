@@ -1,4 +1,7 @@
-"""Events: arming of guards, resets, schedules, and the accumulation of events (Zeno)."""
+"""Events: arming of guards, resets, schedules, and the accumulation of events (Zeno).
+
+Derivatives across an event (saltation) come from `watch.ChartFlow.locate` and `replay.py`.
+"""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import ExperimentCount, Index, Path
+from .._core.boundary.kinds import ExperimentCount, FilePath, Index
 from .._core.execution import Execution
 from .._core.pieces.description import array_digest, digest_of, function_digest, versions
 from .._core.pieces.run import DaskClient, fill
@@ -37,7 +37,7 @@ class StoredExperiments:
     `estimate_htf(StoredExperiments(store))` needs memory for one chunk only.
     """
 
-    def __init__(self, store: Path):
+    def __init__(self, store: FilePath):
         """**Arguments:** `store`: its folder or address.
 
         **Raises:** `DefinitionError` if it holds no experiments.
@@ -120,7 +120,7 @@ def stream_experiments(
     options: Options = Options(),  # noqa: B008 (immutable)
     *,
     chunk: ExperimentCount = CHUNK,
-    store: Path | None = None,
+    store: FilePath | None = None,
     client: DaskClient | None = None,
 ) -> Iterator[ExperimentData] | StoredExperiments:
     """Run experiments chunk by chunk, in memory that does not depend on their number.

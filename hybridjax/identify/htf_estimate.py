@@ -1,4 +1,7 @@
-"""Harmonic transfer functions from measured inputs and outputs (Sec. V)."""
+"""Harmonic transfer functions from measured inputs and outputs (Sec. V).
+
+The normal equations, with the weight of each experiment, are summed in `spectral_sums.py`.
+"""
 
 from typing import Literal, NamedTuple
 

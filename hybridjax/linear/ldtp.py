@@ -134,9 +134,10 @@ class LDTP(eqx.Module):
         after, d = [*dims[1:], dims[0]], max(dims)
         ny, nu = np.shape(C[0])[0], np.shape(B[0])[1]
         padded: dict[str, Any] = {}
+        xp = jnp if is_traced(given) else np  # JAX compiles a program for each shape
         for name, blocks in given.items():
             full, padded[name] = (d if name in "AB" else ny, d if name in "AC" else nu), []
-            for n, block in enumerate(map(jnp.asarray, blocks)):
+            for n, block in enumerate(map(xp.asarray, blocks)):
                 shape = after[n] if name in "AB" else ny, dims[n] if name in "AC" else nu
                 if block.shape != shape:
                     raise DefinitionError(
@@ -145,8 +146,8 @@ class LDTP(eqx.Module):
                         f"outputs: it should be {shape}."
                     )
                 sizes = zip(full, shape, strict=True)
-                padded[name].append(jnp.pad(block, [(0, p - q) for p, q in sizes]))
-        padded = {name: jnp.stack(blocks) for name, blocks in padded.items()}
+                padded[name].append(xp.pad(block, [(0, p - q) for p, q in sizes]))
+        padded = {name: xp.stack(blocks) for name, blocks in padded.items()}
         return cls(**padded, dims=dims, inputs=inputs, outputs=outputs, coordinates=coordinates)
 
     @property

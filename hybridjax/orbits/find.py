@@ -1,4 +1,7 @@
-"""The search for a limit cycle, by Newton's method on the return map with its exact Jacobian."""
+"""The search for a limit cycle, by Newton's method on the return map with its exact Jacobian.
+
+If Newton's method fails, `newton.search` makes further attempts.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -61,20 +64,20 @@ def find_limit_cycle(
     **Arguments:**
 
     - `guess`: a rough `Guess`, or the `LimitCycle` of a similar system, which is the best guess.
-        From a cycle, a clocked system begins at the same phase of its own clock, and `settle` and
-        `max_period` must be left out. Default: the model's own guess.
+        With a cycle, leave out `settle` and `max_period`; a clocked system begins at the same phase
+        of its own clock. Default: the model's own guess.
     - `section`: the section of the return map of an autonomous system, e.g. `Crossing("v",
         "falling")` or `AtEvent("heelstrike")`. Newton's method starts at the guess if it lies on
         the section, else where the flow from the guess first crosses it. Default: the section
         right after the event that the guess names (`Guess(..., after="heelstrike")`), or else the
-        plane through the guess across the flow.
+        plane through the guess that is orthogonal to the flow (in scaled states).
     - `multiplicity`: number of periods of the clock, or returns to the section, after which the
         cycle closes: 2 for the cycle that is born in a period doubling. Default: 1, or that of the
         cycle that is the guess.
     - `conserved`: values of conserved quantities, by the names of outputs, e.g.
-        `{"energy": 1784.8}`. Cycles then form families, with a multiplier of exactly 1 for each
-        quantity, and these values select one of them. Default: none, or those of the cycle that is
-        the guess.
+        `{"energy": 1784.8}`. A conserved quantity gives a family of cycles and a multiplier of
+        exactly 1; its value selects one cycle. Default: none, or those of the cycle that is the
+        guess.
     - `settle`: time to simulate before Newton's method begins, so that transients decay (the paper
         takes 60 s). It does not help if the cycle is unstable. Default: 0.
     - `max_period`: for autonomous systems, the time after which the search for a return to the

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -141,9 +142,8 @@ def _root(map, damped, max_steps):
         _residual, solver, map.anchor.q[:, 0] / map.sizes, map,
         has_aux=True, max_steps=max_steps, throw=False,
     )  # fmt: skip
-    # (Of a definite type, as on the host: what is compiled for the one serves the other.)
-    steps = solution.stats["num_steps"].astype(int)
-    return solution.value * map.sizes, solution.aux, steps
+    # An integer of JAX, not a weakly typed one, for which later programs would compile again.
+    return solution.value * map.sizes, solution.aux, jnp.asarray(solution.stats["num_steps"], int)
 
 
 @_root.def_jvp

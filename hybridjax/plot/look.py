@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args
@@ -16,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 
 from .._core.boundary.checked import checked
+from .._core.boundary.kinds import FilePath
 from .._core.boundary.values import Whole
 from .._core.signal import unit_of, with_unit
 from .._core.writing import Format, replacing
@@ -160,7 +160,7 @@ def letters(axes: Any) -> None:
 
 @checked
 def save(
-    path: str | os.PathLike,
+    path: FilePath,
     plot: Plot | Figure | Axes,
     formats: Sequence[Format] = ("png",),
     dpi: Resolution = 150,

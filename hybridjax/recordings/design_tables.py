@@ -1,13 +1,12 @@
 """The next experiment as a table, for hardware that plays one, and back."""
 
 import csv
-import os
 from pathlib import Path
 
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import PeriodCount, Positive
+from .._core.boundary.kinds import FilePath, PeriodCount, Positive
 from .._core.writing import replacing
 from ..errors import DefinitionError, FileFormatError
 from ..experiments.design.design import Design
@@ -22,7 +21,7 @@ _BY_PHASE = ("experiment", "cycle", "section", "phase")
 
 @checked
 def write_design(
-    path: str | os.PathLike,
+    path: FilePath,
     design: Design,
     *,
     cycles: PeriodCount | None = None,
@@ -64,7 +63,7 @@ def write_design(
 
 
 @checked
-def add_command(recording: Recording, phase: Phase, path: str | os.PathLike) -> Recording:
+def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording:
     """Add the inputs that hardware was commanded to apply, where they were not measured.
 
     Experiment s was applied in trial s, from the first whole cycle on, and each value held from its

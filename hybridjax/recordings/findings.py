@@ -1,4 +1,8 @@
-"""Warnings about data, by cause."""
+"""`Finding`: a warning about data, by its cause.
+
+Findings are made in `inspection/` (signals), `beats/` (events alone), `advice.py` and
+`natural.py` (estimates).
+"""
 
 import textwrap
 from collections.abc import Iterable, Sequence

@@ -67,9 +67,9 @@ def identify_recording(
     **Arguments:** those of `section_data`, and
 
     - `order`: the number of multipliers. Default: the result of `choose_order`.
-    - `drift`: number of cycles. Slower changes are not treated as responses to the inputs: they are
-      removed from the outputs, and from the signals that define the phase, before the phase is
-      estimated, and the fit allows for the remainder. Default: None.
+    - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
+      removed from the outputs and from the signals that define the phase, the phase is estimated
+      from the result, and the fit allows for drift that remains. Default: None.
 
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
     `section_data` and `fit_series`; `PrecisionError` in single precision.

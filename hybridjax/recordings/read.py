@@ -1,13 +1,12 @@
 """Recordings from files."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import SignalNames
+from .._core.boundary.kinds import FilePath, SignalNames
 from ..errors import DefinitionError, FileFormatError
 from .formats.arrays import read_arrow, read_excel, read_hdf5, read_matlab, read_npz
 from .formats.bag import read_bag
@@ -19,7 +18,7 @@ from .recording import Recording, check_events
 
 @checked
 def read_recording(
-    *paths: str | os.PathLike,
+    *paths: FilePath,
     time: str = "time",
     signals: SignalNames | None = None,
     units: Mapping[str, str] | None = None,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, ExperimentCount, Path, Seed
+from .._core.boundary.kinds import Count, ExperimentCount, FilePath, Seed
 from .._core.pieces.description import function_digest, versions
 from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable
@@ -29,7 +29,7 @@ def monte_carlo(
     seed: Seed = 0,
     *,
     chunk: Count | None = None,
-    store: Path | None = None,
+    store: FilePath | None = None,
     client: DaskClient | None = None,
 ) -> Any:
     """Draw a random computation many times.

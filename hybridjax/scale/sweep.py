@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Path
+from .._core.boundary.kinds import Count, FilePath
 from .._core.execution import Execution
 from .._core.pieces.description import array_digest, function_digest, versions
 from .._core.pieces.run import DaskClient, fill
@@ -52,7 +52,7 @@ def sweep(
     *,
     guess: LimitCycle | None = None,
     chunk: Count | None = None,
-    store: Path | None = None,
+    store: FilePath | None = None,
     client: DaskClient | None = None,
     force: bool = False,
 ) -> Any:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 import hybridjax as hj
 from hybridjax._core.boundary.checked import checked
 from hybridjax._core.boundary.containers import Names
-from hybridjax._core.boundary.kinds import Count, Numbers, Positive, Scalar, SignalNames
+from hybridjax._core.boundary.kinds import Count, FilePath, Numbers, Positive, Scalar, SignalNames
 from hybridjax._core.boundary.values import Complexes, Integers, Number, Reals
 
 
@@ -56,6 +56,7 @@ REFUSED = [
     (bool, 1, "must be True or False, not 1"),
     (Literal["a", "b"], "c", "must be 'a' or 'b', not 'c'"),
     (int | str | None, 0.5, "must be an integer, a string or None, not 0.5"),
+    (FilePath, "", "must be the name of a file or folder, not ''"),
     (Sequence[str], "ab", "must be a sequence (each item a string), not 'ab'"),
     (tuple[float, float], (1.0,), "must be a tuple of 2 (a finite number, a finite number)"),
     (Mapping[str, Positive], {"a": -1}, "`x['a']` must be a positive number, not -1"),

@@ -3,6 +3,8 @@
 import gc
 import os
 import pathlib
+import pickle
+import shutil
 import subprocess
 import sys
 import threading
@@ -157,25 +159,53 @@ def cache_setting():
 def test_the_cache_is_a_folder_of_its_own(tmp_path, monkeypatch, cache_setting):
     """Nothing in the folder that is given is read or changed."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "shared").mkdir(0o777)
+    (tmp_path / "shared").mkdir()
     (tmp_path / "shared/jit_f-cache").write_bytes(b"a colleague's")
-    folder = hj.enable_compilation_cache("shared")
-    assert folder == tmp_path / "shared/programs"
+    for _ in range(2):
+        folder = hj.enable_compilation_cache("shared")
+        assert folder == tmp_path / "shared/programs"
     assert jax.config.jax_compilation_cache_dir == str(folder)
     assert folder.stat().st_mode & 0o777 == 0o700
     assert (tmp_path / "shared/jit_f-cache").read_bytes() == b"a colleague's"
+    assert {x.name for x in (tmp_path / "shared").iterdir()} == {"jit_f-cache", "programs"}
 
 
-@pytest.mark.parametrize("mode", [0o777, 0o770, None])
-def test_a_cache_of_others_is_refused(tmp_path, mode, cache_setting):
-    (tmp_path / "elsewhere").mkdir(0o700)
-    if mode is None:
-        (tmp_path / "programs").symlink_to(tmp_path / "elsewhere")
-    else:
-        (tmp_path / "programs").mkdir()
-        (tmp_path / "programs").chmod(mode)
-    with pytest.raises(hj.DefinitionError, match="other users can write"):
-        hj.enable_compilation_cache(tmp_path)
+def test_programs_are_not_unpickled(monkeypatch):
+    """A program is read from the cache while pickle does not work."""
+    events = []
+    jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
+    for name in ("load", "loads", "Unpickler"):
+        monkeypatch.delattr(pickle, name)
+    for _ in range(2):
+        events.clear()
+        jax.jit(lambda x: x + 1.2345).lower(jnp.ones(7)).compile()
+    assert "/jax/compilation_cache/cache_hits" in events
+
+
+ATTACKS = {
+    "open to all": lambda x: (x / "programs").chmod(0o777),
+    "open to a group": lambda x: (x / "programs").chmod(0o770),
+    "exchanged by those who write the folder above": lambda x: x.chmod(0o777),
+    "exchanged by the owner of the folder above": lambda x: os.chown(x, 12345, -1),
+    "of another user": lambda x: os.chown(x / "programs", 12345, -1),
+    "a link": lambda x: (x / "programs").symlink_to((x / "programs").rename(x / "y")),
+    "a copy": lambda x: shutil.copytree((x / "programs").rename(x / "y"), x / "programs"),
+    "a pipe in it": lambda x: os.mkfifo(x / "programs/jit_f-cache"),
+    "a link in it": lambda x: (x / "programs/jit_f-cache").symlink_to(x),
+    "a file of 30 GiB in it": lambda x: os.truncate(
+        os.open(x / "programs/jit_f-cache", os.O_CREAT | os.O_WRONLY), 30 * 2**30
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_cache_of_others_is_refused(tmp_path, attack, cache_setting):
+    if "user" in attack or "owner" in attack:
+        os.geteuid() == 0 or pytest.skip("only root gives files away")
+    hj.enable_compilation_cache(tmp_path / "x")
+    ATTACKS[attack](tmp_path / "x")
+    with pytest.raises(hj.DefinitionError, match="give another folder"):
+        hj.enable_compilation_cache(tmp_path / "x")
 
 
 def test_without_a_home_nothing_is_kept(monkeypatch, cache_setting):

@@ -119,6 +119,13 @@ def test_what_is_in_the_way_stays(full, block, early):
     assert tree(full.parent) == before
 
 
+def test_nothing_is_written_through_a_link_to_a_folder(full):
+    before = tree(full.parent / "away")
+    with pytest.raises(hj.DefinitionError, match="nothing is written through links"):
+        write(full / "link", RESULTS)
+    assert tree(full.parent / "away") == before
+
+
 def test_a_list_with_names_outside_touches_nothing_there(full):
     away = full.parent / "away" / "file"
     digest = hashlib.sha256(b"away").hexdigest()

@@ -21,8 +21,8 @@ from ..toys import Field
 
 
 # Systems of which both executors are compiled in every run of the tests; the rest is slow.
-FEW = ("BuckConverter", "PaddleJuggler", "VerticalHopper")
-FEW_STRUCTURES = sorted(STRUCTURES)[:2]
+FEW = ("PaddleJuggler", "VerticalHopper")
+FEW_STRUCTURES = sorted(STRUCTURES)[:1]
 
 
 def slow_but(names, few):

@@ -1,9 +1,12 @@
 """Objects of every public kind, each made once, on first use: good arguments for the table."""
 
+import jax
 import matplotlib
 import numpy as np
 
 import hybridjax as hj
+from hybridjax.orbits.continuation import Branch, BranchEnd
+from hybridjax.orbits.limit_cycles import LimitCycles
 
 
 NAMES = ("x", "y")
@@ -47,6 +50,22 @@ def section_data(t, inputs, **options):
     return hj.recordings.section_data(t.recording, t.phase, **about, **options)
 
 
+def cycles(t):
+    """The same cycle twice, without the program that finds many."""
+    twice = lambda x: jax.tree.map(lambda x: np.stack([x, x]), x)  # noqa: E731
+    c, fields = t.cycle, ("period", "anchor", "legs", "factors", "residual", "iterations", "result")
+    many = {name: twice(getattr(c, name)) for name in fields}
+    return LimitCycles(
+        systems=twice(c.system), base=c.base, codes=np.array([c.event_sequence] * 2),
+        settings=c.settings, conserved=c.conserved, multiplicity=c.multiplicity, **many,
+    )  # fmt: skip
+
+
+def branch(t):
+    ends = [BranchEnd(mu, hj.Result.OK, "end of the parameter range") for mu in (0.1, 0.2)]
+    return Branch("mu", np.array([0.1, 0.2]), t.cycles, (), tuple(ends))
+
+
 def plot(t):
     matplotlib.use("agg")
     return hj.plot.multipliers(np.array([0.5]))
@@ -55,8 +74,8 @@ def plot(t):
 MAKE = {
     "system": lambda t: hj.models.HopfOscillator(),
     "cycle": lambda t: hj.find_limit_cycle(t.system),
-    "cycles": lambda t: hj.find_limit_cycles([t.system, hj.models.HopfOscillator(mu=0.2)], t.cycle),
-    "branch": lambda t: hj.continuation(t.cycle, "mu", (0.1, 0.11), step=0.5),
+    "cycles": cycles,
+    "branch": branch,
     "placed": lambda t: hj.place_sections(t.cycle, PHASE),
     "map": lambda t: hj.section_map(t.cycle, t.placed, 0, 1),
     "response": lambda t: hj.response_function(t.cycle, t.placed, NAMES),

@@ -40,6 +40,7 @@ def test_each_is_the_cycle_that_is_found_alone(found):
     np.testing.assert_allclose(found.multipliers[:4, 2:], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_failures_are_reported_by_index(found):
     np.testing.assert_array_equal(found.failed, [4])
     assert np.isnan(found.multipliers[4]).all() and np.isfinite(found.multipliers[:4]).all()
@@ -69,6 +70,8 @@ def test_systems_that_are_alike_or_undefined(wheel):
     wheels = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(slopes)
     found = hj.find_limit_cycles(wheels, wheel, execution=FOUR)
     np.testing.assert_array_equal(found.failed, [9])
+    assert np.isnan(found.multipliers[9]).all() and np.isfinite(found.multipliers[:9]).all()
+    assert found.summary().startswith("10/11 found; #9: ")
     alike = hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR)
     assert alike.ok.all()
 

@@ -124,6 +124,15 @@ def test_hdf5(tmp_path):
     refused("the unit of 'x' is nan", path)
     path.write_bytes(path.read_bytes()[:1000])
     refused("no HDF5 file, or damaged", path)
+    layout = h5py.VirtualLayout((9,), "f8")
+    layout[:] = h5py.VirtualSource(path, "x", (9,))
+    for virtual in (True, False):
+        with h5py.File(tmp_path / "y.h5", "w") as file:
+            if virtual:
+                file.create_virtual_dataset("x", layout)
+            else:
+                file.create_dataset("x", (9,), "f8", external=[(path, 0, 72)])
+        refused("'x' lies in other files", tmp_path / "y.h5")
 
 
 # Tables

@@ -1,6 +1,8 @@
 """Pieces on a cluster of two processes: the same to the last bit, whoever is killed."""
 
 import os
+import re
+import shutil
 import signal
 import threading
 import time
@@ -16,7 +18,7 @@ import hybridjax as hj
 distributed = pytest.importorskip("distributed")
 pytest.importorskip("zarr")
 
-DRAWS = 40
+DRAWS = 24
 
 
 class Plane(hj.Chart):
@@ -38,7 +40,7 @@ class Driven(hj.HybridSystem):
 
 def walk(rng):
     """A random computation that takes a while."""
-    time.sleep(0.05)
+    time.sleep(0.02)
     steps = rng.normal(size=(100, 2)).cumsum(axis=0)
     return {"end": steps[-1], "far": np.abs(steps).max()}
 
@@ -114,6 +116,32 @@ def test_a_store_knows_its_function(tmp_path):
         hj.monte_carlo(first, 2, store=tmp_path / "draws.zarr")
     with pytest.raises(hj.DefinitionError, match="its `function` is not the same"):
         hj.monte_carlo(other, 2, store=tmp_path / "draws.zarr")
+
+
+@pytest.mark.parametrize("harm", ["link", "linked folder", "pipe", "large", "shape", "absent"])
+def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
+    """A store that was made to look like that of the call."""
+    first, victim, store = partial(np.random.Generator.normal), tmp_path / "x", tmp_path / "s.zarr"
+    hj.monte_carlo(first, 4, chunk=2, store=store)
+    values = store / "value"
+    victim.mkdir()
+    (victim / "1").write_text("mine")
+    if harm == "linked folder":
+        (values / "c").rename(tmp_path / "y")
+        (values / "c").symlink_to(victim)
+    elif harm == "shape":
+        about = (values / "zarr.json").read_text()
+        (values / "zarr.json").write_text(re.sub(r"\b4\b", f"{10**12}", about, count=1))
+    elif harm == "absent":
+        shutil.rmtree(values)
+    elif harm == "large":
+        os.truncate(values / "c/1", 30 * 2**30)
+    else:
+        (values / "c/1").unlink()
+        (values / "c/1").symlink_to(victim / "1") if harm == "link" else os.mkfifo(values / "c/1")
+    with pytest.raises(hj.DefinitionError, match=r"s\.zarr"):
+        hj.monte_carlo(first, 4, chunk=2, store=store)
+    assert (victim / "1").read_text() == "mine"
 
 
 def test_a_cluster_gives_the_same_numbers(client, whole):

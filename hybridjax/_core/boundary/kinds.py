@@ -22,6 +22,7 @@ from .containers import Either, Having, Instance, Items, Names, Table, Tuple
 from .values import (
     FUNCTION,
     NOTHING,
+    PATH,
     TEXT,
     Complexes,
     ComplexNumber,
@@ -71,7 +72,7 @@ OptionalNames = Annotated[str | Sequence[str], Names(empty=True)]
 NewOptionalNames = Annotated[str | Sequence[str] | Mapping[str, str], Names(units=True, empty=True)]
 NewNames = Annotated[str | Sequence[str] | Mapping[str, str], Names(units=True)]
 """Names that are given to something; or units by name, as in `{"yM": "m", "force": "N"}`."""
-Path = str | os.PathLike[str]
+FilePath = Annotated[str | os.PathLike[str], PATH]
 
 
 _PLAIN = {

@@ -4,6 +4,7 @@ import contextlib
 import math
 import numbers
 import operator
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -225,8 +226,14 @@ class Plain(Kind):
 
 
 TEXT = Plain("a string", lambda value: isinstance(value, str))
+PATH = Plain("the name of a file or folder", lambda value: _is_path(value))
 NOTHING = Plain("None", lambda value: value is None)
 FUNCTION = Plain("a function", callable)
+
+
+def _is_path(value: Any) -> bool:
+    name = os.fspath(value) if isinstance(value, os.PathLike) else value
+    return isinstance(name, str) and name != "" and "\0" not in name
 
 
 def _plain(value: Any, allowed: str) -> Any:

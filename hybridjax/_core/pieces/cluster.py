@@ -14,7 +14,7 @@ from distributed import Client, Reschedule, Worker, WorkerPlugin, as_completed
 from distributed.scheduler import KilledWorker
 
 from ...errors import ComputationError, DefinitionError, HybridJaxError
-from ..compilation import enable_compilation_cache
+from ..cache import enable_compilation_cache
 from ..progress import counted, say
 from .store import ZarrStore
 

@@ -22,10 +22,11 @@ def fill(job: Any, address: Any = None, client: DaskClient | None = None) -> Zar
     **Arguments:**
 
     - `job`: an object that can be pickled, and whose results do not depend on who computes them, in
-      which order. `description`: JSON from which the results can be told from those of other jobs;
-      `begin()`: the job with what is computed before the first piece, and the `Layout` of its
-      results; `arrays()`: what `begin` computed; `resume(layout, arrays)`: the job with the arrays
-      that another process computed; `run(k, workers)`: piece k, with so many threads.
+      which order. `blocks`: the pieces; `description`: JSON from which the results can be told from
+      those of other jobs; `begin()`: the job with what is computed before the first piece, and the
+      `Layout` of its results; `arrays()`: what `begin` computed; `resume(layout, arrays)`: the job
+      with the arrays that another process computed; `run(k, workers)`: piece k, with so many
+      threads.
     - `address` of a store; None: memory. `client`: a Dask client. Default: this process computes
       all pieces.
 
@@ -34,7 +35,7 @@ def fill(job: Any, address: Any = None, client: DaskClient | None = None) -> Zar
     as the job. The store keeps what was computed.
     """
     address = None if address is None else absolute(address)
-    store = None if address is None else open_store(address, job.description)
+    store = None if address is None else open_store(address, job)
     if store is not None:
         job = job.resume(store.layout, store.start)
     else:

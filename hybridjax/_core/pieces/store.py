@@ -7,9 +7,11 @@ pieces can be wrong.
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import math
 import os
+import stat
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -17,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import DefinitionError, FileFormatError
+from .. import limits
 from ..arguments import package
 from ..progress import counted
 from .description import difference
@@ -25,6 +28,7 @@ from .description import difference
 _ABOUT = "hybridjax"
 # The group of the arrays that only this package reads.
 _START = "start"
+_CHECKSUM = 4  # bytes of a chunk
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,8 +117,11 @@ class ZarrStore:
     """
 
     def __init__(self, address: Any):
+        """**Raises:** `DefinitionError` if it cannot be opened, is damaged, or holds links, pipes,
+        or files that are larger than its chunks."""
         self.address = address
-        with _writing(address):
+        sizes = _sizes(address)
+        try:
             self._group = _group(address, "r+")
             about = json.loads(self._group.attrs[_ABOUT])
             # (Zarr would leave out chunks that hold nothing but the fill value.)
@@ -122,14 +129,23 @@ class ZarrStore:
                 name: self._group[name].with_config({"write_empty_chunks": True})
                 for name in about["variables"]
             }
-        first, p = next(iter(self._arrays.values())), len(about["dims"])
-        variables = {
-            name: Variable(x.dtype.str, tuple(x.metadata.dimension_names[p:]), x.shape[p:])
-            for name, x in self._arrays.items()
-        }
-        blocks = Blocks(first.shape[:p], first.chunks[:p])
-        dims = tuple(about["dims"])
-        self.layout = Layout(dims, blocks, variables, {}, (), about["description"])
+            first, p = next(iter(self._arrays.values())), len(about["dims"])
+            variables = {
+                name: Variable(x.dtype.str, tuple(x.metadata.dimension_names[p:]), x.shape[p:])
+                for name, x in self._arrays.items()
+            }
+            blocks = Blocks(first.shape[:p], first.chunks[:p])
+            self.layout = Layout(
+                tuple(about["dims"]), blocks, variables, {}, (), about["description"]
+            )
+        except Exception as error:  # (of many kinds)
+            raise DefinitionError(f"cannot open '{address}' as a store: {error}") from error
+        chunk = max(math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values())
+        for path, size in sizes.items():
+            if size > max(limits.TEXT, chunk + _CHECKSUM):
+                raise DefinitionError(
+                    f"'{path}' is larger than all chunks of its store: delete it."
+                )
 
     @property
     def start(self) -> list[np.ndarray]:
@@ -180,7 +196,11 @@ class ZarrStore:
 
     def dataset(self) -> Any:
         """Return all results as `xarray.Dataset`; on disk, values are read when they are used."""
-        data = package("xarray").open_zarr(self.address, consolidated=False, chunks=None)
+        options = {"consolidated": False, "chunks": None, "zarr_format": 3}
+        try:
+            data = package("xarray").open_zarr(self.address, **options)
+        except Exception as error:  # (of many kinds, for an array that another program has added)
+            raise FileFormatError(f"'{self.address}' is damaged: {error}") from error
         constants = [name for name in data.data_vars if name not in self._arrays]
         description = json.dumps(self.layout.description)
         data = data[[*self._arrays, *constants]].assign_attrs({_ABOUT: description})
@@ -193,35 +213,26 @@ class ZarrStore:
 
     def _present(self, array: Any) -> set[int]:
         """Return the pieces that have a chunk of an array."""
-        blocks, prefix = self.layout.blocks, f"{array.path}/c/".removeprefix("/")
+        pieces = {self._chunk(array, k): k for k in range(len(self.layout.blocks))}
 
-        async def listed() -> list[str]:
-            return [key async for key in array.store.list_prefix(prefix)]
+        async def listed() -> set[int]:
+            keys = array.store.list_prefix(f"{array.path}/c".removeprefix("/"))
+            return {pieces[key] async for key in keys if key in pieces}
 
-        places = (
-            key.removeprefix(prefix).split("/") for key in package("zarr.core.sync").sync(listed())
-        )
-        return {
-            int(np.ravel_multi_index(tuple(map(int, x[: len(blocks.shape)])), blocks.counts))
-            for x in places
-            if len(x) == array.ndim and all(map(str.isdecimal, x))
-        }
+        return package("zarr.core.sync").sync(listed())
 
 
-def open_store(address: str, description: Mapping[str, Any]) -> ZarrStore | None:
-    """Return the store of these results, without its damaged pieces; None if there is nothing at
+def open_store(address: str, job: Any) -> ZarrStore | None:
+    """Return the store of a job's results, without its damaged pieces; None if there is nothing at
     the address.
 
     **Raises:** `DefinitionError` if it holds other results, or something else.
     """
+    sizes = _sizes(address)
     try:
         group = _group(address, "r")
     except FileNotFoundError:
-        if (
-            "://" not in address
-            and os.path.exists(address)
-            and (os.path.isfile(address) or os.listdir(address))
-        ):
+        if sizes:
             raise DefinitionError(
                 f"'{address}' is there, and is no store of results: choose another name."
             ) from None
@@ -235,10 +246,12 @@ def open_store(address: str, description: Mapping[str, Any]) -> ZarrStore | None
             f"'{address}' was not written by hybridjax, or not to its end: choose another store, "
             "or delete it."
         ) from error
-    change = difference(json.loads(json.dumps(description)), theirs)
+    change = difference(json.loads(json.dumps(job.description)), theirs)
     if change is not None:
         raise DefinitionError(f"'{address}' holds other results: {change}. Choose another store.")
     store = ZarrStore(address)
+    if store.layout.blocks != job.blocks:
+        raise DefinitionError(f"'{address}' is damaged: delete it, or choose another store.")
     store.discard_damaged()
     return store
 
@@ -296,7 +309,30 @@ def absolute(address: Any) -> str:
 
 
 def _group(address: Any, mode: Any) -> Any:
-    return package("zarr").open_group(address, mode=mode)
+    # (Arrays of format 2 may be pickled.)
+    return package("zarr").open_group(address, mode=mode, zarr_format=3)
+
+
+def _sizes(address: Any) -> dict[str, int]:
+    """Return the sizes of all files of a store on disk, in bytes.
+
+    **Raises:** `DefinitionError` if it is or holds a link, through which files of others would be
+    read or replaced, or a pipe; or if a description is too large.
+    """
+    if not isinstance(address, str) or "://" in address:
+        return {}
+    tree = ((at, name) for at, *names in os.walk(address) for name in itertools.chain(*names))
+    sizes = {}
+    for path in [address, *itertools.starmap(os.path.join, tree)]:
+        about = os.lstat(path) if os.path.lexists(path) else None
+        if about is None or stat.S_ISDIR(about.st_mode):
+            continue
+        if not stat.S_ISREG(about.st_mode):
+            raise DefinitionError(f"'{path}' is a link or a pipe, which stores cannot hold.")
+        if path.endswith(".json") and about.st_size > limits.TEXT:
+            raise DefinitionError(f"'{path}' has {about.st_size} bytes: delete it.")
+        sizes[path] = about.st_size
+    return sizes
 
 
 @contextlib.contextmanager

@@ -139,22 +139,23 @@ def fit_series(
 ) -> SeriesFit:
     r"""Estimate multipliers and HTFs from time series with any input, with their uncertainty.
 
-    The fit minimizes the output error, for white noise of unknown variance in each output: the sum
-    of squares of the difference between measured and simulated outputs. The unknowns are the
-    numerators, the initial conditions and c. All but c are eliminated (variable projection, Golub
-    and Pereyra 1973). The iteration starts from the periodic ARX problem, solved by total least
-    squares (Ljung, *System Identification: Theory for the User*, treats both).
+    The fit minimizes the output error: the sum of squares of measured minus simulated outputs, each
+    in units of its noise, which is taken as white with an unknown variance. The unknowns are the
+    numerators, the initial conditions and c, the coefficients of the polynomial whose roots are the
+    multipliers. All but c are eliminated (variable projection, Golub and Pereyra 1973). The
+    iteration starts from the periodic ARX problem, solved by total least squares. (Output error and
+    ARX: Ljung, *System Identification: Theory for the User*.)
 
     **Arguments:**
 
-    - `data`: a `Record` of any length, with gaps or without; `ExperimentData`, of which all cycles
-      of the experiments that did not fail are used; `SectionData`; or several of these.
-    - `order`: d, the number of non-zero multipliers, or an `LDTP` model with this number.
-    - `overhang`: number of lags of the numerators beyond d N. Default: N.
+    - `data`: a `Record` of any length, with gaps or without; `ExperimentData` (all cycles of the
+      successful experiments); `SectionData`; or several of these.
+    - `order`: d, the number of non-zero multipliers, or an `LDTP` model that has this number.
+    - `overhang`: number of lags of the numerators beyond d N, with N sections. Default: N.
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
       no input before. Default: "free".
-    - `errors`: source of the covariance. "residuals": the residuals of blocks of successive cycles,
-      which allows for errors that depend on each other (process noise) and on the inputs (nonlinear
+    - `errors`: source of the covariance. "residuals": the residuals in blocks of successive cycles,
+      also for errors that are correlated (process noise) or depend on the inputs (nonlinear
       distortion). "white": the variance of the residuals alone. Default: "residuals".
     - `check`: whether to raise an error for an order that the data do not support. Default: True.
     - `max_steps`: largest number of Gauss-Newton steps. Default: 50.

@@ -1,1 +1,1 @@
-"""What files hold, format by format, as columns by name."""
+"""Readers of files, one module for each family of formats; `read.py` chooses one by the suffix."""

@@ -33,7 +33,7 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
     """Read datasets by their paths, such as `imu/gyro`; an attribute `units` is their unit.
 
     **Raises:** `FileFormatError` for a damaged file, one that declares more than it can hold, for
-    arrays of structs, and as `_read_tree`.
+    arrays that lie in other files, for arrays of structs, and as `_read_tree`.
     """
     h5py = library(path, "h5py", "mat")
     leaves: dict[Place, Leaf] = {}
@@ -47,6 +47,11 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
         # Letters of MATLAB are numbers; its empty arrays hold their shape.
         text = "MATLAB_empty" in node.attrs or node.attrs.get("MATLAB_class") == b"char"
         if node.dtype.kind in "fiu" and not text:
+            if node.external or node.is_virtual:
+                raise FileFormatError(
+                    f"'{path}': '{name}' lies in other files, which are not read: copy its values "
+                    "into this file."
+                )
             unit = node.attrs.get("units", "")
             leaves[place] = Leaf(node, unit.decode() if isinstance(unit, bytes) else str(unit))
 

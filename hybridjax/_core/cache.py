@@ -1,0 +1,130 @@
+"""The folder of compiled programs, which JAX's own cache keeps between processes.
+
+JAX loads machine code from there and runs it. Its cache unpickles nothing, and checks nothing, so
+the folder must be one that nobody else can fill.
+"""
+
+import os
+import pathlib
+import shutil
+import stat
+import tempfile
+import warnings
+
+import jax
+
+from ..errors import DefinitionError
+from .boundary.checked import checked
+from .boundary.kinds import FilePath
+
+
+# A larger file in the folder, in bytes, is no program. Smaller: the largest programs (1e8) are
+# refused. Larger: a file that was put there fills the memory.
+_LARGEST = 2**30
+_MARK = "made-here-"
+
+
+@checked
+def enable_compilation_cache(folder: FilePath | None = None) -> pathlib.Path | None:
+    """Keep compiled programs on disk (JAX's persistent compilation cache), so that the next process
+    starts faster.
+
+    From then on XLA prints no messages about programs that it loads.
+
+    **Arguments:** `folder`: programs are kept in its subfolder `programs`. Loading a program
+    executes it, so a subfolder that other users can write to or exchange, a link, and a copy (such
+    as an unpacked archive) are not used. Default: `$HYBRIDJAX_CACHE`, or `hybridjax` in the user's
+    cache folder (`$XDG_CACHE_HOME` or `~/.cache`).
+
+    **Returns:** the subfolder; `None`, with a warning, if the user's cache folder cannot be used.
+    Then nothing is kept.
+
+    **Raises:** `DefinitionError` if a folder that is given, by argument or by `$HYBRIDJAX_CACHE`,
+    cannot be used.
+    """
+    given = folder or os.environ.get("HYBRIDJAX_CACHE")
+    try:
+        programs = _private_folder(given)
+    except (OSError, RuntimeError) as error:
+        problem = f"cannot keep compiled programs ({error})"
+        if given:
+            raise DefinitionError(f"{problem}: give another folder.") from error
+        warnings.warn(f"{problem}; nothing is kept.", stacklevel=2)
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(programs))
+    # Also the smallest programs: those of users' functions are the first that a process needs.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # XLA prints two errors, a page each, for each program that it loads on a processor with
+    # AVX-512. Its only switch is the level of all its messages, which JAX ties to that of its own.
+    level = getattr(jax.config, "jax_logging_level")  # noqa: B009 (JAX does not declare it)
+    jax.config.update("jax_logging_level", "CRITICAL")
+    jax.config.update("jax_logging_level", level)
+    return programs
+
+
+def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
+    """Make or check the subfolder of programs in a folder, or in the user's cache folder.
+
+    The subfolder holds an empty file whose name has the inode of the subfolder. A copy, such as
+    an unpacked archive, has another inode.
+
+    **Raises:** `OSError` if it cannot be made, other users can write to it or exchange it, or it
+    was not made here; `RuntimeError` for a user without a home.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    folder = pathlib.Path(given or pathlib.Path(base, "hybridjax")).resolve()
+    _make(folder)
+    programs = folder / "programs"
+    if not os.path.lexists(programs):
+        new = pathlib.Path(tempfile.mkdtemp(dir=folder))
+        (new / f"{_MARK}{new.stat().st_ino}").touch()
+        try:
+            new.rename(programs)
+        except OSError:  # another process was faster
+            shutil.rmtree(new)
+    if not stat.S_ISDIR(programs.lstat().st_mode):
+        raise PermissionError(f"'{programs}' is no folder")
+    for path in (programs, *programs.parents):
+        _refuse_others(path, is_above=path != programs)
+    entries = {path: path.lstat() for path in programs.iterdir()}
+    for path, about in entries.items():
+        if not stat.S_ISREG(about.st_mode) or about.st_size > _LARGEST:
+            raise PermissionError(f"'{path}' is no compiled program: delete it")
+    marks = [path.name for path in entries if path.name.startswith(_MARK)]
+    if marks != [f"{_MARK}{programs.stat().st_ino}"]:
+        raise PermissionError(f"'{programs}' was not made in this place: delete it")
+    return programs
+
+
+def _make(folder: pathlib.Path) -> None:
+    """Make a folder, and those above it, that only this user can write."""
+    if not folder.is_dir():
+        _make(folder.parent)
+        folder.mkdir(mode=0o755, exist_ok=True)
+
+
+def _refuse_others(path: pathlib.Path, is_above: bool) -> None:
+    """**Raises:** `PermissionError` if other users can write to a folder, or, in one above it,
+    rename what is not theirs."""
+    if not hasattr(os, "geteuid"):
+        return
+    about, user = path.lstat(), os.geteuid()
+    is_open = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    if is_above and is_open == stat.S_IWGRP and _is_alone(about.st_gid):
+        is_open = False
+    if is_above and about.st_mode & stat.S_ISVTX:
+        is_open = False
+    if is_open or about.st_uid not in (user, 0 if is_above else user):
+        raise PermissionError(f"other users can write to '{path}'")
+
+
+def _is_alone(number: int) -> bool:
+    """Return whether a group is that of this user alone: many systems make one for each user."""
+    import grp  # not on Windows
+    import pwd
+
+    try:
+        group, user = grp.getgrgid(number), pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return False
+    return group.gr_name == user and set(group.gr_mem) <= {user}
