@@ -209,12 +209,11 @@ def _descend(
     cycle = _cycle_at(problem, system, start, near)
     if cycle.result != Result.OK:
         return End(start, start, np.inf, 0, 0, int(cycle.result))
-    end = descend(problem, start, cycle)
-    r = end.residuals
+    x, r, steps, converged = descend(problem, start, cycle)
     if not np.isfinite(r).all():  # there is a cycle, but no observation on it
-        return End(start, start, np.inf, len(r), end.steps, int(Result.NOT_CONVERGED))
-    result = Result.OK if end.converged else Result.NOT_CONVERGED
-    return End(start, end.x, float(r @ r), len(r), end.steps, int(result))
+        return End(start, start, np.inf, len(r), steps, int(Result.NOT_CONVERGED))
+    result = Result.OK if converged else Result.NOT_CONVERGED
+    return End(start, x, float(r @ r), len(r), steps, int(result))
 
 
 def _summary(

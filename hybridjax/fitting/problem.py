@@ -3,7 +3,6 @@
 import dataclasses
 import operator
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -169,20 +168,6 @@ class FitProblem(eqx.Module):
         return jnp.where((cycle.result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
 
 
-class Evaluation(NamedTuple):
-    """The end of an iteration."""
-
-    x: Float[np.ndarray, " p"]
-    """Coordinates of the parameters."""
-    residuals: Float[np.ndarray, " r"]
-    """Infinite where there is no limit cycle, or no observation on it."""
-    jacobian: Float[np.ndarray, "r p"]
-    """Derivatives of the residuals by the coordinates."""
-    steps: int
-    """Evaluations of the model with its derivatives."""
-    converged: bool
-
-
 @quick_jit
 def _with_jacobian(problem: FitProblem, x, guess):
     """Return residuals (r,) and Jacobian (r, p): all columns in one pass, in forward mode."""
@@ -199,8 +184,11 @@ def evaluate(
     return jax.device_get(_with_jacobian(problem, jnp.asarray(x), guess))
 
 
-def descend(problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle) -> Evaluation:
-    """Return the minimum that the Levenberg-Marquardt iteration reaches from x.
+def descend(
+    problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " r"], int, bool]:
+    """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals, number of
+    evaluations, and whether it has converged.
 
     Steps are accepted and their damping changes as in `optimistix.LevenbergMarquardt`. Here the
     iteration runs on the host, so that only the model is compiled.
@@ -221,13 +209,13 @@ def descend(problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle) 
             else:
                 damping *= _MORE
             if done:
-                return Evaluation(x, r, J, steps, True)
+                return x, r, steps, True
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
             break
         damped = np.concatenate([J, np.sqrt(damping) * np.eye(len(x))])
         short = np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
         trial = x - short
-    return Evaluation(x, r, J, steps, False)
+    return x, r, steps, False
 
 
 def _small(change: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"]) -> bool:
