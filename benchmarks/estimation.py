@@ -151,16 +151,17 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
     def run(count, seed):
         return family.run(design.realizations(count, seed), start="periodic", discard=32)
 
-    truth = hj.estimate_htf((run(100, seed + k) for k in range(20)), (-1, 0, 1)).interpolate(chosen)
+    truth = hj.estimate_htf((run(100, seed + k) for k in range(20)), (-1, 0, 1))
+    rows = [int(np.argmin(np.abs(truth.f - x))) for x in chosen]
 
     def draw(rng):
         phases, noise = rng.integers(2**31, size=2).tolist()
         noisy = hj.experiments.add_noise(run(each, phases), snr=20, seed=noise)
-        estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).interpolate(chosen)
+        estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2)
         error = np.abs(np.asarray(estimate.H) - np.asarray(truth.H))
         return {
-            "disc": error <= np.asarray(estimate.confidence_radius()),
-            "variance": np.stack([estimate.variance, estimate.noise_variance]),
+            "disc": (error <= np.asarray(estimate.confidence_radius()))[:, rows],
+            "variance": np.stack([estimate.variance, estimate.noise_variance])[:, :, rows],
         }
 
     found = hj.monte_carlo(draw, runs, seed)
@@ -177,7 +178,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
     family.show(f"{name}.distortion.mean", np.mean(1 - noise / total))
     family.show(f"{name}.distortion.most", np.max(1 - noise / total))
     family.show(f"{name}.distortion.least_covered", (1 - noise / total)[worst])
-    exact, mean = np.asarray(family.model.htf(chosen, (-1, 0, 1)).H), np.asarray(truth.H)
+    exact, mean = np.asarray(family.model.htf(chosen, (-1, 0, 1)).H), np.asarray(truth.H)[:, rows]
     for k, output in enumerate(OUTPUTS):
         bias = np.abs(mean - exact)[1, :, k].max() / np.abs(exact)[1, :, k].max()
         family.show(f"{name}.bias.H0.{output}", bias)

@@ -215,7 +215,7 @@ def walking_layout(seeds=200, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
                 variable(model, STRIDES, noise, rng), len(multipliers)
             )
             modulus = np.stack([np.abs(found.multipliers), np.abs(found.plain)])
-            low, high = np.moveaxis([found.interval(), found.plain_interval()], 2, 0)
+            low, high = np.moveaxis([found.interval(), found.interval(plain=True)], 2, 0)
             held = (low <= np.array(multipliers)) & (np.array(multipliers) <= high)
             return {"modulus": modulus, "held": held.astype(float)}
 

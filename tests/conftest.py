@@ -39,10 +39,10 @@ from hybridjax._core.execution import libraries
 # Files whose fast tests cover each capability once, for `-m core`.
 CORE = (
     "test_layers", "test_budget", "test_words", "test_release", "linear/test_ldtp",
-    "linear/test_htf", "engine/test_move", "systems/test_system", "orbits/test_cycle",
-    "sections/test_linearize", "experiments/test_design", "experiments/test_run",
+    "linear/test_htf", "engine/test_chain", "systems/test_system", "orbits/test_cycle",
+    "sections/test_linearize", "experiments/test_design", "experiments/test_steady",
     "identify/test_nonparametric", "identify/test_structured", "identify/test_rational",
-    "recordings/test_recording", "designs/test_optimal_design", "fitting/test_parameters",
+    "recordings/test_recording", "designs/test_limits", "fitting/test_parameters",
     "_core/test_boundary", "plot/test_plots", "test_io",
 )  # fmt: skip
 

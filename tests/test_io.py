@@ -86,8 +86,10 @@ def test_round_trip_of_any_htf(folder, data):
     harmonics = data.draw(st.sets(st.integers(-3, 3), min_size=1).map(sorted))
     finite = st.complex_numbers(allow_nan=False, allow_infinity=False, max_magnitude=1e300)
     H = data.draw(arrays(complex, (len(harmonics), F, ny, nu), elements=finite))
-    f = data.draw(arrays(float, F, elements=st.floats(allow_nan=False, allow_infinity=False)))
-    names = data.draw(st.lists(st.text(), min_size=ny, max_size=ny, unique=True))
+    numbers = st.floats(-1e300, 1e300)
+    f = data.draw(st.lists(numbers, min_size=F, max_size=F, unique_by=lambda x: round(x, 6)))
+    words = st.text().map("y".__add__)  # (no input's name)
+    names = data.draw(st.lists(words, min_size=ny, max_size=ny, unique=True))
     htf = hj.HTF(f, H, harmonics, 7, None, names, data.draw(st.text()))
     assert same(htf, trip(folder, htf))
 

@@ -3,10 +3,13 @@
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 import hybridjax as hj
+from hybridjax.orbits.limit_cycles import LimitCycles
 
 
 class Field(hj.Chart):
@@ -146,3 +149,14 @@ class Dip(hj.HybridSystem):
 
     def start(self):
         return 1.0 - float(self.depth), 0.0
+
+
+def many(cycle, n):
+    """Return so many times the same cycle, without a program that finds them."""
+    arrays, rest = eqx.partition(cycle, eqx.is_array)
+    arrays = jax.tree_util.tree_map(lambda x: np.broadcast_to(x, (n, *x.shape)), arrays)
+    c, codes = eqx.combine(arrays, rest), np.tile(cycle.event_sequence, (n, 1))
+    return LimitCycles(
+        c.system, c.base, c.period, c.anchor, c.legs, c.factors, c.residual, c.iterations,
+        c.result, codes, cycle.settings, c.conserved, c.multiplicity,
+    )  # fmt: skip

@@ -131,10 +131,16 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
     return kind(**values)
 
 
+def options_of(hint: Any) -> tuple[Any, ...]:
+    """The types of which a field may be."""
+    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+
+
 def _module_in(hint: Any) -> type | None:
     """The kind of module that a field of this type may hold."""
-    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    return next((x for x in options if isinstance(x, type) and issubclass(x, eqx.Module)), None)
+    return next(
+        (x for x in options_of(hint) if isinstance(x, type) and issubclass(x, eqx.Module)), None
+    )
 
 
 def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]) -> dict[str, Any]:

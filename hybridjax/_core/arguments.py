@@ -32,6 +32,19 @@ def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ..
     return tuple(given)
 
 
+def input_and_output_names(
+    inputs: Collection[str] | None, outputs: Collection[str] | None, nu: int, ny: int
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """`names` of nu inputs and of ny outputs.
+
+    **Raises:** `DefinitionError` as `names`, and for an output that is an input.
+    """
+    u, y = names("inputs", inputs, nu), names("outputs", outputs, ny)
+    if shared := [name for name in y if name in u]:
+        raise DefinitionError(f"'{shared[0]}' is in `inputs` and in `outputs`: rename one of them.")
+    return u, y
+
+
 def require_same(
     what: str, a: Any, b: Any, fields: Iterable[str] = ("n_sections", "inputs", "outputs")
 ) -> None:
@@ -44,13 +57,14 @@ def require_same(
 
 
 def package(name: str) -> ModuleType:
-    """A library.
+    """A library, or a module of one.
 
-    **Raises:** `DefinitionError` if it is not installed; extras are called like the libraries.
+    **Raises:** `DefinitionError` if it is not installed.
     """
     try:
         return importlib.import_module(name)
     except ImportError as error:
+        name = name.split(".")[0]
         extra = _EXTRAS.get(name, name)
         raise DefinitionError(
             f"this needs the package {name}, which is not installed: "
@@ -59,4 +73,5 @@ def package(name: str) -> ModuleType:
 
 
 # The extra of a library that is not called like it.
-_EXTRAS = {"pandas": "tables", "distributed": "scale", "zarr": "scale"}
+_EXTRAS = {"distributed": "scale", "zarr": "scale", "ezc3d": "c3d", "h5py": "mat", "rosbags": "ros"}
+_EXTRAS |= dict.fromkeys(("pandas", "pyarrow", "openpyxl"), "tables")

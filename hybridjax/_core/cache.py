@@ -49,7 +49,7 @@ def enable_compilation_cache(folder: FilePath | None = None) -> pathlib.Path | N
         problem = f"cannot keep compiled programs ({error})"
         if given:
             raise DefinitionError(f"{problem}: give another folder.") from error
-        warnings.warn(f"{problem}; nothing is kept.", stacklevel=2)
+        warnings.warn(f"{problem}; nothing is kept.", stacklevel=3)
         return None
     jax.config.update("jax_compilation_cache_dir", str(programs))
     # Also the smallest programs: those of users' functions are the first that a process needs.
@@ -71,8 +71,10 @@ def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
     **Raises:** `OSError` if it cannot be made, other users can write to it or exchange it, or it
     was not made here; `RuntimeError` for a user without a home.
     """
-    base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    folder = pathlib.Path(given or pathlib.Path(base, "hybridjax")).resolve()
+    if not given:
+        base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+        given = pathlib.Path(base, "hybridjax")
+    folder = pathlib.Path(given).resolve()
     _make(folder)
     programs = folder / "programs"
     if not os.path.lexists(programs):

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Int
 
 from .executor import Array, namespace, on_host
@@ -173,21 +174,17 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
     if not sizes or sum(sizes) > _JACOBIAN_COLUMNS:
         return jax.jvp(of, (moving, common), (t_moving, t_common))
 
-    basis: list[jax.Array] = []
-    start = 0
     total = sum(sizes)
-    for x, size in zip([*leaves(moving), *leaves(common)], sizes, strict=True):
-        directions = jnp.zeros((total, size)).at[start : start + size].set(jnp.eye(size))
-        is_by_lane = len(basis) < len(leaves(moving))
-        shape = x.shape[:-1] if is_by_lane else x.shape
-        directions = directions.reshape(total, *shape)
-        if is_by_lane:
-            directions = jnp.broadcast_to(directions[..., None], (total, *x.shape))
-        basis.append(directions.astype(x.dtype))
-        start += size
-    structure = jax.tree_util.tree_structure((moving, common))
-    push = jax.vmap(lambda tangent: jax.jvp(of, (moving, common), tangent), out_axes=(None, 0))
-    end, columns = push(jax.tree_util.tree_unflatten(structure, basis))
+    first = jax.tree_util.tree_map(lambda x: x[..., 0], moving)
+    _, parts = ravel_pytree((first, common))
+
+    def push(direction):
+        of_lane, of_all = parts(direction)
+        spread = lambda t, x: jnp.broadcast_to(t[..., None], x.shape)  # noqa: E731
+        tangents = jax.tree_util.tree_map(spread, of_lane, moving), of_all
+        return jax.jvp(of, (moving, common), tangents)
+
+    end, columns = jax.vmap(push, out_axes=(None, 0))(jnp.eye(total))
 
     # One row for each direction: (total, L) for what lanes have of their own, (total, 1) else.
     rows = [t.reshape(-1, t.shape[-1]) for t in leaves(t_moving)]

@@ -4,17 +4,22 @@ A user's function reads constants of a notebook, calls helpers and methods, and 
 traces it once, and does not notice that one of these has changed. A digest of all of them does.
 """
 
+import builtins
 import contextlib
+import contextvars
 import dis
 import functools as ft
 import hashlib
+import importlib.metadata
 import inspect
 import itertools
 import os
 import pathlib
+import re
 import sys
 import sysconfig
 import types
+import weakref
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar, cast
 
@@ -28,8 +33,9 @@ from .executor import Definition, is_tracer
 from .memo import Memory
 
 
-# Names by which code reads values that are not named in it.
-_HIDDEN = frozenset(("eval", "exec", "globals", "__import__"))
+# Functions by which code reads values that are not named in it, and functions that read files.
+_HIDDEN = re.compile("eval|exec|globals|__import__|import_module|getenv")
+_READING = re.compile("open|(read|open|load)_.+|load|loadtxt|loadmat|genfromtxt|fromfile|memmap")
 _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range
 _PACKAGE = str(pathlib.Path(__file__).parents[1])
 _MODELS = os.path.join(_PACKAGE, "models")
@@ -38,6 +44,7 @@ _FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib"
 
 Thing = TypeVar("Thing")
 Names = tuple[str, ...]
+"""Also a global name with the attributes that code reads of it: `("np", "linalg", "norm")`."""
 
 
 def current(x: Thing) -> Thing:
@@ -73,10 +80,11 @@ def meaning(*things: Any) -> str:
     """Return a digest of functions, classes and objects: of their code, and of all values that they
     read. Two of the same digest compute the same.
 
-    Installed packages are known by the names of their functions; what users replace in them is not
-    noticed, except in `hybridjax.models`.
+    Installed packages are known by their versions and the names of their functions; what users
+    replace in them is not noticed, except in `hybridjax.models`.
 
-    **Raises:** `DefinitionError` if code calls `eval`, `exec`, `globals` or `__import__`.
+    **Raises:** `DefinitionError` if code uses `eval`, `exec`, `globals`, `__import__`,
+    `import_module`, `sys.modules` or `getenv`, or if a function that is no method reads a file.
     """
     walk = _Walk()
     walk.visit_all(things)
@@ -87,6 +95,8 @@ class _Walk:
     def __init__(self):
         self.digest = hashlib.blake2b(digest_size=16)
         self.number: dict[int, int] = {}
+        self.attributes: set[tuple[int, Names]] = set()
+        self.classes = 0  # around what is visited
         self.alive: list[Any] = []  # an id belongs to an object while this lives
 
     def note(self, *words: Any) -> None:
@@ -127,8 +137,19 @@ class _Walk:
                 self.visit_all((x.fget, x.fset))
             case types.MethodType():
                 self.visit_all((x.__func__, x.__self__))
-            case types.ModuleType() | types.BuiltinFunctionType():
+            case types.ModuleType():  # read by other means than the names of its attributes
+                self._origin(x.__name__)
+                if not _is_installed(x.__name__):
+                    self.visit({k: v for k, v in vars(x).items() if not _is_description(k, v)})
+            case types.BuiltinFunctionType():
                 self.note(x.__name__)
+            case weakref.ref():
+                self.visit(x())
+            case contextvars.ContextVar():
+                with contextlib.suppress(LookupError):  # of one that is not set
+                    self.visit(x.get())
+            case memoryview():
+                self.note(x.format, x.shape, x.tobytes())
             case _:
                 self._object(x)
 
@@ -143,10 +164,13 @@ class _Walk:
         else:
             self.digest.update(values.tobytes())
 
+    def _origin(self, module: Any, *words: Any) -> None:
+        self.note(str(module), _version(str(module).partition(".")[0]), *words)
+
     def _function(self, x: types.FunctionType) -> None:
         is_installed = is_of_package(x.__code__.co_filename)
         if is_installed:
-            self.note(x.__module__, x.__qualname__)
+            self._origin(x.__module__, x.__qualname__)
         else:
             self.visit(x.__code__)
             self._globals(x)
@@ -159,41 +183,65 @@ class _Walk:
 
     def _globals(self, x: types.FunctionType) -> None:
         """Visit what a function, and the functions written in it, read of their module."""
-        read, imported, names = _names(x.__code__)
+        paths, imported, names = _names(x.__code__)
         package = x.__globals__.get("__package__")
         modules = {x: sys.modules.get(x, sys.modules.get(f"{package}.{x}")) for x in imported}
-        for name in (*read, *imported):
-            value = modules[name] if name in modules else x.__globals__.get(name)
-            if value is not None:
-                self.note(name)
+        if not self.classes and "read_text" in names:
+            self._refuse_hidden(x, (), pathlib.Path.read_text)
+        for path in (*paths, *((name, "") for name in imported)):
+            value = modules[path[0]] if path[0] in modules else x.__globals__.get(path[0])
+            self._refuse_hidden(
+                x, path, getattr(builtins, path[0], None) if value is None else value
+            )
+            if value is None:
+                continue
+            self.note(path[0])
+            if isinstance(value, types.ModuleType):
+                self._attributes(value, names)
+            if not isinstance(value, types.ModuleType) or path[1:] == () or path[1][:2] == "__":
                 self.visit(value)
-                if isinstance(value, types.ModuleType):
-                    self._attributes(value, names)
-            elif name in _HIDDEN:
-                raise DefinitionError(
-                    f"`{x.__qualname__}` calls `{name}`, so that a change of the values that it "
-                    "reads cannot be noticed: read them by their names."
-                )
+
+    def _refuse_hidden(self, x: types.FunctionType, path: Names, value: Any) -> None:
+        for name in path[1:]:
+            if isinstance(value, types.ModuleType):
+                value = getattr(value, name, None)
+        name = str(getattr(value, "__name__", "")) if callable(value) else ""
+        is_hidden = _HIDDEN.fullmatch(name) or (not self.classes and _READING.fullmatch(name))
+        is_hidden = is_hidden and _is_installed(getattr(value, "__module__", None))
+        if is_hidden or value is sys.modules:
+            raise DefinitionError(
+                f"`{x.__qualname__}` uses `{name or 'sys.modules'}`, so that a change of what it "
+                "reads cannot be noticed: read values before, and use them by their names."
+            )
 
     def _attributes(self, module: types.ModuleType, names: Names) -> None:
         """Visit the attributes of a module that a function names."""
+        if (id(module), names) in self.attributes:
+            return
+        self.attributes.add((id(module), names))
+        self._origin(module.__name__)
+        is_installed = _is_installed(module.__name__)
+        if not is_installed and hasattr(module, "__getattr__"):
+            self.visit(module)
         for name in names:
             if name not in vars(module) and name not in _lazy_names(module):
                 continue
             value = getattr(module, name)
-            if _is_installed(module.__name__) and callable(value):
+            if is_installed and callable(value):
                 continue
-            is_new = id(value) not in self.number
             self.note(name)
-            self.visit(value)
-            if isinstance(value, types.ModuleType) and is_new:
+            if isinstance(value, types.ModuleType):
                 self._attributes(value, names)
+            else:
+                self.visit(value)
 
     def _class(self, x: type) -> None:
+        self.classes += 1
         for base in inspect.getmro(x):
-            self.note(base.__module__, base.__qualname__)
+            self._origin(base.__module__, base.__qualname__)
             if not _is_installed(base.__module__):
                 self.visit({k: v for k, v in vars(base).items() if not _is_description(k, v)})
+        self.classes -= 1
 
     def _object(self, x: Any) -> None:
         self.visit(type(x))
@@ -216,17 +264,36 @@ class _Walk:
 
 
 @ft.lru_cache(4096)
-def _names(code: types.CodeType) -> tuple[Names, Names, Names]:
+def _names(code: types.CodeType) -> tuple[tuple[Names, ...], Names, Names]:
     """Global names that code reads, modules that it imports, and all names and words in it, with
     those of the functions that are written in it."""
-    steps = [(step.opname, step.argval) for step in dis.get_instructions(code)]
-    read = [x for name, x in steps if name == "LOAD_NAME" or name.startswith("LOAD_GLOBAL")]
-    imported = [x for name, x in steps if name == "IMPORT_NAME"]
+    paths: list[Names] = []
+    is_open = False  # whether the next step may read an attribute of the last name
+    for step in dis.get_instructions(code):
+        if step.opname == "LOAD_NAME" or step.opname.startswith("LOAD_GLOBAL"):
+            paths.append((step.argval,))
+        elif is_open and step.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+            paths[-1] += (step.argval,)
+        elif step.opname != "CACHE":
+            is_open = False
+            continue
+        is_open = True
+    imported = [x.argval for x in dis.get_instructions(code) if x.opname == "IMPORT_NAME"]
     words = [x for x in code.co_consts if isinstance(x, str) and x.isidentifier()]
     inner = [_names(x) for x in code.co_consts if isinstance(x, types.CodeType)]
-    every = zip((read, imported, [*code.co_names, *words]), *inner, strict=True)
-    read, imported, names = (tuple(dict.fromkeys(itertools.chain(*x))) for x in every)
-    return read, imported, names
+    every: Any = zip((paths, imported, [*code.co_names, *words]), *inner, strict=True)
+    parts: Any = tuple(tuple(dict.fromkeys(itertools.chain(*x))) for x in every)
+    return parts
+
+
+@ft.cache
+def _version(package: str) -> str:
+    """Return the version of an installed package, "" for others and Python's own."""
+    try:
+        is_own = package in sys.stdlib_module_names
+        return "" if is_own else importlib.metadata.version(package)
+    except (importlib.metadata.PackageNotFoundError, ValueError):  # or no name
+        return str(getattr(sys.modules.get(package), "__version__", ""))
 
 
 def _is_description(name: str, value: Any) -> bool:

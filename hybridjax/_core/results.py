@@ -26,6 +26,7 @@ class Result(enum.IntEnum):
     COINCIDENCE = 13
     STEP_COLLAPSE = 14
     FIELD_NOT_FINITE = 15
+    GUARD_PASSED = 16
 
     @property
     def message(self) -> str:
@@ -46,11 +47,15 @@ _MESSAGES = {
     Result.SINGULAR: "J - I is singular: the cycle is not isolated",
     Result.BAD_INPUT: "the start or the input is NaN or infinite",
     Result.EQUILIBRIUM: "the iteration ended in an equilibrium instead of a cycle",
-    Result.EXTRA_TURNS: "a turn met the section more often than asked (its period is shorter)",
+    Result.EXTRA_TURNS: "the cycle closes sooner, or meets its section more often, than asked",
     Result.COINCIDENCE: "two events coincide on the cycle: their order is not fixed beside it",
     Result.FIELD_NOT_FINITE: (
         "the field or a reset returned NaN or infinity: a division by zero, say, or a mass matrix "
         "that is singular there"
+    ),
+    Result.GUARD_PASSED: (
+        "a reset put the state on a guard, through which it then went without an event: what comes "
+        "to rest there needs a chart of its own"
     ),
     Result.STEP_COLLAPSE: (
         "steps shrank to nothing although the state hardly moves: a field that jumps must do so at "

@@ -65,6 +65,12 @@ def number(x: Any, digits: int = 6, unit: str = "") -> str:
     return f"{value(x) if is_traced(x) else f'{float(x):.{digits}g}'} {unit}".rstrip()
 
 
+def numbers(names: Iterable[str], values: Iterable[Any]) -> str:
+    """Numbers of three digits after the names of signals, in their units."""
+    pairs = zip(names, values, strict=True)
+    return ", ".join(f"{name} {number(x, 3, unit_of(name))}" for name, x in pairs)
+
+
 def fields(module: Any) -> str:
     """A module by its fields, without those that are None."""
     shown_fields = (field for field in dataclasses.fields(module) if field.repr)

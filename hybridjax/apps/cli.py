@@ -127,7 +127,7 @@ def _add_reproduce(commands) -> None:
         help="reproduce Ankarali & Cowan's paper on the vertical hopper",
         description="Reproduce Ankarali & Cowan, 'System Identification of Rhythmic Hybrid "
         "Dynamical Systems via Discrete Time Harmonic Transfer Functions', on their vertical "
-        "hopper: figures, summary.json and results.npz, laid over the exact answer.",
+        "hopper: figures, numbers, and models for hj.load, laid over the exact answer.",
     )
     add = reproduce.add_argument
     add("--out", required=True, type=_place, metavar="DIR",

@@ -12,9 +12,7 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-import numpy as np
-
-from .. import __version__
+from .._core.archive import write_module
 from .._core.cache import enable_compilation_cache
 from .._core.precision import enable_x64
 from .._core.writing import Format, results_folder
@@ -41,7 +39,8 @@ from ..systems.system import own_fields
 from .paper_report import OUTPUTS, summarize, table
 
 
-_SYMBOLS = {"yM": "$y_M$", "vM": r"$\dot y_M$"}
+# Results of each family that are written: the model, HTFs and fits.
+_SAVED = ("ldtp", "exact", "estimate", "rational", "structured")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +79,7 @@ def _log(begin: float, text: str) -> None:
 def reproduce(
     out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format], process: Executor
 ) -> dict:
-    """Run the protocol and write figures, `summary.json` and `results.npz` into the folder `out`.
+    """Run the protocol and write figures, `summary.json` and files for `hj.load` into a folder.
 
     They appear when all of them are ready, and replace those of an earlier run. Other files in the
     folder stay as they are.
@@ -104,7 +103,8 @@ def _names(families: Sequence[str], formats: Sequence[Format]) -> list[str]:
     cycles = [f"fig1_cycle_{family}" for family in families]
     figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
     files = [f"{figure}.{format}" for figure in figures for format in formats]
-    return ["summary.json", "results.npz", *files]
+    saved = [f"{result}_{family}.npz" for family in families for result in _SAVED]
+    return ["summary.json", *saved, *files]
 
 
 def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process: Executor) -> dict:
@@ -127,7 +127,9 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process
     placed = {name: family.placed for name, family in families.items()}
     _draw(_cycles, (placed, perturbed), out, formats, begin)
     summary = summarize(protocol, cycle, families)
-    _write_results(out / "results.npz", protocol, cycle, families)
+    for name, family in families.items():
+        for result in _SAVED:
+            write_module(out / f"{result}_{name}.npz", getattr(family, result))
     drawing.result()
     summary["seconds"] = time.time() - begin
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -229,9 +231,8 @@ def _draw(
 
 def _cycles(plot: Any, placed: Mapping[str, PlacedSections], perturbed: Trajectory) -> Iterator:
     """Fig. 1, for each family of sections."""
-    options = {"perturbed": perturbed, "labels": _SYMBOLS}
     for name, sections in placed.items():
-        drawn = plot.cycle(sections.cycle, *OUTPUTS, sections=sections, **options)
+        drawn = plot.cycle(sections.cycle, *OUTPUTS, sections=sections, perturbed=perturbed)
         yield f"fig1_cycle_{name}", drawn
 
 
@@ -242,11 +243,10 @@ def _comparisons(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -
     estimates: dict[str, Any] = {}
     for name, family in families.items():
         estimates |= {f"2p1z, {name}": family.rational, f"structured, {name}": family.structured}
-    deviations = {name: rf"$\delta$ {symbol}" for name, symbol in _SYMBOLS.items()}
-    yield "fig3_harmonics", plot.harmonics(pairs, labels=deviations)
-    yield "fig4_bode", plot.bodes(pairs, fits=rational, labels=deviations)
-    yield "multipliers", plot.multipliers(cycle, estimates, labels=_SYMBOLS)
-    yield "poles_zeros", plot.poles_zeros(rational, labels=_SYMBOLS)
+    yield "fig3_harmonics", plot.harmonics(pairs)
+    yield "fig4_bode", plot.bodes(pairs, fits=rational)
+    yield "multipliers", plot.multipliers(cycle, estimates)
+    yield "poles_zeros", plot.poles_zeros(rational)
 
 
 def _perturbed(cycle: LimitCycle) -> Trajectory:
@@ -259,49 +259,3 @@ def _perturbed(cycle: LimitCycle) -> Trajectory:
         time=float(cycle.anchor.t[0]), throw=False,
         settings=Settings(rtol=1e-6, atol=1e-6),  # a figure shows no more
     )  # fmt: skip
-
-
-def _write_results(
-    path: Path, protocol: Protocol, cycle: LimitCycle, families: Mapping[str, Family]
-) -> None:
-    first = next(iter(families.values()))
-    arrays: dict[str, Any] = {
-        "f": first.exact.f,
-        "harmonics": first.estimate.harmonics,
-        "multipliers": cycle.multipliers,
-    }
-    for name, family in families.items():
-        arrays |= {f"{x}_{name}": getattr(family.ldtp, x) for x in ("A", "B", "C", "D", "dims")}
-        arrays |= {
-            f"H_exact_{name}": family.exact.H,
-            f"H_estimate_{name}": _on_grid(family.estimate, family.exact.f),
-            f"section_times_{name}": family.placed.lanes.t,
-            f"multipliers_fit_2p1z_{name}": family.rational.multipliers,
-            f"multipliers_fit_structured_{name}": family.structured.multipliers,
-        }
-    header = {
-        "format": "hybridjax reproduce",
-        "version": __version__,
-        "protocol": dataclasses.asdict(protocol),
-        "outputs": OUTPUTS,
-        "inputs": cycle.system.inputs,
-        "coordinates": {name: family.ldtp.coordinates for name, family in families.items()},
-        "conventions": {
-            "f": "input frequency in cycles per period",
-            "H": "axes (harmonic, frequency, output, input); H_m is evaluated at the input "
-            "frequency f, the output frequency is f + m; n is counted from section 0",
-            "A, B, C, D": "x[n+1] = A[n]x[n] + B[n]u[n], y[n] = C[n]x[n] + D[n]u[n], padded with "
-            "zeros; the valid block of A[i] is [:dims[i+1], :dims[i]]; the coordinates of x[n] "
-            "are deviations from the cycle, named in `coordinates`: t is the time of crossing, "
-            "and the state that is missing from a kinematic section's list follows from it",
-            "section_times": "clock time, from section 0 to one period later",
-        },
-    }
-    np.savez(path, header=np.array(json.dumps(header)), **arrays)
-
-
-def _on_grid(estimate: HTF, f) -> np.ndarray:
-    """Return H on the frequencies f: NaN where a failed experiment left it unknown."""
-    H = np.full((len(estimate.harmonics), len(f), *estimate.H.shape[2:]), np.nan, complex)
-    H[:, np.isin(np.asarray(f), np.asarray(estimate.f))] = np.asarray(estimate.H)
-    return H

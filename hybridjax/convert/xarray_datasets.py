@@ -5,15 +5,13 @@ and numbers of harmonics become their coordinates. All other fields are JSON in 
 """
 
 import json
-import types
-import typing
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from .._core.archive import put_together, restored, signals_in, taken_apart
+from .._core.archive import options_of, put_together, restored, signals_in, taken_apart
 from .._core.arguments import package
 from .._core.boundary.checked import checked
 from .._core.executor import is_traced
@@ -132,18 +130,14 @@ def _axes(kind: type, name: str) -> tuple[str, ...]:
         return _STATES[name]
     hint: Any = kind
     for part in name.split("."):
-        module = next(x for x in _options(hint) if isinstance(x, type) and hasattr(x, "__mro__"))
+        module = next(x for x in options_of(hint) if isinstance(x, type) and hasattr(x, "__mro__"))
         hint = module.__dataclass_fields__[part].type  # type: ignore[attr-defined]
-    shaped = next(x for x in _options(hint) if hasattr(x, "dim_str"))
+    shaped = next(x for x in options_of(hint) if hasattr(x, "dim_str"))
     axes: list[str] = []
     for axis in str(shaped.dim_str).split():
         axis = _AXES.get(axis, axis)
         axes.append(f"{axis}_{axes.count(axis) + 1}" if axis in axes else axis)
     return tuple(axes)
-
-
-def _options(hint: Any) -> tuple[Any, ...]:
-    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
 
 
 def _from_recording(recording: Recording) -> Any:

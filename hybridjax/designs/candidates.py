@@ -1,10 +1,11 @@
 """The cosines among which power is divided: the signals that they cause, and their measurement."""
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive, Seed
@@ -77,6 +78,13 @@ class Candidates(NamedTuple):
     def only(self, kept: Kept) -> "Candidates":
         return self._replace(line=self.line[kept], channel=self.channel[kept])
 
+    def responses(
+        self, model: Model, harmonics: Harmonics | None = None
+    ) -> Complex[np.ndarray, "K M ny"]:
+        """Return the HTFs of each cosine's input at its frequency."""
+        f, place = np.unique(self.f, return_inverse=True)
+        return np.asarray(model.htf(f, harmonics).H)[:, place, :, self.channel]
+
     def places(self, design: Design) -> Int[np.ndarray, " L"]:
         """Return the index of the cosine that each line of a design is."""
         inputs = self.channel.max() + 1
@@ -110,7 +118,7 @@ def mean_squares(model: Model, cosines: Candidates) -> Squares:
     inputs = {n: (cosines.channel == i).astype(float) for i, n in enumerate(model.inputs)}
     change = 4 * np.sin(np.pi * cosines.f / cosines.n_sections) ** 2
     rates = {rate_of(name): square * change for name, square in inputs.items()}
-    H = np.asarray(model.htf(cosines.f).H)[:, np.arange(len(cosines.f)), :, cosines.channel]
+    H = cosines.responses(model)
     outputs = dict(zip(model.outputs, (np.abs(H) ** 2).sum(axis=1).T, strict=True))
     return {**inputs, **outputs, **rates}
 
@@ -188,19 +196,16 @@ def measured_htfs(
         htf = model.htf(cosines.f[members], harmonics)
         spectrum = noise.spectrum(cosines.f[members], htf.harmonics)
         variance = 2 * spectrum[..., None] / (cosines.n_sections * cosines.strides)
-        yield Measured(with_variance(htf, model, noise, variance, int(i)), members, int(i))
+        yield Measured(with_variance(htf, noise, variance, int(i)), members, int(i))
 
 
 def with_variance(
-    htf: HTF, model: Model, noise: Noise, variance: Float[np.ndarray, "M F ny 1"], channel: int
+    htf: HTF, noise: Noise, variance: Float[np.ndarray, "M F ny 1"], channel: int
 ) -> HTF:
     """Return the HTFs from one input to the measured outputs, with these variances."""
     H = np.asarray(htf.H)[:, :, noise.outputs, channel : channel + 1]
-    outputs = tuple(model.outputs[k] for k in noise.outputs)
-    return HTF(
-        htf.f, H, htf.harmonics, htf.n_sections, (model.inputs[channel],), outputs,
-        variance=variance,
-    )  # fmt: skip
+    inputs, outputs = (htf.inputs[channel],), tuple(htf.outputs[k] for k in noise.outputs)
+    return dataclasses.replace(htf, H=H, variance=variance, inputs=inputs, outputs=outputs)
 
 
 @checked

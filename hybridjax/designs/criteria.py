@@ -1,7 +1,6 @@
 """The criterion of each goal."""
 
 import dataclasses
-from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
@@ -13,13 +12,14 @@ from ..fitting.observations import ObservedHTF
 from ..identify.denominator import chi, multipliers_of
 from ..identify.joint.model import characteristic_slopes
 from ..identify.variable_projection import (
+    EQUAL_WEIGHTS,
     check_values,
     error_weights,
+    numerator_size,
     powers_basis,
-    require_frequencies,
 )
 from ..linear.htf import HTF
-from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
+from .candidates import Candidates, Model, Noise, Powers, measured_htfs
 from .criterion import Channel, Criterion, LinearCriterion
 from .goals import Goal, Multipliers, Parameters
 from .matrices import ldtp_matrices, response_criterion
@@ -32,9 +32,6 @@ _EXPONENT = {"mean": 1.0, "worst": 16.0}
 # distance at which multipliers of a minimal and of the whole model are the same. Larger: distinct
 # multipliers count as one. Smaller: rounding separates equal ones.
 _SAME = 1e-6
-# Decimal digits to which the errors of two entries must agree (up to a factor) to be treated
-# together. One digit less: fewer channels, with errors that are off by as much.
-_EQUAL_WEIGHTS = 9
 
 
 def criterion_of(
@@ -86,10 +83,10 @@ def _multipliers(
         return matrices.criterion(wanted @ slopes, names)
     c = np.poly(multipliers).real[1:]
     htfs = measured_htfs(model, cosines, goal.fitted_harmonics, noise)
-    channels = denominator_channels(htfs, c, goal.overhang)
+    channels = [x for htf, each, _ in htfs for x in _channels(htf, each, c, goal.overhang)]
     wanted, names = wanted_parts(goal, multipliers, c)
     unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
-    return LinearCriterion(names, unknowns, channels, wanted)
+    return LinearCriterion(names, unknowns, tuple(channels), wanted)
 
 
 def wanted_parts(
@@ -148,27 +145,6 @@ def _parameters(
     return LinearCriterion(wanted, free, tuple(channels), rows)
 
 
-def coefficients(order: int, n_sections: int, overhang: int | None) -> int:
-    """Return how many coefficients each numerator has."""
-    return order * n_sections + (n_sections if overhang is None else overhang) + 1
-
-
-def denominator_channels(
-    htfs: Iterable[Measured], c: Float[np.ndarray, " d"], overhang: int | None
-) -> tuple[Channel, ...]:
-    """Return the measurements with their derivatives by the coefficients c of the denominator.
-
-    **Raises:** `DefinitionError` if the HTFs have too few frequencies, or harmonics that are not
-    symmetric about 0.
-    """
-    channels = []
-    for htf, cosine, _ in htfs:
-        size = coefficients(len(c), htf.n_sections, overhang)
-        require_frequencies(htf, len(c), size)
-        channels += _channels(htf, cosine, c, size)
-    return tuple(channels)
-
-
 def require_symmetric(harmonics: tuple[int, ...], n_sections: int) -> None:
     """**Raises:** `DefinitionError` for harmonics that are not symmetric about 0."""
     if {(-m) % n_sections for m in harmonics} != {m % n_sections for m in harmonics}:
@@ -178,10 +154,10 @@ def require_symmetric(harmonics: tuple[int, ...], n_sections: int) -> None:
 
 
 def _channels(
-    htf: HTF, cosine: Int[np.ndarray, " F"], c: Float[np.ndarray, " d"], size: int
+    htf: HTF, cosine: Int[np.ndarray, " F"], c: Float[np.ndarray, " d"], overhang: int | None
 ) -> list[Channel]:
     r"""Return H delayed by 1 to d periods and divided by the denominator's modulus, and the part of
-    it that numerators of so many coefficients can explain.
+    it that numerators can explain.
 
     From $dH = dB/\chi - H\, d\chi/\chi$ at z and at 1/z, with a channel for all entries whose
     errors depend on the frequency in the same way.
@@ -190,8 +166,11 @@ def _channels(
     are explained by cosines and sines times the coefficients of B_m, whose real and imaginary parts
     are thereby apart: with the same real equations as those of the real B_0. This requires errors
     of the same size in both; otherwise all four equations are taken together.
+
+    **Raises:** `DefinitionError` if the HTFs have too few frequencies, or harmonics that are not
+    symmetric about 0.
     """
-    N, f = htf.n_sections, np.asarray(htf.f)
+    N, f, size = htf.n_sections, np.asarray(htf.f), numerator_size(htf, len(c), overhang)
     require_symmetric(htf.harmonics, N)
     weight = dict(zip(htf.harmonics, error_weights(htf, check_values(htf))[..., 0], strict=True))
     delay = np.exp(-2j * np.pi * f)
@@ -209,7 +188,7 @@ def _channels(
     def add(basis: np.ndarray, factor: np.ndarray, *entries: tuple[np.ndarray, ...]) -> None:
         # (Only the shape of the factors counts: numerators take any size.)
         shape = factor / factor.max()
-        key = np.round(shape, _EQUAL_WEIGHTS).tobytes()
+        key = np.round(shape, EQUAL_WEIGHTS).tobytes()
         if key not in groups:
             shape = shape / np.tile(size_of_chi, len(shape) // len(f))
             groups[key] = powers_basis(basis)[0] * shape[:, None], []
@@ -224,7 +203,7 @@ def _channels(
                 add(powers, np.tile(w, 2), (h.real, h.imag))
                 continue
             mirror, v = slope[-m][..., i], weight[-m][:, i]
-            if np.allclose(v, w, rtol=10.0**-_EQUAL_WEIGHTS, atol=0):
+            if np.allclose(v, w, rtol=10.0**-EQUAL_WEIGHTS, atol=0):
                 even, odd = (h + mirror.conj()) / 2**0.5, (h - mirror.conj()) / 2**0.5
                 add(powers, np.tile(w, 2), (even.real, odd.imag), (even.imag, -odd.real))
                 continue

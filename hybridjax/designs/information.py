@@ -9,15 +9,12 @@ from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..identify.variable_projection import (
     HTFGroup,
-    check_values,
-    error_weights,
-    group_htf,
+    grouped,
     misfit_of,
-    require_frequencies,
 )
 from ..linear.htf import HTF
 from .candidates import Model, NoiseLike, make_noise, with_variance
-from .criteria import coefficients, require_symmetric, wanted_parts
+from .criteria import require_symmetric, wanted_parts
 from .goals import Multipliers
 
 
@@ -77,13 +74,11 @@ def information_map(
     htf = model.htf(design.frequencies, goal.fitted_harmonics)
     require_symmetric(htf.harmonics, htf.n_sections)
     variance = errors.spectrum(design.frequencies, htf.harmonics)[..., None]
-    htf = with_variance(htf, model, errors, variance * design.expected_variance()[:, None], 0)
+    htf = with_variance(htf, errors, variance * design.expected_variance()[:, None], 0)
 
     c = np.poly(np.asarray(model.multipliers)).real[1:]
     N, d = htf.n_sections, len(c)
-    size = coefficients(d, N, goal.overhang)
-    require_frequencies(htf, d, size)
-    groups = group_htf(htf, error_weights(htf, check_values(htf)), size)
+    groups = grouped(htf, d, goal.overhang)
     jacobians = [misfit_of(group, c).jacobian for group in groups]
     rows = np.concatenate([x.reshape(d, -1) for x in jacobians], axis=1)
     wanted, _ = wanted_parts(goal, np.asarray(model.multipliers), c)

@@ -9,14 +9,15 @@ scaled to the distortion of the very experiments.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Positive
+from .._core.boundary.kinds import Count
+from .._core.boundary.values import Number
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import optimize_phases
@@ -34,6 +35,8 @@ _LEAST = 1e-3
 _DIFFERENT = 0.3
 
 Words = Literal["input", "output"]
+# Squares of larger and smaller levels are infinite or zero.
+Level = Annotated[float, Number("a number from 1e-100 to 1e100", low=1e-100, high=1e100)]
 
 
 @checked
@@ -56,12 +59,13 @@ class Distortion(eqx.Module):
 
     cycle: LimitCycle
     sections: FamilyLike
-    rms: Mapping[str, Positive]
+    rms: Mapping[str, Level]
 
     def __check_init__(self):
         as_family(self.sections)
         if not self.rms:
             raise DefinitionError("`rms` of a distortion limits nothing: name an output.")
+        self.cycle.structure.resolve_outputs(tuple(map(str, self.rms)))
 
 
 @checked
@@ -82,9 +86,9 @@ class Limits(eqx.Module):
     - `distortion`: of outputs.
     """
 
-    rms: Mapping[str, Positive] | Words = eqx.field(default_factory=dict)
-    rate: Mapping[str, Positive] = eqx.field(default_factory=dict)
-    peak: Mapping[str, Positive] = eqx.field(default_factory=dict)
+    rms: Mapping[str, Level] | Words = eqx.field(default_factory=dict)
+    rate: Mapping[str, Level] = eqx.field(default_factory=dict)
+    peak: Mapping[str, Level] = eqx.field(default_factory=dict)
     strides: Count | None = eqx.field(static=True, default=None)
     distortion: Distortion | None = None
 
@@ -116,7 +120,7 @@ class Limits(eqx.Module):
         return count
 
 
-Limit = Words | Mapping[str, Positive] | Limits
+Limit = Words | Mapping[str, Level] | Limits
 
 
 def as_limits(limit: Limit) -> Limits:
@@ -260,9 +264,9 @@ class Products(NamedTuple):
 
     def require_those_of(self, model: Model) -> None:
         """**Raises:** `DefinitionError` if the model's transfer functions are different."""
-        f, channel = self.cosines.f, self.cosines.channel
-        H_here = np.mean(self.quadratic.show @ self.quadratic.waves(f, channel), axis=0)
-        H_model = np.asarray(model.htf(f, 0).H)[0, np.arange(len(f)), :, channel]
+        waves = self.quadratic.waves(self.cosines.f, self.cosines.channel)
+        H_here = np.mean(self.quadratic.show @ waves, axis=0)
+        H_model = self.cosines.responses(model, 0)[:, 0]
         for name, H in zip(self.outputs, H_here, strict=True):
             if name not in model.outputs:
                 continue

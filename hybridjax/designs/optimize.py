@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.arguments import require_same
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Positive, Seed
 from .._core.execution import one_blas_thread
@@ -318,9 +319,7 @@ def _check_alike(models: list[Model], design: Design) -> None:
     """**Raises:** `DefinitionError` for models and a design that do not fit together."""
     first = models[0]
     for k, model in enumerate(models):
-        for name in ("n_sections", "inputs", "outputs"):
-            if getattr(model, name) != getattr(first, name):
-                raise DefinitionError(f"model {k} has other {name} than model 0.")
+        require_same(f"model {k} and model 0", model, first)
     if design.n_sections != first.n_sections or design.input_names != first.inputs:
         raise DefinitionError(
             f"the design has {design.n_sections} sections and the inputs "

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Order, Positive, Seed
+from .._core.boundary.kinds import Count, OptionalNames, Order, Positive, Seed
 from .._core.execution import one_blas_thread
 from .._core.html import card, multiplier_table, table, text
 from .._core.progress import working
@@ -38,7 +38,6 @@ class History(NamedTuple):
     """The blocks of a study, and the results after each."""
 
     blocks: tuple[Block, ...] = ()
-    strides: Float[np.ndarray, " B"] = np.zeros(0)
     standard_errors: Float[np.ndarray, "B g"] = np.zeros((0, 0))
     estimate: Estimate | None = None
     plan: OptimalDesign | None = None
@@ -85,6 +84,7 @@ class Study(eqx.Module):
       the expected squared distance from the true one).
     - `goal`: the multipliers of interest, estimated by `fit_multipliers`. Default: all.
     - `limit`: as in `optimal_design`, relative to `first`. Default: rms of the input as in `first`.
+    - `outputs`: names of outputs that will be recorded and that `limit` names. Default: none.
     - `seed`: of phases and division of all blocks but the first. Default: 0.
 
     **Raises:** `DefinitionError` for several inputs, other estimators, and a limit of strides.
@@ -93,45 +93,41 @@ class Study(eqx.Module):
     first: Design
     order: Order = eqx.field(static=True)
     standard_error: Positive = eqx.field(static=True)
-    goal: Multipliers
-    limit: Limit
-    seed: Seed = eqx.field(static=True)
-    _history: History
+    goal: Multipliers = eqx.field(default_factory=Multipliers, kw_only=True)
+    limit: Limit = eqx.field(default="input", kw_only=True)
+    outputs: OptionalNames = eqx.field(static=True, default=(), kw_only=True)
+    seed: Seed = eqx.field(static=True, default=0, kw_only=True)
+    _history: History = eqx.field(default_factory=History, kw_only=True)
 
-    def __init__(
-        self,
-        first: Design,
-        order: Order,
-        standard_error: Positive,
-        *,
-        goal: Multipliers | None = None,
-        limit: Limit = "input",
-        seed: Seed = 0,
-    ):
+    def __check_init__(self):
+        first, goal = self.first, self.goal
         if len(first.input_names) > 1:
             raise DefinitionError(
                 f"`first` has the inputs {', '.join(first.input_names)}: study one at a time."
             )
-        goal = Multipliers() if goal is None else goal
         if goal.estimator == "fit_ldtp":
             raise DefinitionError(
                 "a study estimates multipliers by fit_multipliers: `goal` may have no other "
                 "estimator."
             )
-        if goal.which is not None and goal.which >= order:
+        if goal.which is not None and goal.which >= self.order:
             raise DefinitionError(
-                f"`goal`: there is no multiplier {goal.which}, the order is {order}."
+                f"`goal`: there is no multiplier {goal.which}, the order is {self.order}."
             )
-        limits = as_limits(limit)
+        limits = as_limits(self.limit)
         if limits.strides is not None:
             raise DefinitionError(
                 "`limit` limits the strides, but a study ends at a precision: end it yourself."
             )
         limits.require_inputs(first.input_names)
+        signals = (*first.input_names, *self.outputs)
+        named = () if isinstance(limits.rms, str) else limits.rms
+        if unknown := [n for n in named if n not in signals]:
+            raise DefinitionError(
+                f"`limit` has '{unknown[0]}', but the signals are {', '.join(signals)}: if it is "
+                "an output that will be recorded, name it in `outputs`."
+            )
         Candidates.of(first)
-        self.first, self.order, self.standard_error = first, order, standard_error
-        self.goal, self.limit, self.seed = goal, limit, seed
-        self._history = History()
 
     @property
     def blocks(self) -> int:
@@ -152,7 +148,7 @@ class Study(eqx.Module):
     @property
     def strides(self) -> Float[np.ndarray, " B"]:
         """Cycles of all records up to each block, with those that were discarded."""
-        return self._history.strides
+        return np.cumsum([block.strides for block in self._history.blocks]).astype(float)
 
     @property
     def standard_errors(self) -> Float[np.ndarray, "B g"]:
@@ -164,9 +160,7 @@ class Study(eqx.Module):
     def noise(self) -> dict[str, float]:
         """Standard deviation of each output's noise (and distortion) in the last block, by name."""
         estimate = self._history.estimate
-        if estimate is None:
-            return {}
-        return dict(zip(estimate.fit.outputs, estimate.noise[-1].tolist(), strict=True))
+        return {} if estimate is None else estimate.last_noise
 
     @property
     def done(self) -> bool:
@@ -217,20 +211,19 @@ class Study(eqx.Module):
         errors_so_far = [*self.standard_errors, errors]
         width = max(map(len, errors_so_far))
         padded = [np.append(x, np.full(width - len(x), np.nan)) for x in errors_so_far]
-        strides = np.cumsum([block.strides for block in blocks]).astype(float)
-        plan = None if best.objection else self._next(best, errors, strides[-1], len(blocks))
-        history = History(blocks, strides, np.array(padded), best, plan)
+        strides = sum(block.strides for block in blocks)
+        plan = None if best.objection else self._next(best, errors, strides, len(blocks))
+        history = History(blocks, np.array(padded), best, plan)
         return eqx.tree_at(lambda s: s._history, self, history, is_leaf=lambda x: x is None)
 
     def _next(
         self, best: Estimate, errors: Float[np.ndarray, " g"], strides: float, blocks: int
     ) -> OptimalDesign:
         """Return the design for the missing strides."""
-        noise = dict(zip(best.fit.outputs, best.noise[-1].tolist(), strict=True))
 
         def planned(limit: Limit) -> OptimalDesign:
             return optimal_design(
-                best.fit, self.first, goal=self.goal, limit=limit, noise=noise,
+                best.fit, self.first, goal=self.goal, limit=limit, noise=best.last_noise,
                 seed=self.seed + blocks,
             )  # fmt: skip
 
@@ -305,7 +298,5 @@ def _student(fit: StructuredFit) -> float:
     """Return the ratio of Student's to Gaussian intervals of the fit."""
     from scipy import special  # (a fifth of a second)
 
-    if np.isinf(fit.covariance_freedom):
-        return 1.0
     tail = (1 + _LEVEL) / 2
     return float(special.stdtrit(fit.covariance_freedom, tail) / special.ndtri(tail))

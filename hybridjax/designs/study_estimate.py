@@ -3,6 +3,8 @@
 import dataclasses
 from typing import NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -12,24 +14,18 @@ from ..identify.multipliers import StructuredFit, fit_multipliers, require_order
 from ..identify.spectral_sums import spectral_sums
 from ..identify.variable_projection import (
     HTFGroup,
-    check_values,
-    error_weights,
-    group_htf,
+    grouped,
     maximum_likelihood,
     misfit_of,
-    require_frequencies,
 )
 from ..linear.htf import HTF
 from .allocation import ENOUGH
-from .criteria import coefficients
 from .goals import Multipliers
 
 
 # Estimates of the noise, at most, each from the residual of a fit weighted by the last one. Fewer:
 # weights that are off by the signal in the first estimate.
 _SWEEPS = 10
-# Steps of each of these fits. Fewer: the noise is overestimated, until the next fit continues.
-_MAX_STEPS = 50
 # Standard deviations by which a transient exceeds the noise before the data are rejected. Larger:
 # weak transients bias the multipliers. Smaller: noise is taken for a transient.
 _BEYOND_NOISE = 3.0
@@ -59,7 +55,9 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     H = np.concatenate([sums.along[:, 0] for sums in each], axis=0).swapaxes(0, 1) / power
     variance = np.broadcast_to((N * P / repeats / power)[..., None], (*H.shape, 1))
     names = data.inputs, data.outputs
-    htf = HTF(f / P, H[..., None], each[0].harmonics, N, *names, variance=variance)
+    htf = HTF(np.arange(len(f)), H[..., None], each[0].harmonics, N, *names, variance=variance)
+    # Frequencies may occur several times, measured each time on their own.
+    htf = eqx.tree_at(lambda htf: htf.f, htf, jnp.asarray(f / P))
     return Block(htf, data.u.shape[0] * data.u.shape[1] // N)
 
 
@@ -73,6 +71,11 @@ class Estimate(NamedTuple):
     """Standard deviation of each output's noise in each block."""
     objection: str
     """The reason to reject the order; empty if the data support it."""
+
+    @property
+    def last_noise(self) -> dict[str, float]:
+        """The noise in the last block, by the outputs' names."""
+        return dict(zip(self.fit.outputs, self.noise[-1].tolist(), strict=True))
 
 
 def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estimate:
@@ -90,32 +93,27 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     where these are few; and from the levels of the noise, as if it were white.
     """
     htfs = [block.htf for block in blocks]
-    first, f = htfs[0], np.concatenate([htf.f for htf in htfs])
-    H = np.concatenate([htf.H for htf in htfs], axis=1)
-    size = coefficients(order, first.n_sections, goal.overhang)
+    f, H = jnp.concatenate([x.f for x in htfs]), jnp.concatenate([x.H for x in htfs], axis=1)
     member = np.repeat(np.arange(len(blocks)), [len(htf.f) for htf in htfs])
     # To begin with, all of it may be noise.
     square = [np.mean(np.abs(htf.H) ** 2 / htf.variance, axis=(0, 1, 3)) for htf in htfs]
     noise, c = np.sqrt(square), None
 
-    def grouped() -> tuple[HTF, list[HTFGroup]]:
+    def weighted() -> tuple[HTF, list[HTFGroup]]:
         """Return all lines of all blocks, one after the other, with their variances."""
         each = [htf.variance * std[:, None] ** 2 for htf, std in zip(htfs, noise, strict=True)]
-        htf = HTF(
-            f, H, first.harmonics, first.n_sections, first.inputs, first.outputs,
-            variance=np.concatenate(each, axis=1),
-        )  # fmt: skip
-        require_frequencies(htf, order, size)
-        return htf, group_htf(htf, error_weights(htf, check_values(htf)), size)
+        values = f, H, jnp.concatenate(each, axis=1)
+        htf = eqx.tree_at(lambda htf: (htf.f, htf.H, htf.variance), htfs[0], values)
+        return htf, grouped(htf, order, goal.overhang)
 
     for _ in range(_SWEEPS):
-        _, groups = grouped()
-        c, _ = maximum_likelihood(groups, order, _MAX_STEPS, c)
+        _, groups = weighted()
+        c, _ = maximum_likelihood(groups, order, c)
         change = _relative_noise(groups, c, member, noise.shape)
         noise = noise * change
         if np.abs(np.log(change)).max() < ENOUGH:
             break
-    htf, groups = grouped()
+    htf, groups = weighted()
     by_scatter = fit_multipliers(htf, order, overhang=goal.overhang, check=False)
     by_level = fit_multipliers(htf, order, overhang=goal.overhang, check=False, errors="variance")
     fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())

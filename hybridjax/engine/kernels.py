@@ -21,7 +21,7 @@ from ..systems.solver import Method, Radau, as_method
 from ..systems.structure import Kind, Member, Structure, stacked
 from ..systems.system import Output
 from .arrays import AnyInputs as Inputs, AnyTimes as Times, Array, States
-from .runge_kutta import Step, integrated_divergence, take_step
+from .runge_kutta import Step, integrated_divergence, step_along as _along, take_step
 from .target import AbstractLevels
 
 
@@ -47,9 +47,9 @@ def step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: S
 def step_along(
     s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, along: States
 ) -> tuple[Step, States, States]:
-    """A step in chart a, and the derivatives of its end and of its error along a direction."""
+    """A step in chart a, and the derivatives of its end and of its estimate along a direction."""
     rows = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)(t, q, u, h, along)
-    return Step(*rows[:4]), rows[4], rows[5]
+    return Step(*rows[:5]), rows[5], rows[6]
 
 
 def linear_step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Expanded:
@@ -195,10 +195,8 @@ def _step(method: Method, field: Callable, t, q, u, h):
 
 
 def _step_along(method: Method, field: Callable, t, q, u, h, along):
-    at_input = lambda t, q: field(t, q, u, h, along)  # noqa: E731
-    end = lambda q: take_step(method, at_input, t, q, h, still=at_input)  # noqa: E731
-    value, tangent = jax.jvp(end, (q,), (along,))
-    return jnp.stack([*value, tangent.q, tangent.error])
+    step, *tangent = _along(method, lambda t, q: field(t, q, u, h, along), t, q, h, along)
+    return jnp.stack([*step, *tangent])
 
 
 def _divergence(method: Method, field: Callable, t, q, u, h):

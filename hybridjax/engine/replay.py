@@ -113,7 +113,7 @@ def _advance(
         step = jax.lax.cond(
             here.any(),
             lambda: take_step(method, flow.field, t0, q0, h0, unroll, still.field),
-            lambda: Step(q0, q0, q0, q0),
+            lambda: Step(*[q0] * 5),
         )
         q1, t1 = step.q, t0 + h0
 

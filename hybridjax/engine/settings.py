@@ -56,7 +56,8 @@ class Settings(eqx.Module):
     atol: Float[Array, ""] | None
     """Error of a step relative to each state's `scale`."""
     max_steps: int = eqx.field(static=True)
-    """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
+    """Bound on the number of iterations (steps, tried or taken) of one piece of flow. Where the
+    default, 256, ends a search for a limit cycle, it is repeated with 4096."""
     scale: Float[Array, "A d"] | None
     """Characteristic magnitudes of states, by chart, padded to the dimension of the largest with
     any positive numbers. `None`: magnitudes are taken from each step (see `tolerance`), which is

@@ -29,6 +29,11 @@ from .target import until
 from .watch import slopes
 
 
+# Values and rates of a guard are zero below this part of their terms. Smaller: rounding hides a
+# reset that ends on a guard. Larger: one that ends close to it is reported.
+_SAME = 1e-9
+
+
 class Event(NamedTuple):
     """One event of a trajectory."""
 
@@ -181,6 +186,10 @@ def simulate(
         if result != Result.STEP_LIMIT or steps >= max_steps:
             break
     t, before, after, charts, event = (np.concatenate(x) for x in zip(*rows, strict=True))
+    passed = _passed(s, t, charts, before, after, event, u)
+    if passed is not None:
+        rows, result = slice(passed + 1), Result.GUARD_PASSED
+        t, before, after, charts, event = (x[rows] for x in (t, before, after, charts, event))
 
     def rates(chart, q):
         # Filled up to whole pieces, so that few lengths are compiled.
@@ -212,6 +221,28 @@ def _constant_input(system: HybridSystem, input) -> np.ndarray:
             f"({', '.join(system.inputs)}): give one number for each."
         )
     return np.broadcast_to(value, (nu,))
+
+
+def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
+    """The first event whose reset ends on a guard through which the state then goes, though it
+    cannot count. (It may go through one that it was crossing.)"""
+    passed: list[int] = []
+    events, first = np.flatnonzero(event[:-1] >= 0), np.zeros(1, np.int32)
+    for a in (a for a in np.unique(charts[events]) if s.guards(int(a))):
+        k, n = events[charts[events] == a], s.dims[a]
+
+        def guards(k, q, a=int(a), n=n):
+            return kernels.watched(s, a, None, t[k], q[k, :n].T, u, first)
+
+        now, was, later = guards(k, after), guards(k, before)[:, 0], guards(k + 1, before)[:, 0]
+        slope, f = now[:, 2 : 2 + n], kernels.field(s, int(a), t[k], after[k, :n].T, u)[:, 0]
+        zero = _SAME * np.einsum("gnk,n->gk", np.abs(slope), np.abs(after[:, :n]).max(axis=0))
+        rate = now[:, 1] + np.einsum("gnk,nk->gk", slope, f)
+        still = np.abs(rate) <= _SAME * np.einsum("gnk,nk->gk", np.abs(slope), np.abs(f))
+        crossed = (np.abs(was) <= zero) & (np.array(s.dims)[charts[k - 1]] == n) & ~still
+        on = (np.abs(now[:, 0]) <= zero) & (later < 0) & ~crossed
+        passed += k[on.any(axis=0)].tolist()
+    return min(passed, default=None)
 
 
 @host_first

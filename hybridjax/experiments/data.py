@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.arguments import Numbers, names
+from .._core.arguments import Numbers, input_and_output_names
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
 from .._core.boundary.values import Integers, Reals
@@ -104,8 +104,8 @@ class ExperimentData(eqx.Module):
         self.simulated = simulated
         self.cycle_outputs = None if cycle_outputs is None else np.array(cycle_outputs)
         self.n_sections, self.periods = n_sections, periods
-        self.inputs = names("inputs", inputs, self.u.shape[2])
-        self.outputs = names("outputs", outputs, self.y.shape[2])
+        sizes = self.u.shape[2], self.y.shape[2]
+        self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
         self._check()
 
     def _check(self) -> None:

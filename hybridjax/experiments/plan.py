@@ -18,12 +18,14 @@ from .._core.compilation import at_ease, host_first
 from .._core.executor import Array, from_host, namespace, to_host
 from .._core.memo import Memory
 from .._core.results import Result
-from ..engine.move import move, tape_jacobian
+from ..engine.lanes import IDLE
+from ..engine.move import Options, move, tape_jacobian
 from ..engine.search.state import Stride
 from ..engine.settings import Settings
 from ..engine.watch import watch
 from ..errors import ComputationError
 from ..orbits.return_map import PATIENCE
+from ..orbits.scale import has_implicit
 from ..sections.placed import PlacedSections
 
 
@@ -32,6 +34,11 @@ from ..sections.placed import PlacedSections
 # More: plans take longer to make.
 _EQUAL_STEPS = (1, 2, 3, 4, 6, 8)
 _TOLERANCES = (1.0, 1e-2, 1e-4)
+# Deviations, relative to the states' scales, for which steps are tried where inputs excite modes
+# that die out within a step: in charts with implicit methods. The first, larger: steps are shorter
+# than experiments need. Smaller: experiments far from the cycle take more. Between both, a mode is
+# hidden by the error on the cycle or is not; farther apart: what lies between is not tried.
+_KICKS = (1e-3, 1e-6)
 # Rounding error at a section, relative to the states' scales: the tolerance of the reference
 # solution, and the least accuracy. Larger: errors near it are estimated wrongly. Smaller: rounding
 # exceeds estimates.
@@ -73,12 +80,14 @@ class Plan(eqx.Module):
     - `weight`: true error per embedded error estimate (relative to the tolerance), measured on the
         cycle and relative to the states' scales: the largest that it ever leads to at a later
         section, summed over all periods as if each made the same error.
+    - `least`: error of experiments whose steps seem to have none, in charts with implicit methods.
     """
 
     h: Float[Array, " N"]
     lead: Float[Array, " N"]
     slack: Float[Array, " N"]
     weight: Float[Array, " N"]
+    least: Float[Array, ""]
 
     def stride(self, k: int | Int[Array, ""], lanes: int) -> Stride:
         """Return the first step and its limits at section k, for so many lanes."""
@@ -97,17 +106,19 @@ def make_plan(
     """
     N = placed.n_sections
     placed = to_host(placed)
-    ways = to_host(_try_ways(placed, settings))
     *_, target = placed.onwards()
     with at_ease():
         J, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
-    J = J[:, :, : scale.shape[1]]
+    J, by_input = J[:, :, : scale.shape[1]], J[:, :, scale.shape[1] :]
     J[~placed.time_is_state, :, 0] = 0.0
-    error = np.transpose(ways.ends[:, :-1] - ways.ends[:, -1:], (1, 2, 0))
+    ways = to_host(_try_ways(placed, settings, _kicks(placed, by_input, scale)))
+    error = np.moveaxis(ways.ends[:, :-1] - ways.ends[:, -1:], 0, -1)
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
     impact = np.maximum(_impact(J, error, scale), np.finfo(float).eps)
-    impact = np.where(np.isnan(impact), np.inf, impact)
+    missed = np.isnan(ways.ends[0, -1]) & (np.arange(len(ways.ends[0, -1])) > 0)[:, None]
+    impacts = np.where(missed, 0.0, np.where(np.isnan(impact), np.inf, impact))
+    impact = impacts.max(axis=1)
     lost = ~np.isfinite(impact).any(axis=0)
     if lost.any():
         k = int(np.argmax(lost))
@@ -126,24 +137,32 @@ def make_plan(
         if total <= accuracy:
             break
     spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
-    impact, estimate = impact[best, section], estimate[best, section]
+    # Small deviations, whose errors may be hidden by those on the cycle, have at most the least; it
+    # holds the cycle's own, whose stiff states are less accurate than its others.
+    least = np.zeros(())
+    if ways.estimate.shape[1] > 1:
+        after = (section + 1) % N
+        own = (ways.ends[1:, -1, 0] - placed.lanes.q[:, after]) / scale[after, 1:].T
+        least = impact[best, section].sum() + np.abs(own).max()
+    large = slice(1 + placed.structure().nu)
+    impact, estimate = impacts[best, large, section].T, estimate[best, large, section].T
     # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
-    together = _CAUTION * _accumulated(J, error[best, section], scale) / impact.sum()
-    weight = impact / estimate * np.maximum(together, 1 / _MOST_CANCELLATION)
+    together = _CAUTION * _accumulated(J, error[best, 0, section], scale) / impact[0].sum()
+    weight = (impact / estimate).max(axis=0) * np.maximum(together, 1 / _MOST_CANCELLATION)
+    impact, estimate = impact[0], estimate[0]
     # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
     share = np.minimum(accuracy * estimate / impact, 1.0) / N
-    slack = np.where(
-        best < len(_EQUAL_STEPS), np.maximum(spare * estimate, share), ways.slack[best]
-    )
-    return from_host(Plan(ways.first[best, section], ways.lead, slack, weight))
+    slack = ways.slack[best]
+    slack = np.where(np.isinf(slack), np.maximum(spare * estimate, share), slack)
+    return from_host(Plan(ways.first[best, section], ways.lead, slack, weight, least))
 
 
 class _Ways(NamedTuple):
-    """Candidates from every section to the next."""
+    """Candidates from every section to the next, on the cycle and for M - 1 deviations."""
 
-    ends: Float[Array, "n B N"]
+    ends: Float[Array, "n B M N"]
     """(t, q) after each of K candidates and the reference; NaN for those that do not arrive."""
-    estimate: Float[Array, "K N"]
+    estimate: Float[Array, "K M N"]
     """Error estimates of the ways to go, relative to the tolerance."""
     first: Float[Array, "K N"]
     """Their first steps."""
@@ -151,10 +170,24 @@ class _Ways(NamedTuple):
     lead: Float[Array, " N"]
 
 
+def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]:
+    """Return inputs that cause deviations: none, and where methods are implicit, of each size by
+    each input."""
+    s, nu = placed.structure(), by_input.shape[2]
+    if not has_implicit(s):
+        return np.zeros((1, nu))
+    time = 0 if placed.cycle.clocked else 1
+    largest = np.abs(by_input / np.roll(scale, -1, axis=0)[:, :, None])[:, time:].max(axis=(0, 1))
+    one = np.diag(np.divide(1.0, largest, where=largest > 0, out=np.zeros(nu)))
+    return np.concatenate([np.zeros((1, nu)), *(size * one for size in _KICKS)])
+
+
 @host_first
-def _try_ways(placed: PlacedSections, settings: Settings) -> _Ways:
+def _try_ways(placed: PlacedSections, settings: Settings, kicks: Float[Array, "M nu"]) -> _Ways:
     s, xp, N = placed.structure(), namespace(placed.lanes.t), placed.n_sections
-    K = len(_EQUAL_STEPS) + len(_TOLERANCES)
+    M, implicit = len(kicks), has_implicit(s)
+    equal = () if implicit else _EQUAL_STEPS
+    K, most = len(equal) + len(_TOLERANCES), _EQUAL_STEPS[-1]
     patience = max(settings.max_steps, PATIENCE)
     following, _, target = placed.onwards()
     lead = _lead(placed, target)
@@ -163,13 +196,13 @@ def _try_ways(placed: PlacedSections, settings: Settings) -> _Ways:
 
     # A lane for every section in each of K candidates and the reference.
     W = K + 1
-    divide = np.array([*_EQUAL_STEPS, *[_EQUAL_STEPS[-1]] * len(_TOLERANCES), 2])
-    slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, 1.0])
+    divide = np.array([*equal, *[most] * len(_TOLERANCES), 2])
+    slack = np.array([*[np.inf] * len(equal), *_TOLERANCES, 1.0])
     by_estimate = np.isfinite(slack) & (np.arange(W) < K)
     rtol = xp.where(by_estimate, settings.rtol, ROUNDING)
 
-    all_ways = lambda tree: jax.tree_util.tree_map(lambda x: xp.tile(x, W), tree)  # noqa: E731
-    each = lambda x: xp.repeat(xp.asarray(x), N)  # noqa: E731
+    all_ways = lambda tree: jax.tree_util.tree_map(lambda x: xp.tile(x, W * M), tree)  # noqa: E731
+    each = lambda x: xp.repeat(xp.asarray(x), M * N)  # noqa: E731
     lanes = all_ways(placed.lanes)
     per_lane = ("time", "index", "event", "limit")
     target = dataclasses.replace(target, **{x: all_ways(getattr(target, x)) for x in per_lane})
@@ -177,11 +210,16 @@ def _try_ways(placed: PlacedSections, settings: Settings) -> _Ways:
     accuracy = each(rtol), each(settings.atol * rtol / settings.rtol)
     tolerance = Settings(1.0, 1.0, patience, settings.scale)
     tolerance = eqx.tree_at(lambda x: (x.rtol, x.atol), tolerance, accuracy)
-    moved = move(s, lanes, xp.zeros((s.nu, W * N)), target, tolerance, start).moved
+    u = xp.tile(xp.repeat(kicks.T, N, axis=1), W)
+    moved, tape = move(s, lanes, u, target, tolerance, start, options=Options(tape=implicit))
     ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
-    ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, N)
-    estimate = moved.error.reshape(W, N)[:K] * (rtol[:K, None] / settings.rtol)
+    ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, M, N)
+    estimate = moved.error.reshape(W, M, N)[:K] * (rtol[:K, None, None] / settings.rtol)
     first = longest / divide[:K, None]
+    if tape is not None:  # the first step that is accepted, or all the way
+        taken = xp.take_along_axis(tape.h, xp.argmax(tape.code != IDLE, axis=0)[None], axis=0)
+        shortest = taken.reshape(W, M, N)[:K].min(axis=1)
+        first = xp.where(shortest < 0.9 * first, shortest, longest)
     return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
 
 
@@ -204,16 +242,16 @@ def _lead(placed: PlacedSections, target):
     return xp.where((lead > 1 / _WORST_GUESS) & (lead < _WORST_GUESS), lead, 1.0)
 
 
-def _impact(J, error, scale) -> Float[np.ndarray, "K N"]:
-    """Return the largest later errors that errors of the interval after section k (K, N, n) cause,
+def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
+    """Return the largest later errors that errors of the interval after section k (*K, N, n) cause,
     relative to the scales."""
     N = len(scale)
-    section, worst = np.arange(N), np.zeros((_PERIODS, *error.shape[:2]))
+    section, worst = np.arange(N), np.zeros((_PERIODS, *error.shape[:-1]))
     for m in range(_PERIODS * N):
         at = (section + 1 + m) % N
         now = worst[m // N]
         np.maximum(now, np.max(np.abs(error) / scale[at], axis=-1), out=now)
-        error = np.einsum("kij,ckj->cki", J[at], error)
+        error = np.einsum("kij,...kj->...ki", J[at], error)
     last, before = worst[-1], worst[-2]
     ratio = np.clip(last / np.where(before > 0, before, 1.0), 0.0, 0.999)
     return worst.sum(axis=0) + last * ratio / (1 - ratio)

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import Numbers, names
+from .._core.arguments import Numbers, input_and_output_names
 from .._core.boundary.checked import checked
 from .._core.boundary.containers import Stream
 from .._core.boundary.kinds import Index, NewNames, NewOptionalNames, SectionCount
@@ -75,8 +75,8 @@ class Record(eqx.Module):
             )
         self.n_sections, self.first_section, self.lead = n_sections, first_section, lead
         self.drift = drift
-        self.inputs = names("inputs", inputs, self.u.shape[1])
-        self.outputs = names("outputs", outputs, self.y.shape[1])
+        sizes = self.u.shape[1], self.y.shape[1]
+        self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
 
     @property
     def records(self) -> tuple["Record"]:

@@ -19,6 +19,7 @@ from ..engine.lanes import Lanes
 from ..engine.move import Options, move
 from ..engine.settings import EXPERIMENT, Settings
 from ..errors import DefinitionError
+from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..sections.families import BoundSections
 from ..sections.place import as_placed
@@ -134,7 +135,7 @@ def flow_batch(
     (lanes, result), (y, ok, shares) = jax.lax.scan(section, begin, xs)
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
-    error = ROUNDING + jnp.max(each_turn, axis=0)
+    error = ROUNDING + plan.least + jnp.max(each_turn, axis=0)
     end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
     return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T)
 
@@ -222,7 +223,7 @@ def response_function(
     range.
     """
     placed = as_placed(cycle, sections)
-    z = placed.structure().resolve_outputs(outputs)
+    z = check_outputs(cycle, outputs)
     stepping = plan_flow(placed, accuracy)
     steps = max(_STEPS, _STEPS**2 // placed.n_sections)
     settings = dataclasses.replace(stepping.settings, max_steps=steps)

@@ -20,6 +20,7 @@ from .._core.results import Result
 from ..engine.settings import EXPERIMENT
 from ..errors import ComputationError, DefinitionError
 from ..linear.ldtp import LDTP
+from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
@@ -289,7 +290,7 @@ def prepare(
     """
     placed = as_placed(cycle, sections)
     items = (outputs,) if isinstance(outputs, str | Output) else tuple(outputs)
-    placed.structure().resolve_outputs(items)
+    check_outputs(cycle, items)
     _require_return(cycle, placed)
     start, noise = options.start, options.process_noise
     discard = (DISCARD if start == "cycle" else 0) if options.discard is None else options.discard

@@ -26,7 +26,7 @@ StartName = Literal["cycle", "periodic", "steady"]
 MOST_STEPS = 12
 
 # A linear model has at least one output. This one is defined in every chart.
-_TIME = Output("t", lambda t, q, u: t)
+_NOTHING = Output("nothing", lambda t, q, u: 0.0)
 _linearized = Memory()
 
 
@@ -35,7 +35,7 @@ def linearized(placed: PlacedSections) -> LDTP:
 
     **Raises:** as `linearize`.
     """
-    make = lambda: linearize(placed.cycle, placed, outputs=[_TIME])  # noqa: E731
+    make = lambda: linearize(placed.cycle, placed, outputs=[_NOTHING])  # noqa: E731
     return _linearized.recall(placed, None, make)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, FilePath, Index
 from .._core.execution import Execution
-from .._core.pieces.description import array_digest, digest_of, function_digest, versions
+from .._core.pieces.description import digest_of, versions
 from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, absolute
 from .._core.progress import working
@@ -259,7 +259,7 @@ class ExperimentJob:
             "versions": versions(),
             "model": describe(placed.cycle.system),
             "cycle": rough(placed.cycle),
-            "family": function_digest(placed.family),
+            "family": digest_of(placed.family),
             "design": _design(inputs.source),
             "start": campaign.start,
             "process_noise": None if noise is None else dataclasses.asdict(noise),
@@ -275,13 +275,13 @@ class ExperimentJob:
                 "outputs": [[str(x), unit_of(x)] for x in z.names],
                 "label": placed.family.label,
             },
-            "outputs": [x if isinstance(x, str) else function_digest(x) for x in z.items],
+            "outputs": [x if isinstance(x, str) else digest_of(x) for x in z.items],
         }
 
 
 def _design(source: Design | np.ndarray) -> str:
     if isinstance(source, Design):
         arrays = jax.tree_util.tree_leaves(eqx.filter(source, eqx.is_array))
-        return digest_of(*map(array_digest, arrays), repr(source.input_names))
+        return digest_of(*map(digest_of, arrays), repr(source.input_names))
     parts = (source[k : k + CHUNK] for k in range(0, len(source), CHUNK))  # (may lie on disk)
-    return digest_of(*map(array_digest, parts))
+    return digest_of(*map(digest_of, parts))

@@ -49,14 +49,6 @@ class Covariance(NamedTuple):
         return cls(np.full((size, size), np.inf), np.inf)
 
 
-class Denominator(NamedTuple):
-    """An estimate of the denominator and the covariance of its coefficients."""
-
-    coefficients: Coefficients
-    covariance: Covariance
-    converged: bool
-
-
 def sandwich(
     curvature: Float[np.ndarray, "d d"],
     gradient: Float[np.ndarray, "d d"],

@@ -64,11 +64,11 @@ class Point(ABC):
         """Test whether rounding explains that no part of the undamped step lowers the cost."""
 
 
-def descend(point: P, max_steps: int, damping: float = 0.0) -> tuple[P, bool]:
+def descend(point: P, damping: float = 0.0, max_steps: int = 50) -> tuple[P, bool]:
     """Descend from a point to a minimum; return the last point and whether it is a minimum.
 
     **Arguments:** `damping`: of the first step. Default: 0, a full Gauss-Newton step; damping then
-    begins when a step fails.
+    begins when a step fails. `max_steps`: default 50.
     """
     for _ in range(max_steps):
         whole = point.step(0.0)
@@ -87,26 +87,21 @@ def descend(point: P, max_steps: int, damping: float = 0.0) -> tuple[P, bool]:
     return point, False
 
 
-class Minimum(NamedTuple):
-    """The end of a descent."""
-
-    coefficients: Coefficients
-    converged: bool
-
-
 def least_squares(
     linearize: Callable[[Coefficients], tuple[np.ndarray, np.ndarray]],
     start: Coefficients,
-    max_steps: int = 200,
+    max_steps: int = 50,
     settled_gain: float = 0.0,
-) -> Minimum:
+) -> tuple[Coefficients, bool]:
     """Minimize a sum of squares whose linear unknowns are eliminated.
 
     **Arguments:** `linearize(c)` returns the residuals (n,) and their Jacobian (n, d).
-    `max_steps`: default 200. `settled_gain`: a decrease of the sum that does not matter.
+    `max_steps`: default 50. `settled_gain`: a decrease of the sum that does not matter.
+
+    **Returns:** the last coefficients, and whether they are a minimum.
     """
-    point, converged = descend(_Squares(linearize, start, settled_gain), max_steps)
-    return Minimum(point.c, converged)
+    point, converged = descend(_Squares(linearize, start, settled_gain), 0.0, max_steps)
+    return point.c, converged
 
 
 class _Squares(Point):

@@ -30,7 +30,6 @@ def estimate_htf(
     *,
     repeats: Count = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
-    half_integers: Literal["error", "skip"] = "error",
     threshold: Probability = SILENT_LINE,
 ) -> HTF:
     """Estimate all harmonic transfer functions at all frequencies that the inputs excite.
@@ -41,8 +40,8 @@ def estimate_htf(
     least-squares one. A line on a multiple of 1/2 (other than 0 and N/2) aliases with its own
     conjugate, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`; two or more experiments with
     different phases determine both unknowns. If m inputs excite the same line, at least m
-    experiments are needed to separate their responses. Failed experiments are left out, and with
-    several inputs only frequencies that were measured from each of them are kept.
+    experiments are needed to separate their responses. Failed experiments are left out, and only
+    frequencies that were measured from each input, and multiples of 1/2 with two phases, are kept.
 
     The estimate is that of the best linear approximation for signals of the class that was applied
     (Pintelon and Schoukens 2012, ch. 3), with its `variance`. From several realizations of random
@@ -59,18 +58,16 @@ def estimate_htf(
     - `variance`: "noise" is computed from the repeats, "total" from the realizations; each raises
       an error if it is not available. "auto" is "total" if available, else "noise". Default:
       "auto".
-    - `half_integers`: treatment of multiples of 1/2 that were measured with a single phase, "error"
-      or "skip". Default: "error".
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
 
-    **Returns:** `HTF` with ascending frequencies, source "estimate". Its `variance` is infinite
-    where failed experiments have left one realization.
+    **Returns:** `HTF` with ascending frequencies, source "estimate". Where a frequency was measured
+    in one realization only, its `variance` is that of noise as strong as in the mean of all others;
+    if that is so at most frequencies, there is no variance, and `power` weights them in fits.
 
-    **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines
-    of one experiment disturb each other (the message lists the pair); for one phase only on a
-    multiple of 1/2; for too few periods or realizations for the requested variance; or for parts
-    that do not belong together.
+    **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines of
+    one experiment disturb each other (the message lists the pair); for too few periods or
+    realizations for the requested variance; or for parts that do not belong together.
     """
     if variance == "noise" and repeats < 2:
         raise DefinitionError(
@@ -79,20 +76,13 @@ def estimate_htf(
         )
     require_x64()
     sums = spectral_sums(data, harmonics, threshold=threshold, repeats=repeats)
-    unsolved = sums.one_phase()
-    if unsolved.any() and half_integers == "error":
-        raise DefinitionError(
-            f"f = {sums.f[unsolved][0]:.10g} lies on a multiple of 1/2 and was measured with one "
-            "phase only: measure it in a second experiment with a phase 90 degrees apart "
-            "(multisine(lines='two-phase') does so), or leave it out here with "
-            "half_integers='skip' and use HTF.interpolate."
-        )
-    rows = np.flatnonzero(sums.solvable(sums.gram))
+    rows = np.flatnonzero(sums.solvable())
     setup, (tried, ran) = sums.setup, sums.experiments
     if len(rows) == 0:
         raise DefinitionError(
             f"no frequency is left to estimate: {ran}/{tried} ok; a frequency must have been "
-            f"measured from each of the {len(setup.inputs)} inputs."
+            f"measured from each of the {len(setup.inputs)} inputs, a multiple of 1/2 with two "
+            "phases."
         )
     f, lines = sums.f[rows], _solve_lines(sums, rows)
     why_not = _why_not_total(sums, rows)
@@ -105,15 +95,16 @@ def estimate_htf(
             "variance='noise'."
         )
     total, noise, scatter = lines.noise, None, None
-    if variance != "noise" and (lines.realizations > 0).any() and not why_not:
+    if variance != "noise" and np.median(lines.realizations) > 0 and not why_not:
         total, noise = lines.total, lines.noise
-        freedom = np.maximum(lines.realizations, 1).astype(float)
+        shared = lines.realizations.sum()
+        freedom = np.where(lines.realizations < 1, shared, lines.realizations).astype(float)
         scatter = Scatter(freedom, _roundness(sums, rows, lines.H))
     elif lines.noise is not None:
         scatter = Scatter(sums.count[rows] * (repeats - 1.0))
     return HTF(
         f, lines.H, sums.harmonics, setup.n_sections, setup.inputs, setup.outputs, "estimate",
-        variance=total, noise_variance=noise, scatter=scatter,
+        variance=total, noise_variance=noise, scatter=scatter, power=lines.power,
     )  # fmt: skip
 
 
@@ -124,9 +115,12 @@ class _LineEstimates(NamedTuple):
     realizations: Int[np.ndarray, " F"]
     """Experiments beyond those that the unknowns need: degrees of freedom of the residual."""
     total: Float[np.ndarray, "M F ny nu"]
-    """Variance from the residual; infinite where there is one realization."""
+    """Variance from the residual; from the mean residual of all lines where there is one
+    realization."""
     noise: Float[np.ndarray, "M F ny nu"] | None
     """Variance from repeated windows; None where there was one window."""
+    power: Float[np.ndarray, "F nu"]
+    """Variance of white noise in the outputs relative to that of the estimates."""
 
 
 def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstimates:
@@ -157,9 +151,10 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
     count = sums.count[rows]
     realizations = count - np.where(sums.mirrored[rows], 2 * nu, nu)
     mean = residual / np.maximum(realizations, 1)[:, None, None]
-    mean[realizations < 1] = np.inf
+    mean[realizations < 1] = residual.sum(axis=0) / max(realizations.sum(), 1)
     noise = variance(sums.noise[rows] / count[:, None, None]) if sums.repeats > 1 else None
-    return _LineEstimates(H.transpose(2, 0, 3, 1), realizations, variance(mean), noise)
+    H = H.transpose(2, 0, 3, 1)
+    return _LineEstimates(H, realizations, variance(mean), noise, 1 / spread)
 
 
 def _roundness(

@@ -1,5 +1,6 @@
 """Floquet multipliers from the exact structure of harmonic transfer functions, and their number."""
 
+import dataclasses
 import functools
 from typing import Literal
 
@@ -9,7 +10,7 @@ from jaxtyping import Complex, Float, Int
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
+from .._core.boundary.kinds import Index, Order, Scalar, Vector
 from .._core.execution import one_blas_thread
 from .._core.results import Result
 from ..errors import DefinitionError
@@ -27,10 +28,12 @@ from .variable_projection import (
     error_spectrum,
     error_weights,
     group_htf,
+    grouped,
+    line_variances,
     maximum_likelihood,
     misfit_of,
+    numerator_size,
     numerators_of,
-    require_frequencies,
     summarize,
     weights_of,
 )
@@ -109,12 +112,10 @@ def _evaluate(numerators, c, f, n_sections: int) -> Complex[np.ndarray, "M F ny 
 def fit_multipliers(
     htf: HTF,
     order: Order | LDTP,
-    harmonics: Harmonics | None = None,
     *,
     overhang: Index | None = None,
     errors: Literal["residuals", "variance"] = "residuals",
     check: bool = True,
-    max_steps: StepCount = 50,
 ) -> StructuredFit:
     r"""Fit the common denominator of the HTFs, whose roots are the Floquet multipliers.
 
@@ -129,11 +130,11 @@ def fit_multipliers(
 
     **Arguments:**
 
-    - `htf`: exact or estimated. Without variances each output is weighted by its residuals, whose
-      spectrum is modeled as white noise plus noise filtered by the system.
+    - `htf`: exact or estimated; `htf.select` chooses harmonics. Without variances each output is
+      weighted by its residuals, whose spectrum is modeled as white noise plus noise filtered by the
+      system, and frequencies by the power of their inputs (`htf.power`).
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model whose rank it is.
       `select_order` helps to find it.
-    - `harmonics`: the harmonics to fit. Default: all of `htf`.
     - `overhang`: degree of the numerators beyond d N. Default: N.
     - `errors`: source of the covariance. `"residuals"`: the residuals at each frequency. This
       remains valid if the errors of different harmonics are dependent (process noise, distortion)
@@ -141,32 +142,26 @@ def fit_multipliers(
       then be correct. Default: `"residuals"`.
     - `check`: whether to raise an error if the data do not support so many multipliers (a rank test
       at the level of 1 %): the surplus multipliers would only fit noise. Default: True.
-    - `max_steps`: largest number of Gauss-Newton steps. Default: 50.
 
     **Raises:** `DefinitionError` for an order below 1, NaN in the HTFs, variances that are not
     positive, a harmonic that `htf` does not hold, too few frequencies for so many coefficients (the
     message gives the number needed), or an order that the data do not support.
     """
     order = order.rank() if isinstance(order, LDTP) else order
-    N = htf.n_sections
-    if harmonics is not None:
-        htf = htf.select(harmonics)
     rms = check_values(htf)
     if errors == "variance" and htf.variance is None:
         raise DefinitionError(
             "errors='variance' needs HTFs with variances; these have none: take 'residuals'."
         )
-    size = order * N + (N if overhang is None else overhang) + 1
-    require_frequencies(htf, order, size)
-
+    size = numerator_size(htf, order, overhang)
     f, H = np.asarray(htf.f), np.asarray(htf.H)
     groups = group_htf(htf, error_weights(htf, rms), size)
-    c, converged = maximum_likelihood(groups, order, max_steps)
+    c, converged = maximum_likelihood(groups, order)
     if htf.variance is None:
         for _ in range(_REWEIGHTINGS):
-            variance = error_spectrum(groups, c, f, len(rms))[..., None]
+            variance = error_spectrum(groups, c, f, line_variances(htf), len(rms))
             groups = group_htf(htf, np.broadcast_to(weights_of(variance, rms), H.shape), size)
-            c, converged = maximum_likelihood(groups, order, max_steps, c)
+            c, converged = maximum_likelihood(groups, order, c)
     covariance, cost, freedom = summarize(groups, c, errors)
     if check:
         require_order(groups, htf, order, cost / freedom)
@@ -178,7 +173,7 @@ def fit_multipliers(
         B[group.harmonic, :, i, j] = b
         if group.mirror is not None:
             B[group.mirror, :, i, j] = b.conj()
-    misfit = np.abs(_evaluate(B, c, f, N) - H) ** 2
+    misfit = np.abs(_evaluate(B, c, f, htf.n_sections) - H) ** 2
     return StructuredFit(
         multipliers=multipliers_of(c),
         coefficients=c,
@@ -190,7 +185,7 @@ def fit_multipliers(
         freedom=freedom,
         result=Result.OK if converged else Result.NOT_CONVERGED,
         harmonics=htf.harmonics,
-        n_sections=N,
+        n_sections=htf.n_sections,
         inputs=htf.inputs,
         outputs=htf.outputs,
     )
@@ -219,15 +214,10 @@ def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> Mu
     """
     exact = exact_htf(model, htf)
     multipliers = model.multipliers
-    d, N = len(multipliers), model.n_sections
-    size = d * N + (N if overhang is None else overhang) + 1
-    require_frequencies(exact, d, size)
-    c = np.poly(multipliers).real[1:]
-    information = np.zeros((d, d))
-    for group in group_htf(exact, error_weights(exact, check_values(exact)), size):
-        jacobian = misfit_of(group, c).jacobian.reshape(d, -1)
-        information += jacobian @ jacobian.T
-    return MultiplierEstimate(multipliers, c, np.linalg.inv(information), np.inf)
+    d, c = len(multipliers), np.poly(multipliers).real[1:]
+    groups = grouped(exact, d, overhang)
+    J = np.concatenate([misfit_of(x, c).jacobian.reshape(d, -1) for x in groups], axis=1)
+    return MultiplierEstimate(multipliers, c, np.linalg.inv(J @ J.T), np.inf)
 
 
 def exact_htf(model: LDTP, htf: HTF) -> HTF:
@@ -238,11 +228,7 @@ def exact_htf(model: LDTP, htf: HTF) -> HTF:
     require_same("model and HTFs", model, htf)
     if htf.variance is None:
         raise DefinitionError("a bound needs the variances of the HTFs, and these have none.")
-    H = model.htf(htf.f, htf.harmonics).H
-    return HTF(
-        htf.f, H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
-        variance=htf.variance,
-    )  # fmt: skip
+    return dataclasses.replace(model.htf(htf.f, htf.harmonics), variance=htf.variance)
 
 
 # Largest ratio of squares of rounding errors. Smaller: they count as multipliers of exact HTFs;
@@ -312,10 +298,8 @@ class OrderSelection(eqx.Module):
 def select_order(
     htf: HTF,
     max_order: Order = 5,
-    harmonics: Harmonics | None = None,
     *,
     overhang: Index | None = None,
-    max_steps: StepCount = 50,
 ) -> OrderSelection:
     r"""Compare numbers of multipliers, from none to `max_order`.
 
@@ -332,18 +316,13 @@ def select_order(
 
     **Raises:** `DefinitionError` as `fit_multipliers`.
     """
-    N = htf.n_sections
-    overhang = N if overhang is None else overhang
-    if harmonics is not None:
-        htf = htf.select(harmonics)
     rms = check_values(htf)
-    sizes = [d * N + overhang + 1 for d in range(max_order + 1)]
-    require_frequencies(htf, max_order, sizes[-1])
+    size = numerator_size(htf, max_order, overhang)
     weights = error_weights(htf, rms)
-    largest = group_htf(htf, weights, sizes[-1])
+    largest = group_htf(htf, weights, size)
     noise = np.ones(len(rms))
     if htf.variance is None:
-        c, _ = maximum_likelihood(largest, max_order, max_steps)
+        c, _ = maximum_likelihood(largest, max_order)
         square, number = np.zeros((2, len(rms)))
         for group in largest:
             residual = misfit_of(group, c).residual
@@ -351,20 +330,18 @@ def select_order(
             np.add.at(number, group.channel[:, 0], group.freedom)
         noise = np.maximum(np.sqrt(square / number), SMALLEST_ERROR)
         weights = weights / noise[:, None]
-        largest = group_htf(htf, weights, sizes[-1])
+        largest = group_htf(htf, weights, size)
     values, deviation = _noise_ratios(largest, max_order)
     if noise.max() < ROUNDING:  # rounding errors differ by orders of magnitude
         values = values / _ROUNDING_VARIES
 
-    costs, freedoms, parameters = [], [], []
-    for d, size in enumerate(sizes):
-        groups = group_htf(htf, weights, size)
-        c = maximum_likelihood(groups, d, max_steps).coefficients if d else np.zeros(0)
+    costs, freedoms = [], []
+    for d in range(max_order + 1):
+        groups = group_htf(htf, weights, size - (max_order - d) * htf.n_sections)
+        c = maximum_likelihood(groups, d)[0] if d else np.zeros(0)
         costs.append(sum(float((misfit_of(g, c).residual ** 2).sum()) for g in groups))
         freedoms.append(sum(g.freedom * g.size for g in groups) - d)
-        parameters.append(sum((2 * len(g.period_delay) - g.freedom) * g.size for g in groups) + d)
-    cost, freedom, count = np.array(costs), np.array(freedoms), np.array(parameters)
-    data = int(freedom[0] + count[0])
+    cost, freedom, data = np.array(costs), np.array(freedoms), 2 * htf.H.size
     level, tails = _estimated_noise(htf, cost[-1] / freedom[-1])
     likelihood = data * np.log(np.maximum(cost, 1e-300)) if htf.variance is None else cost / level
     left = values[::-1] / level
@@ -375,7 +352,7 @@ def select_order(
         threshold=np.array([_largest_of_noise(max_order + 1 - d) for d in range(max_order + 1)]),
         cost=cost,
         freedom=freedom,
-        mdl=likelihood + np.log(data) * count,
+        mdl=likelihood + np.log(data) * (data - freedom),
         variances=htf.variance is not None,
     )
 

@@ -172,15 +172,15 @@ def fit_rational(
         weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
         problem = _Problem(powers_b, powers_a, h / rms, weight / np.sqrt(len(h)))
         with np.errstate(all="ignore"):
-            ends = [least_squares(problem.linearize, a, settled_gain=_ACCURACY**2)
+            ends = [least_squares(problem.linearize, a, 200, _ACCURACY**2)
                     for a in problem.starts()]  # fmt: skip
-            projected = [problem.project(end.coefficients) for end in ends]
+            projected = [problem.project(a) for a, _ in ends]
         cost = np.array([float(np.linalg.norm(residual)) for _, residual, _ in projected])
         cost[~np.isfinite(cost)] = np.inf
         if not np.isfinite(cost).any():
             raise ComputationError(f"no start led to a finite fit of {name}: try fewer poles.")
         lowest = cost <= cost.min() * (1 + _ACCURACY)
-        best = int(np.argmax(lowest * [1 + end.converged for end in ends]))
+        best = int(np.argmax(lowest * [1 + converged for _, converged in ends]))
         a, converged = ends[best]
         result = Result.OK if converged else Result.NOT_CONVERGED
         fits.append((projected[best][0] * rms, np.append(1.0, a), cost[best], int(result)))

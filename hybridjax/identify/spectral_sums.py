@@ -54,8 +54,6 @@ class SpectralSums(NamedTuple):
     line: Int[np.ndarray, " K"]
     mirrored: Bool[np.ndarray, " K"]
     """Lines that coincide with their own mirror images: responses to U and conj(U) add there."""
-    tried: Complex[np.ndarray, "K 2*nu 2*nu"]
-    """Sums of conj(X) X^T over all experiments, also those that failed."""
     gram: Complex[np.ndarray, "K 2*nu 2*nu"]
     """Sums of conj(X) X^T."""
     count: Int[np.ndarray, " K"]  # type: ignore[assignment]  # (not the method of tuples)
@@ -83,16 +81,11 @@ class SpectralSums(NamedTuple):
     def f(self) -> Float[np.ndarray, " K"]:
         return self.line / self.setup.periods
 
-    def solvable(self, gram: Complex[np.ndarray, "K n n"]) -> Bool[np.ndarray, " K"]:
+    def solvable(self) -> Bool[np.ndarray, " K"]:
         """Test which lines tell the responses to all inputs (and mirror images) apart."""
         nu = len(self.setup.inputs)
-        single = regular(gram[:, :nu, :nu])
-        return np.where(self.mirrored, single & regular(gram), single)
-
-    def one_phase(self) -> Bool[np.ndarray, " K"]:
-        """Test which mirrored lines were excited with one phase only."""
-        nu = len(self.setup.inputs)
-        return self.mirrored & regular(self.tried[:, :nu, :nu]) & ~regular(self.tried)
+        single = regular(self.gram[:, :nu, :nu])
+        return np.where(self.mirrored, single & regular(self.gram), single)
 
 
 def spectral_sums(
@@ -142,14 +135,10 @@ def _sums_of_part(
     lines, index = np.unique(line, return_inverse=True)
     good = data.ok[experiment]
 
-    def total(values, keep):
+    def total(values):
         """Sums over the entries of each line."""
-        values, where = values[keep], index[keep]
-        order = np.argsort(where, kind="stable")
-        begin = np.flatnonzero(np.diff(where[order], prepend=-1))
         out = np.zeros((len(lines), *values.shape[1:]), values.dtype)
-        if len(begin):
-            out[where[order][begin]] = np.add.reduceat(values[order], begin, axis=0)
+        np.add.at(out, index[good], values[good])
         return out
 
     X = np.concatenate([U, U.conj()], axis=1)
@@ -166,15 +155,14 @@ def _sums_of_part(
         harmonics,
         lines,
         needs_two_phases(lines, setup.periods, setup.n_sections),
-        tried=total(products, np.ones(len(U), bool)),
-        gram=total(products, good),
-        count=total(np.ones(len(U), int), good),
-        along=total(X.conj()[:, :, None, None] * Y[:, None], good),
-        energy=total(np.abs(Y) ** 2, good),
-        present=total(1.0 * (size > 0), good),
-        energies=total(np.abs(turned) ** 2, good),
-        turned=total(turned**2, good),
-        noise=total(noise, good),
+        gram=total(products),
+        count=total(np.ones(len(U), int)),
+        along=total(X.conj()[:, :, None, None] * Y[:, None]),
+        energy=total(np.abs(Y) ** 2),
+        present=total(1.0 * (size > 0)),
+        energies=total(np.abs(turned) ** 2),
+        turned=total(turned**2),
+        noise=total(noise),
         crest_factors=tested,
         repeats=repeats,
         experiments=(len(data.ok), int(data.ok.sum())),

@@ -10,7 +10,7 @@ from scipy import special, stats
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Probability
+from .._core.boundary.kinds import Probability
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import p_value
@@ -58,7 +58,7 @@ def simulate_record(
         square = np.ma.masked_invalid(record.y**2).mean(axis=0).filled(0.0)
         S = np.diag(np.where(square > 0, square, 1.0))
         plain = PeriodicModel.of(model, np.ones(len(S)))
-        model = Predictor(plain, np.stack([S] * model.n_sections), model.inputs, model.outputs)
+        model = Predictor(plain, np.stack([S] * model.n_sections))
     return model.predict(record, free_start)
 
 
@@ -289,7 +289,6 @@ def validate(
     data: RecordedData,
     *,
     start: Literal["free", "cycle"] = "free",
-    lags: Count | None = None,
     level: Probability = 0.01,
 ) -> Validation:
     r"""Simulate a model on data and test the residuals.
@@ -316,7 +315,6 @@ def validate(
     - `data`: as for `fit_series`, preferably not the data of the fit, which always agree too well.
     - `start`: "free", the default, estimates the state at the start of each record from it; "cycle"
       takes it as zero. Declared drift of the records is estimated in either case.
-    - `lags`: number of lags that are tested. Default: one period, less for few cycles.
     - `level`: significance level of the tests. Default: 0.01.
 
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few
@@ -346,14 +344,14 @@ def validate(
                 f"a section was sampled {few} times only; the tests need {FEWEST_SAMPLES} or more "
                 "cycles."
             )
-    if lags is None:
-        tried = range(1, min(N, int(sampled.min()) // _SAMPLES_PER_LAG) + 1)
-        enough = [samples.count(present, lag).min() >= FEWEST_SAMPLES for lag in tried]
-        lags = max(sum(map(bool, enough)), 1)
+    # One period, less for few cycles.
+    tried = range(1, min(N, int(sampled.min()) // _SAMPLES_PER_LAG) + 1)
+    enough = [samples.count(present, lag).min() >= FEWEST_SAMPLES for lag in tried]
+    lags = max(sum(map(bool, enough)), 1)
     if (samples.count(present, lags).max(axis=0) < FEWEST_SAMPLES).any():
         raise DefinitionError(
-            f"`lags` is {lags}, and the records are too short for it: no section was sampled "
-            f"{FEWEST_SAMPLES} times with so many samples before it in its record."
+            f"the records are too short: no section was sampled {FEWEST_SAMPLES} times with {lags} "
+            "samples before it in its record."
         )
     simulated = np.concatenate([simulate_record(tested, r, free_start) for r in compared])
     error = y - simulated

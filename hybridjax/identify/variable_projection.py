@@ -17,12 +17,12 @@ from jaxtyping import Complex, Float, Inexact, Int
 from ..errors import DefinitionError
 from ..linear.htf import HTF
 from .denominator import Covariance, chi, inverse_of_remainder, sandwich
-from .descent import NO_LEADING_COEFFICIENT, ROUNDING, Coefficients, Minimum, least_squares
+from .descent import NO_LEADING_COEFFICIENT, ROUNDING, Coefficients, least_squares
 
 
 # Decimal digits to which weights must agree (up to a factor) to be solved for together. More: a
 # group for each entry, which takes longer; fewer: weights that are off by as much.
-_EQUAL_WEIGHTS = 9
+EQUAL_WEIGHTS = 9
 # Weighted solutions of the linearized problem, at most, and the change of c, relative to 1 + |c|,
 # that ends them. More, smaller: a closer start, which the descent does not need.
 _MAX_REWEIGHTINGS, _SETTLED_START = 6, 1e-3
@@ -157,9 +157,9 @@ def delayed_responses(
 
 
 def maximum_likelihood(
-    groups: list[HTFGroup], order: int, max_steps: int, start: Coefficients | None = None
-) -> Minimum:
-    """Return the coefficients with the smallest misfit.
+    groups: list[HTFGroup], order: int, start: Coefficients | None = None
+) -> tuple[Coefficients, bool]:
+    """Return the coefficients with the smallest misfit, and whether they are a minimum.
 
     **Arguments:** `start`: where the descent starts. Default: the solution of the linearized
     problem.
@@ -170,9 +170,7 @@ def maximum_likelihood(
         jacobian = np.concatenate([p.jacobian.reshape(order, -1) for p in parts], axis=1)
         return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
 
-    return least_squares(
-        linearize, _linearized(groups, order) if start is None else start, max_steps
-    )
+    return least_squares(linearize, _linearized(groups, order) if start is None else start)
 
 
 def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
@@ -241,6 +239,12 @@ def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"
     return group.to_powers @ np.linalg.solve(triangle, q.conj().T @ target) / group.scale
 
 
+def grouped(htf: HTF, order: int, overhang: int | None) -> list[HTFGroup]:
+    """Group all entries of the HTFs, weighted by their variances, for so many multipliers."""
+    size = numerator_size(htf, order, overhang)
+    return group_htf(htf, error_weights(htf, check_values(htf)), size)
+
+
 def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> list[HTFGroup]:
     """Group all entries of the HTFs, with numerators of `size` coefficients.
 
@@ -249,12 +253,13 @@ def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> li
     """
     row_of = {m % htf.n_sections: row for row, m in enumerate(htf.harmonics)}
     opposite = {row: row_of.get(-m % htf.n_sections) for m, row in row_of.items()}
-    real = [row for row, other in opposite.items() if other == row]
-    pairs = [(other, row) for row, other in opposite.items() if other is not None and row < other]
-    single = [row for row, other in opposite.items() if other is None]
-    groups = _groups(htf, weight, size, real, None, real=True)
-    groups += _groups(htf, weight, size, [p for p, _ in pairs], [n for _, n in pairs], real=False)
-    return groups + _groups(htf, weight, size, single, None, real=False)
+    pairs = {other: row for row, other in opposite.items() if other is not None and row < other}
+    kinds = (
+        ([row for row, other in opposite.items() if other == row], None, True),
+        (list(pairs), list(pairs.values()), False),
+        ([row for row, other in opposite.items() if other is None], None, False),
+    )
+    return [group for kind in kinds if kind[0] for group in _groups(htf, weight, size, *kind)]
 
 
 def _groups(
@@ -266,8 +271,6 @@ def _groups(
     real: bool,
 ) -> list[HTFGroup]:
     """Return harmonics whose numerators solve the same problem, one group for each weight."""
-    if not rows:
-        return []
     f = np.asarray(htf.f)
     F, ny, nu = len(f), len(htf.outputs), len(htf.inputs)
 
@@ -280,15 +283,13 @@ def _groups(
 
     powers = np.exp(-2j * np.pi / htf.n_sections * f[:, None] * np.arange(size))
     powers, delay = both(powers, powers.conj()), np.exp(-2j * np.pi * f)
-    basis, to_powers = powers_basis(
-        np.concatenate([np.real(powers), np.imag(powers)]) if real else powers
-    )
-
+    powers = np.concatenate([np.real(powers), np.imag(powers)]) if real else powers
+    basis, to_powers = powers_basis(powers)
     weights, data = entries(weight), entries(np.asarray(htf.H))
     scale = weights[0]
     shape = weights / scale
     _, first, which = np.unique(
-        np.round(shape, _EQUAL_WEIGHTS), axis=1, return_index=True, return_inverse=True
+        np.round(shape, EQUAL_WEIGHTS), axis=1, return_index=True, return_inverse=True
     )
     number, i, j = np.unravel_index(np.arange(len(scale)), (len(rows), ny, nu))
     channel, line = np.stack([i, j], axis=1), both(np.arange(F), np.arange(F))
@@ -350,8 +351,8 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
             m, k, i, _ = (int(x) for x in bad[0])
             raise DefinitionError(
                 f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = "
-                f"{float(htf.f[k]):g} is not a positive number; leave this frequency out, or give "
-                "HTFs without variances."
+                f"{float(htf.f[k]):g} is not a positive number: estimate it from several "
+                "realizations (`Design.realizations`) or windows (`repeats` of estimate_htf)."
             )
     return rms
 
@@ -363,10 +364,11 @@ def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, 
     by the nearest product of a factor for each frequency and one for each harmonic, up to its
     sign (which is the form for white noise and any spectrum of the input).
 
-    **Arguments:** `rms`: errors are taken as equal parts of it where there are no variances.
+    **Arguments:** `rms`: where there are no variances, errors are taken as equal parts of it, but
+    for the power of the inputs.
     """
     if htf.variance is None:
-        return np.broadcast_to(1 / rms[:, None], htf.H.shape)
+        return np.broadcast_to(1 / (rms[:, None] * np.sqrt(line_variances(htf))), htf.H.shape)
     variance = np.asarray(htf.variance)
     if htf.scatter is not None:
         freedom = np.asarray(htf.scatter.freedom)
@@ -374,10 +376,18 @@ def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, 
     return weights_of(variance, rms)
 
 
+def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
+    """Return variances of each frequency and input by white noise, relative to their mean."""
+    if htf.power is None:
+        return np.ones((len(htf.f), 1, len(htf.inputs)))
+    variance = 1 / np.asarray(htf.power)[:, None]
+    return variance / variance.mean()
+
+
 def weights_of(
     variance: Float[np.ndarray, "... ny _"], rms: Float[np.ndarray, " ny"]
 ) -> Float[np.ndarray, "... ny _"]:
-    """Return one over the standard deviation of real and imaginary part of these variances."""
+    """Return one over the standard deviation of real and imaginary part."""
     return np.sqrt(2 / np.maximum(variance, (SMALLEST_ERROR * rms[:, None]) ** 2))
 
 
@@ -399,14 +409,16 @@ def _product_of_factors(
     return size[same] * by_line
 
 
-def require_frequencies(htf: HTF, order: int, size: int) -> None:
-    """Check that the frequencies determine numerators of `size` coefficients and the multipliers.
+def numerator_size(htf: HTF, order: int, overhang: int | None) -> int:
+    """Return how many coefficients each numerator has; `overhang` as of `fit_multipliers`.
 
-    **Raises:** `DefinitionError` for too few.
+    **Raises:** `DefinitionError` for too few frequencies to determine them and the multipliers.
     """
-    harmonics = {m % htf.n_sections for m in htf.harmonics}
+    N = htf.n_sections
+    size = order * N + (N if overhang is None else overhang) + 1
+    harmonics = {m % N for m in htf.harmonics}
     # Half of a pair, or a harmonic that is its own mirror image, has half as many coefficients.
-    unknown = [size if -m % htf.n_sections in harmonics else 2 * size for m in harmonics]
+    unknown = [size if -m % N in harmonics else 2 * size for m in harmonics]
     entries = len(htf.outputs) * len(htf.inputs)
 
     def enough(frequencies: int) -> bool:
@@ -418,30 +430,37 @@ def require_frequencies(htf: HTF, order: int, size: int) -> None:
             f"{order} multipliers: {next(filter(enough, count()))} or more are needed. Measure "
             "more, or lower `order` or `overhang`."
         )
+    return size
 
 
 def error_spectrum(
-    groups: list[HTFGroup], c: Coefficients, f: Float[np.ndarray, " F"], outputs: int
-) -> Float[np.ndarray, "F ny"]:
+    groups: list[HTFGroup],
+    c: Coefficients,
+    f: Float[np.ndarray, " F"],
+    lines: Float[np.ndarray, "F 1 nu"],
+    outputs: int,
+) -> Float[np.ndarray, "F ny nu"]:
     r"""Return the variance of the errors of each output, zero where the residual is zero.
 
     Noise of the sensors is taken for white; noise that drives the system has the system's poles,
-    at all harmonics. The variance of an output is therefore modeled as $a + b / |\chi|^2$.
+    at all harmonics. The variance of an output is therefore modeled as $a + b / |\chi|^2$, times
+    the variances `lines` of frequencies and inputs.
 
     This is a step of scoring towards the largest restricted likelihood (Patterson and Thompson
     1971), from the weights of the groups, which accounts for the fitted numerators.
     """
     square, expected = np.zeros((outputs, 2)), np.zeros((outputs, 2, 2))
     for group in groups:
-        parts = _components(group.period_delay, c) * group.weight**2
-        size = group.scale**2 / 2
+        relative = lines[:, 0, group.channel[:, 1]]  # (F, K), columns alike but for factors
+        parts = _components(group.period_delay, c) * group.weight**2 * relative[group.line, 0]
+        size = group.scale**2 / 2 * relative[0] / relative[0, 0]
         residual = (misfit_of(group, c).residual ** 2).sum(axis=0)
         products = _expected_products(group, c, parts)
         for k, i in enumerate(group.channel[:, 0]):
             square[i] += size[k] * (parts @ residual[:, k])
             expected[i] += size[k] ** 2 * products
     sizes = np.stack([amounts(*pair) for pair in zip(expected, square, strict=True)])
-    return (sizes @ _components(np.exp(-2j * np.pi * f), c)).T
+    return (sizes @ _components(np.exp(-2j * np.pi * f), c)).T[..., None] * lines
 
 
 def _components(

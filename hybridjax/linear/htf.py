@@ -1,13 +1,15 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
+from dataclasses import replace
 from typing import Annotated
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .._core.arguments import Numbers, names, require_same
+from .._core.arguments import Numbers, input_and_output_names, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
 from .._core.boundary.values import Complexes, Reals
@@ -17,7 +19,7 @@ from .._core.precision import require_x64
 from .._core.signal import ratio, with_unit
 from .._core.text import listed
 from ..errors import DefinitionError
-from .frequency_response import Frequencies, Harmonics, check_harmonics
+from .frequency_response import Harmonics, check_harmonics
 
 
 @checked
@@ -65,9 +67,6 @@ class Scatter(eqx.Module):
 # Distance in cycles per period up to which two frequencies are the same. Smaller: rounding makes
 # them different. Larger: lines of very long designs coincide.
 _SAME_FREQUENCY = 1e-9
-# Widest gap between frequencies that is interpolated, in widest steps between frequencies that were
-# measured. Larger: errors of the spline grow as its fourth power. Smaller: single gaps are refused.
-_WIDEST_GAP = 2
 Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=True)]
 
 # Outputs, and harmonics (the largest ones), that a notebook shows. More: larger pages. Fewer: parts
@@ -104,6 +103,8 @@ class HTF(eqx.Module):
     - `noise_variance` (M, F, ny, nu): the part of `variance` that is noise, from repeated periods.
       The remainder is nonlinear distortion, which random phases make random. None if it is unknown.
     - `scatter`: degrees of freedom of `variance`; None if the variance is exact.
+    - `power` (F, nu): excitation of each frequency, in any unit. Fits take errors as inversely
+      proportional to it where `variance` is None. Default: the same for all.
 
     **Raises:** `DefinitionError` if these do not fit together.
     """
@@ -113,6 +114,7 @@ class HTF(eqx.Module):
     variance: Float[Array, "M F ny nu"] | None
     noise_variance: Float[Array, "M F ny nu"] | None
     scatter: Scatter | None
+    power: Float[Array, "F nu"] | None
     harmonics: tuple[int, ...] = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -132,6 +134,7 @@ class HTF(eqx.Module):
         variance: Variance | None = None,
         noise_variance: Variance | None = None,
         scatter: Scatter | None = None,
+        power: Annotated[Numbers, Reals("F nu", sign="positive")] | None = None,
     ):
         require_x64()
         self.f, self.H = from_host((f, H.astype(complex)))
@@ -142,15 +145,17 @@ class HTF(eqx.Module):
                 f"`H` has shape {shape}, but there are {len(self.harmonics)} harmonics and "
                 f"{self.f.shape[0]} frequencies (its first two axes)."
             )
+        if not is_traced(f):
+            require_distinct(np.asarray(f))
         if tuple(np.ravel(np.asarray(harmonics))) != self.harmonics:
             raise DefinitionError(f"`harmonics` must be ascending, but is {harmonics}.")
         self.n_sections = n_sections
-        self.outputs = names("outputs", outputs, shape[2])
-        self.inputs = names("inputs", inputs, shape[3])
+        self.inputs, self.outputs = input_and_output_names(inputs, outputs, shape[3], shape[2])
         self.source = source
         self.variance = _optional("variance", variance, shape)
         self.noise_variance = _optional("noise_variance", noise_variance, shape)
         self.scatter = scatter
+        self.power = _optional("power", power, (shape[1], shape[3]))
         if scatter is not None:
             _optional("scatter.freedom", scatter.freedom, self.f.shape)
             _optional("scatter.roundness", scatter.roundness, shape)
@@ -198,7 +203,11 @@ class HTF(eqx.Module):
         """The same with fewer harmonics."""
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
-        return self._with(self.f, lambda x: x[rows], harmonics)
+        arrays = {"H": self.H, "variance": self.variance, "noise_variance": self.noise_variance}
+        roundness = None if self.scatter is None else self.scatter.roundness
+        arrays, roundness = jax.tree.map(lambda x: x[rows], (arrays, roundness))
+        scatter = None if self.scatter is None else Scatter(self.scatter.freedom, roundness)
+        return replace(self, harmonics=harmonics, scatter=scatter, **arrays)
 
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
@@ -219,52 +228,6 @@ class HTF(eqx.Module):
         if self.scatter is None:
             return jnp.sqrt(-np.log1p(-level) * self.variance)
         return jnp.sqrt(self.scatter.quantile(level) * self.variance)
-
-    def interpolate(self, f: Frequencies) -> "HTF":
-        """The HTFs at other frequencies, by cubic splines between neighbors (host side).
-
-        If the harmonics are symmetric about 0, the symmetry for real signals adds the negative
-        frequencies as neighbors, so that `f = 0` and `f = N/2` can be had too.
-
-        **Arguments:** `f` (F,), cycles per period.
-
-        Variances are interpolated linearly, which is on the safe side: a spline averages.
-
-        **Raises:** `DefinitionError` if a frequency lies in a gap more than twice as wide as the
-        widest step between the frequencies given (or outside them all).
-        """
-        from scipy.interpolate import CubicSpline, make_interp_spline  # (a quarter of a second)
-
-        if is_traced(self.f, self.H, f):
-            raise DefinitionError("`interpolate` works on the host, not inside jit or derivatives.")
-        wanted = np.atleast_1d(f)
-        knots, values = self._neighbors(self.H)
-        given = np.unique(self.f)
-        if len(given) < 2:
-            raise DefinitionError("Interpolation needs at least two frequencies.")
-        step = np.diff(given)
-        widest = _WIDEST_GAP * step[step > _SAME_FREQUENCY].max() + _SAME_FREQUENCY
-        ends = np.flatnonzero(np.diff(knots) > widest) + 1
-        place = np.mod(wanted, self.n_sections)
-        H = np.full((values.shape[0], len(wanted), *values.shape[2:]), np.nan, complex)
-        for run in np.split(np.arange(len(knots)), ends):
-            first, last = knots[run[[0, -1]]] + [-_SAME_FREQUENCY, _SAME_FREQUENCY]
-            inside = (place >= first) & (place <= last)
-            if len(run) > 1 and np.any(inside):
-                H[:, inside] = CubicSpline(knots[run], values[:, run], axis=1)(place[inside])
-        missing = np.isnan(H[0, :, 0, 0])
-        if np.any(missing):
-            raise DefinitionError(
-                f"f = {wanted[missing][0]:g} cycles per period is too far from the frequencies "
-                f"measured ({given[0]:g} to {given[-1]:g}) to interpolate."
-            )
-
-        def linear(values):
-            line = make_interp_spline(*self._neighbors(values), k=1, axis=1)
-            return line(place)
-
-        htf = self._with(wanted, linear, self.harmonics)
-        return eqx.tree_at(lambda x: x.H, htf, from_host(H))
 
     def predict(self, u: Annotated[Numbers, Reals("n nu")]) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
@@ -338,21 +301,6 @@ class HTF(eqx.Module):
         """The largest of `harmonic_errors`, per output."""
         return jnp.max(self.harmonic_errors(other), axis=0)
 
-    def _with(self, f, change, harmonics):
-        """The same at other places; `change` does it to each array that is like `H`."""
-        scatter = self.scatter
-        if scatter is not None:
-            freedom = jnp.broadcast_to(scatter.freedom[:, None, None], self.H.shape)
-            roundness = None if scatter.roundness is None else change(scatter.roundness)
-            scatter = Scatter(change(freedom)[0, :, 0, 0], roundness)
-        variance, noise = (
-            None if v is None else change(v) for v in (self.variance, self.noise_variance)
-        )
-        return HTF(
-            f, change(self.H), harmonics, self.n_sections, self.inputs, self.outputs, self.source,
-            variance=variance, noise_variance=noise, scatter=scatter,
-        )  # fmt: skip
-
     def _circle(self, f):
         """`f` modulo `N`, between `-N/2` and `N/2`."""
         return (f + self.n_sections / 2) % self.n_sections - self.n_sections / 2
@@ -369,19 +317,12 @@ class HTF(eqx.Module):
         mirror = [rows.get(-m % self.n_sections) for m in self.harmonics]
         return None if None in mirror else mirror
 
-    def _neighbors(self, values):
-        """Distinct frequencies on three turns of the circle of length `N`, and values there."""
-        f, H = np.asarray(self.f), np.asarray(values)
-        mirror = self._mirror()
-        if mirror is not None:
-            f, H = np.concatenate([f, -f]), np.concatenate([H, H[np.array(mirror)].conj()], axis=1)
-        f = np.mod(f, self.n_sections)
-        f[self.n_sections - f < _SAME_FREQUENCY] = 0.0
-        order = np.argsort(f, kind="stable")
-        order = order[np.diff(f[order], prepend=-1.0) > _SAME_FREQUENCY]
-        f, H = f[order], H[:, order]
-        turns = np.concatenate([f - self.n_sections, f, f + self.n_sections])
-        return turns, np.tile(H, (1, 3, 1, 1))
+
+def require_distinct(f: Float[np.ndarray, " F"]) -> None:
+    """**Raises:** `DefinitionError` for a frequency that occurs twice."""
+    f = np.sort(f)
+    if len(again := np.flatnonzero(np.diff(f) < _SAME_FREQUENCY)):
+        raise DefinitionError(f"`f` holds {f[again[0]]:.10g} cycles per period twice: keep one.")
 
 
 def _optional(name: str, value: Numbers | None, shape: tuple[int, ...]) -> Array | None:

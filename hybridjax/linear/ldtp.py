@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .._core.arguments import Numbers, names
+from .._core.arguments import Numbers, input_and_output_names
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, PeriodCount, Vector
 from .._core.boundary.values import Integers, Reals
@@ -103,8 +103,7 @@ class LDTP(eqx.Module):
             )
         self.A, self.B, self.C, self.D = A, B, C, through
         self.dims = _dimensions(dims, n_sections, d)
-        self.inputs = names("inputs", inputs, nu)
-        self.outputs = names("outputs", outputs, ny)
+        self.inputs, self.outputs = input_and_output_names(inputs, outputs, nu, ny)
         self.coordinates = None if coordinates is None else tuple(map(tuple, coordinates))
         _check_padding(self)
 

@@ -61,8 +61,9 @@ def _balanced(factors):
     """The factors in other units of each coordinate, powers of two, in which what comes in is as
     large as what goes out (Osborne, J. ACM 7, 1960): so that ranks do not depend on units."""
     factors = [np.array(factor, float) for factor in factors]
-    if not all(np.all(np.isfinite(factor)) for factor in factors):
-        return factors
+    for n, factor in enumerate(factors):
+        if not np.all(np.isfinite(factor)):
+            raise ComputationError(f"Factor {n} of the monodromy holds NaN or infinity.")
     for _ in range(8):  # more rounds change nothing
         for n in range(len(factors)):
             incoming = np.linalg.norm(factors[n - 1], axis=1)
@@ -78,9 +79,7 @@ def _balanced(factors):
 def _carry_range(factors, basis, rtol):
     """Orthonormal basis of `A[N-1] ... A[0] basis`, and each factor in the bases on its way."""
     reduced = []
-    for n, factor in enumerate(factors):
-        if not np.all(np.isfinite(factor)):
-            raise ComputationError(f"Factor {n} of the monodromy holds NaN or infinity.")
+    for factor in factors:
         image = factor @ basis
         left, singular, _ = np.linalg.svd(image, full_matrices=False)
         left = left[:, singular > rtol * np.linalg.norm(factor, 2)]

@@ -8,20 +8,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.compilation import host_first
-from .._core.executor import Array, namespace, on_host, scan
+from .._core.executor import Array, namespace, scan
 
 
 def monodromy(A: Float[Array, "N d d"]) -> Float[Array, "d d"]:
     """The product `A[N-1] ... A[0]`."""
-    if on_host(A):
-        return functools.reduce(lambda product, factor: factor @ product, A)
-    return _monodromy(A)
+    return scan(_multiplied, namespace(A).eye(A.shape[-1], dtype=A.dtype), A)[0]
 
 
-@jax.jit
-def _monodromy(A):
-    identity = jnp.eye(A.shape[-1], dtype=A.dtype)
-    return jax.lax.scan(lambda product, factor: (factor @ product, None), identity, A)[0]
+def _multiplied(product, factor):
+    return factor @ product, None
 
 
 @jax.jit

@@ -16,11 +16,14 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
+from .._core.executor import is_traced
 from .._core.vector_math.factorizations import solve_positive
+from ..errors import DefinitionError
 from ..systems.structure import as_vector
 
 
@@ -64,9 +67,9 @@ class Mechanism(eqx.Module):
     - `potential`: V(q) -> number, by default 0.
 
     Methods are for one state, in fields, guards, resets and outputs, and are written out as plain
-    operations there: nothing is handed to LAPACK. Where the mass matrix is singular, or
-    not positive, accelerations and velocities are NaN: a trajectory ends there with
-    `Result.FIELD_NOT_FINITE`.
+    operations there: nothing is handed to LAPACK. Where the mass matrix is singular, or not
+    positive, they raise `DefinitionError` for arrays; in fields and resets accelerations and
+    velocities are NaN there: a trajectory ends with `Result.FIELD_NOT_FINITE`.
     """
 
     kinetic: Callable[[Any, Any], Any]
@@ -92,7 +95,7 @@ class Mechanism(eqx.Module):
         self, q: Float[Array, " n"], v: Float[Array, " n"], force: ArrayLike = 0.0
     ) -> Float[Array, " n"]:
         """a = dv/dt in M a + h = f, under generalized forces f: n numbers, or one for all."""
-        return solve_positive(self.mass(q), force - self.bias(q, v))
+        return _solve(self.mass(q), force - self.bias(q, v))
 
     def constrained(
         self,
@@ -109,7 +112,7 @@ class Mechanism(eqx.Module):
         """
         mass, (jacobian, drift) = self.mass(q), _moving(contact, q, v)
         pushes = jnp.concatenate([(force - self.bias(q, v))[None], jacobian])
-        solved = solve_positive(mass, pushes)
+        solved = _solve(mass, pushes)
         free, by_force = solved[0], solved[1:].T
         constraint = solve_positive(jacobian @ by_force, -(drift + jacobian @ free))
         return Constrained(free + by_force @ constraint, constraint)
@@ -133,7 +136,7 @@ class Mechanism(eqx.Module):
         as an array (k,); `restitution`, e: 0 for a contact that sticks; a number, or k of them.
         """
         jacobian = jax.jacfwd(lambda q: as_vector(contact(q)))(q)
-        by_impulse = solve_positive(self.mass(q), jacobian).T
+        by_impulse = _solve(self.mass(q), jacobian).T
         impulse = solve_positive(jacobian @ by_impulse, -(1 + restitution) * (jacobian @ v))
         return Impact(v + by_impulse @ impulse, impulse)
 
@@ -148,6 +151,15 @@ class Mechanism(eqx.Module):
             lambda p, v: self.kinetic(*jax.jvp(place, (p,), (v,))),
             lambda p: self.potential(place(p)),
         )
+
+
+def _solve(mass, right):
+    """**Raises:** `DefinitionError` for a mass matrix that is singular or not positive."""
+    if not is_traced(mass) and not np.all(np.linalg.eigvalsh(mass) > 0):
+        raise DefinitionError(
+            f"the kinetic energy must be positive for all velocities; its mass matrix is {mass}."
+        )
+    return solve_positive(mass, right)
 
 
 def _moving(contact, q, v):

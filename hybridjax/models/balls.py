@@ -159,11 +159,8 @@ class BouncingChain(HybridSystem):
 
     def guess(self):
         """The cycle of masses that are not coupled (see `PaddleJuggler.exact`)."""
-        a, v = self.restitution, self.g * self.T / 2
-        rate = 2 * jnp.pi / self.T
-        first = jnp.arccos((1 - a) / (1 + a) * v / (self.A * rate)) / rate
-        impact = first + jnp.arange(self.n) * self.T / self.n
-        past = -impact % self.T
-        lift = self.A * jnp.sin(rate * first)
+        juggler = PaddleJuggler(self.A, self.T, self.g, self.restitution)
+        first, lift, v, _ = juggler.exact()
+        past = -(first + jnp.arange(self.n) * self.T / self.n) % self.T
         y = lift + v * past - self.g * past**2 / 2
         return Guess("flight", jnp.concatenate([y, v - self.g * past]))

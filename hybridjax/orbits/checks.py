@@ -1,24 +1,26 @@
 """Checks of a system's clock and of conserved quantities; the reasons of a search that failed."""
 
+import dataclasses
 import itertools
-from collections.abc import Iterator
-from typing import cast
+from collections.abc import Callable, Iterator
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.executor import Array, to_host
+from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.trajectory import simulate
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
-from ..systems.check import check_system
-from ..systems.structure import Structure
-from ..systems.system import HybridSystem
+from ..systems.check import check_output, check_system
+from ..systems.structure import Outputs, Structure
+from ..systems.system import HybridSystem, Output, OutputNames
 from ..systems.transition import Scheduled
 from .coincidence import SAME, coincident, events_of
 from .cycle import LimitCycle
+from .jumps import lines_of_decisions
 from .return_map import Turn
 from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 
@@ -41,7 +43,9 @@ def check_periodic(system: HybridSystem) -> None:
 
 def check_clock(s: Structure) -> None:
     """**Raises:** `DefinitionError` for a clock that is none, or schedules that do not fit it."""
-    given = s.system.period()
+    given: Any = s.system.period()
+    if given is not None and np.shape(given):
+        raise DefinitionError(f"the clock's period must be one number; it is {given}.")
     period = np.nan if given is None else float(given)
     if given is not None and not (np.isfinite(period) and period > 0):
         raise DefinitionError(f"the clock's period must be positive; it is {period}.")
@@ -86,26 +90,51 @@ def check_times(
     **Raises:** `DefinitionError` if they do not have the period that the system states; NaN is
     passed over.
     """
-    clock = s.system.period()
-    if clock is None:
+    if s.system.period() is None:
         return
-    period, sizes = float(clock), np.asarray(scale)
     for a in np.unique(chart):
         n, rows = s.dims[a], np.flatnonzero(chart == a)
-        first, states = t[rows] + _BASE * time, q[:n, rows]
+        sizes = np.concatenate([[time], np.asarray(scale)[a, :n]])
         for name, function in _functions(s, int(a)):
-            now, later = function(first, states), function(first + period, states)
-            size = np.concatenate([[time], sizes[a, :n]])[:, None]
-            slope = np.sum(np.abs(now[:, 1 : 2 + n]) * size, axis=1)
-            differs = np.abs(later - now)[:, 0] > SAME * np.abs(now[:, 0]) + ROUNDING * slope
-            gains = slice(2 + n, None)  # derivatives by inputs
-            if np.any(differs) or np.any(
-                np.abs(later - now)[:, gains] > SAME * np.abs(now)[:, gains].max(initial=0.0)
-            ):
-                raise DefinitionError(
-                    f"{name} does not have the period {period:.6g} that "
-                    f"{type(s.system).__name__}.period() states."
-                )
+            _compare(s, name, function, t[rows] + _BASE * time, q[:n, rows], sizes)
+
+
+def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
+    """Outputs of a cycle that are given to a call.
+
+    **Raises:** `DefinitionError` for one that does not exist, or is not well formed; and for an
+    `Output` that does not have the period of the clock, or depends on time without one.
+    """
+    s = cycle.structure
+    z = s.resolve_outputs(outputs)
+    given = [outputs] if isinstance(outputs, str | Output) else outputs
+    for x in (x for x in given if isinstance(x, Output) and not is_traced(cycle)):
+        clocked = list(check_output(s, x))
+        if clocked and s.system.period() is None:
+            raise DefinitionError(_no_period(s, f"the {clocked[0]} depends on t"))
+        for a, t, q in points(s, cycle.legs) if clocked else ():
+            if s.resolve_outputs(x).defined(a):
+                size = np.append(float(cycle.period), np.asarray(cycle.settings.scale)[a, : len(q)])
+                _compare(s, *_output(s, a, x), t, q, size)
+    return z
+
+
+def _compare(s: Structure, name: str, function, t, q, size: Float[np.ndarray, " 1+n"]) -> None:
+    """**Raises:** `DefinitionError` if a function of (t, q) differs one period of the clock later
+    by more than rounding, for times and states of this `size`."""
+    clock: Any = s.system.period()
+    period = float(clock)
+    now, later = function(t, q), function(t + period, q)
+    slope = np.sum(np.abs(now[:, 1 : 1 + len(size)]) * size[:, None], axis=1)
+    differs = np.abs(later - now)[:, 0] > SAME * np.abs(now[:, 0]) + ROUNDING * slope
+    gains = slice(1 + len(size), None)  # derivatives by inputs
+    if np.any(differs) or np.any(
+        np.abs(later - now)[:, gains] > SAME * np.abs(now)[:, gains].max(initial=0.0)
+    ):
+        raise DefinitionError(
+            f"{name} does not have the period {period:.6g} that {type(s.system).__name__}.period() "
+            "states."
+        )
 
 
 def _functions(s: Structure, a: int) -> Iterator:
@@ -127,8 +156,12 @@ def _functions(s: Structure, a: int) -> Iterator:
             yield f"the predicate of '{s.transitions[g].name}'", holds
     for output in s.system.outputs():
         if s.resolve_outputs(output).defined(a):
-            value = lambda t, q, x=output: kernels.outputs(s, a, (x.name,), t, q, u)  # noqa: E731
-            yield f"the output '{output.name}'", value
+            yield _output(s, a, output)
+
+
+def _output(s: Structure, a: int, output: Output) -> tuple[str, Callable]:
+    u = np.zeros((s.nu, 1))
+    return f"the output '{output.name}'", lambda t, q: kernels.outputs(s, a, (output,), t, q, u)
 
 
 def _no_period(s: Structure, problem: str) -> str:
@@ -136,6 +169,16 @@ def _no_period(s: Structure, problem: str) -> str:
         f"{problem}, but {type(s.system).__name__} states no period: give it a method `period()` "
         "that returns the time after which everything that depends on t repeats."
     )
+
+
+def closes_early(cycle: LimitCycle) -> bool:
+    """Test whether a cycle closes after a part of its `multiplicity` periods already."""
+    map, m = to_host(cycle).return_map, cycle.multiplicity
+    for d in (d for d in range(1, m) if m % d == 0):
+        part = dataclasses.replace(map, multiplicity=d, expected=map.expected * (d / m))
+        if np.max(np.abs(part.turn(map.anchor.q[:, 0]).residual) / map.sizes) < SAME:
+            return True
+    return False
 
 
 def check_conserved(cycle: LimitCycle) -> None:
@@ -182,6 +225,12 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
             f"`conserved={example}`, or take the one nearest to the guess with `throw=False`."
         )
     reason = code.message
+    if code == Result.EXTRA_TURNS and cycle.multiplicity > 1:
+        return (
+            f"the cycle of {name} that was found closes sooner than after the "
+            f"{cycle.multiplicity} periods of `multiplicity`: leave that out, or give a guess "
+            "nearer to the longer cycle, with `settle` if it is stable."
+        )
     if code == Result.NOT_CONVERGED and np.isnan(cycle.residual):
         reason = "Newton came to a state from where one period ends in another chart"
     elif code == Result.NOT_CONVERGED:
@@ -189,6 +238,8 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
         if cycle.conserved:
             reason += f"; perhaps not all of {', '.join(cycle.conserved)} are conserved"
     advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn)
+    if code in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
+        advice += _about_decisions(s)
     if not advice:
         advice = (
             " Try a better guess, or let it settle first if the cycle is stable, e.g. "
@@ -219,6 +270,17 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
         f"{expected:.3g}, and steps of explicit methods are as short as that also where it is at "
         'rest. Use an implicit one, e.g. `settings=Settings(solver="auto")`, or allow more steps, '
         "e.g. `settings=Settings(max_steps=20_000)`."
+    )
+
+
+def _about_decisions(s: Structure) -> str:
+    """The lines at which fields may jump."""
+    lines = dict.fromkeys(x for a in range(len(s.charts)) for x in lines_of_decisions(s, a) if x)
+    if not lines:
+        return ""
+    return (
+        f" The field may jump{','.join(lines)}: then write a chart for each side and a "
+        "`Transition` between them, or `hj.sliding`."
     )
 
 

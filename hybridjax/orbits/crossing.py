@@ -15,6 +15,7 @@ from .._core.executor import Definition, namespace
 from .._core.precision import real
 from .._core.text import fields
 from ..engine.target import AbstractLevels, Target
+from ..systems.check import check_output
 from ..systems.structure import Structure
 from ..systems.system import Output
 
@@ -63,11 +64,18 @@ class Crossing(Definition):
         return fields(self)
 
     def check(self, s: Structure) -> None:
-        """**Raises:** `DefinitionError` for charts or outputs that the system does not have."""
+        """**Raises:** `DefinitionError` for charts or outputs that do not exist, and for
+        functions that are not well formed."""
         for name in self.charts or ():
             s.chart_index(name)
-        if isinstance(self.function, str | Output):
+        if isinstance(self.function, str):
             s.resolve_outputs(self.function)
+            return
+        output: Any = self.function
+        if not isinstance(output, Output):
+            of_state = lambda t, q, u, f=output: f(t, q)  # noqa: E731
+            output = Output(str(self), dict.fromkeys(self.charts or s.names, of_state))
+        list(check_output(s, output))
 
     def in_chart(self, s: Structure, a: int) -> bool:
         """True if it can be crossed in chart a."""

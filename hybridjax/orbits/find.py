@@ -21,12 +21,12 @@ from ..errors import ComputationError, DefinitionError
 from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, integrated
-from .checks import check_clock, check_conserved, check_periodic, check_times, explain
+from .checks import check_clock, check_conserved, check_periodic, check_times, closes_early, explain
 from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
 from .guess import return_map_near
-from .jumps import check_jumps
+from .jumps import check_jumps, has_kinks
 from .newton import Solution, search, solve
 from .return_map import PATIENCE, ReturnMap
 from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_on, stiff_charts
@@ -35,6 +35,9 @@ from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_o
 # A cycle is computed again, in the sizes of its states, if a rough size was larger by more than
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
+# Steps of a piece of a turn where the default limit, which ends searches that run away, is reached.
+# Fewer: neurons have no cycle. More: vain searches last longer.
+_ENOUGH = 4096
 
 
 @checked
@@ -115,7 +118,8 @@ def find_limit_cycle(
         check_periodic(system)
     s = Structure(system)
     settings = settings.filled(LIMIT_CYCLE)
-    if has_implicit(s):
+    patient = settings.max_steps == Settings().max_steps
+    if has_implicit(s) or has_kinks(s):
         settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
@@ -150,14 +154,25 @@ def find_limit_cycle(
     s.resolve_outputs(tuple(map.conserved)).require(int(np.asarray(map.anchor.chart)[0]))
     if isinstance(map.base, AtEvent):
         check_begin(map)
-    map, solution = _in_own_sizes(map, search(map), given)
+    solution = search(map, patient)
+    if patient and int(solution.result) == Result.STEP_LIMIT:
+        say("the same with more steps")
+        map = dataclasses.replace(
+            map, settings=dataclasses.replace(map.settings, max_steps=_ENOUGH)
+        )
+        solution = search(map)
+    map, solution = _in_own_sizes(map, solution, given)
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
-    if solution.is_fixed_point and coincident(map, solution.turn):
+    failure = None
+    if solution.is_fixed_point and closes_early(cycle):
+        failure = Result.EXTRA_TURNS
+    elif solution.is_fixed_point and coincident(map, solution.turn):
         if commutes(cycle):
             say("events coincide, and commute")
         else:
-            code = jax.device_put(np.int32(Result.COINCIDENCE))
-            cycle = dataclasses.replace(cycle, result=code)
+            failure = Result.COINCIDENCE
+    if failure is not None:
+        cycle = dataclasses.replace(cycle, result=jax.device_put(np.int32(failure)))
     code, legs = Result(int(cycle.result)), to_host(cycle.legs)
     check_times(s, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
@@ -179,30 +194,38 @@ def _find_with_auto(system, guess, first: dict, options: dict) -> LimitCycle:
     if cycle.result != Result.OK or len(stiff) == len(cycle.system.charts()):
         return cycle
     fitting = integrated(system, dict.fromkeys(stiff, Radau()))
-    return find_limit_cycle(fitting, cycle, **options)
+    settings = options["settings"]
+    settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
+    options |= dict(settings=settings, throw=False)
+    faster = find_limit_cycle(fitting, cycle, **options)
+    return faster if faster.result == Result.OK else cycle
 
 
 def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[ReturnMap, Solution]:
     """A cycle that was found in rough sizes, in the sizes that states have on it."""
-    if not solution.is_fixed_point:
-        return map, solution
-    s, period = map.structure, solution.turn.period
-    rough = sizes_of(s, map.scale)
-    sizes = sizes_on(s, solution.turn.legs, float(period))
-    # A state at rest keeps its rough size: on the cycle it has only rounding errors.
-    sizes = {k: x if x > SAME * rough[k] else rough[k] for k, x in sizes.items()} | given
-    fine = dataclasses.replace(
-        map,
-        settings=dataclasses.replace(map.settings, scale=scale_of(s, sizes)),
-        anchor=solution.anchor,
-        expected=map.expected if map.base is None else period,
-    )
-    if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # more accurate than asked
-        distance = real(np.max(np.abs(solution.turn.residual) / to_host(fine).sizes))
-        return fine, solution._replace(turn=solution.turn._replace(distance=distance))
-    say("Newton's method, in the sizes of the cycle")
-    again = solve(fine)
-    return (fine, again._replace(steps=solution.steps)) if again.is_fixed_point else (map, solution)
+    s = map.structure
+    while solution.is_fixed_point:
+        period, rough = solution.turn.period, sizes_of(s, map.scale)
+        sizes = sizes_on(s, solution.turn.legs, float(period))
+        # A state at rest keeps its rough size: on the cycle it has only rounding errors. (If all
+        # are, the rough sizes are those of a guess that is far too large.)
+        moving = {k: x for k, x in sizes.items() if x > SAME * rough[k]}
+        sizes = (rough | moving if moving else sizes) | given
+        fine = dataclasses.replace(
+            map,
+            settings=dataclasses.replace(map.settings, scale=scale_of(s, sizes)),
+            anchor=solution.anchor,
+            expected=map.expected if map.base is None else period,
+        )
+        if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # accurate enough
+            distance = real(np.max(np.abs(solution.turn.residual) / to_host(fine).sizes))
+            return fine, solution._replace(turn=solution.turn._replace(distance=distance))
+        say("Newton's method, in the sizes of the cycle")
+        again = solve(fine)
+        if not again.is_fixed_point:
+            break
+        map, solution = fine, again._replace(steps=solution.steps)
+    return map, solution
 
 
 def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) -> LimitCycle:

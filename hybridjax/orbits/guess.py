@@ -13,6 +13,7 @@ from .._core.executor import from_host, namespace, to_host
 from .._core.precision import real
 from .._core.progress import say
 from .._core.results import Result
+from ..engine import kernels
 from ..engine.lanes import Lanes, start_lanes
 from ..engine.move import move
 from ..engine.search.state import Moved
@@ -78,6 +79,13 @@ def return_map_near(
                 f"it is said to be, leads to chart '{event.target}'."
             )
     q = np.pad(np.asarray(guess.state), (0, s.d - s.dims[a]))[:, None]
+    rate = kernels.field(s, a, time, q[: s.dims[a]], np.zeros((s.nu, 1)))[:, 0, 0]
+    if not np.isfinite(rate).all():
+        raise DefinitionError(
+            f"the field of chart '{guess.chart}' at the guess, {guess.state}, is {rate}: start "
+            "elsewhere, or look for a division by zero or a mass matrix that is singular or not "
+            "positive."
+        )
     lanes = from_host(start_lanes(s, time, np.array([a], np.int32), q))
     near = sizes_near(s, a, time[0], q[:, 0], None if period is None else float(period))
     settings = dataclasses.replace(settings, scale=scale_of(s, near.sizes | given))

@@ -1,7 +1,7 @@
 """Limit cycles of many systems at once: the points of a parameter sweep side by side."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import SupportsIndex
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Positive
 from .._core.execution import Execution
-from .._core.html import Curve, card, picture, table, thinned
+from .._core.executor import from_host
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import working
@@ -23,7 +23,7 @@ from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem
 from .batches import Rounds, Tiles
-from .checks import check_periodic
+from .checks import check_periodic, closes_early
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
@@ -35,8 +35,8 @@ from .scale import given_sizes, scale_of
 # Largest number of systems for programs that are compiled in half the time and run longer. Larger:
 # they run more than 3 s longer. Smaller: compiling takes longer than they run.
 SMALL = 2000
-# Cycles, among those on which events coincide, that are tested for whether the events commute; all
-# are, if they do not in one of these. More: the test takes longer. Fewer: exceptions are missed.
+# Cycles that are tested for whether events that coincide commute, and whether the cycle closes
+# early; all are, if one of these fails. More: the test takes longer. Fewer: exceptions are missed.
 _LOOKED_AT = 50
 # Systems per compiled call. More: their arrays leave the cache. Fewer: calls cost more.
 BATCH = 250
@@ -74,7 +74,8 @@ class LimitCycles(eqx.Module):
 
     def __getitem__(self, i: SupportsIndex) -> LimitCycle:
         """The cycle of system i, found or not (see its `result`)."""
-        pick = lambda tree: jax.tree_util.tree_map(lambda x: jnp.asarray(x[i]), tree)  # noqa: E731
+        take = lambda x: np.asarray(x)[i]  # (JAX compiles a program for each shape)  # noqa: E731
+        pick = lambda tree: from_host(jax.tree_util.tree_map(take, tree))  # noqa: E731
         arrays, static = eqx.partition(self.systems, eqx.is_array)
         return LimitCycle(
             eqx.combine(pick(arrays), static), self.base, pick(self.period), pick(self.anchor),
@@ -118,20 +119,6 @@ class LimitCycles(eqx.Module):
 
     def __repr__(self):
         return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
-
-    def _repr_html_(self) -> str:
-        k = thinned(len(self))
-        largest = np.abs(_multipliers(np.asarray(self.factors)[k], self.ok[k])[:, 0])
-        shown = {"period": np.asarray(self.period)[k], "largest modulus": largest}
-        rows = [
-            (name, f"{np.nanmin(x):.6g}", f"{np.nanmax(x):.6g}")
-            for name, x in shown.items()
-            if np.isfinite(x).any()
-        ]
-        ranges = table(("", "from", "to"), rows) if rows else ""
-        curve = picture([Curve(k, largest)], "system", "largest modulus of multipliers")
-        of = f"of {type(self.systems).__name__}: {self.summary(1)}"
-        return card("LimitCycles", of, ranges, curve)
 
 
 @checked
@@ -197,7 +184,10 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
         turn.distance, rounds.steps, rounds.result, rounds.codes, map.settings, map.conserved,
         map.multiplicity,
     )  # fmt: skip
-    return examined(cycles, rounds.together)
+    cycles = examined(cycles, rounds.together)
+    if map.multiplicity == 1:
+        return cycles
+    return _marked(cycles, np.flatnonzero(cycles.ok), closes_early, Result.EXTRA_TURNS)
 
 
 def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
@@ -209,11 +199,18 @@ def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycl
     for i in np.flatnonzero(cycles.ok)[[0, -1]] if cycles.ok.any() else ():
         check_jumps(cycles[int(i)])
     rows = np.flatnonzero(together & cycles.ok)
+    return _marked(cycles, rows, lambda cycle: not commutes(cycle), Result.COINCIDENCE)
+
+
+def _marked(
+    cycles: LimitCycles, rows: Int[np.ndarray, " R"], fails: Callable, code: Result
+) -> LimitCycles:
+    """The cycles, with this result where one fails a test; all are tested if one of few fails."""
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
-    if all(commutes(cycles[i]) for i in few):
+    if not any(fails(cycles[i]) for i in few):
         return cycles
     result = cycles.result.copy()
-    result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
+    result[[i for i in rows if fails(cycles[i])]] = code
     return dataclasses.replace(cycles, result=result)
 
 

@@ -53,16 +53,17 @@ class Solution(NamedTuple):
         return int(self.result) in (Result.OK, Result.SINGULAR)
 
 
-def search(map: ReturnMap) -> Solution:
+def search(map: ReturnMap, patient: bool = False) -> Solution:
     """Newton's method from the anchor's state; where it fails, with another period, then with the
-    smaller steps of Levenberg and Marquardt."""
+    smaller steps of Levenberg and Marquardt. If `patient`, it ends at the limit on steps."""
     say("Newton's method")
     solution = solve(map)
     if int(solution.result) == Result.EXTRA_TURNS:
         turn = solution.turn
         expected = turn.period * map.multiplicity / turn.meetings
         solution = solve(dataclasses.replace(map, anchor=solution.anchor, expected=expected))
-    if not solution.is_fixed_point and int(solution.result) != Result.EQUILIBRIUM:
+    final = (Result.EQUILIBRIUM, Result.STEP_LIMIT)[: 1 + patient]
+    if not solution.is_fixed_point and int(solution.result) not in final:
         # Newton's method may have left the domain of the return map.
         say("Levenberg-Marquardt steps")
         second = _solve_damped(map)

@@ -1,7 +1,5 @@
 """Figures of data: experiments, recordings, impulse responses, and the validation of a model."""
 
-from collections.abc import Mapping
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
@@ -27,7 +25,6 @@ from .look import (
     AxesLike,
     Plot,
     axis_of,
-    label_of,
     letters,
     panels,
 )  # fmt: skip
@@ -56,9 +53,7 @@ def phase(found: Phase, *, ax: AxesLike | None = None) -> Plot:
 
 
 @checked
-def section_data(
-    data: SectionData, *, labels: Mapping[str, str] | None = None, ax: AxesLike | None = None
-) -> Plot:
+def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     """Draw for each signal the average cycle, the deviations from it, and the input's spectrum.
 
     Left: the average cycle. Middle: deviations against phase, gray, with twice their standard
@@ -76,9 +71,9 @@ def section_data(
     with panels(ax, len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names)) as axes:
         for i, (name, x) in enumerate(zip(names, values.T, strict=True)):
             average, spread, last = axes[i]
-            deviation = axis_of(name, labels, deviation=True)
+            deviation = axis_of(name, deviation=True)
             average.plot(phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
-            average.set_ylabel(axis_of(name, labels))
+            average.set_ylabel(axis_of(name))
             spread.plot(at[thin] / N, x[thin], ",", color=COLORS["gray"], rasterized=True)
             std = np.array([np.nanstd(x[at == n]) for n in range(N)])
             for sign in (-2, 2):
@@ -100,11 +95,7 @@ def section_data(
 
 @checked
 def impulse_responses(
-    found: ImpulseResponses,
-    *,
-    input: int = 0,
-    labels: Mapping[str, str] | None = None,
-    ax: AxesLike | None = None,
+    found: ImpulseResponses, *, input: int = 0, ax: AxesLike | None = None
 ) -> Plot:
     """Left: responses to a push against its phase and the time since. Right: some of them with
     bands of 95 %."""
@@ -123,7 +114,7 @@ def impulse_responses(
             )  # fmt: skip
             pushed = found.inputs[input]
             impulse = Signal(pushed, unit_of(pushed) and f"{unit_of(pushed)} s")
-            label = with_unit(f"{label_of(name, labels)} / impulse", ratio(name, impulse))
+            label = with_unit(f"{name} / impulse", ratio(name, impulse))
             plane.get_figure().colorbar(image, ax=plane, label=label)
             plane.set_ylabel("phase of the push")
             for k, m in enumerate(dict.fromkeys(chosen)):
@@ -143,12 +134,7 @@ def impulse_responses(
 
 
 @checked
-def phase_response(
-    found: PhaseResponse,
-    *,
-    labels: Mapping[str, str] | None = None,
-    ax: AxesLike | None = None,
-) -> Plot:
+def phase_response(found: PhaseResponse, *, ax: AxesLike | None = None) -> Plot:
     """The curve with its 95 % band, and that of plain regression, which is biased."""
     with panels(ax, height=2.8) as axes:
         curve = axes[0, 0]
@@ -157,7 +143,7 @@ def phase_response(
         curve.plot(found.phase, found.values, color=CYCLE[0], label="estimated, 95 %")
         curve.plot(found.phase, found.plain, "--", color=COLORS["gray"], label="plain regression")
         curve.axhline(0, color="black", lw=0.4)
-        name = f"response to {label_of(found.input, labels)}"
+        name = f"response to {found.input}"
         curve.set(
             xlabel="phase (cycles)", ylabel=f"{name}\n({curve_unit(found.input)})", xlim=(0, 1)
         )
@@ -166,13 +152,7 @@ def phase_response(
 
 
 @checked
-def experiment(
-    data: ExperimentData,
-    index: int = 0,
-    *,
-    labels: Mapping[str, str] | None = None,
-    ax: AxesLike | None = None,
-) -> Plot:
+def experiment(data: ExperimentData, index: int = 0, *, ax: AxesLike | None = None) -> Plot:
     """Inputs and deviations of the outputs of one experiment, against time in cycles.
 
     One row per signal; cycles before the window that estimates use are shaded, and a failed
@@ -194,7 +174,7 @@ def experiment(
                 panel.step(time, values, where="post", lw=0.5, color=COLORS["black"])
             else:
                 panel.plot(time, values, lw=0.5, color=CYCLE[0])
-            panel.set_ylabel(axis_of(name, labels, deviation=not is_input))
+            panel.set_ylabel(axis_of(name, deviation=not is_input))
             if data.window.start:
                 panel.axvspan(0, data.window.start / data.n_sections, color="0.92", zorder=0)
             if not data.ok[index] and data.failed_at[index] >= 0:
@@ -211,20 +191,14 @@ def experiment(
 
 
 @checked
-def validation(
-    found: Validation,
-    *,
-    cycles: PeriodCount = 4,
-    labels: Mapping[str, str] | None = None,
-    ax: AxesLike | None = None,
-) -> Plot:
+def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | None = None) -> Plot:
     """Measured and simulated outputs, and correlations of the residuals; one row per output.
 
     Left: the last cycles of the first record. Middle: correlations of the residuals with earlier
     ones, right: with earlier inputs. Bars are their means over all sections, in units of their
     standard deviation; beyond the shaded band lie 1 % of them where there is no correlation.
 
-    **Arguments:** `cycles` to show; `labels`: texts for the outputs and inputs by name.
+    **Arguments:** `cycles` to show. Default: 4.
     """
     N, ny = found.n_sections, len(found.outputs)
     shown = slice(max(len(found.measured) - cycles * N, 0), None)
@@ -236,7 +210,7 @@ def validation(
             signal.plot(time, found.simulated[shown, i], color=CYCLE[0], label="simulated")
             measured = dict(ls="", marker=".", ms=3, color="black", label="measured")
             signal.plot(time, found.measured[shown, i], **measured)
-            signal.set_ylabel(axis_of(name, labels, deviation=True))
+            signal.set_ylabel(axis_of(name, deviation=True))
             signal.set_title(f"fit {found.fit[i]:.2f} %")
             signal.margins(x=0.02)
             after = np.arange(1, 1 + found.autocorrelation.shape[1])

@@ -13,17 +13,11 @@ from ..designs.optimize import OptimalDesign
 from ..designs.study import Study
 from ..errors import DefinitionError
 from .frequency import FREQUENCY
-from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, panels
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, panels
 
 
 @checked
-def spectrum(
-    plan: OptimalDesign,
-    model: Model,
-    *,
-    labels: Mapping[str, str] | None = None,
-    ax: AxesLike | None = None,
-) -> Plot:
+def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -> Plot:
     """The spectrum of an optimal design, and of the usual one, below |H_0| of all outputs.
 
     Above: |H_0|, each relative to its largest value. Below: the amplitude of each line (the root of
@@ -42,7 +36,7 @@ def spectrum(
         for k, name in enumerate(model.outputs):
             for i, _ in enumerate(model.inputs):
                 size = H[:, k, i] / H[:, k, i].max()
-                above.plot(f, size, color=CYCLE[k % len(CYCLE)], label=label_of(name, labels))
+                above.plot(f, size, color=CYCLE[k % len(CYCLE)], label=name)
         above.set(yscale="log", ylabel="$|H_0|$ / largest")
         above.legend()
         for power, color, label in (
@@ -64,12 +58,7 @@ def spectrum(
 
 
 @checked
-def information(
-    found: InformationMap,
-    *,
-    labels: Mapping[str, str] | None = None,
-    ax: AxesLike | None = None,
-) -> Plot:
+def information(found: InformationMap, *, ax: AxesLike | None = None) -> Plot:
     """Draw the phases and frequencies at which an experiment learns: one row per output.
 
     Left: how dense the information is over input frequency and the phase at which the output is
@@ -99,7 +88,7 @@ def information(
                 rasterized=True,
             )  # fmt: skip
             chart.set_ylabel("phase (cycles)")
-            chart.set_title(f"measured in {label_of(name, labels)}")
+            chart.set_title(f"measured in {name}")
             bar = chart.get_figure(root=True).colorbar(drawn, ax=chart, pad=0.01)
             bar.set_label("information / mean")
             bar.ax.tick_params(labelsize=7)

@@ -14,7 +14,7 @@ from ..errors import DefinitionError
 from ..identify.multipliers import StructuredFit
 from ..identify.rational import RationalFit
 from ..linear.htf import HTF
-from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, letters, panels
 
 
 Fit = RationalFit | StructuredFit
@@ -31,7 +31,6 @@ def magnitude(
     input: str | int = 0,
     harmonics: Sequence[int] = (0, 1, -1),
     decades: Positive = 5,
-    labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
     """|H_m| of one output against the input frequency, on a logarithmic scale.
@@ -41,7 +40,7 @@ def magnitude(
     the true value at each frequency with a probability of 95 %.
 
     **Arguments:** `output`, `input`: names or indices. `decades`: how far below the largest
-    value the scale reaches. `labels`: texts for the names. `ax`: by default a new figure.
+    value the scale reaches. `ax`: by default a new figure.
 
     **Raises:** `DefinitionError` for an output, input or harmonic that is not there.
     """
@@ -59,7 +58,7 @@ def magnitude(
                 panel.plot(f, size, **line)
                 _band(panel, f, size, radius, line["color"], 0.3 * np.min(size))
         name, pushed = _pick(htf.outputs, output), _pick(htf.inputs, input)
-        label = with_unit(f"$|H_m|$, {label_of(name, labels)}", ratio(name, pushed))
+        label = with_unit(f"$|H_m|$, {name}", ratio(name, pushed))
         panel.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
         _frequency_limits(panel, f)
         top = max(np.nanmax(line.get_ydata()) for line in panel.get_lines())
@@ -75,13 +74,12 @@ def harmonics(
     *,
     input: str | int = 0,
     decades: Positive = 5,
-    labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
     """The paper's Fig. 3: |H_m|, one row per output and one column per section family.
 
     **Arguments:** `families`: by name, an HTF or several (estimate and exact), all with the same
-    outputs. `harmonics`, `input`, `decades` and `labels` as in `magnitude`; a row shares one
+    outputs. `harmonics`, `input` and `decades` as in `magnitude`; a row shares one
     scale.
     """
     columns = _columns(families)
@@ -92,7 +90,7 @@ def harmonics(
             for panel, htfs in zip(row, columns.values(), strict=True):
                 magnitude(
                     *htfs, output=output, input=input, harmonics=harmonics, decades=decades,
-                    labels=labels, ax=panel,
+                    ax=panel,
                 )  # fmt: skip
                 limits.append(panel.get_ylim())
             row[0].set_ylim(*np.max(limits, axis=0))
@@ -106,7 +104,6 @@ def bode(
     harmonic: int = 0,
     outputs: SignalNames | None = None,
     input: str | int = 0,
-    labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
     """Magnitude and phase of one harmonic for several outputs, with fits in black on top.
@@ -131,7 +128,7 @@ def bode(
         upper, lower = axes[:, 0]
         for number, (name, unit) in enumerate(zip(names, units, strict=True)):
             color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
-            label = with_unit(label_of(name, labels), "" if same else unit)
+            label = with_unit(name, "" if same else unit)
             for htf in _exact_first(htfs):
                 f, values, radius = _values(htf, harmonic, name, input)
                 size, line = np.abs(values), _line(htf, htfs, {"color": color}, label)
@@ -168,7 +165,6 @@ def bodes(
     fits: Mapping[str, Fit | Sequence[Fit]] | None = None,
     harmonic: int = 0,
     input: str | int = 0,
-    labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
     """The paper's Fig. 4: a Bode plot of one harmonic with its fits, one column per family.
@@ -183,10 +179,7 @@ def bodes(
             raise DefinitionError(f"there are fits of '{name}', but the HTFs are {list(families)}.")
     with _grid(columns, 2, 3.4, ax) as axes:
         for k, (family, htfs) in enumerate(columns.items()):
-            bode(
-                *htfs, fits=fits.get(family, ()), harmonic=harmonic, input=input, labels=labels,
-                ax=axes[:, k],
-            )  # fmt: skip
+            bode(*htfs, fits=fits.get(family, ()), harmonic=harmonic, input=input, ax=axes[:, k])
     return Plot(axes)
 
 

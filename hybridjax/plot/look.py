@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args
 
@@ -141,15 +141,9 @@ def panels(ax: AxesLike | None, rows: int = 1, columns: int = 1, **options):
     yield axes.reshape(rows, columns)
 
 
-def label_of(name: str, labels: Mapping[str, str] | None) -> str:
-    """The text for a state, input or output: the user's, or its name."""
-    return (labels or {}).get(name, name)
-
-
-def axis_of(name: str, labels: Mapping[str, str] | None, deviation: bool = False) -> str:
+def axis_of(name: str, *, deviation: bool = False) -> str:
     """The label of an axis for a signal, or for its deviation from the cycle, with the unit."""
-    text = label_of(name, labels)
-    return with_unit(rf"$\delta$ {text}" if deviation else text, unit_of(name))
+    return with_unit(rf"$\delta$ {name}" if deviation else name, unit_of(name))
 
 
 def letters(axes: Any) -> None:

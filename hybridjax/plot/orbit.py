@@ -1,6 +1,6 @@
 """A limit cycle in phase space (paper Fig. 1)."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,6 @@ def cycle(
     *,
     sections: PlacedSections | None = None,
     perturbed: Trajectory | None = None,
-    labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
     """The limit cycle in the plane of two states or outputs, colored by chart.
@@ -48,7 +47,6 @@ def cycle(
     - `x`, `y`: names of states or outputs; by default the first two states that every chart has.
     - `sections`: from `place_sections`, drawn as bars; about 8 are numbered, where there is room.
     - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
-    - `labels`: texts for the axes by name, e.g. `{"yM": "$y_M$"}`; units are added.
     - `ax`: where to draw; a new figure of one column's width by default.
 
     **Raises:** `DefinitionError` for a name that does not exist, or sections of another system.
@@ -83,8 +81,8 @@ def cycle(
             _sections(panel, s, sections, (x, y), np.stack([px, py], axis=1))
         if perturbed is not None:
             panel.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
-        panel.set_xlabel(axis_of(x, labels))
-        panel.set_ylabel(axis_of(y, labels))
+        panel.set_xlabel(axis_of(x))
+        panel.set_ylabel(axis_of(y))
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return Plot(axes)
 

@@ -1,7 +1,6 @@
 """Limit cycles over parameters: branches, and maps of sweeps."""
 
 import itertools
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,7 @@ _MARKS = dict(
 
 
 @checked
-def branch(
-    *branches: Branch,
-    output: str | None = None,
-    labels: Mapping[str, str] | None = None,
-    ax: AxesLike | None = None,
-) -> Plot:
+def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = None) -> Plot:
     """Branches of limit cycles, with marks where their stability changes.
 
     Stable cycles are drawn by full lines and unstable ones by dashed lines, one color per branch.
@@ -35,7 +29,6 @@ def branch(
     - `branches`: from `continuation`, all along the same parameter.
     - `output`: the name of a state or output, whose largest value on each cycle is drawn; by
         default the first state of the chart in which the cycle begins.
-    - `labels`: texts for the axes by name, e.g. `{"Vin": "supply"}`; units are added.
     - `ax`: where to draw; a new figure of one column's width by default.
 
     **Raises:** `DefinitionError` for branches along different parameters, or a name that does not
@@ -67,9 +60,7 @@ def branch(
         system = branches[0][0].system
         parameter = Signal(b.parameter, unit_of_parameter(system, b.parameter))
         (output_name,) = branches[0][0].structure.resolve_outputs(name).names
-        panel.set(
-            xlabel=axis_of(parameter, labels), ylabel=f"largest {axis_of(output_name, labels)}"
-        )
+        panel.set(xlabel=axis_of(parameter), ylabel=f"largest {axis_of(output_name)}")
         panel.locator_params(axis="x", nbins=6)
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return Plot(axes)

@@ -13,7 +13,7 @@ from ..identify.multiplier_estimate import MultiplierEstimate, Multipliers, comp
 from ..identify.rational import RationalFit
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
-from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, letters, panels
 
 
 _MARKERS = "osD^vP*X"
@@ -25,7 +25,6 @@ def multipliers(
     estimates: Mapping[str, RationalFit | MultiplierEstimate | Multipliers] | None = None,
     *,
     zoom: bool = True,
-    labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
     """Draw Floquet multipliers in the unit disc: true ones as crosses, estimates as open markers.
@@ -40,7 +39,7 @@ def multipliers(
         others are compared, such as a `SeriesFit`.
     - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`,
         `SeriesFit` or the result of `multiplier_bound`, or multipliers.
-    - `zoom`: draw the inset. `labels`: texts for the outputs by name.
+    - `zoom`: draw the inset.
 
     **Raises:** `DefinitionError` if there are no multipliers.
     """
@@ -49,7 +48,7 @@ def multipliers(
     true = _values(true)
     if true.size == 0:
         raise DefinitionError("`true` holds no multiplier to draw.")
-    series = _series(estimates or {}, labels)
+    series = _series(estimates or {})
     cross: dict[str, Any] = {"marker": "+", "ms": 9, "mew": 1.2, "color": "black"}
     drawn = [(reference, reference, true, cross)]
     for k, (label, z) in enumerate(series.items()):
@@ -81,12 +80,7 @@ def multipliers(
 
 
 @checked
-def poles_zeros(
-    fits: Mapping[str, RationalFit],
-    *,
-    labels: Mapping[str, str] | None = None,
-    ax: AxesLike | None = None,
-) -> Plot:
+def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) -> Plot:
     """Poles (crosses) and zeros (circles) of rational fits in the z-plane, one column per output.
 
     The upper row shows them all, the lower one the surroundings of the poles. A family of
@@ -118,7 +112,7 @@ def poles_zeros(
             upper.set_aspect("equal", adjustable="datalim")
             (x0, x1), (y0, y1) = lower.get_xlim(), lower.get_ylim()
             upper.indicate_inset((x0, y0, x1 - x0, y1 - y0), edgecolor="black")
-            upper.set_title(label_of(output, labels))
+            upper.set_title(output)
             lower.set_title("enlarged: around the poles")
             _complex_axes(lower, "z")
             _complex_axes(upper, "z")
@@ -144,12 +138,12 @@ def _values(source: Any) -> np.ndarray:
     return np.asarray(source).ravel().astype(complex)
 
 
-def _series(estimates: Mapping[str, Any], labels) -> dict[str, np.ndarray]:
+def _series(estimates: Mapping[str, Any]) -> dict[str, np.ndarray]:
     series = {}
     for label, estimate in estimates.items():
         if isinstance(estimate, RationalFit):
             for name, z in zip(estimate.outputs, estimate.multipliers, strict=True):
-                series[f"{label}, {label_of(name, labels)}"] = _values(z)
+                series[f"{label}, {name}"] = _values(z)
         else:
             series[label] = _values(estimate)
     return series

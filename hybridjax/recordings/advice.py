@@ -28,6 +28,9 @@ _FEW = 0.25
 # Correlation of two outputs at a section that makes them redundant. Larger: nearly equal ones
 # pass. Smaller: outputs that share most of a response are reported.
 _SAME_OUTPUTS = 0.98
+# Least modulus of a multiplier that may be that of a tone, and what is left of its mode at the end
+# of a record. Larger: hum passes. Smaller: slow modes are called hum.
+_DAMPED, _DECAYED = 0.9, 0.1
 
 
 class Advice(eqx.Module):
@@ -36,8 +39,7 @@ class Advice(eqx.Module):
     **Fields:**
 
     - `warnings`: findings about the data and the fit; none if there is no reason for doubt.
-    - `plain` (d,): the multipliers from plain regression (ARX). `bias`: their distance from those
-      of the fit.
+    - `plain` (d,): the multipliers from plain regression (ARX).
     - `band`: for each input the frequency (cycles per period) up to which it had power.
     - `strides`: numbers of strides. `expected` (k, d): the standard errors of the multipliers that
       so many strides like these would give.
@@ -45,7 +47,6 @@ class Advice(eqx.Module):
 
     warnings: tuple[Finding, ...]
     plain: Complex[np.ndarray, " d"]
-    bias: float = eqx.field(static=True)
     band: tuple[float, ...] = eqx.field(static=True)
     strides: tuple[int, ...] = eqx.field(static=True)
     expected: Float[np.ndarray, "k d"]
@@ -117,7 +118,18 @@ def advise(
     later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
     with np.errstate(divide="ignore"):
         expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
-    return Advice(tuple(warnings), plain, bias, tuple(band), strides, expected)
+    return Advice(tuple(warnings), plain, tuple(band), strides, expected)
+
+
+def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:
+    """Find multipliers of modes that decay so little that they may be tones or drift."""
+    cycles = max(len(r.u) for r in data.records) / data.n_sections
+    for z in fit.multipliers:
+        if z.imag >= 0 and abs(z) > max(_DAMPED, _DECAYED ** (1 / cycles)):
+            text = f"the mode of the multiplier {z:.3g} hardly decays in the longest record, of "
+            text += f"{cycles:.0f} cycles: hum near a multiple of the rhythm, or drift, looks the "
+            text += "same and spoils the other multipliers. Look for it in the spectra of outputs."
+            yield Finding("no decay", text)
 
 
 def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> Iterator[Finding]:

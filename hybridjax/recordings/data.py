@@ -104,12 +104,11 @@ class SectionData(eqx.Module):
         **Raises:** `DefinitionError` for records that are shorter than P, or have gaps.
         """
         N = self.n_sections
-        first = [-r.first_section % N for r in self.records]
-        cycles = min(len(r.u) - k for r, k in zip(self.records, first, strict=True)) // N
-        parts = [r.part(k, k + cycles * N) for r, k in zip(self.records, first, strict=True)]
+        parts = [r.part(-r.first_section % N, len(r.u)) for r in self.records]
+        n = min(len(r.u) for r in parts) // N * N
         return ExperimentData(
-            np.stack([r.u for r in parts]),
-            np.stack([r.y for r in parts]),
+            np.stack([r.u[:n] for r in parts]),
+            np.stack([r.y[:n] for r in parts]),
             n_sections=N,
             periods=periods,
             inputs=self.inputs,

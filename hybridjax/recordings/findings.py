@@ -55,10 +55,13 @@ class Inspection(eqx.Module):
 
 
 def refuse(findings: Iterable[Finding]) -> None:
-    """**Raises:** `DefinitionError` with the first finding that makes a recording useless."""
+    """**Raises:** `DefinitionError` with the first finding that makes a recording useless, and the
+    texts of others, one of which may be the cause."""
+    findings = list(findings)
     for finding in findings:
         if finding.action == "refused":
-            raise DefinitionError(finding.text)
+            also = listed([x.text for x in findings if x.action == "warned"])
+            raise DefinitionError(finding.text + f" (Found, too: {also})" * bool(also))
 
 
 def print_findings(findings: Iterable[Finding], indent: str = "") -> str:

@@ -8,7 +8,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
-from ..identify.denominator import Covariance, Denominator
+from ..identify.denominator import Covariance
 from ..identify.series.fit import (
     SeriesFit,
     assemble,
@@ -54,11 +54,10 @@ class Split(NamedTuple):
         N = self.early.n_sections
         for d in range(1, most + 1):
             problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
-            c = total_least_squares(delayed_outputs(problem, d))
-            solution = linearize(problem, c)
+            solution = linearize(problem, total_least_squares(delayed_outputs(problem, d)))
             if (solution.freedom <= 2 * d).any():
                 break
-            fit = assemble(problem, solution, Denominator(c, Covariance.unknown(d), False))
+            fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
             if not long:
                 break

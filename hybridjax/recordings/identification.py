@@ -9,7 +9,7 @@ from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNam
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..identify.series.fit import SeriesFit, fit_series
-from .advice import Advice, advise
+from .advice import Advice, advise, undamped
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import Finding, refuse
@@ -106,6 +106,7 @@ def identify_recording(
     held = parts.fit(order)
     say("fit to all")
     fit = fit_series(data, order, check=False)
+    findings = (*findings, *undamped(data, fit))
     curve = None
     of_events = all(w.linear for parts in phase.stretches for w in parts)
     if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:

@@ -142,7 +142,9 @@ def natural_multipliers(
     # The first weights are those of all cycles, the others draws.
     drawn = [_resampled(moments.records, block, rng) for _ in range(_DRAWS)]
     weights = np.stack([np.ones(K), *drawn])
-    state, forward, square, cross, ahead = (_summed(weights, x) for x in moments[:5])
+    state, forward, square, cross, ahead = (
+        np.tensordot(weights, products, (1, 1)) for products in moments[:5]
+    )
     first = np.linalg.pinv(square, hermitian=True) @ np.swapaxes(cross, 2, 3)
     by_instruments = _corrected(_multipliers(ahead @ first @ np.linalg.pinv(cross @ first)), length)
     plain = _multipliers(forward @ np.linalg.inv(state))
@@ -214,13 +216,6 @@ def _moments(data: SectionData, order: int) -> _Moments:
     return _Moments._make([*parts, names[:, 0]])
 
 
-def _summed(
-    weights: Float[np.ndarray, "B K"], products: Float[np.ndarray, "N K a b"]
-) -> Float[np.ndarray, "B N a b"]:
-    """Sum over cycles, each counted as often as its weight."""
-    return np.tensordot(weights, products, (1, 1))
-
-
 def _principal(
     x: Float[np.ndarray, "k p"], other: Float[np.ndarray, "k p"], count: int
 ) -> tuple[Float[np.ndarray, "k d"], Float[np.ndarray, "k d"]]:
@@ -263,9 +258,7 @@ def _resampled(
     weights = np.zeros(len(records))
     names, counts = np.unique(records, return_counts=True)
     if block == counts.max():
-        for record in rng.choice(names, len(names)):
-            weights[records == record] += 1.0
-        return weights
+        return 1.0 * (records[:, None] == rng.choice(names, len(names))).sum(axis=1)
     for record, count in zip(names, counts, strict=True):
         length = min(block, count)
         starts = rng.integers(0, count - length + 1, -(-count // length))

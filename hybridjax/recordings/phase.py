@@ -1,12 +1,12 @@
 """The phase of a recording."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy import signal
 from scipy.interpolate import PchipInterpolator
 
+from .._core.memo import remembered
 from ..errors import DefinitionError
 from .recording import Recording, Trial
 
@@ -63,36 +63,29 @@ class Phase(eqx.Module):
     """
 
     stretches: tuple[tuple[Winding, ...], ...]
-    periods: tuple[Float[np.ndarray, " _"], ...]
-    period: float = eqx.field(static=True)
-    n_sections: int | None = eqx.field(static=True)
-    backwards: float = eqx.field(static=True)
-    dropped: int = eqx.field(static=True)
-    missed: int = eqx.field(static=True)
-    lead: int = eqx.field(static=True)
+    n_sections: int | None = eqx.field(static=True, default=None)
+    backwards: float = eqx.field(static=True, default=0.0)
+    dropped: int = eqx.field(static=True, default=0)
+    missed: int = eqx.field(static=True, default=0)
+    lead: int = eqx.field(static=True, default=0)
 
-    def __init__(
-        self,
-        stretches: Sequence[Sequence[Winding]],
-        *,
-        n_sections: int | None = None,
-        backwards: float = 0.0,
-        dropped: int = 0,
-        missed: int = 0,
-        lead: int = 0,
-    ):
+    def __check_init__(self):
         """**Raises:** `DefinitionError` for stretches that hold fewer than two whole cycles."""
-        self.stretches = tuple(map(tuple, stretches))
-        self.periods = tuple(
+        if self.cycles < 2:
+            raise DefinitionError(
+                f"the recording holds {self.cycles} whole cycles: two are needed."
+            )
+
+    @remembered
+    def periods(self) -> tuple[Float[np.ndarray, " _"], ...]:
+        return tuple(
             np.concatenate([np.zeros(0), *(np.diff(w.edges()) for w in parts)])
             for parts in self.stretches
         )
-        every = np.concatenate(self.periods)
-        if len(every) < 2:
-            raise DefinitionError(f"the recording holds {len(every)} whole cycles: two are needed.")
-        self.period = float(np.median(every))
-        self.n_sections, self.backwards, self.lead = n_sections, backwards, lead
-        self.dropped, self.missed = dropped, missed
+
+    @property
+    def period(self) -> float:
+        return float(np.median(np.concatenate(self.periods)))
 
     def by_trial(self, recording: Recording) -> list[tuple[Trial, tuple[Winding, ...]]]:
         """Return each trial with its stretches.
@@ -111,28 +104,17 @@ class Phase(eqx.Module):
         """Number of whole cycles."""
         return sum(len(p) for p in self.periods)
 
-    def _lines(self) -> list[tuple[Float[np.ndarray, " c"], float, Float[np.ndarray, " c"]]]:
-        """Return for each trial of three cycles or more their numbers around 0, and the slope of a
-        line through their periods, and the distances from it."""
-        lines = []
-        for p in self.periods:
-            k = np.arange(len(p)) - (len(p) - 1) / 2
-            if len(p) > 2:
-                slope = float(k @ p / (k @ k))
-                lines.append((k, slope, p - p.mean() - slope * k))
-        return lines
-
     @property
     def drift(self) -> float:
         """Relative change of the period per cycle: a straight line through each trial."""
-        lines = self._lines()
-        weight = sum(float(k @ k) for k, _, _ in lines)
-        return sum(float(k @ k) * slope for k, slope, _ in lines) / max(weight, 1.0) / self.period
+        long = [(np.arange(len(p)) - (len(p) - 1) / 2, p) for p in self.periods if len(p) > 2]
+        weight = sum(k @ k for k, _ in long)
+        return float(sum(k @ p for k, p in long) / max(weight, 1.0) / self.period)
 
     @property
     def jitter(self) -> float:
         """Relative standard deviation of the periods of each trial about their line."""
-        off = [x for _, _, x in self._lines()]
+        off = [signal.detrend(p) for p in self.periods if len(p) > 2]
         freedom = sum(len(x) - 2 for x in off)
         return float(np.sqrt(sum(x @ x for x in off) / max(freedom, 1))) / self.period
 

@@ -11,7 +11,7 @@ from ..errors import DefinitionError
 from ..orbits.crossing import AtEvent, Crossing
 from ..sections.families import KinematicPhase
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
-from .recording import Recording, check_events, signal_of
+from .recording import Recording, signal_of
 from .smoothing import FEWEST, Bandwidth, Series, bridgeable, gaps, inside, spline, without_spikes
 
 
@@ -91,9 +91,9 @@ def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
     """Return the phase of all trials: their angles in the sense in which they turn."""
     rate = _turns_per_time(angles)
     backwards, total = 0, 0
-    stretches: list[list[Winding]] = []
+    stretches: list[tuple[Winding, ...]] = []
     for time, angle in angles:
-        stretches.append([])
+        stretches.append(())
         edges = np.flatnonzero(np.diff(time) > LONGEST_GAP / abs(rate)) + 1
         for part in np.split(np.arange(len(time)), edges):
             phase = np.sign(rate) * np.unwrap(angle[part]) / (2 * np.pi)
@@ -104,11 +104,11 @@ def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
                 continue
             backwards += int((np.diff(phase) < 0).sum())
             total += len(part)
-            t, finite = time[part], np.ones(len(part), bool)
-            unseen = gaps(t, finite, bridgeable(t, finite))[1:-1]
+            t = time[part]
+            unseen = gaps(t, bridgeable(t))[1:-1]
             monotone = ((low + high) / 2)[rising]
-            stretches[-1].append(Winding(t[rising], monotone, False, unseen))
-    return Phase(stretches, n_sections=n_sections, backwards=backwards / max(total, 1))
+            stretches[-1] += (Winding(t[rising], monotone, False, unseen),)
+    return Phase(tuple(stretches), n_sections=n_sections, backwards=backwards / max(total, 1))
 
 
 def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | None) -> list[_Angle]:
@@ -152,7 +152,7 @@ def _at_common_times(time: Series, signals: Float[np.ndarray, "n 2"]) -> Float[n
         return signals
     signals = signals.copy()
     for k, mine in enumerate(finite.T):
-        holes = gaps(time, mine, bridgeable(time, mine))
+        holes = gaps(time[mine], bridgeable(time[mine]))
         at = finite.any(axis=1) & ~mine & ~inside(holes, time, time)
         signals[at, k] = spline(time, signals[:, k], np.inf)(time[at])
     return signals
@@ -212,7 +212,6 @@ def _from_events(recording: Recording, name: str) -> Phase:
             text = f"no event '{name}'; its events are: {', '.join(trial.events) or 'none'}."
             raise DefinitionError(f"trial '{trial.name}' has {text}")
         times.append(trial.events[name])
-        check_events(f"trial '{trial.name}'", name, times[-1], trial.time)
     intervals = np.concatenate([np.diff(t) for t in times])
     if len(intervals) < 2:
         raise DefinitionError(f"there are too few events '{name}' for two cycles.")
@@ -227,13 +226,12 @@ def _from_events(recording: Recording, name: str) -> Phase:
                 kept.append(x)
         dropped += len(t) - len(kept)
         t = np.array(kept)
-        sampled = np.isfinite(trial.time)
-        pauses = gaps(trial.time, sampled, bridgeable(trial.time, sampled, LONGEST_GAP * period))
+        pauses = gaps(trial.time, bridgeable(trial.time, LONGEST_GAP * period))
         wide = np.flatnonzero((np.diff(t) > longest * period) | inside(pauses, t[:-1], t[1:])) + 1
         missed += sum(max(round(float(t[k] - t[k - 1]) / period), 1) for k in wide)
         parts = [part for part in np.split(t, wide) if len(part) > 1]
-        stretches.append([Winding(p, np.arange(len(p), dtype=float), True) for p in parts])
-    return Phase(stretches, dropped=dropped, missed=missed, lead=1)
+        stretches.append(tuple(Winding(p, 1.0 * np.arange(len(p)), True) for p in parts))
+    return Phase(tuple(stretches), dropped=dropped, missed=missed, lead=1)
 
 
 def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
@@ -244,11 +242,9 @@ def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
     """
     period = _period(intervals)
     length = np.sort(intervals / period)
-    middle = len(length) // 2
-    above = np.flatnonzero(np.diff(length[middle:]) > 0.25)
-    below = np.flatnonzero(np.diff(length[: middle + 1]) > 0.1)
-    longest = length[middle + above[0]] if len(above) else length[-1]
-    shortest = length[below[-1] + 1] if len(below) else length[0]
+    up, down = length[len(length) // 2 :], length[len(length) // 2 :: -1]
+    longest = up[np.argmax(np.diff(up, append=np.inf) > 0.25)]
+    shortest = down[np.argmax(np.diff(down, append=-np.inf) < -0.1)]
     missed, doubled = max(1.5, 1.01 * float(longest)), min(0.5, 0.99 * float(shortest))
     if (length > missed).mean() > _COMMON:
         missed = np.inf

@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize.elementwise import find_root
 
 from .._core import limits
 from .._core.boundary.checked import checked
@@ -98,7 +99,11 @@ class Recording(eqx.Module):
         if unknown := set(units) - set(columns):
             text = f"there is a unit for '{min(unknown)}', but the signals are "
             raise DefinitionError(f"{where}: {text}{', '.join(columns)}.")
+        if both := set(happened) & set(columns):
+            raise DefinitionError(f"{where}: '{min(both)}' is a signal and an event: rename one.")
         happened = {key: np.sort(values[~np.isnan(values)]) for key, values in happened.items()}
+        for key, values in happened.items():
+            check_events(where, key, values, time)
         self.trials = (Trial(time, np.stack(list(columns.values()), axis=1), happened, name),)
         self.signals = tuple(columns)
         self.units = tuple(units.get(key, "") for key in columns)
@@ -151,10 +156,9 @@ class Recording(eqx.Module):
                     text = f"in trial '{a}', but in '{other.unit(key)}' in '{b}': convert one."
                     raise DefinitionError(f"{key} is in '{unit}' {text}")
             order = list(map(other.column, units))
-            if order == sorted(order):
-                trials += other.trials
-            else:
-                trials += [replace(t, values=t.values[:, order]) for t in other.trials]
+            for t in other.trials:  # (signals in the same order are not copied)
+                same = order == sorted(order)
+                trials.append(t if same else replace(t, values=t.values[:, order]))
         notes = dict.fromkeys(note for other in recordings for note in other.notes)
         signals = dict(zip(units, trials[0].values.T, strict=True))
         return Recording(trials[0].time, signals, units=units, notes=[*notes]).with_trials(trials)
@@ -223,17 +227,13 @@ class Recording(eqx.Module):
         for trial, x in self.samples(signal):
             curve = spline(trial.time, without_spikes(x), bandwidth)
             t, y = curve.x, sign * (curve(curve.x) - level)
-            longest = bridgeable(t, np.isfinite(t), 0.5 / bandwidth)
+            longest = bridgeable(t, 0.5 / bandwidth)
             at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & (np.diff(t) <= longest))
             if not len(at):
                 text = f"{signal} is never seen to cross {level:g}, {crossing.direction}."
                 raise DefinitionError(f"trial '{trial.name}': {text}")
-            low, high = t[at], t[at + 1]
-            for _ in range(50):  # bisections: to rounding
-                middle = (low + high) / 2
-                below = sign * (curve(middle) - level) < 0
-                low, high = np.where(below, middle, low), np.where(below, high, middle)
-            trials.append(replace(trial, events=trial.events | {event: (low + high) / 2}))
+            crossed = find_root(lambda t, curve=curve: curve(t) - level, (t[at], t[at + 1])).x
+            trials.append(replace(trial, events=trial.events | {event: crossed}))
         return self.with_trials(trials)
 
     def with_trials(self, trials: Iterable[Trial]) -> "Recording":

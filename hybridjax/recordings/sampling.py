@@ -193,7 +193,7 @@ def _sample(
         values = np.zeros((len(start), signals.shape[1]))
         for i, x in enumerate(signals.T):
             finite = np.isfinite(x)
-            holes = gaps(time, finite, bridgeable(time, finite, period / N))
+            holes = gaps(time[finite], bridgeable(time[finite], period / N))
             lost = inside(holes, start, end)
             if i >= nu:
                 values[:, i] = curves[i - nu](start)
@@ -268,7 +268,7 @@ def without_drift(
             middle, level = cycle_means(
                 trial, smoothing.without_spikes(values[:, k]), stretches, phase.period
             )
-            if len(middle) >= FEWEST:
+            if len(middle) >= FEWEST and cycles < np.inf:  # (a constant drift is the mean)
                 slow = spline(middle, level - level.mean(), 0.5 / (cycles * phase.period))
                 values[:, k] -= slow(np.clip(trial.time, middle[0], middle[-1]))
         trials.append(replace(trial, values=values))
@@ -279,7 +279,7 @@ def cycle_means(
     trial: Trial, x: Series, stretches: Sequence[Winding], period: float
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return the middle of each cycle without a long gap, and the mean of a signal over it."""
-    holes = gaps(trial.time, np.isfinite(x), LONGEST_GAP * period)
+    holes = gaps(trial.time[np.isfinite(x)], LONGEST_GAP * period)
     middles, levels = [np.zeros(0)], [np.zeros(0)]
     for edges in (w.edges() for w in stretches):
         whole = ~inside(holes, edges[:-1], edges[1:])

@@ -5,7 +5,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.linalg import solveh_banded
 
 from .._core.boundary.values import Number
@@ -77,17 +77,15 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     return CubicSpline(time, smooth, bc_type="natural")
 
 
-def bridgeable(time: Series, finite: Bool[np.ndarray, " n"], longest: int | float = 0.0) -> float:
+def bridgeable(time: Series, longest: int | float = 0.0) -> float:
     """Return the longest gap that a spline bridges: `longest`, but not less than three samples."""
-    return max(longest, 3.001 * float(np.median(np.diff(time[finite]))))
+    return max(longest, 3.001 * float(np.median(np.diff(time))))
 
 
-def gaps(
-    time: Series, finite: Bool[np.ndarray, " n"], longest: int | float
-) -> Float[np.ndarray, "g 2"]:
+def gaps(time: Series, longest: int | float) -> Float[np.ndarray, "g 2"]:
     """Return the intervals without samples that are longer than `longest`, from the one before all
     samples, which starts at -inf, to the one after them."""
-    edges = np.concatenate([[-np.inf], time[finite], [np.inf]])
+    edges = np.concatenate([[-np.inf], time, [np.inf]])
     wide = np.flatnonzero(np.diff(edges) > longest)
     return np.stack([edges[wide], edges[wide + 1]], axis=1)
 
@@ -104,13 +102,8 @@ def inside(
 def means(time: Series, values: Series, edges: Float[np.ndarray, " m1"]) -> Float[np.ndarray, " m"]:
     """Return means of a signal between successive edges; it is linear between its samples."""
     finite = np.isfinite(values)
-    time, values = time[finite], values[finite]
-    area = np.concatenate([[0.0], np.cumsum(np.diff(time) * (values[1:] + values[:-1]) / 2)])
-    at = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, len(time) - 2)
-    since = edges - time[at]
-    slope = (values[at + 1] - values[at]) / (time[at + 1] - time[at])
-    whole = area[at] + since * (values[at] + slope * since / 2)
-    return np.diff(whole) / np.diff(edges)
+    area = make_interp_spline(time[finite], values[finite], k=1).antiderivative()
+    return np.diff(area(edges)) / np.diff(edges)
 
 
 def without_spikes(values: Series) -> Series:

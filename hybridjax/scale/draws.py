@@ -8,7 +8,7 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, ExperimentCount, FilePath, Seed
-from .._core.pieces.description import function_digest, versions
+from .._core.pieces.description import digest_of, versions
 from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable
 from .._core.progress import working
@@ -83,7 +83,7 @@ class Draws:
         return {
             "kind": "monte_carlo",
             "versions": versions(),
-            "function": function_digest(self.function),
+            "function": digest_of(self.function),
             "draws": self.blocks.shape[0],
             "seed": self.seed,
             "piece": list(self.blocks.block),

@@ -16,7 +16,7 @@ from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed
 from .._core.boundary.values import Reals
-from .._core.pieces.description import function_digest
+from .._core.pieces.description import digest_of
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
 from ..errors import DefinitionError
@@ -173,7 +173,7 @@ class Family:
             for name in self.names:
                 del model["numbers"][name]
             return model
-        return model | {"from parameters": function_digest(self.model)}
+        return model | {"from parameters": digest_of(self.model)}
 
 
 def _parameters(model: Any) -> tuple[list[str] | None, list[str]]:

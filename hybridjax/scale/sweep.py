@@ -13,7 +13,7 @@ from scipy.stats import qmc
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, FilePath
 from .._core.execution import Execution
-from .._core.pieces.description import array_digest, function_digest, versions
+from .._core.pieces.description import digest_of, versions
 from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable, near_cube
 from .._core.precision import require_x64
@@ -115,10 +115,10 @@ def sweep(
         "kind": "sweep",
         "versions": versions(),
         "model": family.describe(system),
-        "over": {name: array_digest(x) for name, x in space.axes.items()},
+        "over": {name: digest_of(x) for name, x in space.axes.items()},
         "form": list(space.dims),
         "want": list(wanted.names),
-        "measures": {name: function_digest(f) for name, f in wanted.measures.items()},
+        "measures": {name: digest_of(f) for name, f in wanted.measures.items()},
         "guess": None if guess is None else rough(guess),
         "piece": list(blocks.block),
     }

@@ -15,6 +15,7 @@ from ..engine import kernels
 from ..engine.lanes import for_each_chart, only
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
+from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..systems.structure import Structure
 from ..systems.system import Output, OutputNames
@@ -49,14 +50,15 @@ def linearize(
     - `inputs`: names. Default: all.
 
     **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
-    lies, or an input that does not exist; `ComputationError` as `place_sections`.
+    lies, or uses the time without having the period of a clock, or an input that does not exist;
+    `ComputationError` as `place_sections`.
     """
     placed = as_placed(cycle, sections)
     s, traced, charts = placed.structure(), is_traced(placed), range(len(cycle.system.charts()))
     if outputs is None:
         states = s.state_names()
         outputs = [x for x in states if all(s.state_function(x, a) is not None for a in charts)]
-    z = s.resolve_outputs(outputs)
+    z = check_outputs(cycle, outputs)
     for a in charts if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
     names, columns = inputs_of(s, inputs)

@@ -17,6 +17,7 @@ from ..engine import kernels
 from ..engine.lanes import Lanes, Tape, for_each_chart, needed, only
 from ..engine.move import tape_jacobian
 from ..engine.target import Target
+from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle, orbit_picture
 from ..systems.structure import Outputs, Structure
 from ..systems.system import Output, OutputNames
@@ -106,7 +107,7 @@ class PlacedSections(eqx.Module):
         **Raises:** `DefinitionError` for a name that is no output.
         """
         require_x64()
-        return _observe(self, tuple(self.structure().resolve_outputs(outputs).items))
+        return _observe(self, tuple(check_outputs(self.cycle, outputs).items))
 
     @property
     def time_is_state(self) -> Bool[Array, " N"]:

@@ -1,6 +1,6 @@
 """Checks of a system: names, shapes of every function, finite parameters."""
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -10,11 +10,12 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from .._core.executor import is_traced
 from ..errors import DefinitionError
+from .chart import Chart
 from .quotient import Quotient
 from .solver import ByChart
 from .structure import Structure, quoted
-from .system import HybridSystem
-from .transition import Scheduled
+from .system import HybridSystem, Output
+from .transition import Scheduled, Transition
 
 
 # Systems that have passed, but for their numbers. (A `Memory` forgets with its object, and each
@@ -61,20 +62,31 @@ def _form(system: HybridSystem) -> Hashable:
 def _check_functions(s: Structure) -> Iterator[str]:
     """Check all functions; yield the names of those that use the time."""
     system, kind = s.system, type(s.system).__name__
+    charts = system.charts()
+    for name, items, type_ in (
+        ("charts", charts.values() if isinstance(charts, Mapping) else None, Chart),
+        ("transitions", system.transitions(), Transition),
+        ("outputs", system.outputs(), Output),
+    ):
+        if not isinstance(items, Iterable) or not all(isinstance(x, type_) for x in items):
+            several = "a dict of" if type_ is Chart else "several"
+            raise DefinitionError(
+                f"{kind}.{name}() must return {several} `hj.{type_.__name__}`, not {items}."
+            )
     if not s.charts:
         raise DefinitionError(f"{kind} has no charts.")
-    _check_units(kind, "inputs", system.inputs, system.input_units)
+    _check_names(kind, "inputs", system.inputs, system.input_units)
     for name in system.solver.names if isinstance(system.solver, ByChart) else ():
         s.chart_index(name)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
+        _check_names(f"chart '{name}'", "inputs", chart.inputs or ())
         for unknown in set(chart.inputs or ()) - set(system.inputs):
             raise DefinitionError(
                 f"chart '{name}' uses input '{unknown}', which the system does not have; inputs "
                 f"are {quoted(system.inputs)}."
             )
-        if len(set(chart.states)) < len(chart.states):
-            raise DefinitionError(f"chart '{name}' names a state twice: {quoted(chart.states)}.")
-        _check_units(f"chart '{name}'", "states", chart.states, chart.units)
+        _check_names(f"chart '{name}'", "states", (*chart.states, *chart.absent))
+        _check_names(f"chart '{name}'", "states", chart.states, chart.units)
         s.method(a)
         states = f"the chart has the {s.dims[a]} states {quoted(chart.states)}"
         field = lambda *x, a=a: s.field(a, *x)  # noqa: E731
@@ -83,19 +95,25 @@ def _check_functions(s: Structure) -> Iterator[str]:
         raise DefinitionError(
             f"charts of {kind} give a state different units: {quoted(s.state_names())}."
         )
-    names = [tr.name for tr in s.transitions]
-    for name in names:
-        if names.count(name) > 1:
-            raise DefinitionError(f"two transitions are called '{name}'; give each its own name.")
+    _check_names(kind, "transitions", [tr.name for tr in s.transitions])
     # Transitions of one kind are one program; the first and the last may index beyond the states.
     for g in sorted({g for kind in s.kinds for g in (kind[0], kind[-1])}):
         yield from _check_transition(s, g)
+    names = [output.name for output in system.outputs()]
+    _check_names(kind, "states and outputs", (*map(str, s.state_names()), *names))
     for output in system.outputs():
-        values = s.resolve_outputs(output)
-        for a, name in enumerate(s.names):
-            if values.defined(a):
-                what = f"output '{output.name}' in chart '{name}'"
-                yield from _check_shape(s, a, what, lambda *x, a=a, z=values: z(a, *x), (1,), "")
+        yield from check_output(s, output)
+
+
+def check_output(s: Structure, output: Output) -> Iterator[str]:
+    """Check an output in each chart; yield its name in those where it uses the time."""
+    for name in () if callable(output.function) else output.function:
+        s.chart_index(name)
+    values = s.resolve_outputs(output)
+    for a, name in enumerate(s.names):
+        if values.defined(a):
+            what = f"output '{output.name}' in chart '{name}'"
+            yield from _check_shape(s, a, what, lambda *x, a=a: values(a, *x), (1,), "")
 
 
 def _check_transition(s: Structure, g: int) -> Iterator[str]:
@@ -146,7 +164,12 @@ def _check_indices(function: Callable, *point: np.ndarray) -> None:
             return
 
 
-def _check_units(what: str, kind: str, names: Sequence[str], units: Sequence[str]) -> None:
+def _check_names(what: str, kind: str, names: Sequence[str], units: Sequence[str] = ()) -> None:
+    """Check that names are distinct, and units as many, or none."""
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        raise DefinitionError(f"{kind} of {what} must be a tuple of names, not {names!r}.")
+    if len(set(names)) < len(names):
+        raise DefinitionError(f"{what} has {kind} of the same name: {quoted(names)}.")
     if len(units) not in (0, len(names)):
         raise DefinitionError(
             f"{what} has the {kind} {quoted(names)}, but {len(units)} units: give one for each, "

@@ -33,6 +33,8 @@ class Method(NamedTuple):
     """The error by which steps are controlled grows as this power of the step."""
     gain: float = 1.0
     """The error is this power of the estimate."""
+    rough: Row = ()
+    """Weights of the increments in an estimate of one order less, if the power is not 1."""
     filter: float = 0.0
     """The estimate is multiplied by (1 - h g J)^-1, with this g."""
 
@@ -47,8 +49,7 @@ class Radau(eqx.Module):
 
     E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, 2nd ed. (1996), sections
     IV.5 and IV.8: collocation at the Radau points, L-stable and stiffly accurate. The error
-    estimate has order `stages`, and is turned into one of the step as there (their tolerances are
-    powers of those asked for).
+    estimate has order `stages`, and is turned into one of the step where the solution is smooth.
 
     **Arguments:** `stages`, 3, 5 or 7.
     """
@@ -131,7 +132,7 @@ def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) ->
     return _method(name, a, tableau.b_sol, np.array(c), tableau.b_error, order)
 
 
-def _method(name: str, a, b, c, error, order: float, **controls: float) -> Method:
+def _method(name: str, a, b, c, error, order: float, **controls: Any) -> Method:
     rows = tuple(tuple(map(float, row)) for row in a)
     b, c, error = (tuple(map(float, x)) for x in (b, c, error))
     return Method(name, rows, b, c, error, order, **controls)
@@ -153,7 +154,7 @@ def _radau(s: int) -> Method:
     full[1:, 1:] = a
     return _method(
         f"Radau({s})", full, full[-1], np.concatenate([[0.0], c]), error, 2.0 * s,
-        gain=2 * s / (s + 1), filter=gamma,
+        gain=2 * s / (s + 1), filter=gamma, rough=tuple(-_lagrange(c, 0.0) @ full[1:]),
     )  # fmt: skip
 
 
@@ -161,8 +162,10 @@ def _integrals(c: Float[np.ndarray, " s"], end: float) -> Float[np.ndarray, " s"
     """Integrals from 0 to `end` of the Lagrange polynomials at the points c."""
     x, weights = np.polynomial.legendre.leggauss(len(c))
     x = end * (1 + x) / 2
-    values = [
-        np.prod((x[:, None] - np.delete(c, j)) / (c[j] - np.delete(c, j)), axis=1)
-        for j in range(len(c))
-    ]
-    return end / 2 * np.array(values) @ weights
+    return end / 2 * weights @ np.array([_lagrange(c, point) for point in x])
+
+
+def _lagrange(c: Float[np.ndarray, " s"], x: float) -> Float[np.ndarray, " s"]:
+    """Values at x of the Lagrange polynomials at the points c."""
+    others = [np.delete(c, j) for j in range(len(c))]
+    return np.array([np.prod((x - o) / (y - o)) for y, o in zip(c, others, strict=True)])

@@ -16,7 +16,7 @@ from .._core.boundary.containers import Names
 from .._core.boundary.kinds import Scalar, Vector
 from .._core.executor import Definition
 from .._core.meaning import code_digest
-from .._core.pieces.description import array_digest
+from .._core.pieces.description import digest_of
 from .._core.precision import real
 from .._core.text import columns, fields, value
 from .chart import Chart, attribute_of
@@ -80,7 +80,7 @@ def describe(system: "HybridSystem") -> dict[str, Any]:
     numbers = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
         name = ".".join(str(getattr(x, "name", x)) for x in path)
-        numbers[name] = float(leaf) if np.ndim(leaf) == 0 else array_digest(leaf)
+        numbers[name] = float(leaf) if np.ndim(leaf) == 0 else digest_of(leaf)
     return {"class": type(system).__qualname__, "numbers": numbers, "code": code_digest(system)}
 
 

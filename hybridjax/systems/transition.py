@@ -68,7 +68,8 @@ class Transition(eqx.Module):
         the crossing is passed without an event.
 
     A guard is armed once it has left zero on the side from which it crosses: a guard that is zero
-    right after a reset does not fire at once.
+    right after a reset does not fire at once. `simulate` ends if the state then goes through it,
+    unless it was crossing this guard before the reset.
     """
 
     name: str = eqx.field(static=True)

@@ -1,6 +1,7 @@
 """Recordings whose truth is known, to try a method before an animal is measured."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -18,8 +19,9 @@ from .._core.signal import unit_of
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..experiments.response import ResponseFunction, response_function
+from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
-from ..recordings.recording import Recording, Trial
+from ..recordings.recording import Recording
 from ..sections.families import ClockPhase
 from ..systems.system import OutputNames
 
@@ -95,8 +97,13 @@ def simulate_recording(
 
     **Raises:** `DefinitionError` as `response_function`.
     """
-    cycle.structure.resolve_outputs(outputs)
-    force = np.asarray(force, float)
+    check_outputs(cycle, outputs)
+    force, inputs = np.asarray(force, float), cycle.structure.inputs
+    if force.shape[1] < 2 or force.shape[2] != len(inputs):
+        raise DefinitionError(
+            f"`force` has shape {force.shape}, but needs two samples or more of {len(inputs)} "
+            f"inputs ({', '.join(inputs)}): its axes are trials, samples, inputs."
+        )
     period = float(cycle.period)
     if not 1 <= rate * period * steps <= SECTIONS:
         raise DefinitionError(
@@ -171,8 +178,8 @@ def spoil(
         if gap is not None:
             y[(time >= gap[0]) & (time < gap[1])] = np.nan
         values[:, columns] = y
-        trials.append(Trial(time, values, trial.events, trial.name))
-    return eqx.tree_at(lambda r: r.trials, recording, tuple(trials))
+        trials.append(replace(trial, values=values))
+    return recording.with_trials(trials)
 
 
 @checked
@@ -211,13 +218,11 @@ def simulate_beats(
         raise DefinitionError(f"`rhythm` must be one number or {S}, none above `rate`.")
     w = np.broadcast_to(np.asarray(rhythm, float), S)
     steps = int(np.ceil(w.max() / (rate * _STEP)))
-    h, table = 1 / (rate * steps), np.append(table, table[0])
+    h, nodes, table = 1 / (rate * steps), np.arange(n + 1) / n, np.append(table, table[0])
     rng = np.random.default_rng(seed)
 
     def at(phase):
-        place = (phase % 1.0) * n
-        low = np.minimum(place.astype(int), n - 1)
-        return table[low] + (place - low) * (table[low + 1] - table[low])
+        return np.interp(phase % 1.0, nodes, table)
 
     phase: Any = rng.uniform(size=S)
     events: list[list[float]] = [[] for _ in range(S)]

@@ -208,7 +208,7 @@ def test_a_cache_of_others_is_refused(tmp_path, attack, cache_setting):
         hj.enable_compilation_cache(tmp_path / "x")
 
 
-def test_without_a_home_nothing_is_kept(monkeypatch, cache_setting):
+def test_without_a_home_nothing_is_kept(tmp_path, monkeypatch, cache_setting):
     for name in ("HYBRIDJAX_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     for has_home in (True, False):
@@ -217,6 +217,7 @@ def test_without_a_home_nothing_is_kept(monkeypatch, cache_setting):
         monkeypatch.setenv("HOME", "/dev/null")
         with pytest.warns(UserWarning, match="nothing is kept"):
             assert hj.enable_compilation_cache() is None
+    assert hj.enable_compilation_cache(tmp_path) == tmp_path / "programs"
 
 
 def raise_no_home():

@@ -136,6 +136,21 @@ WAYS = {
     "an attribute of a module": ("def f(x): return other.K * x", "other.K = 2"),
     "an attribute of a module, by a word": ("def f(x): return getattr(other, 'K')", "other.K = 2"),
     "a function of a module": ("def f(x): return other.h(x)", "other.h = lambda x: 3 * x"),
+    "a module in a list": ("K = [other]\ndef f(x): return K[0].h(x)", "other.h = lambda x: 3 * x"),
+    "a module as an argument": (
+        "def g(m, x): return m.h(x)\ndef f(x): return g(other, x)",
+        "other.h = lambda x: 3 * x",
+    ),
+    "the table of a module": ("def f(x): return vars(other)['K']", "other.K = 2"),
+    "another attribute of an inner module": (
+        "other.inner.J = 1\ndef g(x): return other.inner.J\ndef f(x): return g(x) + other.inner.K",
+        "other.inner.K = 2",
+    ),
+    "a weak reference": (
+        "import weakref\nclass A:\n    pass\na = A()\na.k = 1\nr = weakref.ref(a)\n"
+        "def f(x): return r().k",
+        "a.k = 2",
+    ),
     "a module of a package": ("def f(x): return other.inner.K * x", "other.inner.K = 2"),
 }
 
@@ -168,10 +183,15 @@ def test_what_is_not_read_is_not_noticed(monkeypatch):
     assert meaning(space["f"]) == digest
 
 
-def test_names_that_code_makes_are_refused():
+@pytest.mark.parametrize(
+    "code",
+    ["eval('K')", "importlib.import_module('K')", "open('K').read()", "np.loadtxt('K')",
+     "sys.modules['K']", "os.getenv('K')", "pathlib.Path('K').read_text()"],
+)  # fmt: skip
+def test_values_that_are_not_named_are_refused(code):
     space = {"__name__": "users_module"}
-    exec("K = 1\ndef f(x): return eval('K') * x", space)
-    with pytest.raises(DefinitionError, match="calls `eval`"):
+    exec(f"import importlib, os, pathlib, sys, numpy as np\ndef f(x): return {code} * x", space)
+    with pytest.raises(DefinitionError, match="`f` uses `"):
         meaning(space["f"])
 
 

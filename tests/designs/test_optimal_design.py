@@ -83,20 +83,19 @@ def test_experiments_are_as_promised(plan, isochron_ldtp):
     assert plan.strides_for(plan.standard_errors.max() / 2) == 4 * plan.strides
 
 
-@pytest.mark.slow
-def test_fits_reach_what_is_promised(plan, isochron_ldtp):
-    """60 draws of the noise: the rms error has a standard error of 7 %."""
-    data = hj.experiments.simulate_experiments(isochron_ldtp, plan.design, start="periodic")
-    variance = with_variance(isochron_ldtp, plan.design).variance
+def test_fits_reach_what_is_promised(model):
+    """The plain analysis of a plan, most of whose lines stand in one experiment: their power
+    weights them. 16 draws of the noise."""
+    noise = {"x": 0.02, "v": 0.06}
+    plan = hj.optimal_design(model, hj.multisine(8, periods=32).scaled(0.01), noise=noise)
+    data = hj.experiments.simulate_experiments(model, plan.design, start="periodic")
     errors = []
-    for seed in range(60):
-        noisy = hj.experiments.add_noise(data, std=list(NOISE.values()), seed=seed)
-        htf = hj.estimate_htf(noisy, HARMONICS)
-        htf = hj.HTF(htf.f, htf.H, HARMONICS, 32, "u", ("yM", "vM"), variance=variance)
-        errors.append(hj.fit_multipliers(htf, 2).compare(isochron_ldtp.multipliers).error[0])
-    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(
-        np.linalg.norm(plan.standard_errors), rel=0.2
-    )
+    for seed in range(16):
+        noisy = hj.experiments.add_noise(data, std=list(noise.values()), seed=seed)
+        fit = hj.fit_multipliers(hj.estimate_htf(noisy, HARMONICS), 2)
+        errors.append(fit.compare(model.multipliers).error[0])
+    rms = np.sqrt(np.mean(np.square(errors)))
+    assert rms == pytest.approx(np.linalg.norm(plan.standard_errors), rel=0.3)
 
 
 def test_units_and_estimates(isochron_ldtp, usual):

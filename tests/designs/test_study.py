@@ -114,6 +114,8 @@ def test_repeated_windows_count(model, first):
 
 
 def test_bad_data(model, first):
+    with pytest.raises(hj.DefinitionError, match="`limit` has 'nope', but the signals are u"):
+        hj.designs.Study(first, 2, 1e-4, limit={"nope": 1.0})
     study, data = hj.designs.Study(first, 2, 1e-4), measured(model, first)
     for change, message in (
         (dict(outputs=("a", "b")), "blocks of one study have different outputs"),

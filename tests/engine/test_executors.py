@@ -22,7 +22,6 @@ from ..toys import Field
 
 # Systems of which both executors are compiled in every run of the tests; the rest is slow.
 FEW = ("PaddleJuggler", "VerticalHopper")
-FEW_STRUCTURES = sorted(STRUCTURES)[:1]
 
 
 def slow_but(names, few):
@@ -74,7 +73,8 @@ def test_both_agree_on_the_gallery(name):
     agree(system, chart, np.asarray(guess.state), u, float(guess.time), duration)
 
 
-@pytest.mark.parametrize("name", slow_but(STRUCTURES, FEW_STRUCTURES))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(STRUCTURES))
 def test_both_agree_on_random_systems(name):
     plan = STRUCTURES[name][0]
     for number in range(2):
@@ -95,6 +95,7 @@ def compiled(hopper_cycle):
         compilation._WORTH_COMPILING = patience
 
 
+@pytest.mark.slow
 def test_both_find_the_same_cycle(hopper_cycle, compiled):
     cycle = compiled
     assert cycle.event_sequence == hopper_cycle.event_sequence

@@ -10,8 +10,17 @@ import pytest
 from scipy.linalg import expm
 
 import hybridjax as hj
+from hybridjax._core.executor import to_host
+from hybridjax.engine.lanes import start_lanes
+from hybridjax.engine.move import move
 from hybridjax.engine.runge_kutta import inverse, take_step
+from hybridjax.engine.search.state import Stride
+from hybridjax.engine.settings import Settings
+from hybridjax.engine.target import Target
+from hybridjax.orbits.crossing import ListLevels
 from hybridjax.systems.solver import as_method
+from hybridjax.systems.structure import Structure
+from hybridjax.systems.system import integrated
 
 from ..toys import Field
 
@@ -57,6 +66,36 @@ def test_radau_is_a_collocation_method(stages):
     assert abs(error @ c**stages) > 1e-5
 
 
+@pytest.mark.parametrize("rate", [1.0, 1e3, 1e5])
+def test_no_error_of_a_stiff_step_is_hidden(rate):
+    """Of a mode that follows, or is excited, by however little, and dies out within the step."""
+    field = lambda t, q: -rate * (q - jnp.cos(t)) - jnp.sin(t)  # noqa: E731
+    excited, h = np.array([[0.0, 1.0, 1e-4, 1e-8]]), 0.4
+    step = take_step(as_method(hj.Radau()), field, jnp.zeros(4), 1.0 + excited, jnp.array([h]))
+    error = np.abs(np.asarray(step.q) - np.cos(h) - excited * np.exp(-rate * h))
+    assert np.all(error < 5 * np.asarray(step.error) + 1e-15)
+
+
+class Ramp(hj.HybridSystem):
+    """x rises, and v dies out fast."""
+
+    def charts(self):
+        return {"a": Field(("x", "v"), lambda t, q, u: (1.0 + 0 * q[0], -2e3 * q[1]))}
+
+
+def test_a_landing_is_as_stiff_as_its_chart():
+    """The last part of the way, five decay times long, is no explicit step."""
+    s = Structure(integrated(Ramp(), hj.Radau()))
+    levels = ListLevels((hj.Crossing("x", "rising", 1.0),))
+    one, none = np.ones(1), np.zeros(1, np.int32)
+    lanes = to_host(start_lanes(s, np.zeros(1), none, np.array([[0.0], [1e-3]])))
+    target = Target(np.array([np.inf]), none, none - 1, 2 * one, None, levels, hj.Result.OK)
+    settings = Settings(1e-9, 1e-9, 64, np.ones((1, 2)))
+    stride = Stride(one, 0.9975 * one, 1e7 * one)
+    moved = move(s, lanes, np.zeros((s.nu, 1)), target, settings, stride)
+    np.testing.assert_allclose(moved.moved.lanes.q, [[1.0], [0.0]], atol=1e-7)
+
+
 @pytest.mark.parametrize("solver", [hj.Radau(3), hj.Radau(5), diffrax.Kvaerno3()])
 def test_estimates_are_of_the_size_of_errors(solver):
     """Of a step whose end is known, one of its modes stiff."""
@@ -67,7 +106,7 @@ def test_estimates_are_of_the_size_of_errors(solver):
 
     step = take_step(method, field, jnp.zeros(1), jnp.ones((2, 1)), jnp.array([h]))
     error = np.abs(np.asarray(step.q[:, 0]) - [1 / (1 + h), np.cos(h)]).max()
-    estimate = np.abs(np.asarray(step.error)).max() ** method.gain
+    estimate = np.abs(np.asarray(step.estimate)).max() ** method.gain
     assert 0.5 < estimate / error < 10
 
 

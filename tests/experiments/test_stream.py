@@ -152,7 +152,7 @@ def test_other_experiments_are_refused(made, arguments):
             stream(**call, options=Options(**options), store=made.address)
 
 
-@pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
+@pytest.mark.parametrize("start", ["periodic", pytest.param("steady", marks=pytest.mark.slow)])
 def test_another_process_can_run_a_piece(arguments, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")

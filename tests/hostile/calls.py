@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.identify.joint.prediction import noise_spectrum
 from hybridjax.recordings.sampling import without_drift
 
 from .things import APEX, NAMES as STATES, PHASE
@@ -108,7 +107,6 @@ def linear(t):
     htf = t.estimate
     yield htf.__getitem__, dict(m=0)
     yield htf.select, dict(harmonics=0)
-    yield htf.interpolate, dict(f=f[:2])
     yield htf.confidence_radius, {}
     yield htf.predict, dict(u=u)
     for name in ("error", "harmonic_errors"):
@@ -170,7 +168,6 @@ def estimates(t):
     yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)
     yield t.joint.htf, dict(f=np.array([0.1, 0.2]))
     yield t.driven.noise_spectrum, dict(f=np.array([0.1, 0.2]))
-    yield noise_spectrum, dict(noise=t.model, f=np.array([0.1]))
     yield hj.identify.ldtp_bound, dict(model=t.model, htf=t.uncertain)
     yield hj.identify.realize, dict(source=t.exact)
 

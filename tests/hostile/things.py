@@ -1,12 +1,12 @@
 """Objects of every public kind, each made once, on first use: good arguments for the table."""
 
-import jax
 import matplotlib
 import numpy as np
 
 import hybridjax as hj
 from hybridjax.orbits.continuation import Branch, BranchEnd
-from hybridjax.orbits.limit_cycles import LimitCycles
+
+from ..toys import many
 
 
 NAMES = ("x", "y")
@@ -38,9 +38,9 @@ def run(t, u):
 def recording(t):
     """Sixty turns that a force disturbs a little, by the law of an oscillator."""
     z = [1.0 + 0j]
-    force = np.random.default_rng(0).normal(size=len(TIME))
+    force = np.random.default_rng(0).normal(size=121).repeat(20)[: len(TIME)]
     for f in force[:-1]:
-        z.append(z[-1] * np.exp(2j * np.pi * TIME[1] + 0.01 * (1 - abs(z[-1]) ** 2)) + 0.002 * f)
+        z.append(z[-1] * np.exp(2j * np.pi * TIME[1] + 0.01 * (1 - abs(z[-1]) ** 2)) + 0.004 * f)
     signals = {"f": force, "x": np.real(z), "v": np.imag(z)}
     return hj.Recording(TIME, signals, units={"f": "N"}).mark("strike", RISES)
 
@@ -48,17 +48,6 @@ def recording(t):
 def section_data(t, inputs, **options):
     about = dict(inputs=inputs, outputs=("x", "v"), n_sections=2)
     return hj.recordings.section_data(t.recording, t.phase, **about, **options)
-
-
-def cycles(t):
-    """The same cycle twice, without the program that finds many."""
-    twice = lambda x: jax.tree.map(lambda x: np.stack([x, x]), x)  # noqa: E731
-    c, fields = t.cycle, ("period", "anchor", "legs", "factors", "residual", "iterations", "result")
-    many = {name: twice(getattr(c, name)) for name in fields}
-    return LimitCycles(
-        systems=twice(c.system), base=c.base, codes=np.array([c.event_sequence] * 2),
-        settings=c.settings, conserved=c.conserved, multiplicity=c.multiplicity, **many,
-    )  # fmt: skip
 
 
 def branch(t):
@@ -74,7 +63,7 @@ def plot(t):
 MAKE = {
     "system": lambda t: hj.models.HopfOscillator(),
     "cycle": lambda t: hj.find_limit_cycle(t.system),
-    "cycles": cycles,
+    "cycles": lambda t: many(t.cycle, 2),
     "branch": branch,
     "placed": lambda t: hj.place_sections(t.cycle, PHASE),
     "map": lambda t: hj.section_map(t.cycle, t.placed, 0, 1),

@@ -116,6 +116,13 @@ def test_a_drift_is_found_where_samples_are_missing(small):
     assert fit.freedom == samples - 8 - fit.unknowns
 
 
+def test_outputs_that_do_not_answer_are_refused(small):
+    data = record(small, 4 * 60, 0)
+    noise = hj.Record(data.u, np.random.default_rng(0).normal(size=data.y.shape), n_sections=4)
+    with pytest.raises(hj.DefinitionError, match="the outputs do not answer the inputs"):
+        hj.fit_ldtp(noise, small)
+
+
 def test_periodic_series_and_their_htfs_agree(small):
     """One steady window of a multisine, in the time and in the frequency domain."""
     design = hj.multisine(periods=32, n_sections=4, band=(0, 2), lines="odd", seed=0)

@@ -29,10 +29,10 @@ def test_the_level_of_the_rank_test(small, variance):
     for seed in range(runs):
         data = noisy(htf, variance[1:], np.random.default_rng(seed))
         try:
-            hj.fit_multipliers(data, 3, max_steps=5)
+            hj.fit_multipliers(data, 3)
         except hj.DefinitionError as error:
             refused += "the data support 2 multipliers, not 3" in str(error)
-    assert hj.select_order(data, 3, max_steps=3).by_rank == 2
+    assert hj.select_order(data, 3).by_rank == 2
     assert covered(refused, runs, 0.98)
     hj.fit_multipliers(data, 3, check=False)
 
@@ -46,10 +46,10 @@ def test_variances_from_few_realizations(small, variance):
         rough = variance[1:] * rng.gamma(3.0, 1 / 3, variance[1:].shape)
         data = with_variance(htf, noisy(htf, variance[1:], rng).H, rough, np.full(80, 3.0))
         try:
-            hj.fit_multipliers(data, 3, max_steps=5)
+            hj.fit_multipliers(data, 3)
         except hj.DefinitionError:
             refused += 1
-    assert hj.select_order(data, 4, max_steps=5).by_rank == 2
+    assert hj.select_order(data, 4).by_rank == 2
     assert covered(refused, runs, 0.98)
 
 

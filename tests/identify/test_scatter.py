@@ -130,8 +130,8 @@ def test_a_failed_realization_leaves_the_others(model):
     data = hj.ExperimentData(data.u, data.y, n_sections=N, periods=P, result=result)
     estimate = hj.estimate_htf(data)
     lost = np.isin(estimate.f, LINES.f[LINES.experiment == 0])
-    assert np.all(np.isinf(estimate.variance[:, lost]))
-    assert np.all(np.isfinite(estimate.variance[:, ~lost]))
+    ratio = np.mean(estimate.variance[:, lost]) / np.mean(estimate.variance[:, ~lost])
+    assert ratio == pytest.approx(2, rel=0.3)  # of one experiment instead of two
     with pytest.raises(hj.DefinitionError, match="measured in one realization only"):
         hj.estimate_htf(data, variance="total")
 

@@ -150,13 +150,13 @@ def test_spurious_multipliers_raise_an_error(small):
     refused, runs = 0, 8
     for seed in range(runs):
         try:
-            hj.fit_series(record(small, 400, seed, 0.3), 3, max_steps=5)
+            hj.fit_series(record(small, 400, seed, 0.3), 3)
         except hj.DefinitionError as error:
             assert "the data support 2 multipliers, not 3" in str(error)
             refused += 1
     assert covered(refused, runs, 0.98)
     data = record(small, 400, 0, 0.3)
-    assert len(hj.fit_series(data, 3, check=False, max_steps=5).multipliers) == 3
+    assert len(hj.fit_series(data, 3, check=False).multipliers) == 3
 
 
 def test_announced_drift_is_removed(small):

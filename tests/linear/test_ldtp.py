@@ -1,4 +1,4 @@
-"""LDTP: simulation, impulse response, periodic states, transformations, bad input."""
+"""LDTP: simulation, periodic states, transformations, bad input."""
 
 import equinox as eqx
 import jax
@@ -32,19 +32,6 @@ def test_simulation_follows_the_definition(seed, shape, start):
         np.testing.assert_allclose(row[: len(x)], x, rtol=0, atol=1e-12)
         np.testing.assert_array_equal(row[len(x) :], 0)
     np.testing.assert_allclose(ldtp.simulate(u, x0, start), ys, rtol=0, atol=1e-12)
-
-
-def test_impulse_response_is_the_response_to_impulses(synthetic):
-    lags, N = 9, synthetic.n_sections
-    response = synthetic.impulse_response(lags)
-    assert response.shape == (N, lags, 2, 2)
-    for k in range(N):
-        for j in range(2):
-            u = np.zeros((lags, 2))
-            u[0, j] = 1
-            y = synthetic.simulate(u, first_section=k)
-            for r in range(lags):
-                np.testing.assert_allclose(response[(k + r) % N, r, :, j], y[r], atol=1e-14)
 
 
 @settings(max_examples=5)

@@ -1,4 +1,4 @@
-"""Linearizations of the walkers with feedback, and their HTFs from experiments.
+"""Linearizations of the walkers with feedback.
 
 The truth is `benchmarks/walkers_truth.py`: differences of another simulation, equations by hand.
 """
@@ -43,18 +43,3 @@ def test_A_and_B(name):
         ours = model.A[n][: len(rows), : len(columns)], model.B[n][: len(rows), 0]
         np.testing.assert_allclose(ours[0], A, rtol=0, atol=1e-8 * np.max(np.abs(A)))
         np.testing.assert_allclose(ours[1], B, rtol=0, atol=1e-8 * np.max(np.abs(B)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", WALKERS)
-def test_HTFs_of_80_experiments(name):
-    sections = placed(name)
-    output = sections.cycle.system.charts()["step"].states[0]
-    design = hj.multisine(4, 48, band=(0, 2), amplitude=1e-3, experiments=80)
-    data = hj.run_experiments(
-        sections.cycle, sections, design, output, start="periodic", discard=48
-    )
-    assert data.ok.all() and len(data.ok) == 80
-    estimate = hj.estimate_htf(data, harmonics=(-1, 0, 1))
-    exact = hj.linearize(sections.cycle, sections, output).htf(estimate.f, harmonics=(-1, 0, 1))
-    assert estimate.error(exact)[0] < 1e-5

@@ -49,23 +49,3 @@ def test_the_multipliers_of_the_hopper_by_its_parameters(hopper_cycle):
     slopes = eqx.filter_jit(eqx.filter_jacfwd(multiplier))(hopper_cycle.system)
     for name, value in true.items():
         assert complex(*np.asarray(getattr(slopes, name))) == pytest.approx(value, abs=1e-9), name
-
-
-@pytest.mark.slow
-def test_the_trace_of_the_jugglers_monodromy():
-    """Beside the gradient of its closed form (Holmes 1982)."""
-    juggler = hj.models.PaddleJuggler()
-    cycle = hj.find_limit_cycle(juggler)
-
-    def trace(system):
-        found = hj.find_limit_cycle(system, cycle)
-        return jnp.trace(hj.linearize(found, hj.ClockPhase(2)).monodromy())
-
-    def exact(system):
-        return jnp.sum(system.exact()[3]).real
-
-    gradient = eqx.filter_jit(eqx.filter_grad(trace))(juggler)
-    expected = eqx.filter_grad(exact)(juggler)
-    for name in ("A", "T", "g", "restitution"):
-        slope, true = getattr(gradient, name), getattr(expected, name)
-        np.testing.assert_allclose(slope, true, rtol=1e-9, err_msg=name)

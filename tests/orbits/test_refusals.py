@@ -38,6 +38,33 @@ def test_a_schedule_that_does_not_fit_the_clock():
         hj.find_limit_cycle(Kicked(beat=2.0, schedule=3.0), hj.Guess("a", (0.3,)))
 
 
+BEAT = Kicked(schedule=1.0)
+
+
+@pytest.mark.parametrize("size", [1e300, 1e100])
+def test_a_guess_that_is_far_too_large_leads_to_the_same_cycle(size):
+    cycle = hj.find_limit_cycle(BEAT, hj.Guess("a", (size,)))
+    np.testing.assert_allclose(cycle.state["x"], np.exp(-0.9) / (1 - np.exp(-1)), rtol=1e-12)
+
+
+def test_a_cycle_of_one_period_is_none_of_two():
+    with pytest.raises(hj.ComputationError, match="closes sooner than after the 2 periods"):
+        hj.find_limit_cycle(BEAT, hj.Guess("a", (0.6,)), multiplicity=2)
+
+
+def test_outputs_of_a_call_have_the_period_of_the_clock():
+    cycle = hj.find_limit_cycle(BEAT, hj.Guess("a", (0.6,)))
+    for value in (lambda t, q, u: jnp.cos(1.3 * t), lambda t, q, u: u[0] * jnp.cos(1.3 * t)):
+        with pytest.raises(hj.DefinitionError, match="output 'z' does not have the period 1"):
+            hj.linearize(cycle, hj.ClockPhase(4), hj.Output("z", value))
+
+
+def test_a_ball_does_not_fall_through_the_floor():
+    ball = hj.models.BouncingBall(restitution=0.0)
+    path = hj.simulate(ball, "fall", (1.0, 0.0), 2.0, throw=False)
+    assert path.result == hj.Result.GUARD_PASSED and len(path.events) == 1
+
+
 def test_a_cycle_as_the_guess_begins_at_the_same_phase(hopper_cycle):
     """Of the clock of the other system."""
     slower = hj.models.VerticalHopper(omega=2 * jnp.pi / 1.05)

@@ -30,13 +30,11 @@ def test_magnitude_draws_the_values(estimate, exact):
 
 
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
-    figure = hj.plot.harmonics(
-        {"isochron": (estimate, exact), "again": exact}, labels={"vM": r"$\dot y_M$"}
-    ).figure
+    figure = hj.plot.harmonics({"isochron": (estimate, exact), "again": exact}).figure
     assert isinstance(figure, Figure)
     grid = np.reshape(figure.axes, (2, 2))
     assert [ax.get_title() for ax in grid[0]] == ["isochron", "again"]
-    assert [ax.get_ylabel() for ax in grid[:, 0]] == ["$|H_m|$, yM", r"$|H_m|$, $\dot y_M$"]
+    assert [ax.get_ylabel() for ax in grid[:, 0]] == ["$|H_m|$, yM", "$|H_m|$, vM"]
     assert [ax.get_title(loc="left") for ax in grid.ravel()] == list("ABCD")
     assert sum(ax.get_legend() is not None for ax in grid.ravel()) == 1
     assert grid[0, 0].get_ylim() == grid[0, 1].get_ylim()
@@ -103,8 +101,8 @@ def test_experiment(hopper):
     data = hj.experiments.simulate_experiments(
         hopper, hj.multisine(periods=4, band=(0, 2.0)), discard=2
     )
-    figure = hj.plot.experiment(data, -1, labels={"yM": "$y_M$"}).figure
-    assert [ax.get_ylabel() for ax in figure.axes] == ["u", r"$\delta$ $y_M$", r"$\delta$ vM"]
+    figure = hj.plot.experiment(data, -1).figure
+    assert [ax.get_ylabel() for ax in figure.axes] == ["u", r"$\delta$ yM", r"$\delta$ vM"]
     y = figure.axes[2].get_lines()[0]
     np.testing.assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
     np.testing.assert_allclose(y.get_xdata()[32], 1.0)
@@ -159,13 +157,13 @@ def found(hopper):
 
 
 def test_validation_draws_signals_and_correlations(found):
-    figure = hj.plot.validation(found, cycles=2, labels={"vM": "speed"}).figure
+    figure = hj.plot.validation(found, cycles=2).figure
     grid = np.reshape(figure.axes, (2, 3))
     simulated, measured = grid[1, 0].get_lines()
     np.testing.assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
     np.testing.assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
     np.testing.assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
-    assert grid[1, 0].get_ylabel() == r"$\delta$ speed"
+    assert grid[1, 0].get_ylabel() == r"$\delta$ vM"
     assert grid[0, 0].get_title() == f"fit {found.fit[0]:.2f} %"
     for k, values in ((1, found.autocorrelation[:, :, 0]), (2, found.cross_correlation[:, :, 0])):
         heights = [path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()]

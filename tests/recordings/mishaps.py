@@ -119,9 +119,21 @@ def scaled(which, gain=1.0, offset=0.0):
     return signals(which, lambda x, s: gain * x + offset * x.std(), SECOND)
 
 
-def overflow(x, s):
-    step = 0.8 * np.ptp(x) / 2**12
-    return np.round((x - x.min()) / step) % 2**12 * step + x.min()
+def overflow(bits):
+    def wrap(x, s):
+        step = 0.8 * np.ptp(x) / 2**bits
+        return np.round((x - x.min()) / step) % 2**bits * step + x.min()
+
+    return wrap
+
+
+def renumbered(trial, s):
+    n, step = len(trial.time), np.median(np.diff(trial.time))
+    lost = s.rng.choice(n // 32, 3, replace=False)
+    t = kept(trial, ~np.isin(np.arange(n) // 32, lost))
+    time = trial.time[0] + step * np.arange(len(t.time))
+    events = {k: np.interp(at, t.time, time) for k, at in t.events.items()}
+    return replace(t, time=time, events=events)
 
 
 def slow_sensor(x, s):
@@ -130,12 +142,16 @@ def slow_sensor(x, s):
     return signal.sosfilt(sos, x - x[0]) + x[0]
 
 
-def hidden_events(trial, s):
-    values = trial.values.copy()
-    middles = s.rng.choice(trial.events[s.event], 5, replace=False)
-    away = np.abs(trial.time[:, None] - middles).min(axis=1) < 0.075 * s.period
-    values[np.ix_(away, [s.recording.column(x) for x in s.outputs])] = np.nan
-    return replace(trial, values=values)
+def hidden(choose):
+    """Outputs are missing around those events that `choose(events, scene)` returns."""
+
+    def hide(trial, s):
+        values, middles = trial.values.copy(), choose(trial.events[s.event], s)
+        away = np.abs(trial.time[:, None] - middles).min(axis=1) < 0.075 * s.period
+        values[np.ix_(away, [s.recording.column(x) for x in s.outputs])] = np.nan
+        return replace(trial, values=values)
+
+    return trials(hide)
 
 
 def swapped(trial, s):
@@ -205,6 +221,8 @@ MISHAPS = {
     ),
     "hum of the mains": signals("uy", lambda x, s: x + 0.02 * x.std() * np.sin(
         2 * np.pi * 50.2 * s.trial.time / s.period)),
+    "hum near the rhythm": signals("uy", lambda x, s: x + 0.02 * x.std() * np.sin(
+        2 * np.pi * 1.02 * s.trial.time / s.period)),
     "push leaks into outputs": signals("y", lambda x, s: x + (
         0.01 * x.std() / s.values(s.input).std() * s.values(s.input))),
     "slow sensors": signals("y", slow_sensor),
@@ -213,14 +231,17 @@ MISHAPS = {
     "clipped at the top": clipped("y0", 0.0, 0.95),
     "clipped at both ends": clipped("y0", 0.1, 0.9),
     "push clipped": clipped("u", 0.05, 0.95),
-    "integers overflow": signals("y0", overflow),
+    "integers overflow": signals("y0", overflow(12)),
+    "16 bits overflow": signals("y-1", overflow(16)),
     # missing and wrong samples
     "1 % of the samples lost": signals(
         "y", lambda x, s: np.where(s.rng.random(len(x)) < 0.01, np.nan, x)
     ),
     "gap of five cycles": signals("y", lambda x, s: np.where(s.from_middle < 2.65, np.nan, x)),
     "gap of the push": signals("u", lambda x, s: np.where(s.from_middle < 1.15, np.nan, x)),
-    "gaps over the crossing": trials(hidden_events),
+    "gaps over the crossing": hidden(lambda at, s: s.rng.choice(at, 5, replace=False)),
+    "a gap over each seventh crossing": hidden(lambda at, s: at[::7]),
+    "packets lost and renumbered": trials(renumbered),
     "0.1 % spikes": struck("y", 0.001),
     "1 % spikes": struck("y", 0.01),
     "0.1 % spikes of the push": struck("u", 0.001),
@@ -245,6 +266,7 @@ MISHAPS = {
         s.recording.trials[2].values[:, s.recording.column(s.input)], len(x)), SECOND),
     "push unrelated in all": signals("u", lambda x, s: np.roll(x, len(x) // 2)),
     "push switched on late": signals("u", lambda x, s: np.where(s.cycles < 10.0, 0.0, x)),
+    "push lost in two trials": signals("u", lambda x, s: 0 * x, (1, 2)),
     "push not plugged in": signals("u", lambda x, s: 0 * x),
     "the same trial thrice": with_copies,
     "overlapping trials": with_end,
@@ -272,6 +294,7 @@ MISHAPS = {
 EVENT_MISHAPS = {
     "events lost and doubled": misjudged(lost=0.05, doubled=0.05),
     "events inexact": misjudged(off=0.0005),
+    "events jitter": misjudged(off=0.01),
     "another event in one trial": trials(lambda trial, s: replace(
         trial, events={s.event: trial.events[s.event] + 0.4 * s.period}), SECOND),
 }  # fmt: skip

@@ -58,7 +58,11 @@ def test_nothing_is_found_where_nothing_is_wrong(seed, force, noise):
 CAUSES = {
     "drift": ["slow drift", "the zero wanders", "sensor slips in one trial"],
     "clipped": ["clipped at the top", "clipped at both ends", "push clipped"],
-    "overflow": ["integers overflow"],
+    "overflow": ["integers overflow", "16 bits overflow"],
+    "a silent input": ["push lost in two trials"],
+    "missed events": ["a gap over each seventh crossing", "a third of the samples not there"],
+    "odd cycles": ["packets lost and renumbered"],
+    "inexact events": ["events jitter"],
     "no value": ["-9999 for no value"],
     "frozen": ["0 for no value", "output frozen for a while", "push frozen for a while"],
     "an empty trial": ["output frozen"],
@@ -77,7 +81,7 @@ CAUSES = {
     "another event": ["another event in one trial"],
     "": [
         "rounded to 12 bits", "slow sensors", "sensor saturates softly", "1 % of the samples lost",
-        "gap of five cycles", "gap of the push", "a third of the samples not there", "few samples",
+        "gap of five cycles", "gap of the push", "few samples",
         "clock slows down", "push late", "push early", "events lost and doubled",
     ],
 }  # fmt: skip

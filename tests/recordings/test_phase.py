@@ -100,26 +100,3 @@ def test_splines_are_those_of_scipy(seed, n, bandwidth):
     np.testing.assert_allclose(spline(t, y, bandwidth)(x), reference(x / step), atol=1e-9)
     through = CubicSpline(t, y, bc_type="natural")
     np.testing.assert_allclose(spline(t, y, np.inf)(x), through(x), atol=1e-9)
-
-
-def test_a_crossing_in_a_gap_is_not_known(wave):
-    """Both cycles that it bounds are left out; a gap elsewhere, and single samples, do no harm."""
-    t, (_, x, v) = wave.trials[0].time, wave.trials[0].values.T
-    top = hj.Crossing("v", "falling")  # at whole seconds
-
-    def cycles(start, end):
-        hidden = np.where((t > start) & (t < end), np.nan, v)
-        return hj.recordings.estimate_phase(hj.Recording(t, {"x": x, "v": hidden}), top)
-
-    for gap in [(6.96, 7.04), (6.82, 7.02), (6.9, 7.1)]:
-        found = cycles(*gap)
-        assert found.missed == 2 and len(found.stretches[0]) == 2
-        for k in (0, 1):
-            inner = whole(found, k)
-            np.testing.assert_allclose(inner, np.round(inner), atol=1e-3)
-    for gap in [(7.3, 7.5), (6.995, 7.005)]:
-        found = cycles(*gap)
-        assert found.missed == 0 and len(found.stretches[0]) == 1
-    hidden = np.where(np.abs(t - np.round(t)) < 0.05, np.nan, v)
-    with pytest.raises(hj.DefinitionError, match="v is never seen to cross 0, falling"):
-        hj.Recording(t, {"v": hidden}).mark("top", top)

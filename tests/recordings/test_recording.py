@@ -22,6 +22,8 @@ GOOD = {"a": T, "b": 2 * T}
         (T, {"a": list("abcde")}, {}, "a must be real numbers"),
         (T, GOOD, {"units": {"c": "N"}}, "a unit for 'c', but the signals are a, b"),
         (T, GOOD, {"events": {"e": [np.inf]}}, "e is infinite at sample 0"),
+        (T, GOOD, {"events": {"e": [9.0]}}, "events 'e' .* are outside of the recording"),
+        (T, GOOD, {"events": {"a": [1.0]}}, "'a' is a signal and an event"),
     ],
 )
 def test_bad_recordings(time, signals, options, message):

@@ -44,7 +44,7 @@ def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     np.testing.assert_array_equal(
         np.abs(whole.multipliers).max("multiplier"), whole.spectral_radius
     )
-    assert list(whole.state_name.values) == ["th", "w"]
+    assert list(whole.coords) == ["slope", "spokes", "state_name", "state_unit"]
     alone = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.09, spokes=8.0))
     assert whole.period.sel(slope=0.09, spokes=8.0) == pytest.approx(float(alone.period))
 

@@ -23,6 +23,7 @@ ROOM = {
 TO_B = hj.Transition("go", "a", "b", lambda t, q, u: q[0], reset=lambda t, q, u: (q[0],))
 
 
+SUM = hj.Output("sum", lambda t, q, u: q.sum())
 HOPPER = hj.models.VerticalHopper()
 
 
@@ -76,7 +77,13 @@ def replaced(**changes):
             Anything({"a": Field(("x",), lambda t, q, u: (q[0], 1.0))}),
             r"field of chart 'a' returns",
         ),
-        (Anything({"a": Field(("x", "x"), lambda t, q, u: q)}), "names a state twice"),
+        (
+            Anything({"a": Field(("x", "x"), lambda t, q, u: q)}),
+            "states of the same name: 'x', 'x'",
+        ),
+        (Anything({"a": Field("xv", lambda t, q, u: q)}), "must be a tuple of names, not 'xv'"),
+        (Anything(ROOM, named=(SUM, SUM)), "states and outputs of the same name"),
+        (Anything(ROOM, named=SUM), r"outputs\(\) must return several `hj.Output`"),
         (replaced(source="c"), "there is no chart 'c'; charts are 'a', 'b'"),
         (replaced(reset=lambda t, q, u: q), r"reset of transition 'go' \(a -> b\) returns shape"),
         (replaced(guard=lambda t, q, u: q), r"guard of transition 'go' \(a -> b\) returns shape"),
@@ -85,7 +92,7 @@ def replaced(**changes):
             Anything({"a": Field(("x", "v"), lambda t, q, u: (q[1], -q[2]))}),
             "field of chart 'a' cannot be evaluated: index 2 is out of bounds",
         ),
-        (Anything(ROOM, (TO_B, TO_B)), "two transitions are called 'go'"),
+        (Anything(ROOM, (TO_B, TO_B)), "transitions of the same name: 'go', 'go'"),
         (
             eqx.tree_at(lambda s: s.k, HOPPER, jnp.array(np.inf)),
             "parameter `k` of VerticalHopper is inf",
@@ -100,7 +107,7 @@ def test_what_is_wrong_is_said(system, message):
 def test_outputs_by_name_by_function_and_by_chart():
     energy = hj.Output("energy", {"a": lambda t, q, u: q[0] ** 2 + q[1] ** 2 + t + u[0]})
     s = Structure(Anything(ROOM, named=(energy,)))
-    z = s.resolve_outputs(("x", "energy", hj.Output("sum", lambda t, q, u: q.sum())))
+    z = s.resolve_outputs(("x", "energy", SUM))
     assert z.names == ("x", "energy", "sum")
     values = z(0, 1.0, jnp.array([2.0, 3.0]), jnp.array([10.0]))
     np.testing.assert_array_equal(values, [2.0, 24.0, 5.0])

@@ -201,9 +201,11 @@ class ZarrStore:
             data = package("xarray").open_zarr(self.address, **options)
         except Exception as error:  # (of many kinds, for an array that another program has added)
             raise FileFormatError(f"'{self.address}' is damaged: {error}") from error
-        constants = [name for name in data.data_vars if name not in self._arrays]
+        # (Zarr lists arrays in any order.)
+        dims = [name for name in self.layout.dims if name in data.coords]
+        beside = sorted({*data.coords, *data.data_vars} - {*dims, *self._arrays})
         description = json.dumps(self.layout.description)
-        data = data[[*self._arrays, *constants]].assign_attrs({_ABOUT: description})
+        data = data[[*dims, *self._arrays, *beside]].assign_attrs({_ABOUT: description})
         return data if isinstance(self.address, str) else data.load()
 
     def _chunk(self, array: Any, k: int) -> str:

@@ -21,7 +21,7 @@ from jax.extend.core import primitives
 from ..boundary.checked import checked
 from ..executor import on_cpu
 from . import factorizations
-from .trigonometry import arccos, arcsin, arctan, arctan2, are_double, cos, sin, tan
+from .trigonometry import arccos, arcsin, arctan, arctan2, cos, sin, tan
 
 
 _TRIGONOMETRY = {
@@ -212,7 +212,7 @@ def _ours(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn | None:
         return _in_place_of(eqn, _FACTORIZATIONS[eqn.primitive], avals, options)
     if not trigonometry or eqn.primitive not in _TRIGONOMETRY:
         return None
-    if eqn.params.get("accuracy") is not None or not are_double(*(x.dtype for x in avals)):
+    if eqn.params.get("accuracy") is not None or any(x.dtype != jnp.float64 for x in avals):
         return None
     return _in_place_of(eqn, _TRIGONOMETRY[eqn.primitive], avals)
 

@@ -14,11 +14,9 @@ functions that were written with `jnp`.
   zeros, infinities and NaN are treated as `jnp` treats them. Subnormal numbers may count as zero,
   as they do in all arithmetic of XLA on CPU.
 
-Each has derivatives of all orders, in forward and reverse mode. Arguments of other types go to
-`jnp`'s own function.
+Each has derivatives of all orders, in forward and reverse mode. Arguments are of float64.
 """
 
-import functools as ft
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -130,11 +128,6 @@ def _leg(x):
     return jnp.sqrt((1 - x) * (1 + x))
 
 
-def are_double(*dtypes) -> bool:
-    """Return whether arguments of these types are all float64."""
-    return all(x == jnp.float64 for x in dtypes)
-
-
 def _with_derivatives(kernel: Callable, *rules: Callable) -> Callable:
     """`kernel` with one rule (tangent, value, *arguments) for each argument."""
     function = jax.custom_jvp(kernel)
@@ -142,29 +135,23 @@ def _with_derivatives(kernel: Callable, *rules: Callable) -> Callable:
     return function
 
 
-def _function(plain: Callable, fast: Callable) -> Callable:
-    """Return a function that is `fast` for float64, and `plain` for other types."""
-    fast.__name__ = plain.__name__
-    fast = jax.jit(fast)  # traced once: every further use costs one equation
-
-    @ft.wraps(plain, assigned=("__name__", "__qualname__", "__doc__"), updated=())
-    def function(*xs):
-        return (fast if are_double(*map(jnp.result_type, xs)) else plain)(*xs)
-
-    return function
+def _function(name: str, function: Callable) -> Callable:
+    """Return a function that is traced once: every further use costs one equation."""
+    function.__name__ = name
+    return jax.jit(function)
 
 
-sin = _function(jnp.sin, lambda x: _sincos(x)[0])
-cos = _function(jnp.cos, lambda x: _sincos(x)[1])
-tan = _function(jnp.tan, _tan)
+sin = _function("sin", lambda x: _sincos(x)[0])
+cos = _function("cos", lambda x: _sincos(x)[1])
+tan = _function("tan", _tan)
 arctan2 = _function(
-    jnp.arctan2,
+    "arctan2",
     _with_derivatives(
         _arctan2,
         lambda dy, _, y, x: dy * (x / (x**2 + y**2)),
         lambda dx, _, y, x: dx * (-y / (x**2 + y**2)),
     ),
 )
-arctan = _function(jnp.arctan, _with_derivatives(_arctan, lambda dx, _, x: dx / (1 + x**2)))
-arcsin = _function(jnp.arcsin, _with_derivatives(_arcsin, lambda dx, _, x: dx / _leg(x)))
-arccos = _function(jnp.arccos, _with_derivatives(_arccos, lambda dx, _, x: -dx / _leg(x)))
+arctan = _function("arctan", _with_derivatives(_arctan, lambda dx, _, x: dx / (1 + x**2)))
+arcsin = _function("arcsin", _with_derivatives(_arcsin, lambda dx, _, x: dx / _leg(x)))
+arccos = _function("arccos", _with_derivatives(_arccos, lambda dx, _, x: -dx / _leg(x)))

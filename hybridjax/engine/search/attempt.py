@@ -35,6 +35,10 @@ _ASIDE = 1e-4
 # measured from its expected time. Higher: a method of order 4 goes further, and more landings are
 # rejected as too inaccurate. Lower: more steps until a lane lands.
 _LANDING_REACH = 0.25
+# A landing in a chart with an implicit method may add this part of the error that a step may have:
+# no later step damps it before the section. Higher: sections have errors that nobody reports.
+# Lower: more steps until a lane lands.
+_LANDING_PART = 1e-2
 # A landing is accurate to this part of the step: its last correction is at most as large (or lasts
 # no longer than an instant), and it lies no farther beyond the step in which the crossing was met.
 # Corrections square their error. Higher: a crossing is off by more than a replay corrects to
@@ -75,7 +79,10 @@ def land(
     first = xp.where(near, first, 0.0)
     end = flow.locate(t + tau, step.q, step.f1, which, first)
     share = xp.abs(first) / xp.where(aim.reach > 0, aim.reach, 1.0)
-    error = xp.max(end.error / allowed * xp.where(share > 0, share, 0.0) ** 2, axis=0)
+    # (A short step is explicit: where modes die out within it, it has no orders of the method's.)
+    implicit = flow.method.implicit
+    weight = 1 / _LANDING_PART if implicit else xp.where(share > 0, share, 0.0) ** 2
+    error = xp.max(end.error / allowed * weight, axis=0)
     fine = xp.abs(end.last) <= LANDING * xp.abs(tau + end.past) + INSTANT * span
     lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(error) <= 1.0)
     return Landing(
@@ -172,16 +179,16 @@ def _step(
             lambda: flow.step_along(t, q, tau, along),
             lambda: (plain(), along, namespace(q).zeros_like(q)),
         )
-    step = cond(present, plain, lambda: Step(q, q, q, q))
+    step = cond(present, plain, lambda: Step(*[q] * 5))
     if task.tangents is False:
         return step, None, None
     shift = _ASIDE * size(task.settings, flow.a, q, step.q)
     shifted = cond(
         present & task.tangents,
-        lambda: flow.step(t, q + shift * _direction(len(q)), tau, unroll).error,
-        lambda: step.error,
+        lambda: flow.step(t, q + shift * _direction(len(q)), tau, unroll).estimate,
+        lambda: step.estimate,
     )
-    return step, None, shifted - step.error
+    return step, None, shifted - step.estimate
 
 
 def _errors(
@@ -195,7 +202,8 @@ def _errors(
     if settings.scale is None:
         rounding = rounding_error(flow.field, t + tau, step.q, step.f1)
     allowed = tolerance(settings, a, q, tau, step, rounding)
-    error = xp.max(xp.abs(step.error) / allowed, axis=0, initial=0.0)
+    motion = step.error if change is None else step.estimate
+    error = xp.max(xp.abs(motion) / allowed, axis=0, initial=0.0)
     if change is not None:
         scale = size(settings, a, q, step.q)
         if along is None:
@@ -204,9 +212,8 @@ def _errors(
             scale = scale * xp.maximum(1.0, xp.max(xp.abs(along) / scale, axis=0))
         change = xp.max(xp.abs(change) / (settings.rtol * scale), axis=0, initial=0.0)
         error = xp.maximum(error, xp.where(xp.isfinite(change), change, 0.0))
-    gain = flow.method.gain
-    if gain != 1:
-        error = error**gain * settings.rtol ** (gain - 1)
+        gain = flow.method.gain
+        error = error**gain * settings.rtol ** (gain - 1) if gain != 1 else error
     finite = xp.isfinite(step.q).all(axis=0) & ~xp.isnan(error)
     return allowed, xp.where(finite, error, xp.inf)
 

@@ -11,6 +11,7 @@ of the largest class is the exact minimum of experiments, and every greater numb
 Lines are integers `j` here: `f = j / P`, angle per section `2 pi j / (N P)`.
 """
 
+import itertools
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -155,7 +156,7 @@ def _products(periods: int) -> list[list[int]]:
 def _hits(classes: list[int], products: list[list[int]]) -> int:
     """Return the number of second-order products of some classes that fall on one of them."""
     mask = sum(1 << c for c in classes)  # (an experiment has each class once)
-    pairs = ((a, b) for i, a in enumerate(classes) for b in classes[i:])
+    pairs = itertools.combinations_with_replacement(classes, 2)
     return sum((products[a][b] & mask).bit_count() for a, b in pairs)
 
 

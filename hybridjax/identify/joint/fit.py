@@ -1,5 +1,6 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
+from contextlib import suppress
 from functools import cached_property
 from typing import Annotated, Literal, cast
 
@@ -9,12 +10,11 @@ from jaxtyping import Float
 
 from ..._core.arguments import Numbers, require_same
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Order, Scalar, StepCount, Vector
+from ..._core.boundary.kinds import Order, Scalar, Vector
 from ..._core.boundary.values import Integers
 from ..._core.precision import require_x64
 from ..._core.results import Result
-from ..._core.signal import unit_of
-from ..._core.text import number
+from ..._core.text import numbers
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, all_harmonics, check_harmonics
@@ -45,6 +45,10 @@ _SETTLED_SHIFT = 1e-3
 # rounding explains (slow states multiply it by up to 1e6). Larger: stalled descents count as
 # converged; smaller: minima of exact data do not.
 _STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
+# Least decrease of the cost by the inputs, for each unknown, in units of the errors' variance (1 if
+# errors are white and nothing answers). Smaller: multipliers of noise that is filtered by the
+# system, which looks like a response. Larger: weak responses are refused.
+_ANSWERED = 5.0
 
 
 class LDTPFit(MultiplierEstimate):
@@ -85,17 +89,9 @@ class LDTPFit(MultiplierEstimate):
     def unknowns(self) -> int:
         return self._coordinates.size
 
-    @property
-    def n_sections(self) -> int:
-        return self.model.n_sections
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        return self.model.inputs
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return self.model.outputs
+    n_sections = property(lambda self: self.model.n_sections)
+    inputs = property(lambda self: self.model.inputs)
+    outputs = property(lambda self: self.model.outputs)
 
     @checked
     def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
@@ -126,16 +122,22 @@ class LDTPFit(MultiplierEstimate):
     ) -> Float[np.ndarray, "M F ny"]:
         """Return the spectrum of the fitted noise at the harmonics of frequencies f (F,).
 
-        See `LDTPFit.noise_spectrum`.
+        White noise with the standard deviation sigma has the spectrum sigma^2 for all f and m. The
+        variance of an H_m that is measured with a cosine of amplitude a in P periods is
+        4 S(f + m) / (N P a^2): that of `Design.expected_variance(noise=1)` times the spectrum.
 
-        **Raises:** `DefinitionError` if no noise was fitted.
+        **Arguments:** `harmonics`: Default: all N.
+
+        **Returns:** (M, F, ny), the squared unit of each output.
+
+        **Raises:** `DefinitionError` if no noise was fitted, or if it grows without bound.
         """
         if self.noise is None:
             raise DefinitionError(
                 "no noise was fitted: HTFs tell its variance at their own lines only "
                 "(`HTF.variance`); fit to series."
             )
-        return noise_spectrum(self.noise, f, harmonics)
+        return noise_spectrum(self.noise, np.atleast_1d(np.asarray(f, float)), harmonics)
 
     @property
     def predictor(self) -> Predictor | None:
@@ -149,7 +151,7 @@ class LDTPFit(MultiplierEstimate):
             D=[size * x for x in model.D],
             K=[K / size.T if K.shape[1] else K for K in model.K],
         )
-        return Predictor(model, D @ D.swapaxes(1, 2), self.inputs, self.outputs)
+        return Predictor(model, D @ D.swapaxes(1, 2))
 
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
@@ -161,9 +163,7 @@ class LDTPFit(MultiplierEstimate):
             )
         if self.noise is not None:
             size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
-            each = zip(self.outputs, size, strict=True)
-            shown = ", ".join(f"{name} {number(x, 3, unit_of(name))}" for name, x in each)
-            about = f"errors one step ahead {shown}"
+            about = f"errors one step ahead {numbers(self.outputs, size)}"
         return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
 
 
@@ -174,8 +174,7 @@ def fit_ldtp(
     *,
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
-    direct: bool = True,
-    max_steps: StepCount = 50,
+    check: bool = True,
 ) -> LDTPFit:
     r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model by maximum likelihood.
 
@@ -211,39 +210,39 @@ def fit_ldtp(
       series, as for `fit_series`.
     - `guess`: dimensions of the state at each section (or one for all): the fit starts from
       `hj.identify.realize` for HTFs, and from a subspace method for time series. Alternatively, an
-      observable initial model with these dimensions. Too few dimensions bias the multipliers:
-      compare `cost` with `freedom` where variances are known, and use `hj.validate` for time
-      series. The iteration finds a local minimum; the same checks reveal a poor one.
+      observable initial model with these dimensions; if its D is zero, D stays zero. Too few
+      dimensions bias the multipliers: compare `cost` with `freedom` where variances are known, and
+      use `hj.validate` for time series. The iteration finds a local minimum; the same checks reveal
+      a poor one.
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
-    - `direct`: whether outputs may depend on the input at their own section; if not, D = 0.
-      Default: True.
-    - `max_steps`: largest number of steps. Default: 50.
+    - `check`: whether to raise an error if outputs do not answer the inputs (not
+      with "innovations"). Default: True.
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data
-    than unknowns, or records with `lead`.
+    than unknowns, outputs that do not answer the inputs, or records with `lead`.
     """
     require_x64()
     if not isinstance(data, HTF):
-        return _fit_to_series(
-            PreparedRecords(data), guess, noise == "innovations", start == "free", direct, max_steps
-        )
+        records, innovations = PreparedRecords(data), noise == "innovations"
+        return _fit_to_series(records, guess, innovations, start == "free", check)
     if noise == "innovations":
         raise DefinitionError("HTFs tell nothing of innovations: give the series.")
     if start == "cycle":
         raise DefinitionError("HTFs have no start, the response is periodic: leave `start` out.")
-    return _fit_to_htf(data, guess, direct, max_steps)
+    return _fit_to_htf(data, guess, check)
 
 
-def _fit_to_htf(htf: HTF, guess: Guess, direct: bool, max_steps: int) -> LDTPFit:
+def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
     scale = check_values(htf)
+    direct = _is_direct(guess)
     if not isinstance(guess, LDTP):
         guess = realize(htf, np.array(given_dims(guess, htf.n_sections, "guess")))
     require_same("guess and data", guess, htf)
     problem = FrequencyProblem.of(htf, error_weights(htf, scale), scale)
-    model = _without_direct(PeriodicModel.of(guess, scale), direct)
+    model = PeriodicModel.of(guess, scale)
     unknowns = local_coordinates(model, direct).size
     freedom = problem.residuals - unknowns
     if freedom < 1:
@@ -252,13 +251,15 @@ def _fit_to_htf(htf: HTF, guess: Guess, direct: bool, max_steps: int) -> LDTPFit
         )
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the guess is resonant at a frequency of the HTFs.")
-    point, converged = minimize(problem, model, direct, max_steps)
+    point, converged = descend(ModelPoint(problem, model, direct), FIRST_DAMPING)
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
         square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
         weight = problem.weight / np.maximum(np.sqrt(square / 2), SMALLEST_ERROR)[:, None]
         problem = problem._replace(weight=weight)
-        point, converged = minimize(problem, point.model, direct, max_steps)
+        point, converged = descend(ModelPoint(problem, point.model, direct), FIRST_DAMPING)
+    if check:
+        _require_answer(point)
     return _finished(point, converged, htf, scale, freedom)
 
 
@@ -267,8 +268,7 @@ def _fit_to_series(
     guess: Guess,
     innovations: bool,
     free_start: bool,
-    direct: bool,
-    max_steps: int,
+    check: bool,
 ) -> LDTPFit:
     if records.lead:
         raise DefinitionError(
@@ -283,14 +283,14 @@ def _fit_to_series(
     same = np.tile(np.eye(ny), (N, 1, 1))
     problem = SeriesProblem(parts, same, innovations, free_start, numbers)
     if not isinstance(guess, LDTP):
-        model = subspace_model(parts, given_dims(guess, N, "guess") or [], innovations)
+        model = subspace_model(records, given_dims(guess, N, "guess") or [], innovations)
     else:
         require_same("guess and data", guess, records)
         model = PeriodicModel.of(guess, scale)
         if innovations:
             columns = zip(model.A, model.C, strict=True)
             model = model._replace(K=[np.zeros((len(A), len(C))) for A, C in columns])
-    model = _without_direct(model, direct)
+    direct = _is_direct(guess)
     unknowns = local_coordinates(model, direct).size
     starts = sum(model.dims[n] for n in first) if free_start else 0
     freedom = numbers - unknowns - starts
@@ -307,7 +307,10 @@ def _fit_to_series(
         )
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the predictions of the guess grow beyond all numbers.")
-    point, converged = minimize(problem.reweighted(model), model, direct, max_steps)
+    start = ModelPoint(problem.reweighted(model), model, direct)
+    point, converged = descend(start, FIRST_DAMPING)
+    if check and not innovations:
+        _require_answer(point)
     return _finished(point, converged, records, scale, freedom)
 
 
@@ -317,7 +320,8 @@ class ModelPoint(Point):
     def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
         self.problem, self.direct, self.model = problem, direct, model
         if isinstance(problem, FrequencyProblem):  # of series, this costs as much as a step
-            self.model = problem.refined(model, direct)
+            with suppress(np.linalg.LinAlgError):  # a resonant model stays as it is
+                self.model = problem.refined(model, direct)
         self.cost = problem.cost(self.model)
 
     @cached_property
@@ -359,18 +363,20 @@ class ModelPoint(Point):
         return bool(gain <= _STALLED_GAIN * self.cost or np.abs(step).max() < _STALLED_STEP)
 
 
-def minimize(
-    problem: Problem, model: PeriodicModel, direct: bool, max_steps: int
-) -> tuple[ModelPoint, bool]:
-    """Return the minimum of the cost from a model on, and whether it was reached.
+def _require_answer(point: ModelPoint) -> None:
+    """**Raises:** `DefinitionError` if the inputs explain no more than unknowns do of noise."""
+    B, D = ([0.0 * x for x in matrices] for matrices in (point.model.B, point.model.D))
+    explained = point.problem.cost(point.model._replace(B=B, D=D)) - point.cost
+    if explained < _ANSWERED * point.coordinates.size:
+        raise DefinitionError(
+            "the outputs do not answer the inputs: they show nothing but noise. Look for inputs "
+            "that were not applied or not recorded with these outputs, or pass check=False."
+        )
 
-    **Arguments:** `direct`: whether D is free.
-    """
-    return descend(ModelPoint(problem, model, direct), max_steps, FIRST_DAMPING)
 
-
-def _without_direct(model: PeriodicModel, direct: bool) -> PeriodicModel:
-    return model if direct else model._replace(D=[0.0 * D for D in model.D])
+def _is_direct(guess: Guess) -> bool:
+    """Return whether outputs may depend on the input at their own section."""
+    return not isinstance(guess, LDTP) or bool(np.asarray(guess.D).any())
 
 
 def _finished(
@@ -430,8 +436,7 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     minimal = realize(np.asarray(model.impulse_response(lags)))
     scale = check_values(exact)
     problem = FrequencyProblem.of(exact, error_weights(exact, scale), scale)
-    direct = bool(np.asarray(model.D).any())
-    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
+    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), _is_direct(model))
     c, slopes = characteristic_slopes(coordinates)
     spread = problem.linearize(coordinates).spread()
     return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)

@@ -72,7 +72,7 @@ class FrequencyProblem(NamedTuple):
     def refined(self, model: PeriodicModel, direct: bool) -> PeriodicModel:
         """Return the model with the best B (and D, if free), in which the HTFs are linear.
 
-        A model that is resonant stays as it is.
+        **Raises:** `LinAlgError` for a model that is resonant or overflows.
         """
         N, (ny, nu) = model.n_sections, model.D[0].shape
         m = np.array(self.harmonics)
@@ -80,10 +80,7 @@ class FrequencyProblem(NamedTuple):
         waves = np.exp(-2j * np.pi / N * np.outer(np.arange(N), m)) / N
         size = ends[-1] + (N * ny if direct else 0)
         gram, along = np.zeros((nu, size, size)), np.zeros((nu, size))
-        try:
-            error = self.errors(model)
-        except np.linalg.LinAlgError:
-            return model
+        error = self.errors(model)
         for rows in _chunks(len(self.f), size * len(m) * ny):
             J = np.zeros((size, len(m), rows.stop - rows.start, ny), complex)
             np.concatenate(_after(model, self.f[rows], m), out=J[: ends[-1]])
@@ -95,10 +92,7 @@ class FrequencyProblem(NamedTuple):
                 columns = (J * self.weight[:, rows, :, j]).reshape(size, -1).view(float)
                 gram[j] += columns @ columns.T
                 along[j] += columns @ np.ascontiguousarray(error[:, rows, :, j]).ravel().view(float)
-        try:
-            each = [NormalEquations(g, a).step(0.0)[0] for g, a in zip(gram, along, strict=True)]
-        except np.linalg.LinAlgError:
-            return model
+        each = [NormalEquations(g, a).step(0.0)[0] for g, a in zip(gram, along, strict=True)]
         change = np.stack(each, axis=1)
         B = [B + change[a:b] for B, (a, b) in zip(model.B, pairwise(ends), strict=True)]
         changes = change[ends[-1] :].reshape(-1, ny, nu)

@@ -15,8 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Scalar, Vector
 from ...errors import DefinitionError
 from ...experiments.record import Record
 from ...linear.frequency_response import Harmonics, check_harmonics
@@ -291,9 +289,8 @@ def _solve_starts(
     return np.linalg.pinv(gram, RANK, hermitian=True) @ along
 
 
-@checked
 def noise_spectrum(
-    noise: LDTP, f: Scalar | Vector, harmonics: Harmonics | None = None
+    noise: LDTP, f: Float[np.ndarray, " F"], harmonics: Harmonics | None = None
 ) -> Float[np.ndarray, "M F ny"]:
     r"""Return the spectrum of periodic noise at the harmonics of excited frequencies.
 
@@ -311,10 +308,6 @@ def noise_spectrum(
     with the adjoint $\mu[n] = C[n] + z^{-1} \mu[n+1] A[n]$ (the cyclic spectrum at cycle frequency
     zero: Gardner, Napolitano and Paura 2006). The noise of $H_m$ at f is that at f + m.
 
-    White noise with the standard deviation sigma has the spectrum sigma^2 for all f and m. The
-    variance of an H_m that is measured with a cosine of amplitude a in P periods is
-    $4 S(f + m) / (N P a^2)$: that of `Design.expected_variance(noise=1)` times the spectrum.
-
     **Arguments:**
 
     - `noise`: a stable model with any number of white inputs of variance one.
@@ -325,7 +318,6 @@ def noise_spectrum(
     **Raises:** `DefinitionError` for a model with a multiplier of modulus one or more, whose noise
     is not stationary.
     """
-    f = np.atleast_1d(np.asarray(f, float))
     N = noise.n_sections
     harmonics = check_harmonics(harmonics, N)
     if len(noise.multipliers) and np.abs(noise.multipliers[0]) >= 1:
@@ -370,12 +362,6 @@ class Predictor(NamedTuple):
     model: PeriodicModel
     S: Float[np.ndarray, "N ny ny"]
     """Covariances of the innovations."""
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-
-    @property
-    def n_sections(self) -> int:
-        return self.model.n_sections
 
     @property
     def dims(self) -> list[int]:
@@ -383,7 +369,7 @@ class Predictor(NamedTuple):
 
     def predict(self, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
-        part = SeriesPart.of(CycleGrid.from_records([record]), np.ones(len(self.outputs)))
+        part = SeriesPart.of(CycleGrid.from_records([record]), np.ones(self.S.shape[1]))
         path = SeriesProblem([part], self.S, True, free_start, 0).path(self.model, part)
         expected = [
             x @ C.T + u @ D.T
@@ -391,4 +377,4 @@ class Predictor(NamedTuple):
         ]
         expected = np.where(part.sampled, part.y - np.stack(path.error), np.stack(expected))
         rows = slice(record.first_section, record.first_section + len(record.u))
-        return np.moveaxis(expected[:, 0], 0, 1).reshape(-1, len(self.outputs))[rows]
+        return np.moveaxis(expected[:, 0], 0, 1).reshape(-1, self.S.shape[1])[rows]

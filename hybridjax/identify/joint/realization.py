@@ -18,10 +18,10 @@ from ...linear.ldtp import LDTP
 from ..denominator import SLOWEST
 from ..descent import ROUNDING
 from ..series.fit import SeriesFit
+from ..series.records import PreparedRecords
 from ..variable_projection import SMALLEST_ERROR
 from .frequency import FrequencyProblem
 from .model import PeriodicModel
-from .prediction import SeriesPart
 
 
 Names = tuple[str, ...] | None
@@ -216,7 +216,7 @@ _SHRINKAGE = 1e-6
 
 
 def subspace_model(
-    parts: Sequence[SeriesPart], dims: Sequence[int], innovations: bool
+    records: PreparedRecords, dims: Sequence[int], innovations: bool
 ) -> PeriodicModel:
     """Return a model with these dimensions, with or without K.
 
@@ -227,10 +227,10 @@ def subspace_model(
 
     **Raises:** `DefinitionError` for too few cycles for a past as long as the states need.
     """
-    z, y, inside = _signals(parts)
-    N, ny, most = len(dims), y.shape[2], int(max(dims))
-    columns = z.shape[2]
-    sections = [_Section(z, y, inside, n, N) for n in range(N)]
+    grid, N, ny, most = records.whole(), len(dims), len(records.outputs), int(max(dims))
+    z = np.concatenate([grid.u, grid.y / records.scale], axis=3)
+    sampled, columns = np.asarray(grid.sampled.all(axis=3)), z.shape[3]
+    sections = [_Section(z, sampled, n, ny) for n in range(N)]
     samples = min(len(section.y) for section in sections)
     past = min(samples // (_ROWS * columns), default_horizon(N))
     needed = -(-most // columns) + 1
@@ -265,17 +265,15 @@ class _Section:
 
     def __init__(
         self,
-        z: Float[np.ndarray, "R n columns"],
-        y: Float[np.ndarray, "R n ny"],
-        inside: Bool[np.ndarray, "R n"],
+        z: Float[np.ndarray, "R T N columns"],
+        sampled: Bool[np.ndarray, "R T N"],
         section: int,
-        N: int,
+        ny: int,
     ):
-        at_section = np.arange(y.shape[1]) % N == section
-        self._z = z
-        self.record, self.time = np.nonzero(inside & np.isfinite(y).all(axis=2) & at_section)
-        self.y = y[self.record, self.time]
-        self.u = z[self.record, self.time, : z.shape[2] - y.shape[2]]
+        self.record, cycle = np.nonzero(sampled[:, :, section])
+        self.time = cycle * z.shape[2] + section
+        self._z = z.reshape(len(z), -1, z.shape[3])
+        self.u, self.y = np.split(self._z[self.record, self.time], [-ny], axis=1)
 
     def past(self, length: int, later: int = 0) -> Float[np.ndarray, "samples columns"]:
         """Return the `length` samples before, `later` samples later: newest first, zero before a
@@ -288,26 +286,6 @@ class _Section:
         """Return the effect of the past on the output."""
         rows = np.concatenate([self.u, self.past(length)], axis=1)
         return _regress(rows, self.y)[self.u.shape[1] :]
-
-
-def _signals(
-    parts: Sequence[SeriesPart],
-) -> tuple[Float[np.ndarray, "R n columns"], Float[np.ndarray, "R n ny"], Bool[np.ndarray, "R n"]]:
-    """Return inputs and outputs of all records side by side, with zeros for missing samples; the
-    outputs, with NaN there; and whether a sample lies inside of a record."""
-    longest = max(part.shape[1] for part in parts)
-
-    def flat(name: str) -> np.ndarray:  # (N R T k) -> (R, T N, k)
-        out = []
-        for part in parts:
-            x = getattr(part, name)
-            x = np.pad(x, [(0, 0), (0, 0), (0, longest - x.shape[2]), (0, 0)])
-            out.append(np.moveaxis(x, 0, 2).reshape(x.shape[1], -1, x.shape[3]))
-        return np.concatenate(out)
-
-    u, y, sampled, lost = map(flat, ("u", "y", "sampled", "lost"))
-    inside = np.asarray((sampled | lost).any(axis=2))
-    return np.concatenate([u, y], axis=2), np.where(sampled, y, np.nan), inside
 
 
 def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -7,12 +7,11 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, StepCount, Vector
+from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, Vector
 from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
-from ..._core.signal import unit_of
-from ..._core.text import number
+from ..._core.text import numbers
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, check_harmonics
@@ -21,7 +20,6 @@ from ...linear.ldtp import LDTP
 from ..denominator import (
     SLOWEST,
     Covariance,
-    Denominator,
     block_freedom,
     chi,
     correlated_cycles,
@@ -119,10 +117,7 @@ class SeriesFit(MultiplierEstimate):
 
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
-        noise = ", ".join(
-            f"{name} {number(x, 3, unit_of(name))}"
-            for name, x in zip(self.outputs, self.noise, strict=True)
-        )
+        noise = numbers(self.outputs, self.noise)
         return f"noise {noise}; {self.n_sections} sections, {self.numerators.shape[1]} lags{state}"
 
 
@@ -135,7 +130,6 @@ def fit_series(
     start: Literal["free", "cycle"] = "free",
     errors: Literal["residuals", "white"] = "residuals",
     check: bool = True,
-    max_steps: StepCount = 50,
 ) -> SeriesFit:
     r"""Estimate multipliers and HTFs from time series with any input, with their uncertainty.
 
@@ -158,15 +152,13 @@ def fit_series(
       also for errors that are correlated (process noise) or depend on the inputs (nonlinear
       distortion). "white": the variance of the residuals alone. Default: "residuals".
     - `check`: whether to raise an error for an order that the data do not support. Default: True.
-    - `max_steps`: largest number of Gauss-Newton steps. Default: 50.
 
     **Raises:** `DefinitionError` for records that do not fit together, inputs that are zero, too
     few cycles (the message says how many are needed), or an order that the data do not support.
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
-    records = PreparedRecords(data)
-    return fit_records(records, order, overhang, start, errors, check, max_steps)
+    return fit_records(PreparedRecords(data), order, overhang, start, errors, check)
 
 
 @one_blas_thread()
@@ -177,27 +169,26 @@ def fit_records(
     start: Literal["free", "cycle"] = "free",
     errors: Literal["residuals", "white"] = "residuals",
     check: bool = True,
-    max_steps: int = 50,
 ) -> SeriesFit:
     """Fit records that are prepared; see `fit_series`."""
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
     delayed = delayed_outputs(problem, order)
-    c, solution, _ = minimize(problem, total_least_squares(delayed), max_steps)
+    solution, _ = minimize(problem, total_least_squares(delayed))
     _require_freedom(problem, solution)
     noise = _noise(solution)  # the weights that the residuals suggest
     problem = problem._replace(scale=problem.scale * noise)
-    c, solution, converged = minimize(problem, c, max_steps)
+    solution, converged = minimize(problem, solution.c)
     if check:
         refuse_order(delayed, noise * _noise(solution))
     covariance = coefficient_covariance(problem, solution, errors)
-    return assemble(problem, solution, Denominator(c, covariance, converged))
+    return assemble(problem, solution, covariance, converged)
 
 
 def assemble(
-    problem: OutputErrorProblem, solution: Linearization, denominator: Denominator
+    problem: OutputErrorProblem, solution: Linearization, covariance: Covariance, converged: bool
 ) -> SeriesFit:
-    """Return the fit with this denominator, in the units of the data."""
+    """Return the fit with the denominator of a solution, in the units of the data."""
     N, nu, ny = problem.shape
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
@@ -210,15 +201,15 @@ def assemble(
         for i, root in enumerate(row):
             roots[n, i, :, : root.shape[1]] = root
     return SeriesFit(
-        multipliers=multipliers_of(denominator.coefficients),
-        coefficients=denominator.coefficients,
-        covariance=denominator.covariance.matrix,
+        multipliers=multipliers_of(solution.c),
+        coefficients=solution.c,
+        covariance=covariance.matrix,
         numerators=by_input(solution.numerators),
         slopes=by_input(solution.slope),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
         noise=_noise(solution) * problem.scale,
-        covariance_freedom=denominator.covariance.freedom,
-        result=Result.OK if denominator.converged else Result.NOT_CONVERGED,
+        covariance_freedom=covariance.freedom,
+        result=Result.OK if converged else Result.NOT_CONVERGED,
         n_sections=N,
         inputs=problem.records.inputs,
         outputs=problem.records.outputs,

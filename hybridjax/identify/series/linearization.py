@@ -230,10 +230,8 @@ def each_fit(
     return [[x for grids in by_section for x in grids[k]] for k in range(len(parts))]
 
 
-def minimize(
-    problem: OutputErrorProblem, start: Coefficients, max_steps: int
-) -> tuple[Coefficients, Linearization, bool]:
-    """Return the c that minimizes the sum of squares, the problem there, and whether it settled."""
+def minimize(problem: OutputErrorProblem, start: Coefficients) -> tuple[Linearization, bool]:
+    """Return the problem at the c that minimizes the sum of squares, and whether it settled."""
     last: list[Linearization] = []
 
     def at(c: Coefficients) -> Linearization:
@@ -241,5 +239,5 @@ def minimize(
             last[:] = [linearize(problem, c)]
         return last[0]
 
-    c, converged = least_squares(lambda c: at(c).as_residuals(), start, max_steps)
-    return c, at(c), converged
+    c, converged = least_squares(lambda c: at(c).as_residuals(), start)
+    return at(c), converged

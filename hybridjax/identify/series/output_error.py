@@ -60,7 +60,8 @@ class SectionRegression(NamedTuple):
         to_starts = (np.swapaxes(right, 1, 2) * inverse)[:, : starts.shape[2]]
         remainder = rows * inputs
         remainder = remainder - basis @ (basis.swapaxes(1, 2) @ remainder)
-        return cls(inputs, starts, rows, basis, to_starts, remainder.reshape(-1, inputs.shape[2]))
+        remainder = remainder.reshape(rows.size, inputs.shape[2])
+        return cls(inputs, starts, rows, basis, to_starts, remainder)
 
     @property
     def freedom(self) -> float:

@@ -88,7 +88,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
             raise DefinitionError(f"trial '{trial.name}' has no samples of the input {name}.")
         start = np.concatenate([np.zeros(0), *(w.time[:-1] for w in parts)])
         duration = np.concatenate([np.zeros(0), *(np.diff(w.time) for w in parts)])
-        holes = gaps(trial.time, finite, bridgeable(trial.time, finite))
+        holes = gaps(trial.time[finite], bridgeable(trial.time[finite]))
         # An interval may begin or end just where the input does.
         used = ~inside(holes, start + 1e-9 * duration, start + (1 - 1e-9) * duration)
         if not used.any():

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.archive import read_arrays
+from ..._core.arguments import package
 from ..._core.signal import with_unit
 from ...errors import DefinitionError, FileFormatError
-from .columns import EVENT, Columns, Wanted, check_declared, library, reading, split_header
+from .columns import EVENT, Columns, Wanted, check_declared, reading, split_header
 from .text import read_plain
 
 
@@ -35,7 +36,7 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
     **Raises:** `FileFormatError` for a damaged file, one that declares more than it can hold, for
     arrays that lie in other files, for arrays of structs, and as `_read_tree`.
     """
-    h5py = library(path, "h5py", "mat")
+    h5py = package("h5py")
     leaves: dict[Place, Leaf] = {}
 
     def visit(name: str, node: Any) -> None:
@@ -158,7 +159,7 @@ def read_arrow(path: Path, wanted: Wanted) -> list[Columns]:
 
     **Raises:** `FileFormatError` for a damaged file, or one that declares more than it can hold.
     """
-    dataset = library(path, "pyarrow.dataset", "tables")
+    dataset = package("pyarrow.dataset")
     kind = path.suffix.lower().removeprefix(".")
     with reading(path, f"{kind} file"):
         file = dataset.dataset(path, format=kind)
@@ -176,7 +177,7 @@ def read_excel(path: Path, wanted: Wanted) -> list[Columns]:
     **Raises:** `FileFormatError` for a damaged file, one that declares more than it can hold, and
     a first sheet without a table, with the row.
     """
-    openpyxl = library(path, "openpyxl", "tables")
+    openpyxl = package("openpyxl")
     with reading(path, "Excel file"):
         with zipfile.ZipFile(path) as archive:
             check_declared(path, sum(x.file_size for x in archive.infolist()))

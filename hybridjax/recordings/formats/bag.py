@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..._core.arguments import package
 from ...errors import FileFormatError
-from .columns import Columns, Wanted, library, reading
+from .columns import Columns, Wanted, reading
 
 
 # Longest array in a message whose numbers become signals. Longer: scans and images become thousands
@@ -26,8 +27,8 @@ def read_bag(path: Path, wanted: Wanted) -> list[Columns]:
     **Raises:** `DefinitionError` for a topic that does not exist; `FileFormatError` for a damaged
     file, and arrays whose length changes.
     """
-    reader = library(path, "rosbags.highlevel", "ros").AnyReader
-    typesys = library(path, "rosbags.typesys", "ros")
+    reader = package("rosbags.highlevel").AnyReader
+    typesys = package("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.LATEST)
     with reading(path, "bag of ROS"), reader([path], default_typestore=store) as bag:
         names = {x.topic.lstrip("/") for x in bag.connections}

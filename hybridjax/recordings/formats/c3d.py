@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.arguments import package
 from ..._core.signal import with_unit
-from ...errors import FileFormatError
-from .columns import Columns, Wanted, library, reading, two_columns
+from .columns import Columns, Wanted, check_rows, reading, two_columns
 
 
 Named = list[tuple[str, Float[np.ndarray, " n"]]]
@@ -25,16 +25,13 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
 
     **Raises:** `FileFormatError` for a damaged or truncated file.
     """
-    ezc3d = library(path, "ezc3d", "c3d")
+    ezc3d = package("ezc3d")
     with reading(path, "C3D file"):
         file = ezc3d.c3d(str(path))
         declared = _declared_frames(path)
     header, parameters, data = file["header"]["points"], file["parameters"], file["data"]
     first, frames = header["first_frame"], data["points"].shape[2]
-    if declared not in (None, frames):
-        raise FileFormatError(
-            f"'{path}' has {frames} frames, but its header says {declared}: it is damaged."
-        )
+    check_rows(path, frames, declared, "frames")
     tables = []
     for columns in (_points(parameters["POINT"], data), _analogs(parameters["ANALOG"], data)):
         two_columns(path, [name for name, _ in columns])

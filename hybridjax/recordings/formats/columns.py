@@ -1,6 +1,5 @@
 """The interface of all readers of files: which columns are wanted, and which were read."""
 
-import importlib
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -73,7 +72,13 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
         names = ", ".join(name for name, _ in headers.values())
         raise DefinitionError(f"{where} has no column '{time}'; its columns are {names}.")
     clock = clocks[0]
-    scale = _seconds(where, clock)
+    unit = time_unit(clock) or "s"
+    if unit not in _SECONDS:
+        raise DefinitionError(
+            f"{where}: the times in '{clock}' are in '{unit}', which is no known unit of time: "
+            "convert them to s, ms, us, ns, min or h (divide frames by the sampling rate)."
+        )
+    scale = _SECONDS[unit]
     times = scale * numbers(where, clock, columns.values[clock])
     events = {name: at * scale for name, at in columns.events.items()}
     signals: dict[str, Any] = {}
@@ -169,20 +174,6 @@ def time_unit(header: str) -> str:
     return split_header(header)[1] or (trailing[2] if trailing else "")
 
 
-def _seconds(where: str, header: str) -> float:
-    """Return the unit of times in seconds; no unit means seconds.
-
-    **Raises:** `DefinitionError` for an unknown unit.
-    """
-    unit = time_unit(header) or "s"
-    if unit not in _SECONDS:
-        raise DefinitionError(
-            f"{where}: the times in '{header}' are in '{unit}', which is no known unit of time: "
-            "convert them to s, ms, us, ns, min or h (divide frames by the sampling rate)."
-        )
-    return _SECONDS[unit]
-
-
 def two_columns(path: Path, names: Sequence[str]) -> None:
     """**Raises:** `FileFormatError` if a name occurs twice."""
     if len(set(names)) < len(names):
@@ -190,18 +181,12 @@ def two_columns(path: Path, names: Sequence[str]) -> None:
         raise FileFormatError(f"'{path}' has two columns '{twice}'.")
 
 
-def library(path: Path, module: str, extra: str) -> Any:
-    """Import the package that reads a file.
-
-    **Raises:** `DefinitionError` if it is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise DefinitionError(
-            f"'{path}' is read by the package {module.split('.')[0]}, which is not installed: "
-            f"`pip install 'hybridjax[{extra}]'`."
-        ) from error
+def check_rows(path: Path, rows: int, declared: Any, what: str) -> None:
+    """**Raises:** `FileFormatError` for another number of rows than the header declares."""
+    if declared is not None and str(declared) != str(rows):
+        raise FileFormatError(
+            f"'{path}' has {rows} {what}, but its header says {declared}: it is damaged."
+        )
 
 
 @contextmanager

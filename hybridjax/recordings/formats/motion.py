@@ -8,7 +8,7 @@ import numpy as np
 
 from ..._core.signal import with_unit
 from ...errors import FileFormatError
-from .columns import Columns, Wanted
+from .columns import Columns, Wanted, check_rows
 from .text import read_lines, read_plain, read_table, split_line, split_names, to_number
 
 
@@ -27,13 +27,6 @@ def read_text(path: Path, wanted: Wanted) -> list[Columns]:
     return blocks or [read_plain(path, lines)]
 
 
-def _check_rows(path: Path, rows: int, declared: str | None, what: str) -> None:
-    if declared not in (None, str(rows)):
-        raise FileFormatError(
-            f"'{path}' has {rows} {what}, but its header says {declared}: it is damaged."
-        )
-
-
 def _opensim(path: Path, lines: list[str], end: int) -> Columns:
     """Read a motion or storage file: `key=value` up to `endheader`, then names, then numbers."""
     facts = dict(x.replace(" ", "").lower().split("=", 1) for x in lines[:end] if "=" in x)
@@ -44,7 +37,7 @@ def _opensim(path: Path, lines: list[str], end: int) -> Columns:
     names = split_names(lines[start], separator)
     names = ["time (s)" if x == "time" else x for x in names]  # times of OpenSim are seconds
     table = read_table(path, names, lines, start + 1, separator)
-    _check_rows(path, len(next(iter(table.values.values()))), facts.get("nrows"), "rows")
+    check_rows(path, len(next(iter(table.values.values()))), facts.get("nrows"), "rows")
     degrees = ("angles are in degrees",) if facts.get("indegrees") == "yes" else ()
     return Columns(table.values, table.notes + degrees)
 
@@ -59,7 +52,7 @@ def _trc(path: Path, lines: list[str]) -> Columns:
     unit = facts.get("units", "")
     columns = [with_unit(f"{marker}.{axis}", unit) for marker in names[2::3] for axis in "xyz"]
     table = read_table(path, ["frame#", "time (s)", *columns], lines, 5, "\t")
-    _check_rows(path, len(table.values.pop("frame#")), facts.get("numframes"), "frames")
+    check_rows(path, len(table.values.pop("frame#")), facts.get("numframes"), "frames")
     return table
 
 

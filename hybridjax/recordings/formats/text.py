@@ -92,10 +92,7 @@ def split_line(line: str, separator: str) -> list[str]:
 
 def split_names(line: str, separator: str) -> list[str]:
     """Return the fields of a line, without empty ones at its end."""
-    names = split_line(line, separator)
-    while names and not names[-1]:
-        names.pop()
-    return names
+    return split_line(line.rstrip(f"{separator} \t"), separator)
 
 
 def to_number(text: str) -> float | None:
@@ -127,7 +124,7 @@ def read_table(
             text = f"'{path}', line {start + mixed + 1}: there are points beside decimal commas; "
             raise FileFormatError(f"{text}export one of the two, and no separators of thousands.")
         lines = [x.replace(",", ".") for x in lines]
-    values = None
+    values = np.zeros((0, 0))
     try:  # a number in every field
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about an empty table
@@ -136,7 +133,7 @@ def read_table(
             )
     except ValueError:
         pass
-    if values is None or values.shape[1] != len(headers):
+    if values.shape[1] != len(headers):
         values = _by_line(path, headers, lines, start, separator)
     if not values.size:
         raise FileFormatError(f"'{path}' has a header, but no samples.")

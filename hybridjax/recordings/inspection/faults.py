@@ -1,7 +1,7 @@
 """Samples that were not measured (placeholders, frozen, clipped and wrapped signals, copies), and
 trials that differ from the others in units, columns, clocks or cycles."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -21,6 +21,9 @@ _FROZEN = 0.25, 10, 4
 # Least fraction of samples on plateaus at an extreme that is clipping, and its ratio to those on
 # other plateaus. Larger: clipping passes. Smaller: rounded or resting signals are reported.
 _CLIPPED, _MOSTLY = 0.005, 5
+# Relative difference of the number of levels from a power of two that is an overflow. Larger:
+# impacts of a signal in integers are refused. Smaller: overflows of fast signals pass.
+_ALL_LEVELS = 0.01
 # Fraction of equal samples that makes two signals, or two trials, copies. Larger: copies with a few
 # edited samples pass. Smaller: signals that rest at zero together are copies.
 _EQUAL = 0.99
@@ -42,6 +45,11 @@ _OFF = 10.0
 _CORRELATED, _PHASES = 0.8, HARMONICS // 2
 # Relative difference of periods of trials. Larger: other speeds pass. Smaller: jitter is reported.
 _OTHER_PERIOD = 0.02
+# Fewest cycles that have a usual duration. Larger: short trials are not judged. Smaller: chance is.
+_STRETCH = 8
+# Difference from the median duration of cycles that makes an odd one, in medians of differences and
+# in periods. Larger: lost samples pass. Smaller: variable rhythms are reported.
+_ODD, _ALIKE_PERIODS = 12.0, 0.05
 # Drift: number of cosines over a trial, and the ratio of the mean power of the slowest quarter to
 # that of the others. Larger: drift passes. A ratio below 14: a multiplier of 0.9 is reported.
 _COSINES, _RATIO = 24, 20.0
@@ -104,7 +112,7 @@ def clipped(recording: Recording, name: str) -> Iterator[Finding]:
 
 
 def wrapped(recording: Recording, name: str) -> Iterator[Finding]:
-    """Find integers that overflow: jumps by half of their levels, which are a power of two."""
+    """Find integers that overflow: jumps up and down by half of their levels, a power of two."""
     for trial, x in recording.samples(name):
         levels = np.unique(x[np.isfinite(x)])
         if len(levels) < 2:
@@ -113,14 +121,27 @@ def wrapped(recording: Recording, name: str) -> Iterator[Finding]:
         count = (x - levels[0]) / step
         whole = 1 + round(float(np.nanmax(count)))
         off = np.nanmax(np.abs(count - np.round(count)))
-        jumps = int((np.abs(np.diff(count)) > 0.5 * whole).sum())
-        if off < 1e-3 and whole.bit_count() == 1 and jumps > 1:  # scaled integers, but for rounding
+        bits = round(np.log2(whole))  # (of many levels, the outermost are not met)
+        jumps = np.diff(count) / 2.0**bits
+        both = min((jumps > 0.5).sum(), (jumps < -0.5).sum())
+        if off < 1e-3 and abs(whole / 2.0**bits - 1) < _ALL_LEVELS and both:  # but for rounding
             text = (
                 f"{name} jumps by its whole range in trial '{trial.name}', as integers that "
-                f"overflow: undo it (`numpy.unwrap` with period={whole * step:.6g})."
+                f"overflow: undo it (`numpy.unwrap` with period={2**bits * step:.6g})."
             )
             yield Finding("overflow", text, "refused")
             return
+
+
+def silent_inputs(recording: Recording, names: Iterable[str]) -> Iterator[Finding]:
+    """Find inputs that are constant in some trials only."""
+    for name in names:
+        samples = recording.samples(name)
+        width = [np.ptp(x[np.isfinite(x)]) if np.isfinite(x).any() else 0.0 for _, x in samples]
+        silent = [f"'{t.name}'" for (t, _), w in zip(samples, width, strict=True) if not w]
+        if silent and max(width):
+            text = f"{name} does not change in trial {listed(silent)}: if it acted there and was "
+            yield Finding("a silent input", f"{text}not recorded, leave the trial out.")
 
 
 def doubled_signals(recording: Recording, names: Sequence[str]) -> Iterator[Finding]:
@@ -238,6 +259,29 @@ def clocks(recording: Recording) -> Iterator[Finding]:
     if jumps:
         text = f"{listed(jumps)}: if this was no pause, make a trial of each part."
         yield Finding("jump of the clock", text)
+
+
+def odd_cycles(recording: Recording, phase: Phase) -> Iterator[Finding]:
+    """Find single cycles of another duration, and many that are two periods long."""
+    missed = []
+    for trial, period in zip(recording.trials, phase.periods, strict=True):
+        if len(period) < _STRETCH:
+            continue
+        usual = float(np.median(period))
+        off = np.abs(period - usual)
+        odd = off > max(_ODD * float(np.median(off)), _ALIKE_PERIODS * usual)
+        if not odd.any():
+            continue
+        text = f"{odd.sum()} cycles of trial '{trial.name}' last {period[odd].mean():.4g}, all "
+        text += f"others about {usual:.4g}: if "
+        if odd.mean() < 0.1:
+            text += "samples were lost and times numbered anew, make a trial of each part."
+            yield Finding("odd cycles", text)
+        elif np.abs(period[odd] / usual - 2).max() < 2 * _ALIKE_PERIODS:
+            missed.append(f"{text}events were missed, in gaps or between levels, choose others.")
+    for text in missed:
+        everywhere = len(missed) == len(recording.trials)
+        yield Finding("missed events", text, "refused" if everywhere else "warned")
 
 
 def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -> Iterator[Finding]:

@@ -29,6 +29,9 @@ _SHORTEST, _PARTS = 16, 4
 # Unexplained power of a part relative to the median that makes a disturbance. Larger: stumbles
 # pass. Smaller: noisy parts are reported.
 _DISTURBED = 9.0
+# Part of the outputs' variance that errors of event times explain. Larger: inexact events pass.
+# Smaller: real deviations along the cycle are called errors.
+_SHIFTED = 0.7
 
 _NOT_MEASURED = (
     ("no value", faults.placeholders, "has samples that stand for no value, such as -9999"),
@@ -80,6 +83,7 @@ def inspect(
                 clean = _masked(clean, [name], bad)
         findings += faults.clipped(clean, name)
         findings += () if name in inputs else faults.wrapped(clean, name)
+    findings += faults.silent_inputs(clean, [name for name in names if name in inputs])
     findings += faults.doubled_signals(clean, names)
     copies, more = faults.repeated_samples(clean, names)
     findings += more
@@ -107,6 +111,8 @@ def inspect_cycles(recording: Recording, phase: Phase, data: SectionData) -> lis
     """Return the findings that need the phase and the data at the sections."""
     outputs = tuple(x for x in data.outputs if x in recording.signals)
     return [
+        *faults.odd_cycles(recording, phase),
+        *inexact_events(data),
         *faults.other_cycles(recording, phase, outputs),
         *faults.slow_changes(recording, phase, outputs),
         *(unanswered(data, [t.name for t in recording.trials]) if outputs else ()),
@@ -173,17 +179,20 @@ def unanswered(data: SectionData, names: Sequence[str]) -> Iterator[Finding]:
             answers = _answers(pushed, i)
             if len(answers):
                 where = [place(names[p.trial], p.time) for p in pushed]
-                yield from _odd(name, answers, where)
+                yield from _odd(name, answers, where, len(data.inputs) > 1)
                 break
 
 
-def _odd(name: str, answers: Float[np.ndarray, "n 4"], where: list[str]) -> Iterator[Finding]:
-    """Find odd gains of an input; `where`: places of the parts."""
+def _odd(
+    name: str, answers: Float[np.ndarray, "n 4"], where: list[str], several: bool
+) -> Iterator[Finding]:
+    """Find odd gains of an input; `where`: places of the parts. `several`: it is not alone."""
     gain, error, left, explained = answers.T
     usual = float(np.median(gain))
     together = abs(error**-2.0 @ gain) / np.sqrt((error**-2.0).sum())
     if together < CLEAR and np.mean((gain / error) ** 2) < CLEAR:
-        yield Finding("no answer", f"the outputs do not answer {name}: was it recorded with them?")
+        text = f"the outputs do not answer {name}: was it recorded with them?"
+        yield Finding("no answer", text, "warned" if several else "refused")
         return
     texts = {
         "another sign": "the outputs answer {} with the other sign ({}): turn it.",
@@ -266,6 +275,27 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
 def _centered(x: Float[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
     """Subtract the means: each part has a level of its own."""
     return x - x.mean(axis=0)
+
+
+def inexact_events(data: SectionData) -> Iterator[Finding]:
+    """Find events whose times scatter: outputs after them deviate along the average cycle, by times
+    that do not depend on those of the events before."""
+    N, size = data.n_sections, data.rms()[1]
+    waves = 2j * np.pi * np.fft.fftfreq(N, 1 / N)[:, None]
+    slope = np.fft.ifft(waves * np.fft.fft(data.cycle_outputs, axis=0), axis=0).real / size
+    slope, late, whole, left = slope[: N // 5].ravel(), [], 0.0, 0.0
+    for r in data.records:
+        first = -r.first_section % N
+        y = (r.y[first:] / size)[: (len(r.y) - first) // N * N].reshape(-1, N * len(size))
+        y = y[np.isfinite(y[:, : len(slope)]).all(axis=1), : len(slope)]
+        late.append(y @ slope / max(slope @ slope, np.finfo(float).tiny))
+        whole, left = whole + (y**2).sum(), left + ((y - late[-1][:, None] * slope) ** 2).sum()
+    times = np.concatenate(late)
+    follows = abs(times[1:] @ times[:-1]) / max(times @ times, np.finfo(float).tiny)
+    if left < (1 - _SHIFTED) * whole and follows < 0.5:
+        text = f"outputs deviate at the start of cycles as if it were inexact by {times.std():.2g} "
+        text += "of a cycle: define the phase by the crossing of a signal, or by an angle."
+        yield Finding("inexact events", text)
 
 
 def feedback(data: SectionData) -> Iterator[Finding]:
