@@ -112,11 +112,12 @@ def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tu
 
     def to_next(carry, k, bound):
         i, lanes = k % N, carry[0]
-        ends = (bound.time[i] + (k // N) * period)[None], i[None], bound.event[i][None]
+        time, event = bound.time[i] + (k // N) * period, bound.event[i]
         if isinstance(bound.levels, _FromAnchor):  # at first to the anchor
-            anchor = np.inf, N, np.int32(-1)
-            ends = tuple(xp.where(k == 0, x, end) for x, end in zip(anchor, ends, strict=True))
-        limit = lanes.t + 1.5 * period
+            first = k == 0
+            time, i = xp.where(first, np.inf, time), xp.where(first, N, i)
+            event = xp.where(first, np.int32(-1), event)
+        ends, limit = (time[None], i[None], event[None]), lanes.t + 1.5 * period
         target = Target(*ends, limit, None, bound.levels, Result.SECTION_MISSED)
         carry, tape = go(carry, target)
         return carry, (lanes, carry[0].t, carry[2], tape)
@@ -124,6 +125,7 @@ def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tu
     def onwards(carry, k):
         carry, anchor = carry
         bound = _bind(s, map, family, anchor, go)
+        assert isinstance(family.anchor, Crossing)
         levels = _FromAnchor(bound.levels, family.anchor, N)
         carry, flow = to_next(carry, k, dataclasses.replace(bound, levels=levels))
         anchor = jax.tree_util.tree_map(lambda x, y: jnp.where(k == 0, x, y), carry[0], anchor)
