@@ -14,7 +14,11 @@ NUMBER = re.compile(r"[+-]?\s?\d+(?:\.\d*)?(?:e[+-]?\d+)?")
 
 def blocks(page: str) -> list[tuple[str, str]]:
     """Language and text of each fence of a document."""
-    text = (ROOT / page).read_text()
+    return fences((ROOT / page).read_text())
+
+
+def fences(text: str) -> list[tuple[str, str]]:
+    """Language and content of each fence in a text."""
     return re.findall(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 

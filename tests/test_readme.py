@@ -4,6 +4,7 @@ import re
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import hybridjax as hj
 from hybridjax.apps.cli import main
 
 from .conftest import OUTPUTS
-from .sessions import ROOT, Session, blocks, same_output
+from .sessions import ROOT, Session, blocks, fences, same_output
 
 
 CLAIMS = ROOT / "CLAIMS.md"
@@ -43,35 +44,58 @@ def test_sessions_print_what_the_readme_shows(capsys, tmp_path, monkeypatch):
     assert (tmp_path / "bode.png").stat().st_size > 10_000
 
 
-@pytest.fixture
-def trials(tmp_path, hopper_cycle):
-    """What the README's recording is read from."""
+@pytest.fixture(scope="module")
+def read_section(tmp_path_factory, hopper_cycle):
+    """A function that runs the fences of one section of the README after those of its opening, and
+    returns the module in which they ran."""
+    folder = tmp_path_factory.mktemp("readme")
+    # What the README's recording is read from.
     force = [hj.testing.random_force(200, 100, bandwidth=8, rms=0.02, seed=k) for k in range(2)]
     force = np.stack(force)
     made = hj.testing.simulate_recording(hopper_cycle, force, OUTPUTS, rate=100, steps=1)
     for name, trial in zip(("trial1", "trial2"), made.trials, strict=True):
         table = np.column_stack([trial.time, trial.values])
         header = ",".join(("time", *("force" if x == "u" else x for x in made.signals)))
-        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=header, comments="")
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header=header, comments="")
+    parts = re.split(r"^## (.*)$", (ROOT / "README.md").read_text(), flags=re.MULTILINE)
+    sections = dict(zip(parts[1::2], parts[2::2], strict=True))
+
+    def read(heading):
+        for language, text in fences(sections[heading]):
+            if language in ("python", "py"):
+                session.run(text)
+            elif language == "bash":
+                assert main(shlex.split(text)[1:]) in (None, 0)
+        return session.module
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        session = Session("README.md", patch)
+        read("A session")
+        read("Your own system")
+        yield read
+    pyplot.close("all")
 
 
 @pytest.mark.slow
-def test_every_session_and_command_runs(tmp_path, monkeypatch, trials):
-    """In the order in which they stand, in one session: fences of python, py and bash."""
-    monkeypatch.chdir(tmp_path)
-    session = Session("README.md", monkeypatch)
-    for language, text in blocks("README.md"):
-        if language in ("python", "py"):
-            session.run(text)
-        elif language == "bash" and text.startswith("hybridjax"):
-            assert main(shlex.split(text)[1:]) in (None, 0)
-    pyplot.close("all")
-    made = session.module
-    found = made.result.fit.compare(made.cycle.multipliers)
-    assert found.max_error < 1e-2 and (tmp_path / "report" / "report.html").exists()
+@pytest.mark.parametrize("heading", ["Many of them, and derivatives", "Fewer strides"])
+def test_the_section_runs(heading, read_section):
+    read_section(heading)
+
+
+@pytest.mark.slow
+def test_the_section_on_fits_finds_the_parameters(read_section):
+    made = read_section("Along a parameter, and from data to parameters")
     for name in ("M", "k", "b"):  # up to the distortion that the experiments hold
         value, true = (float(getattr(x, name)) for x in (made.fit.system, made.hopper))
         assert abs(value / true - 1) < 1e-4, name
+
+
+@pytest.mark.slow
+def test_the_section_on_recordings_finds_the_multipliers(read_section):
+    made = read_section("From a recording")
+    found = made.result.fit.compare(made.cycle.multipliers)
+    assert found.max_error < 1e-2 and Path("report/report.html").exists()
 
 
 def test_links_lead_somewhere():

@@ -88,23 +88,37 @@ def _move_jvp(primals, tangents):
     taped = options._replace(tape=True, glide=False, tangents=closely)
     still = constant((s, lanes, u, target, setout))
     recorded: Recorded = _search(*still, result, settings, taped)  # pyright: ignore[reportCallIssue]
-    tape = recorded.tape
-    assert tape is not None
+    primals = s, lanes, u, target, recorded, options.glide
+    ends = _follow_jvp(primals, (*tangents[:4], None, None))
+    return ends if options.tape else tuple(x._replace(tape=None) for x in ends)
+
+
+@eqx.filter_custom_jvp
+def follow(s, lanes, u, target, recorded: Recorded, unroll: bool) -> Recorded:
+    """Recorded flow, with the derivatives of `move` from lanes that are close to its start."""
+    return recorded
+
+
+def _follow_jvp(primals, tangents):
+    s, lanes, u, target, recorded, unroll = primals
     target, levels = target.split()
 
     def repeat(by_lane, common):
         (t, q, u, time), (s, levels) = by_lane, common
         begin = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
         end = eqx.tree_at(lambda x: x.time, target, time).with_levels(levels)
-        return replay(s, begin, u, end, tape, options.glide)
+        return replay(s, begin, u, end, recorded.tape, unroll)
 
     t_s, t_lanes, t_u, t_target, *_ = tangents
     by_lane = (lanes.t, lanes.q, u, target.time), (t_lanes.t, t_lanes.q, t_u, t_target.time)
     (t, q), (t_t, t_q) = lane_jvp(repeat, by_lane, ((s, levels), (t_s, t_target.levels)))
     ends = lambda x: (x.moved.lanes.t, x.moved.lanes.q)  # noqa: E731
-    out = eqx.tree_at(ends, Recorded(recorded.moved, tape if options.tape else None), (t, q))
+    out = eqx.tree_at(ends, recorded, (t, q))
     none = jax.tree_util.tree_map(lambda _: None, out)
     return out, eqx.tree_at(ends, none, (t_t, t_q), is_leaf=lambda x: x is None)
+
+
+follow.def_jvp(_follow_jvp)
 
 
 def flow_jacobian(

@@ -22,6 +22,7 @@ from .problem import (
     FitProblem,
     Free,
     Parameters,
+    descend,
     evaluate,
     free_parameters,
 )
@@ -56,7 +57,7 @@ def fit_model(
     r"""Fit parameters of a system to data by nonlinear least squares.
 
     Each type of data converts a limit cycle to weighted residuals; the Levenberg-Marquardt
-    iteration (`optimistix.LevenbergMarquardt`) changes the parameters, with the exact Jacobian
+    iteration changes the parameters, with the exact Jacobian
     through the cycle, its events and its sections. Parameters do not move along combinations that
     the data do not identify, and the result lists these.
 
@@ -123,10 +124,10 @@ def identifiability(
     problem, near = _prepare(system, data, free, guess)
     parameters, cycle = problem.parameters, find_limit_cycle(system, near)
     x = parameters.encode(parameters.read(system))
-    end = evaluate(problem, x, cycle)
-    if not np.isfinite(end.residuals).all():
+    residuals, jacobian = evaluate(problem, x, cycle)
+    if not np.isfinite(residuals).all():
         raise ComputationError("the system has a limit cycle, but cannot produce such data.")
-    return diagnose(parameters.names, _relative(parameters, x, end.jacobian))
+    return diagnose(parameters.names, _relative(parameters, x, jacobian))
 
 
 def _prepare(
@@ -208,12 +209,11 @@ def _descend(
     cycle = _cycle_at(problem, system, start, near)
     if cycle.result != Result.OK:
         return End(start, start, np.inf, 0, 0, int(cycle.result))
-    end = evaluate(problem, jnp.asarray(start), cycle, descend=True)
-    r, steps = np.asarray(end.residuals), int(end.steps)
+    x, r, steps, converged = descend(problem, start, cycle)
     if not np.isfinite(r).all():  # there is a cycle, but no observation on it
         return End(start, start, np.inf, len(r), steps, int(Result.NOT_CONVERGED))
-    result = Result.OK if end.converged else Result.NOT_CONVERGED
-    return End(start, np.asarray(end.x), float(r @ r), len(r), steps, int(result))
+    result = Result.OK if converged else Result.NOT_CONVERGED
+    return End(start, x, float(r @ r), len(r), steps, int(result))
 
 
 def _summary(
@@ -226,10 +226,9 @@ def _summary(
     x = jnp.asarray(best.x)
     # The cycle of the guess is nearer than the first one, which may be too far away.
     cycle = _cycle_at(problem, system, best.x, _cycle_at(problem, system, best.start, near))
-    end = evaluate(problem, x, cycle)
-    residuals, values = np.asarray(end.residuals), decode(x)
+    (residuals, jacobian), values = evaluate(problem, x, cycle), decode(x)
     size = np.asarray(_sizes(jnp.asarray(values)))
-    sensitivity = _relative(parameters, x, end.jacobian)
+    sensitivity = _relative(parameters, x, jacobian)
     identified = diagnose(parameters.names, sensitivity)
     rank = identified.rank
     freedom = len(residuals) - rank

@@ -3,14 +3,12 @@
 import dataclasses
 import operator
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
-import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Float
 
 from .._core.compilation import quick_jit
 from .._core.results import Result
@@ -21,8 +19,8 @@ from ..systems.system import HybridSystem
 from .observations import AbstractObservation
 
 
-# The iteration ends when a step changes no coordinate by more than this, in sum and relative to it
-# (coordinates have no unit), and the cost by no more than this part and as much. Larger: parameters
+# The iteration ends when a step changes no coordinate and no residual by more than this, in sum and
+# relative to it (they have no unit). Larger: parameters
 # without the digits that the data have. Smaller: steps that only change rounding errors.
 _TOLERANCE = 1e-9
 # Evaluations of the model from one guess. Fewer: distant guesses do not converge. More: hopeless
@@ -31,6 +29,12 @@ MAX_STEPS = 64
 # No step is taken along directions whose sensitivity is below this part of the largest one. Larger:
 # badly identified parameters keep their initial values. Smaller: unidentifiable ones wander off.
 _RCOND = 1e-8
+# A step is accepted if the cost falls by this part of the predicted reduction; beyond a larger part
+# the damping falls. Lower: steps that gain nothing count. Higher: good ones are repeated.
+_ACCEPTED, _GOOD = 0.01, 0.99
+# Factors of the damping after good and after rejected steps. Nearer to 1: more steps until it fits.
+# Farther: it swings between too much and too little.
+_LESS, _MORE = 3.5, 4.0
 
 Bounds = tuple[float | int, float | int]
 Free = str | Sequence[str] | Mapping[str, Bounds | None]
@@ -130,7 +134,7 @@ def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
     """
     map = guess.return_map.at_phase_of(system)
     q, turn, steps = root(map, False, NEWTON_STEPS)
-    period = map.expected if map.base is None else map.turn(q).period
+    period = map.expected if map.base is None else map.turn(q, turn.record).period
     code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)
     return dataclasses.replace(
         guess,
@@ -164,20 +168,6 @@ class FitProblem(eqx.Module):
         return jnp.where((cycle.result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
 
 
-class Evaluation(NamedTuple):
-    """The end of an iteration."""
-
-    x: Float[Array, " p"]
-    """Coordinates of the parameters."""
-    residuals: Float[Array, " r"]
-    """Infinite where there is no limit cycle, or no observation on it."""
-    jacobian: Float[Array, "r p"]
-    """Derivatives of the residuals by the coordinates."""
-    steps: Int[Array, ""]
-    """Evaluations of the model with its derivatives."""
-    converged: Bool[Array, ""]
-
-
 @quick_jit
 def _with_jacobian(problem: FitProblem, x, guess):
     """Return residuals (r,) and Jacobian (r, p): all columns in one pass, in forward mode."""
@@ -187,42 +177,46 @@ def _with_jacobian(problem: FitProblem, x, guess):
     return push(jnp.eye(x.shape[0]))
 
 
-@eqx.filter_custom_jvp
-def _residuals(x, problem, guess, free):
-    r, J = _with_jacobian(problem, x, guess)
-    return r, (r, J)
-
-
-@_residuals.def_jvp
-def _residuals_jvp(primals, tangents):
-    """optimistix linearizes at every trial point, so that this is one evaluation for each."""
-    x, problem, guess, free = primals
-    r, J = _with_jacobian(problem, x, guess)
-    return (r, (r, J)), (free * (J @ tangents[0]), (None, None))
-
-
-@quick_jit
-def _iterate(problem: FitProblem, x, guess, free) -> Evaluation:
-    solution: optx.Solution[Any, Any] = optx.least_squares(
-        lambda x, args: _residuals(x, *args),
-        optx.LevenbergMarquardt(_TOLERANCE, _TOLERANCE, linear_solver=lx.SVD(rcond=_RCOND)),
-        x,
-        (problem, guess, free),
-        has_aux=True,
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    done = cast(Array, solution.result == optx.RESULTS.successful)
-    residuals, jacobian = solution.aux
-    return Evaluation(solution.value, residuals, jacobian, solution.stats["num_steps"], done)
-
-
 def evaluate(
-    problem: FitProblem, x: Float[Array, " p"], guess: LimitCycle, descend: bool = False
-) -> Evaluation:
-    """Return residuals and Jacobian at x, or at the minimum to which the iteration descends.
+    problem: FitProblem, x: Float[Array | np.ndarray, " p"], guess: LimitCycle
+) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
+    """Return residuals and Jacobian at x."""
+    return jax.device_get(_with_jacobian(problem, jnp.asarray(x), guess))
 
-    Both are one compiled function, since another would compile for as long: derivatives of zero
-    move nothing.
+
+def descend(
+    problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " r"], int, bool]:
+    """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals, number of
+    evaluations, and whether it has converged.
+
+    Steps are accepted and their damping changes as in `optimistix.LevenbergMarquardt`. Here the
+    iteration runs on the host, so that only the model is compiled.
     """
-    return _iterate(problem, x, guess, jnp.asarray(float(descend)))
+    trial, damping = x, 1.0
+    r, J = evaluate(problem, x, guess)
+    for steps in range(1, MAX_STEPS + 1):
+        if steps > 1:
+            change = trial - x
+            r_new, J_new = evaluate(problem, trial, guess)
+            predicted = (J @ change) @ (J @ change + 2 * r)
+            gain = (r_new - r) @ (r_new + r)
+            # (Rounding decides whether a step of this size is accepted.)
+            done = _small(change, trial) and _small(r_new - r, r_new)
+            if gain <= _ACCEPTED * predicted:
+                damping /= _LESS if gain < _GOOD * predicted < 0 else 1.0
+                x, r, J = trial, r_new, J_new
+            else:
+                damping *= _MORE
+            if done:
+                return x, r, steps, True
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
+            break
+        damped = np.concatenate([J, np.sqrt(damping) * np.eye(len(x))])
+        short = np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
+        trial = x - short
+    return x, r, steps, False
+
+
+def _small(change: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"]) -> bool:
+    return bool(np.all(np.abs(change) < _TOLERANCE * (1 + np.abs(x))))

@@ -50,9 +50,10 @@ def _turn(systems, map: ReturnMap, anchor: Lanes, period, wanted):
 
     def turn(*system):
         each = _one(map, *system)
-        turn = each.turn_with_jacobian(each.anchor.q[:, 0], wanted)
-        events = turn.codes.ravel(), turn.times.ravel()
-        return each.anchor, each.expected, turn._replace(codes=None, times=None), *events
+        turned = each.turn_with_jacobian(each.anchor.q[:, 0], wanted)
+        events = turned.codes.ravel(), turned.times.ravel()
+        turned = turned._replace(codes=None, times=None, record=None)
+        return each.anchor, each.expected, turned, *events
 
     return eqx.filter_vmap(turn)(systems, anchor, period)
 

@@ -227,7 +227,8 @@ def _turn_along(
         change = lambda x, v: x + step * v if eqx.is_inexact_array(x) else x  # noqa: E731
         return map.at_phase_of(jax.tree_util.tree_map(change, system, direction))
 
-    return map.departure(q), map.turn_with_jacobian(q, along=along)
+    turn = map.turn_with_jacobian(q, along=along)
+    return map.departure(q), turn._replace(record=None)
 
 
 def _rotated(sequence: Iterable[int]) -> tuple[int, ...]:

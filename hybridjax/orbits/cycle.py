@@ -344,7 +344,7 @@ def _pieces(map: ReturnMap, measure: Callable, tangents: bool = False) -> list:
     """`measure(structure, lanes, target, tape)` of each piece of one turn."""
     s, parts = map.structure, []
 
-    def flow(lanes, target, h, result):
+    def flow(lanes, target, h, result, _):
         u = np.zeros((s.nu, 1))
         options = Options(tape=True, new_input=False, tangents=tangents)
         moved, tape = move(s, lanes, u, target, map.settings, h, result, options)

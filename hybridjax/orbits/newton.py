@@ -79,14 +79,14 @@ def solve(map: ReturnMap, once_more: bool = False) -> Solution:
     has the derivatives of the cycle.
     """
     q, turn, steps = root(map, False, MAX_STEPS)
-    turn = map.turn_with_jacobian(q) if once_more else turn
-    return Solution(map.departure(q), turn, steps, map.judge(q, turn))
+    turn = map.turn_with_jacobian(q, record=turn.record) if once_more else turn
+    return Solution(map.departure(q), turn._replace(record=None), steps, map.judge(q, turn))
 
 
 @quick_jit
 def _solve_damped(map: ReturnMap) -> Solution:
     q, turn, steps = root(map, True, 2 * MAX_STEPS)
-    return Solution(map.departure(q), turn, steps, map.judge(q, turn))
+    return Solution(map.departure(q), turn._replace(record=None), steps, map.judge(q, turn))
 
 
 def newton_steps(
@@ -157,8 +157,10 @@ def _root_jvp(primals, tangents):
     q, turn, steps = root(*primals)
     fixed = jax.tree_util.tree_map(lambda _: None, map.settings)
     t_map = eqx.tree_at(lambda m: m.settings, t_map, fixed, is_leaf=lambda x: x is None)
-    _, by_parameters = eqx.filter_jvp(lambda map: map.turn(q).residual, (map,), (t_map,))
-    jacobian = map.turn_with_jacobian(q).jacobian * sizes / sizes[:, None]
+    # (The steps of the last turn are taken again: a search would take as long to compile.)
+    again = lambda map: map.turn(q, turn.record).residual  # noqa: E731
+    _, by_parameters = eqx.filter_jvp(again, (map,), (t_map,))
+    jacobian = map.turn_with_jacobian(q, record=turn.record).jacobian * sizes / sizes[:, None]
     operator = lx.MatrixLinearOperator(jacobian)
     step = lx.linear_solve(operator, by_parameters / sizes, _linear_solver(), throw=False)
     nothing = jax.tree_util.tree_map(lambda _: None, (turn, steps))

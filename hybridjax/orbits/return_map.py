@@ -20,9 +20,10 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.events import arm
-from ..engine.lanes import Lanes, start_lanes
-from ..engine.move import Options, flow_jacobian, move
+from ..engine.lanes import Lanes, Tape, start_lanes
+from ..engine.move import Options, flow_jacobian, follow, move, tape_jacobian
 from ..engine.replay import replay
+from ..engine.search.state import Recorded
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
 from ..engine.watch import Watch, slopes, watch
@@ -87,6 +88,8 @@ class Turn(NamedTuple):
     result: Int[Array, ""]
     meetings: Int[Array, ""]
     """Number of crossings of the section on which the turn ended, as far as its pieces show."""
+    record: Recorded | None
+    """The pieces, and the lengths, ends and events of their steps (K each). (None on the host.)"""
 
     @property
     def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
@@ -172,40 +175,52 @@ class ReturnMap(eqx.Module):
         other = np.arange(len(s.transitions))[:, None] != self.event
         return lanes._replace(armed=lanes.armed & other) if self.event >= 0 else lanes
 
-    def turn(self, q: Float[Array, " d"]) -> Return:
-        """One turn from a state on the section."""
+    def turn(self, q: Float[Array, " d"], record: Recorded | None = None) -> Return:
+        """One turn from a state on the section; by the steps of a `record`, from a state close to
+        its start."""
         s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
 
-        def flow(lanes, target, h, result):
+        def flow(lanes, target, h, result, piece):
+            if piece is not None:
+                return follow(s, lanes, u, target, piece, False).moved, None
             options = Options(new_input=False)
             return move(s, lanes, u, target, self.settings, h, result, options).moved, None
 
-        return self.travel(q, flow)[0]
+        return self.travel(q, flow, record)[0]
 
     def turn_with_jacobian(
         self,
         q: Float[Array, " d"],
         wanted: Bool[Array, ""] | bool = True,
         along: "Callable[[Array], ReturnMap] | None" = None,
+        record: Recorded | None = None,
     ) -> Turn:
         """One turn from a state on the section, with its derivatives.
 
         **Arguments:** `wanted`: whether derivatives with respect to the state are computed;
-        otherwise they are meaningless. `along`: the map after a step of the parameters.
+        otherwise they are meaningless. `along`: the map after a step of the parameters. `record`:
+        see `turn`.
         """
         s, xp = self.structure, namespace(q)
 
-        def flow(lanes, target, h, result):
-            jacobian, moved, tape = flow_jacobian(
-                s, lanes, target, self.settings, h, result, new_input=False, wanted=wanted
-            )
+        def flow(lanes, target, h, result, piece):
+            if piece is None:
+                jacobian, moved, tape = flow_jacobian(
+                    s, lanes, target, self.settings, h, result, new_input=False, wanted=wanted
+                )
+            else:
+                moved, tape = piece
+                jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
+                moved = moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:]))
             moves = None
             if along is not None:
                 other = along  # (known to be a function in the function below, too)
                 moves = _derivative(lambda step: self._end(other(step), lanes, target, tape))
-            return moved, (lanes, jacobian[0, 1:], moves, tape.code, tape.t)
+            steps = Tape(tape.h, tape.code, tape.t, None, None, None)
+            recorded = None if on_host(q) else Recorded(moved, steps)
+            return moved, (lanes, jacobian[0, 1:], moves, tape.code, tape.t, recorded)
 
-        end, (legs, factors, moves, codes, times) = self.travel(q, flow)
+        end, (legs, factors, moves, codes, times, recorded) = self.travel(q, flow, record)
         legs = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), legs)
         codes, valid = codes[..., 0], self.valid
         off, by_state = self.held(q)
@@ -222,6 +237,7 @@ class ReturnMap(eqx.Module):
         return Turn(
             end.residual, jacobian, legs, factors, codes, times[..., 0],
             end.period, xp.max(defect / self.sizes), end.result, self._meetings(legs, codes),
+            recorded,
         )  # fmt: skip
 
     def _end(self, other: "ReturnMap", lanes: Lanes, target: Target, tape) -> Float[Array, " d"]:
@@ -285,7 +301,9 @@ class ReturnMap(eqx.Module):
         values = lambda q: jax.lax.switch(self.anchor.chart[0], branches, q)  # noqa: E731
         return values(q), jax.jacfwd(values)(q)
 
-    def travel(self, q: Float[Array, " d"], flow: Callable) -> tuple[Return, Any]:
+    def travel(
+        self, q: Float[Array, " d"], flow: Callable, record: Recorded | None = None
+    ) -> tuple[Return, Any]:
         """One turn, piece by piece, each computed by `flow`, and the other results of `flow`.
 
         The pieces end at K - 1 times, then on the section on which the turn began.
@@ -308,13 +326,14 @@ class ReturnMap(eqx.Module):
 
         def leg(carry, end):
             lanes, h, result = carry
+            *end, piece = end
             time, index, event, limit = (x[None] for x in end)
             target = Target(time, index, event, limit, None, ends.levels, ends.missed)
-            moved, extra = flow(lanes, target, h, result)
+            moved, extra = flow(lanes, target, h, result, piece)
             return (moved.lanes, moved.h, moved.result), extra
 
         begin = self.departure(q), (0.5 * expected / LEGS)[None], xp.zeros(1, xp.int32)
-        each = ends.time, ends.index, ends.event, ends.limit
+        each = ends.time, ends.index, ends.event, ends.limit, record
         (end, _, result), extra = scan(leg, begin, each)
         same = (result[0] == Result.OK) & (end.chart[0] == self.anchor.chart[0])
         residual = xp.where(self.valid, end.q[:, 0], 0.0) - q - self.held(q)[0]

@@ -110,24 +110,44 @@ def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tu
         moved, tape = move(s, lanes, u, target, map.settings, h, result, options)
         return (moved.lanes, moved.h, moved.result), tape
 
-    def to_next(carry, k):
+    def to_next(carry, k, bound):
         i, lanes = k % N, carry[0]
-        ends = (bound.time[i] + (k // N) * period)[None], i[None], bound.event[i][None]
-        limit = lanes.t + 1.5 * period
+        time, event = bound.time[i] + (k // N) * period, bound.event[i]
+        if isinstance(bound.levels, _FromAnchor):  # at first to the anchor
+            first = k == 0
+            time, i = xp.where(first, np.inf, time), xp.where(first, N, i)
+            event = xp.where(first, np.int32(-1), event)
+        ends, limit = (time[None], i[None], event[None]), lanes.t + 1.5 * period
         target = Target(*ends, limit, None, bound.levels, Result.SECTION_MISSED)
         carry, tape = go(carry, target)
         return carry, (lanes, carry[0].t, carry[2], tape)
 
+    def onwards(carry, k):
+        carry, anchor = carry
+        bound = _bind(s, map, family, anchor, go)
+        assert isinstance(family.anchor, Crossing)
+        levels = _FromAnchor(bound.levels, family.anchor, N)
+        carry, flow = to_next(carry, k, dataclasses.replace(bound, levels=levels))
+        anchor = jax.tree_util.tree_map(lambda x, y: jnp.where(k == 0, x, y), carry[0], anchor)
+        return (carry, anchor), flow
+
     carry = begin, (0.1 * period / N)[None], xp.zeros(1, xp.int32)
-    if isinstance(family.anchor, Crossing):
-        target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
-        carry, _ = go(carry, to_section(target, family.anchor))
-        bound = _bind(s, map, family, carry[0], go)
+    if isinstance(family.anchor, Crossing) and family.points == 1 and not on_host(period):
+        # (One loop to the anchor and on to all sections: a search of its own would take a third of
+        # the time of compilation.)
+        (_, anchor), flows = scan(onwards, (carry, begin), xp.arange(N + 1))
+        bound, first = _bind(s, map, family, anchor, go), flows[2][0, 0]
+        flows = jax.tree_util.tree_map(lambda x: x[1:], flows)
     else:
-        bound = _bind(s, map, family, begin, go)
-        carry, _ = to_next(carry, xp.arange(1)[0])
-    first = carry[2][0]
-    _, flows = scan(to_next, carry, xp.arange(1, N + 1))
+        if isinstance(family.anchor, Crossing):
+            target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
+            carry, _ = go(carry, to_section(target, family.anchor))
+            bound = _bind(s, map, family, carry[0], go)
+        else:
+            bound = _bind(s, map, family, begin, go)
+            carry, _ = to_next(carry, xp.arange(1)[0], bound)
+        first = carry[2][0]
+        _, flows = scan(lambda carry, k: to_next(carry, k, bound), carry, xp.arange(1, N + 1))
     lanes, end, result, tape = _side_by_side(flows)
     normal = _normals(s, bound, lanes)
     f = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
@@ -137,6 +157,26 @@ def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tu
     with_time = xp.isinf(bound.time) & (map.base is None)
     dims = xp.asarray(s.dims)[lanes.chart] + with_time - ~flat
     return first, (bound, lanes, tape, end - lanes.t, result, drop, dims, normal)
+
+
+class _FromAnchor(AbstractLevels):
+    """The level functions of N sections, and that of their anchor with the index N."""
+
+    levels: AbstractLevels | None
+    anchor: Crossing
+    n_sections: int = eqx.field(static=True)
+
+    def present(self, s, a):
+        later = self.levels is not None and self.levels.present(s, a)
+        return later or self.anchor.in_chart(s, a)
+
+    def level(self, s, a, i, t, q):
+        N, never = self.n_sections, jnp.ones(())
+        first = self.anchor.level(s, a, t, q) if self.anchor.in_chart(s, a) else never
+        if self.levels is None or not self.levels.present(s, a):
+            return jnp.where(i == N, first, never)
+        later = self.levels.level(s, a, jnp.minimum(i, N - 1), t, q)
+        return jnp.where(i == N, first, later)
 
 
 def _side_by_side(tree):
