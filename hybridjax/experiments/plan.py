@@ -4,6 +4,7 @@ A plan gives first steps and error estimates, not control flow: experiments that
 than the cycle are integrated as accurately, perhaps in more steps.
 """
 
+import contextlib
 import dataclasses
 from typing import Annotated, NamedTuple
 
@@ -15,7 +16,7 @@ from jaxtyping import Float, Int
 
 from .._core.boundary.values import Number
 from .._core.compilation import at_ease, host_first
-from .._core.executor import Array, from_host, namespace, to_host
+from .._core.executor import Array, from_host, is_inside_program, is_traced, namespace, to_host
 from .._core.memo import Memory
 from .._core.results import Result
 from ..engine.lanes import IDLE
@@ -298,5 +299,7 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
         scales = np.concatenate([time, sizes], axis=1)
         return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
 
-    with jax.ensure_compile_time_eval():  # a plan is no part of the program that JAX traces
+    # A plan is no part of the program that JAX traces.
+    inside = is_inside_program() and not is_traced(placed)
+    with jax.ensure_compile_time_eval() if inside else contextlib.nullcontext():
         return _made.recall(placed, accuracy, make)

@@ -62,24 +62,6 @@ def test_every_block_is_counted_and_none_is_changed(studies, model, first):
     np.testing.assert_array_equal(again.design.phase, studies[1].design.phase)
 
 
-@pytest.mark.slow
-def test_blocks_of_one_design_are_as_good_as_one_block(model, first):
-    """The same experiments in one block and in two: but for the noise of each, the same problem."""
-    data = measured(model, first.realizations(2))
-    half = len(data.u) // 2
-    parts = [
-        dataclasses.replace(data, u=data.u[k], y=data.y[k], result=None)
-        for k in (slice(half), slice(half, None))
-    ]
-    study = hj.designs.Study(first, order=2, standard_error=1e-5)
-    together = study.add(data).fit
-    apart = study.add(parts[0]).add(parts[1]).fit
-    np.testing.assert_allclose(
-        apart.multipliers, together.multipliers, atol=0.1 * together.standard_errors[0]
-    )
-    np.testing.assert_allclose(apart.standard_errors, together.standard_errors, rtol=0.05)
-
-
 def test_too_much_noise_to_begin_with(model, first):
     """Equal amplitudes are repeated with other phases."""
     study = hj.designs.Study(first, order=2, standard_error=1e-3)

@@ -1,6 +1,5 @@
 """The flow under the transformations of JAX: exact derivatives through events, in both modes."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,43 +102,6 @@ def test_reverse_mode_through_an_impact_on_a_moving_paddle():
     found, value = jax.jit(jax.jacrev(lambda x: (juggler(x),) * 2, has_aux=True))(x)
     np.testing.assert_allclose(value, juggler_exact(x), rtol=1e-12)
     np.testing.assert_allclose(found, jax.jacfwd(juggler_exact)(x), rtol=1e-10, atol=1e-11)
-
-
-@pytest.mark.slow
-def test_a_section_map_in_closed_form():
-    """From the top of a flight, through an impact, to a level of the speed: vmap of forward over
-    reverse mode, and third derivatives, to which two corrections onto the event are right."""
-    system = hj.models.PaddleJuggler()
-    cycle = hj.find_limit_cycle(system, settings=Settings(1e-13, 1e-13))
-    P = hj.section_map(cycle, [hj.Crossing("v", "falling", level) for level in (0.0, 2.0)], 0, 1)
-
-    def arrival(x):
-        system = hj.models.PaddleJuggler(A=x[2], restitution=x[3])
-        end = eqx.tree_at(lambda P: P.placed.cycle.system, P, system)(x[:2], x[4], x[5])
-        return jnp.append(end.q, end.t)
-
-    def exact(x):
-        t, y, v = impact(*x)
-        rest = (v - 2.0) / 9.81
-        return jnp.stack([*fall(y, v, rest), x[5] + t + rest])
-
-    def both(f):
-        return lambda x: jax.jacfwd(lambda x: (jax.jacrev(f)(x), f(x)))(x)
-
-    def thrice(f):
-        line = lambda s: f(x[0] + s * (x[1] - x[0]))  # noqa: E731
-        return jax.jacfwd(jax.jacfwd(jax.jacfwd(line)))(0.0)
-
-    x = jnp.array([[1.3, 0.1, 0.15, 0.7, 0.05, 0.56], [1.25, 0.0, 0.16, 0.72, 0.02, 0.58]])
-    values = jax.jit(lambda: (jax.vmap(arrival)(x), *jax.vmap(both(arrival))(x), thrice(arrival)))
-    truth = (jax.vmap(exact)(x), *jax.vmap(both(exact))(x), thrice(exact))
-    for value, true, rtol in zip(values(), truth, (1e-12, 1e-9, 1e-11, 1e-8), strict=True):
-        np.testing.assert_allclose(value, true, atol=rtol * np.abs(true).max())
-    lost = jnp.array([-3.0, 0.0])
-    with pytest.raises(hj.ComputationError, match="not reached from section 0"):
-        P(lost)
-    _, slope = jax.jit(lambda q: jax.jvp(lambda q: P(q).q, (q,), (q,)))(lost)
-    assert np.isnan(slope).all()
 
 
 def hopper(x):

@@ -161,18 +161,3 @@ def test_linearization_of_a_stiff_system(damped):
     ratio = size / size[:, None]
     np.testing.assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
     np.testing.assert_allclose(B[:, 0] / size, exactly[:2, 2] / size, rtol=1e-8, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_stiff_cycle(damped):
-    """Followed in both modes, and twice; the cycle is linear in the parameter."""
-
-    def state(a):
-        return hj.find_limit_cycle(Damped(a, solver=hj.Radau()), damped).anchor.q[:, 0]
-
-    size = np.array(list(damped.scale.values()))
-    for derivative in (jax.jacfwd, jax.jacrev):
-        found = jax.jit(derivative(state))(20.0)
-        np.testing.assert_allclose(found / size, exact(1.0) / size, rtol=1e-9, atol=1e-12)
-    twice = jax.jit(jax.jacfwd(jax.jacfwd(state)))(20.0)
-    np.testing.assert_allclose(twice / size, 0.0, atol=1e-9)

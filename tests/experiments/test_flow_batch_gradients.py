@@ -76,16 +76,3 @@ def test_reverse_and_forward_mode_agree_with_differences(experiment, parameters)
     np.testing.assert_allclose(by_x, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
     true = central(lambda v: value(parameters, v[:, None])[0], u[:, 0])
     np.testing.assert_allclose(by_u[:, 0], true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
-
-
-@pytest.mark.slow
-def test_reverse_mode_stores_the_states_at_the_sections(experiment, parameters):
-    f = jax.grad(lambda x, u: loss(experiment, x, u)[0])
-
-    def memory(cycles):
-        program = jax.jit(f).lower(parameters, inputs(cycles)).compile()
-        return program.memory_analysis().temp_size_in_bytes
-
-    short, long = memory(4), memory(16)
-    assert (long - short) / (12 * N) < 512  # bytes for each section
-    assert long < 10_000_000

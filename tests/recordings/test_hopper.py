@@ -36,33 +36,6 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     assert not any(w.cause == "outputs" for w in hj.recordings.advise(data[1], fits[1]).warnings)
 
 
-@pytest.mark.slow
-def test_order_and_advice(hopper_recording, angle):
-    noisy = spoil(hopper_recording, noise=1e-3)
-    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
-    data = hj.recordings.section_data(noisy, angle, **options)
-    fit = hj.fit_series(data.records, order=2)
-    advice = hj.recordings.advise(data, fit)
-    assert hj.recordings.choose_order(data) == 2
-    assert any("plain regression (ARX) would give" in w.text for w in advice.warnings)
-    assert np.abs(advice.plain[0]) < np.abs(fit.multipliers[0])
-    assert (np.diff(advice.expected[:, 0]) <= 0).all()
-    fast = {"check": False}
-    too_many = hj.recordings.advise(data, hj.fit_series(data.records, order=3, **fast)).warnings
-    order = "Order: the data do not carry 3 multipliers"
-    assert any(repr(w).startswith(order) for w in too_many)
-    assert not any(w.cause == "order" for w in advice.warnings)
-    assert not any(w.cause == "outputs" for w in advice.warnings)
-    slow = hj.Recording(
-        noisy.trials[0].time,
-        {"u": np.sin(0.3 * noisy.trials[0].time), **dict(zip(
-            ("yM", "vM"), noisy.trials[0].values[:, 1:].T, strict=True))},
-    )  # fmt: skip
-    poor = hj.recordings.section_data(slow, angle, **options)
-    said = hj.recordings.advise(poor, hj.fit_series(poor.records, order=2, **fast)).warnings
-    assert any(w.cause == "narrow excitation" for w in said)
-
-
 def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycle):
     """Sixteen sections of four samples each, spikes in one per cent of force and outputs."""
     clean = spoil(hopper_recording, noise=1e-4)
