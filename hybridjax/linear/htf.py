@@ -73,10 +73,6 @@ Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=Tr
 # of the response are hidden.
 _SHOWN = 4
 
-# Part of the largest line of an input below which a line is rounding. Smaller: rounding counts as
-# an input. Larger: weak lines are ignored.
-_SILENT_LINE = 1e-10
-
 
 @checked
 class HTF(eqx.Module):
@@ -229,56 +225,6 @@ class HTF(eqx.Module):
             return jnp.sqrt(-np.log1p(-level) * self.variance)
         return jnp.sqrt(self.scatter.quantile(level) * self.variance)
 
-    def predict(self, u: Annotated[Numbers, Reals("n nu")]) -> Float[Array, "time ny"]:
-        """The periodic response to an input that repeats for ever.
-
-        Harmonics that are not stored count as zero. Differentiable with respect to `H`.
-
-        **Arguments:** `u` (n, nu), real, `n` a multiple of `N`, starting at section 0.
-
-        **Returns:** (n, ny).
-
-        **Raises:** `DefinitionError` if `n` is no multiple of `N`, if the harmonics are not
-        symmetric about 0, or if `u` holds a frequency that is not on the grid `f` (up to sign).
-        """
-        if is_traced(self.f, u):
-            raise DefinitionError("`predict` must know `u` and `f`: call it outside of jit.")
-        values = np.asarray(u)
-        n, nu = values.shape
-        if n == 0 or n % self.n_sections or nu != len(self.inputs):
-            raise DefinitionError(
-                f"`u` has shape {values.shape}, but needs a multiple of {self.n_sections} samples "
-                f"and {len(self.inputs)} columns."
-            )
-        mirror = self._mirror()
-        if mirror is None:
-            raise DefinitionError(
-                f"A real response needs harmonics symmetric about 0, not {self.harmonics}."
-            )
-        periods = n // self.n_sections
-        U = np.fft.fft(values, axis=0)
-        lines = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
-        # Each line or its mirror image is among the frequencies: axes of signs, lines, frequencies.
-        f = lines[:, None] / periods * np.array([1, -1])[:, None, None]
-        distance = np.abs(self._circle(np.asarray(self.f) - f))
-        measured = distance.min(axis=2, initial=np.inf) < _SAME_FREQUENCY
-        if not measured.any(axis=0).all():
-            lost = lines[~measured.any(axis=0)][0] / periods
-            raise DefinitionError(
-                f"`u` holds the frequency f = {abs(self._circle(lost)):g} cycles per period, where "
-                "the HTFs are not known."
-            )
-        rows = np.where(measured[0], *distance.argmin(axis=2))
-        H = jnp.where(
-            ~measured[0][:, None, None],
-            jnp.conj(self.H[np.array(mirror)][:, rows]),
-            self.H[:, rows],
-        )
-        parts = jnp.einsum("mkij,kj->mki", H, U[lines])
-        places = (lines + periods * np.array(self.harmonics)[:, None]) % n
-        Y = jnp.zeros((n, len(self.outputs)), complex).at[places].add(parts)
-        return jnp.fft.ifft(Y, axis=0).real
-
     def harmonic_errors(self, other: "HTF") -> Float[Array, "M ny"]:
         """Largest difference from `other` over frequencies and inputs, per harmonic and output.
 
@@ -310,12 +256,6 @@ class HTF(eqx.Module):
         if m not in self.harmonics:
             raise DefinitionError(f"Harmonic {m} is not stored; those are {self.harmonics}.")
         return self.harmonics.index(m)
-
-    def _mirror(self):
-        """The index of the negative of each harmonic, or `None` if one is not stored."""
-        rows = {m % self.n_sections: row for row, m in enumerate(self.harmonics)}
-        mirror = [rows.get(-m % self.n_sections) for m in self.harmonics]
-        return None if None in mirror else mirror
 
 
 def require_distinct(f: Float[np.ndarray, " F"]) -> None:
