@@ -73,6 +73,10 @@ Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=Tr
 # of the response are hidden.
 _SHOWN = 4
 
+# Part of the largest line of an input below which a line is rounding. Smaller: rounding counts as
+# an input. Larger: weak lines are ignored.
+_SILENT_LINE = 1e-10
+
 
 @checked
 class HTF(eqx.Module):
@@ -224,6 +228,44 @@ class HTF(eqx.Module):
         if self.scatter is None:
             return jnp.sqrt(-np.log1p(-level) * self.variance)
         return jnp.sqrt(self.scatter.quantile(level) * self.variance)
+
+    def predict(self, u: Annotated[Numbers, Reals("n nu")]) -> Float[Array, "time ny"]:
+        """The periodic response to an input that repeats for ever.
+
+        Harmonics that are not stored count as zero. Differentiable with respect to `H`.
+
+        **Arguments:** `u` (n, nu), real, `n` a multiple of `N`, starting at section 0.
+
+        **Returns:** (n, ny).
+
+        **Raises:** `DefinitionError` if `n` is no multiple of `N`, if the harmonics are not
+        symmetric about 0, or if `u` holds a frequency that is not on the grid `f` (up to sign).
+        """
+        if is_traced(self.f, u):
+            raise DefinitionError("`predict` must know `u` and `f`: call it outside of jit.")
+        (n, nu), N, u = u.shape, self.n_sections, np.asarray(u)
+        if n == 0 or n % N or nu != len(self.inputs):
+            raise DefinitionError(
+                f"`u` has shape {u.shape}, but needs a multiple of {N} samples and "
+                f"{len(self.inputs)} columns."
+            )
+        # A real system responds to -f with the conjugate of its response to f.
+        mirror = np.array([self._index(-m) for m in self.harmonics])
+        f = np.concatenate([self.f, -np.asarray(self.f)])
+        H = jnp.concatenate([self.H, jnp.conj(self.H[mirror])], axis=1)
+        U, periods = np.fft.fft(u, axis=0), n // N
+        lines = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
+        distance = np.abs(self._circle(lines[:, None] / periods - f))
+        lost = distance.min(axis=1, initial=np.inf) > _SAME_FREQUENCY
+        if lost.any():
+            raise DefinitionError(
+                f"`u` holds the frequency f = {abs(self._circle(lines[lost][0] / periods)):g} "
+                "cycles per period, where the HTFs are not known."
+            )
+        parts = jnp.einsum("mkij,kj->mki", H[:, distance.argmin(axis=1)], U[lines])
+        places = (lines + periods * np.array(self.harmonics)[:, None]) % n
+        Y = jnp.zeros((n, len(self.outputs)), complex).at[places].add(parts)
+        return jnp.fft.ifft(Y, axis=0).real
 
     def harmonic_errors(self, other: "HTF") -> Float[Array, "M ny"]:
         """Largest difference from `other` over frequencies and inputs, per harmonic and output.

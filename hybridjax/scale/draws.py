@@ -13,7 +13,7 @@ from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable
 from .._core.progress import working
 from ..errors import ComputationError, DefinitionError
-from .wanted import as_numbers, require_form
+from .wanted import as_numbers, form, stacked
 
 
 # Pieces of a call, unless `chunk` is given. Fewer: more is lost with a worker. More: many small
@@ -91,7 +91,7 @@ class Draws:
 
     def begin(self) -> tuple["Draws", Layout]:
         """Return the job with the form of its results."""
-        variables = self.first()
+        variables = self.first() | {"failed": Variable("<i8")}
         number: dict[str, Any] = {"draw": (("draw",), np.arange(self.blocks.shape[0]), {})}
         layout = Layout(("draw",), self.blocks, variables, number, ("draw",), self.description)
         return dataclasses.replace(self, variables=variables), layout
@@ -106,48 +106,37 @@ class Draws:
 
     def first(self) -> dict[str, Variable]:
         """Return the form of results, from the first draw that succeeds."""
-        failure = None
+        values = None
         for i in range(*self.blocks.shape):
-            try:
-                values = self._draw(i)
-            except ComputationError as error:
-                failure = error
-                continue
-            variables = {
-                name: Variable(x.dtype.str, tuple(f"{name}_{j}" for j in range(x.ndim)), x.shape)
-                for name, x in values.items()
-            }
-            return variables | {"failed": Variable("<i8")}
-        raise ComputationError(f"all draws failed, the last because {failure}")
+            values = self._draw(i)
+            if isinstance(values, dict):
+                return {name: form(name, x) for name, x in values.items()}
+        raise ComputationError(f"all draws failed, the last because {values}")
 
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
         """Return the draws of piece k."""
         (rows,) = self.blocks.slices(k)
-        count = rows.stop - rows.start
-        drawn = {
-            name: np.full((count, *x.shape), x.fill, x.dtype) for name, x in self.variables.items()
+        drawn = [self._draw(i) for i in range(rows.start, rows.stop)]
+        failed = [isinstance(values, ComputationError) for values in drawn]
+        names = self.variables.keys() - {"failed"}
+        other = {x for values in drawn if isinstance(values, dict) for x in values.keys() ^ names}
+        if other:
+            raise DefinitionError(
+                f"`function` must always give the same names, but `{min(other)}` only "
+                "in some draws."
+            )
+        return {"failed": np.array(failed, int)} | {
+            name: stacked(name, [x[name] if isinstance(x, dict) else None for x in drawn], variable)
+            for name, variable in self.variables.items()
+            if name != "failed"
         }
-        for i in range(count):
-            try:
-                values = self._draw(rows.start + i)
-            except ComputationError:
-                drawn["failed"][i] = 1
-                continue
-            drawn["failed"][i] = 0
-            other = {*values, "failed"} ^ {*drawn}
-            if other:
-                raise DefinitionError(
-                    f"`function` must always give the same names, but `{min(other)}` only in some "
-                    "draws."
-                )
-            for name, x in values.items():
-                require_form(name, x, self.variables[name])
-                drawn[name][i] = x
-        return drawn
 
-    def _draw(self, i: int) -> dict[str, np.ndarray]:
+    def _draw(self, i: int) -> dict[str, np.ndarray] | ComputationError:
         stream = np.random.SeedSequence(self.seed, spawn_key=(i,))
-        values = self.function(np.random.default_rng(stream))
+        try:
+            values = self.function(np.random.default_rng(stream))
+        except ComputationError as error:
+            return error
         named = values if isinstance(values, Mapping) else {"value": values}
         if not named.keys().isdisjoint(("failed", "draw")):
             raise DefinitionError("results of `function` cannot be named `failed` or `draw`.")

@@ -108,6 +108,7 @@ def linear(t):
     yield htf.__getitem__, dict(m=0)
     yield htf.select, dict(harmonics=0)
     yield htf.confidence_radius, {}
+    yield htf.predict, dict(u=u)
     for name in ("error", "harmonic_errors"):
         yield getattr(htf, name), dict(other=t.exact)
 

@@ -1,5 +1,6 @@
-"""Harmonic transfer functions: exact values, three independent ways, bad input."""
+"""Harmonic transfer functions: exact values, three independent ways, prediction, bad input."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.test_util
@@ -68,6 +69,18 @@ def test_three_ways_agree(seed, shape, f):
     np.testing.assert_allclose(htf.H[:, 0, :, j], Y[lines] / U[k], rtol=0, atol=1e-12)
 
 
+@settings(max_examples=4)
+@given(seeds, st.sampled_from(SHAPES[:2]))
+def test_prediction_is_the_periodic_response(seed, shape):
+    dims, ny, nu = shape
+    N, P = len(dims), 4
+    ldtp = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
+    u = np.random.default_rng(seed).normal(size=(P * N, nu))
+    y = ldtp.simulate(u, ldtp.periodic_state(u, P))
+    htf = ldtp.htf(np.arange(P * N // 2 + 1) / P)  # negative frequencies by symmetry
+    np.testing.assert_allclose(htf.predict(u), y, rtol=0, atol=1e-11)
+
+
 def test_derivatives(synthetic):
     f = np.array([0.4, 1.7])
 
@@ -78,6 +91,18 @@ def test_derivatives(synthetic):
 
     arrays = (synthetic.A, synthetic.B, synthetic.C, synthetic.D, f)
     jax.test_util.check_grads(values, arrays, order=1, modes=("rev",), eps=1e-6)
+    u = np.cos(2 * np.pi * 0.5 * np.arange(12) / 6)[:, None] * np.ones(2)
+
+    def loss(htf):
+        return jnp.sum(htf.predict(u) ** 2)
+
+    htf = synthetic.htf([0.5])
+    gradient = eqx.filter_grad(lambda H: loss(eqx.tree_at(lambda h: h.H, htf, H)))(htf.H)
+    bump = np.zeros(htf.H.shape)
+    bump[2, 0, 1, 0] = 1e-6
+    up, down = (loss(eqx.tree_at(lambda h: h.H, htf, htf.H + s * bump)) for s in (1, -1))
+    slope = np.asarray(gradient)[2, 0, 1, 0].real
+    np.testing.assert_allclose((up - down) / 2e-6, slope, rtol=1e-6)
 
 
 def test_a_multiplier_on_the_unit_circle_is_named():
