@@ -188,6 +188,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
     trials = escape(", ".join(t.name for t in recording.trials))
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(found).items() if amount}
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
+    expected = zip(found.advice.strides, found.advice.expected, strict=True)
     parts = [
         "<h1>Floquet multipliers from a recording</h1>",
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
@@ -199,6 +200,12 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         f"<ul>{notes}</ul>" if notes else "",
         html.card("Phase", "", html.text(repr(found.phase))),
         data._repr_html_(),
+        html.card(
+            "Standard errors to be expected from more strides", "", html.table(
+                ("strides", *map(html.complex_number, found.fit.multipliers)),
+                [(str(n), *(f"{e:.1e}" for e in errors)) for n, errors in expected],
+            ),
+        ),
         "<p>A multiplier is the factor by which a deviation from the average cycle changes in one "
         "cycle. A modulus below 1 is stable; the smaller, the faster the return.</p>",
         "<p>For the validation, a model of most strides is simulated on the strides that were held "

@@ -1,11 +1,11 @@
-"""Reasons to doubt a fit to recorded data."""
+"""Reasons to doubt a fit to recorded data, and how many strides a better one needs."""
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
 from .._core.results import Result
@@ -41,11 +41,15 @@ class Advice(eqx.Module):
     - `warnings`: findings about the data and the fit; none if there is no reason for doubt.
     - `plain` (d,): the multipliers from plain regression (ARX).
     - `band`: for each input the frequency (cycles per period) up to which it had power.
+    - `strides`: numbers of strides. `expected` (k, d): the standard errors of the multipliers that
+      so many strides like these would give.
     """
 
     warnings: tuple[Finding, ...]
     plain: Complex[np.ndarray, " d"]
     band: tuple[float, ...] = eqx.field(static=True)
+    strides: tuple[int, ...] = eqx.field(static=True)
+    expected: Float[np.ndarray, "k d"]
 
     def __repr__(self) -> str:
         return print_findings(self.warnings) or "Nothing speaks against the fit."
@@ -109,7 +113,12 @@ def advise(
             text = f"{count} samples of {name} stuck out of all around them, and were left out."
             warnings.append(Finding("spikes", text))
     warnings += () if curve is None else curve.warnings
-    return Advice(tuple(warnings), plain, tuple(band))
+    # Variances decrease with the number of strides beyond that of the unknowns.
+    strides = (100, 300, 1000, 3000)
+    later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
+    with np.errstate(divide="ignore"):
+        expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
+    return Advice(tuple(warnings), plain, tuple(band), strides, expected)
 
 
 def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:
