@@ -211,7 +211,7 @@ def _matches(value: Any, hint: Any) -> bool:
         return isinstance(value, tuple) and all(_matches(x, arguments[0]) for x in value)
     if hint is int:  # none that is larger than a header may declare
         whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        return whole and abs(value) <= limits.PERIODS
+        return whole and bool(abs(value) <= limits.PERIODS)
     return isinstance(value, hint)
 
 

@@ -167,7 +167,8 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> 
         bars.append(np.stack([point - _BAR * along, point + _BAR * along]))
         if i % step == 0:  # at the end of the bar that is outside of the loop
             outwards = np.sign(along / unit @ ((point - center) / unit)) or 1.0
-            ax.text(*(point + 2 * _BAR * outwards * along), str(i), **_NUMBER)
+            x, y = point + 2 * _BAR * outwards * along
+            ax.text(x, y, str(i), **_NUMBER)
     bars = np.stack(bars)
     gaps = np.full((len(bars), 1), np.nan)
     flat = [np.hstack([bars[..., k], gaps]).ravel() for k in (0, 1)]

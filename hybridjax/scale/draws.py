@@ -91,7 +91,7 @@ class Draws:
 
     def begin(self) -> tuple["Draws", Layout]:
         """Return the job with the form of its results."""
-        variables = self.first() | {"failed": Variable("<i8")}
+        variables = self.first()
         number: dict[str, Any] = {"draw": (("draw",), np.arange(self.blocks.shape[0]), {})}
         layout = Layout(("draw",), self.blocks, variables, number, ("draw",), self.description)
         return dataclasses.replace(self, variables=variables), layout
@@ -116,19 +116,18 @@ class Draws:
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
         """Return the draws of piece k."""
         (rows,) = self.blocks.slices(k)
-        drawn = [self._draw(i) for i in range(rows.start, rows.stop)]
-        failed = [isinstance(values, ComputationError) for values in drawn]
-        names = self.variables.keys() - {"failed"}
-        other = {x for values in drawn if isinstance(values, dict) for x in values.keys() ^ names}
+        lost = dict.fromkeys(self.variables) | {"failed": np.array(1)}
+        drawn = map(self._draw, range(rows.start, rows.stop))
+        drawn = [lost if isinstance(values, ComputationError) else values for values in drawn]
+        other = {name for values in drawn for name in values.keys() ^ lost.keys()}
         if other:
             raise DefinitionError(
-                f"`function` must always give the same names, but `{min(other)}` only "
-                "in some draws."
+                f"`function` must always give the same names, but `{min(other)}` only in some "
+                "draws."
             )
-        return {"failed": np.array(failed, int)} | {
-            name: stacked(name, [x[name] if isinstance(x, dict) else None for x in drawn], variable)
-            for name, variable in self.variables.items()
-            if name != "failed"
+        return {
+            name: stacked(name, [values[name] for values in drawn], x)
+            for name, x in self.variables.items()
         }
 
     def _draw(self, i: int) -> dict[str, np.ndarray] | ComputationError:
@@ -140,4 +139,5 @@ class Draws:
         named = values if isinstance(values, Mapping) else {"value": values}
         if not named.keys().isdisjoint(("failed", "draw")):
             raise DefinitionError("results of `function` cannot be named `failed` or `draw`.")
-        return {name: as_numbers(name, value) for name, value in named.items()}
+        numbers = {name: as_numbers(name, value) for name, value in named.items()}
+        return numbers | {"failed": np.array(0)}
