@@ -48,20 +48,16 @@ class Wanted:
         values = self._values(cycles)
         for name, measure in self.measures.items():
             values[name] = self._first(cycles, name, measure)[None]
-        dims = {"state": "state_name", "multipliers": "multiplier"}
+        dims = {"state": ("state_name",), "multipliers": ("multiplier",)}
         attributes = {
             "result": _flags([x.name.lower() for x in Result], [int(x) for x in Result]),
             "period": {"units": self._time_unit} if self._time_unit else {},
             "chart": _flags(self._charts),
         }
+        forms = {name: form(name, x[0]) for name, x in values.items()}
         return {
-            name: Variable(
-                x.dtype.str,
-                (dims[name],) if name in dims else tuple(f"{name}_{i}" for i in range(x.ndim - 1)),
-                x.shape[1:],
-                attributes.get(name, {}),
-            )
-            for name, x in values.items()
+            name: x._replace(dims=dims.get(name, x.dims), attributes=attributes.get(name, {}))
+            for name, x in forms.items()
         }
 
     def constants(self) -> dict[str, Constant]:

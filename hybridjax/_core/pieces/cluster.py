@@ -61,7 +61,7 @@ def _run(client: Client, job: Any, store: ZarrStore, missing: Sequence[int]) -> 
     packed = cloudpickle.dumps((job, address))
     x64 = bool(jax.config.read("jax_enable_x64"))
     # Dask gives out the tasks again that a lost worker had, and what they need.
-    needed = client.submit(_unchanged, packed, pure=False)
+    needed = client.submit(bytes, packed, pure=False)
     tasks = client.map(_piece, missing, packed=needed, x64=x64, pure=False)
     pieces = dict(zip(tasks, missing, strict=True))
     del tasks  # a task whose result is written is forgotten
@@ -80,10 +80,6 @@ def _run(client: Client, job: Any, store: ZarrStore, missing: Sequence[int]) -> 
     finally:
         if client.status == "running":
             client.cancel(list(pieces))
-
-
-def _unchanged(packed: bytes) -> bytes:
-    return packed
 
 
 def _check_packages(client: Client) -> None:
