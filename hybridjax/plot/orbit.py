@@ -44,7 +44,7 @@ def cycle(
 
     **Arguments:**
 
-    - `x`, `y`: names of states or outputs; by default the first two states that every chart has.
+    - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
     - `sections`: from `place_sections`, drawn as bars; about 8 are numbered, where there is room.
     - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
     - `ax`: where to draw; a new figure of one column's width by default.
