@@ -51,8 +51,8 @@ class LDTP(eqx.Module):
     - `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d): the matrices, padded with zeros.
     - `D` (N, ny, nu): feed-through; `None` means zero.
     - `dims` (N,): the true dimension of each `x[n]`; `None` means `d` everywhere.
-    - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`; by default `u`, `y`, or
-      `u0, u1, ...` where there are several.
+    - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`. Default: `u` and `y`, or
+      `u0, u1, ...` for several.
     - `coordinates`: names of the coordinates at each section, for documentation.
 
     **Raises:** `DefinitionError` for shapes, names or dimensions that do not fit, for entries
@@ -179,8 +179,8 @@ class LDTP(eqx.Module):
     ) -> Float[Array, "time d"]:
         """The states that an input leads to.
 
-        **Arguments:** `u` (n, nu), the input from `first_section` on; `x0`, the state there,
-        either padded (d,) or with its true dimension; by default zero.
+        **Arguments:** `u` (n, nu), the input from `first_section` on; `x0`, the state there, either
+        padded (d,) or with its true dimension. Default: zero.
 
         **Returns:** (n + 1, d), padded with zeros, `x0` first.
         """

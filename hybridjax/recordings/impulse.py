@@ -65,7 +65,8 @@ def impulse_responses(
 
     **Arguments:**
 
-    - `fit`: fit to the `data`, whose period gives the area of an input held for one section.
+    - `fit`: the fit. `data`: the data that were fitted; their period gives the area of an input
+      held for one section.
     - `cycles`: duration of the responses. Default: 3, or longer if the push is wide.
     - `width`: standard deviation of the push (Gaussian), in cycles. 0: the push is held for one
       section. Default: the smallest width for which the spectrum of the push lies in the band of

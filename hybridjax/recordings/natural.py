@@ -108,12 +108,11 @@ def natural_multipliers(
 ) -> NaturalMultipliers:
     r"""Estimate Floquet multipliers from variability alone: output-only identification.
 
-    The return map of every section is estimated from how deviations continue into the next cycle,
-    as in the Floquet analysis of gait (Hurmuzlu and Basdogan 1994). Disturbances of the rhythm are
-    unknown, and taken as independent from cycle to cycle. The state at a section consists of all
-    outputs there and at the section before, in the `order` combinations that vary most. All
-    sections have the same multipliers: the coefficients of their characteristic polynomials are
-    averaged.
+    The return map of every section is estimated from the deviations in successive cycles, as in the
+    Floquet analysis of gait (Hurmuzlu and Basdogan 1994). Disturbances of the rhythm are unknown,
+    and taken as independent from cycle to cycle. The state at a section consists of all outputs
+    there and at the section before, in the `order` combinations that vary most. All sections have
+    the same multipliers: the coefficients of their characteristic polynomials are averaged.
 
     The mean of each record is estimated, which biases the multipliers if there are few cycles. This
     bias is corrected to first order in the inverse number of cycles (Pope 1990). Measurement noise

@@ -313,7 +313,7 @@ class Design(eqx.Module):
             return 4 * noise**2 / (samples * power)
 
     def cycles(self, discard: Index = DISCARD) -> int:
-        """Return the cost of the design: cycles of all experiments, each with `discard` more."""
+        """Return the number of cycles of all experiments, with `discard` more cycles in each."""
         return self.experiments * (self.periods + discard)
 
     def crest_factors(self) -> Float[np.ndarray, " S"]:

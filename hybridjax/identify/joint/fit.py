@@ -222,7 +222,7 @@ def fit_ldtp(
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data
-    than unknowns, outputs that do not answer the inputs, or records with `lead`.
+    than unknowns, outputs that do not respond to the inputs, or records with `lead`.
     """
     require_x64()
     if not isinstance(data, HTF):
