@@ -52,12 +52,13 @@ class Scatter(eqx.Module):
     def quantile(self, level: Probability) -> Float[Array, "*M F ny nu"]:
         r"""Quantile of $|\delta H|^2 / v$ at this probability.
 
-        The quantile is $\nu (\alpha^{-1/\nu} - 1)$ (Fisher's $F_{2, 2\nu}$) with $\alpha = (1 -
-        p)(1 + p^2 (w - 1))$ for the level p and the roundness w. For Gaussian errors the shape of
-        the sample is independent of its mean (Basu, Sankhya 1955). Therefore discs have the stated
-        coverage for any w whose mean is one. Errors of equal moduli and random phases lie on a
-        circle around zero. If the mean of a few of them is large, they lie on an arc, nearly on a
-        line, and w is small.
+        The quantile is $\nu (\alpha^{-1/\nu} - 1)$ (Fisher's $F_{2, 2\nu}$). If the roundness w is
+        None, $\alpha = 1 - p$ for the level p, otherwise $\alpha = (1 - p)(1 + p^2 (w - 1))$: the
+        flatter the sample, the larger the quantile. For Gaussian errors the shape of the sample is
+        independent of its mean (Basu, Sankhya 1955). Therefore discs have the stated coverage for
+        any w whose mean is one. Errors of equal moduli and random phases lie on a circle around
+        zero. If the mean of a few of them is large, they lie on an arc, nearly on a line, and w is
+        small.
         """
         miss = 1 - level
         if self.roundness is not None:
