@@ -117,7 +117,7 @@ def panels(
     **Raises:** `DefinitionError` for another number of Axes.
     """
     if ax is None:
-        size = {"figsize": (width, height), "layout": "constrained", "squeeze": False}
+        size: Any = {"figsize": (width, height), "layout": "constrained", "squeeze": False}
         with style():
             axes = pyplot.subplots(rows, columns, **size, **options)[1]
             for panel in axes.flat:  # here, since ticks are made when the figure is drawn
