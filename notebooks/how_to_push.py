@@ -77,13 +77,6 @@ hj.plot.spectrum(study.plan, study.fit)
 study.plan
 
 # %% [markdown]
-# And this is where one learns: in a few lines, and (for each output) at some phases of the stride
-# more than at others.
-
-# %%
-hj.plot.information(hj.designs.information_map(study.fit, study.design, noise=study.noise))
-
-# %% [markdown]
 # ## Push, look, and push again
 #
 # Each block is designed from all that was measured before, and the study ends as soon as the

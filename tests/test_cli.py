@@ -22,7 +22,7 @@ def _python(*arguments):
     [
         ("--version", f"hybridjax {hj.__version__}\n"),
         ("--help", "usage: hybridjax"),
-        ("reproduce --help", "--amplitude"),
+        ("reproduce --help", "--seed"),
         ("identify --help", "--crossing"),
         ("sweep --help", "--over"),
     ],
@@ -40,7 +40,7 @@ def test_help_does_not_import_jax(arguments, text):
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduce")
-    options = ["--quick", "--out", str(out), "--param", "M=2.0", "--formats", "png,svg"]
+    options = ["--quick", "--out", str(out), "--formats", "png,svg"]
     run = _python("-m", "hybridjax", "reproduce", *options)
     assert run.returncode == 0, run.stderr
     return out
@@ -81,10 +81,8 @@ def alone(*_):
 
 
 def test_reproduce_draws_its_figures(tmp_path):
-    """By a small protocol of one family of sections."""
-    protocol = Protocol(("isochron",), experiments=20, cycles=28, keep=8, n_sections=8)
-    reproduce(tmp_path, protocol, ("png", "svg"), alone())
-    names = ["fig1_cycle_isochron", "fig3_harmonics", "fig4_bode"]
+    reproduce(tmp_path, Protocol(20, 28, 8), ("png", "svg"), alone())
+    names = ["fig1_cycle_isochron", "fig1_cycle_kinematic", "fig3_harmonics", "fig4_bode"]
     for name in (*names, "multipliers", "poles_zeros"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
         assert "<svg" in (tmp_path / f"{name}.svg").read_text()
@@ -95,35 +93,19 @@ def test_reproduce_draws_its_figures(tmp_path):
 SECOND_PROCESS = "hybridjax.apps.second_process.second_process"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--param q=1", "no parameter 'q'; parameters are m, M"),
-        ("--param M=nan", "VerticalHopper: `M` must be a finite number"),
-        ("--experiments 10", "need at least 20 experiments"),
-        ("--quick --keep 36", "leaves no cycle to discard"),
-        ("--out /dev/null/x", "cannot write to '/dev/null/x'"),
-    ],
-)
-def test_bad_input_is_one_sentence(tmp_path, monkeypatch, arguments, message):
+def test_bad_input_is_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr(SECOND_PROCESS, alone)
-    with pytest.raises(SystemExit) as error:
-        main(["reproduce", "--out", str(tmp_path / "new" / "er"), *arguments.split()])
-    assert message in str(error.value) and "\n" not in str(error.value)
-    assert not list(tmp_path.iterdir())
+    with pytest.raises(SystemExit, match="^hybridjax: cannot write to '/dev/null/x'.*") as error:
+        main(["reproduce", "--out", "/dev/null/x"])
+    assert "\n" not in str(error.value)
 
 
 WRONG = {
     "reproduce": {
         "": "required: --out",
-        "--out x --param M": "'M' is not NAME=VALUE with a number",
-        "--out x --param M=1 --param M=2": "--param gives a parameter twice",
-        "--out x --cycles 0": "--cycles: '0' is not a whole number from 1 to",
-        "--out x --experiments 1000000000000": "--experiments: '1000000000000' is not a whole",
         "--out x --seed -1": "--seed: '-1' is not a whole number from 0 on",
         "--out x --formats gif": "--formats: 'gif' is not one or more of png, pdf, svg",
         "--out=": "--out: '' is not a name",
-        "--out x --amplitude 0": "--amplitude: '0' is not a positive number",
     },
     "identify x.csv --out x --input u --outputs y": {
         "": "one of the arguments --phase --crossing --event is required",
@@ -132,6 +114,8 @@ WRONG = {
         "--event e --center 1,2": "--center and --scale are of the angle of --phase",
         "--phase y,v --center 1": "--center: '1' is not two numbers",
         "--phase y,v --scale 1,-2": "--scale: '1,-2' is not two positive numbers",
+        "--event e --order 1000000000000": "--order: '1000000000000' is not a whole number",
+        "--event e --bandwidth 0": "--bandwidth: '0' is not a positive number",
         "--event e --sections 8.5": "--sections: '8.5' is not a whole number from 1 to",
         "--crossing y:up": "'y:up' is not a signal, a direction and a value",
         "--crossing y:rising:nan": "'y:rising:nan' is not a signal, a direction and a value",
@@ -170,12 +154,8 @@ def protocols(monkeypatch):
     return asked
 
 
-def test_explicit_sizes_win(protocols):
-    for options, sizes in {
-        "": (80, 84, 64),
-        "--quick --experiments 25": (25, 36, 16),
-        "--keep 17 --cycles 40 --quick": (20, 40, 17),
-    }.items():
+def test_the_short_form_has_other_sizes(protocols):
+    for options, sizes in {"": (80, 84, 64), "--quick": (20, 36, 16)}.items():
         assert main(["reproduce", "--out", "x", *options.split()]) == 0
         protocol = protocols.pop()
         assert (protocol.experiments, protocol.cycles, protocol.keep) == sizes

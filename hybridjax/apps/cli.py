@@ -13,14 +13,6 @@ from .._core import limits
 from .._core.writing import Format
 
 
-# Sizes of the paper's protocol, and of its short form.
-_SIZES = {
-    "experiments": ("S", "number of experiments", 80, 20),
-    "cycles": ("C", "cycles in each experiment", 84, 36),
-    "keep": ("P", "last cycles used for estimation", 64, 16),
-}
-
-
 def _between(convert: Callable[[str], Any], low: Any, high: Any = math.inf) -> Callable:
     """A function that converts a text to a number between two bounds."""
 
@@ -77,7 +69,6 @@ _crossing = _option(
     r"\s*([^:]*[^:\s])\s*(?::(rising|falling)(?::(.*))?)?",
     str, lambda direction: direction or "rising", lambda value: _FINITE(value or "0"),
 )  # fmt: skip
-_assignment = _option("NAME=VALUE with a number", "([^=]*)=(.*)", str.strip, float)
 _format = "|".join(get_args(Format))
 _formats = _option(
     f"one or more of {', '.join(get_args(Format))}", f"((?:{_format})(?:, *(?:{_format}))*)",
@@ -132,22 +123,12 @@ def _add_reproduce(commands) -> None:
     add = reproduce.add_argument
     add("--out", required=True, type=_place, metavar="DIR",
         help="folder for the results; made if needed")  # fmt: skip
-    add("--family", choices=("isochron", "kinematic", "both"), default="both",
-        help="Poincaré sections (default: %(default)s)")  # fmt: skip
-    for name, (metavar, what, paper, quick) in _SIZES.items():
-        add(f"--{name}", type=_count, metavar=metavar,
-            help=f"{what} (default: {paper}; {quick} with --quick)")  # fmt: skip
-    add("--sections", type=_count, default=32, metavar="N",
-        help="sections in each cycle (default: %(default)s)")  # fmt: skip
-    add("--amplitude", type=_positive, default=0.01, metavar="A",
-        help="of each cosine, in N (default: %(default)s)")  # fmt: skip
     add("--seed", type=_seed, default=0,
         help="of the random subsets and phases (default: %(default)s)")  # fmt: skip
-    add("--param", action="append", default=[], metavar="NAME=VALUE", type=_assignment,
-        help="change a parameter of the hopper, e.g. M=1.8; may be repeated")  # fmt: skip
-    add("--quick", action="store_true", help="a short form, with other defaults")
+    add("--quick", action="store_true", help="a short form: 20 experiments of 36 cycles, of which "
+        "16 are used, in place of 80 experiments of 84, of which 64 are used")  # fmt: skip
     _add_formats(reproduce)
-    reproduce.set_defaults(run=_reproduce, parser=reproduce)
+    reproduce.set_defaults(run=_reproduce)
 
 
 def _add_formats(command) -> None:
@@ -210,7 +191,6 @@ def _add_sweep(commands) -> None:
         help="period, state, multipliers, spectral_radius, events, residual; with "
         "commas (default: spectral_radius,period)")  # fmt: skip
     add("--out", required=True, type=_place, metavar="STORE", help="the Zarr store, e.g. map.zarr")
-    add("--scheduler", metavar="ADDRESS", help="of a Dask cluster that does the work")
     add("--force", action="store_true", help="also more than 50 million points")
     sweep.set_defaults(run=_sweep, parser=sweep)
 
@@ -272,27 +252,13 @@ def _identify(options) -> int:
 
 
 def _reproduce(options) -> int:
-    parameters = dict(options.param)
-    if len(parameters) < len(options.param):
-        options.parser.error("--param gives a parameter twice")
     from .second_process import second_process
 
     with second_process("hybridjax.apps.reproduce", "hybridjax.plot.plane") as process:
         from .reproduce import Protocol, reproduce
 
-        sizes = {
-            name: getattr(options, name) or (quick if options.quick else paper)
-            for name, (_, _, paper, quick) in _SIZES.items()
-        }
-        both = ("isochron", "kinematic")
-        protocol = Protocol(
-            families=both if options.family == "both" else (options.family,),
-            n_sections=options.sections,
-            amplitude=options.amplitude,
-            seed=options.seed,
-            parameters=parameters,
-            **sizes,
-        )
+        sizes = (20, 36, 16) if options.quick else (80, 84, 64)
+        protocol = Protocol(*sizes, options.seed)
         summary = reproduce(options.out, protocol, options.formats, process)
     return _status(all(family["converged"] for family in summary["families"].values()))
 

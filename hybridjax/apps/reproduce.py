@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from .._core.archive import write_module
 from .._core.cache import enable_compilation_cache
@@ -18,7 +18,7 @@ from .._core.precision import enable_x64
 from .._core.writing import Format, results_folder
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
-from ..errors import ComputationError, DefinitionError
+from ..errors import ComputationError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import paper_design
 from ..experiments.run import run_experiments
@@ -35,26 +35,24 @@ from ..sections.families import AbstractSections, ClockPhase, KinematicPhase
 from ..sections.linearize import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
-from ..systems.system import own_fields
 from .paper_report import OUTPUTS, summarize, table
 
 
-# Results of each family that are written: the model, HTFs and fits.
+_FAMILIES = "isochron", "kinematic"
 _SAVED = ("ldtp", "exact", "estimate", "rational", "structured")
 
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """The sizes and parameters of a run. The defaults are the paper's."""
+    """The sizes of a run. The defaults are the paper's."""
 
-    families: tuple[str, ...] = ("isochron", "kinematic")
     experiments: int = 80
     cycles: int = 84
+    """Cycles in each experiment,"""
     keep: int = 64
-    n_sections: int = 32
-    amplitude: float = 0.01
+    """the last of which are used for estimation."""
     seed: int = 0
-    parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Of the random subsets and phases of the design."""
 
 
 class Family(NamedTuple):
@@ -89,40 +87,44 @@ def reproduce(
 
     **Returns:** what `summary.json` holds.
 
-    **Raises:** `DefinitionError` for a protocol that cannot be carried out, a folder that cannot be
-    written, or one in which another file has the name of a result; `ComputationError` if a step
-    fails.
+    **Raises:** `DefinitionError` for a folder that cannot be written, or one in which another file
+    has the name of a result; `ComputationError` if a step fails.
     """
-    names = _names(protocol.families, formats)
+    names = _names(formats)
     with results_folder(Path(out), "reproduce", names) as folder:
         return _reproduce(folder, protocol, formats, process)
 
 
-def _names(families: Sequence[str], formats: Sequence[Format]) -> list[str]:
+def _names(formats: Sequence[Format]) -> list[str]:
     """Return the names of all files that are written."""
-    cycles = [f"fig1_cycle_{family}" for family in families]
+    cycles = [f"fig1_cycle_{family}" for family in _FAMILIES]
     figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
     files = [f"{figure}.{format}" for figure in figures for format in formats]
-    saved = [f"{result}_{family}.npz" for family in families for result in _SAVED]
+    saved = [f"{result}_{family}.npz" for family in _FAMILIES for result in _SAVED]
     return ["summary.json", *saved, *files]
 
 
 def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process: Executor) -> dict:
     _set_up()
     begin = time.time()
-    hopper = _hopper(protocol.parameters)
-    design = _design(protocol)
+    # Lines without second-order products on them need many experiments.
+    division = "sum-free" if protocol.experiments >= 80 else "random"
+    design = paper_design(
+        periods=protocol.keep, seed=protocol.seed, division=division,
+        experiments=protocol.experiments,
+    )  # fmt: skip
     _log(begin, f"design: {design.experiments} experiments, {len(design.f)} frequencies")
-    cycle = _find(hopper)
+    cycle = find_limit_cycle(VerticalHopper())
     multipliers = ", ".join(f"{z:.9f}" for z in cycle.multipliers)
     _log(begin, f"limit cycle: period {float(cycle.period):.6g}, multipliers {multipliers}")
 
     # The second process identifies the second family, and then draws the figures that take longer.
-    first, *second = protocol.families
-    tasks = [process.submit(_identify, name, cycle, design, protocol, begin) for name in second]
-    families = {first: _identify(first, cycle, design, protocol, begin)}
+    discard = protocol.cycles - protocol.keep
+    first, second = _FAMILIES
+    task = process.submit(_identify, second, cycle, design, discard, begin)
+    families = {first: _identify(first, cycle, design, discard, begin)}
     perturbed = _perturbed(cycle)
-    families |= {name: task.result() for name, task in zip(second, tasks, strict=True)}
+    families[second] = task.result()
     drawing = process.submit(_draw, _comparisons, (cycle, families), out, formats, begin)
     placed = {name: family.placed for name, family in families.items()}
     _draw(_cycles, (placed, perturbed), out, formats, begin)
@@ -142,41 +144,6 @@ def _set_up() -> None:
     enable_compilation_cache()
 
 
-def _hopper(parameters: Mapping[str, float]) -> VerticalHopper:
-    names = [x.name for x in own_fields(VerticalHopper)]
-    for name in parameters:
-        if name not in names:
-            raise DefinitionError(
-                f"the hopper has no parameter '{name}'; parameters are {', '.join(names)}."
-            )
-    return VerticalHopper(**cast(dict[str, Any], parameters))
-
-
-def _design(protocol: Protocol) -> Design:
-    """Return the paper's design, without second-order products on the lines if there is room."""
-    if protocol.keep >= protocol.cycles:
-        raise DefinitionError(
-            f"--keep {protocol.keep} of --cycles {protocol.cycles} leaves no cycle to discard: the "
-            "transient must die out first."
-        )
-    f_max = min(10.0, protocol.n_sections / 2 - 1 / protocol.keep)
-    cosines = 2 * f_max * protocol.keep / protocol.experiments
-    room = cosines <= protocol.keep / 4  # a quarter of the classes in each experiment
-    return paper_design(
-        protocol.n_sections, protocol.keep, (0.0, f_max), protocol.amplitude, protocol.seed,
-        division="sum-free" if room else "random", experiments=protocol.experiments,
-    )  # fmt: skip
-
-
-def _find(hopper: VerticalHopper) -> LimitCycle:
-    """Return the hopper's cycle, by Newton from its own guess, or after 60 s of settling as in the
-    paper."""
-    try:
-        return find_limit_cycle(hopper)
-    except ComputationError:
-        return find_limit_cycle(hopper, settle=60.0)
-
-
 def _sections(name: str, count: int) -> AbstractSections:
     apex = Crossing("vM", "falling")
     if name == "isochron":
@@ -186,24 +153,18 @@ def _sections(name: str, count: int) -> AbstractSections:
     )
 
 
-def _identify(
-    name: str, cycle: LimitCycle, design: Design, protocol: Protocol, begin: float
-) -> Family:
+def _identify(name: str, cycle: LimitCycle, design: Design, discard: int, begin: float) -> Family:
     """Return all results with one family of sections."""
     _set_up()
-    placed = place_sections(cycle, _sections(name, protocol.n_sections))
+    placed = place_sections(cycle, _sections(name, design.n_sections))
     ldtp = linearize(cycle, placed, OUTPUTS)
     exact = ldtp.htf(design.frequencies)
     _log(begin, f"{name}: sections, exact A, B, C, D and HTF")
-    discard = protocol.cycles - protocol.keep
     data = run_experiments(cycle, placed, design, OUTPUTS, discard=discard)
     experiments = data.summary()
     _log(begin, f"{name}: experiments, {experiments}")
     if not data.ok.any():
-        raise ComputationError(
-            f"no experiment on {name} sections ran to its end: {experiments}. Take a smaller "
-            "--amplitude."
-        )
+        raise ComputationError(f"no experiment on {name} sections ran to its end: {experiments}.")
     estimate = estimate_htf(data)
     rational, rational_exact = fit_rational(estimate), fit_rational(exact)
     structured = fit_multipliers(estimate, ldtp)

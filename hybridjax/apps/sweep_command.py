@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from .._core.arguments import package
 from ..errors import DefinitionError
 from ..plot.look import save
 from ..plot.over_parameters import sweep as plot_sweep
@@ -23,18 +22,7 @@ def run(options: Any) -> int:
     if len(over) < len(options.over):
         raise DefinitionError("a parameter has two axes: give each `--over` another name.")
     file, name = options.model
-    arguments = _load(file, name), over, options.want
-    if options.scheduler is None:
-        maps = sweep(*arguments, store=options.out, force=options.force)
-    else:
-        distributed = package("distributed")
-        package("cloudpickle").register_pickle_by_value(sys.modules[Path(file).stem])
-        try:
-            client = distributed.Client(options.scheduler)
-        except (OSError, ValueError) as error:
-            raise DefinitionError(f"no Dask scheduler answers at '{options.scheduler}'.") from error
-        with client:
-            maps = sweep(*arguments, store=options.out, client=client, force=options.force)
+    maps = sweep(_load(file, name), over, options.want, store=options.out, force=options.force)
     print(maps)
     converged = int((maps.result == 0).sum())
     print(f"{converged} of {maps.result.size} points have a limit cycle")
@@ -50,7 +38,7 @@ def _load(file: str, name: str) -> Any:
     path = Path(file)
     if not path.is_file():
         raise DefinitionError(f"there is no file '{file}': give the model as FILE.py:NAME.")
-    sys.path.insert(0, str(path.parent.resolve()))  # for its own imports, and those of workers
+    sys.path.insert(0, str(path.parent.resolve()))  # for its own imports
     module = importlib.import_module(path.stem)
     if Path(module.__file__ or "").resolve() != path.resolve():
         raise DefinitionError(f"another module is called '{path.stem}': rename '{file}'.")

@@ -4,6 +4,5 @@ from .goals import (
     Multipliers as Multipliers,
     Parameters as Parameters,
 )
-from .information import information_map as information_map
 from .limits import Distortion as Distortion, Limits as Limits
 from .study import Study as Study

@@ -6,7 +6,7 @@ from .data import (
     section_data as section_data,
     validation as validation,
 )
-from .designs import information as information, spectrum as spectrum, strides as strides
+from .designs import spectrum as spectrum, strides as strides
 from .frequency import (
     bode as bode,
     bodes as bodes,

@@ -1,4 +1,4 @@
-"""Designs for a question: where their power is, where they learn, and what strides buy."""
+"""Designs for a quantity of interest: their spectra, and standard errors against strides."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,12 +8,11 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from .._core.boundary.checked import checked
 from .._core.signal import unit_of, with_unit
 from ..designs.candidates import Model
-from ..designs.information import InformationMap
 from ..designs.optimize import OptimalDesign
 from ..designs.study import Study
 from ..errors import DefinitionError
 from .frequency import FREQUENCY
-from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, panels
+from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, panels
 
 
 @checked
@@ -54,48 +53,6 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
         below.set_ylim(1e-3 * top, 2 * top)
         below.legend()
         axes[0, 0].get_figure(root=True).align_ylabels(axes)
-    return Plot(axes)
-
-
-@checked
-def information(found: InformationMap, *, ax: AxesLike | None = None) -> Plot:
-    """Draw the phases and frequencies that contribute information: one row per output.
-
-    Left: density of the information over the input frequency and the phase at which the output is
-    measured, relative to its mean over all outputs. Right: density over the phase alone; its mean
-    (gray) is the output's share of the information. The band shown holds nine tenths of the
-    information.
-    """
-    ny, _, N = found.share.shape
-    lines = np.rint(found.f * found.periods).astype(int)
-    by_line = found.share.sum(axis=(0, 2))
-    order = np.argsort(-by_line)
-    kept = order[: 1 + int(np.argmax(np.cumsum(by_line[order]) >= 0.9))]
-    first, last = lines[kept].min(), lines[kept].max()
-    density = np.zeros((ny, last - first + 1, N))
-    inside = (lines >= first) & (lines <= last)
-    density[:, lines[inside] - first] = found.share[:, inside]
-    density /= density.sum(axis=0).mean()
-    edges = (np.arange(first, last + 2) - 0.5) / found.periods
-    phase = np.arange(N + 1) / N
-    profile = found.share.sum(axis=1) * N
-    size = {"width": PAGE, "height": 0.5 + 1.7 * ny, "width_ratios": (4, 1)}
-    with panels(ax, ny, 2, **size, sharey=True) as axes:
-        for k, name in enumerate(found.outputs):
-            chart, side = axes[k]
-            drawn = chart.pcolormesh(
-                edges, phase - 0.5 / N, density[k].T, cmap="Blues", vmin=0, vmax=density.max(),
-                rasterized=True,
-            )  # fmt: skip
-            chart.set_ylabel("phase (cycles)")
-            chart.set_title(f"measured in {name}")
-            bar = chart.get_figure(root=True).colorbar(drawn, ax=chart, pad=0.01)
-            bar.set_label("information / mean")
-            bar.ax.tick_params(labelsize=7)
-            side.barh(np.arange(N) / N, profile[k], height=1 / N, color=CYCLE[0])
-            side.axvline(profile[k].mean(), color="0.5", lw=0.6)
-        axes[-1, 0].set_xlabel(FREQUENCY)
-        axes[-1, 1].set_xlabel("over all $f$")
     return Plot(axes)
 
 

@@ -208,8 +208,6 @@ def designs_data(t):
     yield hj.designs.Distortion, dict(cycle=t.cycle, sections=PHASE, rms={"x": 1.0})
     yield hj.designs.Study, dict(first=t.one_input, order=1, standard_error=1.0)
     yield t.study.add, dict(data=t.block)
-    question = dict(noise={"y": 1.0}, goal=t.study.goal)
-    yield hj.designs.information_map, dict(model=t.decaying, design=t.one_input) | question
     yield hj.designs.draws, dict(fit=t.joint, count=1)
     yield t.plan.strides_for, dict(standard_error=1.0)
 
@@ -272,7 +270,6 @@ def plots(t):
     yield plot.harmonics, dict(families={"a": t.estimate})
     yield positional(plot.magnitude), dict(values=t.estimate)
     yield plot.spectrum, dict(plan=t.plan, model=t.model)
-    yield plot.information, dict(found=t.information)
     yield plot.strides, dict(plan=t.plan, studies={"a": t.studied})
     yield plot.cycle, dict(cycle=t.cycle)
     yield positional(plot.branch), dict(values=t.branch)

@@ -89,9 +89,6 @@ MAKE = {
     ),
     "study": lambda t: hj.designs.Study(t.one_input, order=1, standard_error=1e-9, goal=GOAL),
     "studied": lambda t: t.study.add(t.block),
-    "information": lambda t: hj.designs.information_map(
-        t.decaying, t.one_input, noise={"y": 1.0}, goal=GOAL
-    ),
     "joint": lambda t: hj.fit_ldtp(t.uncertain, t.model),
     "record": record,
     "driven": lambda t: hj.fit_ldtp(t.record, t.model, noise="innovations"),

@@ -31,16 +31,6 @@ def test_the_spectrum_of_a_design(plan):
         hj.plot.spectrum(plan, hj.testing.synthetic_ldtp())
 
 
-def test_where_one_learns():
-    found = hj.designs.information_map(MODEL, USUAL, **ASKED)
-    chart, side = hj.plot.information(found).axes[0]
-    image = np.asarray(chart.collections[0].get_array())
-    assert image.shape[0] == 4 and image.mean() == pytest.approx(1)
-    lengths = [bar.get_width() for bar in side.patches]
-    np.testing.assert_allclose(lengths, 4 * found.share.sum(axis=(0, 1)))
-    assert "f$ (cycles/period)" in chart.get_xlabel() and chart.get_ylabel() == "phase (cycles)"
-
-
 def test_what_strides_buy(plan):
     study = hj.designs.Study(USUAL, 1, 1e-9, goal=GOAL)
     data = hj.experiments.simulate_experiments(MODEL, USUAL, start="periodic")
