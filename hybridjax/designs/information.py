@@ -2,19 +2,14 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
-from ..identify.variable_projection import (
-    HTFGroup,
-    grouped,
-    misfit_of,
-)
-from ..linear.htf import HTF
+from ..identify.variable_projection import grouped, misfit_of, unfold
 from .candidates import Model, NoiseLike, make_noise, with_variance
-from .criteria import require_symmetric, wanted_parts
+from .criteria import wanted_parts
 from .goals import Multipliers
 
 
@@ -72,7 +67,6 @@ def information_map(
         )
     errors = make_noise(model, noise, {})
     htf = model.htf(design.frequencies, goal.fitted_harmonics)
-    require_symmetric(htf.harmonics, htf.n_sections)
     variance = errors.spectrum(design.frequencies, htf.harmonics)[..., None]
     htf = with_variance(htf, errors, variance * design.expected_variance()[:, None], 0)
 
@@ -83,23 +77,14 @@ def information_map(
     rows = np.concatenate([x.reshape(d, -1) for x in jacobians], axis=1)
     wanted, _ = wanted_parts(goal, np.asarray(model.multipliers), c)
     influence = wanted @ np.linalg.inv(rows @ rows.T)
-    residual = _by_harmonic(htf, groups, [np.tensordot(influence, x, 1) for x in jacobians])
+    parts = [np.tensordot(influence, x[:, 0] + 1j * x[:, 1], 1) for x in jacobians]  # (g, E, K)
+    F, K = len(htf.f), [x.shape[2] for x in parts]
+    here, opposite = (
+        [x[:, at].reshape(-1, k) for x, k in zip(parts, K, strict=True)]
+        for at in (slice(F), slice(-F, None))
+    )
+    residual = unfold(htf, groups, here, opposite)[..., 0]
+    residual = residual.reshape(len(htf.harmonics), -1, F, len(htf.outputs))
     turn = np.exp(2j * np.pi * np.outer(htf.harmonics, np.arange(N)) / N)
-    share = (np.abs(np.einsum("gmfo,mn->gofn", residual, turn)) ** 2).sum(axis=0)
+    share = (np.abs(np.einsum("mgfo,mn->gofn", residual, turn)) ** 2).sum(axis=0)
     return InformationMap(np.asarray(htf.f), share / share.sum(), htf.outputs, design.periods)
-
-
-def _by_harmonic(
-    htf: HTF, groups: list[HTFGroup], parts: list[Float[np.ndarray, "g 2 _ _"]]
-) -> Complex[np.ndarray, "g M F ny"]:
-    """Return the residuals of each harmonic at f alone. (Rows of pairs hold H_m at f, and then the
-    conjugate of H_{-m}, which is H_m at -f.)"""
-    F = len(htf.f)
-    residual = np.zeros((len(parts[0]), len(htf.harmonics), F, len(htf.outputs)), complex)
-    for group, part in zip(groups, parts, strict=True):
-        value = part[:, 0] + 1j * part[:, 1]
-        output = group.channel[:, 0]
-        residual[:, group.harmonic, :, output] = np.moveaxis(value[:, :F], 2, 0)
-        if group.mirror is not None:
-            residual[:, group.mirror, :, output] = np.moveaxis(value[:, F:].conj(), 2, 0)
-    return residual

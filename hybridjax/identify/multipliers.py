@@ -35,6 +35,7 @@ from .variable_projection import (
     numerator_size,
     numerators_of,
     summarize,
+    unfold,
     weights_of,
 )
 
@@ -166,13 +167,8 @@ def fit_multipliers(
     if check:
         require_order(groups, htf, order, cost / freedom)
 
-    B = np.zeros((len(H), size, *H.shape[2:]), complex)
-    for group in groups:
-        b = numerators_of(group, c).T
-        i, j = group.channel.T
-        B[group.harmonic, :, i, j] = b
-        if group.mirror is not None:
-            B[group.mirror, :, i, j] = b.conj()
+    b = [numerators_of(group, c) for group in groups]
+    B = unfold(htf, groups, b, [x.conj() for x in b])
     misfit = np.abs(_evaluate(B, c, f, htf.n_sections) - H) ** 2
     return StructuredFit(
         multipliers=multipliers_of(c),

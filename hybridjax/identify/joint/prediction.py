@@ -23,7 +23,7 @@ from ..descent import NormalEquations
 from ..series.output_error import RANK
 from ..series.records import CycleGrid
 from ..variable_projection import SMALLEST_ERROR
-from .frequency import adjoints
+from .frequency import transfer
 from .model import LocalCoordinates, PeriodicModel
 
 
@@ -302,11 +302,10 @@ def noise_spectrum(
     Over long windows of L samples its spectrum is
 
     $$S(\varphi) = \lim \frac{1}{L}\, E\,\Big|\sum_n v[n]\, e^{-2 \pi i \varphi n / N}\Big|^2
-    = \frac{1}{N} \sum_n \big| D[n] + z^{-1} \mu[n+1] B[n] \big|^2, \qquad
-    z = e^{2 \pi i \varphi / N},$$
+    = \sum_k \sum_j | H_{k,j}(\varphi - k) |^2$$
 
-    with the adjoint $\mu[n] = C[n] + z^{-1} \mu[n+1] A[n]$ (the cyclic spectrum at cycle frequency
-    zero: Gardner, Napolitano and Paura 2006). The noise of $H_m$ at f is that at f + m.
+    with the harmonic transfer functions $H_k$ from all inputs j (the cyclic spectrum at cycle
+    frequency zero: Gardner, Napolitano and Paura 2006). The noise of $H_m$ at f is that at f + m.
 
     **Arguments:**
 
@@ -326,13 +325,10 @@ def noise_spectrum(
             f"{np.abs(noise.multipliers[0]):.4g}, which must be below 1."
         )
     model = PeriodicModel.of(noise, np.ones(len(noise.outputs)))
-    z = np.exp(2j * np.pi / N * np.add.outer(harmonics, f).ravel())
-    mu = adjoints(model, z)
-    total = np.zeros((len(z), len(noise.outputs)))
-    for n in range(N):
-        after = np.tensordot(model.B[n].T, mu[(n + 1) % N], 1) / z[:, None]  # (inputs, F, ny)
-        total += (np.abs(model.D[n].T[:, None] + after) ** 2).sum(axis=0)
-    return total.reshape(len(harmonics), len(f), len(noise.outputs)) / N
+    k = np.arange(N)
+    H = transfer(model, np.add.outer(k, f).ravel(), tuple(k.tolist()))  # (k, inputs at f + j)
+    square = (np.abs(H) ** 2).sum(axis=3).reshape(N, N, len(f), -1)
+    return np.stack([square[k, (m - k) % N].sum(axis=0) for m in harmonics])
 
 
 def noise_model(
