@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ...errors import DefinitionError
-from ...experiments.record import Record
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.ldtp import LDTP
 from ..descent import NormalEquations
@@ -363,14 +362,13 @@ class Predictor(NamedTuple):
     def dims(self) -> list[int]:
         return self.model.dims
 
-    def predict(self, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:
+    def predict(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "R T N ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
-        part = SeriesPart.of(CycleGrid.from_records([record]), np.ones(self.S.shape[1]))
+        part = SeriesPart.of(grid, np.ones(self.S.shape[1]))
         path = SeriesProblem([part], self.S, True, free_start, 0).path(self.model, part)
         expected = [
             x @ C.T + u @ D.T
             for x, C, u, D in zip(path.x, self.model.C, part.u, self.model.D, strict=True)
         ]
         expected = np.where(part.sampled, part.y - np.stack(path.error), np.stack(expected))
-        rows = slice(record.first_section, record.first_section + len(record.u))
-        return np.moveaxis(expected[:, 0], 0, 1).reshape(-1, self.S.shape[1])[rows]
+        return np.moveaxis(expected, 0, 2)
