@@ -326,7 +326,7 @@ def noise_spectrum(
     model = PeriodicModel.of(noise, np.ones(len(noise.outputs)))
     k = np.arange(N)
     H = transfer(model, np.add.outer(k, f).ravel(), tuple(k.tolist()))  # (k, inputs at f + j)
-    square = (np.abs(H) ** 2).sum(axis=3).reshape(N, N, len(f), -1)
+    square = (np.abs(H) ** 2).sum(axis=3).reshape(N, N, len(f), len(noise.outputs))
     return np.stack([square[k, (m - k) % N].sum(axis=0) for m in harmonics])
 
 
