@@ -54,7 +54,8 @@ def write_report(
     """Write all results of a recording into a folder. They appear when all of them are ready.
 
     - `report.html`: everything in one page that needs no other file.
-    - `sections.csv`: deviations of inputs and outputs at the sections. `cycle.csv`: their average.
+    - `sections.csv`: deviations of inputs and outputs from the average cycle at the sections.
+      `cycle.csv`: the average cycle.
     - `htf.npz`, `fit.npz`: for `hj.load`. `summary.json`: the numbers.
     - `figures/`: in each of the `formats` of `hj.plot.save`, and as PNG for the page.
 

@@ -245,11 +245,12 @@ class LDTP(eqx.Module):
     def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, computed on the host from the factors `A[n]`.
 
-        Their product is never formed, so that multipliers far below `1e-16` of the largest keep
-        their digits. Zeros are not found by size: they are counted from the dimensions and the
-        ranks of the factors (as by `rank`). A direction that contracts to less than `1e-12` of the
-        others between neighboring sections counts with them, as the print of the model says: more
-        sections show it, or `LimitCycle.multipliers`. Below 1e-308 they are given as 0.
+        The product of the factors is never formed, so that multipliers far below `1e-16` of the
+        largest are accurate. The number of zero multipliers follows from the dimensions and the
+        ranks of the factors (see `rank`), not from a threshold on multipliers. A direction that
+        contracts to less than `1e-12` of the others between neighboring sections counts as a zero
+        multiplier, and the printed model gives the number of these. To resolve it, use more
+        sections, or `LimitCycle.multipliers`. Multipliers below 1e-308 are 0.
 
         **Returns:** (r,) by decreasing modulus, then imaginary part; conjugate pairs are exact.
         """
@@ -276,7 +277,7 @@ class LDTP(eqx.Module):
     def periodic_states(
         self, u: Annotated[Numbers, Reals("S n nu")], periods: PeriodCount
     ) -> Float[Array, "S d"]:
-        """States as of `periodic_state`, for S inputs (S, P N, nu) at once."""
+        """The states of `periodic_state` for S inputs (S, P N, nu)."""
         u = self._input(u)
         if u.shape[1] != periods * self.n_sections:
             raise DefinitionError(

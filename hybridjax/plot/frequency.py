@@ -110,10 +110,10 @@ def bode(
 
     **Arguments:**
 
-    - `htfs`: exact ones lie as broad pale lines under the estimates, and those with a variance
-      have bands that hold the true values with a probability of 95 %; their phase is drawn where
-      it is known, which it is not where the band reaches down to zero.
-    - `fits`: of this harmonic, drawn over the band of the HTFs.
+    - `htfs`: exact HTFs are drawn as broad pale lines under the estimates. HTFs with a variance
+      have bands that contain the true values with a probability of 95 %. Their phase is not drawn
+      where the band of the magnitude contains zero.
+    - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs.
     - `outputs`: names; by default all. One color each.
     - `ax`: two Axes, for magnitude and phase; by default a new figure.
 
@@ -169,7 +169,8 @@ def bodes(
 ) -> Plot:
     """The paper's Fig. 4: a Bode plot of one harmonic with its fits, one column per family.
 
-    **Arguments:** `families` and `fits`: by the same names; the others as in `bode`.
+    **Arguments:** `families` and `fits`: HTFs and fits by the name of the section family. The other
+    arguments are those of `bode`.
 
     **Raises:** `DefinitionError` for fits of a family that is not there.
     """

@@ -38,9 +38,9 @@ def cycle(
 ) -> Plot:
     """The limit cycle in the plane of two states or outputs, colored by chart.
 
-    Events are marked by dots, resets that move the point by dashed lines, sections by short bars:
-    along the section where it is a curve in this plane (its level depends on x and y only),
-    across the orbit elsewhere.
+    Events are marked by dots, resets that move the point by dashed lines, sections by short bars. A
+    bar lies along the section if this is a curve in the plane (its level depends on x and y only),
+    otherwise across the orbit.
 
     **Arguments:**
 
