@@ -15,7 +15,7 @@ from ..identify.descent import NormalEquations, Spread
 from ..identify.joint.frequency import transfer, transfer_slopes
 from ..identify.joint.model import LocalCoordinates, PeriodicModel, local_coordinates
 from ..identify.joint.realization import default_horizon, realize
-from ..identify.variable_projection import check_values, error_weights
+from ..identify.weights import check_values, error_weights
 from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs

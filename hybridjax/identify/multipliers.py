@@ -21,23 +21,19 @@ from .denominator import chi, multipliers_of
 from .descent import ROUNDING
 from .multiplier_estimate import MultiplierEstimate
 from .variable_projection import (
-    SMALLEST_ERROR,
     HTFGroup,
-    check_values,
     delayed_responses,
     error_spectrum,
-    error_weights,
     group_htf,
     grouped,
-    line_variances,
     maximum_likelihood,
     misfit_of,
     numerator_size,
     numerators_of,
     summarize,
     unfold,
-    weights_of,
 )
+from .weights import SMALLEST_ERROR, check_values, error_weights, line_variances, weights_of
 
 
 # Fits of HTFs without variances whose weights come from the last misfit. Fewer: weights of the

@@ -21,7 +21,7 @@ from ...linear.ldtp import LDTP
 from ..descent import NormalEquations
 from ..series.output_error import RANK
 from ..series.records import CycleGrid
-from ..variable_projection import SMALLEST_ERROR
+from ..weights import SMALLEST_ERROR
 from .frequency import transfer
 from .model import LocalCoordinates, PeriodicModel
 
