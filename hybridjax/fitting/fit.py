@@ -13,13 +13,19 @@ from .._core.boundary.kinds import Count, Seed
 from .._core.progress import counted, working
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
-from ..identify.descent import FIRST_DAMPING, Squares, descend
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.system import Guess, HybridSystem
 from .model_fit import Identifiability, ModelFit, ParameterGuess, diagnose
 from .observations import AbstractObservation
-from .problem import FitProblem, Free, Parameters, evaluate, free_parameters
+from .problem import (
+    FitProblem,
+    Free,
+    Parameters,
+    descend,
+    evaluate,
+    free_parameters,
+)
 
 
 Data = AbstractObservation | Sequence[AbstractObservation]
@@ -35,12 +41,6 @@ _PERFECT = 1e-12
 # less than so many of its standard deviations. Larger: local minima are accepted. Smaller: global
 # ones are not, and all guesses are tried.
 _LIKELY = 4.0
-# Sum of squares that a step need not gain: residuals have no unit. Larger: parameters without the
-# digits that the data have. Smaller: steps that only change rounding errors.
-_SETTLED = 1e-18
-# Part of the largest sensitivity below which no undamped step is taken. Larger: badly identified
-# parameters keep their initial values. Smaller: unidentifiable ones wander off.
-_RANK = 1e-8
 
 
 @checked
@@ -209,21 +209,11 @@ def _descend(
     cycle = _cycle_at(problem, system, start, near)
     if cycle.result != Result.OK:
         return End(start, start, np.inf, 0, 0, int(cycle.result))
-    steps = 0
-
-    def linearize(x: Float[np.ndarray, " p"]):
-        nonlocal steps
-        steps += 1
-        r, J = evaluate(problem, x, cycle)
-        return (r if np.isfinite(J).all() else np.full_like(r, np.inf)), J
-
-    first = Squares(linearize, start, _SETTLED, _RANK)
-    count = len(first.residual)
-    if not np.isfinite(first.cost):  # there is a cycle, but no observation on it
-        return End(start, start, np.inf, count, steps, int(Result.NOT_CONVERGED))
-    point, converged = descend(first, FIRST_DAMPING)
+    x, r, steps, converged = descend(problem, start, cycle)
+    if not np.isfinite(r).all():  # there is a cycle, but no observation on it
+        return End(start, start, np.inf, len(r), steps, int(Result.NOT_CONVERGED))
     result = Result.OK if converged else Result.NOT_CONVERGED
-    return End(start, point.c, point.cost, count, steps, int(result))
+    return End(start, x, float(r @ r), len(r), steps, int(result))
 
 
 def _summary(

@@ -19,6 +19,23 @@ from ..systems.system import HybridSystem
 from .observations import AbstractObservation
 
 
+# The iteration ends when a step changes no coordinate and no residual by more than this, in sum and
+# relative to it (they have no unit). Larger: parameters
+# without the digits that the data have. Smaller: steps that only change rounding errors.
+_TOLERANCE = 1e-9
+# Evaluations of the model from one guess. Fewer: distant guesses do not converge. More: hopeless
+# ones take longer.
+MAX_STEPS = 64
+# No step is taken along directions whose sensitivity is below this part of the largest one. Larger:
+# badly identified parameters keep their initial values. Smaller: unidentifiable ones wander off.
+_RCOND = 1e-8
+# A step is accepted if the cost falls by this part of the predicted reduction; beyond a larger part
+# the damping falls. Lower: steps that gain nothing count. Higher: good ones are repeated.
+_ACCEPTED, _GOOD = 0.01, 0.99
+# Factors of the damping after good and after rejected steps. Nearer to 1: more steps until it fits.
+# Farther: it swings between too much and too little.
+_LESS, _MORE = 3.5, 4.0
+
 Bounds = tuple[float | int, float | int]
 Free = str | Sequence[str] | Mapping[str, Bounds | None]
 
@@ -165,3 +182,41 @@ def evaluate(
 ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
     """Return residuals and Jacobian at x."""
     return jax.device_get(_with_jacobian(problem, jnp.asarray(x), guess))
+
+
+def descend(
+    problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " r"], int, bool]:
+    """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals, number of
+    evaluations, and whether it has converged.
+
+    Steps are accepted and their damping changes as in `optimistix.LevenbergMarquardt`. Here the
+    iteration runs on the host, so that only the model is compiled.
+    """
+    trial, damping = x, 1.0
+    r, J = evaluate(problem, x, guess)
+    for steps in range(1, MAX_STEPS + 1):
+        if steps > 1:
+            change = trial - x
+            r_new, J_new = evaluate(problem, trial, guess)
+            predicted = (J @ change) @ (J @ change + 2 * r)
+            gain = (r_new - r) @ (r_new + r)
+            # (Rounding decides whether a step of this size is accepted.)
+            done = _small(change, trial) and _small(r_new - r, r_new)
+            if gain <= _ACCEPTED * predicted:
+                damping /= _LESS if gain < _GOOD * predicted < 0 else 1.0
+                x, r, J = trial, r_new, J_new
+            else:
+                damping *= _MORE
+            if done:
+                return x, r, steps, True
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
+            break
+        damped = np.concatenate([J, np.sqrt(damping) * np.eye(len(x))])
+        short = np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
+        trial = x - short
+    return x, r, steps, False
+
+
+def _small(change: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"]) -> bool:
+    return bool(np.all(np.abs(change) < _TOLERANCE * (1 + np.abs(x))))

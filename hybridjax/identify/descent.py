@@ -100,18 +100,15 @@ def least_squares(
 
     **Returns:** the last coefficients, and whether they are a minimum.
     """
-    point, converged = descend(Squares(linearize, start, settled_gain), 0.0, max_steps)
+    point, converged = descend(_Squares(linearize, start, settled_gain), 0.0, max_steps)
     return point.c, converged
 
 
-class Squares(Point):
+class _Squares(Point):
     """A point of `least_squares`."""
 
-    def __init__(
-        self, linearize: Callable, c: Coefficients, settled_gain: float, rank: float | None = None
-    ):
-        """**Arguments:** `rank`: singular values that are zero, relative to the largest."""
-        self.c, self._linearize, self._settled_gain, self._rank = c, linearize, settled_gain, rank
+    def __init__(self, linearize: Callable, c: Coefficients, settled_gain: float):
+        self.c, self._linearize, self._settled_gain = c, linearize, settled_gain
         with np.errstate(all="ignore"):
             self.residual, self.jacobian = linearize(c)
             self.cost = float(self.residual @ self.residual)
@@ -122,11 +119,11 @@ class Squares(Point):
             size = np.sqrt(damping) * np.linalg.norm(jacobian, axis=0)
             jacobian = np.concatenate([jacobian, np.diag(size)])
             residual = np.concatenate([residual, np.zeros(len(size))])
-        step = np.linalg.lstsq(jacobian, -residual, rcond=self._rank)[0]
+        step = np.linalg.lstsq(jacobian, -residual)[0]
         return step, float(((jacobian @ step) ** 2).sum())
 
-    def moved(self, step: Coefficients) -> "Squares":
-        return Squares(self._linearize, self.c + step, self._settled_gain, self._rank)
+    def moved(self, step: Coefficients) -> "_Squares":
+        return _Squares(self._linearize, self.c + step, self._settled_gain)
 
     def settled(self, step: Coefficients, gain: float) -> bool:
         small = np.linalg.norm(step) <= ROUNDING * (1 + np.linalg.norm(self.c))
