@@ -33,22 +33,14 @@ def variance(model, design):
 
 
 def test_standard_errors_are_the_cramer_rao_bound(plan, isochron_ldtp):
-    """That of `multiplier_bound`; for any weights of H_m and H_{-m}, and without one of them."""
+    """That of `multiplier_bound`; for any weights of H_m and H_{-m}."""
     for design, said in ((plan.usual, plan.usual_variances), (plan.design, plan.variances)):
-        bound = hj.identify.multiplier_bound(isochron_ldtp, with_variance(isochron_ldtp, design))
+        htf = with_variance(isochron_ldtp, design)
+        bound = hj.identify.multiplier_bound(isochron_ldtp, htf)
         np.testing.assert_allclose(said, np.diag(bound.multiplier_covariances[0]), rtol=2e-3)
-
-    def covariance(harmonics, *scale):
-        htf = with_variance(isochron_ldtp, plan.usual).select(harmonics)
-        variance = np.asarray(htf.variance) * np.array(scale)[:, None, None, None]
-        return hj.identify.multiplier_bound(
-            isochron_ldtp, dataclasses.replace(htf, variance=variance)
-        ).covariance
-
-    same, other = (covariance((-1, 0, 1), 1, 1, x) for x in (1, 1 + 1e-6))
-    np.testing.assert_allclose(other, same, rtol=1e-4)
-    lost = covariance((-1, 0, 1), 1e12, 1, 1)
-    np.testing.assert_allclose(lost, covariance((0, 1), 1, 1), rtol=1e-4)
+        unequal = dataclasses.replace(htf, variance=(htf.variance.T * (1 + 1e-6 * np.arange(5))).T)
+        other = hj.identify.multiplier_bound(isochron_ldtp, unequal)
+        np.testing.assert_allclose(other.covariance, bound.covariance, rtol=2e-3)
 
 
 def test_no_other_design_is_better_than_the_certificate_allows(plan, isochron_ldtp):
