@@ -57,7 +57,7 @@ class Study(eqx.Module):
     study.fit.contains(true)         # confidence regions, valid at the time of stopping
     ```
 
-    The first block is applied as it is, whatever `limit` is. Each later block has the
+    The first block is applied unchanged, also if it exceeds `limit`. Each later block has the
     `optimal_design` for the model fitted to all blocks before it, with the noise estimated from
     these, and as many experiments as are missing, but at most twice the strides so far. While the
     data do not support `order` multipliers, the first block is repeated with new phases. No prior

@@ -35,8 +35,8 @@ def spectral_radius(model: LDTP | LimitCycle, smoothing: Probability = 1e-3) -> 
     `LDTP.characteristic_polynomial` is smooth as well, and without bias: trace and determinant are
     $-c_1$ and $(-1)^d c_d$.
 
-    **Arguments:** `model`: from `linearize` or `find_limit_cycle`; of a batch, one at a time
-    (`jax.vmap`). `smoothing`: $\epsilon$, between 0 and 1; the larger, the smoother.
+    **Arguments:** `model`: result of `linearize` or `find_limit_cycle`; for a batch use `jax.vmap`.
+    `smoothing`: $\epsilon$, between 0 and 1; the larger, the smoother.
     """
     power = monodromy(model.A if isinstance(model, LDTP) else model.factors)
     return _smooth_radius(power, jnp.asarray(smoothing, float))

@@ -289,7 +289,8 @@ def validate(
     **Arguments:**
 
     - `model`: identified or exact; a `SeriesFit` is simulated as it is.
-    - `data`: as for `fit_series`, preferably not the data of the fit, which always agree too well.
+    - `data`: data as for `fit_series`, preferably other data than those of the fit, with which a
+      model always agrees too well.
     - `start`: "free", the default, estimates the initial state of each record from the record;
       "cycle" takes it as zero. Declared drift of the records is estimated in either case.
     - `level`: significance level of the tests. Default: 0.01.

@@ -64,7 +64,7 @@ class Mechanism(eqx.Module):
 
     - `kinetic`: T(q, v) -> number, quadratic in v and positive; from a mass matrix,
         `lambda q, v: 0.5 * v @ M(q) @ v`.
-    - `potential`: V(q) -> number, by default 0.
+    - `potential`: V(q) -> number. Default: 0.
 
     Methods take one state, in fields, guards, resets and outputs. They compile to plain arithmetic
     operations without LAPACK. If the mass matrix is singular or not positive, methods raise

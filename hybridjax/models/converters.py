@@ -67,10 +67,10 @@ class BuckConverter(HybridSystem):
 class CukConverter(HybridSystem):
     """A clock closes the switch, and the sum of both coils' currents opens it at a reference.
 
-    States: current `i1` of the coil at the supply, voltage `v1` of the capacitor that carries the
-    energy over, current `i2` of the coil at the load, and the load's voltage `v2` (of opposite sign
-    to the supply, here counted as positive). While the switch is open, the diode conducts all the
-    time (continuous conduction). Input `u` is added to the reference current.
+    States: current `i1` of the coil at the supply, voltage `v1` of the capacitor that transfers the
+    energy, current `i2` of the coil at the load, and the load's voltage `v2` (of opposite sign to
+    the supply, here counted as positive). While the switch is open, the diode conducts all the time
+    (continuous conduction). Input `u` is added to the reference current.
 
     S. Ćuk, R. D. Middlebrook, A new optimum topology switching dc-to-dc converter, IEEE Power
     Electronics Specialists Conference, 1977; under such control, beyond its stable cycle: C. K.

@@ -52,10 +52,10 @@ def sliding(
 
     **Arguments:**
 
-    - `charts`: two, by name: the one in which h > 0, then the one in which h < 0, with the same
-        states. Their fields must extend smoothly beyond the surface.
+    - `charts`: two charts with the same states, by name: first the one in which h > 0, then the one
+      in which h < 0. Their fields must extend smoothly beyond the surface.
     - `surface`: h(t, q) -> number.
-    - `name`: of the chart of sliding, which has the same states.
+    - `name`: name of the chart of sliding, which has the same states.
 
     **Raises:** `DefinitionError` if the charts are not two with the same states and inputs.
     """

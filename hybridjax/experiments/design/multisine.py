@@ -225,7 +225,7 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
     distortion. Phases of lines that are measured in several experiments together (multiples of 1/2,
     orthogonal experiments) are kept.
 
-    **Arguments:** `seed`: of the random phases at the start of the minimization. Default: 0.
+    **Arguments:** `seed`: seed of the random phases at the start of the minimization. Default: 0.
 
     **Raises:** `DefinitionError` if there is no phase to choose.
     """
