@@ -92,7 +92,7 @@ def exact(kind: str, data, cycle, seeds: int) -> None:
                 print(f"fitting.{kind}.not_seen {text}")
         errors.append(np.abs(seen_errors(fit, true)).max())
         guesses.append(len(fit.guesses))
-        steps.append(fit.guesses.steps.sum())
+        steps.append(sum(guess.steps for guess in fit.guesses))
     show(f"{kind}.exact.worst", max(errors))
     show(f"{kind}.exact.good", np.sum(np.array(errors) < 1e-6))
     show(f"{kind}.exact.of", seeds)

@@ -1,6 +1,7 @@
 """The criterion of each goal."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -11,13 +12,7 @@ from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
 from ..identify.denominator import chi, multipliers_of
 from ..identify.joint.model import characteristic_slopes
-from ..identify.variable_projection import (
-    EQUAL_WEIGHTS,
-    check_values,
-    error_weights,
-    numerator_size,
-    powers_basis,
-)
+from ..identify.variable_projection import grouped
 from ..linear.htf import HTF
 from .candidates import Candidates, Model, Noise, Powers, measured_htfs
 from .criterion import Channel, Criterion, LinearCriterion
@@ -145,76 +140,17 @@ def _parameters(
     return LinearCriterion(wanted, free, tuple(channels), rows)
 
 
-def require_symmetric(harmonics: tuple[int, ...], n_sections: int) -> None:
-    """**Raises:** `DefinitionError` for harmonics that are not symmetric about 0."""
-    if {(-m) % n_sections for m in harmonics} != {m % n_sections for m in harmonics}:
-        raise DefinitionError(
-            f"the harmonics of `goal` must be symmetric about 0, not {harmonics}."
-        )
-
-
 def _channels(
     htf: HTF, cosine: Int[np.ndarray, " F"], c: Float[np.ndarray, " d"], overhang: int | None
-) -> list[Channel]:
-    r"""Return H delayed by 1 to d periods and divided by the denominator's modulus, and the part of
-    it that numerators can explain.
+) -> Iterator[Channel]:
+    r"""Yield H delayed by 1 to d periods, and the part of it that numerators can explain, from
+    $dH = dB/\chi - H\, d\chi/\chi$.
 
-    From $dH = dB/\chi - H\, d\chi/\chi$ at z and at 1/z, with a channel for all entries whose
-    errors depend on the frequency in the same way.
-
-    Where H_m and H_{-m} are different, sum and difference of H_m(w) and H_m(-w) = conj H_{-m}(w)
-    are explained by cosines and sines times the coefficients of B_m, whose real and imaginary parts
-    are thereby apart: with the same real equations as those of the real B_0. This requires errors
-    of the same size in both; otherwise all four equations are taken together.
-
-    **Raises:** `DefinitionError` if the HTFs have too few frequencies, or harmonics that are not
-    symmetric about 0.
+    **Raises:** `DefinitionError` if the HTFs have too few frequencies.
     """
-    N, f, size = htf.n_sections, np.asarray(htf.f), numerator_size(htf, len(c), overhang)
-    require_symmetric(htf.harmonics, N)
-    weight = dict(zip(htf.harmonics, error_weights(htf, check_values(htf))[..., 0], strict=True))
-    delay = np.exp(-2j * np.pi * f)
-    size_of_chi = np.abs(chi(delay, c))
-    delayed = delay ** np.arange(1, len(c) + 1)[:, None] / size_of_chi
-    slope = {
-        m: weight[m] * H[:, :, 0] * delayed[..., None]
-        for m, H in zip(htf.harmonics, np.asarray(htf.H), strict=True)
-    }  # (delays, F, ny)
-    angle = 2 * np.pi / N * f[:, None] * np.arange(size)
-    cosines, sines = np.cos(angle), np.sin(angle)
-    powers = np.concatenate([cosines, -sines])
-    groups: dict[bytes, tuple[np.ndarray, list[np.ndarray]]] = {}
-
-    def add(basis: np.ndarray, factor: np.ndarray, *entries: tuple[np.ndarray, ...]) -> None:
-        # (Only the shape of the factors counts: numerators take any size.)
-        shape = factor / factor.max()
-        key = np.round(shape, EQUAL_WEIGHTS).tobytes()
-        if key not in groups:
-            shape = shape / np.tile(size_of_chi, len(shape) // len(f))
-            groups[key] = powers_basis(basis)[0] * shape[:, None], []
-        groups[key][1].extend(np.concatenate(parts, axis=1).T for parts in entries)
-
-    for m in htf.harmonics:
-        if m < 0 and -m in weight:
-            continue
-        for i in range(len(htf.outputs)):
-            h, w = slope[m][..., i], weight[m][:, i]
-            if 2 * m % N == 0:
-                add(powers, np.tile(w, 2), (h.real, h.imag))
-                continue
-            mirror, v = slope[-m][..., i], weight[-m][:, i]
-            if np.allclose(v, w, rtol=10.0**-EQUAL_WEIGHTS, atol=0):
-                even, odd = (h + mirror.conj()) / 2**0.5, (h - mirror.conj()) / 2**0.5
-                add(powers, np.tile(w, 2), (even.real, odd.imag), (even.imag, -odd.real))
-                continue
-            both = [[cosines, sines], [-sines, cosines], [cosines, -sines], [-sines, -cosines]]
-            parts = h.real, h.imag, mirror.real, mirror.imag
-            add(np.block(both), np.concatenate([w, w, v, v]), parts)
-    return [
-        Channel(
-            np.tile(cosine, len(basis) // len(f)),
-            basis,
-            np.stack(entries, axis=2).reshape(len(basis), -1),
-        )
-        for basis, entries in groups.values()
-    ]
+    for group in grouped(htf, len(c), overhang):
+        delays = range(1, len(c) + 1)
+        slopes = [group.weighted(c, group.period_delay[:, None] ** j * group.data) for j in delays]
+        size = np.tile(group.weight / np.abs(chi(group.period_delay, c)), 2)
+        cosines = np.tile(cosine[group.line], 2)
+        yield Channel(cosines, size[:, None] * group.basis, np.concatenate(slopes, axis=1))

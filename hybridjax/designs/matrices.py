@@ -8,17 +8,18 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..errors import DefinitionError
+from ..identify.descent import NormalEquations, Spread
 from ..identify.joint.frequency import transfer, transfer_slopes
 from ..identify.joint.model import LocalCoordinates, PeriodicModel, local_coordinates
 from ..identify.joint.realization import default_horizon, realize
-from ..identify.variable_projection import check_values, error_weights
+from ..identify.weights import check_values, error_weights
 from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
-from .criterion import SINGULAR, Channel, LinearCriterion
+from .criterion import Channel, LinearCriterion
 from .goals import FrequencyResponse
 
 
@@ -31,16 +32,13 @@ _POINTS = 64
 
 
 class Matrices(NamedTuple):
-    """Combinations of the P local coordinates, and the information about them."""
+    """Combinations of the P local coordinates, and their uncertainty."""
 
     coordinates: LocalCoordinates
     channel: Channel
     """Derivatives by those combinations that the usual design determines."""
-    size: Float[np.ndarray, " P"]
-    """One over the unit of each coordinate."""
-    values: Float[np.ndarray, " P"]
-    """Eigenvalues of the usual information in these units."""
-    vectors: Float[np.ndarray, "P P"]
+    spread: Spread
+    """Uncertainty of the coordinates with the usual design."""
 
     def criterion(
         self,
@@ -54,18 +52,17 @@ class Matrices(NamedTuple):
 
         **Raises:** `DefinitionError` if the usual design does not determine them.
         """
-        kept = _determined(self.values)
-        turned = wanted / self.size @ self.vectors
-        square = turned**2 / np.maximum(self.values, SINGULAR * self.values[-1])
         quantity = np.arange(len(wanted)) if part is None else part
-        whole = np.bincount(quantity, square.sum(axis=1))
-        if (np.bincount(quantity, square[:, ~kept].sum(axis=1)) > _MISSED * whole).any():
+        shown, hidden = (
+            np.bincount(quantity, ((wanted @ root) ** 2).sum(axis=1)) for root in self.spread
+        )
+        if (hidden > _MISSED * (shown + hidden)).any():
             raise DefinitionError(
                 "the usual design does not determine what `goal` asks for: measure more harmonics "
                 "or lines."
             )
-        wanted = turned[:, kept] / np.sqrt(self.values[kept])
-        unknowns = tuple(f"combination {k} of the matrices" for k in range(kept.sum()))
+        wanted = wanted @ self.spread.root
+        unknowns = tuple(f"combination {k} of the matrices" for k in range(wanted.shape[1]))
         return LinearCriterion(names, unknowns, (self.channel,), wanted, part)
 
 
@@ -93,21 +90,13 @@ def ldtp_matrices(
     for lines, rows in _rows(coordinates, htfs, scale):
         flat = _flat(rows * np.sqrt(power[lines])[:, None, None])
         gram += flat @ flat.T
-    size = np.sqrt(np.diag(gram))
-    size = np.where(size > 0, size, 1.0)
-    values, vectors = np.linalg.eigh(gram / size / size[:, None])
-    kept = _determined(values)
-    turn = (vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]).T
+    spread = NormalEquations(gram, np.zeros(len(gram))).spread()
     cosine, slopes = [], []
     for lines, rows in _rows(coordinates, htfs, scale):
         cosine.append(np.repeat(lines, rows.shape[2]))
-        slopes.append(turn @ _flat(rows))
+        slopes.append(spread.root.T @ _flat(rows))
     channel = Channel.direct(np.concatenate(cosine), np.concatenate(slopes, axis=1))
-    return Matrices(coordinates, channel, size, values, vectors)
-
-
-def _determined(values: Float[np.ndarray, " P"]) -> Bool[np.ndarray, " P"]:
-    return values > SINGULAR * values[-1]
+    return Matrices(coordinates, channel, spread)
 
 
 def _rows(

@@ -16,7 +16,7 @@ from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.system import Guess, HybridSystem
-from .model_fit import Identifiability, ModelFit, ParameterGuesses, diagnose
+from .model_fit import Identifiability, ModelFit, ParameterGuess, diagnose
 from .observations import AbstractObservation
 from .problem import (
     FitProblem,
@@ -220,9 +220,10 @@ def _summary(
     problem: FitProblem, system: HybridSystem, near: LimitCycle, ends: list[End], best: End
 ) -> ModelFit:
     parameters, weighted = problem.parameters, problem.weighted
-    start, fitted, cost, _, steps, result = map(np.array, zip(*ends, strict=True))
     decode = lambda x: np.asarray(parameters.decode(jnp.asarray(x)))  # noqa: E731
-    guesses = ParameterGuesses(decode(start), decode(fitted), cost, steps, result)
+    guesses = tuple(
+        ParameterGuess(decode(e.start), decode(e.x), e.cost, e.steps, e.result) for e in ends
+    )
     x = jnp.asarray(best.x)
     # The cycle of the guess is nearer than the first one, which may be too far away.
     cycle = _cycle_at(problem, system, best.x, _cycle_at(problem, system, best.start, near))

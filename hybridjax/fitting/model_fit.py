@@ -4,11 +4,12 @@ import itertools
 import operator
 from collections.abc import Mapping
 from fractions import Fraction
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy import stats
 
 from .._core.boundary.checked import checked
@@ -128,32 +129,16 @@ def _describe(names: tuple[str, ...], row: Float[np.ndarray, " p"]) -> str:
     return f"a common factor, with these powers, of ({powers})"
 
 
-class ParameterGuesses(eqx.Module):
-    """The S guesses of a fit, in the order in which they were tried.
+class ParameterGuess(NamedTuple):
+    """A guess of a fit, and its result."""
 
-    **Fields:** `values` (S, p), the guesses, and `fitted` (S, p), the fitted values; `cost` (S,)
-    there; `steps` (S,), evaluations of the model with its derivatives; `result` (S,), codes.
-    """
-
-    values: Float[np.ndarray, "S p"]
-    fitted: Float[np.ndarray, "S p"]
-    cost: Float[np.ndarray, " S"]
-    steps: Int[np.ndarray, " S"]
-    result: Int[np.ndarray, " S"]
-
-    def __len__(self) -> int:
-        return len(self.result)
-
-    @property
-    def ok(self) -> Bool[np.ndarray, " S"]:
-        """True for each guess that converged."""
-        return self.result == Result.OK
-
-    def __repr__(self) -> str:
-        rows = [f"{'cost':>10}  {'steps':>5}  result"]
-        for cost, steps, code in zip(self.cost, self.steps, self.result, strict=True):
-            rows.append(f"{cost:10.4g}  {steps:5d}  {Result(int(code)).message}")
-        return "\n".join(rows)
+    values: Float[np.ndarray, " p"]
+    fitted: Float[np.ndarray, " p"]
+    cost: float
+    steps: int
+    """Evaluations of the model with its derivatives."""
+    result: int
+    """Code of `Result`."""
 
 
 class ModelFit(eqx.Module):
@@ -170,7 +155,8 @@ class ModelFit(eqx.Module):
     - `cost`: sum of their squares. `freedom`: r less the number of identified combinations; the
         expected cost where all data have standard deviations.
     - `identifiability`: the combinations of parameters that the data identify.
-    - `guesses`: the result of each guess. `result`: code of the best one.
+    - `guesses`: for each guess, in order, its `values` (p,), the `fitted` ones (p,), their `cost`,
+        the number of evaluations, `steps`, and the `result`. `result`: code of the best one.
     - `problem`: the minimized function.
     """
 
@@ -183,7 +169,7 @@ class ModelFit(eqx.Module):
     cost: float = eqx.field(static=True)
     freedom: int = eqx.field(static=True)
     identifiability: Identifiability
-    guesses: ParameterGuesses
+    guesses: tuple[ParameterGuess, ...]
     result: int = eqx.field(static=True)
     problem: FitProblem
 
@@ -242,9 +228,11 @@ class ModelFit(eqx.Module):
 
     def _cost(self) -> str:
         expected = f", expected {self.freedom}" if self.weighted else ""
+        good = sum(guess.result == Result.OK for guess in self.guesses)
+        steps = sum(guess.steps for guess in self.guesses)
         return (
-            f"cost {self.cost:.6g}{expected}; {int(np.sum(self.guesses.ok))} of "
-            f"{len(self.guesses)} guesses converged, {int(np.sum(self.guesses.steps))} evaluations"
+            f"cost {self.cost:.6g}{expected}; {good} of {len(self.guesses)} guesses converged, "
+            f"{steps} evaluations"
         )
 
     def _repr_html_(self) -> str:

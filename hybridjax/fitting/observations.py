@@ -21,7 +21,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.plan import Plan
 from ..experiments.response import course, flow_batch, response_function
-from ..identify.variable_projection import check_values, error_weights
+from ..identify.weights import check_values, error_weights
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections, FamilyLike, as_family

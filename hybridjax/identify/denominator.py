@@ -27,7 +27,10 @@ _SMALLEST_REMAINDER = 0.1
 
 def chi(period_delay: Complex[np.ndarray, " E"], c: Coefficients) -> Complex[np.ndarray, " E"]:
     r"""Return $1 + c_1 z^{-N} + \ldots + c_d z^{-dN}$ at values of $z^{-N}$, the period's delay."""
-    return np.polynomial.polynomial.polyval(period_delay, np.concatenate([[1.0], c]))
+    value = np.zeros_like(period_delay)
+    for coefficient in c[::-1]:
+        value = (value + coefficient) * period_delay
+    return 1 + value
 
 
 def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:

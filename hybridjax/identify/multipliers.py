@@ -21,22 +21,19 @@ from .denominator import chi, multipliers_of
 from .descent import ROUNDING
 from .multiplier_estimate import MultiplierEstimate
 from .variable_projection import (
-    SMALLEST_ERROR,
     HTFGroup,
-    check_values,
     delayed_responses,
     error_spectrum,
-    error_weights,
     group_htf,
     grouped,
-    line_variances,
     maximum_likelihood,
     misfit_of,
     numerator_size,
     numerators_of,
     summarize,
-    weights_of,
+    unfold,
 )
+from .weights import SMALLEST_ERROR, check_values, error_weights, line_variances, weights_of
 
 
 # Fits of HTFs without variances whose weights come from the last misfit. Fewer: weights of the
@@ -167,13 +164,8 @@ def fit_multipliers(
     if check:
         require_order(groups, htf, order, cost / freedom)
 
-    B = np.zeros((len(H), size, *H.shape[2:]), complex)
-    for group in groups:
-        b = numerators_of(group, c).T
-        i, j = group.channel.T
-        B[group.harmonic, :, i, j] = b
-        if group.mirror is not None:
-            B[group.mirror, :, i, j] = b.conj()
+    b = [numerators_of(group, c) for group in groups]
+    B = unfold(htf, groups, b, [x.conj() for x in b])
     misfit = np.abs(_evaluate(B, c, f, htf.n_sections) - H) ** 2
     return StructuredFit(
         multipliers=multipliers_of(c),

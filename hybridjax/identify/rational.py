@@ -1,7 +1,8 @@
 """The paper's parametric fit: one rational function of z for one harmonic (Sec. VI-C3)."""
 
+import functools
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
@@ -20,6 +21,13 @@ from .multiplier_estimate import (
     Multipliers,
     channel_index,
     compare_multipliers,
+)
+from .variable_projection import (
+    HTFGroup,
+    delayed_columns,
+    equal_weights,
+    numerators_of,
+    residuals_of,
 )
 
 
@@ -157,9 +165,9 @@ def fit_rational(
             f"{poles} poles and {zeros} zeros have {poles + zeros + 1} coefficients, too many for "
             f"{len(H)} frequencies."
         )
-    w = np.exp(-2j * np.pi * np.asarray(htf.f) / htf.n_sections)[:, None]
-    powers_b = w ** (int(form == "delayed") + np.arange(zeros + 1))
-    powers_a = w ** (1 + np.arange(poles))
+    # The denominator of a system with one section.
+    f = np.asarray(htf.f) / htf.n_sections
+    powers = np.exp(-2j * np.pi * f[:, None] * (int(form == "delayed") + np.arange(zeros + 1)))
     fits = []
     for row in rows:
         h = H[:, row]
@@ -170,12 +178,12 @@ def fit_rational(
         if rms == 0 or (weighting == "relative" and np.abs(h).min() < ROUNDING * rms):
             raise DefinitionError(f"{name} is zero at a frequency: there is nothing to fit there.")
         weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
-        problem = _Problem(powers_b, powers_a, h / rms, weight / np.sqrt(len(h)))
+        entry = (0, -1, 1.0, (row, column), h / rms, weight / np.sqrt(len(h)))
+        (group,) = equal_weights(f, zeros + 1, powers, [entry])
+        linearize = functools.partial(residuals_of, [group])
         with np.errstate(all="ignore"):
-            ends = [least_squares(problem.linearize, a, 200, _ACCURACY**2)
-                    for a in problem.starts()]  # fmt: skip
-            projected = [problem.project(a) for a, _ in ends]
-        cost = np.array([float(np.linalg.norm(residual)) for _, residual, _ in projected])
+            ends = [least_squares(linearize, a, 200, _ACCURACY**2) for a in _starts(group, poles)]
+            cost = np.array([float(np.linalg.norm(linearize(a)[0])) for a, _ in ends])
         cost[~np.isfinite(cost)] = np.inf
         if not np.isfinite(cost).any():
             raise ComputationError(f"no start led to a finite fit of {name}: try fewer poles.")
@@ -183,7 +191,8 @@ def fit_rational(
         best = int(np.argmax(lowest * [1 + converged for _, converged in ends]))
         a, converged = ends[best]
         result = Result.OK if converged else Result.NOT_CONVERGED
-        fits.append((projected[best][0] * rms, np.append(1.0, a), cost[best], int(result)))
+        b = numerators_of(group, a)[:, 0] * rms
+        fits.append((b, np.append(1.0, a), cost[best], int(result)))
     numerator, denominator, residual, result = map(np.array, zip(*fits, strict=True))
     roots = np.stack([_roots(a) for a in denominator])
     with np.errstate(over="ignore", invalid="ignore"):  # a useless pole far outside overflows
@@ -212,48 +221,11 @@ def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     return np.concatenate([np.full(len(coefficients) - 1 - len(finite), np.nan), finite])
 
 
-class _Problem(NamedTuple):
-    """The weighted residual W (H - B/A) of F lines."""
-
-    powers_b: Complex[np.ndarray, "F q1"]
-    """The powers of z of the coefficients of B,"""
-    powers_a: Complex[np.ndarray, "F p"]
-    """and of those of A after its leading 1."""
-    h: Complex[np.ndarray, " F"]
-    weight: Float[np.ndarray, " F"]
-
-    def project(
-        self, a: Float[np.ndarray, " p"]
-    ) -> tuple[Float[np.ndarray, " q1"], Float[np.ndarray, " rows"], Float[np.ndarray, "rows p"]]:
-        """Return the best numerator, the residual and its derivative by the coefficients of A."""
-        bottom = 1 + self.powers_a @ a
-        by_numerator = (self.weight / bottom)[:, None] * self.powers_b
-        q, triangle = np.linalg.qr(_real(by_numerator))
-        target = _real((self.weight * self.h)[:, None])[:, 0]
-        b = np.linalg.solve(triangle, q.T @ target)
-        residual = target - q @ (q.T @ target)
-        # B/A and the space of all B/A change with the denominator (Golub and Pereyra 1973).
-        slope = -self.powers_a / bottom[:, None]
-        moved = _real((by_numerator @ b)[:, None] * slope)
-        turned = np.stack([_real(x[:, None] * by_numerator).T @ residual for x in slope.T], axis=1)
-        jacobian = q @ (q.T @ moved) - moved - q @ np.linalg.solve(triangle.T, turned)
-        return b, residual, jacobian
-
-    def linearize(self, a: Float[np.ndarray, " p"]):
-        return self.project(a)[1:]
-
-    def starts(self) -> Iterator[Float[np.ndarray, " p"]]:
-        """Iterate as Sanathanan and Koerner: the last denominator weighs the next problem."""
-        h, p = self.h[:, None], self.powers_a.shape[1]
-        a = np.zeros(p)
-        for step in range(1 + max(_STARTS)):
-            scale = (self.weight / np.abs(1 + self.powers_a @ a))[:, None]
-            columns = _real(scale * np.concatenate([h * self.powers_a, -self.powers_b], axis=1))
-            size = np.linalg.norm(columns, axis=0)
-            a = (np.linalg.lstsq(columns / size, -_real(scale * h)[:, 0])[0] / size)[:p]
-            if step in _STARTS:
-                yield a
-
-
-def _real(z: Complex[np.ndarray, "F n"]) -> Float[np.ndarray, "rows n"]:
-    return np.concatenate([np.real(z), np.imag(z)])
+def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:
+    """Iterate as Sanathanan and Koerner: the last denominator weighs the next problem."""
+    a = np.zeros(poles)
+    for step in range(1 + max(_STARTS)):
+        columns, _ = delayed_columns(group, a)
+        a = np.linalg.lstsq(columns[:, 1:], -columns[:, 0])[0]
+        if step in _STARTS:
+            yield a

@@ -195,19 +195,7 @@ def _excited(data: ExperimentData, windows: list[slice], threshold: float, first
         )
     excited = ((size > threshold * peak) & (size > ROUNDING * peak.max())).any(axis=2)
     experiment, line = np.nonzero(excited)
-    number = excited.sum(axis=1)
-
-    def hint(experiment: int) -> str:
-        lines = number[experiment - first]
-        if lines <= data.periods // 2 + 1:
-            return ""
-        return (
-            f" ({lines} lines are excited, more than any experiment can hold: is the "
-            f"input periodic over the last P = {data.periods} periods, and without noise above "
-            "`threshold`?)"
-        )
-
-    check_sharing(experiment + first, line, data.periods, hint)
+    check_sharing(experiment + first, line, data.periods)
     return experiment, line, U[experiment, line]
 
 

@@ -1,11 +1,10 @@
 """Is an identified model good enough? Simulation of data that it was not fitted to."""
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import special, stats
 
 from .._core.arguments import require_same
@@ -43,32 +42,33 @@ def can_be_compared(model: LDTP | SeriesFit | Predictor, record: Record, free_st
     return int(np.isfinite(record.y).sum()) > _SAMPLES_PER_UNKNOWN * unknown
 
 
-def simulate_record(
-    model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool
-) -> Float[np.ndarray, "n ny"]:
+def simulate(
+    model: LDTP | SeriesFit | Predictor, grid: CycleGrid, free_start: bool
+) -> Float[np.ndarray, "S T N ny"]:
     """Return the outputs of a model: a `Predictor` one step ahead, others from inputs alone.
 
-    **Arguments:** `record`, without unknown inputs. `free_start`: from the state that fits the
-    record best, or from zero. A drift that the record announces is estimated in either case.
+    **Arguments:** `free_start`: from the states that fit each record best, or from zero. A drift
+    that the records announce is estimated in either case.
     """
     if isinstance(model, SeriesFit):
-        return _simulate_fit(model, record, free_start)
+        return _simulate_fit(model, grid, free_start)
     if isinstance(model, LDTP):
         # Outputs in units of their size, so that none is neglected.
-        square = np.ma.masked_invalid(record.y**2).mean(axis=0).filled(0.0)
-        S = np.diag(np.where(square > 0, square, 1.0))
+        square = (grid.y**2).sum(axis=(0, 1, 2))
+        S = np.diag(np.where(square > 0, square / grid.sampled.sum(axis=(0, 1, 2)), 1.0))
         plain = PeriodicModel.of(model, np.ones(len(S)))
         model = Predictor(plain, np.stack([S] * model.n_sections))
-    return model.predict(record, free_start)
+    return model.predict(grid, free_start)
 
 
-def _simulate_fit(fit: SeriesFit, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:
+def _simulate_fit(
+    fit: SeriesFit, grid: CycleGrid, free_start: bool
+) -> Float[np.ndarray, "S T N ny"]:
     N, R, ny, nu = fit.numerators.shape
-    grid = CycleGrid.from_records([record])
     v, T = divide_by_chi(fit.coefficients, grid.u), grid.u.shape[1]
     # As in the fit, earlier inputs act on so many cycles without a model.
     free = min(_free_cycles(fit), T) if free_start else 0
-    out = np.zeros((T, N, ny))
+    out = np.zeros(grid.y.shape)
     for n, i in np.ndindex(N, ny):
         forced = lagged_inputs(v, n, R, fit.lead) @ fit.numerators[n, :, i].reshape(R * nu, 1)
         starts = start_responses(fit.coefficients, grid.first[:, n], T, free)
@@ -76,8 +76,8 @@ def _simulate_fit(fit: SeriesFit, record: Record, free_start: bool) -> Float[np.
         regression = SectionRegression.make(forced, unknown, none, grid.sampled[:, :, n, i])
         y, sampled = grid.y[:, :, n, i], grid.sampled[:, :, n, i]
         error = regression.residual(np.ones(1), y).reshape(y.shape)
-        out[:, n, i] = np.where(sampled, y - error, regression.response(np.ones(1), y))[0]
-    return out.reshape(T * N, ny)[record.first_section :][: len(record.u)]
+        out[:, :, n, i] = np.where(sampled, y - error, regression.response(np.ones(1), y))
+    return out
 
 
 def _free_cycles(fit: SeriesFit) -> int:
@@ -95,52 +95,23 @@ FEWEST_SAMPLES = 8
 _POWER = 0.8
 
 
-class Samples(NamedTuple):
-    """The samples of S records, one after the other."""
-
-    n_sections: int
-    section: Int[np.ndarray, " n"]
-    before: Int[np.ndarray, " n"]
-    """The number of earlier samples in the same record."""
-    u: Float[np.ndarray, "n nu"]
-
-    @classmethod
-    def of(cls, records: Sequence[Record]) -> "Samples":
-        N, before = records[0].n_sections, [np.arange(len(r.u)) for r in records]
-        section = [(r.first_section + k) % N for r, k in zip(records, before, strict=True)]
-        u = np.concatenate([r.u for r in records])
-        return cls(N, np.concatenate(section), np.concatenate(before), u)
-
-    def at(self, lags: int) -> list[Int[np.ndarray, " k"]]:
-        """Return the samples at each section with so many samples before them."""
-        late = self.before >= lags
-        return [np.flatnonzero(late & (self.section == n)) for n in range(self.n_sections)]
-
-    def count(  # type: ignore[override]  # (of tuples)
-        self, present: Bool[np.ndarray, "n ny"], lags: int
-    ) -> Int[np.ndarray, "N ny"]:
-        """Return how often each section was sampled with so many samples before it."""
-        return np.stack([present[rows].sum(axis=0) for rows in self.at(lags)])
-
-
 def whiteness_test(
-    samples: Samples,
-    error: Float[np.ndarray, "n ny"],
-    size: Float[np.ndarray, "N ny"],
-    lags: int,
+    error: Float[np.ndarray, "S T N ny"], size: Float[np.ndarray, "N ny"], lags: int
 ) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
     """Return correlations of residuals with earlier ones, section by section, and p-values.
 
     **Arguments:** `size`: rms of the residuals at each section.
     """
-    scale, N = np.where(size > 0, size, 1.0), samples.n_sections
-    z, tested = np.zeros((N, lags, size.shape[1])), np.zeros((N, lags, size.shape[1]), bool)
+    S, T, N, ny = error.shape
+    scaled = (error / np.where(size > 0, size, 1.0)).reshape(S, T * N, ny)
+    z, tested = np.zeros((N, lags, ny)), np.zeros((N, lags, ny), bool)
     for k in range(lags):
-        for n, rows in enumerate(samples.at(k + 1)):
-            product = error[rows] * error[rows - k - 1] / scale[n] / scale[(n - k - 1) % N]
-            count = np.isfinite(product).sum(axis=0)
-            z[n, k] = np.nansum(product, axis=0) / np.sqrt(np.maximum(count, 1))
-            tested[n, k] = count >= FEWEST_SAMPLES
+        product = np.full(scaled.shape, np.nan)
+        product[:, k + 1 :] = scaled[:, k + 1 :] * scaled[:, : -k - 1]
+        product = product.reshape(error.shape)
+        count = np.isfinite(product).sum(axis=(0, 1))
+        z[:, k] = np.nansum(product, axis=(0, 1)) / np.sqrt(np.maximum(count, 1))
+        tested[:, k] = count >= FEWEST_SAMPLES
     # The mean over the sections of each lag, and the deviations from it: independent.
     z = z * tested
     count = tested.sum(axis=0)
@@ -155,23 +126,29 @@ def whiteness_test(
 
 
 def independence_test(
-    samples: Samples, error: Float[np.ndarray, "n ny"], lags: int, level: float
+    u: Float[np.ndarray, "S T N nu"],
+    error: Float[np.ndarray, "S T N ny"],
+    lags: int,
+    level: float,
 ) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
     """Test the part of residuals that present and past inputs explain, section by section.
+
+    **Arguments:** `error`: NaN where the inputs of so many lags are not known.
 
     **Returns:** the correlations with the inputs, the p-values, and the smallest visible misfits,
     in standard deviations of the noise, for tests of this level. A misfit of rms r times the noise
     makes F ratios of n samples noncentral, by $n r^2$. The power is that of one F ratio with the
     degrees of freedom of all sections, which is 1 to 4 % too optimistic.
     """
-    N, ny, nu = samples.n_sections, error.shape[1], samples.u.shape[1]
+    _, _, N, ny = error.shape
+    nu = u.shape[3]
     z, deviates, tested = np.zeros((N, lags, ny, nu)), np.zeros(ny), np.zeros(ny)
     degrees = np.zeros((2, ny))
-    for n, rows in enumerate(samples.at(lags - 1)):
-        past = samples.u[rows[:, None] - np.arange(lags)].reshape(len(rows), -1)
+    for n in range(N):
+        past = lagged_inputs(u, n, lags, 0)
         for i in range(ny):
-            present = np.isfinite(error[rows, i])
-            U, r, count = past[present], error[rows, i][present], int(present.sum())
+            present = np.isfinite(error[:, :, n, i])
+            U, r, count = past[present], error[:, :, n, i][present], int(present.sum())
             if count < FEWEST_SAMPLES or not r.any():
                 continue
             size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
@@ -333,10 +310,17 @@ def validate(
             f"{max(len(r.u) for r in records) / N:.3g} cycles: too few to tell the model from an "
             "unknown start."
         )
-    y = np.concatenate([r.y for r in compared])
-    samples, present = Samples.of(compared), np.isfinite(y)
-    spread = np.ma.masked_invalid(y).std(axis=0).filled(0.0)
-    sampled = samples.count(present, 0)
+    grid = CycleGrid.from_records(compared)
+    first = np.array([r.first_section for r in compared])
+    before = np.arange(grid.inside[0].size).reshape(-1, N) - first[:, None, None]  # in the record
+    y = np.where(grid.sampled, grid.y, np.nan)
+    spread = np.ma.masked_invalid(y).std(axis=(0, 1, 2)).filled(0.0)
+
+    def count(lags: int) -> Int[np.ndarray, "N ny"]:
+        """Return how often each section was sampled with so many samples before it."""
+        return (grid.sampled & (before >= lags)[..., None]).sum(axis=(0, 1))
+
+    sampled = count(0)
     for name, few, size in zip(outputs, sampled.min(axis=0), spread, strict=True):
         if not size:
             raise DefinitionError(f"the output {name} is constant or missing at every sample.")
@@ -347,23 +331,24 @@ def validate(
             )
     # One period, less for few cycles.
     tried = range(1, min(N, int(sampled.min()) // _SAMPLES_PER_LAG) + 1)
-    enough = [samples.count(present, lag).min() >= FEWEST_SAMPLES for lag in tried]
+    enough = [count(lag).min() >= FEWEST_SAMPLES for lag in tried]
     lags = max(sum(map(bool, enough)), 1)
-    if (samples.count(present, lags).max(axis=0) < FEWEST_SAMPLES).any():
+    if (count(lags).max(axis=0) < FEWEST_SAMPLES).any():
         raise DefinitionError(
             f"the records are too short: no section was sampled {FEWEST_SAMPLES} times with {lags} "
             "samples before it in its record."
         )
-    simulated = np.concatenate([simulate_record(tested, r, free_start) for r in compared])
+    simulated = simulate(tested, grid, free_start)
     error = y - simulated
-    square = np.stack([np.nansum(error[at] ** 2, axis=0) for at in samples.at(0)])
+    square = np.nansum(error**2, axis=(0, 1))
     rms = np.sqrt(square.sum(axis=0) / sampled.sum(axis=0))
-    size = np.sqrt(np.mean(simulated**2, axis=0))
-    auto, whiteness = whiteness_test(samples, error, np.sqrt(square / sampled), lags)
-    cross, independence, visible = independence_test(samples, error, lags, level / ny)
-    first = int(np.argmax([len(r.u) for r in compared]))
-    longest, begin = compared[first], sum(len(r.u) for r in compared[:first])
-    shown = slice(begin, begin + len(longest.u) - longest.lead)  # later inputs are unknown
+    size = np.sqrt(np.mean(simulated[grid.inside] ** 2, axis=0))
+    auto, whiteness = whiteness_test(error, np.sqrt(square / sampled), lags)
+    late = np.where((before >= lags - 1)[..., None], error, np.nan)
+    cross, independence, visible = independence_test(grid.u, late, lags, level / ny)
+    k = int(np.argmax([len(r.u) for r in compared]))
+    longest = compared[k]
+    shown = slice(first[k], first[k] + len(longest.u) - longest.lead)  # later inputs are unknown
     return Validation(
         fit=100 * (1 - rms / spread),
         noise=rms,
@@ -372,8 +357,8 @@ def validate(
         visible=np.where(size > 0, visible * rms / np.where(size > 0, size, 1.0), np.inf),
         autocorrelation=auto,
         cross_correlation=cross,
-        measured=y[shown],
-        simulated=simulated[shown],
+        measured=y[k].reshape(-1, ny)[shown],
+        simulated=simulated[k].reshape(-1, ny)[shown],
         level=level,
         first_section=longest.first_section,
         left_out=len(records) - len(compared),

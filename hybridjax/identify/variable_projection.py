@@ -8,6 +8,7 @@ depends on c alone (variable projection: Golub and Pereyra 1973).
 Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\varepsilon|^2}$.
 """
 
+from collections.abc import Sequence
 from itertools import count
 from typing import Literal, NamedTuple
 
@@ -18,6 +19,7 @@ from ..errors import DefinitionError
 from ..linear.htf import HTF
 from .denominator import Covariance, chi, inverse_of_remainder, sandwich
 from .descent import NO_LEADING_COEFFICIENT, ROUNDING, Coefficients, least_squares
+from .weights import check_values, error_weights
 
 
 # Decimal digits to which weights must agree (up to a factor) to be solved for together. More: a
@@ -29,70 +31,59 @@ _MAX_REWEIGHTINGS, _SETTLED_START = 6, 1e-3
 
 
 class HTFGroup(NamedTuple):
-    """Entries of the HTFs with the same equations and, up to a factor, the same weights.
+    """Responses with the same equations and, up to a factor, the same weights.
 
-    There are E equations, one per frequency (positive, and negative for pairs of harmonics), K
-    entries and R coefficients of each numerator, which are real if `real`. Equations of real
-    numerators are split into real and imaginary parts: then there are twice as many `rows`.
+    There are E complex equations for each of K responses, and r real unknowns of its numerator.
     """
 
     harmonic: Int[np.ndarray, " K"]
-    """The position of an entry's harmonic in the HTFs,"""
-    mirror: Int[np.ndarray, " K"] | None
-    """that of the opposite harmonic, whose conjugate has the same numerator,"""
+    """The position of a response's harmonic in the HTFs,"""
+    mirror: Int[np.ndarray, " K"]
+    """that of the opposite harmonic, -1 where there is no other,"""
+    share: Complex[np.ndarray, " K"]
+    """the factor of the response in the HTF of its harmonic (conjugate: in the opposite one),"""
     channel: Int[np.ndarray, "K 2"]
     """and its output and input."""
-    real: bool
     line: Int[np.ndarray, " E"]
     """The frequency that an equation belongs to."""
     period_delay: Complex[np.ndarray, " E"]
     """z^-N, the delay by one period."""
-    basis: Inexact[np.ndarray, "rows r"]
-    """Orthonormal basis of the powers of z^-1 on these frequencies."""
+    basis: Float[np.ndarray, "2*E r"]
+    """Orthonormal basis of the numerators' values on these frequencies."""
     to_powers: Inexact[np.ndarray, "R r"]
-    """The (smallest) coefficients of the powers that make each element of the basis."""
+    """The (smallest) coefficients of the powers of z^-1 that make each element of the basis."""
     weight: Float[np.ndarray, " E"]
     scale: Float[np.ndarray, " K"]
     data: Complex[np.ndarray, "E K"]
-    """H times `scale`."""
+    """The responses times `scale`."""
 
     @property
     def freedom(self) -> int:
-        """Real equations that the numerators of one entry leave."""
-        return 2 * len(self.period_delay) - self.basis.shape[1] * (1 if self.real else 2)
+        """Real equations that the numerator of one response leaves."""
+        return len(self.basis) - self.basis.shape[1]
 
     @property
     def size(self) -> int:
-        """K, the number of entries."""
+        """K, the number of responses."""
         return self.data.shape[1]
-
-    def split(self, values: Complex[np.ndarray, "E n"]) -> Inexact[np.ndarray, "rows n"]:
-        """Return one row for each equation of the numerators."""
-        return np.concatenate([np.real(values), np.imag(values)]) if self.real else values
-
-    def components(self, rows: Inexact[np.ndarray, "rows n"]) -> Float[np.ndarray, "2 E n"]:
-        """Return the real and imaginary parts of rows that `split` has made."""
-        if self.real:
-            return rows.reshape(2, len(self.period_delay), -1)
-        return np.stack([np.real(rows), np.imag(rows)])
 
     def weighted(
         self, c: Coefficients, values: Complex[np.ndarray, "E n"]
-    ) -> Inexact[np.ndarray, "rows n"]:
+    ) -> Float[np.ndarray, "2*E n"]:
         """Return the rows of chi H = B, weighted: errors of H are multiplied by chi there."""
-        return self.split((self.weight / np.abs(chi(self.period_delay, c)))[:, None] * values)
+        return split((self.weight / np.abs(chi(self.period_delay, c)))[:, None] * values)
 
     def numerator_space(
         self, c: Coefficients
-    ) -> tuple[Inexact[np.ndarray, "rows r"], Inexact[np.ndarray, "r r"]]:
+    ) -> tuple[Float[np.ndarray, "2*E r"], Float[np.ndarray, "r r"]]:
         """Return an orthonormal basis of the numerators' weighted values, and its QR's triangle."""
         w = self.weight / np.abs(chi(self.period_delay, c))
-        return np.linalg.qr(np.concatenate([w, w])[: len(self.basis), None] * self.basis)
+        return np.linalg.qr(np.concatenate([w, w])[:, None] * self.basis)
 
-    def leverage(self, q: Inexact[np.ndarray, "rows r"]) -> Float[np.ndarray, "2 E"]:
-        """Return the share of each real equation that the numerators explain for any data."""
-        share = (np.abs(q) ** 2).sum(axis=1)
-        return share.reshape(2, -1) if self.real else np.stack([share, share])
+
+def split(values: Complex[np.ndarray, "*d E n"]) -> Float[np.ndarray, "*d 2*E n"]:
+    """Return real parts, then imaginary parts."""
+    return np.concatenate([values.real, values.imag], axis=-2)
 
 
 class Misfit(NamedTuple):
@@ -105,55 +96,75 @@ class Misfit(NamedTuple):
     noise: Float[np.ndarray, "d d"]
     """Part of jacobian^T jacobian that comes from errors of variance 1 in the data, per entry."""
     leverage: Float[np.ndarray, "2 E"]
+    """The share of each real equation that the numerators explain for any data."""
 
 
 def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     """Return the misfit at c and its derivatives; `Misfit.noise` is zero unless asked for."""
-    d, equations = len(c), len(group.period_delay)
+    d, E = len(c), len(group.period_delay)
     q, _ = group.numerator_space(c)
     below = chi(group.period_delay, c)[:, None]
-    target = group.weighted(c, below * group.data)
-    explained = q @ (q.conj().T @ target)
+    target = split((group.weight[:, None] / np.abs(below)) * below * group.data)
+    explained = q @ (q.T @ target)
+    # The delays divided by chi (up to its phase, which all rows share).
+    delays = group.period_delay[:, None] ** np.arange(1, d + 1)[:, None, None] / below
 
-    def filtered(rows, j):
-        """z^-jN / chi times the rows (up to the phase of chi, which all rows share)."""
-        factor = group.period_delay[:, None] ** j / below
-        if group.real:
-            rows = rows[:equations] + 1j * rows[equations:]
-        rows = group.split(factor * rows)
-        return rows - q @ (q.conj().T @ rows)
+    def filtered(rows):
+        rows = split(delays * (rows[:E] + 1j * rows[E:]))
+        return rows - q @ (q.T @ rows)
 
-    slopes = [group.components(filtered(explained, j)) for j in range(1, d + 1)]
     by_noise = np.zeros((d, d))
     if noise:
-        leaks = [filtered(q, j).ravel() for j in range(1, d + 1)]
-        by_noise = np.array([[np.vdot(a, b).real for a in leaks] for b in leaks])
-        by_noise *= 1 if group.real else 2
-    residual = group.components(target - explained)
-    return Misfit(residual, np.reshape(slopes, (d, *residual.shape)), by_noise, group.leverage(q))
+        leaks = filtered(q).reshape(d, -1)
+        by_noise = leaks @ leaks.T
+    residual = (target - explained).reshape(2, E, -1)
+    slopes = filtered(explained).reshape(d, *residual.shape)
+    return Misfit(residual, slopes, by_noise, (q**2).sum(axis=1).reshape(2, E))
+
+
+def delayed_columns(
+    group: HTFGroup, c: Coefficients
+) -> tuple[Float[np.ndarray, "n d1"], Float[np.ndarray, " E"]]:
+    r"""Return $z^{-jN} H$, j = 0, ..., d, less numerators and weighted by $1/|\chi|$.
+
+    The coefficients of chi combine the columns to errors alone. Then the part of each equation's
+    variance that numerators leave.
+    """
+    q, _ = group.numerator_space(c)
+    rows = [
+        group.weighted(c, group.period_delay[:, None] ** j * group.data) for j in range(len(c) + 1)
+    ]
+    columns = np.stack([(x - q @ (q.T @ x)).ravel() for x in rows], axis=1)
+    left = 2 - (q**2).sum(axis=1).reshape(2, -1).sum(axis=0)
+    return columns, left / np.abs(chi(group.period_delay, c)) ** 2
 
 
 def delayed_responses(
     groups: list[HTFGroup], c: Coefficients
 ) -> tuple[Float[np.ndarray, "d1 r"], Float[np.ndarray, "d1 d1"]]:
-    r"""Return roots of two Gram matrices of $z^{-jN} H$, j = 0, ..., d, less numerators.
+    """Return roots of two Gram matrices of the delayed responses of all groups.
 
-    The responses of all groups are weighted by $1/|\chi|$; the coefficients of chi combine them to
-    errors alone. The first root is in units of the second, which is that of the Gram matrix that is
-    expected from errors of variance 1. (The Gram matrix itself would lose half of the digits.)
+    The first root is in units of the second, which is that of the Gram matrix that is expected from
+    errors of variance 1. (The Gram matrix itself would lose half of the digits.)
     """
     delays, columns, noise_gram = np.arange(len(c) + 1), [], 0.0
     for group in groups:
-        q, _ = group.numerator_space(c)
-        parts = [group.weighted(c, group.period_delay[:, None] ** j * group.data) for j in delays]
-        parts = [group.components(part - q @ (q.conj().T @ part)).ravel() for part in parts]
-        columns.append(np.stack(parts, axis=1))
-        left = (2 - group.leverage(q).sum(axis=0)) / np.abs(chi(group.period_delay, c)) ** 2
+        delayed, left = delayed_columns(group, c)
+        columns.append(delayed)
         by_delay = (left * (group.period_delay ** delays[:, None]).real).sum(axis=1)
         noise_gram = noise_gram + by_delay[np.abs(delays[:, None] - delays)] * group.size
     noise = np.linalg.cholesky(noise_gram)
     _, triangle = np.linalg.qr(np.concatenate(columns))
     return np.linalg.solve(noise, triangle.T), noise
+
+
+def residuals_of(
+    groups: list[HTFGroup], c: Coefficients
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d"]]:
+    """Return the residuals of all groups, and their Jacobian."""
+    parts = [misfit_of(group, c) for group in groups]
+    jacobian = np.concatenate([p.jacobian.reshape(len(c), -1) for p in parts], axis=1)
+    return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
 
 
 def maximum_likelihood(
@@ -164,13 +175,8 @@ def maximum_likelihood(
     **Arguments:** `start`: where the descent starts. Default: the solution of the linearized
     problem.
     """
-
-    def linearize(c):
-        parts = [misfit_of(group, c) for group in groups]
-        jacobian = np.concatenate([p.jacobian.reshape(order, -1) for p in parts], axis=1)
-        return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
-
-    return least_squares(linearize, _linearized(groups, order) if start is None else start)
+    start = _linearized(groups, order) if start is None else start
+    return least_squares(lambda c: residuals_of(groups, c), start)
 
 
 def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
@@ -236,7 +242,28 @@ def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"
     """Return the best numerators for c, of data that are not scaled."""
     q, triangle = group.numerator_space(c)
     target = group.weighted(c, chi(group.period_delay, c)[:, None] * group.data)
-    return group.to_powers @ np.linalg.solve(triangle, q.conj().T @ target) / group.scale
+    return group.to_powers @ np.linalg.solve(triangle, q.T @ target) / group.scale
+
+
+def unfold(
+    htf: HTF,
+    groups: list[HTFGroup],
+    values: Sequence[Inexact[np.ndarray, "n _"]],
+    opposite: Sequence[Inexact[np.ndarray, "n _"]],
+) -> Complex[np.ndarray, "M n ny nu"]:
+    """Return numbers of the HTFs from those of the responses of each group.
+
+    **Arguments:** `opposite`: numbers of the same responses for the opposite harmonic.
+    """
+    _, _, ny, nu = htf.H.shape
+    out = np.zeros((len(htf.harmonics), len(values[0]), ny, nu), complex)
+    for group, here, there in zip(groups, values, opposite, strict=True):
+        i, j = group.channel.T
+        np.add.at(out, (group.harmonic, slice(None), i, j), (group.share * here).T)
+        two = group.mirror >= 0
+        mirrored = (group.share.conj() * there).T[two]
+        np.add.at(out, (group.mirror[two], slice(None), i[two], j[two]), mirrored)
+    return out
 
 
 def grouped(htf: HTF, order: int, overhang: int | None) -> list[HTFGroup]:
@@ -246,69 +273,77 @@ def grouped(htf: HTF, order: int, overhang: int | None) -> list[HTFGroup]:
 
 
 def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> list[HTFGroup]:
-    """Group all entries of the HTFs, with numerators of `size` coefficients.
+    r"""Group all entries of the HTFs, with numerators of `size` coefficients.
 
-    Positive and negative frequencies are used, since H_m(-w) = conj H_{-m}(w); where m and -m
-    are the same harmonic the numerators are real.
+    The numerator of $H_m$ is real if m and -m are the same harmonic. It is the conjugate of that of
+    $H_{-m}$ otherwise, so that $(H_m + H_{-m}) / \sqrt 2$ and $(H_m - H_{-m}) / (\sqrt 2 i)$ are
+    two responses with real numerators, and independent errors if both weights are the same. Other
+    pairs, and harmonics without the opposite one, have complex numerators.
     """
-    row_of = {m % htf.n_sections: row for row, m in enumerate(htf.harmonics)}
-    opposite = {row: row_of.get(-m % htf.n_sections) for m, row in row_of.items()}
-    pairs = {other: row for row, other in opposite.items() if other is not None and row < other}
-    kinds = (
-        ([row for row, other in opposite.items() if other == row], None, True),
-        (list(pairs), list(pairs.values()), False),
-        ([row for row, other in opposite.items() if other is None], None, False),
-    )
-    return [group for kind in kinds if kind[0] for group in _groups(htf, weight, size, *kind)]
+    f, H, N = np.asarray(htf.f), np.asarray(htf.H), htf.n_sections
+    powers = np.exp(-2j * np.pi / N * f[:, None] * np.arange(size))
+    turned = np.concatenate([powers, 1j * powers], axis=1)
+    pair = np.concatenate([turned, np.concatenate([powers, -1j * powers], axis=1)])
+    row_of = {m % N: row for row, m in enumerate(htf.harmonics)}
+    real: list[tuple] = []
+    single: list[tuple] = []
+    double: list[tuple] = []
+    half = np.sqrt(0.5)
+    for m, row in row_of.items():
+        other, h, w = row_of.get(-m % N, -1), H[row], weight[row]
+        g, v = H[other], weight[other]
+        same = (np.abs(v - w) <= 10.0**-EQUAL_WEIGHTS * w).all(axis=0)
+        for i, j in np.ndindex(same.shape):
+            at, channel = (slice(None), i, j), (i, j)
+            if other == row:
+                real.append((row, -1, 1.0, channel, h[at], w[at]))
+            elif other < 0:
+                single.append((row, -1, 1.0, channel, h[at], w[at]))
+            elif row < other and same[i, j]:
+                real.append((row, other, half, channel, half * (h + g)[at], w[at]))
+                real.append((row, other, 1j * half, channel, half / 1j * (h - g)[at], w[at]))
+            elif row < other:
+                both = np.concatenate([h[at], g[at]]), np.concatenate([w[at], v[at]])
+                double.append((row, other, 1.0, channel, *both))
+    kinds = (powers, real), (turned, single), (pair, double)
+    return [group for kind in kinds if kind[1] for group in equal_weights(f, size, *kind)]
 
 
-def _groups(
-    htf: HTF,
-    weight: Float[np.ndarray, "M F ny nu"],
-    size: int,
-    rows: list[int],
-    mirror: list[int] | None,
-    real: bool,
+def equal_weights(
+    f: Float[np.ndarray, " F"], size: int, matrix: Complex[np.ndarray, "E u"], entries: list[tuple]
 ) -> list[HTFGroup]:
-    """Return harmonics whose numerators solve the same problem, one group for each weight."""
-    f = np.asarray(htf.f)
-    F, ny, nu = len(f), len(htf.outputs), len(htf.inputs)
+    """Return responses whose numerators solve the same problem, one group for each weight.
 
-    def both(values, conjugate):  # negative frequencies after the positive ones
-        return values if mirror is None else np.concatenate([values, conjugate])
-
-    def entries(values):  # (M, F, ny, nu) -> (E, K)
-        parts = [values[rows]] + ([] if mirror is None else [values[mirror].conj()])
-        return np.moveaxis(np.concatenate(parts, axis=1), 1, 0).reshape(-1, len(rows) * ny * nu)
-
-    powers = np.exp(-2j * np.pi / htf.n_sections * f[:, None] * np.arange(size))
-    powers, delay = both(powers, powers.conj()), np.exp(-2j * np.pi * f)
-    powers = np.concatenate([np.real(powers), np.imag(powers)]) if real else powers
-    basis, to_powers = powers_basis(powers)
-    weights, data = entries(weight), entries(np.asarray(htf.H))
-    scale = weights[0]
-    shape = weights / scale
+    **Arguments:** `matrix`: maps u real coefficients to the numerator's values. `entries`: for
+    each response the position of its harmonic and of the opposite one, its share, output and
+    input, values and weights.
+    """
+    harmonic, mirror, share, channel, data, weights = map(np.array, zip(*entries, strict=True))
+    basis, to_powers = powers_basis(split(matrix))
+    if len(to_powers) > size:
+        to_powers = to_powers[:size] + 1j * to_powers[size:]
+    scale = weights[:, 0]
+    shape = weights / scale[:, None]
     _, first, which = np.unique(
-        np.round(shape, EQUAL_WEIGHTS), axis=1, return_index=True, return_inverse=True
+        np.round(shape, EQUAL_WEIGHTS), axis=0, return_index=True, return_inverse=True
     )
-    number, i, j = np.unravel_index(np.arange(len(scale)), (len(rows), ny, nu))
-    channel, line = np.stack([i, j], axis=1), both(np.arange(F), np.arange(F))
+    line = np.tile(np.arange(len(f)), len(matrix) // len(f))
     groups = []
     for k, representative in enumerate(first):
         same = np.flatnonzero(which.ravel() == k)
         groups.append(
             HTFGroup(
-                harmonic=np.array(rows)[number[same]],
-                mirror=None if mirror is None else np.array(mirror)[number[same]],
+                harmonic=harmonic[same],
+                mirror=mirror[same],
+                share=share[same],
                 channel=channel[same],
-                real=real,
                 line=line,
-                period_delay=both(delay, delay.conj()),
+                period_delay=np.exp(-2j * np.pi * f[line]),
                 basis=basis,
                 to_powers=to_powers,
-                weight=shape[:, representative],
+                weight=shape[representative],
                 scale=scale[same],
-                data=data[:, same] * scale[same],
+                data=(data[same] * scale[same, None]).T,
             )
         )
     return groups
@@ -325,88 +360,6 @@ def powers_basis(
     u, s, vh = np.linalg.svd(powers, full_matrices=False)
     kept = s > 0.1 * ROUNDING * s[0]  # one combination less would change bounds by 0.3 %
     return u[:, kept], vh[kept].conj().T / s[kept]
-
-
-# Smallest error that an HTF is supposed to have, relative to the rms of its output: that of
-# rounding. Smaller: infinite weights; larger: exact outputs count too little beside noisy ones.
-SMALLEST_ERROR = 1e-15
-
-
-def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
-    """Return the rms of each output's HTFs.
-
-    **Raises:** `DefinitionError` for NaN, an output that is zero, or variances that are no
-    positive numbers.
-    """
-    H = np.asarray(htf.H)
-    if not np.isfinite(H).all():
-        raise DefinitionError("the HTFs hold NaN or infinity.")
-    rms = np.sqrt(np.mean(np.abs(H) ** 2, axis=(0, 1, 3)))
-    if (rms == 0).any():
-        name = htf.outputs[int(np.argmin(rms))]
-        raise DefinitionError(f"the HTFs of {name} are zero: leave this output out.")
-    if htf.variance is not None:
-        bad = np.argwhere(~(np.isfinite(htf.variance) & (np.asarray(htf.variance) >= 0)))
-        if len(bad):
-            m, k, i, _ = (int(x) for x in bad[0])
-            raise DefinitionError(
-                f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = "
-                f"{float(htf.f[k]):g} is not a positive number: estimate it from several "
-                "realizations (`Design.realizations`) or windows (`repeats` of estimate_htf)."
-            )
-    return rms
-
-
-def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, "M F ny nu"]:
-    """Return one over the standard deviation of real and imaginary part, known or supposed.
-
-    Variances that were estimated with few degrees of freedom are poor weights: they are replaced
-    by the nearest product of a factor for each frequency and one for each harmonic, up to its
-    sign (which is the form for white noise and any spectrum of the input).
-
-    **Arguments:** `rms`: where there are no variances, errors are taken as equal parts of it, but
-    for the power of the inputs.
-    """
-    if htf.variance is None:
-        return np.broadcast_to(1 / (rms[:, None] * np.sqrt(line_variances(htf))), htf.H.shape)
-    variance = np.asarray(htf.variance)
-    if htf.scatter is not None:
-        freedom = np.asarray(htf.scatter.freedom)
-        variance = _product_of_factors(variance, np.asarray(htf.harmonics), freedom)
-    return weights_of(variance, rms)
-
-
-def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
-    """Return variances of each frequency and input by white noise, relative to their mean."""
-    if htf.power is None:
-        return np.ones((len(htf.f), 1, len(htf.inputs)))
-    variance = 1 / np.asarray(htf.power)[:, None]
-    return variance / variance.mean()
-
-
-def weights_of(
-    variance: Float[np.ndarray, "... ny _"], rms: Float[np.ndarray, " ny"]
-) -> Float[np.ndarray, "... ny _"]:
-    """Return one over the standard deviation of real and imaginary part."""
-    return np.sqrt(2 / np.maximum(variance, (SMALLEST_ERROR * rms[:, None]) ** 2))
-
-
-def _product_of_factors(
-    variance: Float[np.ndarray, "M F ny nu"],
-    harmonics: Int[np.ndarray, " M"],
-    freedom: Float[np.ndarray, " F"],
-) -> Float[np.ndarray, "M F ny nu"]:
-    """Return the product of factors of frequency and harmonic with the same sums."""
-    if not variance.all():
-        return variance
-    _, same = np.unique(np.abs(harmonics), return_inverse=True)
-    share = freedom / freedom.sum()
-    size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
-    for _ in range(20):  # more sweeps change nothing in 6 digits
-        by_line = (variance / size[same]).mean(axis=0)
-        by_harmonic = np.tensordot(share, variance / by_line, axes=(0, 1))
-        size = np.stack([by_harmonic[same == k].mean(axis=0) for k in range(len(size))])[:, None]
-    return size[same] * by_line
 
 
 def numerator_size(htf: HTF, order: int, overhang: int | None) -> int:
@@ -479,11 +432,9 @@ def _expected_products(
     `parts[l]`.
     """
     q, _ = group.numerator_space(c)
-    rows = np.concatenate([parts, parts], axis=1)[:, : len(q)]
-    taken = (np.abs(q) ** 2).sum(axis=1)
-    along = [q.conj().T @ (row[:, None] * q) for row in rows]
-    both = np.array([[np.vdot(a, b).real for a in along] for b in along])
-    return (1 if group.real else 2) * (rows * (1 - 2 * taken) @ rows.T + both)
+    rows = np.concatenate([parts, parts], axis=1)
+    along = np.stack([q.T @ (row[:, None] * q) for row in rows]).reshape(2, -1)
+    return rows * (1 - 2 * (q**2).sum(axis=1)) @ rows.T + along @ along.T
 
 
 def amounts(

@@ -18,8 +18,8 @@ from ..identify.series.fit import (
 )
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
-from ..identify.series.records import PreparedRecords
-from ..identify.validate import Validation, can_be_compared, simulate_record, validate
+from ..identify.series.records import CycleGrid, PreparedRecords
+from ..identify.validate import Validation, can_be_compared, simulate, validate
 from .data import SectionData
 
 
@@ -65,10 +65,10 @@ class Split(NamedTuple):
         if not fits:
             text = f"{self.early.cycles} cycles are too few for one multiplier with {N} sections"
             raise DefinitionError(f"{text}: record more, or take fewer sections.")
-        misfits = []
+        grid, misfits = CycleGrid.from_records(ends), []
         for fit in fits:
-            error = [simulate_record(fit, r, free_start=True) - r.y for r in ends]
-            square = np.nanmean(np.concatenate(error) ** 2, axis=0)
+            error = (simulate(fit, grid, free_start=True) - grid.y) * grid.sampled
+            square = (error**2).sum(axis=(0, 1, 2)) / grid.sampled.sum(axis=(0, 1, 2))
             misfits.append(float(np.log(square).mean()) / 2)
         return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
 

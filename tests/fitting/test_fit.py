@@ -66,12 +66,10 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     nothing_fits = hj.ObservedCycle(
         PHASES, ("x", "v"), np.arange(8.0).reshape(4, 2) - 3.0, period=oscillation.period, **STD
     )
-    several = hj.fit_model(
-        oscillation.system, nothing_fits, ("p", "q", "w"), guess=oscillation, guesses=3
-    )
-    assert len(several.guesses) == 3 and several.cost == several.guesses.cost.min()
-    assert np.ptp(several.guesses.values[:, 0]) > 0
-    assert repr(several.guesses).count("\n") == 3
+    free = ("p", "q", "w")
+    several = hj.fit_model(oscillation.system, nothing_fits, free, guess=oscillation, guesses=3)
+    assert len(several.guesses) == 3 and several.cost == min(g.cost for g in several.guesses)
+    assert np.ptp([g.values[0] for g in several.guesses]) > 0
     one = hj.fit_model(
         oscillation.system, observed(oscillation), ("p", "q", "w"), guess=oscillation, guesses=3
     )

@@ -6,7 +6,8 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
-from hybridjax.identify.variable_projection import error_spectrum, group_htf, weights_of
+from hybridjax.identify.variable_projection import error_spectrum, group_htf
+from hybridjax.identify.weights import weights_of
 
 from .conftest import scaled
 

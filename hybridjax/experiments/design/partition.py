@@ -12,7 +12,7 @@ Lines are integers `j` here: `f = j / P`, angle per section `2 pi j / (N P)`.
 """
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool, Complex, Int
@@ -164,12 +164,10 @@ def check_sharing(
     experiment: Int[np.ndarray, " K"],
     line: Int[np.ndarray, " K"],
     periods: int,
-    hint: Callable[[int], str] = lambda experiment: "",
 ) -> None:
     """Check that no two lines of one experiment have the same class.
 
-    **Raises:** `DefinitionError` that names the experiment and the first pair; the text of
-    `hint(experiment)` is added to it.
+    **Raises:** `DefinitionError` that names the experiment and the first pair.
     """
     classes = line_class(line, periods)
     order = np.lexsort((line, classes, experiment))
@@ -183,7 +181,15 @@ def check_sharing(
         if low < high:
             relation = "add up to" if (high - low) % periods else "differ by"
             reason = f"{f} and {high / periods:.10g} {relation} an integer"
+        count, most = int((experiment == number).sum()), periods // 2 + 1
+        hint = ""
+        if count > most:
+            hint = (
+                f" ({count} lines are excited, and no experiment can hold more than {most}: a "
+                f"recorded input must repeat after P = {periods} periods, with noise below "
+                "`threshold`)"
+            )
         raise DefinitionError(
             f"experiment {number}: {reason}, so their responses fall on the same frequencies; "
-            f"move one of them to another experiment{hint(number)}."
+            f"move one of them to another experiment{hint}."
         )

@@ -25,7 +25,7 @@ from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
-from ..variable_projection import SMALLEST_ERROR, check_values, error_weights
+from ..weights import SMALLEST_ERROR, check_values, error_weights
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum

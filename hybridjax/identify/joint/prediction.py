@@ -16,14 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ...errors import DefinitionError
-from ...experiments.record import Record
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.ldtp import LDTP
 from ..descent import NormalEquations
 from ..series.output_error import RANK
 from ..series.records import CycleGrid
-from ..variable_projection import SMALLEST_ERROR
-from .frequency import adjoints
+from ..weights import SMALLEST_ERROR
+from .frequency import transfer
 from .model import LocalCoordinates, PeriodicModel
 
 
@@ -302,11 +301,10 @@ def noise_spectrum(
     Over long windows of L samples its spectrum is
 
     $$S(\varphi) = \lim \frac{1}{L}\, E\,\Big|\sum_n v[n]\, e^{-2 \pi i \varphi n / N}\Big|^2
-    = \frac{1}{N} \sum_n \big| D[n] + z^{-1} \mu[n+1] B[n] \big|^2, \qquad
-    z = e^{2 \pi i \varphi / N},$$
+    = \sum_k \sum_j | H_{k,j}(\varphi - k) |^2$$
 
-    with the adjoint $\mu[n] = C[n] + z^{-1} \mu[n+1] A[n]$ (the cyclic spectrum at cycle frequency
-    zero: Gardner, Napolitano and Paura 2006). The noise of $H_m$ at f is that at f + m.
+    with the harmonic transfer functions $H_k$ from all inputs j (the cyclic spectrum at cycle
+    frequency zero: Gardner, Napolitano and Paura 2006). The noise of $H_m$ at f is that at f + m.
 
     **Arguments:**
 
@@ -326,13 +324,10 @@ def noise_spectrum(
             f"{np.abs(noise.multipliers[0]):.4g}, which must be below 1."
         )
     model = PeriodicModel.of(noise, np.ones(len(noise.outputs)))
-    z = np.exp(2j * np.pi / N * np.add.outer(harmonics, f).ravel())
-    mu = adjoints(model, z)
-    total = np.zeros((len(z), len(noise.outputs)))
-    for n in range(N):
-        after = np.tensordot(model.B[n].T, mu[(n + 1) % N], 1) / z[:, None]  # (inputs, F, ny)
-        total += (np.abs(model.D[n].T[:, None] + after) ** 2).sum(axis=0)
-    return total.reshape(len(harmonics), len(f), len(noise.outputs)) / N
+    k = np.arange(N)
+    H = transfer(model, np.add.outer(k, f).ravel(), tuple(k.tolist()))  # (k, inputs at f + j)
+    square = (np.abs(H) ** 2).sum(axis=3).reshape(N, N, len(f), len(noise.outputs))
+    return np.stack([square[k, (m - k) % N].sum(axis=0) for m in harmonics])
 
 
 def noise_model(
@@ -367,14 +362,13 @@ class Predictor(NamedTuple):
     def dims(self) -> list[int]:
         return self.model.dims
 
-    def predict(self, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:
+    def predict(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "R T N ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
-        part = SeriesPart.of(CycleGrid.from_records([record]), np.ones(self.S.shape[1]))
+        part = SeriesPart.of(grid, np.ones(self.S.shape[1]))
         path = SeriesProblem([part], self.S, True, free_start, 0).path(self.model, part)
         expected = [
             x @ C.T + u @ D.T
             for x, C, u, D in zip(path.x, self.model.C, part.u, self.model.D, strict=True)
         ]
         expected = np.where(part.sampled, part.y - np.stack(path.error), np.stack(expected))
-        rows = slice(record.first_section, record.first_section + len(record.u))
-        return np.moveaxis(expected[:, 0], 0, 1).reshape(-1, self.S.shape[1])[rows]
+        return np.moveaxis(expected, 0, 2)

@@ -19,7 +19,7 @@ from ..denominator import SLOWEST
 from ..descent import ROUNDING
 from ..series.fit import SeriesFit
 from ..series.records import PreparedRecords
-from ..variable_projection import SMALLEST_ERROR
+from ..weights import SMALLEST_ERROR
 from .frequency import FrequencyProblem
 from .model import PeriodicModel
 

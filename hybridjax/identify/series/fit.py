@@ -32,7 +32,8 @@ from ..denominator import (
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import refuse_invented
-from ..variable_projection import SMALLEST_ERROR, amounts
+from ..variable_projection import amounts
+from ..weights import SMALLEST_ERROR
 from .linearization import Linearization, each_fit, linearize, measured_outputs, minimize, sum_up
 from .output_error import OutputErrorProblem, SectionRegression
 from .records import CycleGrid, PreparedRecords, delay_cycles, divide_by_chi, lagged_inputs

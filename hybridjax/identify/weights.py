@@ -1,0 +1,89 @@
+"""The errors of harmonic transfer functions, known or supposed, as weights of fits."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..errors import DefinitionError
+from ..linear.htf import HTF
+
+
+# Smallest error that an HTF is supposed to have, relative to the rms of its output: that of
+# rounding. Smaller: infinite weights; larger: exact outputs count too little beside noisy ones.
+SMALLEST_ERROR = 1e-15
+
+
+def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
+    """Return the rms of each output's HTFs.
+
+    **Raises:** `DefinitionError` for NaN, an output that is zero, or variances that are no
+    positive numbers.
+    """
+    H = np.asarray(htf.H)
+    if not np.isfinite(H).all():
+        raise DefinitionError("the HTFs hold NaN or infinity.")
+    rms = np.sqrt(np.mean(np.abs(H) ** 2, axis=(0, 1, 3)))
+    if (rms == 0).any():
+        name = htf.outputs[int(np.argmin(rms))]
+        raise DefinitionError(f"the HTFs of {name} are zero: leave this output out.")
+    if htf.variance is not None:
+        bad = np.argwhere(~(np.isfinite(htf.variance) & (np.asarray(htf.variance) >= 0)))
+        if len(bad):
+            m, k, i, _ = (int(x) for x in bad[0])
+            raise DefinitionError(
+                f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = "
+                f"{float(htf.f[k]):g} is not a positive number: estimate it from several "
+                "realizations (`Design.realizations`) or windows (`repeats` of estimate_htf)."
+            )
+    return rms
+
+
+def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, "M F ny nu"]:
+    """Return one over the standard deviation of real and imaginary part, known or supposed.
+
+    Variances that were estimated with few degrees of freedom are poor weights: they are replaced
+    by the nearest product of a factor for each frequency and one for each harmonic, up to its
+    sign (which is the form for white noise and any spectrum of the input).
+
+    **Arguments:** `rms`: where there are no variances, errors are taken as equal parts of it, but
+    for the power of the inputs.
+    """
+    if htf.variance is None:
+        return np.broadcast_to(1 / (rms[:, None] * np.sqrt(line_variances(htf))), htf.H.shape)
+    variance = np.asarray(htf.variance)
+    if htf.scatter is not None:
+        freedom = np.asarray(htf.scatter.freedom)
+        variance = _product_of_factors(variance, np.asarray(htf.harmonics), freedom)
+    return weights_of(variance, rms)
+
+
+def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
+    """Return variances of each frequency and input by white noise, relative to their mean."""
+    if htf.power is None:
+        return np.ones((len(htf.f), 1, len(htf.inputs)))
+    variance = 1 / np.asarray(htf.power)[:, None]
+    return variance / variance.mean()
+
+
+def weights_of(
+    variance: Float[np.ndarray, "... ny _"], rms: Float[np.ndarray, " ny"]
+) -> Float[np.ndarray, "... ny _"]:
+    """Return one over the standard deviation of real and imaginary part."""
+    return np.sqrt(2 / np.maximum(variance, (SMALLEST_ERROR * rms[:, None]) ** 2))
+
+
+def _product_of_factors(
+    variance: Float[np.ndarray, "M F ny nu"],
+    harmonics: Int[np.ndarray, " M"],
+    freedom: Float[np.ndarray, " F"],
+) -> Float[np.ndarray, "M F ny nu"]:
+    """Return the product of factors of frequency and harmonic with the same sums."""
+    if not variance.all():
+        return variance
+    _, same = np.unique(np.abs(harmonics), return_inverse=True)
+    share = freedom / freedom.sum()
+    size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
+    for _ in range(20):  # more sweeps change nothing in 6 digits
+        by_line = (variance / size[same]).mean(axis=0)
+        by_harmonic = np.tensordot(share, variance / by_line, axes=(0, 1))
+        size = np.stack([by_harmonic[same == k].mean(axis=0) for k in range(len(size))])[:, None]
+    return size[same] * by_line
