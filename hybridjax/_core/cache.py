@@ -77,6 +77,8 @@ def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
     folder = pathlib.Path(given).resolve()
     _make(folder)
     programs = folder / "programs"
+    for path in programs.parents:
+        _refuse_others(path, is_above=True)
     if not os.path.lexists(programs):
         new = pathlib.Path(tempfile.mkdtemp(dir=folder))
         (new / f"{_MARK}{new.stat().st_ino}").touch()
@@ -84,16 +86,17 @@ def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
             new.rename(programs)
         except OSError:  # another process was faster
             shutil.rmtree(new)
-    if not stat.S_ISDIR(programs.lstat().st_mode):
+    here = programs.lstat()
+    if not stat.S_ISDIR(here.st_mode):
         raise PermissionError(f"'{programs}' is no folder")
-    for path in (programs, *programs.parents):
-        _refuse_others(path, is_above=path != programs)
+    _refuse_others(programs, is_above=False)
     entries = {path: path.lstat() for path in programs.iterdir()}
     for path, about in entries.items():
-        if not stat.S_ISREG(about.st_mode) or about.st_size > _LARGEST:
+        is_ours = about.st_uid == here.st_uid and about.st_nlink == 1  # and no link to others'
+        if not (stat.S_ISREG(about.st_mode) and about.st_size <= _LARGEST and is_ours):
             raise PermissionError(f"'{path}' is no compiled program: delete it")
     marks = [path.name for path in entries if path.name.startswith(_MARK)]
-    if marks != [f"{_MARK}{programs.stat().st_ino}"]:
+    if marks != [f"{_MARK}{here.st_ino}"]:
         raise PermissionError(f"'{programs}' was not made in this place: delete it")
     return programs
 

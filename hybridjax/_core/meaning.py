@@ -34,8 +34,9 @@ from .memo import Memory
 
 
 # Functions by which code reads values that are not named in it, and functions that read files.
-_HIDDEN = re.compile("eval|exec|globals|__import__|import_module|getenv")
+_HIDDEN = re.compile("eval|exec|globals|__import__|import_module|getenv|check_output|urlopen")
 _READING = re.compile("open|(read|open|load)_.+|load|loadtxt|loadmat|genfromtxt|fromfile|memmap")
+_FRAMES = {"__globals__", "f_globals", "f_locals"}
 _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range
 _PACKAGE = str(pathlib.Path(__file__).parents[1])
 _MODELS = os.path.join(_PACKAGE, "models")
@@ -139,10 +140,13 @@ class _Walk:
                 self.visit_all((x.__func__, x.__self__))
             case types.ModuleType():  # read by other means than the names of its attributes
                 self._origin(x.__name__)
+                self.visit(type(x))
                 if not _is_installed(x.__name__):
                     self.visit({k: v for k, v in vars(x).items() if not _is_description(k, v)})
             case types.BuiltinFunctionType():
                 self.note(x.__name__)
+                if not isinstance(x.__self__, types.ModuleType):
+                    self.visit(x.__self__)
             case weakref.ref():
                 self.visit(x())
             case contextvars.ContextVar():
@@ -163,6 +167,8 @@ class _Walk:
             self.visit_all(values.ravel().tolist())
         else:
             self.digest.update(values.tobytes())
+        if isinstance(x, np.ndarray):
+            self.visit(getattr(x, "__dict__", None))  # of a subclass: a mask
 
     def _origin(self, module: Any, *words: Any) -> None:
         self.note(str(module), _version(str(module).partition(".")[0]), *words)
@@ -176,7 +182,9 @@ class _Walk:
             self._globals(x)
         wrapped = getattr(x, "__wrapped__", None)
         # A wrapper of a package may remember what it has been called with.
-        self.visit_all((wrapped,) if is_installed and wrapped else (x.__closure__ or ()))
+        registered = vars(x).get("registry")  # the functions of one that dispatches by type
+        is_wrapper = is_installed and wrapped
+        self.visit_all((wrapped, registered) if is_wrapper else (x.__closure__ or ()))
         self.visit_all((x.__defaults__, x.__kwdefaults__))
         if not is_installed:
             self.visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})
@@ -186,6 +194,8 @@ class _Walk:
         paths, imported, names = _names(x.__code__)
         package = x.__globals__.get("__package__")
         modules = {x: sys.modules.get(x, sys.modules.get(f"{package}.{x}")) for x in imported}
+        if _FRAMES & {*names}:
+            self._refuse_hidden(x, (), globals)
         if not self.classes and "read_text" in names:
             self._refuse_hidden(x, (), pathlib.Path.read_text)
         for path in (*paths, *((name, "") for name in imported)):
@@ -220,6 +230,7 @@ class _Walk:
             return
         self.attributes.add((id(module), names))
         self._origin(module.__name__)
+        self.visit(type(module))
         is_installed = _is_installed(module.__name__)
         if not is_installed and hasattr(module, "__getattr__"):
             self.visit(module)
@@ -241,6 +252,7 @@ class _Walk:
             self._origin(base.__module__, base.__qualname__)
             if not _is_installed(base.__module__):
                 self.visit({k: v for k, v in vars(base).items() if not _is_description(k, v)})
+        self.visit(type(x))
         self.classes -= 1
 
     def _object(self, x: Any) -> None:

@@ -13,6 +13,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.compilation import host_first
+from .._core.meaning import current
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
@@ -163,7 +164,7 @@ def simulate(
     system = settings.system(system)
     check_system(system)
     constant = _constant_input(system, input)
-    s = Structure(Driven(system, input) if callable(input) else system)
+    s = Structure(current(Driven(system, input)) if callable(input) else system)
     a, start = s.chart_index(chart), Guess(chart, state, time)
     if start.state.shape != (s.dims[a],):
         raise DefinitionError(

@@ -178,12 +178,15 @@ class ResponseFunction(eqx.Module):
         `failed_at` (S,), error estimates `error` (S,), and final states `end` (S, m). Experiments
         that fail raise no error.
 
-        **Raises:** `DefinitionError` for inputs of another shape.
+        **Raises:** `DefinitionError` for inputs of another shape, and if the code of the cycle's
+        system has changed.
         """
         require_x64(system)
         u, placed = jnp.asarray(u, float), self.placed
         require_shape(u.shape, placed.n_sections, len(placed.cycle.system.inputs))
-        if system is not None:
+        if system is None:
+            placed.cycle.require_current()
+        else:
             placed = eqx.tree_at(lambda x: x.cycle.system, placed, system)
         if start is None:
             start = jnp.tile(placed.section_zero[:, None], len(u))

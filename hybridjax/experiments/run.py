@@ -169,9 +169,10 @@ class Campaign:
     def run(self, rows: slice | None = None, workers: int | None = None) -> ExperimentData:
         """Run the experiments of consecutive `rows`. Default: all of them.
 
-        **Raises:** `DefinitionError` for an output that is not defined where experiments go;
-        `ComputationError` if a steady start is not found.
+        **Raises:** `DefinitionError` for an output that is not defined where experiments go, and if
+        the system's code has changed; `ComputationError` if a steady start is not found.
         """
+        self.placed.cycle.require_current()
         rows = slice(0, len(self.inputs)) if rows is None else rows
         workers = self.execution.workers if workers is None else workers
         execution = dataclasses.replace(self.execution, workers=workers)

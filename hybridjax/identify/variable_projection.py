@@ -10,7 +10,7 @@ Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\vareps
 
 from collections.abc import Sequence
 from itertools import count
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Inexact, Int
@@ -83,7 +83,7 @@ class HTFGroup(NamedTuple):
 
 def split(values: Complex[np.ndarray, "*d E n"]) -> Float[np.ndarray, "*d 2*E n"]:
     """Return real parts, then imaginary parts."""
-    return np.concatenate([values.real, values.imag], axis=-2)
+    return np.concatenate([np.real(values), np.imag(values)], axis=-2)
 
 
 class Misfit(NamedTuple):
@@ -259,10 +259,12 @@ def unfold(
     out = np.zeros((len(htf.harmonics), len(values[0]), ny, nu), complex)
     for group, here, there in zip(groups, values, opposite, strict=True):
         i, j = group.channel.T
-        np.add.at(out, (group.harmonic, slice(None), i, j), (group.share * here).T)
+        at: Any = (group.harmonic, slice(None), i, j)
+        np.add.at(out, at, (group.share * here).T)
         two = group.mirror >= 0
         mirrored = (group.share.conj() * there).T[two]
-        np.add.at(out, (group.mirror[two], slice(None), i[two], j[two]), mirrored)
+        at = (group.mirror[two], slice(None), i[two], j[two])
+        np.add.at(out, at, mirrored)
     return out
 
 

@@ -15,7 +15,7 @@ from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import Scalar, Vector
 from .._core.executor import Definition
-from .._core.meaning import code_digest
+from .._core.meaning import code_digest, current
 from .._core.pieces.description import digest_of
 from .._core.precision import real
 from .._core.text import columns, fields, value
@@ -190,7 +190,7 @@ def integrated(system: HybridSystem, solver: Any) -> HybridSystem:
     """The same system, integrated by this solver, or by solvers by the names of charts."""
     other = copy.copy(system)
     object.__setattr__(other, "solver", solvers(solver))
-    return other
+    return current(other)
 
 
 class Derived(HybridSystem):

@@ -1,7 +1,6 @@
 """Whatever changes what a function computes changes its digest; what does not, leaves it."""
 
 import sys
-import time
 import types
 
 import pytest
@@ -17,7 +16,6 @@ WAYS = {
         "K = 1.0\ndef h(x): return K * x\ndef f(x): return h(x)",
         "K = 2.0",
     ),
-    "a global in a comprehension": ("K = 1\ndef f(x): return [K * y for y in x]", "K = 2"),
     "a global in an inner function": ("K = 1\ndef f(x): return (lambda y: K * y)(x)", "K = 2"),
     "a helper written anew": (
         "def h(x): return x\ndef f(x): return h(x)",
@@ -43,7 +41,6 @@ WAYS = {
     ),
     "a default": ("def f(x, k=1): return k * x", "f.__defaults__ = (2,)"),
     "a default by name": ("def f(x, *, k=1): return k * x", "f.__kwdefaults__['k'] = 2"),
-    "a default that is a list": ("def f(x, k=[1]): return k[0] * x", "f.__defaults__[0][0] = 2"),
     "the code": ("def f(x): return x\ndef g(x): return 2 * x", "f.__code__ = g.__code__"),
     "an attribute of a function": ("def f(x): return f.k * x\nf.k = 1", "f.k = 2"),
     "a constant of a partial": (
@@ -53,11 +50,6 @@ WAYS = {
     "a method": (
         "class A:\n    def h(self, x): return x\n    def f(self, x): return self.h(x)\nf = A().f",
         "A.h = lambda self, x: 2 * x",
-    ),
-    "a method of a base class": (
-        "class B:\n    def h(self): return 1\nclass A(B):\n    i = 0\n"
-        "a = A()\ndef f(x): return a.h()",
-        "B.h = lambda self: 2",
     ),
     "an attribute of a base class": (
         "class B:\n    k = 1\nclass A(B):\n    pass\na = A()\ndef f(x): return a.k * x",
@@ -151,7 +143,23 @@ WAYS = {
         "def f(x): return r().k",
         "a.k = 2",
     ),
-    "a module of a package": ("def f(x): return other.inner.K * x", "other.inner.K = 2"),
+    "a property of a metaclass": (
+        "class M(type):\n    k = property(lambda c: 1)\nclass A(metaclass=M):\n    pass\n"
+        "def f(x): return A.k * x",
+        "M.k = property(lambda c: 2)",
+    ),
+    "a function by types": (
+        "import functools\n@functools.singledispatch\ndef h(x): return x\ndef f(x): return h(x)",
+        "h.register(float, lambda x: 2 * x)",
+    ),
+    "the owner of a built-in method": (
+        "K = {'k': 1}\ng = K.get\ndef f(x): return g('k')",
+        "K['k'] = 2",
+    ),
+    "a mask": (
+        "import numpy as np\nK = np.ma.array([1.0, 2.0], mask=[0, 0])\ndef f(x): return K.sum()",
+        "K[0] = np.ma.masked",
+    ),
 }
 
 
@@ -186,20 +194,11 @@ def test_what_is_not_read_is_not_noticed(monkeypatch):
 @pytest.mark.parametrize(
     "code",
     ["eval('K')", "importlib.import_module('K')", "open('K').read()", "np.loadtxt('K')",
-     "sys.modules['K']", "os.getenv('K')", "pathlib.Path('K').read_text()"],
+     "sys.modules['K']", "os.getenv('K')", "pathlib.Path('K').read_text()",
+     "f.__globals__['K']", "sys._getframe().f_globals['K']"],
 )  # fmt: skip
 def test_values_that_are_not_named_are_refused(code):
     space = {"__name__": "users_module"}
     exec(f"import importlib, os, pathlib, sys, numpy as np\ndef f(x): return {code} * x", space)
     with pytest.raises(DefinitionError, match="`f` uses `"):
         meaning(space["f"])
-
-
-def test_functions_that_call_each_other_are_visited_once():
-    """Sixty of them, each calling the ten before."""
-    lines = [" + ".join(f"g{j}(x)" for j in range(max(i - 10, 0), i)) or "x" for i in range(60)]
-    space = {"__name__": "users_module"}
-    exec("\n".join(f"def g{i}(x): return {line}" for i, line in enumerate(lines)), space)
-    before = time.process_time()
-    meaning(space["g59"])
-    assert time.process_time() - before < 1.0

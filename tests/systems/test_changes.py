@@ -49,10 +49,8 @@ def test_a_constant_of_the_notebook_is_changed(monkeypatch):
     "use",
     [
         lambda cycle: hj.linearize(cycle, SECTIONS, "x"),
-        lambda cycle: hj.place_sections(cycle, SECTIONS),
         lambda cycle: hj.run_experiments(cycle, SECTIONS, DESIGN, "x"),
         lambda cycle: hj.continuation(cycle, "wind", (0.0, 0.1)),
-        lambda cycle: hj.section_map(cycle, SECTIONS, 0, 1),
         lambda cycle: hj.response_function(cycle, SECTIONS, "x"),
         lambda cycle: cycle.trajectory(),
     ],
@@ -63,6 +61,22 @@ def test_a_cycle_belongs_to_the_code_as_it_was(use, monkeypatch):
     with pytest.raises(hj.DefinitionError, match="have changed since this limit cycle was found"):
         use(cycle)
     assert hj.find_limit_cycle(Slowed(), cycle).stable  # (as a guess it will do)
+
+
+def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
+    cycle = hj.find_limit_cycle(Slowed(), settings=hj.Settings(solver=hj.Radau()))
+    assert len(cycle.trajectory().t) > 2  # another solver is no other code
+    response = hj.response_function(cycle, SECTIONS, "x")
+    chunks = hj.experiments.stream_experiments(cycle, SECTIONS, DESIGN, "x", chunk=1)
+    force = lambda t: DRAG * jnp.cos(t)  # noqa: E731
+    ends = []
+    for drag in (0.7, 1.3):
+        monkeypatch.setitem(globals(), "DRAG", drag)
+        ends.append(hj.simulate(Turns(), "on", (0.0, 0.0), 0.1, input=force).after[-1, 1])
+    np.testing.assert_allclose(ends[1], ends[0] * 1.3 / 0.7, rtol=1e-2)
+    for use in (lambda: response(DESIGN.inputs(cycles=1)), lambda: next(chunks)):
+        with pytest.raises(hj.DefinitionError, match="have changed since"):
+            use()
 
 
 class Turning(hj.Chart):
