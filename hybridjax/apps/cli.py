@@ -166,6 +166,8 @@ def _add_identify(commands) -> None:
     add("files", nargs="+", metavar="FILE", help="one trial in each: CSV, Excel, Parquet, MATLAB, "
         "HDF5, C3D, OpenSim, ROS and more")  # fmt: skip
     add("--input", required=True, type=_names, metavar="NAMES", help="measured perturbations")
+    add("--reference", type=_names, metavar="NAMES",
+        help="what acts from outside, where a controller makes the input")  # fmt: skip
     add("--outputs", required=True, type=_names, metavar="NAMES", help="measured outputs")
     phase = identify.add_mutually_exclusive_group(required=True)
     phase.add_argument("--phase", type=_two_names, metavar="X,V",
@@ -246,7 +248,12 @@ def _identify(options) -> int:
     from .recording_report import PAGE, report_folder, write_results
 
     with report_folder(options.out, options.input, options.formats) as folder:
-        named = (*options.input, *options.outputs, *(options.phase or (options.crossing or ())[:1]))
+        named = (
+            *options.input,
+            *(options.reference or ()),
+            *options.outputs,
+            *(options.phase or (options.crossing or ())[:1]),
+        )
         signals = tuple(dict.fromkeys(named))
         recording = read_recording(*options.files, time=options.time, signals=signals)
         print(recording)
@@ -263,7 +270,7 @@ def _identify(options) -> int:
         result = identify_recording(
             recording, sections, inputs=options.input, outputs=options.outputs,
             n_sections=options.sections, order=options.order, bandwidth=options.bandwidth,
-            timing=options.timing, drift=options.drift,
+            timing=options.timing, drift=options.drift, reference=options.reference,
         )  # fmt: skip
         print(result)
         write_results(folder, result, options.formats)

@@ -204,7 +204,7 @@ def _excited(data: ExperimentData, windows: list[slice], threshold: float, first
         return (
             f" ({lines} lines are excited, more than any experiment can hold: is the "
             f"input periodic over the last P = {data.periods} periods, and without noise above "
-            "`threshold`?)"
+            "`threshold`? Where a controller makes it, name the `reference`.)"
         )
 
     check_sharing(experiment + first, line, data.periods, hint)

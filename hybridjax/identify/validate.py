@@ -1,5 +1,6 @@
 """Is an identified model good enough? Simulation of data that it was not fitted to."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -10,13 +11,14 @@ from scipy import special, stats
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Probability
+from .._core.boundary.kinds import Probability, SignalNames
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import p_value
 from ..errors import DefinitionError
 from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
+from .instrument import in_loop
 from .joint.fit import LDTPFit
 from .joint.model import PeriodicModel
 from .joint.prediction import Predictor
@@ -290,6 +292,7 @@ def validate(
     *,
     start: Literal["free", "cycle"] = "free",
     level: Probability = 0.01,
+    reference: SignalNames | None = None,
 ) -> Validation:
     r"""Simulate a model on data and test the residuals.
 
@@ -316,6 +319,9 @@ def validate(
     - `start`: "free", the default, estimates the state at the start of each record from it; "cycle"
       takes it as zero. Declared drift of the records is estimated in either case.
     - `level`: significance level of the tests. Default: 0.01.
+    - `reference`: names of those inputs of the data that act from outside on a loop, and not on
+      the model. Independence is then that of the references: inputs that a controller makes depend
+      on the noise, whatever the model. Default: None.
 
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few
     cycles, or all records are too short to be compared or for so many lags.
@@ -323,8 +329,12 @@ def validate(
     free_start = start == "free"
     tested = (model.predictor or model.model) if isinstance(model, LDTPFit) else model
     records = uninterrupted_records(data)
+    drive = records
+    if reference is not None:
+        records, drive = in_loop(data, reference)
     require_same("model and data", model, records[0])
-    compared = [r for r in records if can_be_compared(tested, r, free_start)]
+    usable = [can_be_compared(tested, r, free_start) for r in records]
+    compared = list(itertools.compress(records, usable))
     N, outputs, ny = records[0].n_sections, records[0].outputs, len(records[0].outputs)
     if not compared:
         raise DefinitionError(
@@ -359,7 +369,8 @@ def validate(
     rms = np.sqrt(square.sum(axis=0) / sampled.sum(axis=0))
     size = np.sqrt(np.mean(simulated**2, axis=0))
     auto, whiteness = whiteness_test(samples, error, np.sqrt(square / sampled), lags)
-    cross, independence, visible = independence_test(samples, error, lags, level / ny)
+    outside = Samples.of(list(itertools.compress(drive, usable)))
+    cross, independence, visible = independence_test(outside, error, lags, level / ny)
     first = int(np.argmax([len(r.u) for r in compared]))
     longest, begin = compared[first], sum(len(r.u) for r in compared[:first])
     shown = slice(begin, begin + len(longest.u) - longest.lead)  # later inputs are unknown

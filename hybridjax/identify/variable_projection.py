@@ -44,7 +44,8 @@ class HTFGroup(NamedTuple):
     """and its output and input."""
     real: bool
     line: Int[np.ndarray, " E"]
-    """The frequency that an equation belongs to."""
+    """The frequency that an equation belongs to, or its class f + integers where the errors of a
+    class are dependent."""
     period_delay: Complex[np.ndarray, " E"]
     """z^-N, the delay by one period."""
     basis: Inexact[np.ndarray, "rows r"]
@@ -292,7 +293,10 @@ def _groups(
         np.round(shape, EQUAL_WEIGHTS), axis=1, return_index=True, return_inverse=True
     )
     number, i, j = np.unravel_index(np.arange(len(scale)), (len(rows), ny, nu))
-    channel, line = np.stack([i, j], axis=1), both(np.arange(F), np.arange(F))
+    channel, line = np.stack([i, j], axis=1), np.arange(F)
+    if htf.scatter is not None and htf.scatter.shared:  # errors of a class are dependent
+        line = np.unique(np.round(np.minimum(f % 1, -f % 1), 9), return_inverse=True)[1]
+    line = both(line, line)
     groups = []
     for k, representative in enumerate(first):
         same = np.flatnonzero(which.ravel() == k)

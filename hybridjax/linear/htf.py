@@ -34,19 +34,24 @@ class Scatter(eqx.Module):
     - `roundness` (M, F, ny, nu): $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ of the residuals d of
       the realizations, relative to its mean for Gaussian errors: 0 where all lie on a line. None,
       and ones, are scatter that says nothing but its size.
+    - `shared`: whether all lines f + integers have their errors from the same noise, as in a loop.
+      Default: False, independent errors.
 
     **Raises:** `DefinitionError` for freedom that is not positive, or negative roundness.
     """
 
     freedom: Float[Array, " F"]
     roundness: Float[Array, "M F ny nu"] | None
+    shared: bool = eqx.field(static=True)
 
     def __init__(
         self,
         freedom: Annotated[Numbers, Reals("F", sign="positive")],
         roundness: Annotated[Numbers, Reals("M F ny nu", sign="nonnegative")] | None = None,
+        shared: bool = False,
     ):
         require_x64()
+        self.shared = shared
         self.freedom = jnp.asarray(freedom)
         self.roundness = None if roundness is None else jnp.asarray(roundness)
 
@@ -206,7 +211,7 @@ class HTF(eqx.Module):
         arrays = {"H": self.H, "variance": self.variance, "noise_variance": self.noise_variance}
         roundness = None if self.scatter is None else self.scatter.roundness
         arrays, roundness = jax.tree.map(lambda x: x[rows], (arrays, roundness))
-        scatter = None if self.scatter is None else Scatter(self.scatter.freedom, roundness)
+        scatter = self.scatter and replace(self.scatter, roundness=roundness)
         return replace(self, harmonics=harmonics, scatter=scatter, **arrays)
 
     def __matmul__(self, other: "HTF | HasHTF") -> "HTF":
@@ -432,7 +437,7 @@ def _combined(
         least = jnp.min(jnp.stack(known), axis=0)[lines.row].min(axis=1)
         rows = np.zeros(len(first.f), int)
         rows[lines.row] = np.arange(len(lines.row))[:, None]
-        scatter = Scatter(least[rows])
+        scatter = Scatter(least[rows], shared=True)
     source = "exact" if all(x.source == "exact" for x in operands) else "estimate"
     return HTF(
         first.f, lines.entries(result, N // 2), every, N, inputs, outputs, source,

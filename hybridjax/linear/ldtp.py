@@ -238,7 +238,7 @@ class LDTP(eqx.Module):
         (ny, nu), (inner, nr) = (np.shape(x.D)[1:] for x in (self, other))
         K, L, M = np.zeros((nu + nr, ny + inner)), np.zeros((nu + nr, nr)), np.eye(ny, ny + inner)
         K[:nu, ny:], L[nu:] = np.eye(nu), np.eye(nr)
-        return self._connected(other._matrices, K, L, M, other.inputs, self.outputs)
+        return self._connected(other.matrices, K, L, M, other.inputs, self.outputs)
 
     def __add__(self, other: "LDTP") -> "LDTP":
         """The sum of the outputs of two systems with the same inputs: parallel systems.
@@ -249,7 +249,7 @@ class LDTP(eqx.Module):
         ny, nu = np.shape(self.D)[1:]
         L, M = np.tile(np.eye(nu), (2, 1)), np.tile(np.eye(ny), (1, 2))
         K = np.zeros((2 * nu, 2 * ny))
-        return self._connected(other._matrices, K, L, M, self.inputs, self.outputs)
+        return self._connected(other.matrices, K, L, M, self.inputs, self.outputs)
 
     def inverse(self) -> "LDTP":
         """The system that returns the inputs from the outputs.
@@ -285,7 +285,7 @@ class LDTP(eqx.Module):
         if isinstance(controller, LDTP):
             require_chain("feedback", self.outputs, controller.inputs, self, controller)
             require_chain("feedback", controller.outputs, self.inputs, self, controller)
-            F = controller._matrices
+            F = controller.matrices
         else:
             F = algebra.static_gain(from_host(controller), self.n_sections, (nu, ny))
         algebra.require_well_posed(-self.D @ F.D)
@@ -294,11 +294,12 @@ class LDTP(eqx.Module):
         return self._connected(F, K, L, np.eye(ny, ny + nu), self.inputs, self.outputs)
 
     @property
-    def _matrices(self) -> algebra.Matrices:
+    def matrices(self) -> algebra.Matrices:
+        """A, B, C, D and dims."""
         return algebra.Matrices(self.A, self.B, self.C, self.D, self.dims)
 
     def _connected(self, other, K, L, M, inputs, outputs) -> "LDTP":
-        A, B, C, D, dims = algebra.connect(self._matrices, other, K, L, M)
+        A, B, C, D, dims = algebra.connect(self.matrices, other, K, L, M)
         d = A.shape[1] if is_traced(dims) else int(np.max(dims))  # without common padding
         return LDTP(A[:, :d, :d], B[:, :d], C[:, :, :d], D, dims, inputs, outputs)
 

@@ -1,6 +1,7 @@
 """Data at the sections of a recorded cycle."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -82,6 +83,18 @@ class SectionData(eqx.Module):
     def missing(self) -> float:
         """Fraction of samples with a missing input or output."""
         return float(np.isnan(self._deviations()).any(axis=1).mean())
+
+    def only(self, inputs: Sequence[str]) -> "SectionData":
+        """Return the same with these inputs alone."""
+        columns = [self.inputs.index(name) for name in inputs]
+        named = tuple(self.inputs[i] for i in columns)
+        rows = columns + list(range(len(self.inputs), len(self.signals)))
+        return replace(
+            self,
+            records=tuple(replace(r, u=r.u[:, columns], inputs=named) for r in self.records),
+            cycle_inputs=self.cycle_inputs[:, columns],
+            spikes=tuple(self.spikes[i] for i in rows),
+        )
 
     def rms(self) -> tuple[Float[np.ndarray, " nu"], Float[np.ndarray, " ny"]]:
         """Return root mean squares of the deviations of inputs and outputs."""

@@ -1,5 +1,6 @@
 """Fits that are tried on strides to which they were not fitted."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Covariance
+from ..identify.instrument import in_loop
 from ..identify.series.fit import (
     SeriesFit,
     assemble,
@@ -46,10 +48,15 @@ class Split(NamedTuple):
 
     early: PreparedRecords
     late: list[Record]
+    drive: PreparedRecords | None = None
+    """From the references to the inputs, where a controller makes these."""
+    reference: Sequence[str] | None = None
 
     def best_order(self, most: int = 4) -> int:
         """Choose an order; see `choose_order`."""
         ends = uninterrupted_records(self.late)
+        if self.reference is not None:
+            ends, _ = in_loop(self.late, self.reference)
         fits: list[SeriesFit] = []
         N = self.early.n_sections
         for d in range(1, most + 1):
@@ -74,8 +81,8 @@ class Split(NamedTuple):
 
     def fit(self, order: int) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
-        fit = fit_records(self.early, order, check=False)
-        return HeldOut(fit, validate(fit, self.late))
+        fit = fit_records(self.early, order, check=False, drive=self.drive)
+        return HeldOut(fit, validate(fit, self.late, reference=self.reference))
 
 
 @checked
@@ -103,7 +110,7 @@ def hold_out(data: SectionData, order: Order, share: Probability = 0.25) -> Held
     return split(data, share).fit(order)
 
 
-def split(data: SectionData, share: float = 0.25) -> Split:
+def split(data: SectionData, share: float = 0.25, reference: Sequence[str] | None = None) -> Split:
     """Split the records into a part to be fitted, and a part to be held out."""
     enough = min(1.0, _ENOUGH / data.cycles)
     ends = [round(len(r.u) * enough) for r in data.records]
@@ -116,4 +123,7 @@ def split(data: SectionData, share: float = 0.25) -> Split:
         cut = 0 if k in held_out else end if k in fitted else round(end * (1 - share))
         early += [r.part(0, cut)] if cut else []
         late += [r.part(cut, end)] if cut < end else []
-    return Split(PreparedRecords(early), late)
+    if reference is None:
+        return Split(PreparedRecords(early), late)
+    plant, drive = map(PreparedRecords, in_loop(early, reference))
+    return Split(plant, late, drive, reference)

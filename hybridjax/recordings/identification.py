@@ -60,6 +60,7 @@ def identify_recording(
     bandwidth: Bandwidth | None = None,
     timing: Literal["clock", "duration"] | None = None,
     drift: DriftCycles | None = None,
+    reference: SignalNames | None = None,
 ) -> Identification:
     """Identify multipliers, transfer functions and impulse responses from a recording, and list the
     reasons to doubt them. The recording is inspected first (`hj.recordings.inspect`).
@@ -70,13 +71,18 @@ def identify_recording(
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
+    - `reference`: recorded signals that act on the inputs from outside, where a controller makes
+      the inputs from the outputs. The results are those of the plant; see `fit_series`. Default:
+      None, inputs from outside.
 
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
     `section_data` and `fit_series`; `PrecisionError` in single precision.
     """
     require_x64()
     say("inspection")
-    inspection = inspect(recording, inputs=inputs, outputs=outputs)
+    outside = inputs if reference is None else reference
+    every = tuple(dict.fromkeys((*inputs, *outside)))
+    inspection = inspect(recording, inputs=every, outputs=outputs)
     refuse(inspection.findings)
     recording = inspection.recording
     say("phase")
@@ -90,22 +96,23 @@ def identify_recording(
     data = section_data(
         recording,
         phase,
-        inputs=inputs,
+        inputs=every,
         outputs=outputs,
         n_sections=n_sections,
         bandwidth=bandwidth,
         timing=timing,
     )
     data = data if drift is None else data.with_drift(drift)
-    findings = (*inspection.findings, *inspect_cycles(recording, phase, data))
+    findings = (*inspection.findings, *inspect_cycles(recording, phase, data.only(outside)))
     refuse(findings)
     say("order")
-    parts = split(data)
+    parts = split(data, reference=reference)
     order = parts.best_order() if order is None else order
     say("fit to the first three quarters")
     held = parts.fit(order)
     say("fit to all")
-    fit = fit_series(data, order, check=False)
+    fit = fit_series(data, order, check=False, reference=reference)
+    data = data.only(inputs)
     findings = (*findings, *undamped(data, fit))
     curve = None
     of_events = all(w.linear for parts in phase.stretches for w in parts)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, Vector
+from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, SignalNames, Vector
 from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
@@ -30,12 +30,18 @@ from ..denominator import (
     sandwich,
 )
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
+from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import refuse_invented
 from ..variable_projection import SMALLEST_ERROR, amounts
 from .linearization import Linearization, each_fit, linearize, measured_outputs, minimize, sum_up
 from .output_error import OutputErrorProblem, SectionRegression
 from .records import CycleGrid, PreparedRecords, delay_cycles, divide_by_chi, lagged_inputs
+
+
+# Rounds of a fit in a loop, at most, and the change of c, relative to 1 + |c|, that ends them.
+# More, smaller: digits far below standard errors. Fewer, larger: exact data lose digits.
+_MOST_ROUNDS, _SETTLED = 30, 1e-10
 
 
 class SeriesFit(MultiplierEstimate):
@@ -130,6 +136,7 @@ def fit_series(
     start: Literal["free", "cycle"] = "free",
     errors: Literal["residuals", "white"] = "residuals",
     check: bool = True,
+    reference: SignalNames | None = None,
 ) -> SeriesFit:
     r"""Estimate multipliers and HTFs from time series with any input, with their uncertainty.
 
@@ -152,13 +159,22 @@ def fit_series(
       also for errors that are correlated (process noise) or depend on the inputs (nonlinear
       distortion). "white": the variance of the residuals alone. Default: "residuals".
     - `check`: whether to raise an error for an order that the data do not support. Default: True.
+    - `reference`: names of those inputs of the data that act from outside on a loop. The fit is
+      then that of the plant, from the other inputs, which a controller makes. The reference is the
+      instrument (refined instrumental variables: Gilson and Van den Hof, Automatica 41, 2005), so
+      that noise that goes round the loop does not bias the fit, whatever its spectrum. Default:
+      None, inputs that do not depend on the outputs.
 
     **Raises:** `DefinitionError` for records that do not fit together, inputs that are zero, too
-    few cycles (the message says how many are needed), or an order that the data do not support.
+    few cycles (the message says how many are needed), an order that the data do not support, or a
+    plant that is stable in its loop only.
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
-    return fit_records(PreparedRecords(data), order, overhang, start, errors, check)
+    if reference is None:
+        return fit_records(PreparedRecords(data), order, overhang, start, errors, check)
+    records, drive = map(PreparedRecords, in_loop(data, reference))
+    return fit_records(records, order, overhang, start, errors, check, drive)
 
 
 @one_blas_thread()
@@ -169,9 +185,13 @@ def fit_records(
     start: Literal["free", "cycle"] = "free",
     errors: Literal["residuals", "white"] = "residuals",
     check: bool = True,
+    drive: PreparedRecords | None = None,
 ) -> SeriesFit:
-    """Fit records that are prepared; see `fit_series`."""
+    """Fit records that are prepared; see `fit_series`. `drive`: from references to the inputs."""
     overhang = records.n_sections if overhang is None else overhang
+    if drive is not None:
+        driven = driven_inputs(drive, order, overhang, start)
+        return _fit_in_loop(records, driven, order, overhang, start, errors, check)
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
     delayed = delayed_outputs(problem, order)
     solution, _ = minimize(problem, total_least_squares(delayed))
@@ -183,6 +203,60 @@ def fit_records(
         refuse_order(delayed, noise * _noise(solution))
     covariance = coefficient_covariance(problem, solution, errors)
     return assemble(problem, solution, covariance, converged)
+
+
+def driven_inputs(
+    drive: PreparedRecords, order: int, overhang: int, start: Literal["free", "cycle"]
+) -> list[Float[np.ndarray, "S T N nu"]]:
+    """Return the part of the inputs that answers the references, which noise does not reach."""
+    problem = OutputErrorProblem.from_data(drive, order, overhang, start == "free")
+    solution, _ = minimize(problem, total_least_squares(delayed_outputs(problem, order)))
+    return [respond(problem, solution, grid.u) for grid in drive.grids]
+
+
+def respond(
+    problem: OutputErrorProblem, solution: Linearization, u: Float[np.ndarray, "S T N nu"]
+) -> Float[np.ndarray, "S T N ny"]:
+    """Return the response to inputs from zero on, in the units of the data."""
+    v, lags = divide_by_chi(solution.c, u), (problem.lags, problem.records.lead)
+    return problem.scale * np.stack(
+        [lagged_inputs(v, n, *lags) @ b for n, b in enumerate(solution.numerators)], axis=2
+    )
+
+
+def _fit_in_loop(records, driven, order, overhang, start, errors, check) -> SeriesFit:
+    r"""Fit with the part of the inputs that references drive as the instrument.
+
+    The gradient of the output error is that of the driven inputs $\hat u$, its residual that of
+    the measured ones: $\sum \psi(\hat u) (y - (B / \chi) u) = 0$. This is the output-error
+    problem from $\hat u$ to $y - (B / \chi) (u - \hat u)$, solved until the last term settles.
+    """
+    grids = [grid._replace(u=u) for grid, u in zip(records.grids, driven, strict=True)]
+    records, measured = records.with_grids(grids), records.grids
+    problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
+    solution, _ = minimize(problem, total_least_squares(delayed_outputs(problem, order)))
+    _require_freedom(problem, solution)
+    if (largest := np.abs(multipliers_of(solution.c)[0])) >= 1:
+        raise DefinitionError(
+            f"the plant does not seem stable without its loop (a multiplier of {largest:.4g} in "
+            "modulus), and its output error would grow: use `fit_ldtp` with `reference`."
+        )
+    settled = False
+    for _ in range(_MOST_ROUNDS):
+        beside = [
+            grid._replace(y=(a.y - respond(problem, solution, a.u - grid.u)) * grid.sampled)
+            for a, grid in zip(measured, grids, strict=True)
+        ]
+        scale = problem.scale * _noise(solution)
+        problem = problem._replace(records=records.with_grids(beside), scale=scale)
+        last, (solution, converged) = solution.c, minimize(problem, solution.c)
+        settled = bool(np.abs(solution.c - last).max() < _SETTLED * (1 + np.abs(last).max()))
+        if settled:
+            break
+    if check:
+        refuse_order(delayed_outputs(problem, order), _noise(solution))
+    covariance = coefficient_covariance(problem, solution, errors)
+    return assemble(problem, solution, covariance, converged and settled)
 
 
 def assemble(

@@ -1,5 +1,6 @@
 """Records as fits use them: grids of records, cycles and sections, with delays and filters."""
 
+import copy
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -96,6 +97,12 @@ class PreparedRecords:
             if not size:
                 raise DefinitionError(f"the output {name} is zero or missing at every sample.")
         self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / self.sampled.sum(axis=0))
+
+    def with_grids(self, grids: list[CycleGrid]) -> "PreparedRecords":
+        """Return the same with other values on the grids."""
+        new = copy.copy(self)
+        new.grids = grids
+        return new
 
     def whole(self) -> CycleGrid:
         """Return all records on one grid."""

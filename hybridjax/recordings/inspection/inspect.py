@@ -313,5 +313,5 @@ def feedback(data: SectionData) -> Iterator[Finding]:
         share = repeated / max(repeated + float(deviations[i]) ** 2, np.finfo(float).tiny)
         if share > 0.5:
             text = f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: fits "
-            text += "are biased. Add a perturbation, and name it as the input."
+            text += "are biased. Add a perturbation, and name it as the `reference`."
             yield Finding("feedback", text)
