@@ -68,9 +68,10 @@ def estimate_htf(
       (`identify/instrument.py`). References have to excite all lines of a class f + integers, up to
       N/2. Default: None, inputs that act on the plant from outside.
 
-    **Returns:** `HTF` with ascending frequencies, source "estimate". Where a frequency was measured
-    in one realization only, its `variance` is that of noise as strong as in the mean of all others;
-    if that is so at most frequencies, there is no variance, and `power` weights them in fits.
+    **Returns:** `HTF` with ascending frequencies, source "estimate". At a frequency that was
+    measured in one realization only, `variance` is computed from the mean residual of the other
+    frequencies. If most frequencies were measured once, `variance` is that of noise or None, and
+    fits use `power` as weights.
 
     **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines of
     one experiment disturb each other (the message lists the pair); for too few periods or

@@ -32,8 +32,8 @@ class HTFGroup(NamedTuple):
     """Entries of the HTFs with the same equations and, up to a factor, the same weights.
 
     There are E equations, one per frequency (positive, and negative for pairs of harmonics), K
-    entries and R coefficients of each numerator, which are real if `real`. Equations of real
-    numerators are split into real and imaginary parts: then there are twice as many `rows`.
+    entries (`channel`: output and input) and R coefficients of each numerator, real if `real`: then
+    equations are split into real and imaginary parts, and there are twice as many `rows`.
     """
 
     harmonic: Int[np.ndarray, " K"]
@@ -41,11 +41,9 @@ class HTFGroup(NamedTuple):
     mirror: Int[np.ndarray, " K"] | None
     """that of the opposite harmonic, whose conjugate has the same numerator,"""
     channel: Int[np.ndarray, "K 2"]
-    """and its output and input."""
     real: bool
     line: Int[np.ndarray, " E"]
-    """The frequency that an equation belongs to, or its class f + integers where the errors of a
-    class are dependent."""
+    """The noise that an equation's errors stem from, that of its frequency or its class,"""
     period_delay: Complex[np.ndarray, " E"]
     """z^-N, the delay by one period."""
     basis: Inexact[np.ndarray, "rows r"]
@@ -293,10 +291,8 @@ def _groups(
         np.round(shape, EQUAL_WEIGHTS), axis=1, return_index=True, return_inverse=True
     )
     number, i, j = np.unravel_index(np.arange(len(scale)), (len(rows), ny, nu))
-    channel, line = np.stack([i, j], axis=1), np.arange(F)
-    if htf.scatter is not None and htf.scatter.shared:  # errors of a class are dependent
-        line = np.unique(np.round(np.minimum(f % 1, -f % 1), 9), return_inverse=True)[1]
-    line = both(line, line)
+    line = np.arange(F) if htf.scatter is None else htf.scatter.sources(f)
+    channel, line = np.stack([i, j], axis=1), both(line, line)
     groups = []
     for k, representative in enumerate(first):
         same = np.flatnonzero(which.ravel() == k)

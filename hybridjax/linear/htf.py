@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from .._core.arguments import Numbers, names, require_same
 from .._core.boundary.checked import checked
@@ -26,15 +26,16 @@ from .frequency_response import Harmonics, check_harmonics
 
 @checked
 class Scatter(eqx.Module):
-    r"""What is known of the scatter that `HTF.variance` was estimated from.
+    r"""Degrees of freedom of an estimated `HTF.variance`, and shape of the sample that it was
+    estimated from.
 
     **Arguments:**
 
     - `freedom` (F,): complex degrees of freedom of the variance.
     - `roundness` (M, F, ny, nu): $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ of the residuals d of
-      the realizations, relative to its mean for Gaussian errors: 0 where all lie on a line. None,
-      and ones, are scatter that says nothing but its size.
-    - `shared`: whether all lines f + integers have their errors from the same noise, as in a loop.
+      the realizations, relative to its mean for Gaussian errors: 0 if all residuals lie on a line.
+      None (as an array of ones): the shape is not used.
+    - `shared`: whether the errors of all lines f + integers stem from the same noise, as in a loop.
       Default: False, independent errors.
 
     **Raises:** `DefinitionError` for freedom that is not positive, or negative roundness.
@@ -55,14 +56,22 @@ class Scatter(eqx.Module):
         self.freedom = jnp.asarray(freedom)
         self.roundness = None if roundness is None else jnp.asarray(roundness)
 
+    def sources(self, f: Float[np.ndarray, " F"]) -> Int[np.ndarray, " F"]:
+        """Return the index of the noise from which the errors of each line stem."""
+        if not self.shared:
+            return np.arange(len(f))
+        return np.unique(np.round(np.minimum(f % 1, -f % 1), 9), return_inverse=True)[1]
+
     def quantile(self, level: Probability) -> Float[Array, "*M F ny nu"]:
         r"""Quantile of $|\delta H|^2 / v$ at this probability.
 
-        $\nu (\alpha^{-1/\nu} - 1)$, Fisher's $F_{2, 2\nu}$, of $\alpha = (1 - p)(1 + p^2 (w - 1))$
-        for the level p and the roundness w. The shape of the scatter of Gaussian errors is
-        independent of their mean (Basu, Sankhya 1955), so that discs hold as often as they say for
+        The quantile is $\nu (\alpha^{-1/\nu} - 1)$ (Fisher's $F_{2, 2\nu}$). If the roundness w is
+        None, $\alpha = 1 - p$ for the level p, otherwise $\alpha = (1 - p)(1 + p^2 (w - 1))$: the
+        flatter the sample, the larger the quantile. For Gaussian errors the shape of the sample is
+        independent of its mean (Basu, Sankhya 1955). Therefore discs have the stated coverage for
         any w whose mean is one. Errors of equal moduli and random phases lie on a circle around
-        zero: where few of them have a large mean, they lie on an arc, nearly in line.
+        zero. If the mean of a few of them is large, they lie on an arc, nearly on a line, and w is
+        small.
         """
         miss = 1 - level
         if self.roundness is not None:
@@ -268,11 +277,12 @@ class HTF(eqx.Module):
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
 
-        $r^2 = v \ln(1 / (1 - level))$ for a variance $v$ that is known. Where it was estimated from
-        few experiments, discs are larger (`Scatter.quantile`). They are right for complex Gaussian
-        errors, and nearly so where one product of two cosines makes errors of equal moduli, from
-        four realizations on. The true value is the best linear approximation for inputs of the
-        kind that was applied, not the response to infinitely small ones.
+        $r^2 = v \ln(1 / (1 - level))$ for a variance $v$ that is known. If the variance was
+        estimated from few experiments, discs are larger (`Scatter.quantile`). The probability is
+        exact for complex Gaussian errors. With at least four realizations it is nearly exact for
+        errors of equal moduli, as from the distortion by a single product of two cosines. The true
+        value is the best linear approximation for inputs of the kind that was applied, not the
+        response to infinitely small ones.
 
         **Raises:** `DefinitionError` without `variance`.
         """

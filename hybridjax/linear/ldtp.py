@@ -52,8 +52,8 @@ class LDTP(eqx.Module):
     - `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d): the matrices, padded with zeros.
     - `D` (N, ny, nu): feed-through; `None` means zero.
     - `dims` (N,): the true dimension of each `x[n]`; `None` means `d` everywhere.
-    - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`; by default `u`, `y`, or
-      `u0, u1, ...` where there are several.
+    - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`. Default: `u` and `y`, or
+      `u0, u1, ...` for several.
     - `coordinates`: names of the coordinates at each section, for documentation.
 
     **Raises:** `DefinitionError` for shapes, names or dimensions that do not fit, for entries
@@ -181,8 +181,8 @@ class LDTP(eqx.Module):
     ) -> Float[Array, "time d"]:
         """The states that an input leads to.
 
-        **Arguments:** `u` (n, nu), the input from `first_section` on; `x0`, the state there,
-        either padded (d,) or with its true dimension; by default zero.
+        **Arguments:** `u` (n, nu), the input from `first_section` on; `x0`, the state there, either
+        padded (d,) or with its true dimension. Default: zero.
 
         **Returns:** (n + 1, d), padded with zeros, `x0` first.
         """
@@ -321,11 +321,12 @@ class LDTP(eqx.Module):
     def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, computed on the host from the factors `A[n]`.
 
-        Their product is never formed, so that multipliers far below `1e-16` of the largest keep
-        their digits. Zeros are not found by size: they are counted from the dimensions and the
-        ranks of the factors (as by `rank`). A direction that contracts to less than `1e-12` of the
-        others between neighboring sections counts with them, as the print of the model says: more
-        sections show it, or `LimitCycle.multipliers`. Below 1e-308 they are given as 0.
+        The product of the factors is never formed, so that multipliers far below `1e-16` of the
+        largest are accurate. The number of zero multipliers follows from the dimensions and the
+        ranks of the factors (see `rank`), not from a threshold on multipliers. A direction that
+        contracts to less than `1e-12` of the others between neighboring sections counts as a zero
+        multiplier, and the printed model gives the number of these. To resolve it, use more
+        sections, or `LimitCycle.multipliers`. Multipliers below 1e-308 are 0.
 
         **Returns:** (r,) by decreasing modulus, then imaginary part; conjugate pairs are exact.
         """
@@ -352,7 +353,7 @@ class LDTP(eqx.Module):
     def periodic_states(
         self, u: Annotated[Numbers, Reals("S n nu")], periods: PeriodCount
     ) -> Float[Array, "S d"]:
-        """States as of `periodic_state`, for S inputs (S, P N, nu) at once."""
+        """The states of `periodic_state` for S inputs (S, P N, nu)."""
         u = self._input(u)
         if u.shape[1] != periods * self.n_sections:
             raise DefinitionError(

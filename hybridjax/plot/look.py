@@ -71,8 +71,8 @@ def _load_backend() -> None:
 def style() -> contextlib.AbstractContextManager:
     """The package's look, for figures of your own: `with hj.plot.style(): ...`.
 
-    Functions of this module use it when they make the figure; on Axes that they are given they
-    leave fonts and sizes alone. Global settings of matplotlib are never changed.
+    Functions of this module use it for figures that they create; they do not change the fonts and
+    sizes of given Axes. Global settings of matplotlib are never changed.
     """
     _load_backend()
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
@@ -161,7 +161,7 @@ def save(
 ) -> tuple[Path, ...]:
     """Write a figure, in one file for each format.
 
-    **Arguments:** `path` without suffix (that of a format is dropped); `plot`, or any figure or
+    **Arguments:** `path` without suffix (a suffix of a format is dropped); `plot`, or any figure or
     Axes of matplotlib; `formats`, of "png", "pdf" and "svg"; `dpi` of a PNG.
 
     **Returns:** the paths.

@@ -38,13 +38,13 @@ def cycle(
 ) -> Plot:
     """The limit cycle in the plane of two states or outputs, colored by chart.
 
-    Events are marked by dots, resets that move the point by dashed lines, sections by short bars:
-    along the section where it is a curve in this plane (its level depends on x and y only),
-    across the orbit elsewhere.
+    Events are marked by dots, resets that move the point by dashed lines, sections by short bars. A
+    bar lies along the section if this is a curve in the plane (its level depends on x and y only),
+    otherwise across the orbit.
 
     **Arguments:**
 
-    - `x`, `y`: names of states or outputs; by default the first two states that every chart has.
+    - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
     - `sections`: from `place_sections`, drawn as bars; about 8 are numbered, where there is room.
     - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
     - `ax`: where to draw; a new figure of one column's width by default.

@@ -52,7 +52,7 @@ def monte_carlo(
     - `function` of a `numpy.random.Generator`: returns a number, an array, or a mapping of names to
         numbers and arrays, with the same names and shapes in every draw. A draw that raises
         `ComputationError` is NaN.
-    - `draws`: their number. `seed`: of all of them. Default: 0.
+    - `draws`: number of draws. `seed`: seed of all draws. Default: 0.
     - `chunk`: number of draws in a piece. Default: a 256th of all.
     - `store`, `client`: as for `sweep`.
 

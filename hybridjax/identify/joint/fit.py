@@ -225,8 +225,8 @@ def fit_ldtp(
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
-    - `check`: whether to raise an error if outputs do not answer the inputs (not
-      with "innovations"). Default: True.
+    - `check`: whether to raise an error if outputs do not respond to the inputs. It has no effect
+      with "innovations". Default: True.
     - `reference`: names of those inputs of the series that act from outside on a loop. The fit is
       then that of the plant, from the other inputs, which a controller makes, always with
       innovations, and of stable and unstable plants alike. It is consistent in the loop if D is
@@ -236,7 +236,7 @@ def fit_ldtp(
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data
-    than unknowns, outputs that do not answer the inputs, or records with `lead`.
+    than unknowns, outputs that do not respond to the inputs, or records with `lead`.
     """
     require_x64()
     if not isinstance(data, HTF):
@@ -442,8 +442,8 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
 
     The errors of the HTFs are independent, circular and Gaussian, as for `multiplier_bound`. The
     unknowns are the matrices A[n], B[n], C[n] (and D[n], if the model has any) instead of free
-    numerators: this is the bound of `fit_ldtp`. The square of the ratio of the two standard errors
-    is the factor of data that the structure saves.
+    numerators: this is the bound of `fit_ldtp`. The squared ratio of the standard errors of
+    `multiplier_bound` to these is the factor by which the structure reduces the amount of data.
 
     **Arguments:**
 
