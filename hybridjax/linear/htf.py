@@ -309,38 +309,26 @@ class HTF(eqx.Module):
         """
         if is_traced(self.f, u):
             raise DefinitionError("`predict` must know `u` and `f`: call it outside of jit.")
-        values = np.asarray(u)
-        n, nu = values.shape
-        if n == 0 or n % self.n_sections or nu != len(self.inputs):
+        (n, nu), N, u = u.shape, self.n_sections, np.asarray(u)
+        if n == 0 or n % N or nu != len(self.inputs):
             raise DefinitionError(
-                f"`u` has shape {values.shape}, but needs a multiple of {self.n_sections} samples "
-                f"and {len(self.inputs)} columns."
+                f"`u` has shape {u.shape}, but needs a multiple of {N} samples and "
+                f"{len(self.inputs)} columns."
             )
-        mirror = self._mirror()
-        if mirror is None:
-            raise DefinitionError(
-                f"A real response needs harmonics symmetric about 0, not {self.harmonics}."
-            )
-        periods = n // self.n_sections
-        U = np.fft.fft(values, axis=0)
+        # A real system responds to -f with the conjugate of its response to f.
+        mirror = np.array([self._index(-m) for m in self.harmonics])
+        f = np.concatenate([self.f, -np.asarray(self.f)])
+        H = jnp.concatenate([self.H, jnp.conj(self.H[mirror])], axis=1)
+        U, periods = np.fft.fft(u, axis=0), n // N
         lines = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
-        # Each line or its mirror image is among the frequencies: axes of signs, lines, frequencies.
-        f = lines[:, None] / periods * np.array([1, -1])[:, None, None]
-        distance = np.abs(self._circle(np.asarray(self.f) - f))
-        measured = distance.min(axis=2, initial=np.inf) < SAME_FREQUENCY
-        if not measured.any(axis=0).all():
-            lost = lines[~measured.any(axis=0)][0] / periods
+        distance = np.abs(self._circle(lines[:, None] / periods - f))
+        lost = distance.min(axis=1, initial=np.inf) > SAME_FREQUENCY
+        if lost.any():
             raise DefinitionError(
-                f"`u` holds the frequency f = {abs(self._circle(lost)):g} cycles per period, where "
-                "the HTFs are not known."
+                f"`u` holds the frequency f = {abs(self._circle(lines[lost][0] / periods)):g} "
+                "cycles per period, where the HTFs are not known."
             )
-        rows = np.where(measured[0], *distance.argmin(axis=2))
-        H = jnp.where(
-            ~measured[0][:, None, None],
-            jnp.conj(self.H[np.array(mirror)][:, rows]),
-            self.H[:, rows],
-        )
-        parts = jnp.einsum("mkij,kj->mki", H, U[lines])
+        parts = jnp.einsum("mkij,kj->mki", H[:, distance.argmin(axis=1)], U[lines])
         places = (lines + periods * np.array(self.harmonics)[:, None]) % n
         Y = jnp.zeros((n, len(self.outputs)), complex).at[places].add(parts)
         return jnp.fft.ifft(Y, axis=0).real
@@ -373,12 +361,6 @@ class HTF(eqx.Module):
         if m not in self.harmonics:
             raise DefinitionError(f"Harmonic {m} is not stored; those are {self.harmonics}.")
         return self.harmonics.index(m)
-
-    def _mirror(self):
-        """The index of the negative of each harmonic, or `None` if one is not stored."""
-        rows = {m % self.n_sections: row for row, m in enumerate(self.harmonics)}
-        mirror = [rows.get(-m % self.n_sections) for m in self.harmonics]
-        return None if None in mirror else mirror
 
 
 @runtime_checkable

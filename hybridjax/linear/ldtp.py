@@ -136,7 +136,7 @@ class LDTP(eqx.Module):
         padded: dict[str, Any] = {}
         xp = jnp if is_traced(given) else np  # JAX compiles a program for each shape
         for name, blocks in given.items():
-            full, padded[name] = (d if name in "AB" else ny, d if name in "AC" else nu), []
+            full, parts = (d if name in "AB" else ny, d if name in "AC" else nu), []
             for n, block in enumerate(map(xp.asarray, blocks)):
                 shape = after[n] if name in "AB" else ny, dims[n] if name in "AC" else nu
                 if block.shape != shape:
@@ -145,9 +145,8 @@ class LDTP(eqx.Module):
                         f"x[{(n + 1) % len(A)}] {after[n]} coordinates, with {nu} inputs and {ny} "
                         f"outputs: it should be {shape}."
                     )
-                sizes = zip(full, shape, strict=True)
-                padded[name].append(xp.pad(block, [(0, p - q) for p, q in sizes]))
-        padded = {name: xp.stack(blocks) for name, blocks in padded.items()}
+                parts.append(xp.pad(block, [(0, p - q) for p, q in zip(full, shape, strict=True)]))
+            padded[name] = xp.stack(parts)
         return cls(**padded, dims=dims, inputs=inputs, outputs=outputs, coordinates=coordinates)
 
     @property

@@ -78,19 +78,6 @@ def style() -> contextlib.AbstractContextManager:
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
 
 
-def new_figure(
-    rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float = 2.6, **options
-) -> tuple[Figure, np.ndarray]:
-    """A figure and its array of Axes (rows, columns)."""
-    figure, axes = pyplot.subplots(
-        rows, columns, figsize=(width, height), layout="constrained", squeeze=False, **options
-    )
-    for ax in axes.ravel():
-        # Said here, since ticks are chosen when the figure is drawn, in whatever style then.
-        ax.tick_params(labelsize=_STYLE["xtick.labelsize"])
-    return figure, axes
-
-
 Resolution = Annotated[int, Whole(10, 10_000)]
 """Dots per inch."""
 AxesLike = Axes | np.ndarray | Sequence
@@ -121,14 +108,21 @@ class Plot:
 
 
 @contextlib.contextmanager
-def panels(ax: AxesLike | None, rows: int = 1, columns: int = 1, **options):
+def panels(
+    ax: AxesLike | None, rows: int = 1, columns: int = 1, *,
+    width: float = COLUMN, height: float = 2.6, **options,
+):  # fmt: skip
     """The grid of Axes that is given, or a new one in the package's style, (rows, columns).
 
     **Raises:** `DefinitionError` for another number of Axes.
     """
     if ax is None:
+        size: Any = {"figsize": (width, height), "layout": "constrained", "squeeze": False}
         with style():
-            yield new_figure(rows, columns, **options)[1]
+            axes = pyplot.subplots(rows, columns, **size, **options)[1]
+            for panel in axes.flat:  # here, since ticks are made when the figure is drawn
+                panel.tick_params(labelsize=_STYLE["xtick.labelsize"])
+            yield axes
         return
     axes = np.asarray(ax, dtype=object)
     if not all(isinstance(panel, Axes) for panel in axes.flat):
