@@ -144,13 +144,15 @@ def htf_by_reference(
         elif setup != about:
             raise DefinitionError(f"these experiments do not belong together: {setup}, {about}.")
         else:
-            total = Sums(*(x + y for x, y in zip(total, sums, strict=True)))
+            between = total.between + sums.between
+            total = Sums(total.total + sums.total, between, total.count + sums.count)
     if total is None or not total.count:
         raise DefinitionError("`data` holds no experiment that ran to its end.")
     N, P, names, outputs = setup
     ny = len(outputs)
     columns = [list(range(ny)), *([ny + i for i in part] for part in roles)]
-    ports = Ports(*Ports.rows(N, ny + len(names), *columns), N)
+    y, u, r = Ports.rows(N, ny + len(names), *columns)
+    ports = Ports(y, u, r, N)
     classes = excited_classes(total, ports, P)
     inputs = tuple(names[i] for i in roles.inputs)
     return solve(total, ports, classes, P, inputs, outputs, (repeats, variance))

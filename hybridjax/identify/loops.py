@@ -85,8 +85,8 @@ def loop(
         names = (*data.outputs, *data.inputs)
         others = [x for x in (*r, *d) if x not in reference]
         rows = [[names.index(x) for x in part] for part in (outputs, inputs, reference, others)]
-        *ports, known = Ports.rows(data.n_sections, len(names), *rows)
-        system = Ports(*ports, data.n_sections)
+        after, before, outside, known = Ports.rows(data.n_sections, len(names), *rows)
+        system = Ports(after, before, outside, data.n_sections)
         sums = _without(products, known)
         classes = excited_classes(sums, system, data.periods)
         return solve(
