@@ -13,10 +13,10 @@
 # %% [markdown]
 # # Fit parameters, and learn a term
 #
-# Two ways to use experiments on a hopper of which not everything is known. First its equations
-# are known and their parameters are not: `fit_model` finds those that the data see, and names the
-# others. Then one force is unknown: a small neural network takes its place, and is trained
-# through touchdowns and lift-offs.
+# This notebook uses experiments on a hopper in two ways. First, its equations are known and its
+# parameters are not: `fit_model` estimates the parameters that the data identify, and lists the
+# others. Then one force is unknown: a small neural network takes its place, and is trained through
+# touchdowns and lift-offs.
 
 # %%
 import equinox as eqx
@@ -37,8 +37,9 @@ SECTIONS, OUTPUTS = 8, ("yM", "vM")
 # %% [markdown]
 # ## Parameters from harmonic transfer functions
 #
-# The experiments: multisines as a force on the body, at a signal to noise ratio of 20 dB, and
-# four realizations of the design, so that the estimate knows its own variances.
+# The experiments apply multisines as a force on the body, at a signal-to-noise ratio of 20 dB. The
+# design has four realizations of the random phases, from which the variances of the estimate are
+# computed.
 
 # %%
 truth = hj.models.VerticalHopper()
@@ -52,8 +53,8 @@ estimate = hj.estimate_htf(data, (-1, 0, 1))
 estimate
 
 # %% [markdown]
-# The fit starts from a hopper all of whose parameters are wrong. The Jacobian is exact, through
-# the limit cycle, its events and the sections (which are anchored at the apex and move with it).
+# The fit starts from a hopper all of whose parameters are wrong. The Jacobian is exact, through the
+# limit cycle, its events and the sections (which are anchored at the apex and move with it).
 
 # %%
 names = ("m", "M", "k", "b", "l0", "a", "g")
@@ -65,10 +66,10 @@ fit
 print(fit.identifiability)
 
 # %% [markdown]
-# Seven parameters were asked for, and the data see five combinations of them: a longer leg shifts
-# the body upwards and changes no deviation from the cycle, and the actuator's force and gravity
-# come in as their ratio only. What is not seen stays where it was; what is seen can be compared
-# with the truth by its joint 95 % region.
+# Seven parameters are free, and the data identify five combinations of them. A longer leg shifts
+# the body upwards and changes no deviation from the cycle; the actuator's force and gravity enter
+# only as their ratio. Combinations that are not identified keep their initial values. The
+# identified ones are compared with the truth by their joint 95 % confidence region.
 
 # %%
 for name in ("m", "M", "k", "b"):
@@ -103,11 +104,11 @@ with hj.plot.style():
     panels[0, 0].legend()
 
 # %% [markdown]
-# ## A law that is not known
+# ## An unknown law
 #
-# Now the foot's damping in flight is no number times its speed, and nobody told us the law. The
-# chart for flight gets its force from a part of the system that may be anything: a function, or a
-# neural network.
+# Now the damping force of the foot in flight is not proportional to its speed, and the law is
+# unknown. The flight chart gets this force from an attribute of the system, which may be a function
+# or a neural network.
 
 
 # %%
@@ -144,9 +145,9 @@ def true_law(v):
 
 
 # %% [markdown]
-# Eight experiments of four periods with random forces, recorded eight times per period at a
-# signal to noise ratio of 40 dB. They begin in stance, where the body's height and speed are all
-# there is.
+# Eight experiments of four periods apply random forces. Outputs are recorded eight times per period
+# at a signal-to-noise ratio of 40 dB. The experiments begin in stance, where the height and speed
+# of the body are the complete state.
 
 # %%
 PERIODS = 4
@@ -162,13 +163,12 @@ scale = jnp.asarray(records.y.std(axis=(0, 1)))
 start = jnp.zeros((5, 8)).at[:3].set(jnp.array([[0.5], *records.cycle_outputs[0][:, None]]))
 
 # %% [markdown]
-# `response_function` computes what `run_experiments` does, as a function with derivatives,
-# through 8 experiments of 4 periods with a touchdown and a lift-off each. The network has few
-# weights, so that their derivatives by all of them are cheap in forward mode, and least squares
-# by Levenberg and Marquardt's iteration end at the noise within 60 steps. (Of a larger network
-# one would take the gradient, in reverse mode, and an optimizer for such, of `optax` say; here
-# 400 steps of Adam's end at twelve times the variance of the noise.) A weak pull towards zero
-# keeps what the data do not see.
+# `response_function` computes the same outputs as `run_experiments`, as a differentiable function.
+# The eight experiments have a touchdown and a lift-off in each of their four periods. The network
+# has few weights, so that forward-mode derivatives are cheap, and Levenberg-Marquardt reaches the
+# noise level within 60 steps. (For a larger network, use reverse-mode gradients and an optimizer
+# such as those of `optax`; here 400 steps of Adam end at twelve times the variance of the noise.) A
+# weak regularization towards zero determines the weights that the data do not identify.
 
 # %%
 network = eqx.nn.MLP(1, 1, 6, 1, activation=jnp.tanh, key=jax.random.key(0), dtype=float)
@@ -199,8 +199,9 @@ print(f"mean square misfit {np.mean(misfit(begin) ** 2):.3g} at first, {last:.3g
 print("noise: 0.0001")
 
 # %% [markdown]
-# The learned law beside the true one, and the multipliers of the hopper that has it. Nobody
-# measured the foot: all that is known of it came through the leg's force on the body.
+# The next cell compares the learned law with the true one, and the multipliers of the hopper
+# with the learned law. The foot was not measured: all information about it comes from the force of
+# the leg on the body.
 
 # %%
 found = hj.find_limit_cycle(eqx.tree_at(lambda s: s.damping, guess.system, learned), guess)

@@ -13,12 +13,13 @@
 # %% [markdown]
 # # How to push
 #
-# Somebody hops at a steady rhythm. An actuator can push, with an rms force of 1 mN and no more, and
-# 4000 strides are all that we may ask for. We want the Floquet multipliers, the factors by which a
-# disturbance changes from one stride to the next, to 5e-5. Nothing is known but that there are two.
+# A hopper has a steady rhythm. An actuator applies forces of at most 1 mN (rms), and the budget is
+# 4000 strides. The goal is a standard error of 5e-5 of the Floquet multipliers, the factors by
+# which a disturbance changes from one stride to the next. All that is known is that there are two
+# of them.
 #
-# Here the hopper is a model, so that the end can be compared with the truth. The study itself sees
-# nothing but records.
+# The hopper is a model here, so that the result can be compared with the truth. The study uses only
+# the records.
 
 # %%
 import pathlib
@@ -44,10 +45,10 @@ def laboratory(design):
 
 
 # %% [markdown]
-# ## The first block: all frequencies alike
+# ## The first block: equal amplitudes
 #
-# A sixth of the budget goes into learning where to push. Odd lines keep what a nonlinear body adds
-# of even order away from what we measure.
+# A sixth of the budget is spent to learn which frequencies matter. With odd lines only (a line is
+# an excited frequency), even-order nonlinear distortion does not fall on the measured lines.
 
 # %%
 first = hj.multisine(32, periods=32, lines="odd").scaled(rms=force)
@@ -59,35 +60,35 @@ study = study.add(laboratory(study.design))
 study
 
 # %% [markdown]
-# ## What is scarce?
+# ## Which limit applies?
 #
-# The fit is a model, if a poor one. It says what a better design is worth: much where the force is
-# the limit, nothing where the way from the cycle is (safety, comfort, linearity). Ask before you
-# push.
+# The first fit is a rough model. It predicts the gain of a better design: large if the force is
+# limited, none if the deviation from the cycle is limited (for safety, comfort or linearity). Check
+# which limit applies before the next block.
 
 # %%
 print(study.plan.advice)
 print(hj.optimal_design(study.fit, first, limit="output").advice)
 
 # %% [markdown]
-# The power goes to the resonance. That moves the body more: the print of the plan says how far.
+# The optimal design concentrates power at the resonance. This moves the body more; the printed plan
+# shows how far.
 
 # %%
 hj.plot.spectrum(study.plan, study.fit)
 study.plan
 
 # %% [markdown]
-# And this is where one learns: in a few lines, and (for each output) at some phases of the stride
-# more than at others.
+# The information lies in a few lines and, for each output, mostly at some phases of the stride.
 
 # %%
 hj.plot.information(hj.designs.information_map(study.fit, study.design, noise=study.noise))
 
 # %% [markdown]
-# ## Push, look, and push again
+# ## Block by block
 #
-# Each block is designed from all that was measured before, and the study ends as soon as the
-# interval is as narrow as was asked, or the budget is spent.
+# Each block is designed from all earlier data. The study ends as soon as the interval is as narrow
+# as requested, or the budget is spent.
 
 # %%
 while not study.done and study.strides[-1] + study.design.cycles(0) <= budget:
@@ -98,10 +99,10 @@ study
 hj.plot.strides(study.plan, {"this study": study})
 
 # %% [markdown]
-# ## Was it right?
+# ## Comparison with the truth
 #
-# The region was computed at a time that the data chose, and is made to hold the true multipliers in
-# 95 % of studies (`docs/experiments.md`).
+# The data determined when the study stopped. The region still contains the true multipliers in 95 %
+# of studies (`docs/experiments.md`).
 
 # %%
 print("in the region of 95 %:", study.fit.contains(cycle.multipliers))
@@ -110,9 +111,9 @@ study.fit.compare(cycle.multipliers)
 # %% [markdown]
 # ## For the hardware
 #
-# A block as a table: against time for hardware that plays samples, or one row for each section, for
-# hardware that triggers on phase. Look at the peak before you send it: the rms force is limited
-# here, not its peak (`hj.designs.Limits(rms={"u": 0.001}, peak={"u": 0.003})` limits both).
+# A block is written as a table: against time for hardware that plays samples, or with one row per
+# section for hardware that triggers on phase. Check the peak first: here only the rms force is
+# limited (`hj.designs.Limits(rms={"u": 0.001}, peak={"u": 0.003})` limits both).
 
 # %%
 block = study.design
@@ -127,6 +128,6 @@ for name in ("time.csv", "phase.csv"):
         print(name, *(next(file).strip() for _ in range(4)), sep="\n  ")
 
 # %% [markdown]
-# What comes back is a recording. `section_data(...).experiments(block.periods)` makes of it what
-# `study.add` takes (the notebook `recording` shows how); a study can be made again from its
-# blocks on another day, since it depends on nothing else.
+# The hardware returns a recording. `section_data(...).experiments(block.periods)` converts it to
+# the argument of `study.add` (see the notebook `recording`). A study depends only on its arguments
+# and blocks, so that it can be reconstructed from stored data on another day.

@@ -13,11 +13,11 @@
 # %% [markdown]
 # # Spikes under a known current: a phase response curve
 #
-# A neuron of the mouse's globus pallidus fires by itself, about fifty times a second. A sine
-# current of 20 pA was injected, of another frequency in each trial of 10 s (Olivares, Wilson and
-# Goldberg; `data/README.md` has source and license). All that is used is when it fired. The phase
-# runs from 0 at one spike to 1 at the next, $\dot\varphi = w + Z(\varphi)\,I(t)$; Z is the phase
-# response curve.
+# A neuron of the mouse's globus pallidus fires spontaneously, about fifty times a second. A sine
+# current of 20 pA was injected, with a different frequency in each trial of 10 s (Olivares, Wilson
+# and Goldberg; `data/README.md` has source and license). Only the times of the spikes are used. The
+# phase runs from 0 at one spike to 1 at the next, $\dot\varphi = w + Z(\varphi)\,I(t)$; Z is the
+# phase response curve.
 
 # %%
 from pathlib import Path
@@ -34,7 +34,7 @@ data = np.load(next(path for path in files if path.exists()))
 # %% [markdown]
 # ## A recording of events
 #
-# One trial for each frequency; every tenth of them, so that this page is made quickly.
+# The recording has one trial for each frequency; every tenth trial is used, to save time.
 
 # %%
 time = np.arange(0, 10.0002, 2e-4)
@@ -53,8 +53,8 @@ phase = hj.recordings.estimate_phase(recording, hj.AtEvent("spike"))
 print(phase)
 
 # %% [markdown]
-# The current changes intervals by half. A limit at 1.5 medians would have taken the long ones for
-# missed spikes; limits are where the lengths of the intervals end.
+# The current changes intervals by half. A limit at 1.5 median intervals would count the long ones
+# as missed spikes; therefore the limits are gaps in the distribution of intervals.
 
 # %%
 figure = hj.plot.phase(phase)
@@ -62,9 +62,9 @@ figure = hj.plot.phase(phase)
 # %% [markdown]
 # ## The curve
 #
-# With what the data cannot tell, in plain words. R2 is the share of the variance of intervals
-# within trials that is forecast in trials, or parts of them, that the curve was not fitted to.
-# Dashed: plain regression of intervals on the current at phases that grow linearly.
+# The result lists the limits of the data. R2 is the predicted fraction of the variance of intervals
+# within trials, for blocks of intervals that were left out of the fit. Dashed: plain regression of
+# intervals on the current at phases that grow linearly.
 
 # %%
 found = hj.recordings.phase_response(recording, phase, input="current")
@@ -81,23 +81,26 @@ panel.errorbar(
 legend = panel.legend(fontsize="x-small")
 
 # %% [markdown]
-# The published curve is from other stimulation, with noise currents. How smooth ours is follows
-# from the data (marginal likelihood). Plain regression takes the phase as growing linearly from
-# spike to spike; a late spike then has regressors of its own, and the curve is another one. What is
-# left of neighboring intervals is correlated, so that one number, the phase, is not all of the
-# neuron's state. The intervals are those of the phase model, which holds only so far.
+# The published curve was estimated from stimulation with noise currents. The smoothness of our
+# curve is determined by the data (marginal likelihood). Plain regression assumes that the phase
+# grows linearly from spike to spike, so that its regressors depend on the time of the next spike,
+# which biases the curve. The residuals of neighboring intervals are correlated, so that the phase
+# alone is not the complete state of the neuron. The confidence intervals are valid only for the
+# phase model.
 #
-# ## Forecasts of the next spike
+# ## Predictions of the next spike
 #
-# Each block of intervals is forecast by a curve that was fitted to the others, and by a flat one.
+# Each block of intervals is predicted by a curve that was fitted to the others, and by a flat
+# curve.
 
 # %%
 print(f"R2 of intervals left out: {found.left_out:.3f}; of a flat curve: {found.left_out_flat:.3f}")
 
 # %% [markdown]
-# ## Where the truth is known
+# ## A simulated check
 #
-# The same protocol on a phase model with the estimated rate and jitter, and a known curve.
+# The same protocol is applied to a phase model with the estimated rate and jitter, and a known
+# curve.
 
 # %%
 x = np.arange(400) / 400

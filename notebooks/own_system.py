@@ -13,13 +13,12 @@
 # %% [markdown]
 # # Your own hybrid system
 #
-# A one-legged hopper that no clock drives: a mass on a springy leg, in the manner of Raibert's
-# machines. It falls, lands, and compresses the leg. From when the leg is shortest until it has
-# its length again and leaves the ground, a cylinder pushes, which puts in the energy that the
-# damper takes out.
+# The system is a one-legged hopper without a clock, a mass on a springy leg like Raibert's
+# machines. It falls, lands, and compresses the leg. While the leg extends, a cylinder pushes and
+# replaces the energy that the damper dissipates.
 #
-# This notebook writes it down, finds its limit cycle, checks the answer by hand, measures it as
-# one would measure a machine, and shows what happens when something is wrong.
+# This notebook defines the system, finds its limit cycle, checks the multiplier by simulation,
+# identifies it from experiments, and shows typical errors.
 
 # %%
 import jax
@@ -35,9 +34,9 @@ hj.enable_x64()  # before any model is built
 # %% [markdown]
 # ## Charts, guards, resets
 #
-# A *chart* is a phase of the motion, with named states and a vector field. The field is written
-# for one state; it returns as many rates as there are states. `u` are the inputs, here a vertical
-# force on the body.
+# A *chart* is a continuous mode, with named states and a vector field. The vector field is a
+# function of one state, and returns the rates of all states. `u` contains the inputs, here a
+# vertical force on the body.
 
 
 # %%
@@ -64,10 +63,10 @@ class Stance(hj.Chart):
 
 
 # %% [markdown]
-# The system says which charts there are, and which *transitions* lead from one to another. A
-# transition happens when its guard falls through zero; the reset maps the state into the new
-# chart (the same state, if it is left out). Parameters are arrays: they can be changed without
-# compiling anything again, and differentiated.
+# The system lists its charts, and the *transitions* between them. A transition happens when its
+# guard falls through zero. Its reset maps the state into the new chart (default: the same state).
+# Parameters are arrays: they can be differentiated, and new values do not cause another
+# compilation.
 
 
 # %%
@@ -105,9 +104,9 @@ class Robot(hj.HybridSystem):
 robot = Robot()
 
 # %% [markdown]
-# ## Let it hop
+# ## A trajectory
 #
-# Dropped from 90 cm, it loses height for some hops, and then repeats itself.
+# Dropped from 90 cm, the hopper loses height for some hops, and then hops periodically.
 
 # %%
 drop = hj.simulate(robot, "flight", (0.9, 0.0), duration=4.0)
@@ -121,9 +120,9 @@ print([event.name for event in drop.events[:6]])
 # %% [markdown]
 # ## Its limit cycle
 #
-# Nothing tells the time in this system, so that the cycle is sought from a section to itself:
-# here the apex, where the speed falls through zero in flight. Newton's method uses the exact
-# Jacobian of one hop, through all three events.
+# The system is autonomous, so that the cycle is a fixed point of the return map of a section: here
+# the apex, where the speed falls through zero in flight. Newton's method uses the exact Jacobian of
+# one hop, through all three events.
 
 # %%
 apex = hj.Crossing("v", "falling", charts=("flight",))
@@ -133,9 +132,9 @@ cycle
 # %%
 hj.plot.cycle(cycle)
 # %% [markdown]
-# One multiplier: of the two states, one is along the orbit. A hop takes away nearly half of what
-# a disturbance has left. That can be checked by hand: drop the robot a little above the apex, and
-# look where the next apex is.
+# There is one multiplier, because one of the two dimensions is along the orbit. Each hop removes
+# nearly half of a disturbance. To check this, drop the robot a little above the apex, and compare
+# the height of the next apex.
 
 # %%
 height, nudge = cycle.state["y"], 1e-6
@@ -154,10 +153,10 @@ print(f"by hand {slope:.8f}, exactly {cycle.multipliers[0].real:.8f}")
 # %% [markdown]
 # ## Measure it
 #
-# Sixteen sections of the phase plane, evenly spaced in the angle of height and speed: of a system
-# without a clock, sections must be given by the state. (None of them may lie exactly on an event.
-# At the bottom the speed is zero, as it is at the apex, so that the center is moved a little.)
-# Then multisine forces, held between sections, and the response.
+# Sixteen sections are evenly spaced in the angle of height and speed, because autonomous systems
+# need state-based sections. (No section may lie exactly on an event. At the bottom the speed is
+# zero, as at the apex, so that the center is moved a little.) Multisine forces are held between
+# sections, and the response is recorded.
 
 # %%
 _, *orbit = cycle.trajectory()("y", "v")
@@ -179,8 +178,8 @@ fit.compare(cycle.multipliers)
 # %% [markdown]
 # ## Which parameter would help?
 #
-# All of it can be differentiated: here the multiplier, by all parameters at once. (Most of the
-# time goes into compiling. Forward mode does for a few parameters.)
+# Everything can be differentiated: here the multiplier, with respect to all parameters at once.
+# (Compiling takes most of the time. Forward mode suits a few parameters.)
 
 
 # %%
@@ -197,8 +196,8 @@ for name in ("m", "g", "l0", "k", "b", "thrust"):
 # %% [markdown]
 # ## When something is wrong
 #
-# What is wrong is said at the call that was wrong: in a definition, in a design, on the way to
-# the cycle, or for each experiment.
+# Errors are raised at the call that causes them: in a definition, in a design, or in the search for
+# the cycle. Failures of experiments are reported for each experiment.
 
 
 # %%

@@ -14,9 +14,9 @@
 # # The paper, step by step
 #
 # Ankarali and Cowan identify a rhythmic hybrid system from input-output experiments. This notebook
-# does the same with a system that is written here, and lays every estimate over the exact answer.
-# Equations and sections refer to *System Identification of Rhythmic Hybrid Dynamical Systems via
-# Discrete Time Harmonic Transfer Functions* (CDC 2014).
+# does the same with a system that is defined here, and compares every estimate with the exact
+# result. Equations and sections refer to *System Identification of Rhythmic Hybrid Dynamical
+# Systems via Discrete Time Harmonic Transfer Functions* (CDC 2014).
 
 # %%
 import dataclasses
@@ -34,9 +34,9 @@ SECTIONS, EXPERIMENTS, PERIODS, DISCARD = 32, 80, 64, 20  # the paper's numbers
 # %% [markdown]
 # ## A hybrid system (Sec. II)
 #
-# Two masses on a leg spring with a sinusoidal actuator. In flight the foot moves too and is damped;
-# in stance it rests on the ground, so the two charts have different dimensions. A field is
-# written for one state; batches, padding and derivatives happen elsewhere.
+# Two masses are connected by a leg spring with a sinusoidal actuator. In flight the foot moves too
+# and is damped; in stance it rests on the ground, so that the two charts have different dimensions.
+# A vector field is a function of one state; the package handles batches, padding and derivatives.
 
 
 # %%
@@ -103,7 +103,7 @@ class Hopper(hj.HybridSystem):
 hopper = Hopper()
 
 # %% [markdown]
-# A trajectory from a rough start, with its events:
+# A trajectory from a rough initial state, with its events:
 
 # %%
 trajectory = hj.simulate(hopper, "stance", (2.05, 1.9), duration=10.0, time=0.5)
@@ -113,8 +113,8 @@ for event in trajectory.events[:4]:
 # %% [markdown]
 # ## The limit cycle
 #
-# Newton on the return map with its exact Jacobian; the paper lets the simulation settle for 60 s
-# instead. The multipliers have a negative real part: the sign was lost in print.
+# Newton's method is applied to the return map with its exact Jacobian; the paper simulates 60 s of
+# transient instead. The multipliers have a negative real part: the sign was lost in print.
 
 # %%
 cycle = hj.find_limit_cycle(hopper, hj.Guess("stance", (2.0, 1.9), time=0.5))
@@ -141,8 +141,9 @@ axes = hj.plot.cycle(cycle, "yM", "vM", sections=placed["kinematic"], perturbed=
 # %% [markdown]
 # ## The linear periodic system (eqs. 5 to 7)
 #
-# Exact, through the events. Dimensions vary from section to section: on a kinematic section the
-# time of crossing `t` is a coordinate, and the state that the section determines is left out.
+# The linearization is exact, through the events. Dimensions vary from section to section: on a
+# kinematic section the time of crossing `t` is a coordinate, and the state that the section
+# determines is left out.
 
 # %%
 outputs = ("yM", "vM")
@@ -156,8 +157,9 @@ for name, model in models.items():
 # %% [markdown]
 # ## A design (Sec. V)
 #
-# 620 frequencies in 80 experiments, as in the paper. The rules of Sec. V-B are checked by
-# every design; the fewest experiments that obey them are 20, which `hj.multisine()` finds.
+# The design has 620 frequencies in 80 experiments, as in the paper. Every design is checked for the
+# rules of Sec. V-B. At least 20 experiments are needed to obey them; `hj.multisine()` makes such a
+# design.
 
 # %%
 design = hj.paper_design(SECTIONS, PERIODS, experiments=EXPERIMENTS, seed=0)
@@ -167,7 +169,8 @@ print(hj.multisine(SECTIONS, PERIODS, seed=0))
 # %% [markdown]
 # ## Experiments
 #
-# All of them run side by side, from the limit cycle; the first 20 cycles are left out of estimates.
+# All experiments run side by side, from the limit cycle; the first 20 cycles are not used for
+# estimation.
 
 # %%
 data = {
@@ -228,7 +231,7 @@ everything |= {f"structured, {name}": fit for name, fit in structured.items()}
 axes = hj.plot.multipliers(cycle, everything)
 
 # %% [markdown]
-# The choice of sections leaves the poles where they are and moves the zeros (Sec. VI-C2):
+# The choice of sections does not change the poles, but it moves the zeros (Sec. VI-C2):
 
 # %%
 figure = hj.plot.poles_zeros(rational)
@@ -236,8 +239,9 @@ figure = hj.plot.poles_zeros(rational)
 # %% [markdown]
 # ## Beyond the paper
 #
-# Parameters are differentiable leaves, and a new value does not compile anything anew. How the
-# multipliers depend on the mass of the body, each cycle found from the last:
+# Parameters can be differentiated, and a new value does not cause another compilation. The
+# multipliers depend on the mass of the body as follows (the search for each cycle starts from the
+# previous one):
 
 # %%
 neighbor = cycle

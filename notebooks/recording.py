@@ -13,9 +13,9 @@
 # %% [markdown]
 # # From a recording to Floquet multipliers
 #
-# A laboratory has sampled signals, a measured perturbation, and the dirt of reality. This notebook
-# goes from there to multipliers with honest intervals. The recording is made here, by a simulated
-# hopper, so that the truth is known at the end; with your own data, begin at *The five lines* with
+# A laboratory has sampled signals, a measured perturbation, noise and artifacts. This notebook
+# computes multipliers with confidence intervals from such data. The recording is simulated with a
+# hopper, so that the true multipliers are known. With your own data, begin at *The five lines* with
 # `recording = hj.read_recording("trial1.csv", "trial2.csv")`.
 
 # %%
@@ -32,9 +32,9 @@ hj.enable_x64()
 # %% [markdown]
 # ## A recording
 #
-# Two trials of 250 strides at 200 samples per second: position and velocity of the body, and a
-# random force with power up to 8 Hz, which knows nothing of strides. Then the dirt: noise,
-# rounding, 1 % of the samples lost, and a gap of ten strides.
+# The recording has two trials of 250 strides at 200 samples per second: position and velocity of
+# the body, and a random force with power up to 8 Hz, independent of the strides. Artifacts are
+# added: noise, rounding, 1 % lost samples, and a gap of ten strides.
 
 # %%
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
@@ -49,8 +49,8 @@ recording
 # %% [markdown]
 # ## The five lines
 #
-# Phase is the angle of position and velocity about the center of their loop, which is estimated;
-# each cycle is sampled at 32 phases; two multipliers are fitted.
+# Phase is the angle of position and velocity about the center of their loop, which is estimated.
+# Each cycle is sampled at 32 phases, and two multipliers are fitted.
 
 # %%
 angle = hj.KinematicPhase(32, position="yM", velocity="vM")
@@ -73,11 +73,11 @@ fit.compare(cycle.multipliers)
 print("held by the 95 % regions:", fit.contains(cycle.multipliers))
 
 # %% [markdown]
-# ## Surer multipliers: one event in each cycle
+# ## Smaller standard errors: one event in each cycle
 #
-# At the sections of this angle position and velocity are two sides of one number, and noise moves
-# every crossing. Cycles from apex to apex, with time running evenly in between, keep both signals.
-# The multipliers are the same, and surer.
+# At sections defined by this angle, position and velocity contain the same information, and noise
+# shifts every crossing. Cycles from apex to apex, with the phase linear in between, use the
+# information of both signals. The multipliers are the same, and their standard errors are smaller.
 
 # %%
 apex = hj.Crossing("vM", "falling")
@@ -90,7 +90,8 @@ print("held by the 95 % regions:", surer.contains(cycle.multipliers))
 # %% [markdown]
 # ## Look at the data first
 #
-# The periods of the cycles, the average cycle, the deviations from it, and the force's spectrum.
+# The figures show the periods of the cycles, the average cycle, the deviations from it, and the
+# spectrum of the force.
 
 # %%
 figure = hj.plot.phase(phase)
@@ -101,10 +102,11 @@ figure = hj.plot.section_data(data)
 # %% [markdown]
 # ## How many multipliers, and is the model good?
 #
-# The order that predicts strides best that it was not fitted to; and a model of the first three
-# quarters, simulated on the last. What is left is correlated in time since the splines smooth over
-# neighboring sections, and with the input since numerators are estimates (98 at each section, from
-# 360 strides) and the hopper is not quite linear.
+# The order with the best prediction of held-out strides is chosen. Then a model is fitted to the
+# first three quarters and simulated on the last. Its residuals are correlated in time, because the
+# splines smooth over neighboring sections. They are correlated with the input, because the
+# numerators are estimates (98 at each section, from 360 strides) and the hopper is not exactly
+# linear.
 
 # %%
 print("order:", hj.recordings.choose_order(data))
@@ -115,10 +117,10 @@ held_out.validation
 figure = hj.plot.validation(held_out.validation)
 
 # %% [markdown]
-# ## What the data cannot carry
+# ## Limits of the data
 #
-# In plain words, with the multipliers that plain regression would have given, and the standard
-# errors that other numbers of strides would give.
+# The advice lists reasons to doubt the fit, the multipliers by plain regression, and predicted
+# standard errors for other numbers of strides.
 
 # %%
 advice = hj.recordings.advise(data, fit)
@@ -132,8 +134,8 @@ axes = hj.plot.multipliers(fit, {"plain regression": advice.plain})
 # %% [markdown]
 # ## Transfer functions and impulse responses
 #
-# Harmonic transfer functions beside the exact ones of the linearized hopper, and what a brief push
-# does at each phase.
+# The figures compare harmonic transfer functions with the exact ones of the linearized hopper, and
+# show the response to a brief perturbation at each phase.
 
 # %%
 sections = hj.KinematicPhase(
@@ -150,7 +152,7 @@ figure = hj.plot.impulse_responses(hj.recordings.impulse_responses(fit, data))
 # %% [markdown]
 # ## The next experiment
 #
-# A multisine as a table: by phase, for hardware that triggers on it, or against time.
+# A multisine is written as a table: by phase, for hardware that triggers on it, or against time.
 
 # %%
 design = hj.multisine(periods=64, band=(0, 8.0), lines="odd").scaled(rms=0.02)
@@ -165,7 +167,7 @@ with tempfile.TemporaryDirectory() as folder:
 # hybridjax identify trial1.csv trial2.csv --input force --outputs yM,vM --phase yM,vM --out results
 # ```
 #
-# does the same and writes one page for a colleague. From Python:
+# does the same and writes a report of one page. From Python:
 
 # %%
 found = hj.identify_recording(recording, angle, inputs="u", outputs=("yM", "vM"), order=2)

@@ -11,11 +11,11 @@
 # ---
 
 # %% [markdown]
-# # A walking robot: what five strides a run can tell
+# # A walking robot: five strides per run
 #
-# A robot with two legs and real impacts walked twelve times, ten steps each, its motor driven by
-# feedback and iterative learning (I. Manchester; `data/README.md` has source and license). The
-# input was recorded. This is a page about what must *not* be concluded.
+# A robot with two legs and real impacts walked twelve times, ten steps each, with its motor driven
+# by feedback and iterative learning (I. Manchester; `data/README.md` has source and license). The
+# input was recorded. This page shows which conclusions these data do *not* support.
 
 # %%
 from pathlib import Path
@@ -53,9 +53,9 @@ steps = [np.diff(trial.events["step"]) for trial in recording.trials]
 print(np.round(1000 * np.array([s[0::2].mean() - s[1::2].mean() for s in steps])), "ms")
 
 # %% [markdown]
-# ## The input is made from the rhythm
+# ## The input depends on the cycle
 #
-# Where the legs change, angles are relabeled, and jump: nothing is smoothed across that, and no
+# At the change of legs, angles are relabeled and jump. Nothing is smoothed across the jumps, and no
 # section lies there (`bandwidth=np.inf`).
 
 # %%
@@ -77,8 +77,8 @@ figure = hj.plot.section_data(strides)
 # %% [markdown]
 # ## There are too few strides for a fit
 #
-# Each run begins in an unknown state, and has a mean of its own: two fifths of it are used up
-# before anything is learned. The fit is refused, with the number that is missing.
+# Each run has an unknown initial state and an unknown mean. They cost two fifths of the run, before
+# anything else is estimated. The fit raises an error with the number of missing cycles.
 
 # %%
 try:
@@ -87,10 +87,11 @@ except hj.DefinitionError as error:
     print(error)
 
 # %% [markdown]
-# ## The closed loop, with its input a part of it
+# ## The closed loop
 #
-# How deviations go on into the next stride can be asked without an input. The answer is about robot
-# *and* controller, and the interval, from resampling whole runs, is as wide as it has to be.
+# The part of a deviation that remains after one stride can be estimated without an input. The
+# result concerns the robot *and* its controller. The interval, from resampling of whole runs, is
+# very wide.
 
 # %%
 angles = hj.recordings.section_data(

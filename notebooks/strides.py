@@ -11,14 +11,14 @@
 # ---
 
 # %% [markdown]
-# # How many strides do I need, and how sure am I?
+# # How many strides are needed, and how precise is the result?
 #
-# Somebody hops at a steady rhythm, and we push and measure. The pushes are small and known, the
-# measurements noisy. From them we want to know how quickly the hopper recovers from a stumble:
-# its Floquet multipliers, the factors by which a disturbance shrinks from one stride to the next.
+# A hopper has a steady rhythm. It is perturbed by small known forces, and its response is measured
+# with noise. The goal is to estimate how quickly it recovers from a disturbance: its Floquet
+# multipliers, the factors by which a disturbance changes from one stride to the next.
 #
-# Here the hopper is a model, so that every answer can be compared with the truth. The analysis
-# uses nothing but the records.
+# The hopper is a model here, so that every result can be compared with the truth. The analysis uses
+# only the records.
 
 # %%
 import numpy as np
@@ -35,9 +35,10 @@ print("true multipliers", np.round(truth, 4))
 # %% [markdown]
 # ## An experiment
 #
-# A *multisine* is a sum of cosines. This one has odd lines only: what a nonlinear body adds of
-# even order then falls between them, where it does no harm. Four draws of the random phases will
-# tell us later what scatters. Printing a design says what it costs.
+# A *multisine* is a sum of cosines at excited frequencies, called lines. This one has odd lines
+# only, so that even-order nonlinear distortion falls between them, where it causes no error.
+# Variances will be computed from the scatter over four realizations of the random phases. A printed
+# design shows its cost in strides.
 
 # %%
 design = hj.multisine(lines="odd", periods=64, seed=1).realizations(4).scaled(rms=0.005)
@@ -53,10 +54,10 @@ print(data.summary())
 # %% [markdown]
 # ## The response, with its uncertainty
 #
-# A rhythmic system answers one frequency at many: harmonic m of the transfer function says what
-# comes out m cycles per stride away from what went in. The band is where the true value lies with
-# a probability of 95 %, as the four realizations show. It narrows with the number of
-# realizations, but it does not know about mistakes that all of them share.
+# A rhythmic system responds to one frequency at many: harmonic m of the transfer function is the
+# response m cycles per stride above the input frequency. The band, computed from the four
+# realizations, contains the true value with a probability of 95 %. It narrows with the number of
+# realizations, but does not include errors that all of them share.
 
 # %%
 estimate = hj.estimate_htf(data, (-1, 0, 1))
@@ -74,8 +75,8 @@ print(hj.select_order(estimate))
 # %% [markdown]
 # ## The multipliers
 #
-# All harmonics and outputs are fitted with one denominator, whose roots they are. The regions
-# hold the true multipliers with a probability of 95 %.
+# All harmonics and outputs are fitted with one denominator, whose roots are the multipliers. The
+# regions contain the true multipliers with a probability of 95 %.
 
 # %%
 fit = hj.fit_multipliers(estimate, order=2)
@@ -87,8 +88,9 @@ hj.plot.multipliers(truth, {"20 dB": fit})
 # %% [markdown]
 # ## How many strides?
 #
-# With noise the error falls with the square root of the number of strides: twice the strides, 0.7
-# times the error. Each number is the root of the mean square over ten draws of the noise.
+# With noise, the error is inversely proportional to the square root of the number of strides: twice
+# the strides, 0.7 times the error. Each number is the root of the mean square over ten draws of the
+# noise.
 
 # %%
 for count in (1, 2, 4):
@@ -102,11 +104,10 @@ for count in (1, 2, 4):
     print(f"{len(record.y) * 84:5d} strides: error of the multipliers {rms:.1e}")
 
 # %% [markdown]
-# ## Fewer strides: any push will do
+# ## Fewer strides: any input
 #
-# With 300 strides in one piece, and pushes that are plain noise, the same structure is fitted to
-# the series itself. It needs neither a steady state nor a period, and it leaves out samples that
-# were lost.
+# The same structure is fitted to a time series, here 300 strides with white-noise forces. Such a
+# fit needs neither a steady state nor a periodic input, and it leaves out missing samples.
 
 # %%
 rng = np.random.default_rng(0)
@@ -124,8 +125,8 @@ print("error", np.max(np.abs(series.multipliers - truth)))
 # %% [markdown]
 # ## Is the model good?
 #
-# The second record was not used for the fit. A tenth of it is noise, so that no model explains
-# more than 90 % of it.
+# The second record was not used for the fit. Noise is a tenth of it, so that no model explains more
+# than 90 %.
 
 # %%
 test = hj.Record(noisy.u[1], noisy.y[1], n_sections=32, outputs=outputs)
@@ -136,11 +137,11 @@ report
 hj.plot.validation(report)
 
 # %% [markdown]
-# It explains nearly all of that. Yet what it leaves is still correlated, over fractions of a
-# stride. That is the error of the model itself: the multipliers are two numbers, which 300 noisy
-# strides tell well, but the response to a push at each of 32 instants of the stride is some
-# thousand numbers. Four times the strides make it half as large, and the exact model leaves
-# nothing but noise:
+# The model explains nearly all of that. Yet its residuals are correlated over fractions of a
+# stride, because of errors of the model itself. The multipliers are two numbers, which 300 noisy
+# strides determine well, but the response to a force at each of 32 instants of the stride has
+# several thousand. With four times the strides this error is half as large. The exact model leaves
+# only noise:
 
 # %%
 hj.validate(hj.linearize(cycle, phase, outputs), test)

@@ -11,11 +11,12 @@
 # ---
 
 # %% [markdown]
-# # A sweep, and the best of it
+# # A sweep, and its best hopper
 #
-# 10 000 hoppers that differ in the stiffness of their leg and the damping of their foot: which of
-# them hop stably, how fast do they forget a disturbance, and which is best among those that hop
-# equally high? The last question is answered twice, by gradient and by looking at all of them.
+# This notebook sweeps 10 000 hoppers that differ in the stiffness of their leg and the damping of
+# their foot. Which of them hop stably, how fast do they recover from a disturbance, and which is
+# best among those that hop equally high? The last question is answered twice, by gradient and by
+# comparing all of them.
 
 # %%
 import equinox as eqx
@@ -35,9 +36,9 @@ POINTS = 100  # in each direction
 # %% [markdown]
 # ## Limit cycles and multipliers of all of them
 #
-# One call. Newton starts from one hopper's cycle, and then from those of neighbors; where that
-# fails a hopper is left to itself for 40 periods first. What has no cycle of this kind is listed by
-# index, with the reason.
+# A single call finds them all. Newton's method starts from the cycle of one hopper, and then from
+# those of its neighbors. If it fails, 40 periods of the transient are simulated first. Hoppers
+# without such a cycle are listed by index, with the reason.
 
 # %%
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
@@ -48,11 +49,11 @@ cycles = hj.find_limit_cycles(hoppers, guess=cycle)
 cycles
 
 # %% [markdown]
-# Each hopper has four multipliers, two of which are zero: touchdown forgets the foot. The
-# largest modulus says how fast disturbances die out; below one the hopper is stable. The angle of
-# the first multiplier says how the rest of a disturbance changes from period to period: at 0 it
-# keeps its sign, at pi it changes it, and in between it oscillates. White: no cycle with one flight
-# and one stance per period.
+# Each hopper has four multipliers, two of which are zero, because touchdown erases the state of the
+# foot. The largest modulus determines how fast disturbances decay; below one the hopper is stable.
+# The angle of the first multiplier shows how a disturbance changes from period to period: at 0 it
+# keeps its sign, at pi it changes its sign, and in between it oscillates. White: no cycle with one
+# flight and one stance per period.
 
 # %%
 first = cycles.multipliers[:, 0].reshape(POINTS, POINTS)
@@ -80,16 +81,15 @@ with hj.plot.style():
     right.set_ylabel("")
 
 # %% [markdown]
-# Multipliers meet on the real axis where the angle reaches 0 or pi.
-# The modulus of the largest has a kink there, and its derivative grows without bound on one side.
+# Two multipliers coincide on the real axis where the angle reaches 0 or pi. The modulus of the
+# largest has a kink there, and its derivative grows without bound on one side.
 #
 # ## The best hopper of a given height
 #
-# `hj.spectral_radius` is smooth everywhere, and a little above the true radius: the number
-# $r$ with $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$.
-# Its slopes and those of the height of the apex go through the limit cycle and its events;
-# forwards, since there are only two parameters. The optimizer is one of scipy, for losses with
-# constraints.
+# `hj.spectral_radius` is smooth everywhere, and a little above the true radius: the number $r$ with
+# $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$. Its gradient,
+# and that of the apex height, are computed through the limit cycle and its events, in forward mode,
+# because there are only two parameters. The optimizer is one of scipy, for losses with constraints.
 
 # %%
 WANTED = 2.3  # height of the body at the apex, in meters
@@ -132,11 +132,12 @@ print("multipliers at the start:  ", cycle.multipliers)
 print("multipliers at the optimum:", best.multipliers)
 
 # %% [markdown]
-# ## Against all of them
+# ## Comparison with all of them
 #
-# Heights of all hoppers, from the states at the 16 points that each cycle keeps (`legs`): the cubic
-# through its neighbors has its top where the speed is zero, good to 0.03 mm. In each of the
-# 100 columns of the sweep, interpolation gives the hopper with the wanted height.
+# The heights of all hoppers are computed from the states at the 16 points that each cycle keeps
+# (`legs`): a cubic through neighboring points has its maximum where the speed is zero, accurate to
+# 0.03 mm. In each of the 100 columns of the sweep, interpolation gives the hopper with the required
+# height.
 
 # %%
 y, v = np.moveaxis(np.asarray(cycles.legs.q)[:, :2], 1, 0)

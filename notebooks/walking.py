@@ -11,13 +11,13 @@
 # ---
 
 # %% [markdown]
-# # Walking that nobody perturbed: multipliers from variability
+# # Unperturbed walking: multipliers from variability
 #
-# A person walks on a treadmill at 0.8 m/s (Moore, Hnat and van den Bogert 2015, PeerJ 3:e918, CC
-# BY 4.0; `data/README.md`). Nobody pushed. How much of a deviation is left one stride later can
-# still be asked: the Floquet analysis of gait (Hurmuzlu and Basdogan 1994). Measurement noise
-# biases the usual regression towards zero, and strides are few: Dingwell and Cusumano (2000) say
-# why to be careful.
+# A person walks on a treadmill at 0.8 m/s (Moore, Hnat and van den Bogert 2015, PeerJ 3:e918, CC BY
+# 4.0; `data/README.md`), without perturbations. The part of a deviation that remains one stride
+# later can still be estimated: the Floquet analysis of gait (Hurmuzlu and Basdogan 1994).
+# Measurement noise biases the usual regression towards zero, and the number of strides is small;
+# Dingwell and Cusumano (2000) discuss the risks.
 
 # %%
 from pathlib import Path
@@ -58,20 +58,23 @@ figure = hj.plot.phase(phase)
 # %% [markdown]
 # ## Multipliers
 #
-# By instruments (states earlier in the same stride, which do not know of the noise), and by least
-# squares on the return map, as is usual. Intervals are from resampling blocks of strides.
+# The multipliers are estimated by instruments (states earlier in the same stride, which are
+# independent of the noise), and by the usual least squares on the return map. Intervals are
+# computed by resampling blocks of strides.
 
 # %%
 for order in (1, 2, 3):
     display(hj.recordings.natural_multipliers(strides, order))
 
 # %% [markdown]
-# What does not change with the order can be believed: deviations of joint angles are mostly gone
-# after a stride, and nothing more precise than the intervals can be said from 77 pairs of strides.
+# Only results that do not depend on the order are reliable: deviations of joint angles mostly
+# vanish within one stride. 77 pairs of strides do not support a more precise statement than the
+# intervals.
 #
-# ## What noise does, where the truth is known
+# ## The effect of noise in a simulation
 #
-# A linear rhythm with a multiplier of 0.6, 300 strides, and white noise on each of three signals.
+# The simulated linear system has a multiplier of 0.6, 300 strides, and white noise on each of three
+# signals.
 
 
 # %%

@@ -15,7 +15,7 @@ def enable_x64() -> None:
 
     hybridjax never does this at import, since the switch is global to JAX. Call it once, before
     anything is computed. Models, guesses, sections and settings may be built earlier; arrays of
-    `jax.numpy` that were made earlier stay 32 bit, and are refused.
+    `jax.numpy` that were made earlier stay 32 bit, and raise an error.
     """
     jax.config.update("jax_enable_x64", True)
 

@@ -14,7 +14,7 @@ from ..sections.families import FamilyLike, as_family
 
 @checked
 class Multipliers(eqx.Module):
-    """The Floquet multipliers: the sum of their variances.
+    """The Floquet multipliers as goal: the criterion is the sum of their variances.
 
     **Arguments:**
 

@@ -43,10 +43,11 @@ def information_map(
     r"""Find the input frequencies, and the phases of the cycle, that identify multipliers.
 
     The multipliers are identified by the derivatives of the HTFs with respect to the coefficients
-    of the multipliers' polynomial. Without the part that numerators can explain, and weighted by
-    their effect on the goal, these derivatives are residuals $r_m(f)$ for each harmonic, output and
-    cosine. The criterion of the goal is the sum of squares of the residuals. A cosine's response at
-    section n is $\sum_m H_m e^{2 \pi i (f + m) n / N}$, so that by Parseval's theorem
+    of the multipliers' polynomial. The part that a change of numerators can explain is subtracted
+    from these derivatives. The remainder, weighted by its effect on the goal, is the residual
+    $r_m(f)$ of each harmonic, output and cosine. The criterion of the goal is the sum of squares of
+    the residuals. A cosine's response at section n is $\sum_m H_m e^{2 \pi i (f + m) n / N}$, so
+    that by Parseval's theorem
 
     $$\sum_m |r_m(f)|^2 = \frac1N \sum_n \Big|\sum_m r_m(f)\, e^{2 \pi i m n / N}\Big|^2,$$
 

@@ -130,11 +130,11 @@ def stream_experiments(
     estimate = hj.estimate_htf(chunks)
     ```
 
-    Without a `store`, each chunk is run when the iterator gets to it. With one, all chunks are run
-    and kept. Experiments that are in the store already are not run again: after an interruption,
-    repeat the call. The records are the same to the last bit for any number of processes and
-    interruptions, on machines of one kind. For this, all of them wait for the optimized program
-    (10 s, once).
+    Without a `store`, each chunk is run when the iterator gets to it. With a `store`, all chunks
+    are run and kept. Experiments that are in the store already are not run again: after an
+    interruption, repeat the call. The records are the same to the last bit for any number of
+    processes and interruptions, on machines of one kind. Therefore all experiments wait for the
+    optimized program (10 s, once).
 
     **Arguments:** those of `run_experiments`, with its keyword arguments as one object, and
 
@@ -149,7 +149,7 @@ def stream_experiments(
     **Returns:** an iterator over `ExperimentData` of consecutive experiments, or with a store
     `StoredExperiments`.
 
-    **Raises:** as `run_experiments`, for arguments that do not fit together at once;
+    **Raises:** as `run_experiments` (at once for arguments that do not fit together);
     `DefinitionError` if the store holds other experiments (with the difference) or cannot be
     written, or if the workers of the client cannot run them; `ComputationError` if the cluster is
     lost.

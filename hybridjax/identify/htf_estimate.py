@@ -42,8 +42,8 @@ def estimate_htf(
     least-squares one. A line on a multiple of 1/2 (other than 0 and N/2) aliases with its own
     conjugate, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`; two or more experiments with
     different phases determine both unknowns. If m inputs excite the same line, at least m
-    experiments are needed to separate their responses. Failed experiments are left out, and only
-    frequencies that were measured from each input, and multiples of 1/2 with two phases, are kept.
+    experiments are needed to separate their responses. Failed experiments are left out. So are
+    frequencies that not every input has excited, and multiples of 1/2 without two phases.
 
     The estimate is that of the best linear approximation for signals of the class that was applied
     (Pintelon and Schoukens 2012, ch. 3), with its `variance`. From several realizations of random

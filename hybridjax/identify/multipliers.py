@@ -119,14 +119,13 @@ def fit_multipliers(
 ) -> StructuredFit:
     r"""Fit the common denominator of the HTFs, whose roots are the Floquet multipliers.
 
-    The maximum-likelihood estimate for independent, circular, Gaussian errors of the
-    HTFs with the variances `htf.variance`: the sum of $|H - B/\chi|^2 / \mathrm{var}$ is
-    minimized over all numerators and c. Numerators are eliminated (variable projection), so
-    that Gauss-Newton steps are taken in the d coefficients c only. The descent starts from the
-    linearized problem, solved by generalized total least squares, which is consistent (Pintelon
+    The maximum-likelihood estimate for independent, circular, Gaussian errors of the HTFs with the
+    variances `htf.variance`: the sum of $|H - B/\chi|^2 / \mathrm{var}$ is minimized over all
+    numerators B and the d coefficients c of the denominator $\chi$. Numerators are eliminated
+    (variable projection), so that Gauss-Newton steps are taken in c only. The descent starts from
+    the linearized problem, solved by generalized total least squares, which is consistent (Pintelon
     and Schoukens, *System Identification: A Frequency Domain Approach*). Positive and negative
-    frequencies are used, $H_m(-w) = \overline{H_{-m}(w)}$; for m = 0 (and N/2) numerators are
-    real.
+    frequencies are used, $H_m(-w) = \overline{H_{-m}(w)}$; for m = 0 (and N/2) numerators are real.
 
     **Arguments:**
 
@@ -204,7 +203,7 @@ def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> Mu
 
     **Arguments:**
 
-    - `model`: the truth. `htf`: its frequencies, harmonics and `variance` count, H does not.
+    - `model`: the true system. `htf`: frequencies, harmonics and `variance`; its H is not used.
     - `overhang`: degree of the numerators beyond d N. Default: N.
 
     **Returns:** the true multipliers with the smallest covariance of an unbiased estimate;

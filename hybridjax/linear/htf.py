@@ -34,7 +34,7 @@ class Scatter(eqx.Module):
     - `freedom` (F,): complex degrees of freedom of the variance.
     - `roundness` (M, F, ny, nu): $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ of the residuals d of
       the realizations, relative to its mean for Gaussian errors: 0 if all residuals lie on a line.
-      None (as an array of ones): the shape is not used.
+      None, or an array of ones: the shape is not used.
     - `shared`: whether the errors of all lines f + integers stem from the same noise, as in a loop.
       Default: False, independent errors.
 

@@ -81,7 +81,7 @@ class TorsoWalker(HybridSystem):
 
     Masses, lengths, `lean` and `stride` are those of the program that goes with E. R. Westervelt,
     J. W. Grizzle, C. Chevallereau, J. H. Choi, B. Morris, Feedback Control of Dynamic Bipedal Robot
-    Locomotion, 2007 (there with g = 9.8); the paper itself could not be compared.
+    Locomotion, 2007 (there with g = 9.8); they were not compared with the paper itself.
 
     J. W. Grizzle, G. Abba, F. Plestan, Asymptotically stable walking for biped robots: analysis via
     systems with impulse effects, IEEE Trans. Automatic Control 46(1), 2001.
@@ -154,12 +154,13 @@ class FiveLinkBiped(HybridSystem):
     only pushes, and that no foot slips, is not checked.)
 
     Masses, lengths, centers of mass and inertias are those of RABBIT in public simulation programs,
-    among them one derived from E. R. Westervelt's and J. W. Grizzle's of 2003; the two publications
-    themselves could not be compared. Inertias are taken about the joints, as in these authors'
-    program of 2001 (which has an earlier set: 20, 6.8 and 3.2 kg; 2.22, 1.08 and 0.93 kg m^2);
-    programs of others take the same numbers about the centers of mass. RABBIT's motors, of 3.32e-4
-    kg m^2 behind gears of 50, and its friction are left out. The virtual constraints, with `lean`,
-    `stride`, `knee`, `lift` and `stiffness`, are not from these sources.
+    among them one derived from E. R. Westervelt's and J. W. Grizzle's of 2003; they were not
+    compared with the two publications below. Inertias are taken about the joints, as in these
+    authors' program of 2001 (with an earlier set of numbers: 20, 6.8 and 3.2 kg; 2.22, 1.08 and
+    0.93 kg m^2); programs of other authors take the same inertias about the centers of mass.
+    RABBIT's motors, of 3.32e-4 kg m^2 behind gears of 50, and its friction are left out. The
+    virtual constraints, with `lean`, `stride`, `knee`, `lift` and `stiffness`, are not from these
+    sources.
 
     C. Chevallereau, G. Abba, Y. Aoustin, F. Plestan, E. R. Westervelt, C. Canudas-de-Wit, J. W.
     Grizzle, RABBIT: a testbed for advanced control theory, IEEE Control Systems Magazine 23(5),

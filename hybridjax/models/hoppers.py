@@ -97,7 +97,7 @@ class CompliantHopper(VerticalHopper):
 
     Input `u` is a force on the upper mass.
 
-    The hopper is that of `hopper.py`; the ground is a spring and a dashpot in parallel, and only
+    The hopper is `VerticalHopper`; the ground is a spring and a dashpot in parallel, and only
     pushes (on such contacts: K. H. Hunt, F. R. E. Crossley, J. Appl. Mech. 42 (1975) 440-445).
     """
 
@@ -171,7 +171,7 @@ class HopperPair(VerticalHopper):
     Inputs are a force on each body. A touchdown multiplies the speed of the body above it by
     `retention`.
 
-    The hopper is that of `hopper.py`; the coupling is ours.
+    The hoppers are `VerticalHopper`; the coupling is not from the literature.
     """
 
     inputs = ("u1", "u2")

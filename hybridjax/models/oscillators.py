@@ -75,10 +75,11 @@ class Mathieu(HybridSystem):
 class RotorFlap(HybridSystem):
     """The flapping angle `b` of a rigid blade; time in radians of its rotation.
 
-    Input `u` is a flapping moment over the moment of inertia, such as pitch makes.
+    Input `u` is a flapping moment, such as one due to pitch, divided by the moment of inertia.
 
     D. A. Peters, K. H. Hohenemser, Application of the Floquet transition matrix to problems of
-    lifting rotor stability, J. American Helicopter Society 16(2), 1971 (without reversed flow).
+    lifting rotor stability, J. American Helicopter Society 16(2), 1971; here without the region of
+    reversed flow.
     """
 
     lock: Parameter = parameter(12.0, doc="Lock number, aerodynamic over inertial forces")

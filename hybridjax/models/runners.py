@@ -145,8 +145,8 @@ class TrottingQuadruped(TwoLeggedBar):
 class SLIPRunner(HybridSystem):
     """A point mass on a massless spring, which touches down at a fixed angle of attack.
 
-    States: height `y` and speeds `vx`, `vy`; in stance also `x`, the place of the mass relative to
-    the foot. (In flight the place does not matter and is left out, so that a step is a cycle.)
+    States: height `y` and speeds `vx`, `vy`; in stance also `x`, the position of the mass relative
+    to the foot. (In flight this position has no effect and is left out, so that a step is a cycle.)
     Input `u` is added to the angle of attack. Energy is conserved (output `energy`): one multiplier
     is exactly 1, and cycles come in families, one for each energy:
     `find_limit_cycle(runner, conserved={"energy": 1784.8}, ...)`.

@@ -48,7 +48,7 @@ class LimitCycle(eqx.Module):
 
     **Fields:**
 
-    - `period`: in the system's unit of time, for all `multiplicity` rounds together.
+    - `period`: in the system's unit of time, until the cycle closes (see `multiplicity`).
     - `anchor`: the time, chart and state at which the cycle begins, on the section `base` (a clock
         section at `anchor.t` if `base` is `None`).
     - `legs`: states at the beginnings of the K pieces into which the cycle is divided.

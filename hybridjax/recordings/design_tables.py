@@ -64,16 +64,16 @@ def write_design(
 
 @checked
 def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording:
-    """Add the inputs that hardware was commanded to apply, where they were not measured.
+    """Add the commanded inputs of hardware to a recording in which they were not measured.
 
     Experiment s was applied in trial s, from the first whole cycle on, and each value held from its
     section to the next. Sample such inputs in the middle: `section_data(..., sampled="middle")`.
 
     **Arguments:** `path`: a table by phase that `write_design` wrote.
 
-    **Raises:** `FileFormatError` if it is no such table, or has experiments of different lengths;
-    `DefinitionError` if the numbers of trials and experiments differ, or the recording has a signal
-    of the same name.
+    **Raises:** `FileFormatError` if the file is no table by phase, or has experiments of different
+    lengths; `DefinitionError` if the numbers of trials and experiments differ, or the recording has
+    a signal of the same name.
     """
     columns = read_tables(Path(path), Wanted("time"))[0].values
     if not set(_BY_PHASE) <= set(columns):

@@ -67,9 +67,8 @@ class AbstractSections(Definition):
 
     - `label`: the label of data taken at these sections, a class variable.
     - `n_sections`: the number N.
-    - `anchor`: the position of section 0. If it is a `Crossing`, section 0 is the point where the
-      cycle crosses it, and this is the first point of the `orbit`. Other values are used by `bind`
-      only.
+    - `anchor`: the position of section 0. A `Crossing`: the point where the cycle crosses it, which
+      is the first point of the `orbit`. Values of other types are interpreted by `bind`.
     - `points`: the number M of points of the orbit that `bind` needs, a class variable. Default: 1.
 
     **Methods of a subclass:**
