@@ -18,6 +18,7 @@ CASES = {
     "multipliers": ("identification.py --seeds 40 --runs 200", 20, "errors and regions of fits"),
     "colored": ("colored.py --draws 40", 10, "regions under colored noise"),
     "process-noise": ("process_noise.py --draws 40", 10, "fits with innovations, validation"),
+    "in-loop": ("in_loop.py --draws 60", 3, "plant and controller apart, in a loop"),
     "state-space": ("joint.py --draws 12", 5, "fits of whole models beside their bound"),
     "recordings": ("recordings.py", 30, "multipliers from recordings, clean and corrupted"),
     "designs": ("designs.py --draws 40", 25, "strides that optimal designs save"),

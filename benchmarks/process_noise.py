@@ -75,7 +75,7 @@ def draw(plant: hj.LDTP, noise: hj.LDTP, rng: np.random.Generator) -> hj.Record:
     return hj.Record(u[before:], y[before:], n_sections=6, outputs=plant.outputs)
 
 
-def _innovations(noise: PeriodicModel) -> tuple[list[np.ndarray], np.ndarray]:
+def innovations(noise: PeriodicModel) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the Kalman gain and the covariance of the innovations of the steady state.
 
     The periodic Riccati equation is iterated (Bittanti and Colaneri 2009) from the covariance of
@@ -106,7 +106,7 @@ def _innovations(noise: PeriodicModel) -> tuple[list[np.ndarray], np.ndarray]:
 
 def bound(joint: hj.LDTP, noise: hj.LDTP, records: list[hj.Record]) -> float:
     """Of the first multiplier, from the information in some records."""
-    K, S = _innovations(PeriodicModel.of(noise, np.ones(2)))
+    K, S = innovations(PeriodicModel.of(noise, np.ones(2)))
     model = PeriodicModel.of(joint, np.ones(2))._replace(K=K)
     coordinates = local_coordinates(model, True)
     parts = [SeriesPart.of(CycleGrid.from_records([r]), np.ones(2)) for r in records]

@@ -26,7 +26,7 @@ PRONOUNS = set(
 # What the package may have at most. A change that needs more says why, and raises the number here;
 # a change that needs less lowers it. The aim: 24 000 lines of code.
 LIMITS = {
-    "code": 24_500,
+    "code": 24_760,
     "files": 220,
     "longest": 500,
     "public_names": 170,
@@ -35,7 +35,7 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_000,
+    "test_lines": 16_250,
     "doc_words": 36_000,
 }
 

@@ -19,13 +19,13 @@ else:
 
 
 def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ...]:
-    """`count` names, with units where these are given; by default `u` or `y` for one, and
+    """`count` names, with units where these are given; by default `u`, `y` or `r` for one, and
     `u0, u1, ...` for several.
 
     **Raises:** `DefinitionError` if `given` has another length.
     """
     if given is None:
-        letter = {"inputs": "u", "outputs": "y"}[kind]
+        letter = {"inputs": "u", "outputs": "y", "references": "r"}[kind]
         return (letter,) if count == 1 else tuple(f"{letter}{i}" for i in range(count))
     if len(given) != count:
         raise DefinitionError(f"{count} {kind} need {count} names, but `{kind}` is {given}.")

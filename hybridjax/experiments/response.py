@@ -19,6 +19,7 @@ from ..engine.lanes import Lanes
 from ..engine.move import Options, move
 from ..engine.settings import EXPERIMENT, Settings
 from ..errors import DefinitionError
+from ..linear.algebra import Matrices
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..sections.families import BoundSections
@@ -49,6 +50,15 @@ class Response(NamedTuple):
     end: Float[Array, "S m"]
     """Times and states on section 0 after the last sample, the time counted within one period as
     that of the start is; NaN after a failure."""
+    feedback: Float[Array, "S n nu"] | None = None
+    """What a controller added to the inputs."""
+
+
+class Feedback(NamedTuple):
+    """A controller that acts at the sections, $u = r - F y$, and the outputs on the cycle."""
+
+    matrices: Matrices
+    on_cycle: Float[Array, "N ny"]
 
 
 class Course(eqx.Module):
@@ -89,6 +99,7 @@ def flow_batch(
     start: Float[Array, "m S"],
     u: Float[Array, "S n nu"],
     settings: Settings,
+    feedback: Feedback | None = None,
 ) -> Response:
     """Flow S experiments from section 0 through n sections under inputs held between them, n a
     multiple of N.
@@ -106,9 +117,15 @@ def flow_batch(
 
     @jax.checkpoint
     def section(carry, xs):
-        lanes, result = carry
+        lanes, result, state = carry
         k, u = xs
         i, j = k % N, (k + 1) % N
+        answer = None
+        if feedback is not None:  # of outputs before the input acts
+            A, B, C, D, _ = (x[i] for x in feedback.matrices)
+            deviation = observe(s, z, lanes, u) - feedback.on_cycle[i][:, None]
+            answer = -(C @ state + D @ deviation)
+            state, u = A @ state + B @ deviation, u + answer
         y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
         turns = (j == 0).astype(jnp.int32)
         to = j[None], lanes.t, turns[None]
@@ -128,16 +145,18 @@ def flow_batch(
         )
         ok = result == Result.OK
         share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
-        return (lanes, result), (y, ok, jax.lax.stop_gradient(share))
+        return (lanes, result, state), (y, ok, jax.lax.stop_gradient(share), answer)
 
     xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
-    begin = (lanes, jnp.zeros(S, jnp.int32))
-    (lanes, result), (y, ok, shares) = jax.lax.scan(section, begin, xs)
+    states = 0 if feedback is None else feedback.matrices.A.shape[1]
+    begin = (lanes, jnp.zeros(S, jnp.int32), jnp.zeros((states, S)))
+    (lanes, result, _), (y, ok, shares, answers) = jax.lax.scan(section, begin, xs)
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
     error = ROUNDING + plan.least + jnp.max(each_turn, axis=0)
     end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
-    return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T)
+    answers = None if answers is None else jnp.moveaxis(answers, -1, 0)
+    return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T, answers)
 
 
 @checked_methods

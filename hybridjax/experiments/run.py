@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from .._core.arguments import names
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index
 from .._core.boundary.values import Reals
@@ -17,11 +18,14 @@ from .._core.executor import from_host, on_cpu, to_host
 from .._core.memo import Memory, remembered
 from .._core.progress import counted, working
 from .._core.results import Result
+from .._core.signal import signals, unit_of
 from ..engine.settings import EXPERIMENT
 from ..errors import ComputationError, DefinitionError
-from ..linear.ldtp import LDTP
+from ..linear.algebra import Matrices, static_gain
+from ..linear.ldtp import LDTP, Gain
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
+from ..sections.linearize import linearize
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.structure import Outputs
@@ -30,7 +34,7 @@ from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design
 from .noise import ProcessNoise
 from .plan import Accuracy, Stepping, plan_flow
-from .response import Course, course, flow_batch, require_shape
+from .response import Course, Feedback, course, flow_batch, require_shape
 from .start import StartName, linearized, periodic_start, predict, settle_batch
 
 
@@ -60,7 +64,7 @@ CHUNK = 2 * _BATCH
 class Options:
     """Options of experiments, the keyword arguments of `run_experiments`.
 
-    **Fields:** `start`, `discard`, `process_noise`, `accuracy` and `execution`,
+    **Fields:** `start`, `discard`, `process_noise`, `accuracy`, `execution` and `feedback`,
     with the defaults and the meaning that they have in `run_experiments`.
     """
 
@@ -69,6 +73,7 @@ class Options:
     process_noise: ProcessNoise | None = None
     accuracy: Accuracy = EXPERIMENT
     execution: Execution | None = None
+    feedback: LDTP | Gain | None = None
 
 
 @checked
@@ -84,6 +89,7 @@ def run_experiments(
     process_noise: ProcessNoise | None = None,
     accuracy: Accuracy = EXPERIMENT,
     execution: Execution | None = None,
+    feedback: LDTP | Gain | None = None,
 ) -> ExperimentData:
     """Excite the system around its limit cycle and record its outputs at the sections.
 
@@ -108,13 +114,19 @@ def run_experiments(
         every section, relative to their characteristic magnitudes (`LimitCycle.scale`).
         `data.error` estimates the error of each experiment. Default: 1e-9.
     - `execution`: batches and threads.
+    - `feedback`: a controller F that is at work during the experiments: the input is
+        $u = r - F y$ with r the `design` and y the deviations of the `outputs` from the cycle,
+        measured before u acts. An `LDTP` from the outputs to the inputs, by name, or a static
+        gain, (nu, ny) or (N, nu, ny). It may stabilize an unstable cycle. Default: None.
 
-    **Returns:** `ExperimentData`. `data.summary()` lists failures with their causes.
+    **Returns:** `ExperimentData`. `data.summary()` lists failures with their causes. With
+    `feedback` its inputs are u, then r, named "r", or "r0", "r1", ... where there are several.
 
     **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for an
-    unstable cycle, because experiments would diverge from it, and if a steady start is not found.
+    unstable cycle or loop, because experiments would diverge from it, and if a steady start is not
+    found.
     """
-    options = Options(start, discard, process_noise, accuracy, execution)
+    options = Options(start, discard, process_noise, accuracy, execution, feedback)
     return prepare(cycle, sections, design, outputs, options).run()
 
 
@@ -154,6 +166,7 @@ class Campaign:
     - `process_noise`: as in `run_experiments`.
     - `execution`: batch size and number of threads.
     - `large`: whether to wait for the optimized program.
+    - `feedback`: a controller, or None.
     """
 
     placed: PlacedSections
@@ -165,6 +178,7 @@ class Campaign:
     process_noise: ProcessNoise | None
     execution: Execution
     large: bool
+    feedback: Matrices | None = None
 
     def run(self, rows: slice | None = None, workers: int | None = None) -> ExperimentData:
         """Run the experiments of consecutive `rows`. Default: all of them.
@@ -181,15 +195,20 @@ class Campaign:
         applied = u
         if self.process_noise is not None:
             applied = u + self.process_noise.draw(u.shape, N, rows.start)
-        y, result, failed_at, error = self._respond(applied, start, execution)
+        y, result, failed_at, error, answer = self._respond(applied, start, execution)
         self._require_outputs(y, result)
         z, label = self.at_sections.outputs, self.placed.family.label
+        inputs: tuple[str, ...] = z.structure.inputs
+        if answer is not None:
+            u = np.concatenate([u + answer, u], axis=2)
+            references = names("references", None, len(inputs))
+            inputs = inputs + signals(references, map(unit_of, inputs))
         return ExperimentData(
             u,
             y,
             n_sections=N,
             periods=self.inputs.periods,
-            inputs=z.structure.inputs,
+            inputs=inputs,
             outputs=z.names,
             result=result,
             simulated=Simulated(failed_at, error, label),
@@ -245,23 +264,31 @@ class Campaign:
         return np.where(np.isnan(change), predicted, start.T)
 
     def _respond(self, u, start, execution: Execution):
-        """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures
-        and errors."""
+        """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures,
+        errors, and what a controller added to the inputs."""
         stepping, N, base = self.stepping, self.placed.n_sections, self.at_sections.on_cycle
+        loop = (
+            None
+            if self.feedback is None
+            else from_host(Feedback(self.feedback, jax.numpy.asarray(base)))
+        )
 
         def arguments(rows):
             # (Nobody changes them before the program is done, so they may share memory.)
             x, held = jax.device_put((start[:, rows], u[rows]))
             course = self.at_sections.course
-            return course, stepping.plan, x, held, stepping.settings
+            return course, stepping.plan, x, held, stepping.settings, loop
 
         S, n, _ = u.shape
+        answer = None if loop is None else np.empty(u.shape)
         y, parts = np.empty((S, n // N, *base.shape)), []
         for rows, part in in_batches(self._programs[0], arguments, S, execution, "experiments"):
             np.subtract(part.y.reshape(-1, *y.shape[1:]), base, out=y[rows])
             parts.append((part.result, part.failed_at, part.error))
+            if answer is not None:
+                answer[rows] = part.feedback
         result, failed_at, error = map(np.concatenate, zip(*parts, strict=True))
-        return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error
+        return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error, answer
 
     def _require_outputs(self, y, result) -> None:
         finite = np.isfinite(y)
@@ -292,8 +319,9 @@ def prepare(
     placed = as_placed(cycle, sections)
     items = (outputs,) if isinstance(outputs, str | Output) else tuple(outputs)
     check_outputs(cycle, items)
-    _require_return(cycle, placed)
     start, noise = options.start, options.process_noise
+    feedback = None if options.feedback is None else _controller(placed, items, options)
+    _require_return(cycle, placed, feedback is not None)
     discard = (DISCARD if start == "cycle" else 0) if options.discard is None else options.discard
     N, nu = placed.n_sections, len(cycle.system.inputs)
     inputs = check_inputs(design, discard, N, nu)
@@ -315,7 +343,34 @@ def prepare(
         process_noise=noise,
         execution=execution,
         large=one_program or len(inputs) * inputs.cycles * N > _LARGE,
+        feedback=feedback,
     )
+
+
+def _controller(
+    placed: PlacedSections, outputs: tuple[str | Output, ...], options: Options
+) -> Matrices:
+    """Return the matrices of a controller.
+
+    **Raises:** `DefinitionError` if it does not fit; `ComputationError` if the loop is unstable.
+    """
+    if options.start != "cycle":
+        raise DefinitionError(
+            f"a {options.start} start is that of the system without feedback: start on the cycle, "
+            "and discard cycles."
+        )
+    model, F = linearize(placed.cycle, placed, outputs=outputs), options.feedback
+    loop = model.feedback(F)  # type: ignore[arg-type]  # (not None)
+    if len(loop.multipliers) and abs(loop.multipliers[0]) >= 1:
+        raise ComputationError(
+            f"with this feedback the limit cycle is not stable (largest multiplier "
+            f"{abs(loop.multipliers[0]):.4g} in modulus): see "
+            "`linearize(...).feedback(controller).multipliers`."
+        )
+    if isinstance(F, LDTP):
+        return to_host(F.matrices)
+    shape = len(model.inputs), len(model.outputs)
+    return to_host(static_gain(from_host(F), model.n_sections, shape))
 
 
 def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> Inputs:
@@ -351,7 +406,7 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
     return Inputs(u, cycles, cycles - discard)
 
 
-def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
+def _require_return(cycle: LimitCycle, placed: PlacedSections, stabilized: bool) -> None:
     """**Raises:** an error for cycles that experiments would leave."""
     if not cycle.clocked and bool(np.isfinite(placed.bound.time).any()):
         raise DefinitionError(
@@ -360,12 +415,12 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
             "shifts it for good. Use sections that depend on the state (KinematicPhase, or a list "
             "of Crossing and AtEvent)."
         )
-    if not cycle.stable:
+    if not cycle.stable and not stabilized:
         largest = np.abs(cycle.multipliers[0])
         raise ComputationError(
             f"the limit cycle is not stable (largest multiplier {largest:.4g} in modulus), so "
-            "experiments would leave it: stabilize the system, or use the exact linearization "
-            "(`linearize`), which needs no experiments."
+            "experiments would leave it: stabilize the system, for example by `feedback`, or use "
+            "the exact linearization (`linearize`), which needs no experiments."
         )
 
 

@@ -175,6 +175,8 @@ def experiment_job(
     chunk: int,
 ) -> "ExperimentJob":
     """Return the experiments as pieces whose results do not depend on the number of threads."""
+    if options.feedback is not None:
+        raise DefinitionError("a store keeps no experiments with feedback: leave `store` out.")
     # (Batches as for one thread: their size does not depend on the machine.)
     execution = dataclasses.replace(options.execution or Execution(), workers=1)
     options = dataclasses.replace(options, execution=execution)

@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Probability
+from .._core.boundary.kinds import Count, Probability, SignalNames
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF, Scatter
 from .descent import ROUNDING
+from .instrument import htf_by_reference
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
 
 
@@ -31,6 +32,7 @@ def estimate_htf(
     repeats: Count = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
     threshold: Probability = SILENT_LINE,
+    reference: SignalNames | None = None,
 ) -> HTF:
     """Estimate all harmonic transfer functions at all frequencies that the inputs excite.
 
@@ -60,6 +62,11 @@ def estimate_htf(
       "auto".
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
+    - `reference`: names of those inputs of the data that act from outside on a loop, and not on
+      the plant itself. The result is then that of the plant, from the other inputs, which a
+      controller makes, to the outputs, without the bias of noise that goes round the loop
+      (`identify/instrument.py`). References have to excite all lines of a class f + integers, up to
+      N/2. Default: None, inputs that act on the plant from outside.
 
     **Returns:** `HTF` with ascending frequencies, source "estimate". At a frequency that was
     measured in one realization only, `variance` is computed from the mean residual of the other
@@ -76,6 +83,9 @@ def estimate_htf(
             "pass repeats=2."
         )
     require_x64()
+    if reference is not None:
+        htf = htf_by_reference(data, reference, repeats=repeats, variance=variance)
+        return htf if harmonics is None else htf.select(harmonics)
     sums = spectral_sums(data, harmonics, threshold=threshold, repeats=repeats)
     rows = np.flatnonzero(sums.solvable())
     setup, (tried, ran) = sums.setup, sums.experiments

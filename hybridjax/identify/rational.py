@@ -179,7 +179,7 @@ def fit_rational(
             raise DefinitionError(f"{name} is zero at a frequency: there is nothing to fit there.")
         weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
         entry = (0, -1, 1.0, (row, column), h / rms, weight / np.sqrt(len(h)))
-        (group,) = equal_weights(f, zeros + 1, powers, [entry])
+        (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [entry])
         linearize = functools.partial(residuals_of, [group])
         with np.errstate(all="ignore"):
             ends = [least_squares(linearize, a, 200, _ACCURACY**2) for a in _starts(group, poles)]

@@ -45,7 +45,7 @@ class HTFGroup(NamedTuple):
     channel: Int[np.ndarray, "K 2"]
     """and its output and input."""
     line: Int[np.ndarray, " E"]
-    """The frequency that an equation belongs to."""
+    """The noise that an equation's errors stem from, that of its frequency or its class,"""
     period_delay: Complex[np.ndarray, " E"]
     """z^-N, the delay by one period."""
     basis: Float[np.ndarray, "2*E r"]
@@ -308,17 +308,23 @@ def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> li
                 both = np.concatenate([h[at], g[at]]), np.concatenate([w[at], v[at]])
                 double.append((row, other, 1.0, channel, *both))
     kinds = (powers, real), (turned, single), (pair, double)
-    return [group for kind in kinds if kind[1] for group in equal_weights(f, size, *kind)]
+    sources = np.arange(len(f)) if htf.scatter is None else htf.scatter.sources(f)
+    return [group for kind in kinds if kind[1] for group in equal_weights(f, sources, size, *kind)]
 
 
 def equal_weights(
-    f: Float[np.ndarray, " F"], size: int, matrix: Complex[np.ndarray, "E u"], entries: list[tuple]
+    f: Float[np.ndarray, " F"],
+    sources: Int[np.ndarray, " F"],
+    size: int,
+    matrix: Complex[np.ndarray, "E u"],
+    entries: list[tuple],
 ) -> list[HTFGroup]:
     """Return responses whose numerators solve the same problem, one group for each weight.
 
-    **Arguments:** `matrix`: maps u real coefficients to the numerator's values. `entries`: for
-    each response the position of its harmonic and of the opposite one, its share, output and
-    input, values and weights.
+    **Arguments:** `sources`: for each frequency the number of its noise, see `HTFGroup.line`.
+    `matrix`: maps u real coefficients to the numerator's values. `entries`: for each response the
+    position of its harmonic and of the opposite one, its share, output and input, values and
+    weights.
     """
     harmonic, mirror, share, channel, data, weights = map(np.array, zip(*entries, strict=True))
     basis, to_powers = powers_basis(split(matrix))
@@ -329,7 +335,7 @@ def equal_weights(
     _, first, which = np.unique(
         np.round(shape, EQUAL_WEIGHTS), axis=0, return_index=True, return_inverse=True
     )
-    line = np.tile(np.arange(len(f)), len(matrix) // len(f))
+    line = np.tile(sources, len(matrix) // len(f))
     groups = []
     for k, representative in enumerate(first):
         same = np.flatnonzero(which.ravel() == k)

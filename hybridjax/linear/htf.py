@@ -1,15 +1,15 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
-from .._core.arguments import Numbers, input_and_output_names, require_same
+from .._core.arguments import Numbers, names, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
 from .._core.boundary.values import Complexes, Reals
@@ -19,6 +19,8 @@ from .._core.precision import require_x64
 from .._core.signal import ratio, with_unit
 from .._core.text import listed
 from ..errors import DefinitionError
+from . import algebra
+from .algebra import SAME_FREQUENCY
 from .frequency_response import Harmonics, check_harmonics
 
 
@@ -33,21 +35,32 @@ class Scatter(eqx.Module):
     - `roundness` (M, F, ny, nu): $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ of the residuals d of
       the realizations, relative to its mean for Gaussian errors: 0 if all residuals lie on a line.
       None, or an array of ones: the shape is not used.
+    - `shared`: whether the errors of all lines f + integers stem from the same noise, as in a loop.
+      Default: False, independent errors.
 
     **Raises:** `DefinitionError` for freedom that is not positive, or negative roundness.
     """
 
     freedom: Float[Array, " F"]
     roundness: Float[Array, "M F ny nu"] | None
+    shared: bool = eqx.field(static=True)
 
     def __init__(
         self,
         freedom: Annotated[Numbers, Reals("F", sign="positive")],
         roundness: Annotated[Numbers, Reals("M F ny nu", sign="nonnegative")] | None = None,
+        shared: bool = False,
     ):
         require_x64()
+        self.shared = shared
         self.freedom = jnp.asarray(freedom)
         self.roundness = None if roundness is None else jnp.asarray(roundness)
+
+    def sources(self, f: Float[np.ndarray, " F"]) -> Int[np.ndarray, " F"]:
+        """Return the index of the noise from which the errors of each line stem."""
+        if not self.shared:
+            return np.arange(len(f))
+        return np.unique(np.round(np.minimum(f % 1, -f % 1), 9), return_inverse=True)[1]
 
     def quantile(self, level: Probability) -> Float[Array, "*M F ny nu"]:
         r"""Quantile of $|\delta H|^2 / v$ at this probability.
@@ -67,9 +80,6 @@ class Scatter(eqx.Module):
         return freedom * jnp.expm1(-jnp.log(miss) / freedom)
 
 
-# Distance in cycles per period up to which two frequencies are the same. Smaller: rounding makes
-# them different. Larger: lines of very long designs coincide.
-_SAME_FREQUENCY = 1e-9
 Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=True)]
 
 # Outputs, and harmonics (the largest ones), that a notebook shows. More: larger pages. Fewer: parts
@@ -153,7 +163,8 @@ class HTF(eqx.Module):
         if tuple(np.ravel(np.asarray(harmonics))) != self.harmonics:
             raise DefinitionError(f"`harmonics` must be ascending, but is {harmonics}.")
         self.n_sections = n_sections
-        self.inputs, self.outputs = input_and_output_names(inputs, outputs, shape[3], shape[2])
+        self.inputs = names("inputs", inputs, shape[3])
+        self.outputs = names("outputs", outputs, shape[2])
         self.source = source
         self.variance = _optional("variance", variance, shape)
         self.noise_variance = _optional("noise_variance", noise_variance, shape)
@@ -209,8 +220,59 @@ class HTF(eqx.Module):
         arrays = {"H": self.H, "variance": self.variance, "noise_variance": self.noise_variance}
         roundness = None if self.scatter is None else self.scatter.roundness
         arrays, roundness = jax.tree.map(lambda x: x[rows], (arrays, roundness))
-        scatter = None if self.scatter is None else Scatter(self.scatter.freedom, roundness)
+        scatter = self.scatter and replace(self.scatter, roundness=roundness)
         return replace(self, harmonics=harmonics, scatter=scatter, **arrays)
+
+    def __matmul__(self, other: "HTF | HasHTF") -> "HTF":
+        """This system after another, which acts first: the series `P @ Q`.
+
+        HTFs are multiplied as harmonic matrices, see `feedback`.
+
+        **Raises:** `DefinitionError` as `feedback`, and if the outputs of `other` are not the
+        inputs of this system, by name and unit.
+        """
+        other = other if isinstance(other, HTF) else other.htf(self.f)
+        require_chain("@", other.outputs, self.inputs, self, other)
+        return _combined(algebra.series, [self, other], other.inputs, self.outputs)
+
+    def __add__(self, other: "HTF | HasHTF") -> "HTF":
+        """The sum of the outputs of two systems with the same inputs.
+
+        **Raises:** `DefinitionError` as `feedback`, and if inputs or outputs differ.
+        """
+        other = other if isinstance(other, HTF) else other.htf(self.f)
+        require_same("terms of a sum", self, other)
+        return _combined(algebra.parallel, [self, other], self.inputs, self.outputs)
+
+    def inverse(self) -> "HTF":
+        """The HTFs from the outputs to the inputs.
+
+        **Raises:** `DefinitionError` as `feedback`, and for different numbers of both.
+        """
+        if len(self.inputs) != len(self.outputs):
+            raise DefinitionError(
+                f"{len(self.outputs)} outputs of {len(self.inputs)} inputs have no inverse."
+            )
+        return _combined(algebra.inverse, [self], self.outputs, self.inputs)
+
+    def feedback(self, controller: "HTF | HasHTF") -> "HTF":
+        r"""The loop of this system and a controller, $u = r - F y$: $(I + P F)^{-1} P$.
+
+        HTFs are matrices at each class of lines f + integers, $H(f)[a, b] = H_{a-b}(f + b)$, since
+        every input frequency of the class answers every other one. Variances are propagated to
+        first order, from errors that are independent and circular; where one operand has none, it
+        is taken as exact if its source is "exact".
+
+        **Arguments:** `controller`: HTFs with the same frequencies, or anything with a method
+        `htf`: an `LDTP`, a fit.
+
+        **Raises:** `DefinitionError` if not all N harmonics and all lines f + integers are there,
+        or if names, units or frequencies do not fit.
+        """
+        other = controller if isinstance(controller, HTF) else controller.htf(self.f)
+        require_chain("feedback", self.outputs, other.inputs, self, other)
+        require_chain("feedback", other.outputs, self.inputs, self, other)
+        return _combined(algebra.feedback, [self, other], self.inputs, self.outputs)
 
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
@@ -260,7 +322,7 @@ class HTF(eqx.Module):
         U, periods = np.fft.fft(u, axis=0), n // N
         lines = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
         distance = np.abs(self._circle(lines[:, None] / periods - f))
-        lost = distance.min(axis=1, initial=np.inf) > _SAME_FREQUENCY
+        lost = distance.min(axis=1, initial=np.inf) > SAME_FREQUENCY
         if lost.any():
             raise DefinitionError(
                 f"`u` holds the frequency f = {abs(self._circle(lines[lost][0] / periods)):g} "
@@ -282,10 +344,7 @@ class HTF(eqx.Module):
         require_x64()
         fields = "n_sections", "harmonics", "inputs", "outputs"
         require_same("HTFs to be compared", self, other, fields)
-        if self.f.shape != other.f.shape or not (
-            is_traced(self.f, other.f) or np.allclose(self.f, other.f, rtol=0, atol=_SAME_FREQUENCY)
-        ):
-            raise DefinitionError("Two HTFs at different frequencies cannot be compared.")
+        _require_same_lines(self, other)
         scale = jnp.max(jnp.abs(other[0]), axis=(0, 2))
         return jnp.max(jnp.abs(self.H - other.H), axis=(1, 3)) / scale
 
@@ -304,10 +363,84 @@ class HTF(eqx.Module):
         return self.harmonics.index(m)
 
 
+@runtime_checkable
+class HasHTF(Protocol):
+    """Anything with HTFs at all frequencies: `LDTP`, fits."""
+
+    def htf(self, f: Vector) -> HTF: ...
+
+
+def require_chain(
+    name: str, outputs: tuple[str, ...], inputs: tuple[str, ...], a: Any, b: Any
+) -> None:
+    """**Raises:** `DefinitionError` if outputs are not the inputs that they become, by name and
+    unit, or two systems differ in their sections."""
+    require_same("systems to be connected", a, b, ("n_sections",))
+    if outputs != inputs:
+        raise DefinitionError(
+            f"{name}: the outputs {outputs} of one system are not the inputs {inputs} of the "
+            "other: give them the same names and units (units are not converted)."
+        )
+
+
+def _require_same_lines(a: HTF, b: HTF) -> None:
+    if a.f.shape != b.f.shape or not (
+        is_traced(a.f, b.f) or np.allclose(a.f, b.f, rtol=0, atol=SAME_FREQUENCY)
+    ):
+        raise DefinitionError("Two HTFs at different frequencies cannot be compared.")
+
+
+def _combined(
+    operation: algebra.Operation,
+    operands: list[HTF],
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+) -> HTF:
+    """Return the result of an operation on harmonic matrices, with its variances."""
+    first = operands[0]
+    N, every = first.n_sections, check_harmonics(None, first.n_sections)
+    if is_traced(first.f):
+        raise DefinitionError("the algebra of HTFs must know `f`: call it outside of jit.")
+    for x in operands:
+        _require_same_lines(first, x)
+        if x.harmonics != every:
+            raise DefinitionError(
+                f"the algebra of HTFs takes all {N} harmonics, not {x.harmonics}."
+            )
+    lines = algebra.Lines.of(np.asarray(first.f), N)
+    to_matrices = lambda x: lines.matrices(x, N // 2)  # noqa: E731
+    result, pairs = operation(*(to_matrices(x.H) for x in operands))
+
+    def variance(name: str) -> Array | None:
+        given = [getattr(x, name) for x in operands]
+        exact = [x.source == "exact" for x in operands]
+        if all(exact) or any(v is None and not e for v, e in zip(given, exact, strict=True)):
+            return None
+        filled = [
+            jnp.zeros(x.H.shape) if v is None else v for x, v in zip(operands, given, strict=True)
+        ]
+        return lines.entries(
+            algebra.variance_of(pairs, [to_matrices(v) for v in filled]), N // 2
+        ).real
+
+    known = [x.scatter.freedom for x in operands if x.scatter is not None]
+    scatter = None
+    if known:  # of all lines of a class, the least
+        least = jnp.min(jnp.stack(known), axis=0)[lines.row].min(axis=1)
+        rows = np.zeros(len(first.f), int)
+        rows[lines.row] = np.arange(len(lines.row))[:, None]
+        scatter = Scatter(least[rows], shared=True)
+    source = "exact" if all(x.source == "exact" for x in operands) else "estimate"
+    return HTF(
+        first.f, lines.entries(result, N // 2), every, N, inputs, outputs, source,
+        variance=variance("variance"), noise_variance=variance("noise_variance"), scatter=scatter,
+    )  # fmt: skip
+
+
 def require_distinct(f: Float[np.ndarray, " F"]) -> None:
     """**Raises:** `DefinitionError` for a frequency that occurs twice."""
     f = np.sort(f)
-    if len(again := np.flatnonzero(np.diff(f) < _SAME_FREQUENCY)):
+    if len(again := np.flatnonzero(np.diff(f) < SAME_FREQUENCY)):
         raise DefinitionError(f"`f` holds {f[again[0]]:.10g} cycles per period twice: keep one.")
 
 

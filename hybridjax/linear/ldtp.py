@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .._core.arguments import Numbers, input_and_output_names
+from .._core.arguments import Numbers, names, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, PeriodCount, Vector
 from .._core.boundary.values import Integers, Reals
@@ -18,14 +18,15 @@ from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.text import listed
 from ..errors import DefinitionError
-from . import time_response
+from . import algebra, time_response
 from .frequency_response import Frequencies, Harmonics, check_harmonics, harmonic_transfer
-from .htf import HTF
+from .htf import HTF, require_chain
 from .multipliers import product_eigenvalues, product_rank
 
 
 Matrix = Annotated[Numbers, Reals("rows columns")]
 Signals = Annotated[Numbers, Reals("n nu")]
+Gain = Annotated[Numbers, Reals()]
 
 # Singular values of a factor below this part of its largest one are zero. Smaller: rounding is
 # taken for multipliers. Larger: multipliers of weak directions count as zero.
@@ -103,7 +104,7 @@ class LDTP(eqx.Module):
             )
         self.A, self.B, self.C, self.D = A, B, C, through
         self.dims = _dimensions(dims, n_sections, d)
-        self.inputs, self.outputs = input_and_output_names(inputs, outputs, nu, ny)
+        self.inputs, self.outputs = names("inputs", inputs, nu), names("outputs", outputs, ny)
         self.coordinates = None if coordinates is None else tuple(map(tuple, coordinates))
         _check_padding(self)
 
@@ -225,6 +226,81 @@ class LDTP(eqx.Module):
         H = harmonic_transfer(self.A, self.B, self.C, self.D, f)
         chosen = np.asarray(harmonics) % self.n_sections
         return HTF(f, H[chosen], harmonics, self.n_sections, self.inputs, self.outputs, "exact")
+
+    def __matmul__(self, other: "LDTP") -> "LDTP":
+        """This system after another, which acts first: the series `P @ Q`.
+
+        **Raises:** `DefinitionError` if the outputs of `other` are not the inputs of this system,
+        by name and unit, or the numbers of sections differ.
+        """
+        require_chain("@", other.outputs, self.inputs, self, other)
+        (ny, nu), (inner, nr) = (np.shape(x.D)[1:] for x in (self, other))
+        K, L, M = np.zeros((nu + nr, ny + inner)), np.zeros((nu + nr, nr)), np.eye(ny, ny + inner)
+        K[:nu, ny:], L[nu:] = np.eye(nu), np.eye(nr)
+        return self._connected(other.matrices, K, L, M, other.inputs, self.outputs)
+
+    def __add__(self, other: "LDTP") -> "LDTP":
+        """The sum of the outputs of two systems with the same inputs: parallel systems.
+
+        **Raises:** `DefinitionError` if inputs, outputs or numbers of sections differ.
+        """
+        require_same("terms of a sum", self, other)
+        ny, nu = np.shape(self.D)[1:]
+        L, M = np.tile(np.eye(nu), (2, 1)), np.tile(np.eye(ny), (1, 2))
+        K = np.zeros((2 * nu, 2 * ny))
+        return self._connected(other.matrices, K, L, M, self.inputs, self.outputs)
+
+    def inverse(self) -> "LDTP":
+        """The system that returns the inputs from the outputs.
+
+        **Raises:** `DefinitionError` if D is not square and invertible at all sections: an inverse
+        then has to know later outputs. The inverse of its HTFs needs no D.
+        """
+        if self.D.shape[1] != self.D.shape[2] or not is_traced(self.D) and (
+            np.linalg.matrix_rank(np.asarray(self.D)) < self.D.shape[1]
+        ).any():  # fmt: skip
+            raise DefinitionError(
+                "an inverse needs a square and invertible D at all sections, since it would have "
+                "to know later outputs without: invert the HTFs, `model.htf(f).inverse()`."
+            )
+        D = jnp.linalg.inv(self.D)
+        A, B = self.A - self.B @ D @ self.C, self.B @ D
+        return LDTP(A, B, -D @ self.C, D, self.dims, self.outputs, self.inputs)
+
+    def feedback(self, controller: "LDTP | Gain") -> "LDTP":
+        r"""The loop of this system and a controller, $u = r - F y$: $(I + P F)^{-1} P$.
+
+        **Arguments:** `controller`: F, a system from the outputs to the inputs of this one, by name
+        and unit, or a static gain, (nu, ny) or (N, nu, ny). F acts at the sections: u[n] answers
+        the y[n] that is measured before u[n] acts.
+
+        **Returns:** the system from r, which has the names of u, to y. Its states are those of P,
+        then those of F; its `multipliers` are those of the loop.
+
+        **Raises:** `DefinitionError` if names, units or numbers of sections differ, or where direct
+        feed-through of both makes a loop without a response.
+        """
+        ny, nu = self.D.shape[1:]
+        if isinstance(controller, LDTP):
+            require_chain("feedback", self.outputs, controller.inputs, self, controller)
+            require_chain("feedback", controller.outputs, self.inputs, self, controller)
+            F = controller.matrices
+        else:
+            F = algebra.static_gain(from_host(controller), self.n_sections, (nu, ny))
+        algebra.require_well_posed(-self.D @ F.D)
+        K, L = np.zeros((nu + ny, ny + nu)), np.eye(nu + ny, nu)
+        K[:nu, ny:], K[nu:, :ny] = -np.eye(nu), np.eye(ny)
+        return self._connected(F, K, L, np.eye(ny, ny + nu), self.inputs, self.outputs)
+
+    @property
+    def matrices(self) -> algebra.Matrices:
+        """A, B, C, D and dims."""
+        return algebra.Matrices(self.A, self.B, self.C, self.D, self.dims)
+
+    def _connected(self, other, K, L, M, inputs, outputs) -> "LDTP":
+        A, B, C, D, dims = algebra.connect(self.matrices, other, K, L, M)
+        d = A.shape[1] if is_traced(dims) else int(np.max(dims))  # without common padding
+        return LDTP(A[:, :d, :d], B[:, :d], C[:, :, :d], D, dims, inputs, outputs)
 
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
         """The padded product `A[i+N-1] ... A[i]` over one period from section `i`."""

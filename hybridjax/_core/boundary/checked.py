@@ -19,6 +19,7 @@ from .values import Kind, Misfit
 Thing = TypeVar("Thing", bound=Callable)
 Class = TypeVar("Class", bound=type)
 
+_OPERATORS = "__call__", "__getitem__", "__matmul__", "__add__"
 _JAX_ERRORS = jax.errors.JAXTypeError, jax.errors.JAXIndexError
 
 
@@ -53,7 +54,7 @@ def checked_methods(cls: Class) -> Class:
     """A class whose public methods are checked, but not its constructor: results, which this
     package makes, and JAX."""
     for name, member in list(vars(cls).items()):
-        if name.startswith("_") and name not in ("__call__", "__getitem__"):
+        if name.startswith("_") and name not in _OPERATORS:
             continue
         function = member.__func__ if isinstance(member, classmethod | staticmethod) else member
         if not inspect.isfunction(function) or getattr(function, "__isabstractmethod__", False):

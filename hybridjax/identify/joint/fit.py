@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..._core.arguments import Numbers, require_same
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Order, Scalar, Vector
+from ..._core.boundary.kinds import Order, Scalar, SignalNames, Vector
 from ..._core.boundary.values import Integers
 from ..._core.precision import require_x64
 from ..._core.results import Result
@@ -22,6 +22,7 @@ from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..denominator import multipliers_of
 from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
+from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
@@ -29,7 +30,13 @@ from ..weights import SMALLEST_ERROR, check_values, error_weights
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
-from .realization import default_horizon, given_dims, realize, subspace_model
+from .realization import (
+    answers_at_once,
+    default_horizon,
+    given_dims,
+    realize,
+    subspace_model,
+)
 
 
 Problem = FrequencyProblem | SeriesProblem
@@ -175,6 +182,7 @@ def fit_ldtp(
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
     check: bool = True,
+    reference: SignalNames | None = None,
 ) -> LDTPFit:
     r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model by maximum likelihood.
 
@@ -219,6 +227,12 @@ def fit_ldtp(
       none. Default: "free".
     - `check`: whether to raise an error if outputs do not respond to the inputs. It has no effect
       with "innovations". Default: True.
+    - `reference`: names of those inputs of the series that act from outside on a loop. The fit is
+      then that of the plant, from the other inputs, which a controller makes, always with
+      innovations, and of stable and unstable plants alike. It is consistent in the loop if D is
+      zero wherever the controller answers at once; whether D is zero is found from the answer of
+      the outputs to the reference. In a loop whose reference was not recorded, pass
+      noise="innovations" and an initial model with D = 0. Default: None.
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data
@@ -226,8 +240,19 @@ def fit_ldtp(
     """
     require_x64()
     if not isinstance(data, HTF):
-        records, innovations = PreparedRecords(data), noise == "innovations"
-        return _fit_to_series(records, guess, innovations, start == "free", check)
+        drive = None
+        if reference is not None:
+            data, drive = in_loop(data, reference)
+        innovations = noise == "innovations" or drive is not None
+        records, direct = PreparedRecords(data), _is_direct(guess)
+        if drive is not None and not isinstance(guess, LDTP):
+            direct = answers_at_once(records, PreparedRecords(drive))
+        return _fit_to_series(records, guess, innovations, start == "free", check, direct)
+    if reference is not None:
+        raise DefinitionError(
+            "HTFs have no reference any more: estimate those of the plant, by "
+            "`estimate_htf(data, reference=...)`."
+        )
     if noise == "innovations":
         raise DefinitionError("HTFs tell nothing of innovations: give the series.")
     if start == "cycle":
@@ -269,6 +294,7 @@ def _fit_to_series(
     innovations: bool,
     free_start: bool,
     check: bool,
+    direct: bool,
 ) -> LDTPFit:
     if records.lead:
         raise DefinitionError(
@@ -283,11 +309,11 @@ def _fit_to_series(
     same = np.tile(np.eye(ny), (N, 1, 1))
     problem = SeriesProblem(parts, same, innovations, free_start, numbers)
     if not isinstance(guess, LDTP):
-        model = subspace_model(records, given_dims(guess, N, "guess") or [], innovations)
+        dims = given_dims(guess, N, "guess") or []
+        model = subspace_model(records, dims, innovations, direct)
     else:
         require_same("guess and data", guess, records)
         model = PeriodicModel.of(guess, scale, ny if innovations else 0)
-    direct = _is_direct(guess)
     unknowns = local_coordinates(model, direct).size
     starts = sum(model.dims[n] for n in first) if free_start else 0
     freedom = numbers - unknowns - starts

@@ -5,6 +5,7 @@ from typing import Annotated, Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
+from scipy import special
 
 from ..._core.arguments import Numbers, names
 from ..._core.boundary.checked import checked
@@ -216,9 +217,9 @@ _SHRINKAGE = 1e-6
 
 
 def subspace_model(
-    records: PreparedRecords, dims: Sequence[int], innovations: bool
+    records: PreparedRecords, dims: Sequence[int], innovations: bool, direct: bool = True
 ) -> PeriodicModel:
-    """Return a model with these dimensions, with or without K.
+    """Return a model with these dimensions, with or without K and D.
 
     Each output is regressed on its past and that of the inputs, section by section. The effect of
     the past of a section on the outputs from there on is a matrix whose rank is the dimension of
@@ -240,7 +241,7 @@ def subspace_model(
             f"about {_ROWS * columns * needed} are needed. Give a model as `guess`, as of "
             "`hj.identify.realize(hj.fit_series(...))`."
         )
-    rules = [section.regression(past) for section in sections]
+    rules = [section.regression(past, direct) for section in sections]
     horizon = max(-(-most // ny) + 1, min(past, N, default_horizon(0)))
     to_state = []
     for n, section in enumerate(sections):
@@ -257,7 +258,52 @@ def subspace_model(
             )
         kept = np.maximum(s[: dims[n]], _SHRINKAGE * s[0])
         to_state.append(ahead @ (vh[: dims[n]].T / kept * np.sqrt(len(section.y))))
-    return _from_states(sections, to_state, past, innovations)
+    return _from_states(sections, to_state, past, innovations, direct)
+
+
+# Probability that noise alone counts as an answer to a reference at the same section. Smaller: a
+# weak feed-through is set to zero. Larger: more unknowns than there are.
+_AT_ONCE = 1e-3
+
+
+def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
+    """Test whether the outputs answer the inputs of a loop at their own section.
+
+    If so, they answer a reference at once, given the past of all signals: the likelihood-ratio
+    test, section by section (Anderson, *Multivariate Statistical Analysis*, 2003, section 8.4),
+    which holds for any controller. Inputs that answer outputs at once look the same in the inputs.
+
+    **Raises:** `DefinitionError` if both answer each other at once: no model of the noise tells
+    them apart.
+    """
+    grid, ny = records.whole(), len(records.outputs)
+    nr = len(drive.inputs)
+    z = np.concatenate([drive.whole().u, grid.u, grid.y / records.scale], axis=3)
+    sampled = np.asarray(grid.sampled.all(axis=3))
+    statistic, freedom, left, whole = 0.0, 0, 0.0, 0.0
+    for n in range(records.n_sections):
+        section = _Section(z, sampled, n, ny)
+        count = len(section.y)
+        length = max(min(count // (_ROWS * z.shape[3]), default_horizon(len(z[0, 0]))), 1)
+        past = section.past(length)
+        r, u = section.u[:, :nr], section.u[:, nr:]
+        rows = np.concatenate([past, r], axis=1)
+        errors = [section.y - x @ _regress(x, section.y) for x in (past, rows)]
+        floor = _SHRINKAGE * section.y.T @ section.y  # errors of the regressions, without noise
+        sizes = [np.linalg.slogdet(e.T @ e + floor)[1] for e in errors]
+        statistic += max(count - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (sizes[0] - sizes[1])
+        freedom += ny * nr
+        left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
+        whole += float((u**2).sum())
+    if special.gammaincc(freedom / 2, statistic / 2) > _AT_ONCE:
+        return False
+    if left > _SHRINKAGE * whole:
+        raise DefinitionError(
+            "outputs answer inputs at the same section, where the inputs have a part that neither "
+            "the reference nor the past explains: no model of the noise tells the two directions "
+            "apart. Pass a model with D = 0 as `guess` if outputs do not respond at once."
+        )
+    return True
 
 
 class _Section:
@@ -282,9 +328,9 @@ class _Section:
         rows = self._z[self.record[:, None], np.maximum(back, 0)]
         return np.where((back >= 0)[..., None], rows, 0.0).reshape(len(back), -1)
 
-    def regression(self, length: int) -> Float[np.ndarray, "columns ny"]:
+    def regression(self, length: int, direct: bool) -> Float[np.ndarray, "columns ny"]:
         """Return the effect of the past on the output."""
-        rows = np.concatenate([self.u, self.past(length)], axis=1)
+        rows = np.concatenate([self.u * direct, self.past(length)], axis=1)
         return _regress(rows, self.y)[self.u.shape[1] :]
 
 
@@ -297,14 +343,18 @@ def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _from_states(
-    sections: list[_Section], to_state: list[np.ndarray], past: int, innovations: bool
+    sections: list[_Section],
+    to_state: list[np.ndarray],
+    past: int,
+    innovations: bool,
+    direct: bool,
 ) -> PeriodicModel:
     N, nu = len(sections), sections[0].u.shape[1]
     C, D, A, B, K = [], [], [], [], []
     for n, section in enumerate(sections):
         x = section.past(past) @ to_state[n]
         rows = np.concatenate([x, section.u], axis=1)
-        output = _regress(rows, section.y)
+        output = _regress(np.concatenate([x, section.u * direct], axis=1), section.y)
         rows = np.concatenate([rows, section.y - rows @ output], axis=1)
         later = _regress(rows, section.past(past, 1) @ to_state[(n + 1) % N])
         d = x.shape[1]

@@ -1,0 +1,176 @@
+"""The plant and its controller apart: regions and errors of what is identified in a loop.
+
+The vertical hopper, linearized at 8 clock sections, with the feedback `GAIN` of height and speed,
+u = r - K y, at work. r is white, and process noise as large as r acts beside it; sensors have noise
+of a tenth of the outputs' rms, which goes round the loop. Printed, as `name value` lines, over
+`--draws` draws:
+
+- `bound`: Cramer-Rao bound of the plant's first multiplier, for 300 strides of the loop.
+- `ldtp.rms`, `ldtp.ratio` (to the bound), `ldtp.covered`, `ldtp.p`: of `fit_ldtp(reference="r")`:
+  rms error, how often its 95 % region holds the true multiplier, p-value of 95 % (binomial test).
+  `without.covered`: without the reference, and with D free.
+- `plant.covered`, `plant.p`, `controller.*`: how often the 95 % discs of HTFs hold the truth, of
+  `hj.identify.loop` with two references, and noise of a fifth of r in what the controller does;
+  the p-value is that of their mean over draws (t test).
+- `seconds.*`: CPU seconds of fits.
+
+    python benchmarks/in_loop.py [--draws 400] [--size 1.0]
+"""
+
+import argparse
+import time
+
+import equinox as eqx
+import numpy as np
+from process_noise import innovations
+from scipy import stats
+
+import hybridjax as hj
+from hybridjax.identify.denominator import multipliers_of
+from hybridjax.identify.instrument import in_loop
+from hybridjax.identify.joint.model import PeriodicModel, characteristic_slopes, local_coordinates
+from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem
+from hybridjax.identify.multiplier_estimate import MultiplierEstimate
+from hybridjax.identify.series.records import CycleGrid
+
+
+N, STRIDES, BEFORE, SENSOR, MOTOR = 8, 300, 20, 0.1, 0.2
+GAIN = np.array([[0.3, 1.0]])
+
+
+def hopper() -> hj.LDTP:
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    phase = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
+    exact = hj.linearize(cycle, phase, ("yM", "vM"))
+    minimal = hj.identify.realize(exact.htf(np.arange(1, 128) / 32 + 1 / 77), order=2)
+    return eqx.tree_at(lambda x: x.D, minimal, 0 * minimal.D)  # (1e-17)
+
+
+def respond(model: hj.LDTP, r, d, w, e) -> tuple[np.ndarray, np.ndarray]:
+    """u and y of the loop u = r - K y, y = C x + d + e, for signals (S, n, .)."""
+    A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
+    x, u, y = np.zeros((len(r), A.shape[1])), np.zeros(r.shape), np.zeros(d.shape)
+    for i in range(r.shape[1]):
+        n = i % N
+        y[:, i] = x @ C[n].T + d[:, i] + e[:, i]
+        u[:, i] = r[:, i] - y[:, i] @ GAIN.T
+        x = x @ A[n].T + (u[:, i] + w[:, i]) @ B[n].T
+    return u, y
+
+
+def sizes(model: hj.LDTP) -> np.ndarray:
+    """Return the rms of the outputs without noise."""
+    r, zero = np.random.default_rng(1).normal(size=(1, N * STRIDES, 1)), np.zeros((N * STRIDES, 2))
+    return respond(model, r, zero[None], 0 * r, zero[None])[1].std(axis=(0, 1))
+
+
+def draw(model: hj.LDTP, size: float, sensor: np.ndarray, rng: np.random.Generator) -> hj.Record:
+    n, left = N * (STRIDES + BEFORE), slice(N * BEFORE, None)
+    r, w = rng.normal(size=(2, 1, n, 1))
+    e = sensor * rng.normal(size=(1, n, 2))
+    u, y = respond(model, r, 0 * e, size * w, e)
+    z = np.concatenate([u, r], axis=2)[0, left]
+    return hj.Record(z, y[0, left], n_sections=N, inputs=("u", "r"), outputs=model.outputs)
+
+
+def bound(model: hj.LDTP, size: float, sensor: np.ndarray, records: list[hj.Record]) -> float:
+    """Of the first multiplier, from the information of the predictions in some records."""
+    B = np.concatenate([size * np.asarray(model.B), np.zeros((N, model.A.shape[1], 2))], axis=2)
+    D = np.tile(np.concatenate([np.zeros((2, 1)), np.diag(sensor)], axis=1), (N, 1, 1))
+    noise = hj.LDTP(model.A, B, model.C, D, model.dims, outputs=model.outputs)
+    K, S = innovations(PeriodicModel.of(noise, np.ones(2)))
+    coordinates = local_coordinates(PeriodicModel.of(model, np.ones(2))._replace(K=K), False)
+    plant = [record for r in records for record in in_loop(r, ("r",))[0]]
+    parts = [SeriesPart.of(CycleGrid.from_records([r]), np.ones(2)) for r in plant]
+    problem = SeriesProblem(parts, S, True, True, 0)
+    c, slopes = characteristic_slopes(coordinates)
+    root = slopes @ problem.linearize(coordinates).spread().root * np.sqrt(len(records))
+    least = MultiplierEstimate(multipliers_of(c), c, root @ root.T, np.inf)
+    return float(least.standard_errors[0])
+
+
+def parametric(model, size, sensor, rng) -> dict[str, float]:
+    data, true = draw(model, size, sensor, rng), np.asarray(model.multipliers)[:1]
+    results = {}
+
+    def record(name, fit):
+        began = time.process_time()
+        fit = fit()
+        results[f"{name}.seconds"] = time.process_time() - began
+        results[f"{name}.error"] = float(np.abs(fit.multipliers - true).min())
+        results[f"{name}.covered"] = float(fit.contains(true).all())
+
+    dims = np.asarray(model.dims)
+    record("ldtp", lambda: hj.fit_ldtp(data, dims, reference="r"))
+    alone = hj.Record(data.u[:, :1], data.y, n_sections=N, inputs="u", outputs=data.outputs)
+    record("without", lambda: hj.fit_ldtp(alone, dims, noise="innovations"))
+    return results
+
+
+def discs(model, size, sensor, design, truths, rng) -> dict[str, float]:
+    """Return the shares of discs of HTFs that hold the truth."""
+    both = design.realizations(6, seed=int(rng.integers(1 << 31)))
+    z = both.inputs(both.periods + BEFORE)
+    w, e = rng.normal(size=(*z.shape[:2], 1)), sensor * rng.normal(size=(*z.shape[:2], 2))
+    d = sizes(model) * z[..., 1:]
+    c = MOTOR * rng.normal(size=w.shape)
+    u, y = respond(model, z[..., :1] + c, d, size * w, e)
+    inputs = np.concatenate([u, z[..., :1], d], axis=2)
+    data = hj.ExperimentData(
+        inputs, y, n_sections=N, periods=both.periods, outputs=model.outputs,
+        inputs=("u", "r", "d0", "d1"),
+    )  # fmt: skip
+    loop = hj.identify.loop(data, at_input="r", at_output=("d0", "d1"))
+    return {
+        name: float((np.abs(htf.H - truths[name]) <= htf.confidence_radius()).mean())
+        for name, htf in (("plant", loop.plant), ("controller", loop.controller))
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--draws", type=int, default=400)
+    parser.add_argument("--size", type=float, default=1.0, help="of process noise, relative to r")
+    options = parser.parse_args()
+    hj.enable_x64()
+    model, rng, draws = hopper(), np.random.default_rng(0), options.draws
+    sensor = SENSOR * sizes(model)
+    show = lambda what, value: print(f"in_loop.{what} {value:.4g}", flush=True)  # noqa: E731
+
+    records = [draw(model, options.size, sensor, rng) for _ in range(10)]
+    least = bound(model, options.size, sensor, records)
+    show("bound", least)
+    found: dict[str, list[float]] = {}
+    for k in range(draws):
+        one = parametric(model, options.size, sensor, np.random.default_rng((1, k)))
+        for name, value in one.items():
+            found.setdefault(name, []).append(value)
+    for name in ("ldtp", "without"):
+        covered, error = (np.array(found[f"{name}.{x}"]) for x in ("covered", "error"))
+        rms = np.sqrt((error**2).mean())
+        show(f"{name}.rms", rms)
+        show(f"{name}.ratio", rms / least)
+        show(f"{name}.draws", len(covered))
+        show(f"{name}.covered", covered.mean())
+        show(f"{name}.p", stats.binomtest(int(covered.sum()), len(covered), 0.95).pvalue)
+        show(f"{name}.seconds", np.median(found[f"{name}.seconds"]))
+    design = hj.multisine(
+        N, 8, band=(0, N / 2), inputs=3, division="orthogonal", amplitude=1.0, seed=1
+    )
+    gain = hj.LDTP(
+        np.zeros((N, 1, 1)), np.zeros((N, 1, 2)), np.zeros((N, 1, 1)), np.tile(GAIN, (N, 1, 1))
+    )
+    f = np.unique(design.line) / design.periods
+    truths = {"plant": model.htf(f).H, "controller": gain.htf(f).H}
+    shares = [
+        discs(model, options.size, sensor, design, truths, np.random.default_rng((2, k)))
+        for k in range(draws)
+    ]
+    for name in truths:
+        share = np.array([x[name] for x in shares])
+        show(f"{name}.covered", share.mean())
+        show(f"{name}.p", stats.ttest_1samp(share, 0.95).pvalue)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,261 @@
+r"""HTFs of a plant that is in a loop: an external reference is the instrument.
+
+With a controller at work, $u = r - F y$, noise v of the output goes round the loop into u, and
+the ratio of y to u is that of a mixture of plant and controller. The reference r is independent of
+v. In each class of lines f + integers let R, U and Y be the spectra of M experiments, one column
+for each experiment. Then
+
+$$P = (Y \hat U^*) (U \hat U^*)^{-1}, \qquad \hat U = (U R^*) (R R^*)^{-1} R,$$
+
+which is $T_{yr} T_{ur}^{-1}$ for as many references as inputs. With $E = Y - P U$, which holds no
+part of R, the error of P is $E \hat U^* (U \hat U^*)^{-1}$: the variance of its entry (a, b) is
+that of row a of E times the entry (b, b) of $(\hat U \hat U^*)^{-1}$ (Pintelon and Schoukens 2012,
+sections 2.6 and 7.2.7, for matrices; Söderström and Stoica 1983).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Int
+
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..experiments.record import Record, RecordedData, uninterrupted_records
+from ..linear.algebra import Lines
+from ..linear.frequency_response import check_harmonics
+from ..linear.htf import HTF, Scatter
+from .spectral_sums import SILENT_LINE, Experiments
+
+
+# Smallest singular value of the inputs' answer to the references, relative to the largest, with
+# which the plant is told apart. Smaller: noise is divided by noise. Larger: plants are refused
+# behind controllers of high gain.
+_ANSWERS = 1e-4
+
+
+class Roles(NamedTuple):
+    """What each input of the data is to the plant: columns of its own inputs, of references."""
+
+    inputs: list[int]
+    references: list[int]
+
+    @classmethod
+    def of(
+        cls, names: Sequence[str], reference: Sequence[str], fewest: int | None = None
+    ) -> "Roles":
+        """**Raises:** `DefinitionError` unless references are some, not all, of the inputs, and
+        `fewest` or more. Default: as many as the others."""
+        if unknown := [name for name in reference if name not in names]:
+            raise DefinitionError(
+                f"there is no reference {unknown[0]!r} among the inputs {', '.join(names)}."
+            )
+        references = [list(names).index(name) for name in reference]
+        inputs = [i for i in range(len(names)) if i not in references]
+        if not inputs:
+            raise DefinitionError(
+                "all inputs are references: name the signals that the controller makes as inputs, "
+                "too."
+            )
+        if len(references) < (len(inputs) if fewest is None else fewest):
+            raise DefinitionError(
+                f"{len(inputs)} inputs of the plant need as many references, which move each of "
+                f"them from outside: there are {len(references)}."
+            )
+        return cls(inputs, references)
+
+
+def in_loop(data: RecordedData, reference: Sequence[str]) -> tuple[list[Record], list[Record]]:
+    """Return records from the plant's inputs to the outputs, and from the references to these
+    inputs.
+
+    **Raises:** `DefinitionError` as `Roles.of`, and if a reference is an input.
+    """
+    records = uninterrupted_records(data)
+    names = records[0].inputs
+    roles = Roles.of(names, reference)
+    require_loop(roles, [r.u for r in records], names)
+    pick = lambda x: tuple(names[i] for i in x)  # noqa: E731
+    plant, drive = [], []
+    for r in records:
+        u, ref = r.u[:, roles.inputs], r.u[:, roles.references]
+        plant.append(dataclasses.replace(r, u=u, inputs=pick(roles.inputs)))
+        ends = dict(inputs=pick(roles.references), outputs=pick(roles.inputs))
+        drive.append(dataclasses.replace(r, u=ref, y=u, **ends))
+    return plant, drive
+
+
+def require_loop(roles: Roles, signals: Sequence[np.ndarray], names: Sequence[str]) -> None:
+    """**Raises:** `DefinitionError` for an input that is its reference: there is no loop then."""
+    for i in roles.inputs:
+        for k in roles.references:
+            if all(np.array_equal(x[..., i], x[..., k]) for x in signals):
+                raise DefinitionError(
+                    f"{names[i]} and {names[k]} are the same signal: there is no loop, leave "
+                    "`reference` out."
+                )
+
+
+class Sums(NamedTuple):
+    """Products of spectra z of outputs, inputs and references in K classes, over experiments."""
+
+    total: Complex[np.ndarray, "K n n"]
+    """Sums of z z*, of the means over windows."""
+    between: Complex[np.ndarray, "K n n"]
+    """Sums of the covariances of these means between windows."""
+    count: int
+
+
+def spectral_products(data: ExperimentData, repeats: int) -> Sums:
+    N, P = data.n_sections, data.periods
+    z = np.concatenate([data.y, data.u], axis=2)[data.ok]
+    bins = (np.arange(P // 2 + 1)[:, None] + P * np.arange(N)) % (N * P)
+    spectra = np.stack([np.fft.fft(z[:, w], axis=1)[:, bins] for w in data.windows(repeats)])
+    # (windows, S, K, N, signals) to (windows, K, N * signals, S), components first
+    spectra = np.moveaxis(spectra, 1, 4)
+    spectra = spectra.reshape(*spectra.shape[:2], -1, spectra.shape[4])
+    mean = spectra.sum(axis=0) / repeats
+    apart = spectra - mean
+    between = (apart @ apart.conj().swapaxes(2, 3)).sum(axis=0) / max(repeats - 1, 1) / repeats
+    return Sums(mean @ mean.conj().swapaxes(1, 2), between, len(z))
+
+
+def htf_by_reference(
+    data: Experiments,
+    reference: Sequence[str],
+    *,
+    repeats: int = 1,
+    variance: Literal["auto", "noise", "total"] = "auto",
+) -> HTF:
+    """Return the HTFs of the plant, with all harmonics; see `estimate_htf`.
+
+    **Raises:** `DefinitionError` as `Roles.of`, and if the references excite no whole class of
+    lines, or the inputs do not answer them.
+    """
+    total = None
+    for part in [data] if isinstance(data, ExperimentData) else data:
+        roles = Roles.of(part.inputs, reference)
+        require_loop(roles, [part.u], part.inputs)
+        sums = spectral_products(part, repeats)
+        about = (part.n_sections, part.periods, part.inputs, part.outputs)
+        if total is None:
+            total, setup = sums, about
+        elif setup != about:
+            raise DefinitionError(f"these experiments do not belong together: {setup}, {about}.")
+        else:
+            between = total.between + sums.between
+            total = Sums(total.total + sums.total, between, total.count + sums.count)
+    if total is None or not total.count:
+        raise DefinitionError("`data` holds no experiment that ran to its end.")
+    N, P, names, outputs = setup
+    ny = len(outputs)
+    columns = [list(range(ny)), *([ny + i for i in part] for part in roles)]
+    y, u, r = Ports.rows(N, ny + len(names), *columns)
+    ports = Ports(y, u, r, N)
+    classes = excited_classes(total, ports, P)
+    inputs = tuple(names[i] for i in roles.inputs)
+    return solve(total, ports, classes, P, inputs, outputs, (repeats, variance))
+
+
+class Ports(NamedTuple):
+    """Rows of the sums, for the outputs, inputs and references of a system."""
+
+    outputs: Int[np.ndarray, " a"]
+    inputs: Int[np.ndarray, " b"]
+    references: Int[np.ndarray, " c"]
+    N: int
+
+    @staticmethod
+    def rows(N: int, signals: int, *roles: list[int]) -> list[Int[np.ndarray, " a"]]:
+        """Return the rows of signals, for all components."""
+        return [np.add.outer(np.arange(N) * signals, np.array(x, int)).ravel() for x in roles]
+
+
+def excited_classes(sums: Sums, ports: Ports, P: int) -> Int[np.ndarray, " k"]:
+    """Return the classes in which all lines of all references are excited.
+
+    **Raises:** `DefinitionError` if there is none.
+    """
+    r = ports.references
+    power = sums.total[:, r[:, None], r]
+    size = np.sqrt(np.einsum("kii->ki", power).real)
+    strong = size > SILENT_LINE * size.max()
+    scale = np.where(strong, size, 1)
+    least = np.linalg.eigvalsh(power / scale[:, :, None] / scale[:, None])[:, 0]
+    whole = strong.all(axis=1) & (least > SILENT_LINE)
+    if whole.any():
+        return np.flatnonzero(whole)
+    best = int(strong.sum(axis=1).argmax())
+    raise DefinitionError(
+        f"the reference excites too little: at f = {best / P:g} + integers it tells "
+        f"{int(np.linalg.matrix_rank(power[best], SILENT_LINE * size.max() ** 2, True))} of "
+        f"{len(r)} components apart. Excite all lines up to N/2 (`hj.multisine(N, P, band=(0, "
+        "N / 2))`), or use `fit_ldtp` with `reference`, which takes any signal."
+    )
+
+
+def solve(
+    sums: Sums,
+    ports: Ports,
+    classes: Int[np.ndarray, " k"],
+    P: int,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    how: tuple[int, str],
+) -> HTF:
+    """Return the HTFs from the inputs to the outputs in some classes."""
+    y, u, r, N = ports
+    G, (repeats, kind) = sums.total[classes], how
+
+    def block(rows, columns, G=G):
+        return G[:, rows[:, None], columns]
+
+    to_r = np.linalg.solve(block(r, r), block(r, u))  # (R R*)^-1 R U*
+    power = block(u, r) @ to_r
+    size = np.linalg.svd(power, compute_uv=False)
+    drive = np.linalg.svd(block(r, r), compute_uv=False)[:, 0]
+    weak = size[:, -1] < _ANSWERS**2 * np.maximum(size[:, 0], SILENT_LINE * drive)
+    if weak.any():
+        raise DefinitionError(
+            f"the inputs do not answer the references in {len(u)} independent ways at f = "
+            f"{classes[weak][0] / P:g} + integers (the singular values of T_ur fall to "
+            f"{np.sqrt(size[weak][0, -1] / size[weak][0, 0]):.1e} of the largest): choose "
+            "references that move each input."
+        )
+    H = np.linalg.solve(power, to_r.conj().swapaxes(1, 2) @ block(r, y)).conj().swapaxes(1, 2)
+    spread = np.linalg.inv(power)
+
+    def variance(G, freedom):
+        cross = block(y, u, G) @ H.conj().swapaxes(1, 2)
+        square = block(y, y, G) - cross - cross.conj().swapaxes(1, 2)
+        square = square + H @ block(u, u, G) @ H.conj().swapaxes(1, 2)
+        rows = np.maximum(np.einsum("kii->ki", square).real, 0) / freedom
+        return rows[:, :, None] * np.einsum("kii->ki", spread).real[:, None]
+
+    freedom = sums.count - len(u)
+    total = noise = None
+    if kind != "noise" and freedom > 0:
+        total = variance(G, freedom)
+    if repeats > 1:
+        noise = variance(sums.between[classes], sums.count)
+    if kind == "total" and total is None:
+        raise DefinitionError(
+            f"{sums.count} experiments with {len(u)} unknowns each leave no scatter: apply several "
+            "realizations (`Design.realizations`), or pass variance='noise'."
+        )
+    if total is None:
+        total, freedom, noise = noise, sums.count * (repeats - 1), None
+
+    f = (classes[:, None] + P * np.arange(N)) / P
+    f = np.unique(np.round(P * np.abs((f + N / 2) % N - N / 2)).astype(int)) / P
+    lines = Lines.of(f, N)
+
+    def entries(x):
+        return None if x is None else lines.entries(x, N // 2).real
+
+    scatter = None if total is None else Scatter(np.full(len(f), float(freedom)), shared=True)
+    return HTF(
+        f, lines.entries(H, N // 2), check_harmonics(None, N), N, inputs, outputs, "estimate",
+        variance=entries(total), noise_variance=entries(noise), scatter=scatter,
+    )  # fmt: skip

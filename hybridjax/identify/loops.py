@@ -1,0 +1,125 @@
+"""Plant, controller, loop and sensitivity from experiments with a loop at work."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, SignalNames
+from .._core.precision import require_x64
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..linear.htf import HTF
+from .instrument import Ports, Roles, Sums, excited_classes, solve, spectral_products
+
+
+class Loop(eqx.Module):
+    r"""What the experiments tell of the loop $u = r - F y$, $y = P u + d$.
+
+    **Fields**, each with variances, or None where no reference tells it:
+
+    - `plant`: P, from u to y. `controller`: F, from y to u (fed back with a negative sign).
+    - `closed`: $(I + P F)^{-1} P$, from r to y. `sensitivity`: $(I + F P)^{-1}$, from r to u. With
+      the reference d alone: $-F (I + P F)^{-1}$, from d to u, and $(I + P F)^{-1}$, from d to y.
+    - `missing`: the experiments that would tell the rest.
+    """
+
+    plant: HTF | None
+    controller: HTF | None
+    closed: HTF
+    sensitivity: HTF
+    missing: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        named = ("plant", "controller", "closed", "sensitivity")
+        lines = [f"  {name:11} {getattr(self, name)!r}" for name in named if getattr(self, name)]
+        return "\n".join(["Loop", *lines, *(f"  {text}" for text in self.missing)])
+
+
+@checked
+def loop(
+    data: ExperimentData,
+    *,
+    at_input: SignalNames | None = None,
+    at_output: SignalNames | None = None,
+    repeats: Count = 1,
+) -> Loop:
+    """Tell the plant and its controller apart, from references that enter their loop.
+
+    A reference at the plant's input, of which u contains a part, is the instrument for the plant,
+    one at its output, of which y contains a part, that for the controller. Both may act in the
+    same experiments or in different ones; each counts as known while the other is used. The HTFs
+    come with first-order variances, see `estimate_htf` with `reference`; `hj.fit_multipliers` and
+    `hj.fit_ldtp` take them, those of unstable plants, too.
+
+    **Arguments:**
+
+    - `data`: experiments whose inputs hold u and the references, with periodic references that
+      excite all lines f + integers.
+    - `at_input`: names of references at the plant's input, as many as inputs u.
+    - `at_output`: names of references at its output, as many as outputs y.
+    - `repeats`: as for `estimate_htf`. Default: 1.
+
+    **Raises:** `DefinitionError` without a reference, for references that are not among the inputs,
+    too few of them, or those that excite too little.
+    """
+    require_x64()
+    r, d = at_input or (), at_output or ()
+    if not (r or d):
+        raise DefinitionError(
+            "a loop is told apart by references: name those that enter at the plant's input "
+            "(`at_input`), at its output (`at_output`), or both."
+        )
+    roles = Roles.of(data.inputs, (*r, *d), fewest=0)
+    u, y = [data.inputs[i] for i in roles.inputs], data.outputs
+    for what, given, needed in (("at_input", r, u), ("at_output", d, y)):
+        if given and len(given) < len(needed):
+            raise DefinitionError(
+                f"`{what}` needs {len(needed)} references, one for each of {', '.join(needed)}, "
+                f"not {len(given)}."
+            )
+    products = spectral_products(data, repeats)
+
+    def estimate(outputs: Sequence[str], inputs: Sequence[str], reference: Sequence[str]) -> HTF:
+        names = (*data.outputs, *data.inputs)
+        others = [x for x in (*r, *d) if x not in reference]
+        rows = [[names.index(x) for x in part] for part in (outputs, inputs, reference, others)]
+        after, before, outside, known = Ports.rows(data.n_sections, len(names), *rows)
+        system = Ports(after, before, outside, data.n_sections)
+        sums = _without(products, known)
+        classes = excited_classes(sums, system, data.periods)
+        return solve(
+            sums, system, classes, data.periods, tuple(inputs), tuple(outputs), (repeats, "auto")
+        )
+
+    plant = estimate(y, u, r) if r else None
+    controller = None
+    if d:
+        controller = estimate(u, y, d)
+        controller = eqx.tree_at(lambda x: x.H, controller, -controller.H)
+    missing = []
+    if not r:
+        missing.append(
+            "The plant: experiments with a reference at its input (a push, an injected current) "
+            "would tell it; this one reaches it through the controller only."
+        )
+    if not d:
+        missing.append(
+            "The controller: experiments with a reference at its sensor (a moved scene, an offset "
+            "added to y) would tell it; this one reaches it through the plant only."
+        )
+    first = r or d
+    answer, entered = (y, u) if r else (u, y)
+    closed, sensitivity = (estimate(x, first, first) for x in (answer, entered))
+    return Loop(plant, controller, closed, sensitivity, tuple(missing))
+
+
+def _without(sums: Sums, known: np.ndarray) -> Sums:
+    """Return products of what is left of all signals without what known references explain."""
+    if not len(known):
+        return sums
+    total = sums.total
+    power = total[:, known[:, None], known]
+    left = total[:, :, known] @ np.linalg.pinv(power, hermitian=True) @ total[:, known]
+    return Sums(total - left, sums.between, sums.count - len(known))

@@ -1,0 +1,182 @@
+r"""Series, parallel, inverse and feedback of linear periodic systems.
+
+Systems are joined side by side first, with inputs w and outputs z; then
+$w = K z + L r$ and $y = M z$ connect them.
+
+HTFs are matrices, one for each class of frequencies f + integers: components of the input at
+f + b become components of the output at f + a by $H(f)[a, b] = H_{a-b}(f + b)$, indices modulo N.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from .._core.compilation import host_first
+from .._core.executor import Array, is_traced, namespace
+from ..errors import DefinitionError
+
+
+# Distance in cycles per period up to which two frequencies are the same. Smaller: rounding makes
+# them different. Larger: lines of very long designs coincide.
+SAME_FREQUENCY = 1e-9
+# Smallest singular value of I - K D, relative to the largest, with which systems can be connected.
+# Smaller: responses are rounding errors. Larger: loops that have a response are refused.
+_WELL_POSED = 1e-12
+
+
+class Matrices(NamedTuple):
+    """Padded matrices and true dimensions of an LDTP."""
+
+    A: Float[Array, "N d d"]
+    B: Float[Array, "N d nu"]
+    C: Float[Array, "N ny d"]
+    D: Float[Array, "N ny nu"]
+    dims: Int[Array, " N"]
+
+
+def static_gain(gain: Float[Array, "*N ny nu"], n_sections: int, shape: tuple[int, int]):
+    """Return a gain, or N of them, as a system without states, for `shape` (ny, nu).
+
+    **Raises:** `DefinitionError` for another shape.
+    """
+    if gain.shape not in (shape, (n_sections, *shape)):
+        raise DefinitionError(
+            f"a gain must have the shape {shape}, or {(n_sections, *shape)} for each section, not "
+            f"{gain.shape}."
+        )
+    xp, N, (ny, nu) = namespace(gain), n_sections, shape
+    D = xp.broadcast_to(gain, (N, ny, nu))
+    A, B, C = xp.zeros((N, 0, 0)), xp.zeros((N, 0, nu)), xp.zeros((N, ny, 0))
+    return Matrices(A, B, C, D, xp.zeros(N, int))
+
+
+@host_first
+def connect(
+    a: Matrices,
+    b: Matrices,
+    K: Float[Array, "nw nz"],
+    L: Float[Array, "nw nr"],
+    M: Float[Array, "ny nz"],
+) -> Matrices:
+    """Connect two systems, with inputs w = K z + L r and outputs y = M z.
+
+    States of both stand one after the other at each section, and padding behind both.
+    """
+    xp = namespace(a.A)
+
+    def beside(x, y):
+        corner = xp.zeros((len(x), x.shape[1], y.shape[2]))
+        corner_of_y = xp.zeros((len(x), y.shape[1], x.shape[2]))
+        upper, lower = xp.concatenate([x, corner], axis=2), xp.concatenate([corner_of_y, y], axis=2)
+        return xp.concatenate([upper, lower], axis=1)
+
+    A, B, C, D = (beside(x, y) for x, y in zip(a[:4], b[:4], strict=True))
+    to_inputs = xp.linalg.solve(
+        xp.eye(len(K)) - K @ D, xp.concatenate([K @ C, xp.broadcast_to(L, (len(D), *L.shape))], 2)
+    )
+    by_state, by_input = to_inputs[..., : C.shape[2]], to_inputs[..., C.shape[2] :]
+    place = [xp.arange(x.A.shape[1]) >= x.dims[:, None] for x in (a, b)]
+    size = C.shape[2]
+    order = xp.argsort(xp.concatenate(place, axis=1) * size + xp.arange(size), axis=1)
+    rows, after = order[:, None, :], xp.roll(order, -1, axis=0)[:, :, None]
+    A = xp.take_along_axis(xp.take_along_axis(A + B @ by_state, after, 1), rows, 2)
+    B = xp.take_along_axis(B @ by_input, after, 1)
+    C = xp.take_along_axis(M @ (C + D @ by_state), rows, 2)
+    return Matrices(A, B, C, M @ D @ by_input, a.dims + b.dims)
+
+
+def require_well_posed(through: Float[Array, "N n n"]) -> None:
+    """**Raises:** `DefinitionError` where a section answers itself without bounds."""
+    if is_traced(through):
+        return
+    values = np.linalg.svd(np.eye(through.shape[1]) - np.asarray(through), compute_uv=False)
+    if len(bad := np.flatnonzero(values[:, -1] < _WELL_POSED * np.maximum(values[:, 0], 1))):
+        raise DefinitionError(
+            f"the loop has no response at section {bad[0]}, where direct feed-through answers "
+            "itself (I + D of plant times D of controller is singular): let the controller wait a "
+            "section."
+        )
+
+
+class Lines(NamedTuple):
+    """Where the entries of harmonic matrices lie in HTFs: of K classes, each with N lines."""
+
+    row: Int[np.ndarray, "K N"]
+    """The line of an HTF that holds component b,"""
+    mirrored: Bool[np.ndarray, "K N"]
+    """by the conjugate of its mirror image if true."""
+
+    @classmethod
+    def of(cls, f: Float[np.ndarray, " F"], N: int) -> "Lines":
+        """Find the lines of each class f + integers.
+
+        **Raises:** `DefinitionError` for a class that lacks a line.
+        """
+        start = np.minimum(f % 1, -f % 1)
+        start = np.sort(start)[np.insert(np.diff(np.sort(start)) > SAME_FREQUENCY, 0, True)]
+        wanted = start[:, None] + np.arange(N)
+        size = np.abs((f - wanted[..., None] + N / 2) % N - N / 2)
+        opposite = np.abs((f + wanted[..., None] + N / 2) % N - N / 2)
+        there, mirrored = size.min(axis=2) < SAME_FREQUENCY, opposite.min(axis=2) < SAME_FREQUENCY
+        if not (there | mirrored).all():
+            lost = (wanted[~(there | mirrored)][0] + N / 2) % N - N / 2
+            raise DefinitionError(
+                f"the HTFs do not hold f = {abs(lost):.10g} cycles per period: algebra takes all "
+                f"lines f + integers, up to N/2 = {N / 2:g}."
+            )
+        return cls(np.where(there, size.argmin(axis=2), opposite.argmin(axis=2)), ~there)
+
+    def matrices(self, x: Array, zero: int) -> Complex[Array, "K Nny Nnu"]:
+        """Return the harmonic matrices of values (N, F, ny, nu) with harmonic 0 at `zero`."""
+        (K, N), xp = self.row.shape, namespace(x)
+        m = np.arange(N)[:, None] - np.arange(N)
+        sign = np.where(self.mirrored, -1, 1)[:, None]
+        values = x[(sign * m + zero) % N, self.row[:, None]]  # (K, a, b, ny, nu)
+        values = xp.where(self.mirrored[:, None, :, None, None], xp.conj(values), values)
+        return values.swapaxes(2, 3).reshape(K, N * x.shape[2], N * x.shape[3])
+
+    def entries(self, matrices: Array, zero: int) -> Complex[Array, "N F ny nu"]:
+        """Return the values of all lines, whose harmonic matrices these are."""
+        (K, N), xp = self.row.shape, namespace(matrices)
+        values = matrices.reshape(K, N, matrices.shape[1] // N, N, -1).swapaxes(2, 3)
+        _, first = np.unique(self.row, return_index=True)
+        k, b = np.unravel_index(first, self.row.shape)
+        mirrored, m = self.mirrored[k, b], np.arange(N)[:, None] - zero
+        values = values[k, (b + np.where(mirrored, -m, m)) % N, b]
+        return xp.where(mirrored[:, None, None], xp.conj(values), values)
+
+
+Operation = Callable[..., tuple[Array, list[tuple]]]
+"""Takes matrices X, and returns the result Y with pairs (G, H), one for each X: to first order
+dY is the sum of the G dX H."""
+
+
+def series(P, Q):
+    return P @ Q, [(None, Q), (P, None)]
+
+
+def parallel(P, Q):
+    return P + Q, [(None, None)] * 2
+
+
+def inverse(P):
+    R = namespace(P).linalg.inv(P)
+    return R, [(R, R)]
+
+
+def feedback(P, F):
+    xp = namespace(P)
+    before = xp.linalg.inv(xp.eye(P.shape[1]) + P @ F)
+    R = before @ P
+    return R, [(before, xp.eye(P.shape[2]) - F @ R), (R, R)]
+
+
+def variance_of(pairs: list[tuple], variances: list[Array]) -> Array:
+    """Return the variance of a result from those of independent errors of all entries."""
+    total = 0.0
+    for (before, after), v in zip(pairs, variances, strict=True):
+        v = v if before is None else abs(before) ** 2 @ v
+        total = total + (v if after is None else v @ abs(after) ** 2)
+    return total

@@ -1,0 +1,114 @@
+"""Series, parallel, inverse and feedback, against lifted systems of python-control."""
+
+import dataclasses
+
+import control
+import equinox as eqx
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from .conftest import blocks_at_random
+
+
+N = 4
+IN, OUT = {"u": "N", "w": ""}, {"y": "m", "v": ""}
+# All lines f + integers of four classes, among them those that are their own mirror images.
+F = np.array([0, 0.5, 1, 1.5, 2, 0.3, 1.3, 0.7, 1.7, -0.2, 0.8, 1.8, -1.2])
+
+
+def system(seed, dims, inputs=IN, outputs=OUT, through=1.0):
+    A, B, C, D = blocks_at_random(seed, dims, len(outputs), len(inputs))
+    return hj.LDTP.from_blocks(A, B, C, [through * d for d in D], inputs, outputs)
+
+
+def lifted(ldtp):
+    """The system from all inputs of a period to all outputs of it, of python-control."""
+    n, nu = ldtp.A.shape[1], ldtp.D.shape[2]
+    x = np.eye(n, n + N * nu)  # as a function of the state at section 0, and of all inputs
+    rows = []
+    for k in range(N):
+        u = np.eye(N * nu, n + N * nu, n)[k * nu : (k + 1) * nu]
+        rows.append(ldtp.C[k] @ x + ldtp.D[k] @ u)
+        x = ldtp.A[k] @ x + ldtp.B[k] @ u
+    y = np.concatenate(rows)
+    return control.ss(x[:, :n], x[:, n:], y[:, :n], y[:, n:], True)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return system(0, (3, 2, 4, 1)), system(1, (1, 2, 1, 3), OUT, IN, 0.1)
+
+
+def test_systems_against_lifted_ones(pair):
+    P, F = pair
+    a, b = map(lifted, pair)
+    z = np.exp(2j * np.pi * np.array([0.0, 0.17, 0.5]))
+    for ours, theirs in (
+        (P @ F, a * b),
+        (P + P, a + a),
+        (P.feedback(F), control.feedback(a, b)),
+        (P.feedback(0.1 * np.eye(2)), control.feedback(a, 0.1 * np.eye(2 * N))),
+    ):
+        np.testing.assert_allclose(lifted(ours)(z), theirs(z), rtol=0, atol=1e-12)
+    both = np.moveaxis(lifted(P.inverse())(z), 2, 0) @ np.moveaxis(a(z), 2, 0)
+    np.testing.assert_allclose(both, np.tile(np.eye(2 * N), (3, 1, 1)), atol=1e-12)
+    assert P.feedback(F).inputs == tuple(IN) and (P @ F).inputs == (P @ F).outputs == tuple(OUT)
+    inside = eqx.filter_jit(lambda P, F: P.feedback(F).htf(0.3).H)(P, F)
+    np.testing.assert_allclose(inside, P.feedback(F).htf(0.3).H, rtol=0, atol=1e-12)
+
+
+def test_transfer_functions_against_systems(pair):
+    P, K = pair
+    H, G = P.htf(F), K.htf(F)
+    for ours, exact in (
+        (H @ G, P @ K),
+        (H @ K, P @ K),
+        (H + H, P + P),
+        (H.inverse(), P.inverse()),
+        (H.feedback(G), P.feedback(K)),
+    ):
+        np.testing.assert_allclose(ours.H, exact.htf(F).H, rtol=0, atol=1e-12)
+        assert ours.source == "exact" and ours.variance is None
+        assert (ours.inputs, ours.outputs) == (exact.inputs, exact.outputs)
+
+
+def test_variances_are_those_of_draws(pair):
+    H, G = (x.htf(F[5:]) for x in pair)
+    rng, size = np.random.default_rng(0), 1e-5
+
+    def drawn(x):
+        noise = rng.normal(size=(*x.H.shape, 2)) @ [1, 1j] * size / np.sqrt(2)
+        return dataclasses.replace(x, H=x.H + noise)
+
+    def known(x):
+        return dataclasses.replace(x, source="estimate", variance=np.full(x.H.shape, size**2))
+
+    for operation in (hj.HTF.__matmul__, lambda H, G: H.inverse(), hj.HTF.feedback):
+        exact, draws = operation(H, G), [operation(drawn(H), drawn(G)).H for _ in range(200)]
+        square = np.mean(np.abs(np.array(draws) - exact.H) ** 2, axis=0)
+        ratio = square / operation(known(H), known(G)).variance
+        # (Errors of neighboring entries are those of the same draws.)
+        assert abs(ratio.mean() - 1) < 0.08 and ratio.std() < 0.1
+
+
+def test_what_does_not_fit_is_refused(pair):
+    P, K = pair
+    refused = lambda text: pytest.raises(hj.DefinitionError, match=text)  # noqa: E731
+    with refused(r"'y' \(m\).*'y' \(mm\)"):
+        P.feedback(system(1, (1, 2, 1, 3), {"y": "mm", "v": ""}, IN))
+    with refused("are not the inputs"):
+        P @ P
+    with refused("different n_sections"):
+        P @ system(2, (2, 2), OUT, IN)
+    with refused("needs a square and invertible D"):
+        system(2, (2, 2, 2, 2), through=0).inverse()
+    with refused("no response at section 2"):
+        eqx.tree_at(lambda x: x.D, K, K.D.at[2].set(-np.linalg.inv(P.D[2]))).feedback(P)
+    with refused(r"shape \(2, 2\), or \(4, 2, 2\)"):
+        P.feedback(np.eye(3))
+    with refused("do not hold f = 1.3"):
+        P.htf([0.3, 0.7]).inverse()
+    with refused("takes all 4 harmonics"):
+        P.htf(F, (0, 1)) @ K.htf(F, (0, 1))
