@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from .._core.archive import write_module
 from .._core.cache import enable_compilation_cache
@@ -108,7 +108,9 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process
     _set_up()
     begin = time.time()
     # Lines without second-order products on them need many experiments.
-    division = "sum-free" if protocol.experiments >= 80 else "random"
+    division: Literal["random", "sum-free"] = "sum-free"
+    if protocol.experiments < 80:
+        division = "random"
     design = paper_design(
         periods=protocol.keep, seed=protocol.seed, division=division,
         experiments=protocol.experiments,

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -203,9 +203,10 @@ def with_variance(
     htf: HTF, noise: Noise, variance: Float[np.ndarray, "M F ny 1"], channel: int
 ) -> HTF:
     """Return the HTFs from one input to the measured outputs, with these variances."""
-    H = np.asarray(htf.H)[:, :, noise.outputs, channel : channel + 1]
+    H: Any = np.asarray(htf.H)[:, :, noise.outputs, channel : channel + 1]
     inputs, outputs = (htf.inputs[channel],), tuple(htf.outputs[k] for k in noise.outputs)
-    return dataclasses.replace(htf, H=H, variance=variance, inputs=inputs, outputs=outputs)
+    other: Any = variance
+    return dataclasses.replace(htf, H=H, variance=other, inputs=inputs, outputs=outputs)
 
 
 @checked

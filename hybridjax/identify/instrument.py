@@ -15,7 +15,7 @@ sections 2.6 and 7.2.7, for matrices; Söderström and Stoica 1983).
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Int
@@ -81,7 +81,7 @@ def in_loop(data: RecordedData, reference: Sequence[str]) -> tuple[list[Record],
     for r in records:
         u, ref = r.u[:, roles.inputs], r.u[:, roles.references]
         plant.append(dataclasses.replace(r, u=u, inputs=pick(roles.inputs)))
-        ends = dict(inputs=pick(roles.references), outputs=pick(roles.inputs))
+        ends: dict[str, Any] = dict(inputs=pick(roles.references), outputs=pick(roles.inputs))
         drive.append(dataclasses.replace(r, u=ref, y=u, **ends))
     return plant, drive
 
@@ -104,7 +104,7 @@ class Sums(NamedTuple):
     """Sums of z z*, of the means over windows."""
     between: Complex[np.ndarray, "K n n"]
     """Sums of the covariances of these means between windows."""
-    count: int
+    experiments: int
 
 
 def spectral_products(data: ExperimentData, repeats: int) -> Sums:
@@ -145,8 +145,8 @@ def htf_by_reference(
             raise DefinitionError(f"these experiments do not belong together: {setup}, {about}.")
         else:
             between = total.between + sums.between
-            total = Sums(total.total + sums.total, between, total.count + sums.count)
-    if total is None or not total.count:
+            total = Sums(total.total + sums.total, between, total.experiments + sums.experiments)
+    if total is None or not total.experiments:
         raise DefinitionError("`data` holds no experiment that ran to its end.")
     N, P, names, outputs = setup
     ny = len(outputs)
@@ -233,19 +233,19 @@ def solve(
         rows = np.maximum(np.einsum("kii->ki", square).real, 0) / freedom
         return rows[:, :, None] * np.einsum("kii->ki", spread).real[:, None]
 
-    freedom = sums.count - len(u)
+    freedom = sums.experiments - len(u)
     total = noise = None
     if kind != "noise" and freedom > 0:
         total = variance(G, freedom)
     if repeats > 1:
-        noise = variance(sums.between[classes], sums.count)
+        noise = variance(sums.between[classes], sums.experiments)
     if kind == "total" and total is None:
         raise DefinitionError(
-            f"{sums.count} experiments with {len(u)} unknowns each leave no scatter: apply several "
-            "realizations (`Design.realizations`), or pass variance='noise'."
+            f"{sums.experiments} experiments with {len(u)} unknowns each leave no scatter: apply "
+            "several realizations (`Design.realizations`), or pass variance='noise'."
         )
     if total is None:
-        total, freedom, noise = noise, sums.count * (repeats - 1), None
+        total, freedom, noise = noise, sums.experiments * (repeats - 1), None
 
     f = (classes[:, None] + P * np.arange(N)) / P
     f = np.unique(np.round(P * np.abs((f + N / 2) % N - N / 2)).astype(int)) / P

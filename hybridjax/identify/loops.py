@@ -122,4 +122,4 @@ def _without(sums: Sums, known: np.ndarray) -> Sums:
     total = sums.total
     power = total[:, known[:, None], known]
     left = total[:, :, known] @ np.linalg.pinv(power, hermitian=True) @ total[:, known]
-    return Sums(total - left, sums.between, sums.count - len(known))
+    return Sums(total - left, sums.between, sums.experiments - len(known))

@@ -335,7 +335,7 @@ def equal_weights(
     _, first, which = np.unique(
         np.round(shape, EQUAL_WEIGHTS), axis=0, return_index=True, return_inverse=True
     )
-    line = np.tile(sources, len(matrix) // len(f))
+    copies = len(matrix) // len(f)
     groups = []
     for k, representative in enumerate(first):
         same = np.flatnonzero(which.ravel() == k)
@@ -345,8 +345,8 @@ def equal_weights(
                 mirror=mirror[same],
                 share=share[same],
                 channel=channel[same],
-                line=line,
-                period_delay=np.exp(-2j * np.pi * f[line]),
+                line=np.tile(sources, copies),
+                period_delay=np.tile(np.exp(-2j * np.pi * f), copies),
                 basis=basis,
                 to_powers=to_powers,
                 weight=shape[representative],

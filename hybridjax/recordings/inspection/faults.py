@@ -3,6 +3,7 @@ trials that differ from the others in units, columns, clocks or cycles."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -137,7 +138,9 @@ def silent_inputs(recording: Recording, names: Iterable[str]) -> Iterator[Findin
     """Find inputs that are constant in some trials only."""
     for name in names:
         samples = recording.samples(name)
-        width = [np.ptp(x[np.isfinite(x)]) if np.isfinite(x).any() else 0.0 for _, x in samples]
+        width: list[Any] = [
+            np.ptp(x[np.isfinite(x)]) if np.isfinite(x).any() else 0.0 for _, x in samples
+        ]
         silent = [f"'{t.name}'" for (t, _), w in zip(samples, width, strict=True) if not w]
         if silent and max(width):
             text = f"{name} does not change in trial {listed(silent)}: if it acted there and was "
