@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from .._core import limits
 from .._core.arguments import Numbers, input_and_output_names, require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
-from .._core.boundary.values import Complexes, Reals
+from .._core.boundary.kinds import NewNames, Probability, Vector
+from .._core.boundary.values import Complexes, Reals, Whole
 from .._core.executor import from_host, is_traced
 from .._core.html import COLORS, Curve, card, picture
 from .._core.precision import require_x64
@@ -94,7 +95,8 @@ class HTF(eqx.Module):
     - `f` (F,): input frequencies, cycles per period.
     - `H` (M, F, ny, nu): complex values.
     - `harmonics` (M,): ascending integers, the `m` of `H`'s first axis.
-    - `n_sections`: `N`, the number of sections (samples) in one period.
+    - `n_sections`: `N`, the number of sections (samples) in one period; 0 in continuous time, where
+        n / N is time in periods, and every integer m a harmonic of its own.
     - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`.
     - `source`: a label, "exact" or "estimate".
     - `variance` (M, F, ny, nu): E|dH|^2 of the complex error dH of estimates, which is circular
@@ -126,7 +128,7 @@ class HTF(eqx.Module):
         f: Vector,
         H: Annotated[Numbers, Complexes("M F ny nu")],
         harmonics: Harmonics,
-        n_sections: SectionCount,
+        n_sections: Annotated[int, Whole(0, limits.SECTIONS)],
         inputs: NewNames | None = None,
         outputs: NewNames | None = None,
         source: str = "estimate",
@@ -167,11 +169,12 @@ class HTF(eqx.Module):
             f = np.asarray(self.f)
             span = f" {f.min():.4g} to {f.max():.4g}"
         low, high, number = self.harmonics[0], self.harmonics[-1], len(self.harmonics)
+        sections = f"{self.n_sections} sections" if self.n_sections else "continuous time"
         dense = number == high - low + 1
         shown = f"{low} to {high}" if dense and number > 3 else ", ".join(map(str, self.harmonics))
         return (
             f"HTF({self.source}; harmonics {shown}; {count} frequencies{span} cycles/period; "
-            f"{self.n_sections} sections: {listed(self.inputs)} -> {listed(self.outputs)})"
+            f"{sections}: {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 
     def _repr_html_(self) -> str | None:
@@ -243,6 +246,7 @@ class HTF(eqx.Module):
         """
         if is_traced(self.f, u):
             raise DefinitionError("`predict` must know `u` and `f`: call it outside of jit.")
+        self.require_sampled("`predict`")
         values = np.asarray(u)
         n, nu = values.shape
         if n == 0 or n % self.n_sections or nu != len(self.inputs):
@@ -301,8 +305,18 @@ class HTF(eqx.Module):
         """The largest of `harmonic_errors`, per output."""
         return jnp.max(self.harmonic_errors(other), axis=0)
 
+    def require_sampled(self, name: str) -> None:
+        """**Raises:** `DefinitionError` in continuous time."""
+        if not self.n_sections:
+            raise DefinitionError(
+                f"{name} takes HTFs between sections, and these are of continuous time: make them "
+                "by `linearize(cycle, sections).htf(f)`."
+            )
+
     def _circle(self, f):
-        """`f` modulo `N`, between `-N/2` and `N/2`."""
+        """`f` modulo `N`, between `-N/2` and `N/2`; `f` itself in continuous time."""
+        if not self.n_sections:
+            return f
         return (f + self.n_sections / 2) % self.n_sections - self.n_sections / 2
 
     def _index(self, m):
