@@ -78,13 +78,10 @@ def read_module(path: Path, kinds: Mapping[str, type]) -> Any:
     if set(header["arrays"]) != set(members):
         raise damaged(path, "its arrays are not those that its header lists")
     try:
-        module = put_together(kind, static, members)
+        return put_together(kind, static, members)
     except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
         reason = textwrap.shorten(str(error), 200)
         raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
-    if (wrong := _wrong_field(module)) is not None:
-        raise damaged(path, wrong)
-    return module
 
 
 def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -106,7 +103,10 @@ def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray
 
 def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """The module that `taken_apart` took apart. Fields that are not there are `None`, or have
-    their defaults where they are static."""
+    their defaults where they are static.
+
+    **Raises:** `ValueError` for other fields, or a value that is not what its annotation says.
+    """
     other = ValueError(f"its fields are not those of {kind.__name__}")
     if not isinstance(static, dict):
         raise other
@@ -116,7 +116,7 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
         if field.metadata.get("static", False):
             if name in static:
                 values[name] = static.pop(name)
-                if not _matches(values[name], field.type) or not _moderate(values[name]):
+                if not _matches(values[name], field.type):
                     raise ValueError(f"{name} is {reprlib.repr(values[name])}")
             elif field.default is dataclasses.MISSING:
                 raise other
@@ -128,7 +128,10 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
             values[name] = arrays.pop(name, None)
     if static or arrays:
         raise other
-    return kind(**values)
+    module = kind(**values)
+    if (wrong := _wrong_field(module)) is not None:
+        raise ValueError(wrong)
+    return module
 
 
 def options_of(hint: Any) -> tuple[Any, ...]:
@@ -185,13 +188,6 @@ def restored(value: Any, units: Mapping[str, str]) -> Any:
     return Signal(value, str(units[value])) if isinstance(value, str) and value in units else value
 
 
-def _moderate(value: Any) -> bool:
-    """Return whether no whole number in it is larger than a header may declare."""
-    if isinstance(value, tuple):
-        return all(map(_moderate, value))
-    return not isinstance(value, int) or abs(value) <= limits.PERIODS
-
-
 def _wrong_field(thing: eqx.Module) -> str | None:
     """The first field that is not what its annotation says; array axes of one name must agree."""
     with jaxtyped("context"):
@@ -213,8 +209,9 @@ def _matches(value: Any, hint: Any) -> bool:
         return any(_matches(value, option) for option in arguments)
     if origin is tuple:  # tuple[X, ...], the only form in use
         return isinstance(value, tuple) and all(_matches(x, arguments[0]) for x in value)
-    if hint is int:
-        return isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if hint is int:  # none that is larger than a header may declare
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        return whole and bool(abs(value) <= limits.PERIODS)
     return isinstance(value, hint)
 
 

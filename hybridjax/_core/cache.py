@@ -32,15 +32,15 @@ def enable_compilation_cache(folder: FilePath | None = None) -> pathlib.Path | N
     From then on XLA prints no messages about programs that it loads.
 
     **Arguments:** `folder`: programs are kept in its subfolder `programs`. Loading a program
-    executes it, so a subfolder that other users can write to or exchange, a link, and a copy (such
-    as an unpacked archive) are not used. Default: `$HYBRIDJAX_CACHE`, or `hybridjax` in the user's
-    cache folder (`$XDG_CACHE_HOME` or `~/.cache`).
+    executes it. Therefore the subfolder is not used if other users can write to it or exchange it,
+    if it is a link, or if it is a copy, such as an unpacked archive. Default: `$HYBRIDJAX_CACHE`,
+    or `hybridjax` in the user's cache folder (`$XDG_CACHE_HOME` or `~/.cache`).
 
     **Returns:** the subfolder; `None`, with a warning, if the user's cache folder cannot be used.
     Then nothing is kept.
 
-    **Raises:** `DefinitionError` if a folder that is given, by argument or by `$HYBRIDJAX_CACHE`,
-    cannot be used.
+    **Raises:** `DefinitionError` if the folder of the argument or of `$HYBRIDJAX_CACHE` cannot be
+    used.
     """
     given = folder or os.environ.get("HYBRIDJAX_CACHE")
     try:

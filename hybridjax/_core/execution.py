@@ -25,14 +25,14 @@ from .precision import require_x64
 @checked
 @dataclasses.dataclass(frozen=True)
 class Execution:
-    """How many experiments, or many systems, are run. It changes no result beyond rounding.
+    """Batch size and threads of computations. They change results by rounding errors only.
 
     **Fields:**
 
-    - `batch`: experiments or systems per compiled call, by default what is fastest. Another size
-      compiles another program.
-    - `workers`: threads that run such calls at the same time; by default all cores on CPU, and one
-      on an accelerator.
+    - `batch`: experiments or systems per compiled call. Another size requires another compilation.
+      Default: the size that is usually fastest.
+    - `workers`: threads that run such calls at the same time. Default: all cores on CPU, and one on
+      an accelerator.
     """
 
     batch: ExperimentCount | None = None
@@ -40,7 +40,7 @@ class Execution:
 
     @property
     def threads(self) -> int:
-        """The number of threads that `workers` stands for on this machine."""
+        """The number of threads on this machine: `workers`, or its default."""
         return self.workers or (core_count() if on_cpu() else 1)
 
 

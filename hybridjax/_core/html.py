@@ -115,13 +115,6 @@ class Curve(NamedTuple):
     """Whether it is a set of points and not a line."""
 
 
-def thinned(n: int, share: float = 1.0) -> np.ndarray:
-    """Indices of the samples, of n evenly spaced ones, that are drawn of a curve, or of a part of
-    it that has this share of its points."""
-    few = max(2, int(np.ceil(share * _POINTS)))
-    return np.unique(np.linspace(0, n - 1, min(n, few)).round().astype(int))
-
-
 def unit_circle(
     values: Complex[np.ndarray, " d"], regions: Sequence[Complex[np.ndarray, " _"]] = ()
 ) -> str:
@@ -167,7 +160,8 @@ def picture(
         if log:
             axes.yaxis.set_major_formatter("{x:g}")
         for c, visible in zip(curves, shown, strict=True):
-            k = thinned(len(visible))
+            n = len(visible)
+            k = np.linspace(0, n - 1, min(n, _POINTS)).round().astype(int)
             values = np.where(visible, c.y, np.nan)[k]
             line: dict[str, Any] = {"ls": "", "marker": "o", "ms": 3} if c.points else {"lw": 1}
             color = _INK if c.color == "currentColor" else c.color

@@ -51,9 +51,9 @@ _enabled: bool | None = None
 
 @checked
 def enable_progress(enabled: bool = True) -> None:
-    """Let long calls say what they are doing, wherever standard error goes; with `False`, nowhere.
+    """Print the current step of long calls to standard error, or with `False` do not print it.
 
-    Unless this is called, they do so in terminals and in Jupyter.
+    If this function is not called, steps are printed in terminals and in Jupyter only.
     """
     global _enabled
     _enabled = enabled

@@ -8,7 +8,7 @@ from .executor import Array, namespace
 
 
 class Result(enum.IntEnum):
-    """What became of one trajectory, experiment or solve. `Result.OK` is success."""
+    """Code for the success or the failure of a trajectory, an experiment or a solve."""
 
     OK = 0
     SECTION_MISSED = 1
@@ -30,7 +30,7 @@ class Result(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """One sentence for people."""
+        """The meaning of the code, as a sentence."""
         return _MESSAGES[self]
 
 

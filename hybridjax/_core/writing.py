@@ -10,7 +10,6 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -38,31 +37,6 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.unlink()
 
 
-@contextlib.contextmanager
-def made_folder(folder: Path) -> Iterator[None]:
-    """A context in which the folder exists and can be written. If it was made for this, and an
-    error is raised while it is empty, it is removed, as are those above that were made with it.
-
-    **Raises:** `DefinitionError` if it cannot be made or written, or is a link.
-    """
-    _refuse_link(folder)
-    new = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
-    try:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=folder).close()
-        except OSError as error:
-            raise DefinitionError(
-                f"cannot write to '{folder}': {error.strerror or error}."
-            ) from error
-        yield
-    except BaseException:
-        with contextlib.suppress(OSError):
-            for path in new:
-                path.rmdir()
-        raise
-
-
 def _refuse_link(path: Path) -> None:
     if path.is_symlink():
         raise DefinitionError(
@@ -82,26 +56,29 @@ def results_folder(folder: Path, kind: str, names: Iterable[str] = ()) -> Iterat
     """A new folder for results of this kind, which are moved to `folder` when all are there.
 
     Results of the same kind that are there already are replaced or removed. After an error `folder`
-    is as it was before.
+    is as it was before: folders that were made for it are removed.
 
     **Arguments:** `names`: of results to come, with slashes, so that a refusal comes early.
 
     **Raises:** `DefinitionError` if `folder` cannot be written, or holds a file of one of the names
     of the results that is a link, not on the list, or changed since.
     """
-    with made_folder(folder):
+    _refuse_link(folder)
+    made = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
+    new = folder / temporary_name()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        new.mkdir()
         _refuse_others(folder, names, _listed(folder, kind))
-        new = folder / temporary_name()
-        try:
-            new.mkdir()
-            yield new
-            _put(new, folder, kind)
-        except OSError as error:
-            raise DefinitionError(
-                f"cannot write to '{folder}': {error.strerror or error}."
-            ) from error
-        finally:
-            shutil.rmtree(new, ignore_errors=True)
+        yield new
+        _put(new, folder, kind)
+    except OSError as error:
+        raise DefinitionError(f"cannot write to '{folder}': {error.strerror or error}.") from error
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+        with contextlib.suppress(OSError):  # those that were made in vain: they are empty
+            for path in made:
+                path.rmdir()
 
 
 def _put(new: Path, folder: Path, kind: str) -> None:

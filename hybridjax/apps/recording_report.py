@@ -54,8 +54,9 @@ def write_report(
     """Write all results of a recording into a folder. They appear when all of them are ready.
 
     - `report.html`: everything in one page that needs no other file.
-    - `sections.csv`: deviations of inputs and outputs at the sections. `cycle.csv`: their average.
-    - `htf.npz`, `fit.npz`: for `hj.load`. `summary.json`: the numbers.
+    - `sections.csv`: deviations of inputs and outputs from the average cycle at the sections.
+      `cycle.csv`: the average cycle.
+    - `htf.npz`, `fit.npz`: transfer functions and fit, for `hj.load`. `summary.json`: the numbers.
     - `figures/`: in each of the `formats` of `hj.plot.save`, and as PNG for the page.
 
     Other files in the folder stay as they are. Results of an earlier report are replaced, unless

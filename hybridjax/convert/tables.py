@@ -27,7 +27,7 @@ def to_pandas(thing: Tabular) -> Any:
       `Recording.from_frame` reads one trial of it.
     - `LimitCycles`, `Branch`: a row for each cycle, with its parameters; `multipliers.0`, ...
     - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
-    - Fits: a row for each multiplier, with its standard error; of a `RationalFit` a row for each
+    - Fits: a row for each multiplier, with its standard error. A `RationalFit` gives a row for each
       output and pole.
 
     **Raises:** `DefinitionError` where pandas, or xarray, is not installed.

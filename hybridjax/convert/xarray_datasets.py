@@ -76,9 +76,9 @@ def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> 
 
 @checked
 def from_xarray(dataset: Any) -> Saved:
-    """Return the object of which `to_xarray` made a dataset, bit by bit: one of those that
-    `hj.save` writes. Harmonics, frequencies, experiments, samples and signals may have been
-    selected.
+    """Return the object from which `to_xarray` made a dataset, with the same numbers bit by bit. It
+    must be an object that `hj.save` can write. The dataset may be a selection of harmonics,
+    frequencies, experiments, samples or signals.
 
     **Raises:** `DefinitionError` for other datasets; `PrecisionError` in single precision.
     """

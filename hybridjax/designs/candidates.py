@@ -215,8 +215,8 @@ def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
     The draws are Gaussian with the covariance of the fit; those with a multiplier of modulus one or
     more are discarded.
 
-    **Arguments:** `fit`: from `fit_ldtp`. `count`: number of models. `seed` of the draws.
-    Default: 0.
+    **Arguments:** `fit`: result of `fit_ldtp`. `count`: number of models. `seed`: seed of the
+    draws. Default: 0.
 
     **Raises:** `DefinitionError` if hardly any are stable.
     """

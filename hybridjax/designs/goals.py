@@ -21,9 +21,9 @@ class Multipliers(eqx.Module):
     - `which`: index of a single multiplier, in the order of `model.multipliers`. Default: all of
       them, each conjugate pair once.
     - `part`: `"position"`, real and imaginary parts, or `"modulus"`. Default: `"position"`.
-    - `estimator`: the function that will estimate them. `"fit_multipliers"` leaves all numerators
-      free, `"fit_ldtp"` the matrices of a model with this model's (minimal) dimensions.
-      Default: `"fit_multipliers"`.
+    - `estimator`: the function that will estimate them. The unknowns of `"fit_multipliers"` are the
+      multipliers and all numerators, those of `"fit_ldtp"` the matrices of a model with the
+      (minimal) dimensions of this model. Default: `"fit_multipliers"`.
     - `harmonics`: harmonics that the estimator uses. Default: -2 to 2 for `fit_multipliers`, all
       for `fit_ldtp`.
     - `overhang`: argument of `fit_multipliers`.

@@ -42,9 +42,10 @@ def information_map(
 ) -> InformationMap:
     r"""Find the input frequencies, and the phases of the cycle, that identify multipliers.
 
-    The derivatives of the HTFs by the multipliers' polynomial, less the part that numerators
-    explain, and weighted by their effect on the goal, are a residual $r_m(f)$ for every harmonic,
-    output and cosine; the criterion of the goal is the sum of their squares. A cosine's response at
+    The multipliers are identified by the derivatives of the HTFs with respect to the coefficients
+    of the multipliers' polynomial. Without the part that numerators can explain, and weighted by
+    their effect on the goal, these derivatives are residuals $r_m(f)$ for each harmonic, output and
+    cosine. The criterion of the goal is the sum of squares of the residuals. A cosine's response at
     section n is $\sum_m H_m e^{2 \pi i (f + m) n / N}$, so that by Parseval's theorem
 
     $$\sum_m |r_m(f)|^2 = \frac1N \sum_n \Big|\sum_m r_m(f)\, e^{2 \pi i m n / N}\Big|^2,$$

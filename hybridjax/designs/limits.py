@@ -45,8 +45,8 @@ class Distortion(eqx.Module):
 
     This is the deviation of `(y(u) + y(-u)) / 2` from the cycle, including the mean, up to fourth
     order in the input. It is computed from exact second derivatives, through all events; they
-    compile at the first call, for some ten seconds. Inputs act at all sections; the
-    distortion is the same for all models of a design.
+    compile at the first call, for some ten seconds. The inputs of the system must act at all
+    sections. If a design has several candidate models, the same distortion is used for all.
 
     **Arguments:**
 
@@ -74,16 +74,17 @@ class Limits(eqx.Module):
 
     **Arguments:**
 
-    - `rms`: of inputs, or of outputs (their deviation from the cycle), over all experiments.
-      `"input"` or `"output"` means that none of these may be larger than in the `design` that is
-      improved.
-    - `rate`: rms of the change of an input from one section to the next (not its largest value).
-    - `peak`: of an input, in every experiment. Phases are then optimized for a low peak, and
-      experiments that still exceed it are scaled down. (Such phases are not random: the scatter of
-      realizations does not show nonlinear distortion.)
+    - `rms`: largest rms values of inputs, or of outputs (their deviation from the cycle), over all
+      experiments. `"input"` or `"output"` means that none of these may be larger than in the
+      `design` that is improved.
+    - `rate`: largest rms of the change of an input from one section to the next (not its largest
+      value).
+    - `peak`: largest modulus of an input, in every experiment. Phases are then optimized for a low
+      peak, and experiments that still exceed it are scaled down. (Such phases are not random: the
+      scatter of realizations does not show nonlinear distortion.)
     - `strides`: cycles of all experiments together, without those that are discarded. Default: as
       many as in `design`.
-    - `distortion`: of outputs.
+    - `distortion`: limit of the nonlinear distortion of outputs.
     """
 
     rms: Mapping[str, Level] | Words = eqx.field(default_factory=dict)

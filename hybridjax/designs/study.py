@@ -57,22 +57,22 @@ class Study(eqx.Module):
     study.fit.contains(true)         # confidence regions, valid at the time of stopping
     ```
 
-    The first block is applied as it is, whatever `limit` is. Each later block has the
+    The first block is applied unchanged, also if it exceeds `limit`. Each later block has the
     `optimal_design` for the model fitted to all blocks before it, with the noise estimated from
     these, and as many experiments as are missing, but at most twice the strides so far. While the
     data do not support `order` multipliers, the first block is repeated with new phases. No prior
     knowledge is used except the number of multipliers.
 
-    *Why intervals hold.* The estimate at the end is that of maximum likelihood from all blocks.
-    Inputs and the time of stopping are decided by earlier data only, which changes nothing in the
-    likelihood; the estimate, divided by its estimated standard error, is Gaussian in the limit of
-    many strides (Wu, Biometrika 72, 1985, for designs that depend on estimates; Anscombe, Proc.
-    Camb. Phil. Soc. 48, 1952, and Chow and Robbins, Ann. Math. Stat. 36, 1965, for stopping as soon
-    as an interval of given width is reached). A standard error that is too small by chance would
-    violate this. Therefore the larger of two is used, from the scatter at the lines that matter and
-    from the level of the noise in all of them, and the width of the interval by Student's
-    distribution with its degrees of freedom is compared with the requested precision, as in Stein's
-    two stages (Ann. Math. Stat. 16, 1945).
+    *Why intervals are valid.* The final estimate is the maximum-likelihood estimate from all
+    blocks. Inputs and the time of stopping depend on earlier data only, and therefore do not change
+    the likelihood. The estimation error, divided by the estimated standard error, is Gaussian in
+    the limit of many strides (Wu, Biometrika 72, 1985, for designs that depend on estimates;
+    Anscombe, Proc. Camb. Phil. Soc. 48, 1952, and Chow and Robbins, Ann. Math. Stat. 36, 1965, for
+    stopping as soon as an interval of given width is reached). A standard error that is too small
+    by chance would violate this. Therefore the larger of two standard errors is used: one from the
+    scatter at the lines that determine the multipliers, the other from the mean noise level of all
+    lines. The study stops when the interval by Student's distribution is as narrow as requested, as
+    in Stein's two stages (Ann. Math. Stat. 16, 1945).
 
     A study is immutable: `add` returns a new one. It depends on its arguments and blocks only, so
     that it can be reconstructed from stored data.
@@ -81,12 +81,13 @@ class Study(eqx.Module):
 
     - `first`: the first block; its lines, periods and power are those of all blocks. One input.
     - `order`: the number of multipliers.
-    - `standard_error`: of each multiplier of `goal`, at which to stop (for `"position"` the root of
-      the expected squared distance from the true one).
+    - `standard_error`: the study stops when each multiplier of `goal` has this standard error (for
+      `"position"`, the root of the expected squared distance from the true multiplier).
     - `goal`: the multipliers of interest, estimated by `fit_multipliers`. Default: all.
     - `limit`: as in `optimal_design`, relative to `first`. Default: rms of the input as in `first`.
     - `outputs`: names of outputs that will be recorded and that `limit` names. Default: none.
-    - `seed`: of phases and division of all blocks but the first. Default: 0.
+    - `seed`: seed of the phases, and of the division of lines among experiments, in all blocks but
+      the first. Default: 0.
 
     **Raises:** `DefinitionError` for several inputs, other estimators, and a limit of strides.
     """
@@ -144,7 +145,7 @@ class Study(eqx.Module):
 
     @property
     def plan(self) -> OptimalDesign | None:
-        """The optimal design for the next block; None where that has equal amplitudes."""
+        """The optimal design for the next block, or None if the next block has equal amplitudes."""
         return self._history.plan
 
     @property
@@ -190,9 +191,9 @@ class Study(eqx.Module):
         recordings: `section_data(...).experiments(periods)`). `repeats`: number of last windows
         that are averaged. Default: 1.
 
-        **Raises:** `DefinitionError` for data of other inputs, outputs or sections, and where a
-        transient of the start is larger than a part `standard_error` of the response (cycles before
-        the window show it); as `estimate_htf`, `fit_multipliers` and `optimal_design`.
+        **Raises:** `DefinitionError` for data of other inputs, outputs or sections, and if the
+        initial transient, relative to the response, exceeds `standard_error` (tested if there are
+        cycles before the window); as `estimate_htf`, `fit_multipliers` and `optimal_design`.
         """
         if data.n_sections != self.first.n_sections or len(data.inputs) > 1:
             raise DefinitionError(

@@ -45,7 +45,7 @@ ROUNDING = 4e-15
 
 @checked
 class Settings(eqx.Module):
-    """Accuracy and effort of the flow.
+    """Accuracy, largest number of steps and method of integration of the flow.
 
     The estimated error of a step in state k of chart a is at most
     `rtol * |q[k]| + atol * scale[a, k]`. Defaults of `rtol` and `atol` are those of the call.

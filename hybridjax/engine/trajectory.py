@@ -150,7 +150,7 @@ def simulate(
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of
         each state in the current step, in any unit. Default: 1e-10.
-    - `max_steps`: bound on the number of steps, rounded up to a multiple of that of the settings.
+    - `max_steps`: largest number of steps, rounded up to a multiple of `settings.max_steps`.
         Default: 100 000.
     - `throw`: raise an error if the trajectory ends early. Default: True; with False, its `result`
         has the reason.

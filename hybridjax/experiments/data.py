@@ -154,7 +154,8 @@ class ExperimentData(eqx.Module):
 
     @property
     def failed_at(self) -> Int[np.ndarray, " S"]:
-        """The sample at which an experiment failed, -1 where it did not or is not known."""
+        """The sample at which an experiment failed; -1 if it did not fail, or if the sample is not
+        known."""
         return np.full(len(self.u), -1) if self.simulated is None else self.simulated.failed_at
 
     @property

@@ -21,7 +21,7 @@ from .design.design import DISCARD, Design
 @checked
 @dataclasses.dataclass(frozen=True)
 class ProcessNoise:
-    r"""A random input, held from section to section, that acts beside the excitation and is not
+    r"""A random input, held from section to section, that is added to the excitation and is not
     recorded: at section n of the experiment $\sigma_{n \bmod N} z_n$, where z is a first-order
     autoregressive series (AR(1)) of variance 1.
 
@@ -29,7 +29,7 @@ class ProcessNoise:
 
     - `std`: standard deviation, in units of the inputs; one number, or N of them, by section (the
       noise is then cyclostationary).
-    - `seed`: of the random numbers. Default: 0.
+    - `seed`: seed of the random numbers. Default: 0.
     - `memory`: correlation time in cycles. The correlation of noise k sections apart is
       $e^{-k / (N \tau)}$. The noise is stationary from the start of an experiment on. Default: 0,
       white noise.
@@ -99,12 +99,12 @@ def simulate_experiments(
 
     **Arguments:**
 
-    - `ldtp`: the model. `design`: for the same N and number of inputs.
+    - `ldtp`: the model. `design`: a design with the same N and number of inputs.
     - `start`: "cycle" starts at zero, which is the limit cycle, so that a transient decays during
       the first cycles; "periodic" starts in the periodic response, without a transient.
     - `discard`: cycles before the window of P periods. Default: 20 from the cycle (as in the
       paper), 0 from a periodic start.
-    - `process_noise`: a random input beside the excitation, which is not recorded.
+    - `process_noise`: a random input that is added to the excitation and is not recorded.
 
     **Returns:** `ExperimentData` with `discard + P` cycles.
 
@@ -152,7 +152,7 @@ def add_noise(
     - `snr`: 10 log10 of the ratio of the variances of the outputs' deviations from the cycle (over
       all samples and OK experiments) and of the noise, in dB, for each output.
     - `memory`: correlation time in cycles, as in `ProcessNoise`. Default: 0, white noise.
-    - `seed`: of the random numbers. Default: 0.
+    - `seed`: seed of the random numbers. Default: 0.
 
     **Raises:** `DefinitionError` unless exactly one of `std` and `snr` is given, with a shape that
     fits the outputs and sections.

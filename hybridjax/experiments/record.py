@@ -35,9 +35,9 @@ class Record(eqx.Module):
       units by name.
     - `lead`: y[i] may depend on inputs up to `u[i + lead]`, because of smoothing or of sections
       that depend on later events.
-    - `drift`: number of cycles. The outputs at each section may also contain an unknown part that
-      changes more slowly. Infinite: a constant, such as an error of the subtracted average cycle.
-      None: only the response.
+    - `drift`: number of cycles. The outputs at each section may also contain an unknown drift that
+      is slower than this. Infinite: the drift is a constant, such as an error of the subtracted
+      average cycle. None: no drift.
     """
 
     u: Float[np.ndarray, "n nu"]
@@ -80,7 +80,7 @@ class Record(eqx.Module):
 
     @property
     def records(self) -> tuple["Record"]:
-        """The record itself, so that functions take one record or data of several alike."""
+        """The record itself in a tuple, as `ExperimentData.records` and `SectionData.records`."""
         return (self,)
 
     def part(self, first: Index, stop: Index) -> "Record":

@@ -88,7 +88,7 @@ def run_experiments(
     """Excite the system around its limit cycle and record its outputs at the sections.
 
     The experiments of a batch run in one compiled call, and the batches on all cores. An experiment
-    that fails (a section missed, events in another order, ...) stops there; the others go on.
+    that fails (a section missed, events in another order, ...) stops there; the others continue.
     `hj.experiments.stream_experiments` runs experiments whose records do not fit into memory.
 
     **Arguments:**
@@ -101,9 +101,9 @@ def run_experiments(
         the periodic response that the linearization predicts, which leaves a transient of second
         order in the inputs. "steady" is a state on the periodic response itself, found by Newton's
         method, without a transient. Default: "cycle".
-    - `discard`: number of cycles before the design's periods that are not for estimation. Default:
-        20 from the cycle (as in the paper), 0 from a periodic or steady start.
-    - `process_noise`: a random input beside the excitation, which is not recorded.
+    - `discard`: number of cycles before the design's periods, which are not used for estimation.
+        Default: 20 from the cycle (as in the paper), 0 from a periodic or steady start.
+    - `process_noise`: a random input that is added to the excitation and is not recorded.
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
         every section, relative to their characteristic magnitudes (`LimitCycle.scale`).
         `data.error` estimates the error of each experiment. Default: 1e-9.
@@ -112,7 +112,7 @@ def run_experiments(
     **Returns:** `ExperimentData`. `data.summary()` lists failures with their causes.
 
     **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for an
-    unstable cycle, from which any experiment would run away, and if a steady start is not found.
+    unstable cycle, because experiments would diverge from it, and if a steady start is not found.
     """
     options = Options(start, discard, process_noise, accuracy, execution)
     return prepare(cycle, sections, design, outputs, options).run()

@@ -138,7 +138,7 @@ def stream_experiments(
 
     **Arguments:** those of `run_experiments`, with its keyword arguments as one object, and
 
-    - `options`: for example `hj.experiments.Options(start="periodic")`. Default: its defaults.
+    - `options`: for example `hj.experiments.Options(start="periodic")`. Default: `Options()`.
     - `design`: an array may lie on disk (`numpy.load(file, mmap_mode="r")`).
     - `chunk`: number of experiments per chunk. Default: 640.
     - `store`: a folder, or an address for fsspec ("s3://bucket/records.zarr"), of a Zarr group. It

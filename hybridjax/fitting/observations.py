@@ -37,12 +37,13 @@ Deviations = Annotated[Numbers, Reals("...", sign="positive")]
 class AbstractObservation(eqx.Module):
     """A measurement, for `fit_model`. Subclass it for data of other types.
 
-    **Fields:** `weighted`: whether residuals are in units of their standard deviations (an array,
-    as all fields that may change without another compilation). Residuals should be dimensionless:
-    where there are no standard deviations, divide by the size of the measured values.
+    **Fields:** `weighted`: whether residuals are in units of their standard deviations, as an array
+    (fields that are arrays may change without another compilation). Residuals should be
+    dimensionless: where there are no standard deviations, divide by the size of the measured
+    values.
 
-    For example, multipliers, by the coefficients of their polynomial (the multipliers themselves
-    have no derivative where two meet):
+    The example observes multipliers by the coefficients of their polynomial, because multipliers
+    have no derivative where two of them coincide:
 
     ```python
     class ObservedMultipliers(hj.AbstractObservation):
@@ -63,12 +64,12 @@ class AbstractObservation(eqx.Module):
         """Return the prediction from this limit cycle minus the measurement, weighted.
 
         The method is called under JAX transformations and differentiated in forward mode, once. The
-        parameters of `cycle.system`, `period` and `anchor` have derivatives by the free parameters,
-        and so have results of `linearize` and `place_sections`; `cycle.legs` and `cycle.factors`
-        are NaN, since they would triple the time of compilation. Functions that need concrete
-        values raise an error, such as `cycle.multipliers`. Linearize the cycle instead:
-        `model = hj.linearize(cycle, sections)`, then `model.characteristic_polynomial()` or
-        `hj.spectral_radius(model)`.
+        parameters of `cycle.system`, `period`, `anchor`, and the results of `linearize` and
+        `place_sections` have derivatives with respect to the free parameters. `cycle.legs` and
+        `cycle.factors` are NaN, because computing them would triple the compile time. Functions
+        that need concrete values raise an error, such as `cycle.multipliers`. Linearize the cycle
+        instead: `model = hj.linearize(cycle, sections)`, then `model.characteristic_polynomial()`
+        or `hj.spectral_radius(model)`.
 
         Return NaN or infinity where the system cannot produce the measurement. The fit then takes a
         shorter step, or gives up a guess at which this happens.
@@ -91,7 +92,8 @@ class ObservedHTF(AbstractObservation):
 
     Residuals are real and imaginary parts of $H^{model}_m(f) - H_m(f)$, in units of their standard
     deviations $\sqrt{v/2}$ where the HTFs have variances v, otherwise relative to the rms of each
-    output's HTFs (from all inputs: these should then have units in which they act alike).
+    output's HTFs over all inputs. In the second case, choose units in which the inputs have effects
+    of similar magnitude.
     """
 
     f: Float[Array, " F"]
@@ -135,9 +137,10 @@ class ObservedHTF(AbstractObservation):
 class ObservedSeries(AbstractObservation):
     """Outputs at the sections in experiments that begin on the limit cycle.
 
-    Residuals are differences of the outputs themselves where the data have their values on the
-    cycle (`ExperimentData.cycle_outputs`), else of deviations from the cycle; in units of `std`, or
-    relative to the rms of each output's deviations. Experiments that failed are left out.
+    If the data have the outputs on the cycle (`ExperimentData.cycle_outputs`), residuals are
+    differences of the outputs, otherwise of their deviations from the cycle. Residuals are in units
+    of `std`, or relative to the rms of each output's deviations. Experiments that failed are left
+    out.
     """
 
     u: Float[Array, "S n nu"]

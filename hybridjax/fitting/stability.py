@@ -21,22 +21,22 @@ def spectral_radius(model: LDTP | LimitCycle, smoothing: Probability = 1e-3) -> 
     $$\sum_{j \ge 0} \rho_\epsilon^{-2j}\, \lVert \Phi^j \rVert_F^2 = d / \epsilon$$
 
     for the monodromy matrix $\Phi$ (d, d) and the Frobenius norm. Multipliers have no derivative
-    where two of them meet, and their largest modulus has kinks; $\rho_\epsilon$ is smooth wherever
-    $\Phi \ne 0$, and so is $\lVert\Phi^k\rVert^{1/k}$, but the derivatives of that do not tend to
-    those of the radius. It is biased upwards:
+    where two of them coincide, and their largest modulus has kinks. $\rho_\epsilon$ is smooth
+    wherever $\Phi \ne 0$. ($\lVert\Phi^k\rVert^{1/k}$ is smooth, too, but for large k its
+    derivatives do not converge to those of the spectral radius.) It is biased upwards:
 
     $$\rho / \sqrt{1 - \epsilon/d} \le \rho_\epsilon \le \rho / \sqrt{1 - \kappa^2 \epsilon}$$
 
-    with the condition number $\kappa$ of the eigenvectors (the upper bound where
-    $\kappa^2 \epsilon < 1$). It depends on the section and its coordinates, as the true radius does
-    not. (J. Vanbiervliet, B. Vandereycken, W. Michiels, S. Vandewalle, M. Diehl, The smoothed
-    spectral abscissa for robust stability optimization, SIAM J. Optim. 20, 2009; here for maps.)
+    with the condition number $\kappa$ of the eigenvectors (the upper bound where $\kappa^2 \epsilon
+    < 1$). Unlike the true spectral radius, it depends on the section and its coordinates. (J.
+    Vanbiervliet, B. Vandereycken, W. Michiels, S. Vandewalle, M. Diehl, The smoothed spectral
+    abscissa for robust stability optimization, SIAM J. Optim. 20, 2009; here for maps.)
 
     `LDTP.characteristic_polynomial` is smooth as well, and without bias: trace and determinant are
     $-c_1$ and $(-1)^d c_d$.
 
-    **Arguments:** `model`: from `linearize` or `find_limit_cycle`; of a batch, one at a time
-    (`jax.vmap`). `smoothing`: $\epsilon$, between 0 and 1; the larger, the smoother.
+    **Arguments:** `model`: result of `linearize` or `find_limit_cycle`; for a batch use `jax.vmap`.
+    `smoothing`: $\epsilon$, between 0 and 1; the larger, the smoother.
     """
     power = monodromy(model.A if isinstance(model, LDTP) else model.factors)
     return _smooth_radius(power, jnp.asarray(smoothing, float))

@@ -61,9 +61,10 @@ def estimate_htf(
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
 
-    **Returns:** `HTF` with ascending frequencies, source "estimate". Where a frequency was measured
-    in one realization only, its `variance` is that of noise as strong as in the mean of all others;
-    if that is so at most frequencies, there is no variance, and `power` weights them in fits.
+    **Returns:** `HTF` with ascending frequencies, source "estimate". At a frequency that was
+    measured in one realization only, `variance` is computed from the mean residual of the other
+    frequencies. If most frequencies were measured once, `variance` is that of noise or None, and
+    fits use `power` as weights.
 
     **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines of
     one experiment disturb each other (the message lists the pair); for too few periods or

@@ -130,9 +130,10 @@ def fit_multipliers(
 
     **Arguments:**
 
-    - `htf`: exact or estimated; `htf.select` chooses harmonics. Without variances each output is
-      weighted by its residuals, whose spectrum is modeled as white noise plus noise filtered by the
-      system, and frequencies by the power of their inputs (`htf.power`).
+    - `htf`: exact or estimated; `htf.select` chooses harmonics. Without variances, weights are
+      estimated from the residuals of each output, whose spectrum is modeled as white noise plus
+      noise filtered by the system; frequencies are weighted by the power of their inputs
+      (`htf.power`).
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model whose rank it is.
       `select_order` helps to find it.
     - `overhang`: degree of the numerators beyond d N. Default: N.
@@ -196,10 +197,10 @@ def fit_multipliers(
 def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> MultiplierEstimate:
     r"""Return the Cramer-Rao bound of the multipliers of a known model.
 
-    For independent, circular, Gaussian errors of the HTFs, with all numerators unknown: the inverse
-    of $J^T J$ at the truth, where J is the derivative of the HTFs in units of their standard
-    deviations, less the part that numerators can imitate. It limits the accuracy that an experiment
-    can reach, before the experiment.
+    The errors of the HTFs are independent, circular and Gaussian, and all numerators are unknown.
+    The bound is the inverse of $J^T J$ at the true values, where J is the derivative of the HTFs in
+    units of their standard deviations, projected orthogonally to all changes of the numerators. It
+    limits the accuracy that an experiment can reach, before the experiment.
 
     **Arguments:**
 

@@ -59,11 +59,11 @@ def remove_transient(
 ) -> TransientFit:
     """Fit the decay of the initial condition's response, and subtract it.
 
-    Needs no model. The input has the period P over all of the record, which is longer than P
-    periods, by `skip` at least. If it is longer by several (20, say), the decay is separated from
-    everything that repeats after P periods, distortion included, and any design will do. With
-    fewer, it is separated only from the response at excited lines, so that the design must leave
-    out half of them (`multisine(lines="odd")`).
+    No model is needed. The input must repeat after P periods in the whole record, and the record
+    must be at least `skip` periods longer than P. If it is longer by several (20, say), the decay
+    is separated from everything that repeats after P periods, distortion included, and any design
+    will do. With fewer, it is separated only from the response at excited lines, so that the design
+    must leave out half of them (`multisine(lines="odd")`).
 
     **Arguments:**
 

@@ -303,8 +303,8 @@ def validate(
     white.
 
     For a fit of `fit_ldtp` to series, the errors of predictions one step ahead are tested (Ljung
-    1999): they are white for a true model with any noise that drives the system, if that noise is
-    described. All fields of the result then refer to these predictions.
+    1999): they are white for a true model if the fit also models the noise. All fields of the
+    result then refer to these predictions.
 
     Records with three samples or fewer for each unknown of their initial condition and drift are
     left out: they agree with any model.
@@ -312,9 +312,10 @@ def validate(
     **Arguments:**
 
     - `model`: identified or exact; a `SeriesFit` is simulated as it is.
-    - `data`: as for `fit_series`, preferably not the data of the fit, which always agree too well.
-    - `start`: "free", the default, estimates the state at the start of each record from it; "cycle"
-      takes it as zero. Declared drift of the records is estimated in either case.
+    - `data`: data as for `fit_series`, preferably other data than those of the fit, with which a
+      model always agrees too well.
+    - `start`: "free", the default, estimates the initial state of each record from the record;
+      "cycle" takes it as zero. Declared drift of the records is estimated in either case.
     - `level`: significance level of the tests. Default: 0.01.
 
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few

@@ -25,14 +25,15 @@ from .frequency_response import Harmonics, check_harmonics
 
 @checked
 class Scatter(eqx.Module):
-    r"""What is known of the scatter that `HTF.variance` was estimated from.
+    r"""Degrees of freedom of an estimated `HTF.variance`, and shape of the sample that it was
+    estimated from.
 
     **Arguments:**
 
     - `freedom` (F,): complex degrees of freedom of the variance.
     - `roundness` (M, F, ny, nu): $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ of the residuals d of
-      the realizations, relative to its mean for Gaussian errors: 0 where all lie on a line. None,
-      and ones, are scatter that says nothing but its size.
+      the realizations, relative to its mean for Gaussian errors: 0 if all residuals lie on a line.
+      None (as an array of ones): the shape is not used.
 
     **Raises:** `DefinitionError` for freedom that is not positive, or negative roundness.
     """
@@ -52,11 +53,13 @@ class Scatter(eqx.Module):
     def quantile(self, level: Probability) -> Float[Array, "*M F ny nu"]:
         r"""Quantile of $|\delta H|^2 / v$ at this probability.
 
-        $\nu (\alpha^{-1/\nu} - 1)$, Fisher's $F_{2, 2\nu}$, of $\alpha = (1 - p)(1 + p^2 (w - 1))$
-        for the level p and the roundness w. The shape of the scatter of Gaussian errors is
-        independent of their mean (Basu, Sankhya 1955), so that discs hold as often as they say for
+        The quantile is $\nu (\alpha^{-1/\nu} - 1)$ (Fisher's $F_{2, 2\nu}$). If the roundness w is
+        None, $\alpha = 1 - p$ for the level p, otherwise $\alpha = (1 - p)(1 + p^2 (w - 1))$: the
+        flatter the sample, the larger the quantile. For Gaussian errors the shape of the sample is
+        independent of its mean (Basu, Sankhya 1955). Therefore discs have the stated coverage for
         any w whose mean is one. Errors of equal moduli and random phases lie on a circle around
-        zero: where few of them have a large mean, they lie on an arc, nearly in line.
+        zero. If the mean of a few of them is large, they lie on an arc, nearly on a line, and w is
+        small.
         """
         miss = 1 - level
         if self.roundness is not None:
@@ -215,11 +218,12 @@ class HTF(eqx.Module):
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
 
-        $r^2 = v \ln(1 / (1 - level))$ for a variance $v$ that is known. Where it was estimated from
-        few experiments, discs are larger (`Scatter.quantile`). They are right for complex Gaussian
-        errors, and nearly so where one product of two cosines makes errors of equal moduli, from
-        four realizations on. The true value is the best linear approximation for inputs of the
-        kind that was applied, not the response to infinitely small ones.
+        $r^2 = v \ln(1 / (1 - level))$ for a variance $v$ that is known. If the variance was
+        estimated from few experiments, discs are larger (`Scatter.quantile`). The probability is
+        exact for complex Gaussian errors. With at least four realizations it is nearly exact for
+        errors of equal moduli, as from the distortion by a single product of two cosines. The true
+        value is the best linear approximation for inputs of the kind that was applied, not the
+        response to infinitely small ones.
 
         **Raises:** `DefinitionError` without `variance`.
         """
@@ -247,38 +251,26 @@ class HTF(eqx.Module):
         if is_traced(self.f, u):
             raise DefinitionError("`predict` must know `u` and `f`: call it outside of jit.")
         self.require_sampled("`predict`")
-        values = np.asarray(u)
-        n, nu = values.shape
-        if n == 0 or n % self.n_sections or nu != len(self.inputs):
+        (n, nu), N, u = u.shape, self.n_sections, np.asarray(u)
+        if n == 0 or n % N or nu != len(self.inputs):
             raise DefinitionError(
-                f"`u` has shape {values.shape}, but needs a multiple of {self.n_sections} samples "
-                f"and {len(self.inputs)} columns."
+                f"`u` has shape {u.shape}, but needs a multiple of {N} samples and "
+                f"{len(self.inputs)} columns."
             )
-        mirror = self._mirror()
-        if mirror is None:
-            raise DefinitionError(
-                f"A real response needs harmonics symmetric about 0, not {self.harmonics}."
-            )
-        periods = n // self.n_sections
-        U = np.fft.fft(values, axis=0)
+        # A real system responds to -f with the conjugate of its response to f.
+        mirror = np.array([self._index(-m) for m in self.harmonics])
+        f = np.concatenate([self.f, -np.asarray(self.f)])
+        H = jnp.concatenate([self.H, jnp.conj(self.H[mirror])], axis=1)
+        U, periods = np.fft.fft(u, axis=0), n // N
         lines = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
-        # Each line or its mirror image is among the frequencies: axes of signs, lines, frequencies.
-        f = lines[:, None] / periods * np.array([1, -1])[:, None, None]
-        distance = np.abs(self._circle(np.asarray(self.f) - f))
-        measured = distance.min(axis=2, initial=np.inf) < _SAME_FREQUENCY
-        if not measured.any(axis=0).all():
-            lost = lines[~measured.any(axis=0)][0] / periods
+        distance = np.abs(self._circle(lines[:, None] / periods - f))
+        lost = distance.min(axis=1, initial=np.inf) > _SAME_FREQUENCY
+        if lost.any():
             raise DefinitionError(
-                f"`u` holds the frequency f = {abs(self._circle(lost)):g} cycles per period, where "
-                "the HTFs are not known."
+                f"`u` holds the frequency f = {abs(self._circle(lines[lost][0] / periods)):g} "
+                "cycles per period, where the HTFs are not known."
             )
-        rows = np.where(measured[0], *distance.argmin(axis=2))
-        H = jnp.where(
-            ~measured[0][:, None, None],
-            jnp.conj(self.H[np.array(mirror)][:, rows]),
-            self.H[:, rows],
-        )
-        parts = jnp.einsum("mkij,kj->mki", H, U[lines])
+        parts = jnp.einsum("mkij,kj->mki", H[:, distance.argmin(axis=1)], U[lines])
         places = (lines + periods * np.array(self.harmonics)[:, None]) % n
         Y = jnp.zeros((n, len(self.outputs)), complex).at[places].add(parts)
         return jnp.fft.ifft(Y, axis=0).real
@@ -324,12 +316,6 @@ class HTF(eqx.Module):
         if m not in self.harmonics:
             raise DefinitionError(f"Harmonic {m} is not stored; those are {self.harmonics}.")
         return self.harmonics.index(m)
-
-    def _mirror(self):
-        """The index of the negative of each harmonic, or `None` if one is not stored."""
-        rows = {m % self.n_sections: row for row, m in enumerate(self.harmonics)}
-        mirror = [rows.get(-m % self.n_sections) for m in self.harmonics]
-        return None if None in mirror else mirror
 
 
 def require_distinct(f: Float[np.ndarray, " F"]) -> None:

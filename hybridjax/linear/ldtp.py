@@ -51,8 +51,8 @@ class LDTP(eqx.Module):
     - `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d): the matrices, padded with zeros.
     - `D` (N, ny, nu): feed-through; `None` means zero.
     - `dims` (N,): the true dimension of each `x[n]`; `None` means `d` everywhere.
-    - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`; by default `u`, `y`, or
-      `u0, u1, ...` where there are several.
+    - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`. Default: `u` and `y`, or
+      `u0, u1, ...` for several.
     - `coordinates`: names of the coordinates at each section, for documentation.
 
     **Raises:** `DefinitionError` for shapes, names or dimensions that do not fit, for entries
@@ -135,7 +135,7 @@ class LDTP(eqx.Module):
         padded: dict[str, Any] = {}
         xp = jnp if is_traced(given) else np  # JAX compiles a program for each shape
         for name, blocks in given.items():
-            full, padded[name] = (d if name in "AB" else ny, d if name in "AC" else nu), []
+            full, parts = (d if name in "AB" else ny, d if name in "AC" else nu), []
             for n, block in enumerate(map(xp.asarray, blocks)):
                 shape = after[n] if name in "AB" else ny, dims[n] if name in "AC" else nu
                 if block.shape != shape:
@@ -144,9 +144,8 @@ class LDTP(eqx.Module):
                         f"x[{(n + 1) % len(A)}] {after[n]} coordinates, with {nu} inputs and {ny} "
                         f"outputs: it should be {shape}."
                     )
-                sizes = zip(full, shape, strict=True)
-                padded[name].append(xp.pad(block, [(0, p - q) for p, q in sizes]))
-        padded = {name: xp.stack(blocks) for name, blocks in padded.items()}
+                parts.append(xp.pad(block, [(0, p - q) for p, q in zip(full, shape, strict=True)]))
+            padded[name] = xp.stack(parts)
         return cls(**padded, dims=dims, inputs=inputs, outputs=outputs, coordinates=coordinates)
 
     @property
@@ -180,8 +179,8 @@ class LDTP(eqx.Module):
     ) -> Float[Array, "time d"]:
         """The states that an input leads to.
 
-        **Arguments:** `u` (n, nu), the input from `first_section` on; `x0`, the state there,
-        either padded (d,) or with its true dimension; by default zero.
+        **Arguments:** `u` (n, nu), the input from `first_section` on; `x0`, the state there, either
+        padded (d,) or with its true dimension. Default: zero.
 
         **Returns:** (n + 1, d), padded with zeros, `x0` first.
         """
@@ -245,11 +244,12 @@ class LDTP(eqx.Module):
     def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, computed on the host from the factors `A[n]`.
 
-        Their product is never formed, so that multipliers far below `1e-16` of the largest keep
-        their digits. Zeros are not found by size: they are counted from the dimensions and the
-        ranks of the factors (as by `rank`). A direction that contracts to less than `1e-12` of the
-        others between neighboring sections counts with them, as the print of the model says: more
-        sections show it, or `LimitCycle.multipliers`. Below 1e-308 they are given as 0.
+        The product of the factors is never formed, so that multipliers far below `1e-16` of the
+        largest are accurate. The number of zero multipliers follows from the dimensions and the
+        ranks of the factors (see `rank`), not from a threshold on multipliers. A direction that
+        contracts to less than `1e-12` of the others between neighboring sections counts as a zero
+        multiplier, and the printed model gives the number of these. To resolve it, use more
+        sections, or `LimitCycle.multipliers`. Multipliers below 1e-308 are 0.
 
         **Returns:** (r,) by decreasing modulus, then imaginary part; conjugate pairs are exact.
         """
@@ -276,7 +276,7 @@ class LDTP(eqx.Module):
     def periodic_states(
         self, u: Annotated[Numbers, Reals("S n nu")], periods: PeriodCount
     ) -> Float[Array, "S d"]:
-        """States as of `periodic_state`, for S inputs (S, P N, nu) at once."""
+        """The states of `periodic_state` for S inputs (S, P N, nu)."""
         u = self._input(u)
         if u.shape[1] != periods * self.n_sections:
             raise DefinitionError(

@@ -15,12 +15,15 @@ from ..errors import ComputationError
 
 Matrix = Float[np.ndarray, "_ _"]
 
-# QR sweeps for one eigenvalue; two or three are usual. Fewer: rare ones fail. More: failure takes
-# longer.
-_MOST_SWEEPS = 60
-# Sweeps after which an exceptional shift breaks a cycle of shifts. Fewer: convergence is disturbed.
-# More: a cycle of shifts ends later.
-_EXCEPTIONAL_EVERY = 10
+# Sweeps of the orthogonal iteration. Fewer: moduli that differ by a factor of ten are not told
+# apart, and the smaller one loses digits. More: time for moduli that hardly differ.
+_MOST_SWEEPS = 16
+# Part of a basis that leaves its subspace in one turn, below which it is rounding. Smaller: it
+# hides that a subspace was found. Larger: multipliers lose digits.
+_SETTLED = 1e-14
+# Change of that part from sweep to sweep that is no progress. Smaller: sweeps in vain. Larger:
+# subspaces that are about to be found are missed.
+_STALLED = 4.0
 
 
 def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
@@ -39,21 +42,19 @@ def product_eigenvalues(factors: Sequence[Matrix], rtol: float) -> Complex[np.nd
     """The non-zero eigenvalues of the product, the largest first, conjugate pairs exact. Those that
     are too small for a number are zero.
 
-    The factors are restricted to the range of the product, on which they are square and regular;
-    then the periodic QR algorithm (Bojanczyk, Golub and Van Dooren, "The periodic Schur
-    decomposition", SPIE 1770, 1992) brings them to triangular form together.
+    The factors are restricted to the range of the product, on which they are square and regular.
+    Orthogonal iteration (Golub and Van Loan, *Matrix Computations*, 2013, sec. 7.3) brings them to
+    block triangular form together, eigenvalues of different sizes in different blocks. The product
+    of the blocks is formed: their eigenvalues are similar in size, so that none drowns in others.
 
     **Arguments:** as in `product_rank`.
 
-    **Raises:** `ComputationError` if the QR algorithm does not converge, or for NaN and infinity.
+    **Raises:** `ComputationError` for NaN and infinity.
     """
     regular = _regular_part(_balanced(factors), rtol)
     if not regular:
         return np.zeros(0, complex)
-    triangular = _periodic_schur([factor.astype(complex) for factor in regular])
-    # (By logarithms, lest the product of some be too small or too large for a number.)
-    logarithms = np.sum([np.log(np.diag(factor)) for factor in triangular], axis=0)
-    eigenvalues = _pair_conjugates(np.exp(logarithms))
+    eigenvalues = np.concatenate([*map(_eigenvalues, _diagonal_blocks(regular))])
     return eigenvalues[np.lexsort((-np.imag(eigenvalues), -np.abs(eigenvalues)))]
 
 
@@ -105,102 +106,34 @@ def _regular_part(factors, rtol):
     return []
 
 
-def _rotation(a, b):
-    """The unitary matrix that takes `(a, b)` to `(r, 0)`."""
-    r = np.hypot(abs(a), abs(b))
-    if r == 0:
-        return np.eye(2, dtype=complex)
-    return np.array([[np.conj(a), np.conj(b)], [-b, a]]) / r
+def _diagonal_blocks(factors):
+    """Yield for each block on the diagonal its part of each factor, all unitarily and periodically
+    similar to the given square ones."""
+    d, stalls = len(factors[0]), 0
+    basis, below = np.eye(d), np.full(d - 1, np.inf)
+    for _ in range(_MOST_SWEEPS):
+        start, before, triangles = basis, below, []
+        for factor in factors:
+            basis, triangle = np.linalg.qr(factor @ basis)
+            triangles.append(triangle)
+        turn = start.T @ basis  # the basis after one turn in that before
+        below = np.array([np.linalg.norm(turn[k:, :k]) for k in range(1, d)])
+        settled = below < _SETTLED
+        alike = (below < _STALLED * before) & (before < _STALLED * below)
+        stalls = stalls + 1 if (settled | alike).all() else 0
+        if settled.all() or stalls == 2:
+            break
+    edges = [0, *(1 + np.flatnonzero(settled)), d]
+    for block in map(slice, edges[:-1], edges[1:]):
+        yield [x[block, block] for x in (*triangles, turn)]
 
 
-def _rotate(factors, k, rotation):
-    """Change coordinates `k, k+1` before the first factor; keep all but the last triangular."""
-    pair = slice(k, k + 2)
-    *triangles, hessenberg = factors
-    hessenberg[pair] = rotation @ hessenberg[pair]
-    for triangle in triangles:
-        triangle[:, pair] = triangle[:, pair] @ rotation.conj().T
-        rotation = _rotation(triangle[k, k], triangle[k + 1, k])
-        triangle[pair] = rotation @ triangle[pair]
-        triangle[k + 1, k] = 0
-    hessenberg[:, pair] = hessenberg[:, pair] @ rotation.conj().T
-
-
-def _hessenberg_triangular(factors):
-    """Unitary changes of coordinates: the last factor Hessenberg, all others triangular."""
-    basis = np.eye(len(factors[0]), dtype=complex)
-    reduced = []
-    for factor in factors[:-1]:
-        basis, triangle = np.linalg.qr(factor @ basis)
-        reduced.append(triangle)
-    hessenberg = factors[-1] @ basis
-    reduced.append(hessenberg)
-    for column in range(len(hessenberg) - 2):
-        for row in range(len(hessenberg) - 1, column + 1, -1):
-            rotation = _rotation(hessenberg[row - 1, column], hessenberg[row, column])
-            _rotate(reduced, row - 1, rotation)
-            hessenberg[row, column] = 0
-    return reduced
-
-
-def _shift(factors, low, high, exceptional):
-    """A shift for the product divided by the triangles' `[low, low]`: it may be rough.
-
-    An eigenvalue of the trailing 2 x 2 block; an exceptional one breaks a stall (LAPACK's way).
-    """
-    pair = slice(high - 1, high + 1)
-    *triangles, hessenberg = factors
-    block = hessenberg[pair, pair]
-    with np.errstate(all="ignore"):
-        for triangle in reversed(triangles):
-            block = block @ (triangle[pair, pair] / triangle[low, low])
-    if not np.all(np.isfinite(block)):
-        return 0.0
-    if exceptional:
-        return block[1, 1] + 0.75 * np.abs(block[1, 0])
-    eigenvalues = np.linalg.eigvals(block)
-    return eigenvalues[np.argmin(np.abs(eigenvalues - block[1, 1]))]
-
-
-def _periodic_schur(factors):
-    """Triangular factors, unitarily and periodically similar to the given square ones."""
-    factors = _hessenberg_triangular(factors)
-    hessenberg = factors[-1]
-    eps = np.finfo(float).eps
-    high, stalled = len(hessenberg) - 1, 0
-    while high > 0:
-        size = np.abs(np.diag(hessenberg))
-        small = np.abs(np.diag(hessenberg, -1)) <= eps * (size[:-1] + size[1:])
-        hessenberg[1:, :-1][np.diag(small)] = 0
-        if small[high - 1]:
-            high, stalled = high - 1, 0
-            continue
-        low = high - 1
-        while low > 0 and not small[low - 1]:
-            low -= 1
-        stalled += 1
-        if stalled > _MOST_SWEEPS:
-            raise ComputationError("The periodic QR algorithm did not converge.")
-        shift = _shift(factors, low, high, exceptional=stalled % _EXCEPTIONAL_EVERY == 0)
-        start = (hessenberg[low, low] - shift, hessenberg[low + 1, low])
-        _rotate(factors, low, _rotation(*start))
-        for k in range(low + 1, high):
-            _rotate(factors, k, _rotation(hessenberg[k, k - 1], hessenberg[k + 1, k - 1]))
-            hessenberg[k + 1, k - 1] = 0
-    return factors
-
-
-def _pair_conjugates(eigenvalues):
-    """The eigenvalues of a real matrix, made exactly real or exactly conjugate in pairs."""
-    left = list(eigenvalues)
-    paired = []
-    while left:
-        value = left.pop(int(np.argmax(np.abs(np.imag(left)))))
-        to_others = np.abs(np.conj(value) - np.array(left))
-        if left and to_others.min() < abs(2 * value.imag):
-            partner = left.pop(int(np.argmin(to_others)))
-            mean = (value + np.conj(partner)) / 2
-            paired += [mean, np.conj(mean)]
-        else:
-            paired.append(complex(value.real, 0.0))
-    return np.array(paired)
+def _eigenvalues(factors):
+    """The eigenvalues of a product, which may be too small or too large for a number on its way."""
+    product, exponent = np.eye(len(factors[0])), 0
+    for factor in factors:
+        product = factor @ product
+        digits = int(np.frexp(np.abs(product).max())[1])
+        product, exponent = np.ldexp(product, -digits), exponent + digits
+    values = np.linalg.eigvals(product).astype(complex)
+    return np.ldexp(values.view(float), exponent).view(complex)

@@ -64,12 +64,12 @@ class Mechanism(eqx.Module):
 
     - `kinetic`: T(q, v) -> number, quadratic in v and positive; from a mass matrix,
         `lambda q, v: 0.5 * v @ M(q) @ v`.
-    - `potential`: V(q) -> number, by default 0.
+    - `potential`: V(q) -> number. Default: 0.
 
-    Methods are for one state, in fields, guards, resets and outputs, and are written out as plain
-    operations there: nothing is handed to LAPACK. Where the mass matrix is singular, or not
-    positive, they raise `DefinitionError` for arrays; in fields and resets accelerations and
-    velocities are NaN there: a trajectory ends with `Result.FIELD_NOT_FINITE`.
+    Methods take one state, in fields, guards, resets and outputs. They compile to plain arithmetic
+    operations without LAPACK. If the mass matrix is singular or not positive, methods raise
+    `DefinitionError` for arrays of numbers. In fields and resets they return NaN, and the
+    trajectory ends with `Result.FIELD_NOT_FINITE`.
     """
 
     kinetic: Callable[[Any, Any], Any]
@@ -104,11 +104,12 @@ class Mechanism(eqx.Module):
         force: ArrayLike,
         contact: Callable[[Any], Any],
     ) -> Constrained:
-        """Motion under contacts that hold, with the forces that hold them.
+        """The acceleration while contacts are closed, and the contact forces.
 
-        **Arguments:** `contact`, the coordinates c(q) that stay where they are, k < n independent
-        ones as an array (k,): the position of a foot on the ground, say. States should satisfy c =
-        const. and J v = 0: what they miss stays (c) or grows slowly (by J v) with rounding.
+        **Arguments:** `contact`, a function c(q) that returns the k < n independent coordinates
+        that the contacts fix, as an array (k,): for example the position of a foot on the ground.
+        States should satisfy c = const. and J v = 0. An error in these is not corrected: J v keeps
+        its value up to rounding, and c drifts accordingly.
         """
         mass, (jacobian, drift) = self.mass(q), _moving(contact, q, v)
         pushes = jnp.concatenate([(force - self.bias(q, v))[None], jacobian])
@@ -124,13 +125,12 @@ class Mechanism(eqx.Module):
         contact: Callable[[Any], Any],
         restitution: ArrayLike = 0.0,
     ) -> Impact:
-        """A rigid impact, in which only the contacts give impulses, and q stays.
+        """A rigid impact: impulses act at the contacts only, and q does not change.
 
         M (v+ - v) = J' P and J v+ = -e J v (Y. Hurmuzlu, D. B. Marghitu, Rigid body collisions of
         planar kinematic chains with multiple contact points, Int. J. Robotics Research 13, 1994).
-        Relabeling, where left becomes right, is a permutation of q and of the velocity that is
-        returned. Whether a contact pulls (a negative normal impulse) or would slip can be seen
-        from `impulse`.
+        To exchange left and right after the impact, permute q and the returned velocity. The
+        `impulse` shows whether a contact pulls (a negative normal impulse) or would slip.
 
         **Arguments:** `contact`, the coordinates c(q) of the contacts made, k <= n independent ones
         as an array (k,); `restitution`, e: 0 for a contact that sticks; a number, or k of them.
@@ -141,7 +141,8 @@ class Mechanism(eqx.Module):
         return Impact(v + by_impulse @ impulse, impulse)
 
     def along(self, placement: Callable[[Any], Any]) -> "Mechanism":
-        """The mechanism in fewer coordinates p, of which all others follow: q = placement(p).
+        """The mechanism in fewer coordinates p, which determine the original ones: q =
+        placement(p).
 
         A biped whose coordinates are those of the hip and angles of its links becomes one that
         stands on a foot: `biped.along(lambda angles: [*hip_above_foot(angles), *angles])`.

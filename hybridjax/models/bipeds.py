@@ -144,22 +144,22 @@ class FiveLinkBiped(HybridSystem):
 
     States: absolute angles of the links from the vertical, positive forward, and their rates, of
     the leg that stands (`shin`, `thigh`), the torso, and the leg that swings. The motors, by
-    input-output linearization, hold four virtual constraints: the knee that carries stays bent by
-    `knee`, the torso leans by `lean`, the swing leg mirrors the stance leg, and its knee bends
-    further by up to `lift` while the stance leg (the line from foot to hip) goes from -`stride` to
-    `stride`. Deviations, such as those that the impact makes, decay as exp(-stiffness t). What is
-    left, the rotation about the foot, is driven by the torso's lean. Input `u` is a further torque
-    between torso and swing thigh. A step ends when the swing foot comes down in front: it sticks,
-    the other foot lifts off, and the legs change their names. (That the ground only pushes, and
-    that no foot slips, is not checked.)
+    input-output linearization, hold four virtual constraints: the stance knee stays bent by `knee`,
+    the torso leans by `lean`, the swing leg mirrors the stance leg, and its knee bends further by
+    up to `lift` while the stance leg (the line from foot to hip) goes from -`stride` to `stride`.
+    Deviations, such as those that the impact makes, decay as exp(-stiffness t). The remaining
+    degree of freedom, the rotation about the foot, is driven by the lean of the torso. Input `u` is
+    a further torque between torso and swing thigh. A step ends when the swing foot comes down in
+    front: it sticks, the other foot lifts off, and the legs change their names. (That the ground
+    only pushes, and that no foot slips, is not checked.)
 
-    Where the numbers are from: masses, lengths, centers of mass and inertias are those that public
-    simulation programs give for RABBIT, among them one derived from E. R. Westervelt's and J. W.
-    Grizzle's of 2003; the two publications themselves could not be compared. Inertias are taken
-    about the joints, as in these authors' program of 2001 (which has an earlier set: 20, 6.8 and
-    3.2 kg; 2.22, 1.08 and 0.93 kg m^2); programs of others take the same numbers about the centers
-    of mass. RABBIT's motors, of 3.32e-4 kg m^2 behind gears of 50, and its friction are left out.
-    The virtual constraints, `lean`, `stride`, `knee`, `lift` and `stiffness` are none of theirs.
+    Masses, lengths, centers of mass and inertias are those of RABBIT in public simulation programs,
+    among them one derived from E. R. Westervelt's and J. W. Grizzle's of 2003; the two publications
+    themselves could not be compared. Inertias are taken about the joints, as in these authors'
+    program of 2001 (which has an earlier set: 20, 6.8 and 3.2 kg; 2.22, 1.08 and 0.93 kg m^2);
+    programs of others take the same numbers about the centers of mass. RABBIT's motors, of 3.32e-4
+    kg m^2 behind gears of 50, and its friction are left out. The virtual constraints, with `lean`,
+    `stride`, `knee`, `lift` and `stiffness`, are not from these sources.
 
     C. Chevallereau, G. Abba, Y. Aoustin, F. Plestan, E. R. Westervelt, C. Canudas-de-Wit, J. W.
     Grizzle, RABBIT: a testbed for advanced control theory, IEEE Control Systems Magazine 23(5),

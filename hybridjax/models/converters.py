@@ -11,9 +11,9 @@ from ..systems.transition import Scheduled, Transition
 class BuckConverter(HybridSystem):
     """A switch, a coil and a capacitor, and a comparator that closes the switch.
 
-    States: voltage `v` at the load, current `i` of the coil (it never rests: continuous
-    conduction), and the voltage `ramp` with which the amplified error is compared. The ramp starts
-    anew once a period; that is a scheduled event. Input `u` is added to the reference voltage.
+    States: voltage `v` at the load, current `i` of the coil (which never vanishes: continuous
+    conduction), and the voltage `ramp` with which the amplified error is compared. A scheduled
+    event resets the ramp once a period. Input `u` is added to the reference voltage.
 
     E. Fossas, G. Olivar, Study of chaos in the buck converter, IEEE Trans. Circuits and Systems I
     43, 1996, whose parameters these are.
@@ -67,15 +67,15 @@ class BuckConverter(HybridSystem):
 class CukConverter(HybridSystem):
     """A clock closes the switch, and the sum of both coils' currents opens it at a reference.
 
-    States: current `i1` of the coil at the supply, voltage `v1` of the capacitor that carries the
-    energy over, current `i2` of the coil at the load, and the load's voltage `v2` (of opposite sign
-    to the supply, here counted as positive). While the switch is open the diode conducts, to the
-    end (continuous conduction). Input `u` is added to the reference current.
+    States: current `i1` of the coil at the supply, voltage `v1` of the capacitor that transfers the
+    energy, current `i2` of the coil at the load, and the load's voltage `v2` (of opposite sign to
+    the supply, here counted as positive). While the switch is open, the diode conducts all the time
+    (continuous conduction). Input `u` is added to the reference current.
 
     S. Ćuk, R. D. Middlebrook, A new optimum topology switching dc-to-dc converter, IEEE Power
     Electronics Specialists Conference, 1977; under such control, beyond its stable cycle: C. K.
     Tse, W. C. Y. Chan, Chaos from a current-programmed Ćuk converter, Int. J. Circuit Theory and
-    Applications 23, 1995. The parameters are of a usual size, and from neither.
+    Applications 23, 1995. The parameters have typical values, which are from neither source.
     """
 
     input_units = ("A",)

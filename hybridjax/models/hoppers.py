@@ -120,7 +120,7 @@ class CompliantHopper(VerticalHopper):
         )
 
     def guess(self):
-        """The hopper's, where the ground carries the foot."""
+        """The guess of `VerticalHopper`, with the foot where the ground carries it."""
         return Guess("contact", (2.0, 1.9, -1e-4, 0.0), 0.5)
 
 
@@ -166,7 +166,7 @@ class PairStanding(Chart):
 
 
 class HopperPair(VerticalHopper):
-    """Two equal hoppers, a vertical spring between their bodies; the second actuator runs behind.
+    """Two equal hoppers whose bodies are joined by a spring; the second actuator lags behind.
 
     Inputs are a force on each body. A touchdown multiplies the speed of the body above it by
     `retention`.
@@ -207,5 +207,6 @@ class HopperPair(VerticalHopper):
         return Transition(name, _PAIR_CHARTS[down], _PAIR_CHARTS[after], guard, reset=reset)
 
     def guess(self):
-        """Each as if it were alone: the first is about to lift off, the other comes down."""
+        """The states of two uncoupled hoppers: the first is about to lift off, the second is
+        falling."""
         return Guess("first", (2.0, 1.9, 1.6, -0.2, 0.55, -2.7), 0.5)

@@ -42,9 +42,9 @@ class AdExNeuron(DrivenNeuron):
     tau w' = a (v - EL) - w, reset to v = EL, w + b at v = peak.
 
     States: potential `v` of the membrane, and adaptation current `w`. The current I(t) = current +
-    amplitude cos(2 pi t / T) calls for one spike a period. Once the exponential has taken over, v
-    would be infinite after C / gL exp(-(v - threshold) / slope): 3.5e-4 ms from `peak` on. (The
-    paper's peak of 20 mV comes so late in it that double precision does not tell its time.)
+    amplitude cos(2 pi t / T) causes one spike in each period. When the exponential term dominates,
+    v becomes infinite within a time of C / gL exp(-(v - threshold) / slope), which is 3.5e-4 ms at
+    `peak`. (At the paper's peak of 20 mV, this time is too short for double precision.)
 
     R. Brette, W. Gerstner, Adaptive exponential integrate-and-fire model as an effective
     description of neuronal activity, J. Neurophysiology 94, 2005, whose parameters these are, but
@@ -86,7 +86,7 @@ class IzhikevichNeuron(DrivenNeuron):
     """v' = 0.04 v^2 + 5 v + 140 - w + I(t) + u, w' = a (b v - w), reset to v = c, w + d at v = 30.
 
     States: potential `v` of the membrane, and its recovery `w` (u in the paper). The current I(t) =
-    current + amplitude cos(2 pi t / T) calls for one spike a period.
+    current + amplitude cos(2 pi t / T) causes one spike in each period.
 
     E. M. Izhikevich, Simple model of spiking neurons, IEEE Trans. Neural Networks 14, 2003, whose
     parameters for regular spiking these are.

@@ -44,10 +44,12 @@ class Duffing(HybridSystem):
 
 
 class Mathieu(HybridSystem):
-    """x'' + 2 c x' + (delta + epsilon cos t) x = u, with the period 2 pi; its cycle is rest.
+    """x'' + 2 c x' + (delta + epsilon cos t) x = u, with the period 2 pi; its cycle is the
+    equilibrium x = 0.
 
     At delta = 0.25, epsilon = 0.1 both multipliers are negative: no real N-th root of the monodromy
-    exists, and the argument of a multiplier does not say how often the state went round.
+    matrix exists, and the argument of a multiplier does not determine the number of revolutions of
+    a deviation.
 
     A. H. Nayfeh, D. T. Mook, Nonlinear oscillations, Wiley 1979, Ch. 5.
     """
@@ -149,8 +151,8 @@ class BeltOscillator(HybridSystem):
 
     States: extension `x` of the spring and speed `v`. Dry friction decreases with the speed
     relative to the belt. On the belt (chart "sticks") both sides push towards the same speed
-    (`hj.sliding`). Every start that comes to stick leaves the belt at x = friction / k: all
-    multipliers are zero. Input `u` is a force.
+    (`hj.sliding`). After sticking, the block always leaves the belt at x = friction / k, so that
+    all multipliers are zero. Input `u` is a force.
 
     R. I. Leine, D. H. van Campen, A. de Kraker, L. van den Steen, Stick-slip vibrations induced by
     alternate friction models, Nonlinear Dynamics 16, 1998.
@@ -194,7 +196,7 @@ class ChuaCircuit(HybridSystem):
     `y` of both capacitors, and current `z` of the coil, without dimensions.
 
     T. Matsumoto, L. O. Chua, M. Komuro, The double scroll, IEEE Trans. Circuits and Systems 32,
-    1985, in whose dimensionless form it stands. Their double scroll is at alpha = 9; at alpha = 8,
+    1985, the source of this dimensionless form. Their double scroll is at alpha = 9; at alpha = 8,
     before its periods double, there is a cycle around either of two equilibria.
     """
 

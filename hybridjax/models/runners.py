@@ -114,14 +114,15 @@ class TwoLeggedBar(HybridSystem):
 
 
 class TrottingQuadruped(TwoLeggedBar):
-    """A bar on four legs, of which a diagonal pair lands at once, and then the other.
+    """A trotting bar on four legs: both legs of a diagonal pair land at the same time.
 
-    Seen from the side both pairs are the same, so that a hop is a cycle, and two of them a stride.
-    Legs of the pair in turn lengthen and shorten by A sin(2 pi t / T). States and input as those of
-    `TwoLeggedBar`; nothing is lost at touchdown (rho = 1), but legs damp. While both feet of a pair
-    stand, a reflex adds `thrust` to the force of the legs. Without it, the order in which the feet
-    land has no effect of first order, and the cycle has multipliers; with it, each order has a
-    derivative of its own (`hj.coincidences`), and `find_limit_cycle` says so.
+    In the side view both pairs are the same, so that one hop is a cycle, and two hops are a stride.
+    Actuators lengthen the legs of the pair that lands next by A sin(2 pi t / T). States and input
+    as those of `TwoLeggedBar`; nothing is lost at touchdown (rho = 1), but legs damp. While both
+    feet of a pair stand, a reflex adds `thrust` to the force of the legs. Without it, the order in
+    which the feet land has no effect of first order, and the cycle has multipliers; with it, each
+    order has a derivative of its own (`hj.coincidences`), and `find_limit_cycle` raises an error
+    that reports this.
 
     The body on springy legs is that of `bar.py`. Events that coincide on its cycle make the flow
     piecewise differentiable: S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen,

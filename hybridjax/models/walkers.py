@@ -103,8 +103,8 @@ class CompassGait(HybridSystem):
 
     States: angles `n` of the swing leg and `s` of the stance leg from the vertical, and their rates
     `vn`, `vs`. Input `u` is a hip torque (+u on n, -u on s). At heelstrike the legs change their
-    names. The guard is zero right after that and moves down, away from its event: only when it has
-    been positive, past the scuff, may it fire.
+    names. The guard is zero right after heelstrike, and then negative. It is armed only once it has
+    been positive, after the feet have scuffed past each other.
 
     A. Goswami, B. Thuilot, B. Espiau, A study of the passive gait of a compass-like biped robot,
     Int. J. Robotics Research 17(12), 1998.

@@ -178,7 +178,8 @@ def continuation(
 
     **Arguments:**
 
-    - `cycle`: the first cycle. Its own value of the parameter lies within the values.
+    - `cycle`: the first cycle. The value of the parameter in its system lies between the first and
+      the last of `values`.
     - `parameter`: the name of a parameter of the system, or of a part of the system with dots, such
         as `"leg.k"`.
     - `values`: two or more numbers, ascending or descending. The branch ends at the first and the

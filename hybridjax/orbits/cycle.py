@@ -56,8 +56,8 @@ class LimitCycle(eqx.Module):
     **Fields:**
 
     - `period`: in the system's unit of time, for all `multiplicity` rounds together.
-    - `anchor`: the point (a lane) at which the cycle begins, on the section `base` (a clock section
-        at `anchor.t` if `base` is `None`).
+    - `anchor`: the time, chart and state at which the cycle begins, on the section `base` (a clock
+        section at `anchor.t` if `base` is `None`).
     - `legs`: states at the beginnings of the K pieces into which the cycle is divided.
     - `factors`: Jacobians of the flow over the pieces, padded with zeros. The valid block of
         `factors[n]` is [:dims[n+1], :dims[n]].
@@ -108,14 +108,14 @@ class LimitCycle(eqx.Module):
 
     @property
     def structure(self) -> Structure:
-        """The system by the indices of its charts and transitions. (Made anew: it holds values of
-        one trace that are invalid in the next.)"""
+        """The system in its normal form, with indices of charts and transitions. (It is computed at
+        each access, because JAX tracers of an earlier trace are invalid in the next.)"""
         return self.return_map.structure
 
     @property
     def scale(self) -> dict[str, float]:
-        """The size of each state on the cycle, by name, unless it was given: errors are judged
-        relative to it."""
+        """Magnitude of each state, by name, relative to which errors are measured: the given one,
+        or the largest on the cycle."""
         _require_values(self, "scale")
         return sizes_of(self.structure, self.return_map.scale)
 
@@ -134,11 +134,12 @@ class LimitCycle(eqx.Module):
     def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, by decreasing modulus (on the host).
 
-        Computed from the factors without forming their product, so that small ones are accurate;
-        if a piece contracts so much that they drown in rounding, from single steps of one more
-        turn. Zeros that stem from resets and sections are counted by rank and left out; 0 stands
-        for values below 1e-308, or with an implicit method, whose steps lose them, below 1e-10.
-        Each conserved quantity that the cycle was selected by has a multiplier of exactly 1.
+        They are computed from the factors without forming their product, so that small multipliers
+        are accurate. If a factor contracts too strongly for double precision, the Jacobians of
+        single steps of another period are used. Multipliers that are zero because of resets and
+        sections are identified by rank and left out. A 0 represents values below 1e-308 or, with an
+        implicit method, below 1e-10. Each conserved quantity with a given value has a multiplier of
+        exactly 1.
         """
         _require_values(self, "multipliers")
         # The factors in sizes of the states, without padding.
@@ -168,9 +169,9 @@ class LimitCycle(eqx.Module):
     def log_multipliers(self) -> Float[np.ndarray, " r"]:
         """Natural logarithms of the moduli of `multipliers`.
 
-        One that is below 1e-308 follows by Liouville's formula if the cycle has no events: the sum
-        of all is the divergence of the field, integrated over one turn. Otherwise it is minus
-        infinity."""
+        The logarithm of a multiplier below 1e-308 follows from Liouville's formula if the cycle has
+        no events: the sum of all logarithms is the integral of the divergence of the vector field
+        over a period. Otherwise it is minus infinity."""
         with np.errstate(divide="ignore"):
             logs = np.log(np.abs(self.multipliers))
         if not self.event_sequence and np.sum(np.isneginf(logs)) == 1:

@@ -133,9 +133,10 @@ def find_limit_cycles(
 ) -> LimitCycles:
     """Find the limit cycles of many systems that differ in their parameters.
 
-    Newton's method first solves a few of them in parallel, from the guess. Each further call solves
-    as many as are done, from the cycles of their neighbors. Systems for which it fails are
-    simulated for 40 periods, and Newton's method starts again from the end.
+    Newton's method first finds the cycles of a few systems in parallel, from the guess. Each
+    further round doubles the number of solved systems, with the cycles of neighboring systems as
+    guesses. If Newton's method fails for a system, the system is simulated for 40 periods, and
+    Newton's method starts again from the final state.
 
     **Arguments:**
 

@@ -57,8 +57,8 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     """Draw for each signal the average cycle, the deviations from it, and the input's spectrum.
 
     Left: the average cycle. Middle: deviations against phase, gray, with twice their standard
-    deviation. Right: the power of inputs against frequency, for outputs the deviation from cycle to
-    cycle, at the section where it is largest.
+    deviation. Right: for an input, its power against frequency; for an output, its deviations in
+    successive cycles, at the section where they are largest.
     """
     N, nu = data.n_sections, len(data.inputs)
     names = data.inputs + data.outputs
@@ -195,10 +195,11 @@ def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | Non
     """Measured and simulated outputs, and correlations of the residuals; one row per output.
 
     Left: the last cycles of the first record. Middle: correlations of the residuals with earlier
-    ones, right: with earlier inputs. Bars are their means over all sections, in units of their
-    standard deviation; beyond the shaded band lie 1 % of them where there is no correlation.
+    ones, right: with earlier inputs. Bars are means of the correlations over all sections, in units
+    of their standard deviation. If there is no correlation, 1 % of the bars lie outside of the
+    shaded band.
 
-    **Arguments:** `cycles` to show. Default: 4.
+    **Arguments:** `cycles`: number of cycles to show. Default: 4.
     """
     N, ny = found.n_sections, len(found.outputs)
     shown = slice(max(len(found.measured) - cycles * N, 0), None)

@@ -21,8 +21,8 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
     """The spectrum of an optimal design, and of the usual one, below |H_0| of all outputs.
 
     Above: |H_0|, each relative to its largest value. Below: the amplitude of each line (the root of
-    twice its power over all experiments), of all inputs together; three decades of it. Lines that
-    no experiment holds are not drawn.
+    twice its power over all experiments), of all inputs together, over three decades. Lines that no
+    experiment excites are not drawn.
 
     **Raises:** `DefinitionError` for a model of other signals.
     """
@@ -59,12 +59,12 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
 
 @checked
 def information(found: InformationMap, *, ax: AxesLike | None = None) -> Plot:
-    """Draw the phases and frequencies at which an experiment learns: one row per output.
+    """Draw the phases and frequencies that contribute information: one row per output.
 
-    Left: how dense the information is over input frequency and the phase at which the output is
-    measured, relative to the mean (of all outputs together). Right: over the phase alone,
-    whose mean over all phases is the output's share of the whole (gray). The band shown holds nine
-    tenths of the information.
+    Left: density of the information over the input frequency and the phase at which the output is
+    measured, relative to its mean over all outputs. Right: density over the phase alone; its mean
+    (gray) is the output's share of the information. The band shown holds nine tenths of the
+    information.
     """
     ny, _, N = found.share.shape
     lines = np.rint(found.f * found.periods).astype(int)
@@ -108,11 +108,11 @@ def strides(
 ) -> Plot:
     """The standard error against the number of strides, on logarithmic axes.
 
-    Lines are bounds: of the usual design (equal amplitudes) and of the optimal one. Points are what
-    studies found after each of their blocks; the first ones have equal amplitudes. With several
-    quantities, the root of the sum of their squares.
+    Lines are bounds for the usual design (equal amplitudes) and for the optimal one. Points are
+    standard errors of studies after each block; the first block has equal amplitudes. For several
+    quantities, the root of the sum of squares is drawn.
 
-    **Arguments:** `studies`: by the label that they get, one or several.
+    **Arguments:** `studies`: by label, one study or several.
 
     **Raises:** `DefinitionError` for a study without a block.
     """

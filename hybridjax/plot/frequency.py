@@ -35,12 +35,12 @@ def magnitude(
 ) -> Plot:
     """|H_m| of one output against the input frequency, on a logarithmic scale.
 
-    One color per |m|, dashed for negative m. Exact HTFs lie as broad pale lines under the
-    estimates, wherever they stand in the arguments. HTFs with a variance have a band that holds
-    the true value at each frequency with a probability of 95 %.
+    One color per |m|, dashed for negative m. Exact HTFs are drawn as broad pale lines under the
+    estimates, in any order of the arguments. HTFs with a variance have a band that holds the true
+    value at each frequency with a probability of 95 %.
 
-    **Arguments:** `output`, `input`: names or indices. `decades`: how far below the largest
-    value the scale reaches. `ax`: by default a new figure.
+    **Arguments:** `output`, `input`: names or indices. `decades`: how far below the largest value
+    the scale reaches. `ax`: Axes. Default: a new figure.
 
     **Raises:** `DefinitionError` for an output, input or harmonic that is not there.
     """
@@ -78,9 +78,9 @@ def harmonics(
 ) -> Plot:
     """The paper's Fig. 3: |H_m|, one row per output and one column per section family.
 
-    **Arguments:** `families`: by name, an HTF or several (estimate and exact), all with the same
-    outputs. `harmonics`, `input` and `decades` as in `magnitude`; a row shares one
-    scale.
+    **Arguments:** `families`: by the name of the family, an HTF or several (estimate and exact),
+    all with the same outputs. `harmonics`, `input` and `decades` as in `magnitude`; a row shares
+    one scale.
     """
     columns = _columns(families)
     outputs = next(iter(columns.values()))[0].outputs
@@ -110,12 +110,12 @@ def bode(
 
     **Arguments:**
 
-    - `htfs`: exact ones lie as broad pale lines under the estimates, and those with a variance
-      have bands that hold the true values with a probability of 95 %; their phase is drawn where
-      it is known, which it is not where the band reaches down to zero.
-    - `fits`: of this harmonic, drawn over the band of the HTFs.
-    - `outputs`: names; by default all. One color each.
-    - `ax`: two Axes, for magnitude and phase; by default a new figure.
+    - `htfs`: exact HTFs are drawn as broad pale lines under the estimates. HTFs with a variance
+      have bands that contain the true values with a probability of 95 %. Their phase is not drawn
+      where the band of the magnitude contains zero.
+    - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs.
+    - `outputs`: names of outputs, one color for each. Default: all.
+    - `ax`: two Axes, for magnitude and phase. Default: a new figure.
 
     **Raises:** `DefinitionError` for a name or harmonic that is not there.
     """
@@ -169,7 +169,8 @@ def bodes(
 ) -> Plot:
     """The paper's Fig. 4: a Bode plot of one harmonic with its fits, one column per family.
 
-    **Arguments:** `families` and `fits`: by the same names; the others as in `bode`.
+    **Arguments:** `families` and `fits`: HTFs and fits by the name of the section family. The other
+    arguments are those of `bode`.
 
     **Raises:** `DefinitionError` for fits of a family that is not there.
     """

@@ -71,24 +71,11 @@ def _load_backend() -> None:
 def style() -> contextlib.AbstractContextManager:
     """The package's look, for figures of your own: `with hj.plot.style(): ...`.
 
-    Functions of this module use it when they make the figure; on Axes that they are given they
-    leave fonts and sizes alone. Global settings of matplotlib are never changed.
+    Functions of this module use it for figures that they create; they do not change the fonts and
+    sizes of given Axes. Global settings of matplotlib are never changed.
     """
     _load_backend()
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
-
-
-def new_figure(
-    rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float = 2.6, **options
-) -> tuple[Figure, np.ndarray]:
-    """A figure and its array of Axes (rows, columns)."""
-    figure, axes = pyplot.subplots(
-        rows, columns, figsize=(width, height), layout="constrained", squeeze=False, **options
-    )
-    for ax in axes.ravel():
-        # Said here, since ticks are chosen when the figure is drawn, in whatever style then.
-        ax.tick_params(labelsize=_STYLE["xtick.labelsize"])
-    return figure, axes
 
 
 Resolution = Annotated[int, Whole(10, 10_000)]
@@ -121,14 +108,21 @@ class Plot:
 
 
 @contextlib.contextmanager
-def panels(ax: AxesLike | None, rows: int = 1, columns: int = 1, **options):
+def panels(
+    ax: AxesLike | None, rows: int = 1, columns: int = 1, *,
+    width: float = COLUMN, height: float = 2.6, **options,
+):  # fmt: skip
     """The grid of Axes that is given, or a new one in the package's style, (rows, columns).
 
     **Raises:** `DefinitionError` for another number of Axes.
     """
     if ax is None:
+        size: Any = {"figsize": (width, height), "layout": "constrained", "squeeze": False}
         with style():
-            yield new_figure(rows, columns, **options)[1]
+            axes = pyplot.subplots(rows, columns, **size, **options)[1]
+            for panel in axes.flat:  # here, since ticks are made when the figure is drawn
+                panel.tick_params(labelsize=_STYLE["xtick.labelsize"])
+            yield axes
         return
     axes = np.asarray(ax, dtype=object)
     if not all(isinstance(panel, Axes) for panel in axes.flat):
@@ -161,7 +155,7 @@ def save(
 ) -> tuple[Path, ...]:
     """Write a figure, in one file for each format.
 
-    **Arguments:** `path` without suffix (that of a format is dropped); `plot`, or any figure or
+    **Arguments:** `path` without suffix (a suffix of a format is dropped); `plot`, or any figure or
     Axes of matplotlib; `formats`, of "png", "pdf" and "svg"; `dpi` of a PNG.
 
     **Returns:** the paths.

@@ -38,14 +38,14 @@ def cycle(
 ) -> Plot:
     """The limit cycle in the plane of two states or outputs, colored by chart.
 
-    Events are marked by dots, resets that move the point by dashed lines, sections by short bars:
-    along the section where it is a curve in this plane (its level depends on x and y only),
-    across the orbit elsewhere.
+    Events are marked by dots, resets that move the point by dashed lines, sections by short bars. A
+    bar lies along the section if this is a curve in the plane (its level depends on x and y only),
+    otherwise across the orbit.
 
     **Arguments:**
 
-    - `x`, `y`: names of states or outputs; by default the first two states that every chart has.
-    - `sections`: from `place_sections`, drawn as bars; about 8 are numbered, where there is room.
+    - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
+    - `sections`: from `place_sections`, drawn as bars; about 8 are numbered.
     - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
     - `ax`: where to draw; a new figure of one column's width by default.
 
@@ -78,7 +78,7 @@ def cycle(
         panel.margins(0.08)
         panel.locator_params(axis="x", nbins=6)
         if sections is not None:
-            _sections(panel, s, sections, (x, y), np.stack([px, py], axis=1))
+            _sections(panel, s, sections, (x, y), center)
         if perturbed is not None:
             panel.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
         panel.set_xlabel(axis_of(x))
@@ -158,21 +158,17 @@ def _text(ax: Axes, text: str, point, center) -> None:
     )  # fmt: skip
 
 
-def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit) -> None:
+def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> None:
     figure: Any = ax.get_figure(root=True)
     width, height = ax.get_position().size * figure.get_size_inches()
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
-    taken = orbit[np.isfinite(orbit).all(axis=1)] / unit  # where no number may stand
     bars, step = [], max(1, round(placed.n_sections / 8))
     for i, (point, along) in enumerate(_meetings(s, placed, names, unit)):
         bars.append(np.stack([point - _BAR * along, point + _BAR * along]))
-        if i % step == 0:
-            ends = np.stack([point - 2 * _BAR * along, point + 2 * _BAR * along]) / unit
-            room = np.linalg.norm(ends[:, None] - taken, axis=2).min(axis=1)
-            if room.max() > _BAR:
-                end = ends[np.argmax(room)]
-                ax.text(unit[0] * end[0], unit[1] * end[1], str(i), **_NUMBER)
-                taken = np.concatenate([taken, end[None]])
+        if i % step == 0:  # at the end of the bar that is outside of the loop
+            outwards = np.sign(along / unit @ ((point - center) / unit)) or 1.0
+            x, y = point + 2 * _BAR * outwards * along
+            ax.text(x, y, str(i), **_NUMBER)
     bars = np.stack(bars)
     gaps = np.full((len(bars), 1), np.nan)
     flat = [np.hstack([bars[..., k], gaps]).ravel() for k in (0, 1)]

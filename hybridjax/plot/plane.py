@@ -107,8 +107,9 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
                     panel.plot(p.real, p.imag, marker="x", label=f"poles, {family}", **line)
                     panel.plot(z.real, z.imag, marker="o", label=f"zeros, {family}", **line)
             poles = np.concatenate([fit.poles[i] for fit in fits.values()])
-            zeros = np.concatenate([fit.zeros[i] for fit in fits.values()])
-            _limits(lower, *_near(poles, zeros[np.isfinite(zeros)]))
+            center = np.real(poles).mean()
+            reach = 1.5 * np.abs(poles - center).max() or 1.0
+            lower.set(xlim=(center - reach, center + reach), ylim=(-reach, reach))
             upper.set_aspect("equal", adjustable="datalim")
             (x0, x1), (y0, y1) = lower.get_xlim(), lower.get_ylim()
             upper.indicate_inset((x0, y0, x1 - x0, y1 - y0), edgecolor="black")
@@ -122,14 +123,6 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
         )  # fmt: skip
         letters(axes)
     return Plot(axes)
-
-
-def _near(poles: np.ndarray, zeros: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the real and imaginary parts of the poles and of the zeros close to them."""
-    center = np.real(poles).mean()
-    reach = np.abs(poles - center).max()
-    points = np.concatenate([poles, poles.conj(), zeros[np.abs(zeros - center) <= 2 * reach]])
-    return np.real(points), np.imag(points)
 
 
 def _values(source: Any) -> np.ndarray:
@@ -190,9 +183,3 @@ def _unit_circle(ax: Axes) -> None:
 
 def _complex_axes(ax: Axes, symbol: str) -> None:
     ax.set(xlabel=rf"$\mathrm{{Re}}\,{symbol}$", ylabel=rf"$\mathrm{{Im}}\,{symbol}$")
-
-
-def _limits(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
-    for setter, values in ((ax.set_xlim, x), (ax.set_ylim, y)):
-        margin = 0.15 * (np.ptp(values) or 1.0)
-        setter(values.min() - margin, values.max() + margin)

@@ -72,8 +72,8 @@ def advise(
 
     **Arguments:** `data`: the data at the sections. `fit`: the result of `fit_series`.
     `validation`: a validation on held-out strides, whose tests are reported. `findings`: findings
-    of an inspection, which come first. `curve`: the phase response curve of events alone, whose
-    warnings come last. Default: None.
+    of an inspection, which come first. `curve`: a phase response curve estimated from events alone;
+    its warnings come last. Default: None.
     """
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)

@@ -80,11 +80,12 @@ class Split(NamedTuple):
 
 @checked
 def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) -> int:
-    """Return the number of multipliers that predicts best what it was not fitted to.
+    """Return the number of multipliers that predicts held-out strides best.
 
-    For each number a first, consistent estimate (total least squares) is made without the held-out
-    strides (see `hold_out`), which it then simulates. The result is the smallest number whose
-    misfit is within 2 % of the best. Of long recordings the first 1000 cycles are used.
+    For each number, the model is estimated by total least squares (which is consistent) without the
+    held-out strides (see `hold_out`), and then simulates these strides. The result is the smallest
+    number whose misfit is within 2 % of the best. At most the first 1000 cycles of a recording are
+    used.
 
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
@@ -93,10 +94,10 @@ def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) 
 
 @checked
 def hold_out(data: SectionData, order: Order, share: Probability = 0.25) -> HeldOut:
-    """Fit all but the last `share` of every record, and validate the fit on that.
+    """Fit all but the last `share` of every record, and validate the fit on this part.
 
-    Of records whose end would be shorter than twelve cycles, a `share` is held out whole. Of long
-    recordings the first 1000 cycles are used.
+    If this part of a record would be shorter than twelve cycles, whole records are held out
+    instead, a `share` of them. At most the first 1000 cycles of a recording are used.
 
     **Raises:** `DefinitionError` if too few cycles are left for either.
     """

@@ -65,12 +65,12 @@ def impulse_responses(
 
     **Arguments:**
 
-    - `fit`: fit to the `data`, whose period gives the area of an input held for one section.
-    - `cycles`: duration of the responses. Default: 3, or for wide pushes twice the time until half
-      of one has acted.
+    - `fit`: the fit. `data`: the data that were fitted; their period gives the area of an input
+      held for one section.
+    - `cycles`: duration of the responses. Default: 3, or longer if the push is wide.
     - `width`: standard deviation of the push (Gaussian), in cycles. 0: the push is held for one
-      section. Default: so wide that the push has no frequencies beyond the band in which the inputs
-      had power, where the response of the system is unknown.
+      section. Default: the smallest width for which the spectrum of the push lies in the band of
+      the inputs, because the response of the system is unknown outside of this band.
 
     **Raises:** `DefinitionError` if fit and data have different sections or names.
     """

@@ -108,25 +108,24 @@ def natural_multipliers(
 ) -> NaturalMultipliers:
     r"""Estimate Floquet multipliers from variability alone: output-only identification.
 
-    The return map of every section is estimated from how deviations continue into the next cycle,
-    as in the Floquet analysis of gait (Hurmuzlu and Basdogan 1994). Disturbances of the rhythm are
-    unknown, and taken as independent from cycle to cycle. The state at a section consists of all
-    outputs there and at the section before, in the `order` combinations that vary most. All
-    sections have the same multipliers: the coefficients of their characteristic polynomials are
-    averaged.
+    The return map of every section is estimated from the deviations in successive cycles, as in the
+    Floquet analysis of gait (Hurmuzlu and Basdogan 1994). Disturbances of the rhythm are unknown,
+    and taken as independent from cycle to cycle. The state at a section consists of all outputs
+    there and at the section before, in the `order` combinations that vary most. All sections have
+    the same multipliers: the coefficients of their characteristic polynomials are averaged.
 
-    Few cycles bias it, too, since each record has its own mean: that is corrected to first order in
-    their number (Pope 1990). Measurement noise biases a plain regression towards zero (Dingwell and
-    Cusumano 2000 show why to be careful with so few cycles and so much noise). Here the states at
-    earlier sections of the same cycle serve as instruments: noise that is not correlated over three
-    sections or more has no effect on them.
+    The mean of each record is estimated, which biases the multipliers if there are few cycles. This
+    bias is corrected to first order in the inverse number of cycles (Pope 1990). Measurement noise
+    biases a plain regression towards zero (Dingwell and Cusumano 2000 show why to be careful with
+    so few cycles and so much noise). Here the states at earlier sections of the same cycle serve as
+    instruments: noise that is not correlated over three sections or more has no effect on them.
 
     **Arguments:**
 
     - `data`: result of `section_data(..., inputs=())`; the average cycle of each trial is
       subtracted.
-    - `order`: the number of multipliers. Directions that are not among those that vary most act as
-      disturbances: trust what does not change with the order. Default: 1.
+    - `order`: the number of multipliers. Directions of smaller variance act as disturbances. Rely
+      only on results that do not change with the order. Default: 1.
     - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
       (Künsch 1989), within each record; whole records where these are short.
 

@@ -45,8 +45,8 @@ def estimate_phase(
           are taken for doubled and left out; where an interval is longer than 1.5 median periods an
           event was missed, and these cycles are left out. In irregular rhythms, with intervals of
           all lengths, these limits are the first gaps in the distribution of intervals. A crossing
-          in a gap counts as missed. This phase, and that of a `Crossing`, depends on the next
-          event, and so do the outputs sampled at it.
+          in a gap counts as missed. This phase, like that of a `Crossing`, depends on the time of
+          the next event, and so do outputs that are sampled at a given phase.
     - `bandwidth`: bandwidth in Hz of the splines through the signals. Default: 32 harmonics of the
       cycle for a `KinematicPhase`, 16 for a `Crossing`.
 

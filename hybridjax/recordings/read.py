@@ -48,7 +48,7 @@ def read_recording(
     of events. Events outside of the recording are left out.
 
     Times are converted to seconds from s, ms, us, ns, min or h; times without a unit are taken as
-    seconds, and `notes` of the recording says so.
+    seconds, with a remark in `notes` of the recording.
 
     **Arguments:** `time`: name of the column with the times. Default: "time". `signals`: names of
     the signals to be read, or of groups, structs, markers and topics; only these take memory.

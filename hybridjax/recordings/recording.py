@@ -207,13 +207,13 @@ class Recording(eqx.Module):
         return Recording.join(joined)
 
     def mark(self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf) -> "Recording":
-        """Add an event: a signal crosses a level.
+        """Add an event at each time at which a signal crosses a level.
 
-        Jumps against the direction (an angle that wraps) are no events, jumps along it are. A
-        signal that crosses the level several times within a cycle, in noise, makes doubled events,
-        which `estimate_phase` leaves out. Crossings in gaps that are longer than three samples, and
-        than half a wavelength at the bandwidth, are unknown, and make no events. Isolated spikes
-        cross nothing (see `section_data`).
+        A jump in the stated direction is an event; a jump in the other direction, as of an angle
+        that wraps, is not. A signal that crosses the level several times within a cycle, in noise,
+        makes doubled events, which `estimate_phase` leaves out. Crossings in gaps that are longer
+        than three samples, and than half a wavelength at the bandwidth, are unknown, and make no
+        events. Isolated spikes are ignored (see `section_data`).
 
         **Arguments:** `event`: its name. `crossing`: crossing of a signal, given by name.
         `bandwidth`: bandwidth in Hz of the smoothing spline whose crossings are taken. Default:

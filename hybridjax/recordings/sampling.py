@@ -40,9 +40,9 @@ def section_data(
 ) -> SectionData:
     """Sample a recording at N phases of each cycle.
 
-    Isolated spikes, which stick out of their neighbors for up to three samples, are left out like
-    missing samples, and counted in `spikes`; transients that recur at the same phase of most cycles
-    (impacts), and pulses of an input that is not smooth otherwise, stay.
+    Isolated spikes of up to three samples count as missing samples; `spikes` is their number.
+    Transients at the same phase of most cycles (impacts) are kept, and so are pulses of an input
+    that is not smooth.
 
     Splines bridge gaps up to the mean time between sections, but not less than three samples of a
     signal. Outputs are NaN at sections in longer gaps, in their own samples or in those of the

@@ -13,7 +13,7 @@ from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable
 from .._core.progress import working
 from ..errors import ComputationError, DefinitionError
-from .wanted import as_numbers, require_form
+from .wanted import as_numbers, form, stacked
 
 
 # Pieces of a call, unless `chunk` is given. Fewer: more is lost with a worker. More: many small
@@ -52,7 +52,7 @@ def monte_carlo(
     - `function` of a `numpy.random.Generator`: returns a number, an array, or a mapping of names to
         numbers and arrays, with the same names and shapes in every draw. A draw that raises
         `ComputationError` is NaN.
-    - `draws`: their number. `seed`: of all of them. Default: 0.
+    - `draws`: number of draws. `seed`: seed of all draws. Default: 0.
     - `chunk`: number of draws in a piece. Default: a 256th of all.
     - `store`, `client`: as for `sweep`.
 
@@ -106,49 +106,38 @@ class Draws:
 
     def first(self) -> dict[str, Variable]:
         """Return the form of results, from the first draw that succeeds."""
-        failure = None
+        values = None
         for i in range(*self.blocks.shape):
-            try:
-                values = self._draw(i)
-            except ComputationError as error:
-                failure = error
-                continue
-            variables = {
-                name: Variable(x.dtype.str, tuple(f"{name}_{j}" for j in range(x.ndim)), x.shape)
-                for name, x in values.items()
-            }
-            return variables | {"failed": Variable("<i8")}
-        raise ComputationError(f"all draws failed, the last because {failure}")
+            values = self._draw(i)
+            if isinstance(values, dict):
+                return {name: form(name, x) for name, x in values.items()}
+        raise ComputationError(f"all draws failed, the last because {values}")
 
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
         """Return the draws of piece k."""
         (rows,) = self.blocks.slices(k)
-        count = rows.stop - rows.start
-        drawn = {
-            name: np.full((count, *x.shape), x.fill, x.dtype) for name, x in self.variables.items()
+        lost = dict.fromkeys(self.variables) | {"failed": np.array(1)}
+        drawn = map(self._draw, range(rows.start, rows.stop))
+        drawn = [lost if isinstance(values, ComputationError) else values for values in drawn]
+        other = {name for values in drawn for name in values.keys() ^ lost.keys()}
+        if other:
+            raise DefinitionError(
+                f"`function` must always give the same names, but `{min(other)}` only in some "
+                "draws."
+            )
+        return {
+            name: stacked(name, [values[name] for values in drawn], x)
+            for name, x in self.variables.items()
         }
-        for i in range(count):
-            try:
-                values = self._draw(rows.start + i)
-            except ComputationError:
-                drawn["failed"][i] = 1
-                continue
-            drawn["failed"][i] = 0
-            other = {*values, "failed"} ^ {*drawn}
-            if other:
-                raise DefinitionError(
-                    f"`function` must always give the same names, but `{min(other)}` only in some "
-                    "draws."
-                )
-            for name, x in values.items():
-                require_form(name, x, self.variables[name])
-                drawn[name][i] = x
-        return drawn
 
-    def _draw(self, i: int) -> dict[str, np.ndarray]:
+    def _draw(self, i: int) -> dict[str, np.ndarray] | ComputationError:
         stream = np.random.SeedSequence(self.seed, spawn_key=(i,))
-        values = self.function(np.random.default_rng(stream))
+        try:
+            values = self.function(np.random.default_rng(stream))
+        except ComputationError as error:
+            return error
         named = values if isinstance(values, Mapping) else {"value": values}
         if not named.keys().isdisjoint(("failed", "draw")):
             raise DefinitionError("results of `function` cannot be named `failed` or `draw`.")
-        return {name: as_numbers(name, value) for name, value in named.items()}
+        numbers = {name: as_numbers(name, value) for name, value in named.items()}
+        return numbers | {"failed": np.array(0)}

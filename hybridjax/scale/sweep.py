@@ -68,7 +68,7 @@ def sweep(
     starts from these cycles, and continues from its own solved points. A piece does not depend on
     which process computes it, nor when: results are the same to the last bit for any number of
     processes and interruptions (on machines of one kind). A point at which the search fails is
-    tried again from the nearest point that succeeded, and after a burn-in.
+    tried again from the nearest point that succeeded, and after a simulation of the transient.
 
     **Arguments:**
 

@@ -1,6 +1,6 @@
 """Quantities that a sweep keeps of limit cycles."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -48,20 +48,16 @@ class Wanted:
         values = self._values(cycles)
         for name, measure in self.measures.items():
             values[name] = self._first(cycles, name, measure)[None]
-        dims = {"state": "state_name", "multipliers": "multiplier"}
+        dims = {"state": ("state_name",), "multipliers": ("multiplier",)}
         attributes = {
             "result": _flags([x.name.lower() for x in Result], [int(x) for x in Result]),
             "period": {"units": self._time_unit} if self._time_unit else {},
             "chart": _flags(self._charts),
         }
+        forms = {name: form(name, x[0]) for name, x in values.items()}
         return {
-            name: Variable(
-                x.dtype.str,
-                (dims[name],) if name in dims else tuple(f"{name}_{i}" for i in range(x.ndim - 1)),
-                x.shape[1:],
-                attributes.get(name, {}),
-            )
-            for name, x in values.items()
+            name: x._replace(dims=dims.get(name, x.dims), attributes=attributes.get(name, {}))
+            for name, x in forms.items()
         }
 
     def constants(self) -> dict[str, Constant]:
@@ -81,7 +77,7 @@ class Wanted:
         """Return the results of some cycles."""
         values = self._values(cycles)
         for name, measure in self.measures.items():
-            values[name] = self._measured(cycles, name, measure, variables[name])
+            values[name] = stacked(name, _measured(cycles, name, measure), variables[name])
         return values
 
     def _values(self, cycles: LimitCycles) -> dict[str, np.ndarray]:
@@ -119,16 +115,14 @@ class Wanted:
             f"shape of its values is unknown ({error or 'none has a limit cycle'})."
         )
 
-    def _measured(self, cycles, name: str, measure: Measure, variable: Variable) -> np.ndarray:
-        out = np.full((len(cycles), *variable.shape), variable.fill, variable.dtype)
-        for i in np.flatnonzero(cycles.ok):
-            try:
-                values = as_numbers(name, measure(cycles[i]))
-            except ComputationError:
-                continue
-            require_form(name, values, variable)
-            out[i] = values
-        return out
+
+def _measured(cycles: LimitCycles, name: str, measure: Measure) -> Iterator[np.ndarray | None]:
+    """Yield the value of a function on each cycle, None where it fails."""
+    for i, ok in enumerate(cycles.ok):
+        try:
+            yield as_numbers(name, measure(cycles[i])) if ok else None
+        except ComputationError:
+            yield None
 
 
 def as_numbers(name: str, values: Any) -> np.ndarray:
@@ -139,13 +133,25 @@ def as_numbers(name: str, values: Any) -> np.ndarray:
     return array.astype(complex if array.dtype.kind == "c" else float)
 
 
-def require_form(name: str, values: np.ndarray, variable: Variable) -> None:
-    """**Raises:** `DefinitionError` for another shape, and for complex numbers after real ones."""
-    if values.shape != variable.shape or not np.can_cast(values.dtype, variable.dtype):
-        raise DefinitionError(
-            f"`{name}` must always give real or always complex arrays of one shape: first "
-            f"{variable.dtype} {variable.shape}, then {values.dtype.str} {values.shape}."
-        )
+def form(name: str, values: np.ndarray) -> Variable:
+    """Return the form of results of which these are one."""
+    dims = tuple(f"{name}_{j}" for j in range(values.ndim))
+    return Variable(values.dtype.str, dims, values.shape)
+
+
+def stacked(name: str, values: Iterable[np.ndarray | None], variable: Variable) -> np.ndarray:
+    """Return values of a user's function in one array, the variable's fill where it failed (None).
+
+    **Raises:** `DefinitionError` for another shape, and for complex numbers after real ones.
+    """
+    rows = [np.full(variable.shape, variable.fill) if x is None else x for x in values]
+    for x in rows:
+        if x.shape != variable.shape or not np.can_cast(x.dtype, variable.dtype):
+            raise DefinitionError(
+                f"`{name}` must always give real or always complex arrays of one shape: first "
+                f"{variable.dtype} {variable.shape}, then {x.dtype.str} {x.shape}."
+            )
+    return np.array(rows, variable.dtype)
 
 
 def _flags(names: Sequence[str], values: Sequence[int] | None = None) -> dict[str, Any]:

@@ -67,8 +67,9 @@ class AbstractSections(Definition):
 
     - `label`: the label of data taken at these sections, a class variable.
     - `n_sections`: the number N.
-    - `anchor`: the position of section 0. A `Crossing`: the point where the cycle crosses it, which
-      is then the first point of the `orbit`. Other values are used by `bind` only.
+    - `anchor`: the position of section 0. If it is a `Crossing`, section 0 is the point where the
+      cycle crosses it, and this is the first point of the `orbit`. Other values are used by `bind`
+      only.
     - `points`: the number M of points of the orbit that `bind` needs, a class variable. Default: 1.
 
     **Methods of a subclass:**
@@ -156,8 +157,8 @@ class ArcLength(_Anchored):
     """N sections at times that cut the orbit into N pieces of equal arc length.
 
     The arc length is that of the curve of some signals on the limit cycle, without the jumps of
-    events, by the trapezoidal rule at 128 times. Where the signals move fast, sections are dense.
-    As at those of a `ClockPhase`, one multiplier of an autonomous cycle is 1.
+    events, by the trapezoidal rule at 128 times. Where the signals move fast, sections are dense in
+    time. As for a `ClockPhase`, an autonomous cycle has a multiplier of 1.
 
     **Fields:**
 
@@ -210,8 +211,8 @@ class KinematicPhase(_Anchored):
     i is at the angle of section 0 minus 2 pi i / N.
 
     The same definition gives the phase of a recording (`hj.recordings.estimate_phase`). At its
-    sections the two signals are functions of one number: as outputs they carry less information
-    than at sections of a phase that is defined by a `Crossing`.
+    sections the position and the velocity determine each other. As outputs they therefore contain
+    less information than at sections of a phase that is defined by a `Crossing`.
 
     **Fields:**
 

@@ -21,7 +21,8 @@ from .transition import Scheduled, Transition
 
 @checked
 class Quotient(Derived):
-    """`system` modulo a symmetry, which is declared here once and written into no reset.
+    """`system` modulo a symmetry. The symmetry is declared here, and the resets of `system` do not
+    contain it.
 
     ```python
     walker = Quotient(Biped(), swap={"left stance": "right stance"}, relabel={"left": "right"},

@@ -44,18 +44,18 @@ def sliding(
         return hj.sliding(sides, lambda t, q: q[1] - self.belt, "sticks")
     ```
 
-    With a and b the rates of h in the fields f_a, f_b of the two sides, a state that comes to the
-    surface h = 0 crosses it if it is carried on there (b < 0 coming from above, a > 0 from below).
-    Otherwise it slides, with the mixture of both fields that stays on the surface, f = (b f_a - a
-    f_b) / (b - a), until one side pulls it away: a rises, or b falls, through zero. Friction,
-    relays and switches without memory are of this kind.
+    Let a and b be the rates of h in the fields f_a (where h > 0) and f_b (where h < 0). A state
+    that reaches the surface h = 0 crosses it if the field of the other side leads away from the
+    surface: b < 0 for a state from above, a > 0 for a state from below. Otherwise it slides along
+    the surface with the field f = (b f_a - a f_b) / (b - a), until a rises, or b falls, through
+    zero. Friction, relays and switches without memory are of this kind.
 
     **Arguments:**
 
-    - `charts`: two, by name: the one in which h > 0, then the one in which h < 0, with the same
-        states. Their fields must extend smoothly beyond the surface.
+    - `charts`: two charts with the same states, by name: first the one in which h > 0, then the one
+      in which h < 0. Their fields must extend smoothly beyond the surface.
     - `surface`: h(t, q) -> number.
-    - `name`: of the chart of sliding, which has the same states.
+    - `name`: name of the chart of sliding, which has the same states.
 
     **Raises:** `DefinitionError` if the charts are not two with the same states and inputs.
     """

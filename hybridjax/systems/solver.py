@@ -48,8 +48,9 @@ class Radau(eqx.Module):
     """The implicit Radau IIA method of order 2 `stages` - 1, for stiff charts at high accuracy.
 
     E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, 2nd ed. (1996), sections
-    IV.5 and IV.8: collocation at the Radau points, L-stable and stiffly accurate. The error
-    estimate has order `stages`, and is turned into one of the step where the solution is smooth.
+    IV.5 and IV.8: collocation at the Radau points, L-stable and stiffly accurate. The embedded
+    error estimate has order `stages`. Where the solution is smooth, a power of this estimate gives
+    the error of the step.
 
     **Arguments:** `stages`, 3, 5 or 7.
     """

@@ -32,7 +32,8 @@ class Output(Definition):
 
     - `name`: its name in data and plots.
     - `function`: one function (t, q, u) -> number for all charts, or a mapping from chart names to
-        such functions. What a missing chart means is an error when the output is needed there.
+        such functions. If the output is needed in a chart that is not in the mapping, an error is
+        raised.
     - `unit`: its unit, for figures and prints.
     """
 
@@ -172,7 +173,7 @@ class HybridSystem(Definition):
         return ()
 
     def guess(self) -> Guess | None:
-        """A start for the search of the limit cycle, if the model knows one."""
+        """The default guess for the search of the limit cycle, or `None`."""
         return None
 
     def __repr__(self):

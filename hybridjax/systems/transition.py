@@ -68,8 +68,9 @@ class Transition(eqx.Module):
         the crossing is passed without an event.
 
     A guard is armed once it has left zero on the side from which it crosses: a guard that is zero
-    right after a reset does not fire at once. `simulate` ends if the state then goes through it,
-    unless it was crossing this guard before the reset.
+    right after a reset does not fire at once. If a reset puts the state on a guard, and the state
+    then passes through it, `simulate` ends. This does not apply if the state was on this guard
+    before the reset, too.
     """
 
     name: str = eqx.field(static=True)

@@ -88,7 +88,7 @@ def simulate_recording(
     **Arguments:**
 
     - `cycle`: the limit cycle on which all trials start. `force`: samples of S trials.
-    - `outputs`: names or `Output`s to be recorded beside the inputs.
+    - `outputs`: names or `Output`s to be recorded in addition to the inputs.
     - `rate`: samples per unit of time, changed slightly so that a whole number of them fits into
       a period. Default: 500. `steps`: steps of the force from sample to sample. Default: 4.
     - `accuracy`: accuracy of the simulation, as in `run_experiments`.

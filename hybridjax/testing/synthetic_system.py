@@ -22,9 +22,9 @@ _BLOCKS = {
 def synthetic_ldtp() -> LDTP:
     """An `LDTP` of 6 sections with the dimensions 3, 2, 3, 2, 3, 2, two inputs and two outputs.
 
-    It comes from no physical system: nothing about it is special, so that algebra which is right
-    here is right. Its multipliers are 0.3270675 ± 0.05964059i; at the sections of dimension 3 there
-    is a structural zero beside them.
+    Its matrices are arbitrary, without a physical system and without symmetries that could hide an
+    error. Its multipliers are 0.3270675 ± 0.05964059i; at the sections of dimension 3 there is a
+    structural zero beside them.
     """
     A, B, C, D = ([np.array(x, float) for x in blocks] for blocks in _BLOCKS.values())
     return LDTP.from_blocks(A, B, C, D)

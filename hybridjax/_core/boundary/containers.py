@@ -81,7 +81,8 @@ class Items(Kind):
                 raise self.refused(value)
             value = tuple(value)
         if self.item is not None:
-            value = _rebuilt(value, [_taken(self.item, i, x) for i, x in enumerate(value)])
+            form = list if isinstance(value, list) else tuple
+            value = form(_taken(self.item, i, x) for i, x in enumerate(value))
         return value if self.form is None or isinstance(value, self.form) else self.form(value)
 
 
@@ -122,7 +123,7 @@ class Table(Kind):
                         f"has the key {show(name)}, but keys {misfit.problem}", near=True
                     ) from None
             out[name] = item if self.value is None else _taken(self.value, name, item)
-        return _rebuilt(value, out)
+        return out
 
 
 class Names(Kind):
@@ -168,15 +169,6 @@ def _taken(kind: Kind, key: Any, value: Any) -> Any:
         return kind.take(value)
     except Misfit as misfit:
         raise misfit.inside(key) from None
-
-
-def _rebuilt(given: Any, taken: Any) -> Any:
-    """Return `given` itself if nothing in it changed."""
-    items = taken.values() if isinstance(taken, dict) else taken
-    before = given.values() if isinstance(given, Mapping) else given
-    if all(a is b for a, b in zip(before, items, strict=True)):
-        return given
-    return taken if isinstance(given, list | Mapping) else tuple(taken)
 
 
 class Stream(Kind):

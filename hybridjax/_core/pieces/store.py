@@ -154,8 +154,13 @@ class ZarrStore:
 
     def missing(self) -> list[int]:
         """Return the pieces of which a chunk is missing."""
-        pieces = set(range(len(self.layout.blocks)))
-        return sorted(pieces - pieces.intersection(*map(self._present, self._arrays.values())))
+
+        async def listed() -> set[str]:
+            return {key async for key in self._group.store.list()}
+
+        present = package("zarr.core.sync").sync(listed())
+        pieces = range(len(self.layout.blocks))
+        return [k for k in pieces if not present.issuperset(self._chunks(k))]
 
     def write(self, k: int, values: Mapping[str, np.ndarray]) -> None:
         """Keep piece k."""
@@ -191,8 +196,8 @@ class ZarrStore:
             try:
                 self.read(k)
             except FileFormatError:
-                for x in self._arrays.values():
-                    package("zarr.core.sync").sync(x.store.delete(self._chunk(x, k)))
+                for chunk in self._chunks(k):
+                    package("zarr.core.sync").sync(self._group.store.delete(chunk))
 
     def dataset(self) -> Any:
         """Return all results as `xarray.Dataset`; on disk, values are read when they are used."""
@@ -208,20 +213,13 @@ class ZarrStore:
         data = data[[*dims, *self._arrays, *beside]].assign_attrs({_ABOUT: description})
         return data if isinstance(self.address, str) else data.load()
 
-    def _chunk(self, array: Any, k: int) -> str:
+    def _chunks(self, k: int) -> list[str]:
+        """Return the keys of the chunks of piece k, one along all axes but those of the points."""
         place = self.layout.blocks.place(k)
-        beside = (0,) * (array.ndim - len(place))  # one chunk along all other axes
-        return "/".join((array.path, "c", *map(str, (*place, *beside)))).removeprefix("/")
-
-    def _present(self, array: Any) -> set[int]:
-        """Return the pieces that have a chunk of an array."""
-        pieces = {self._chunk(array, k): k for k in range(len(self.layout.blocks))}
-
-        async def listed() -> set[int]:
-            keys = array.store.list_prefix(f"{array.path}/c".removeprefix("/"))
-            return {pieces[key] async for key in keys if key in pieces}
-
-        return package("zarr.core.sync").sync(listed())
+        return [
+            f"{x.path}/{x.metadata.encode_chunk_key((*place, *(0,) * (x.ndim - len(place))))}"
+            for x in self._arrays.values()
+        ]
 
 
 def open_store(address: str, job: Any) -> ZarrStore | None:

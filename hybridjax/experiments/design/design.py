@@ -44,12 +44,11 @@ OFF_LINE = 1e-6
 class Design(eqx.Module):
     """Sums of cosines for a number of experiments on a system with N sections (eq. 15).
 
-    Experiment s applies, at section n counted from its start,
-    `u[n] = sum_k a_k cos(2 pi j_k n / (N P) + phi_k)` over its own cosines k, so that
-    `f_k = j_k / P` is in cycles per period of the limit cycle and all signals repeat after P
-    periods. The amplitude is `a` (the paper divides it by pi). Every design that exists obeys
-    the rules of Sec. V (see `check`); the functions `multisine` and `paper_design` make the usual
-    ones, `Design.from_lines` any other.
+    Experiment s applies, at section n counted from its start, `u[n] = sum_k a_k cos(2 pi j_k n / (N
+    P) + phi_k)` over its own cosines k, so that `f_k = j_k / P` is in cycles per period of the
+    limit cycle and all signals repeat after P periods. The amplitude is `a` (the paper divides it
+    by pi). The constructor enforces the rules of Sec. V (see `check`). The functions `multisine`
+    and `paper_design` make the usual designs, `Design.from_lines` any other.
 
     **Fields:** one entry per cosine in the flat arrays, all on the host.
 
@@ -133,8 +132,8 @@ class Design(eqx.Module):
 
         - every f lies in [0, N/2], amplitudes are positive, phases finite;
         - in one experiment no two frequencies differ by, or add up to, an integer;
-        - a frequency that excites several inputs together does so in as many experiments, with
-          phases that tell them apart;
+        - a frequency that excites several inputs together does so in at least as many experiments
+          as inputs, with phases that separate the responses;
         - a frequency on a multiple of 1/2 (eq. 16) is excited in two experiments at least, with
           different phases; 0 and N/2 need only one phase, but not one with cos(phase) = 0.
 
@@ -222,9 +221,10 @@ class Design(eqx.Module):
     ) -> Float[np.ndarray, "S n nu"]:
         """Return the signals of all experiments, n = cycles * N samples long. Default: P cycles.
 
-        They repeat after P periods. Cut anywhere, the last P periods hold the same lines; they
-        have the phases of the design where `cycles` is a multiple of P, shifted ones elsewhere
-        (which is why estimates divide by the spectrum of the window itself).
+        The signals repeat after P periods, so that the last P periods contain the lines of the
+        design for any number of cycles. If `cycles` is not a multiple of P, the phases of these
+        lines are shifted; estimates therefore divide by the spectrum of the input in the same
+        window.
 
         **Arguments:** `experiments`: consecutive ones, e.g. `slice(0, 100)`. Default: all.
         """
@@ -246,7 +246,8 @@ class Design(eqx.Module):
     def scaled(self, rms: Positive) -> "Design":
         """Return the design with amplitudes multiplied so that every signal has this rms value.
 
-        Each experiment and input by itself, over one window; the proportions within stay.
+        Each signal (an input in one experiment) is scaled separately; the ratios of its amplitudes
+        do not change.
         """
         now = np.sqrt(np.mean(self.inputs() ** 2, axis=1))[self.experiment, self.channel]
         return eqx.tree_at(lambda d: d.amplitude, self, self.amplitude * rms / now)
@@ -255,9 +256,9 @@ class Design(eqx.Module):
         """Return the design `count` times over, each time with new random phases.
 
         The sample variance of their responses includes noise and nonlinear distortion, so it gives
-        the variance of an estimate. Cosines of one line and input turn by the same random angle in
-        all experiments of a realization, which keeps differences of 90 degrees and orthogonal
-        experiments as they are.
+        the variance of an estimate. In all experiments of a realization, cosines of the same line
+        and input are rotated by the same random angle, so that phase differences between
+        experiments are kept.
 
         **Returns:** a design with `count` times the experiments, one realization after the other.
         """
@@ -312,7 +313,7 @@ class Design(eqx.Module):
             return 4 * noise**2 / (samples * power)
 
     def cycles(self, discard: Index = DISCARD) -> int:
-        """Return the cost of the design: cycles of all experiments, each with `discard` more."""
+        """Return the number of cycles of all experiments, with `discard` more cycles in each."""
         return self.experiments * (self.periods + discard)
 
     def crest_factors(self) -> Float[np.ndarray, " S"]:

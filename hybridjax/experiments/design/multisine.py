@@ -67,19 +67,20 @@ def multisine(
       0 to 10 as in the paper, or to N/2 if that is less.
     - `amplitude`: amplitude of each cosine, or a function that returns it for an array of f.
       `Design.scaled` sets the rms value of the signals. Default: 0.01.
-    - `seed`: of the phases and the division. Default: 0.
+    - `seed`: seed of the phases and of the division. Default: 0.
     - `lines`: the excited frequencies. `"all"` are all but multiples of 1/2, as in the paper.
-      `"odd"` are those with odd j (P must be even). Distortion of even order then falls between the
-      excited frequencies; at small amplitudes, where it is the largest, this costs half of the
-      frequencies and gains one to two digits. `"two-phase"` adds the multiples of 1/2, each in two
-      experiments with phases 90 degrees apart (0 and N/2 in one). Default: "all".
+      `"odd"` are those with odd j (P must be even). Distortion of even order, which dominates at
+      small amplitudes, then falls between the excited frequencies. This halves the number of
+      frequencies, and reduces the error by a factor of 10 to 100. `"two-phase"` adds the multiples
+      of 1/2, each in two experiments with phases 90 degrees apart (0 and N/2 in one). Default:
+      "all".
     - `division`: the division of frequencies among experiments. `"random"` has no further rule.
       `"sum-free"` keeps the products f_i + f_j and f_i - f_j of an experiment, where quadratic
       distortion falls, off its own frequencies; this needs many experiments with few frequencies
-      each, for example 80 instead of 20. With these two, an experiment excites a single input.
-      `"disjoint"` excites all inputs, on different frequencies. `"orthogonal"` excites all inputs
-      on all frequencies, with phases such that nu experiments separate nu inputs, with nu times the
-      power per frequency. Default: "random".
+      each, for example 80 instead of 20. With `"random"` and `"sum-free"`, an experiment excites a
+      single input. `"disjoint"` excites all inputs, on different frequencies. `"orthogonal"`
+      excites all inputs on all frequencies, with phases such that nu experiments separate nu
+      inputs, with nu times the power per frequency. Default: "random".
     - `experiments`: number of experiments for all inputs together. With more than the fewest,
       signals are weaker, have fewer cosines, and cause less distortion. With the fewest for all
       frequencies, every second-order product falls on a frequency of the same experiment, so
@@ -200,10 +201,10 @@ def paper_design(
 ) -> Design:
     """Return the design of Ankarali & Cowan, Sec. VI-C: 620 frequencies in 80 random subsets.
 
-    The same as `multisine` with four times the experiments that it needs, without multiples of
-    1/2. The paper's rules leave room to choose; by default the subsets are also sum-free:
-    second-order products miss their own lines, which at the paper's amplitude divides the largest
-    error of H_0 by 15 on kinematic sections (`benchmarks/second_order.py`).
+    The same as `multisine` with four times the experiments that it needs, without multiples of 1/2.
+    The paper's rules do not determine the subsets. By default they are also sum-free: the
+    second-order products of a subset do not fall on its own lines. At the paper's amplitude, this
+    divides the largest error of H_0 on kinematic sections by 15 (`benchmarks/second_order.py`).
 
     **Raises:** `DefinitionError` as `multisine`.
     """
@@ -219,12 +220,12 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
 
     The peak is approached by norms $\sum |u|^p$ of growing p, minimized over the phases (Guillaume,
     Schoukens, Pintelon and Kollar, IEEE Trans. Instrum. Meas. 40, 1991). For 31 lines this gives
-    2.2 where random phases give 3.5, so that the same peak carries 2.5 times the power.
-    These phases are not random: the scatter over realizations of them does not show the distortion.
-    Phases of lines that are measured in several experiments together (multiples of 1/2, orthogonal
-    experiments) are kept.
+    2.2 where random phases give 3.5, so that the same peak carries 2.5 times the power. These
+    phases are not random, so that the sample variance over realizations does not contain the
+    distortion. Phases of lines that are measured in several experiments together (multiples of 1/2,
+    orthogonal experiments) are kept.
 
-    **Arguments:** `seed`: of the random phases at the start of the minimization. Default: 0.
+    **Arguments:** `seed`: seed of the random phases at the start of the minimization. Default: 0.
 
     **Raises:** `DefinitionError` if there is no phase to choose.
     """

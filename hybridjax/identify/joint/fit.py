@@ -217,12 +217,12 @@ def fit_ldtp(
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
-    - `check`: whether to raise an error if outputs do not answer the inputs (not
-      with "innovations"). Default: True.
+    - `check`: whether to raise an error if outputs do not respond to the inputs. It has no effect
+      with "innovations". Default: True.
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data
-    than unknowns, outputs that do not answer the inputs, or records with `lead`.
+    than unknowns, outputs that do not respond to the inputs, or records with `lead`.
     """
     require_x64()
     if not isinstance(data, HTF):
@@ -416,8 +416,8 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
 
     The errors of the HTFs are independent, circular and Gaussian, as for `multiplier_bound`. The
     unknowns are the matrices A[n], B[n], C[n] (and D[n], if the model has any) instead of free
-    numerators: this is the bound of `fit_ldtp`. The square of the ratio of the two standard errors
-    is the factor of data that the structure saves.
+    numerators: this is the bound of `fit_ldtp`. The squared ratio of the standard errors of
+    `multiplier_bound` to these is the factor by which the structure reduces the amount of data.
 
     **Arguments:**
 

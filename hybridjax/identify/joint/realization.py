@@ -44,21 +44,21 @@ def realize(
 ) -> LDTP:
     r"""Return a minimal periodic state-space model with given responses.
 
-    The state at a section is the memory of earlier inputs in the outputs from there on. Its
+    The state at a section represents the effect of earlier inputs on the outputs from there on. Its
     dimension is a rank at each section.
 
     - *Markov parameters* (an array (N, lags, ny, nu) as of `LDTP.impulse_response`, or a
-      `SeriesFit`): the dimension is the rank of the Hankel matrix at section n of the responses,
-      `[i, j]`, at section n + i to an input at n - 1 - j (Ho and Kalman 1966, for each section of
-      the period).
+      `SeriesFit`): the dimension at section n is the rank of a Hankel matrix. Its block `[i, j]` is
+      the response at section n + i to an input at section n - 1 - j (Ho and Kalman 1966, for each
+      section of the period).
     - *HTFs* at any frequencies: the outputs at sections n, ..., n + p in response to
       $e^{i w n}$ are $O_n X_n(w)$ plus the response to the inputs in these sections. The latter is
       projected out, and $O_n$ is the range of the remainder (subspace identification from frequency
       responses, McKelvey, Akcay and Ljung 1996, at each section; Uyanik et al. 2019 treat
       periodic systems by lifting). Given A and C, B and D are a linear least-squares problem.
 
-    A[n] takes $O_{n}$, shifted by one section, to $O_{n+1}$. The horizon p is two periods, at least
-    8 sections, or as long as the source allows.
+    A[n] takes $O_{n}$, shifted by one section, to $O_{n+1}$. The horizon p is two periods, but at
+    least 8 sections; it is shorter if the source has too few lags or frequencies.
 
     **Arguments:**
 

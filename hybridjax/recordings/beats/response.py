@@ -132,11 +132,11 @@ def phase_response(
     r"""Estimate the phase response curve of spikes, heartbeats, taps or steps under a known input.
 
     The phase model is integrated from each event until its phase is 1, and the resulting durations
-    are fitted to the measured ones by least squares, over the curve and the rate of each trial. The
-    curve is as smooth as makes the data most probable, and need not be continuous across an event.
-    The end of an interval depends on the input, so that a regression of measured intervals on the
-    input at a linear phase is biased; this estimate is not. The averaging of the curve by the
-    jitter of the rhythm is undone: see `docs/mathematics.md`.
+    are fitted to the measured ones by least squares. The unknowns are the curve and the rate of
+    each trial. The smoothness of the curve maximizes the marginal likelihood of the data; the curve
+    may be discontinuous at an event. The end of an interval depends on the input, so that a
+    regression of measured intervals on the input at a linear phase is biased; this estimate is not.
+    The averaging of the curve by the jitter of the rhythm is undone: see `docs/mathematics.md`.
 
     Standard errors come from blocks of intervals, whose errors may depend on each other: trials if
     there are thirty or more, else parts of them.

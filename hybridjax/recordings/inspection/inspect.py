@@ -48,14 +48,13 @@ def inspect(
     phase: Phase | None = None,
     data: SectionData | None = None,
 ) -> Inspection:
-    """Look for what is wrong with a recording, before anything is computed from it.
+    """Look for errors in a recording before anything is computed from it.
 
-    Findings: numbers that stand for "no value", frozen, clipped and overflowing signals; signals,
-    trials and parts of trials that occur twice; trials with other units, zeros, columns or clocks.
-    Samples that certainly were not measured are left out: missing in the returned recording.
-
-    With `phase` and `data`, also trials of other periods and cycles, slow changes of the outputs,
-    inputs that the outputs do not answer, and inputs that depend on the outputs.
+    The findings are numbers that represent "no value"; frozen, clipped and overflowing signals;
+    signals, trials and parts of trials that occur twice; trials with other units, offsets, columns
+    or clocks. Samples that were certainly not measured are missing in the returned recording. With
+    `phase` and `data`, the function also finds trials with another period or cycle, slow changes of
+    the outputs, inputs to which the outputs do not respond, and inputs that depend on the outputs.
 
     **Arguments:** `inputs`, `outputs`: names of signals; others are not inspected. `phase`, `data`:
     phase and data at the sections, of this recording or of the one that an inspection returned.
