@@ -338,6 +338,7 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
     **Raises:** `DefinitionError` for NaN, an output that is zero, or variances that are no
     positive numbers.
     """
+    htf.require_sampled("a fit")
     H = np.asarray(htf.H)
     if not np.isfinite(H).all():
         raise DefinitionError("the HTFs hold NaN or infinity.")

@@ -190,6 +190,10 @@ class Course(NamedTuple):
     inputs: HybridSystem
     """The system, or the same one with other inputs, by which the flow is linearized."""
 
+    @property
+    def linearized(self) -> Structure:
+        return Structure(self.inputs)
+
     def linear_flow(self, longest: float = np.inf) -> LinearFlow:
         """Linearize the flow along the cycle, in pieces no longer than this part of the period.
 
@@ -197,13 +201,14 @@ class Course(NamedTuple):
         possible would be.)
         """
         if is_traced(self) or is_inside_program():
-            return _linear_flow(*self[1:], longest)
+            return _linear_flow(self, longest)
         name = type(self.inputs), getattr(self.inputs, "parameter", ""), longest
-        make = lambda: _linear_flow(*to_host(self[1:]), longest)  # noqa: E731
+        make = lambda: _linear_flow(to_host(self), longest)  # noqa: E731
         return _flows.recall(self.owner, name, make)
 
 
-def _linear_flow(map, legs, period, events, inputs, longest: float) -> LinearFlow:
+def _linear_flow(course: Course, longest: float) -> LinearFlow:
+    _, map, legs, period, events, _ = course
     s, xp = map.structure, namespace(period)
     L = legs.t.shape[0]
     ends = xp.concatenate([legs.t[1:], (map.anchor.t[0] + period)[None]])
@@ -222,7 +227,7 @@ def _linear_flow(map, legs, period, events, inputs, longest: float) -> LinearFlo
             divide = np.maximum(np.ceil(pieces.h / (longest * period) - 1e-9), 1).astype(int)
         else:
             divide = np.full(len(pieces.t), max(int(np.ceil(_LONGEST / longest)), 1))
-        return _linearized(s, Structure(inputs), pieces, divide, events)
+        return _linearized(s, course.linearized, pieces, divide, events)
 
 
 # Bound on the steps of a turn that is traced, whose number is not known. Fewer: results for long

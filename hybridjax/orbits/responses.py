@@ -271,7 +271,7 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
         values, right = np.linalg.eig(scaled)
     else:
         values, right = jnp.linalg.eig(jax.lax.stop_gradient(scaled))
-    order = xp.argsort(-xp.abs(values) + 1e-9 * (values.imag < 0), stable=True)
+    order = xp.argsort(-xp.abs(values) + 1e-9 * (xp.imag(values) < 0), stable=True)
     if on_host(M):
         kept = int(np.sum(np.abs(values) > _LEAST))
         count = kept if count is None else count
@@ -347,6 +347,7 @@ def _surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
 
 def _returned(a: int, s: Structure, t, q, u):
     chart = s.charts[a]
+    assert isinstance(chart, SlidingChart)
     return chart.returned(t, q, s.chart_input(a, t, u)).ravel()
 
 

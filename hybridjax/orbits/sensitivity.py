@@ -145,11 +145,12 @@ def _due(flow: LinearFlow, events: tuple[int, ...], varied: Varied) -> Float[Arr
 def _off(course: Course, begin: Float[Array, " d"], f: Float[Array, " d"]) -> Float[Array, ""]:
     """The time by which the changed state at phase 0 comes later to the section."""
     map, xp = course.map, namespace(begin)
+    assert map.base is not None
     levels, (t, chart, q, *_) = ListLevels((map.base,)), map.anchor
 
     def work(a, here, out):
         n, u = map.structure.dims[a], xp.zeros((1, 1))
-        by = kernels.linear(Structure(course.inputs), _level, a, t, q[:n], u, levels)[0, :, 0]
+        by = kernels.linear(course.linearized, _level, a, t, q[:n], u, levels)[0, :, 0]
         moved = by[-1] + by[2 : 2 + n] @ begin[:n]
         return out - moved / (by[2 : 2 + n] @ f[:n])
 
@@ -157,5 +158,6 @@ def _off(course: Course, begin: Float[Array, " d"], f: Float[Array, " d"]) -> Fl
 
 
 def _level(a: int, s: Structure, levels: ListLevels, t, q, u):
+    assert isinstance(s.system, Varied)
     of = Structure(s.system.at(u[0]))
     return levels.level(of, a, jnp.zeros((), int), t, q)[None]
