@@ -24,10 +24,11 @@ PRONOUNS = set(
     "found own known one seen here some there these those it them others rest thing things".split()
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
-# a change that needs less lowers it. The aim: 24 000 lines of code.
+# a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and 890
+# the responses of cycles.
 LIMITS = {
-    "code": 24_760,
-    "files": 220,
+    "code": 25_650,
+    "files": 222,
     "longest": 500,
     "public_names": 170,
     "many_parameters": 8,
@@ -35,7 +36,7 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_250,
+    "test_lines": 16_600,
     "doc_words": 36_000,
 }
 

@@ -36,6 +36,8 @@ _POINTS = 4
 
 def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
     """The field of chart a, and its derivatives."""
+    if not on_host(q):
+        return linear(s, _field, a, t, q, u)
     return s.kernel(_field, _expanded, a, lanes=_POINTS)(t, q, u, some=some)
 
 
@@ -94,6 +96,13 @@ def reset(s: Structure, g: Member, t: Times, q: States, u: Inputs, some: Some = 
     return s.by_lane(ft.partial(_reset, g.kind))(t, q, u, g.place)[:, None]
 
 
+def linear_reset(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Expanded:
+    """The state after transitions of one kind, and its derivatives."""
+    if on_host(q):
+        return reset(s, g, t, q, u)
+    return s.by_lane(_columns(ft.partial(_reset, g.kind), 1))(t, q, u, g.place)
+
+
 def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Array, " L"]:
     """Test whether the predicates of transitions of one kind hold."""
     of_lanes = (
@@ -106,7 +115,16 @@ def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Arr
 
 def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) -> Expanded:
     """Outputs in chart a, and their derivatives."""
-    return s.kernel(_outputs, _expanded, a, trees=(items,), lanes=_POINTS)(t, q, u)
+    return linear(s, _outputs, a, t, q, u, items)
+
+
+def linear(
+    s: Structure, function: Callable, a: int, t: Times, q: States, u: Inputs, *trees: Any
+) -> Expanded:
+    """A vector function (chart, structure, *trees, t, q, u) of chart a, and its derivatives."""
+    if not on_host(q):
+        return s.by_lane(_columns(ft.partial(function, a), 1 + len(trees)), *trees)(t, q, u)
+    return s.kernel(function, _expanded, a, trees=trees, lanes=_POINTS)(t, q, u)
 
 
 def levels(

@@ -25,7 +25,7 @@ from ..identify.weights import check_values, error_weights
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections, FamilyLike, as_family
-from ..sections.linearize import inputs_of, linearize
+from ..sections.linearize import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
 
@@ -128,7 +128,7 @@ class ObservedHTF(AbstractObservation):
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
         cycle.structure.resolve_outputs(self.outputs)
-        inputs_of(cycle.structure, self.inputs)
+        cycle.structure.inputs_among(self.inputs)
         place_sections(cycle, self.sections)
         return self
 

@@ -83,11 +83,11 @@ def loop(
 
     def estimate(outputs: Sequence[str], inputs: Sequence[str], reference: Sequence[str]) -> HTF:
         names = (*data.outputs, *data.inputs)
-        others = [x for x in (*r, *d) if x not in reference]
-        rows = [[names.index(x) for x in part] for part in (outputs, inputs, reference, others)]
-        after, before, outside, known = Ports.rows(data.n_sections, len(names), *rows)
+        left_out = [x for x in (*r, *d) if x not in reference]
+        rows = [[names.index(x) for x in part] for part in (outputs, inputs, reference, left_out)]
+        after, before, outside, other = Ports.rows(data.n_sections, len(names), *rows)
         system = Ports(after, before, outside, data.n_sections)
-        sums = _without(products, known)
+        sums = _without(products, other)
         classes = excited_classes(sums, system, data.periods)
         return solve(
             sums, system, classes, data.periods, tuple(inputs), tuple(outputs), (repeats, "auto")

@@ -156,6 +156,7 @@ def fit_rational(
     `ComputationError` if no start leads to a finite fit.
     """
     require_x64(htf.H)
+    htf.require_sampled("`fit_rational`")
     column, rows = channel_index("input", input, htf.inputs), range(len(htf.outputs))
     if output is not None:
         rows = [channel_index("output", output, htf.outputs)]

@@ -16,8 +16,9 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
     """Return the rms of each output's HTFs.
 
     **Raises:** `DefinitionError` for NaN, an output that is zero, or variances that are no
-    positive numbers.
+    positive numbers; or for HTFs of continuous time.
     """
+    htf.require_sampled("a fit")
     H = np.asarray(htf.H)
     if not np.isfinite(H).all():
         raise DefinitionError("the HTFs hold NaN or infinity.")

@@ -27,7 +27,8 @@ def all_harmonics(n_sections: int) -> tuple[int, ...]:
 
 
 def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, ...]:
-    """`harmonics` as an ascending tuple; `None` means all of them.
+    """`harmonics` as an ascending tuple; `None` means all of them. Without sections, in continuous
+    time, there is a harmonic for every integer.
 
     **Raises:** `DefinitionError` for harmonics that are out of range, repeated, or none.
     """
@@ -35,7 +36,7 @@ def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, 
     if harmonics is None:
         return every
     integers = tuple(sorted(harmonics)) if isinstance(harmonics, Iterable) else (harmonics,)
-    outside = [m for m in integers if m not in every]
+    outside = [m for m in integers if m not in every] if n_sections else []
     if outside:
         raise DefinitionError(
             f"Harmonic {outside[0]} does not exist: with {n_sections} sections the harmonics are "

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from .._core import limits
 from .._core.arguments import Numbers, names, require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
-from .._core.boundary.values import Complexes, Reals
+from .._core.boundary.kinds import NewNames, Probability, Vector
+from .._core.boundary.values import Complexes, Reals, Whole
 from .._core.executor import from_host, is_traced
 from .._core.html import COLORS, Curve, card, picture
 from .._core.precision import require_x64
@@ -107,7 +108,8 @@ class HTF(eqx.Module):
     - `f` (F,): input frequencies, cycles per period.
     - `H` (M, F, ny, nu): complex values.
     - `harmonics` (M,): ascending integers, the `m` of `H`'s first axis.
-    - `n_sections`: `N`, the number of sections (samples) in one period.
+    - `n_sections`: `N`, the number of sections (samples) in one period; 0 in continuous time, where
+        n / N is time in periods, and every integer m a harmonic of its own.
     - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`.
     - `source`: a label, "exact" or "estimate".
     - `variance` (M, F, ny, nu): E|dH|^2 of the complex error dH of estimates, which is circular
@@ -139,7 +141,7 @@ class HTF(eqx.Module):
         f: Vector,
         H: Annotated[Numbers, Complexes("M F ny nu")],
         harmonics: Harmonics,
-        n_sections: SectionCount,
+        n_sections: Annotated[int, Whole(0, limits.SECTIONS)],
         inputs: NewNames | None = None,
         outputs: NewNames | None = None,
         source: str = "estimate",
@@ -181,11 +183,12 @@ class HTF(eqx.Module):
             f = np.asarray(self.f)
             span = f" {f.min():.4g} to {f.max():.4g}"
         low, high, number = self.harmonics[0], self.harmonics[-1], len(self.harmonics)
+        sections = f"{self.n_sections} sections" if self.n_sections else "continuous time"
         dense = number == high - low + 1
         shown = f"{low} to {high}" if dense and number > 3 else ", ".join(map(str, self.harmonics))
         return (
             f"HTF({self.source}; harmonics {shown}; {count} frequencies{span} cycles/period; "
-            f"{self.n_sections} sections: {listed(self.inputs)} -> {listed(self.outputs)})"
+            f"{sections}: {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 
     def _repr_html_(self) -> str | None:
@@ -309,6 +312,7 @@ class HTF(eqx.Module):
         """
         if is_traced(self.f, u):
             raise DefinitionError("`predict` must know `u` and `f`: call it outside of jit.")
+        self.require_sampled("`predict`")
         (n, nu), N, u = u.shape, self.n_sections, np.asarray(u)
         if n == 0 or n % N or nu != len(self.inputs):
             raise DefinitionError(
@@ -352,8 +356,18 @@ class HTF(eqx.Module):
         """The largest of `harmonic_errors`, per output."""
         return jnp.max(self.harmonic_errors(other), axis=0)
 
+    def require_sampled(self, name: str) -> None:
+        """**Raises:** `DefinitionError` in continuous time."""
+        if not self.n_sections:
+            raise DefinitionError(
+                f"{name} takes HTFs between sections, and these are of continuous time: make them "
+                "by `linearize(cycle, sections).htf(f)`."
+            )
+
     def _circle(self, f):
-        """`f` modulo `N`, between `-N/2` and `N/2`."""
+        """`f` modulo `N`, between `-N/2` and `N/2`; `f` itself in continuous time."""
+        if not self.n_sections:
+            return f
         return (f + self.n_sections / 2) % self.n_sections - self.n_sections / 2
 
     def _index(self, m):
@@ -398,6 +412,7 @@ def _combined(
 ) -> HTF:
     """Return the result of an operation on harmonic matrices, with its variances."""
     first = operands[0]
+    first.require_sampled("the algebra of HTFs")
     N, every = first.n_sections, check_harmonics(None, first.n_sections)
     if is_traced(first.f):
         raise DefinitionError("the algebra of HTFs must know `f`: call it outside of jit.")
@@ -423,10 +438,10 @@ def _combined(
             algebra.variance_of(pairs, [to_matrices(v) for v in filled]), N // 2
         ).real
 
-    known = [x.scatter.freedom for x in operands if x.scatter is not None]
+    freedoms = [x.scatter.freedom for x in operands if x.scatter is not None]
     scatter = None
-    if known:  # of all lines of a class, the least
-        least = jnp.min(jnp.stack(known), axis=0)[lines.row].min(axis=1)
+    if freedoms:  # of all lines of a class, the least
+        least = jnp.min(jnp.stack(freedoms), axis=0)[lines.row].min(axis=1)
         rows = np.zeros(len(first.f), int)
         rows[lines.row] = np.arange(len(lines.row))[:, None]
         scatter = Scatter(least[rows], shared=True)

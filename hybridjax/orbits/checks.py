@@ -39,7 +39,7 @@ def check_periodic(system: HybridSystem) -> None:
     """
     clocked = check_system(system)
     if clocked and system.period() is None:
-        raise DefinitionError(_no_period(Structure(system), f"the {clocked[0]} depends on t"))
+        raise DefinitionError(_no_period(system, f"the {clocked[0]} depends on t"))
 
 
 def check_clock(s: Structure) -> None:
@@ -53,7 +53,7 @@ def check_clock(s: Structure) -> None:
     for transition in s.transitions:
         if isinstance(transition.guard, Scheduled):
             if given is None:
-                raise DefinitionError(_no_period(s, f"'{transition.name}' is scheduled"))
+                raise DefinitionError(_no_period(s.system, f"'{transition.name}' is scheduled"))
             ratio = period / float(transition.guard.period)
             if not abs(ratio - round(min(ratio, 1e9))) < SAME:
                 raise DefinitionError(
@@ -112,7 +112,7 @@ def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
     for x in (x for x in given if isinstance(x, Output) and not is_traced(cycle)):
         clocked = list(check_output(s, x))
         if clocked and s.system.period() is None:
-            raise DefinitionError(_no_period(s, f"the {clocked[0]} depends on t"))
+            raise DefinitionError(_no_period(s.system, f"the {clocked[0]} depends on t"))
         for a, t, q in points(s, cycle.legs) if clocked else ():
             if s.resolve_outputs(x).defined(a):
                 size = np.append(float(cycle.period), np.asarray(cycle.settings.scale)[a, : len(q)])
@@ -165,9 +165,9 @@ def _output(s: Structure, a: int, output: Output) -> tuple[str, Callable]:
     return f"the output '{output.name}'", lambda t, q: kernels.outputs(s, a, (output,), t, q, u)
 
 
-def _no_period(s: Structure, problem: str) -> str:
+def _no_period(system: HybridSystem, problem: str) -> str:
     return (
-        f"{problem}, but {type(s.system).__name__} states no period: give it a method `period()` "
+        f"{problem}, but {type(system).__name__} states no period: give it a method `period()` "
         "that returns the time after which everything that depends on t repeats."
     )
 

@@ -3,7 +3,6 @@
 import dataclasses
 import functools as ft
 import itertools
-import operator
 from collections.abc import Iterable
 
 import equinox as eqx
@@ -15,8 +14,8 @@ from jaxtyping import Array, Float
 from .._core.compilation import quick_jit
 from .._core.results import Result
 from ..engine.lanes import Lanes
-from ..errors import DefinitionError
 from ..systems.system import HybridSystem
+from ..systems.varied import parameter_of, with_parameter
 from .coincidence import SAME
 from .cycle import LimitCycle
 from .newton import FEW_STEPS, newton_steps
@@ -105,14 +104,14 @@ class Curve:
     def __init__(self, cycle: LimitCycle, parameter: str, span: float):
         self.cycle, self.parameter, self.span = cycle, parameter, span
         self.map, self.sequence = cycle.return_map, _rotated(cycle.event_sequence)
-        self.value = float(_leaf(cycle.system, parameter))
+        self.value = float(parameter_of(cycle.system, parameter))
         flat = jax.tree_util.tree_map(
             lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else x, cycle.system
         )
-        self.direction = _with(flat, parameter, 1.0)
+        self.direction = with_parameter(flat, parameter, 1.0)
 
     def system_at(self, value: float) -> HybridSystem:
-        return _with(self.cycle.system, self.parameter, value)
+        return with_parameter(self.cycle.system, self.parameter, value)
 
     def first(self) -> Point | Result:
         """The cycle itself."""
@@ -235,25 +234,3 @@ def _rotated(sequence: Iterable[int]) -> tuple[int, ...]:
     """Events of a turn, from the same one on wherever the turn begins."""
     events = tuple(sequence)
     return min((events[k:] + events[:k] for k in range(len(events))), default=())
-
-
-def _leaf(system: HybridSystem, parameter: str):
-    """The parameter of that name.
-
-    **Raises:** `DefinitionError` if there is none.
-    """
-    leaves = jax.tree_util.tree_leaves_with_path(system)
-    is_number = lambda x: eqx.is_inexact_array(x) and x.shape == ()  # noqa: E731
-    names = (jax.tree_util.keystr(path).lstrip(".") for path, x in leaves if is_number(x))
-    name, text = type(system).__name__, f"parameters are {', '.join(names)}."
-    try:
-        value = operator.attrgetter(parameter)(system)
-    except (AttributeError, TypeError) as error:
-        raise DefinitionError(f"{name} has no parameter '{parameter}'; {text}") from error
-    if not is_number(value):
-        raise DefinitionError(f"'{parameter}' of {name} is no single floating-point number; {text}")
-    return value
-
-
-def _with(system, parameter: str, value):
-    return eqx.tree_at(operator.attrgetter(parameter), system, jnp.asarray(value, float))

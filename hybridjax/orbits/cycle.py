@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from .._core.boundary.checked import NeedsValues, checked_methods
-from .._core.boundary.kinds import Positive
+from .._core.boundary.kinds import Index, Positive, SignalNames
 from .._core.compilation import at_ease
 from .._core.executor import is_traced, to_host
 from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, unit_circle
 from .._core.meaning import code_digest
 from .._core.memo import remembered
+from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
@@ -23,12 +24,18 @@ from ..engine.replay import Link, divergence, links
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
 from ..errors import DefinitionError
+from ..linear.frequency_response import Frequencies, Harmonics
+from ..linear.htf import HTF
 from ..linear.multipliers import product_eigenvalues
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem
+from ..systems.system import HybridSystem, OutputNames
+from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
+from .linear_flow import Course
+from .responses import Responses, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
+from .sensitivity import Sensitivity, sensitivity
 
 
 Matrix = Float[np.ndarray, "_ _"]
@@ -199,6 +206,68 @@ class LimitCycle(eqx.Module):
             self.system, s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods,
             time=float(anchor.t[0]), settings=self.settings,
         )  # fmt: skip
+
+    def responses(self, modes: Index | None = None) -> Responses:
+        """Responses to brief pushes, at every phase: of the phase, and of the amplitudes of modes.
+
+        They come from one more turn on the cycle, whose steps are linearized, and are exact through
+        events; inputs that resets and guards use act at events (`Responses.impulses`).
+
+        **Arguments:** `modes`: number of modes, those with the largest multipliers. Default: all
+        with multipliers above 1e-6; inside of JAX transformations it must be given.
+
+        **Raises:** `ComputationError` for a double multiplier 1, where phase has no meaning, and
+        for modes whose multipliers coincide; `DefinitionError` for more modes than have amplitudes.
+        """
+        return responses(self._course(), modes)
+
+    def htf(
+        self,
+        f: Frequencies,
+        harmonics: Harmonics = 0,
+        outputs: OutputNames | None = None,
+        inputs: SignalNames | None = None,
+    ) -> HTF:
+        r"""Harmonic transfer functions in continuous time, exact through events.
+
+        An input $e^{2 \pi i f t / T}$ has the response
+        $\sum_m H_m(f) e^{2 \pi i (f + m) t / T}$, with the period T and the time t of the system's
+        clock, or since the anchor of an autonomous cycle. Inputs that guards and resets use act at
+        events. An output that jumps at an event
+        whose time moves has an impulse there, which its harmonics include: their moduli do not
+        decay.
+
+        **Arguments:**
+
+        - `f`: input frequencies, in cycles per period.
+        - `harmonics`: any integers m. Default: 0.
+        - `outputs`: names or `Output`s. Default: all states that every chart defines.
+        - `inputs`: names. Default: all.
+
+        **Raises:** `DefinitionError` for an output that a chart of the cycle does not define, an
+        input that does not exist, and frequencies at a pole, as whole ones of autonomous cycles.
+        """
+        return continuous_htf(self._course(), f, harmonics, outputs, inputs)
+
+    def sensitivity(self, parameter: str) -> Sensitivity:
+        """Derivatives of the period, of times of events and of the shape by a parameter.
+
+        Phase 0 stays on the section of the cycle, or at the anchor's phase of the clock, and
+        phases are times in parts of the period.
+
+        **Arguments:** `parameter`: the name of a parameter of the system, or of a part of it with
+        dots.
+
+        **Raises:** `DefinitionError` for a parameter that does not exist; `ComputationError` for
+        cycles that are not isolated.
+        """
+        return sensitivity(self._course(), parameter)
+
+    def _course(self) -> Course:
+        require_x64()
+        self.require_current()
+        map = self.return_map
+        return Course(self, map, self.legs, self.period, self.event_sequence, map.system)
 
     def __repr__(self):
         if is_traced(self):

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
@@ -13,11 +13,9 @@ from .._core.lanes import by_lane
 from .._core.progress import working
 from ..engine import kernels
 from ..engine.lanes import for_each_chart, only
-from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
-from ..systems.structure import Structure
 from ..systems.system import Output, OutputNames
 from .place import as_placed
 from .placed import PlacedSections, SectionsLike
@@ -61,7 +59,7 @@ def linearize(
     z = check_outputs(cycle, outputs)
     for a in charts if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
-    names, columns = inputs_of(s, inputs)
+    names, columns = s.inputs_among(inputs)
     A, B = placed.flow_jacobians
     C, D = _output_jacobians(placed, tuple(z.items))
     d = s.d + 1
@@ -73,18 +71,6 @@ def linearize(
         inputs=names, outputs=z.names,
         coordinates=None if traced else placed.coordinates(),
     )  # fmt: skip
-
-
-def inputs_of(
-    s: Structure, inputs: SignalNames | None
-) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
-    """Names of inputs (Default: all) and their indices."""
-    names = s.inputs if inputs is None else inputs
-    for name in names:
-        if name not in s.inputs:
-            raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(s.inputs)}.")
-    columns = np.array([s.inputs.index(n) for n in names], int)
-    return tuple(s.inputs[k] for k in columns), columns
 
 
 @host_first

@@ -16,7 +16,6 @@ from ..orbits.cycle import LimitCycle
 from ..systems.structure import Structure
 from ..systems.system import Output
 from .families import FamilyLike
-from .linearize import inputs_of
 from .place import as_placed
 from .placed import PlacedSections, observe
 
@@ -174,7 +173,7 @@ def second_order(
     z = s.resolve_outputs(outputs)
     for a in np.unique(placed.lanes.chart):
         z.require(int(a))
-    _, columns = inputs_of(s, inputs)
+    _, columns = s.inputs_among(inputs)
     first, second = to_host(_derivatives(from_host(placed), tuple(z.items)))
     n = 1 + s.d
     kept = np.r_[:n, n + columns]

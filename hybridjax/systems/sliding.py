@@ -67,7 +67,7 @@ def sliding(
             f"charts '{above}' and '{below}' must have the same states and inputs for a surface "
             "between them."
         )
-    middle = _Slides(f, g, surface)
+    middle = SlidingChart(f, g, surface)
     height = lambda t, q, u: surface(t, q)  # noqa: E731
     held = lambda t, q, u: middle.rates(t, q, u)[1] >= 0  # noqa: E731
     borne = lambda t, q, u: middle.rates(t, q, u)[0] <= 0  # noqa: E731
@@ -91,7 +91,7 @@ def sliding(
     return Sliding({**charts, name: middle}, transitions)
 
 
-class _Slides(DerivedChart):
+class SlidingChart(DerivedChart):
     """Motion along the surface, above which is the `chart`."""
 
     below: Chart
@@ -109,3 +109,10 @@ class _Slides(DerivedChart):
     def field(self, t, q, u):
         (f, g), (a, b) = self.fields(t, q, u), self.rates(t, q, u)
         return (b * f - a * g) / (b - a)
+
+    def returned(self, t, q, u):
+        """The effect (n, n) of a small push once the state is back on the surface, which either
+        side reaches by the same direction f_a - f_b."""
+        (f, g), (a, b) = self.fields(t, q, u), self.rates(t, q, u)
+        normal = jax.grad(self.surface, 1)(jnp.asarray(t, float), jnp.asarray(q, float))
+        return jnp.eye(len(f)) - jnp.outer(f - g, normal) / (a - b)

@@ -74,6 +74,7 @@ def realize(
     """
     require_x64()
     if isinstance(source, HTF):
+        source.require_sampled("`realize`")
         return _from_htf(source, dims, order)
     spread = None
     if isinstance(source, SeriesFit):

@@ -1,0 +1,175 @@
+r"""Harmonic transfer functions in continuous time, and the response of a cycle to lasting changes.
+
+Under an input $e^{i w t}$, deviations from the cycle are $e^{i w t}$ times a function with the
+period of the cycle. It is found from the monodromy matrix and from the forced linear flow over one
+turn; the Fourier integral is a sum over the same nodes, interrupted at events (no truncated series;
+N. M. Wereley, Analysis and control of linear periodically time varying systems, MIT 1991).
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Complex, Float
+
+from .._core.boundary.kinds import SignalNames
+from .._core.compilation import at_ease
+from .._core.executor import Array, is_traced, namespace, on_host, put, scan, to_host
+from ..engine import kernels
+from ..engine.lanes import for_each_chart, only
+from ..errors import DefinitionError
+from ..linear.frequency_response import Frequencies, Harmonics, check_harmonics
+from ..linear.htf import HTF
+from ..systems.check import check_output
+from ..systems.structure import Outputs, Structure
+from ..systems.system import Output, OutputNames
+from .linear_flow import Course, LinearFlow, rule
+from .return_map import ReturnMap
+
+
+# Largest angle by which an input, or a harmonic of the output, turns within a piece. Larger:
+# polynomials on a piece lose digits. Smaller: more pieces than needed.
+_INPUT_TURNS, _OUTPUT_TURNS = 1.5, 4.0
+# Distance in cycles per period from a pole on the unit circle at which a frequency lies on it.
+# Smaller: responses are rounding errors. Larger: frequencies beside it are rejected.
+_POLE = 1e-9
+
+
+class Parts(NamedTuple):
+    """Outputs along a linear flow: values, and derivatives by states and inputs."""
+
+    values: Float[Array, "P K ny"]
+    by_state: Float[Array, "P K ny d"]
+    by_input: Float[Array, "P K ny nu"]
+
+
+def observed(s: Structure, flow: LinearFlow, z: Outputs) -> Parts:
+    """Outputs at the nodes."""
+    xp, (P, K, d), ny = namespace(flow.q), flow.q.shape, len(z.names)
+    chart, t, q = xp.repeat(flow.chart, K), flow.t.ravel(), flow.q.reshape(P * K, d).T
+
+    def work(a, here, out):
+        n = s.dims[a]
+        if not z.defined(a):
+            return out
+        point = only(here, t), only(here, q[:n]), xp.zeros((s.nu, 1))
+        by = kernels.outputs(s, a, tuple(z.items), *point)
+        index = np.ix_(np.arange(ny), np.r_[: 2 + n, 2 + d : 2 + d + s.nu])
+        return put(out, index, xp.where(here, by, out[index]))
+
+    begin = xp.zeros((ny, 2 + d + s.nu, P * K))
+    by = for_each_chart(s, chart, xp.ones(P * K, bool), work, begin)
+    by = xp.moveaxis(by, -1, 0).reshape(P, K, ny, -1)
+    return Parts(by[..., 0], by[..., 2 : 2 + d], by[..., 2 + d :])
+
+
+def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
+    """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of 2, so
+    that calls with similar frequencies share a linearization."""
+    inputs = _INPUT_TURNS / (2 * np.pi * max(np.max(np.abs(f), initial=0.0), 0.1))
+    outputs = _OUTPUT_TURNS / (2 * np.pi * max(np.max(np.abs(harmonics)), 0.1))
+    return float(2.0 ** np.floor(np.log2(min(inputs, outputs, 1.0))))
+
+
+def continuous_htf(
+    course: Course,
+    f: Frequencies,
+    harmonics: Harmonics,
+    outputs: OutputNames | None,
+    inputs: SignalNames | None,
+) -> HTF:
+    """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
+    s, harmonics = course.map.structure, check_harmonics(harmonics, 0)
+    frequencies = f if isinstance(f, jax.Array) else np.asarray(f, float)
+    frequencies = frequencies.reshape(-1)
+    if is_traced(frequencies):
+        raise DefinitionError("`htf` must know `f`: make it outside of jit and grad.")
+    frequencies = np.asarray(frequencies)
+    visited = {s.transitions[g].source for g in course.events}
+    if outputs is None:
+        charts = range(len(s.charts))
+        names = s.state_names()
+        outputs = [x for x in names if all(s.state_function(x, a) is not None for a in charts)]
+    z = s.resolve_outputs(outputs)
+    for x in (x for x in z.items if isinstance(x, Output)):
+        list(check_output(s, x))
+    for name in visited or s.names:
+        z.require(s.chart_index(name))
+    names, columns = s.inputs_among(inputs)
+    flow = course.linear_flow(longest_piece(frequencies, harmonics))
+    if on_host(flow.t):
+        course = to_host(course)
+    with at_ease():
+        H = _transfer(course.map, flow, course.period, z, frequencies, harmonics)
+    return HTF(frequencies, H[..., columns], harmonics, 0, names, z.names, "exact")
+
+
+def _transfer(
+    map: ReturnMap,
+    flow: LinearFlow,
+    period: Float[Array, ""],
+    z: Outputs,
+    f: Float[np.ndarray, " F"],
+    harmonics: tuple[int, ...],
+) -> Complex[Array, "M F ny nu"]:
+    s, xp, w = map.structure, namespace(flow.q), rule().weights
+    clocked, jumps, h = map.base is None, flow.jumps, flow.length
+    y, T = observed(s, flow, z), period
+    free, forced = flow.forward()
+    # Time 0 is that of the clock, or the anchor of an autonomous cycle.
+    t = flow.t if clocked else flow.t - flow.t[0, 0]
+    rate = 2j * np.pi * f / T
+    begin = xp.exp(t[:, :1] * rate)  # (P, F)
+    inside = xp.exp(rate[:, None] * (h[:, None] * rule().nodes)[:, None])  # (P, F, K)
+    push = forced * h[:, None, None, None, None]
+    push = xp.einsum("piakb,pkbu->piaku", push, flow.by_input)  # nodes by inputs at nodes
+    # From piece to piece.
+    kick = xp.einsum("pfk,paku->pfau", inside, push[:, -1]) * begin[..., None, None]
+    at_end = (begin * inside[:, :, -1])[..., None, None]
+    driven = xp.einsum("pab,pfbu->pfau", jumps.by_state, kick) + jumps.by_input[:, None] * at_end
+    through = jumps.by_state @ free[:, -1]
+    advance = lambda x, piece: (piece[0] @ x + piece[1], x)  # noqa: E731
+    zero = xp.zeros(driven.shape[1:], driven.dtype)
+    total, _ = scan(advance, zero, (through + 0j, driven))
+    # Deviations at the beginning: X(T) = exp(i w T) X(0).
+    size = xp.where(map.valid, map.sizes, 1.0)
+    whole = xp.where(map.valid[:, None] & map.valid, flow.monodromy(free), 0.0)
+    whole = whole * size / size[:, None]
+    if on_host(whole):
+        apart = np.abs(np.exp(2j * np.pi * f)[:, None] - np.linalg.eigvals(whole)).min(axis=1)
+        if (apart < _POLE).any():
+            where = "every whole number" if not clocked else "its multipliers of modulus 1"
+            raise DefinitionError(
+                f"`f` = {f[apart.argmin()]:.10g} cycles per period is a pole of the cycle, which "
+                f"lie at {where}: leave it out."
+            )
+    turned = xp.exp(rate * T)[:, None, None] * xp.eye(len(size))
+    start = xp.linalg.solve(turned - whole, total / size[:, None]) * size[:, None]
+    _, x = scan(advance, start, (through + 0j, driven))
+    # Fourier integrals, with exp(-i w t) of the piece and of the node apart.
+    weight = h[:, None] * w
+    C = y.by_state * weight[..., None, None]
+    D = xp.einsum("pkyu,pk->pyku", y.by_input, weight)
+    of_start = xp.einsum("pkya,pkab->pkyb", C, free)
+    of_push = xp.einsum("piya,piaku->pkiyu", C, push)
+    shape = *inside.shape, *D.shape[1::2]
+    within = (inside @ of_push.reshape(*of_push.shape[:2], -1)).reshape(shape)
+    back, before = xp.conj(inside), x / begin[..., None, None]
+    response = xp.einsum("pkyb,pfbu->pfkyu", of_start, before) + within
+    response = response * back[..., None, None] + xp.moveaxis(D, 2, 1)[:, None]
+    # Events whose time moves: the jump of the output at the moment of the event.
+    last = xp.einsum("pab,pfbu->pfau", free[:, -1], before)
+    last = last + xp.einsum("pfk,paku->pfau", inside, push[:, -1])
+    delay = xp.einsum("pa,pfau->pfu", jumps.delay_by_state, last)
+    delay = delay * back[:, :, -1, None] + jumps.delay_by_input[:, None]
+    step = y.values[:, -1] - xp.roll(y.values[:, 0], -1, axis=0)
+    step = xp.where(
+        xp.any(jumps.delay_by_state != 0, axis=1)[:, None]
+        | xp.any(jumps.delay_by_input != 0, axis=1)[:, None],
+        step,
+        0.0,
+    )
+    impulse = step[:, None, :, None] * delay[:, :, None]
+    waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / T))
+    H = xp.tensordot(waves, response, ((1, 2), (0, 2)))
+    return (H + xp.einsum("mp,pfyu->mfyu", waves[:, :, -1], impulse)) / T

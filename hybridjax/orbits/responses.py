@@ -1,0 +1,355 @@
+"""Responses of a cycle to brief pushes: of its phase, and of the amplitudes of its Floquet modes.
+
+The phase response Z of a cycle satisfies dZ/dt = -(Df)^T Z along it, Z(t-)^T = Z(t+)^T S at events
+with the saltation matrix S, and Z . f = 1. The response I of the amplitude of a mode with the
+multiplier exp(kappa T) satisfies dI/dt = -(Df - kappa)^T I with the same jumps, and I . v = 1 for
+the mode v (G. B. Ermentrout, D. H. Terman, Mathematical foundations of neuroscience, Springer 2010,
+Ch. 8; D. Wilson, J. Moehlis, Phys. Rev. E 94, 2016).
+"""
+
+from typing import Annotated, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float, Inexact
+
+from .._core.boundary.checked import checked_methods
+from .._core.boundary.kinds import Index, Numbers
+from .._core.boundary.values import Reals
+from .._core.executor import Array, is_traced, namespace, on_host, singular_values, to_host
+from .._core.text import number
+from ..engine import kernels
+from ..engine.lanes import for_each_chart, only
+from ..errors import ComputationError, DefinitionError
+from ..systems.sliding import SlidingChart
+from ..systems.structure import Structure
+from .linear_flow import Course, LinearFlow, by_name
+from .return_map import SINGULAR, ReturnMap
+
+
+# Modes with multipliers below this modulus have no amplitude response. Smaller: rounding errors,
+# divided by the multiplier, take the place of digits. Larger: slower modes are left out.
+_LEAST = 1e-6
+
+Unit = Literal["time", "cycles", "radians"]
+Phases = Annotated[Numbers, Reals("p")]
+
+
+class PhaseCurve(eqx.Module):
+    """The phase response to one input over one cycle.
+
+    **Fields:** `phase` (P,), in cycles; `values` (P,), in cycles per unit of time and of the input,
+    with NaN between both sides of an event; `input`; `time_unit`.
+    """
+
+    phase: Float[np.ndarray, " P"]
+    values: Float[np.ndarray, " P"]
+    input: str = eqx.field(static=True)
+    time_unit: str = eqx.field(static=True, default="s", kw_only=True)
+
+
+class Impulse(NamedTuple):
+    """The response to an input that acts at an event, through its guard or reset: there, the input
+    changes the phase or the amplitude by `weight` times its value."""
+
+    event: str
+    phase: Float[Array, ""]
+    weight: dict[str, Inexact[Array, ""]]
+    """By name of the input."""
+
+
+@checked_methods
+class Responses(eqx.Module):
+    """Responses of a limit cycle to brief pushes, at every phase (see `LimitCycle.responses`).
+
+    Phase 0 is the anchor of the cycle. At an event, responses are those right after it. In a chart
+    of sliding (`hj.sliding`), a push off the surface is followed by the return to it.
+
+    **Fields:**
+
+    - `period`; `multipliers` (r,) and `exponents` (r,), per unit of time, of the modes that have
+        amplitudes, by decreasing modulus.
+    - `modes` (r, d): the modes at phase 0. They are scaled so that the responses of amplitudes to
+        states have the length 1 there, in units of the states, and a real largest part.
+    - `left_out`: number of modes without an amplitude: with multipliers below 1e-6, and those that
+        events or sliding remove at once.
+    """
+
+    structure: Structure
+    flow: LinearFlow
+    period: Float[Array, ""]
+    multipliers: Complex[Array, " r"]
+    exponents: Complex[Array, " r"]
+    modes: Inexact[Array, "r d"]
+    left_out: int = eqx.field(static=True)
+    event_sequence: tuple[int, ...] = eqx.field(static=True)
+    of_phase: Float[Array, "P K d"] | None
+    """The phase response in time; `None` if clocked."""
+    of_amplitudes: Inexact[Array, "r P K d"]
+    surface: Float[Array, "P K d d"] | None
+    """The effect of a push, less what sliding undoes; `None` without sliding."""
+
+    def phase(self, phase: Phases, unit: Unit = "time") -> dict[str, Float[Array, " p"]]:
+        """Change of the phase after a brief push at some phases, by names of states and inputs.
+
+        For a state, it is the change of phase per change of the state; for an input, per unit of
+        input and time. It is NaN in charts that lack the state. In units of `"time"`, an advance of
+        the cycle in its unit of time; in `"cycles"` or `"radians"`.
+
+        **Raises:** `DefinitionError` for a cycle that is driven by a clock.
+        """
+        scale = {"time": 1.0, "cycles": 1 / self.period, "radians": 2 * np.pi / self.period}[unit]
+        return self._named(self._covector(None), phase, scale)
+
+    def amplitude(self, mode: Index, phase: Phases) -> dict[str, Inexact[Array, " p"]]:
+        """Change of the amplitude of a mode after a brief push at some phases, by names of states
+        and inputs; complex unless its multiplier is positive.
+
+        An amplitude a moves the state by a times the mode, plus the conjugate if it is complex, and
+        changes by the factor exp(exponent * t) in a time t. Real and imaginary parts are two real
+        amplitudes.
+
+        **Raises:** `DefinitionError` for a mode that does not exist.
+        """
+        return self._named(self._covector(mode), phase)
+
+    def impulses(self, mode: Index | None = None) -> tuple[Impulse, ...]:
+        """The responses of the phase (in time), or of the amplitude of a mode, to inputs that act
+        at events."""
+        xp, jumps, s = namespace(self.period), self.flow.jumps, self.structure
+        after = xp.roll(self._covector(mode)[:, 0], -1, axis=0)
+        weight = xp.einsum("pi,piu->pu", after, jumps.by_input)
+        place = xp.argsort(self.flow.event < 0, stable=True)
+        phases = (self.flow.turn + self.flow.length) / self.period
+        return tuple(
+            Impulse(s.transitions[g].name, phases[k], dict(zip(s.inputs, weight[k], strict=True)))
+            for g, k in zip(self.event_sequence, place, strict=False)
+        )
+
+    def curve(self, input: str | None = None) -> PhaseCurve:
+        """The phase response to an input over the cycle, of the type that measured ones have.
+        Default: the first input.
+
+        **Raises:** `DefinitionError` for an input that does not exist or acts at events, for a
+        cycle that is driven by a clock, and inside of transformations of JAX.
+        """
+        of_phase = self._covector(None)
+        names = self.structure.inputs
+        signal = next((x for x in names if input in (None, x)), None)
+        if signal is None:
+            raise DefinitionError(f"there is no input '{input}'; inputs are {', '.join(names)}.")
+        if is_traced(self):
+            raise DefinitionError("`curve` is a figure's: use `phase` inside of jit and grad.")
+        if any(x.weight[signal] != 0 for x in self.impulses()):
+            raise DefinitionError(
+                f"the input '{signal}' acts at events, which no curve shows: see `impulses()`."
+            )
+        flow = to_host(self.flow)
+        values = np.einsum("pki,pkiu->pku", of_phase, flow.by_input)
+        values = values[..., names.index(signal)] / float(self.period)
+        phase = (flow.t - flow.t[0, 0]) / float(self.period)
+        broken = flow.event >= 0
+        tail = np.where(broken, np.nan, values[:, -1])[:, None]
+        values = np.concatenate([values, tail], axis=1).ravel()
+        phase = np.concatenate([phase, phase[:, -1:]], axis=1).ravel()
+        return PhaseCurve(phase, values, signal, time_unit=self.structure.system.time_unit)
+
+    def __repr__(self):
+        name = type(self.structure.system).__name__
+        if is_traced(self):
+            return f"Responses({name}, traced)"
+        kinds = ["no phase (driven by a clock)" if self.of_phase is None else "phase"]
+        kinds += [f"amplitude {k}: exponent {_text(x)}" for k, x in enumerate(self.exponents)]
+        if self.left_out:
+            kinds.append(f"{self.left_out} faster modes left out")
+        has_any = self.of_phase is not None or len(self.exponents)
+        impulses = self.impulses(0 if self.of_phase is None else None) if has_any else ()
+        acting = [x.event for x in impulses if any(x.weight.values())]
+        if acting:
+            kinds.append(f"inputs act at {', '.join(dict.fromkeys(acting))}: see `impulses()`")
+        period = number(self.period, 9, self.structure.system.time_unit)
+        return f"Responses({name}: period {period})" + "".join(f"\n  {x}" for x in kinds)
+
+    def _covector(self, mode: int | None) -> Inexact[Array, "P K d"]:
+        if mode is None:
+            if self.of_phase is None:
+                raise DefinitionError(
+                    f"{type(self.structure.system).__name__} has no phase response: its phase is "
+                    "that of its clock; use `amplitude`."
+                )
+            return self.of_phase
+        if mode >= len(self.exponents):
+            raise DefinitionError(
+                f"there is no mode {mode}; {len(self.exponents)} modes have amplitudes."
+            )
+        return self.of_amplitudes[mode]
+
+    def _named(
+        self, covector: Inexact[Array, "P K d"], phase: Phases, scale: Array = 1.0
+    ) -> dict[str, Array]:
+        flow, s = self.flow, self.structure
+        xp = namespace(flow.q)
+        pushed = xp.einsum("pki,pkiu->pku", covector, flow.by_input)
+        if self.surface is not None:
+            covector = xp.einsum("pki,pkij->pkj", covector, self.surface)
+        chart, states, inputs = flow.at(phase, self.period, covector, pushed)
+        named = by_name(s, chart, states) | dict(zip(s.inputs, inputs.T, strict=True))
+        return {name: value * scale for name, value in named.items()}
+
+
+def responses(course: Course, modes: int | None) -> Responses:
+    """The responses of a cycle (see `LimitCycle.responses`)."""
+    flow = course.linear_flow()
+    host = on_host(flow.t)
+    _, map, _, period, events, _ = to_host(course) if host else course
+    xp, clocked = namespace(flow.t), map.base is None
+    free, _ = flow.forward()
+    valid = map.valid
+    whole = xp.where(valid[:, None] & valid, flow.monodromy(free), 0.0)
+    size = xp.where(valid, map.sizes, 1.0)
+    if not clocked:
+        f = flow.field[0, 0]
+        closed, along = loop(map, whole, f)
+        Z = xp.linalg.solve(closed.T, along)
+        whole = whole - f[:, None] * Z
+    if modes is None and not host:
+        raise DefinitionError("inside of jit and grad, `responses` needs the number of `modes`.")
+    values, right, left = _modes(whole, size, modes)
+    exponents = xp.log(values) / period
+    adjoint, to_go = flow.adjoint(), period - (flow.t - flow.t[0, 0])
+
+    def nodes(ends):
+        return xp.einsum("pkij,pjr->rpki", adjoint, flow.backward(adjoint, xp.stack(ends, axis=1)))
+
+    phase = nodes([Z])[0] if not clocked else None
+    amplitudes = xp.zeros((0, *flow.q.shape), complex)
+    if len(left):  # they grow by their exponents; rounding adds responses of the phase
+        amplitudes = nodes(left) * xp.exp(-exponents[:, None, None] * to_go)[..., None]
+        if phase is not None:
+            slip = xp.einsum("rpki,pki->rpk", amplitudes, flow.field)
+            amplitudes = amplitudes - slip[..., None] * phase
+    if host and not np.any(np.iscomplex(exponents)):
+        amplitudes, right = np.real(amplitudes), np.real(right)
+    total = int(np.sum(valid)) - (not clocked) if host else len(values)
+    surface = _surface(map.structure, flow)
+    return Responses(
+        map.structure, flow, period, values, exponents, right, total - len(values),
+        events, phase, amplitudes, surface,
+    )  # fmt: skip
+
+
+def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
+    """M - I + f w^T, which is regular if the multiplier 1 is simple, and w, with w . f = 1.
+
+    **Raises:** `ComputationError` if it is not simple.
+    """
+    xp = namespace(f)
+    size = xp.where(map.valid, map.sizes, 1.0)
+    along = f / size**2
+    along = along / (along @ f)
+    closed = monodromy - xp.eye(len(f)) + f[:, None] * along
+    if on_host(f):
+        smallest = singular_values(closed * size / size[:, None])[-1]
+        if map.conserved or not smallest > SINGULAR:
+            raise ComputationError(
+                "the cycle has no phase of its own: its multiplier 1 is double, as in a family of "
+                "cycles with a conserved quantity, where pushes change the period."
+            )
+    return closed, along
+
+
+def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
+    """Multipliers, right and left eigenvectors of M, by decreasing modulus.
+
+    **Raises:** `ComputationError` for multipliers that coincide.
+    """
+    xp = namespace(M)
+    scaled = M * size / size[:, None]
+    if on_host(M):
+        values, right = np.linalg.eig(scaled)
+    else:
+        values, right = jnp.linalg.eig(jax.lax.stop_gradient(scaled))
+    order = xp.argsort(-xp.abs(values) + 1e-9 * (xp.imag(values) < 0), stable=True)
+    if on_host(M):
+        kept = int(np.sum(np.abs(values) > _LEAST))
+        count = kept if count is None else count
+        if count > kept:
+            raise DefinitionError(f"{count} modes were asked for; {kept} have amplitudes.")
+    values, right = values[order][:count], right[:, order][:, :count]
+    out = [_eigenpairs(scaled, values[k], right[:, k]) for k in range(len(values))]
+    values = xp.asarray([x for x, *_ in out]) if out else values[:0]
+    rights, lefts = [], []
+    for _, r, l in out:
+        r, l = r * size, l / size
+        largest = xp.argmax(xp.abs(l) * size)
+        l = l * xp.conj(l[largest]) / xp.abs(l[largest]) / xp.sqrt(xp.sum(xp.abs(l) ** 2))
+        rights.append(r / (l @ r))
+        lefts.append(l)
+        if on_host(M):
+            apart = np.abs(l @ r) * np.sqrt(np.sum(np.abs(r / size) ** 2))
+            if not apart > SINGULAR * np.linalg.norm(l * size) * np.sum(np.abs(r / size) ** 2):
+                raise ComputationError(
+                    "two multipliers coincide, and their modes have no amplitudes of their own: "
+                    "ask for the phase alone by `modes=0`, or change a parameter."
+                )
+    return values, xp.stack(rights) if rights else right.T[:0], lefts
+
+
+def _eigenpairs(M: Float[Array, "d d"], value, right):
+    """An eigenvalue with its right and left eigenvectors near an approximation, by one Newton step,
+    which also carries derivatives."""
+    xp, n = namespace(M), len(M)
+    still = M if on_host(M) else jax.lax.stop_gradient(M)
+
+    def pair(M, still, x, value):
+        matrix = xp.concatenate([still - value * np.eye(n), xp.conj(x)[None]])
+        column = xp.append(-x, 0.0)[:, None]
+        off = xp.append(M @ x - value * x, 0.0)
+        step = xp.linalg.solve(xp.concatenate([matrix, column], axis=1), off)
+        return x - step[:n], value - step[n]
+
+    left, *_ = _null(still.T - value * np.eye(n))
+    right, root = pair(M, still, right, value)
+    left, _ = pair(M.T, still.T, left, value)
+    return root, right, left
+
+
+def _null(matrix):
+    """The direction that a matrix contracts most."""
+    xp = namespace(matrix)
+    *_, rows = xp.linalg.svd(matrix if on_host(matrix) else jax.lax.stop_gradient(matrix))
+    return (xp.conj(rows[-1]),)
+
+
+def _surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
+    """The effect of pushes in charts of sliding; identity in others."""
+    sliding = [a for a, chart in enumerate(s.charts) if isinstance(chart, SlidingChart)]
+    if not sliding:
+        return None
+    xp, (P, K, d) = namespace(flow.q), flow.q.shape
+    chart, t, q = xp.repeat(flow.chart, K), flow.t.ravel(), flow.q.reshape(P * K, d).T
+
+    def work(a, here, out):
+        if a not in sliding:
+            return out
+        n = s.dims[a]
+        point = only(here, t), only(here, q[:n]), xp.zeros((s.nu, 1))
+        by = kernels.linear(s, _returned, a, *point)[:, 0].reshape(n, n, -1)
+        by = xp.pad(by, [(0, d - n), (0, d - n), (0, 0)])
+        return xp.where(here, by, out)
+
+    begin = xp.broadcast_to(xp.eye(d)[..., None], (d, d, P * K))
+    by = for_each_chart(s, chart, xp.ones(P * K, bool), work, begin)
+    return xp.moveaxis(by, -1, 0).reshape(P, K, d, d)
+
+
+def _returned(a: int, s: Structure, t, q, u):
+    chart = s.charts[a]
+    assert isinstance(chart, SlidingChart)
+    return chart.returned(t, q, s.chart_input(a, t, u)).ravel()
+
+
+def _text(z) -> str:
+    return f"{z.real:.6g}" if np.imag(z) == 0 else f"{z.real:.6g}{np.imag(z):+.6g}j"

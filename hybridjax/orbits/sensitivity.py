@@ -1,0 +1,163 @@
+"""The response of a cycle to a lasting change of a parameter: period, times of events, shape.
+
+A parameter is an input of frequency 0. The change of the shape at equal phases is the infinitesimal
+shape response curve, and the changes of the times between events are local timing responses (Y.
+Wang, J. P. Gill, H. J. Chiel, P. J. Thomas, SIAM J. Appl. Dyn. Syst. 20, 2021).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .._core.boundary.checked import checked_methods
+from .._core.compilation import at_ease
+from .._core.executor import Array, is_traced, namespace, on_host, scan, to_host
+from .._core.text import number
+from ..engine import kernels
+from ..engine.lanes import for_each_chart
+from ..errors import ComputationError
+from ..systems.structure import Structure
+from ..systems.transition import Scheduled
+from ..systems.varied import Varied
+from .crossing import AtEvent, ListLevels
+from .linear_flow import Course, LinearFlow, by_name
+from .responses import Phases, loop
+from .return_map import SINGULAR
+
+
+@checked_methods
+class Sensitivity(eqx.Module):
+    """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`).
+
+    **Fields:**
+
+    - `parameter`: its name. `period`: derivative of the period.
+    - `events`: names of the events of one period. `times` (E,), derivatives of their times, after
+        phase 0; `durations` (E,), of the time from each to the next, the last to the first.
+    """
+
+    parameter: str = eqx.field(static=True)
+    period: Float[Array, ""]
+    events: tuple[str, ...] = eqx.field(static=True)
+    times: Float[Array, " E"]
+    durations: Float[Array, " E"]
+    structure: Structure
+    flow: LinearFlow
+    duration: Float[Array, ""]
+    """The period itself."""
+    change: Float[Array, "P K d"]
+
+    def shape(self, phase: Phases) -> dict[str, Float[Array, " p"]]:
+        """Derivatives of the states at equal phases, by name; NaN in charts that lack one."""
+        chart, states = self.flow.at(phase, self.duration, self.change)
+        return by_name(self.structure, chart, states)
+
+    def __repr__(self):
+        name = type(self.structure.system).__name__
+        if is_traced(self):
+            return f"Sensitivity({name} to {self.parameter}, traced)"
+        after = [*self.events[1:], *self.events[:1]]
+        rows = [
+            f"\n  {a} to {b}  {number(x, 9)}"
+            for a, b, x in zip(self.events, after, self.durations, strict=True)
+        ]
+        head = f"Sensitivity({name} to {self.parameter}: derivative of the period "
+        return head + f"{number(self.period, 9)})" + "".join(rows)
+
+
+def sensitivity(course: Course, parameter: str) -> Sensitivity:
+    """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`)."""
+    s, varied = course.map.structure, Varied(course.map.system, parameter)
+    course = course._replace(inputs=varied)
+    flow = course.linear_flow()
+    if on_host(flow.q):
+        course = to_host(course)
+    with at_ease():
+        return _sensitivity(course, flow, s, varied)
+
+
+def _sensitivity(course: Course, flow: LinearFlow, s: Structure, varied: Varied) -> Sensitivity:
+    map, period, xp = course.map, course.period, namespace(flow.q)
+    clocked, f0, jumps = map.base is None, flow.field[0, 0], flow.jumps
+    due = _due(flow, course.events, varied)
+    free, forced = flow.forward()
+    force = flow.by_input[..., 0] * flow.length[:, None, None]
+    pushed = xp.einsum("piakb,pkb->pia", forced, force)
+    kick = jumps.by_input[..., 0] + jumps.slip * due[:, None]
+    driven = xp.einsum("pab,pb->pa", jumps.by_state, pushed[:, -1]) + kick
+    through = jumps.by_state @ free[:, -1]
+    advance = lambda x, piece: (piece[0] @ x + piece[1], x)  # noqa: E731
+    total, _ = scan(advance, xp.zeros_like(f0), (through, driven))
+    whole = xp.where(map.valid[:, None] & map.valid, flow.monodromy(free), 0.0)
+    if clocked:
+        longer = map.multiplicity * _derivative(varied, lambda x: x.period())
+        closed = whole - xp.eye(len(f0))
+        if on_host(whole) and np.linalg.svd(closed, compute_uv=False)[-1] < SINGULAR:
+            raise ComputationError(
+                "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
+                "branch by `continuation`."
+            )
+    else:
+        closed, along = loop(map, whole, f0)
+        longer = -(xp.linalg.solve(closed.T, along) @ total)
+    begin = xp.linalg.solve(closed, -(total + f0 * longer))
+    _, starts = scan(advance, begin, (through, driven))
+    change = xp.einsum("pkab,pb->pka", free, starts) + pushed
+    late = xp.einsum("pa,pa->p", jumps.delay_by_state, change[:, -1])
+    late = late + jumps.delay_by_input[:, 0] + due
+    time = flow.t
+    if not clocked:  # phase 0 stays on the section
+        time = flow.t - flow.t[0, 0]
+        ahead = late[-1] - longer if isinstance(map.base, AtEvent) else _off(course, begin, f0)
+        change, late = change + ahead * flow.field, late - ahead
+    change = change + flow.field * (time / period * longer)[..., None]
+    place = xp.argsort(flow.event < 0, stable=True)[: len(course.events)]
+    times = late[place]
+    wrapped = xp.concatenate([times[1:], times[:1] + longer]) - times
+    names = tuple(s.transitions[g].name for g in course.events)
+    return Sensitivity(varied.parameter, longer, names, times, wrapped, s, flow, period, change)
+
+
+def _derivative(varied: Varied, value):
+    """The derivative of a number of the system by the parameter."""
+    zero = jnp.zeros(())
+    of = lambda k: jnp.asarray(value(varied.at(k)), float)  # noqa: E731
+    return jax.jvp(of, (zero,), (jnp.ones(()),))[1]
+
+
+def _due(flow: LinearFlow, events: tuple[int, ...], varied: Varied) -> Float[Array, " P"]:
+    """Changes of the times of scheduled events, at the ends of pieces."""
+    xp, end = namespace(flow.q), flow.t[:, -1]
+    out = xp.zeros_like(end)
+    for g in sorted(set(events)):
+        guard = list(varied.transitions())[g].guard
+        if isinstance(guard, Scheduled):
+            schedule = lambda x, g=g: list(x.transitions())[g].guard  # noqa: E731
+            offset = _derivative(varied, lambda x, of=schedule: of(x).offset)
+            every = _derivative(varied, lambda x, of=schedule: of(x).period)
+            count = xp.round((end - guard.offset) / guard.period)
+            out = xp.where(flow.event == g, offset + count * every, out)
+    return out
+
+
+def _off(course: Course, begin: Float[Array, " d"], f: Float[Array, " d"]) -> Float[Array, ""]:
+    """The time by which the changed state at phase 0 comes later to the section."""
+    map, xp = course.map, namespace(begin)
+    assert map.base is not None
+    levels, (t, chart, q, *_) = ListLevels((map.base,)), map.anchor
+
+    def work(a, here, out):
+        n, u = map.structure.dims[a], xp.zeros((1, 1))
+        by = kernels.linear(course.linearized, _level, a, t, q[:n], u, levels)[0, :, 0]
+        moved = by[-1] + by[2 : 2 + n] @ begin[:n]
+        return out - moved / (by[2 : 2 + n] @ f[:n])
+
+    return for_each_chart(map.structure, chart, xp.ones(1, bool), work, xp.zeros(()))
+
+
+def _level(a: int, s: Structure, levels: ListLevels, t, q, u):
+    assert isinstance(s.system, Varied)
+    of = Structure(s.system.at(u[0]))
+    return levels.level(of, a, jnp.zeros((), int), t, q)[None]

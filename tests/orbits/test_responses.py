@@ -1,0 +1,344 @@
+"""Responses of cycles to pushes, to lasting changes and to sines, against closed forms, finite
+differences of flows and simulated sines."""
+
+# ruff: noqa: E731
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.systems.chart import FieldChart
+
+
+PHASES = np.array([0.0, 0.13, 0.31, 0.52, 0.77, 0.98])
+
+
+class StuartLandau(hj.HybridSystem):
+    mu: hj.Parameter = hj.parameter(0.1)
+    eta: hj.Parameter = hj.parameter(1.0)
+    alpha: hj.Parameter = hj.parameter(-0.4)
+
+    def charts(self):
+        return {"plane": FieldChart(self.field, ("x", "y"))}
+
+    def field(self, t, q, u):
+        z = self.growth(q[0] ** 2 + q[1] ** 2)
+        return z[0] * q[0] - z[1] * q[1] + u[0], z[1] * q[0] + z[0] * q[1]
+
+    def growth(self, r2):
+        return self.mu - r2, self.eta - self.alpha * r2
+
+
+class Neuron(hj.HybridSystem):
+    """v' = I - leak v + square v^2 + u; at v = 1 - grip u, v is reset to low + grip u."""
+
+    current: hj.Parameter = hj.parameter(1.2)
+    leak: hj.Parameter = hj.parameter(1.0)
+    square: hj.Parameter = hj.parameter(0.0)
+    low: hj.Parameter = hj.parameter(0.0)
+    grip: hj.Parameter = hj.parameter(0.0)
+
+    def charts(self):
+        return {"membrane": FieldChart(self.field, ("v",))}
+
+    def field(self, t, q, u):
+        return (self.current - self.leak * q[0] + self.square * q[0] ** 2 + u[0],)
+
+    def transitions(self):
+        guard = lambda t, q, u: 1 - self.grip * u[0] - q[0]  # noqa: E731
+        reset = lambda t, q, u: (self.low + self.grip * u[0],)  # noqa: E731
+        return [hj.Transition("spike", "membrane", "membrane", guard, reset=reset)]
+
+    def guess(self):
+        return hj.Guess("membrane", jnp.atleast_1d(self.low), after="spike")
+
+
+class Square(hj.HybridSystem):
+    """z' = (a + i omega) z in a square with hard walls."""
+
+    a: hj.Parameter = hj.parameter(0.2)
+    omega: hj.Parameter = hj.parameter(1.0)
+
+    WALLS = (("right", 0, 1), ("top", 1, 1), ("left", 0, -1), ("bottom", 1, -1))
+
+    def rates(self, q):
+        return self.a * q[0] - self.omega * q[1], self.omega * q[0] + self.a * q[1]
+
+    def charts(self):
+        charts = {"inside": FieldChart(lambda t, q, u: self.rates(q), ("x", "y"))}
+        for name, axis, _ in self.WALLS:
+            along = lambda t, q, u, k=axis: [r * (i != k) for i, r in enumerate(self.rates(q))]
+            charts[name] = FieldChart(along, ("x", "y"))
+        return charts
+
+    def transitions(self):
+        for name, k, side in self.WALLS:
+            inner = lambda t, q, u, k=k, side=side: 1 - side * q[k]
+            yield hj.Transition(f"to {name}", "inside", name, inner)
+            pressed = lambda t, q, u, k=k, side=side: side * self.rates(q)[k]
+            yield hj.Transition(f"off {name}", name, "inside", pressed)
+
+    def guess(self):
+        return hj.Guess("inside", (1.0, 0.2), after="off right")
+
+
+def _paddle(t):
+    return 0.15 * jnp.sin(2 * jnp.pi * t)
+
+
+class Juggler(hj.HybridSystem):
+    """A ball on a moving paddle."""
+
+    def charts(self):
+        return {"flight": FieldChart(lambda t, q, u: (q[1], u[0] - 9.81), ("y", "v"))}
+
+    def impact(self, t, q, u):
+        return q[0], 1.7 * jax.grad(_paddle)(t) - 0.7 * q[1], *q[2:]
+
+    def transitions(self):
+        gap = lambda t, q, u: q[0] - _paddle(t)  # noqa: E731
+        return [hj.Transition("impact", "flight", "flight", gap, reset=self.impact)]
+
+    def period(self):
+        return 1.0
+
+
+class Measured(Juggler):
+    """The same, with the integrals of its speed times a cosine and a sine."""
+
+    rate: hj.Parameter = hj.parameter(0.0)
+
+    def charts(self):
+        def field(t, q, u):
+            wave = self.rate * t
+            return q[1], u[0] - 9.81, q[1] * jnp.cos(wave), -q[1] * jnp.sin(wave)
+
+        return {"flight": FieldChart(field, ("y", "v", "c", "s"))}
+
+
+@pytest.mark.core
+def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
+    system = StuartLandau()
+    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
+    responses = hj.find_limit_cycle(system, guess, section=section).responses()
+    angle = 2 * np.pi * PHASES
+    phase = responses.phase(PHASES, "radians")
+    exact = -(np.sin(angle) - 0.4 * np.cos(angle)) / np.sqrt(0.1)
+    np.testing.assert_allclose(phase["u"], exact, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(phase["x"], exact, rtol=0, atol=1e-12)
+    amplitude = responses.amplitude(0, PHASES)
+    np.testing.assert_allclose(amplitude["x"], np.cos(angle), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(amplitude["y"], np.sin(angle), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(responses.exponents, [-0.2], rtol=0, atol=1e-12)
+    assert "exponent -0.2" in str(responses)
+
+
+@pytest.mark.core
+def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
+    leaky = hj.find_limit_cycle(Neuron(grip=0.3)).responses()
+    period = np.log(1.2 / 0.2)
+    np.testing.assert_allclose(leaky.period, period, rtol=1e-12)
+    exact = np.exp(PHASES * period) / 1.2
+    np.testing.assert_allclose(leaky.phase(PHASES)["v"], exact, rtol=1e-12)
+    # The guard comes 0.3 / v' = 1.5 earlier, and the reset starts 0.3 / 1.2 ahead.
+    (impulse,) = leaky.impulses()
+    np.testing.assert_allclose(impulse.weight["u"], 1.5 + 0.25, rtol=1e-12)
+    assert "inputs act at spike" in str(leaky)
+    with pytest.raises(hj.DefinitionError, match="acts at events, which no curve shows"):
+        leaky.curve("u")
+    # v' = I + v^2: v = tan(t + arctan v0) for I = 1.
+    system = Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
+    cycle = hj.find_limit_cycle(system)
+    begin, quadratic = np.arctan(-2.0), cycle.responses()
+    period = np.arctan(1.0) - begin
+    exact = np.cos(begin + PHASES * period) ** 2
+    np.testing.assert_allclose(quadratic.phase(PHASES)["u"], exact, rtol=1e-12)
+    curve = quadratic.curve()
+    exact = np.cos(begin + curve.phase * period) ** 2 / period
+    kept = np.isfinite(curve.values)
+    np.testing.assert_allclose(curve.values[kept], exact[kept], rtol=1e-12)
+    assert 0 < np.sum(~kept) <= 2 and curve.input == "u"
+    # Sustained: T = arctan(1) - arctan(low), whose derivative is -1 / (1 + low^2).
+    change = cycle.sensitivity("low")
+    np.testing.assert_allclose(change.period, -1 / 5, rtol=1e-11)
+    np.testing.assert_allclose(change.durations, [-1 / 5], rtol=1e-11)
+    np.testing.assert_allclose(change.shape([0.0])["v"], [1.0], rtol=1e-11)
+
+
+@pytest.mark.core
+def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_derivative():
+    cycle = hj.find_limit_cycle(Square())
+    np.testing.assert_allclose(cycle.period, 6.766182958186238, rtol=1e-11)
+    a, omega = cycle.sensitivity("a"), cycle.sensitivity("omega")
+    np.testing.assert_allclose(a.period - omega.period, 10.784262213426, rtol=1e-9)
+    np.testing.assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
+    # By symmetry each quarter takes its part.
+    np.testing.assert_allclose(np.reshape(a.durations, (4, 2)).sum(1), a.period / 4, rtol=1e-9)
+
+
+def _pushed(cycle, phase, state, push, turns):
+    """Advance of the cycle after a push, by the flow of pushed states."""
+    s, period, settings = cycle.structure, float(cycle.period), cycle.settings
+    a = int(cycle.anchor.chart[0])
+    flow = lambda chart, q, time, t: hj.simulate(
+        cycle.system, chart, q, time, time=t, settings=settings
+    )
+    begin = float(cycle.anchor.t[0])
+    at = flow(s.names[a], cycle.anchor.q[: s.dims[a], 0], phase * period, begin)
+    chart = s.names[at.chart[-1]]
+    q, k = at.after[-1, : s.dims[at.chart[-1]]], s.charts[at.chart[-1]].states.index(state)
+    end = lambda push: flow(chart, q + push * np.eye(len(q))[k], turns * period, at.t[-1])
+    base = end(0.0)
+    f = base.slope_after[-1] / cycle.settings.scale[base.chart[-1]]
+
+    def advance(push):
+        moved = (end(push).after[-1] - base.after[-1]) / cycle.settings.scale[base.chart[-1]]
+        return moved @ f / (f @ f)
+
+    central = lambda h: (advance(h) - advance(-h)) / (2 * h)
+    return (4 * central(push / 2) - central(push)) / 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "system, state, phases, turns",
+    [
+        (hj.models.VanDerPol(), "x", (0.2, 0.6), 4),
+        (hj.models.FitzHughNagumo(), "w", (0.3, 0.83), 1),
+        (hj.models.BeltOscillator(), "x", (0.1, 0.4, 0.8), 1),
+        (hj.models.ChuaCircuit(), "y", (0.3, 0.7), 48),
+        (hj.models.RimlessWheel(), "w", (0.3, 0.8), 27),
+        (hj.models.SimplestWalker(), "th", (0.4,), 35),
+    ],
+    ids=lambda x: type(x).__name__ if isinstance(x, hj.HybridSystem) else "",
+)
+def test_phase_responses_are_those_of_pushed_flows(system, state, phases, turns):
+    cycle = hj.find_limit_cycle(system)
+    phase = cycle.responses(modes=0).phase(phases)[state]
+    pushed = [_pushed(cycle, x, state, 1e-4, turns) for x in phases]
+    np.testing.assert_allclose(phase, pushed, rtol=1e-6, atol=1e-6 * np.max(np.abs(phase)))
+
+
+def test_pushes_off_a_surface_on_which_the_cycle_slides_are_lost():
+    cycle = hj.find_limit_cycle(hj.models.BeltOscillator())
+    flow = cycle.trajectory()
+    sticks = flow.t[flow.chart == cycle.structure.chart_index("sticks")] - flow.t[0]
+    phase = cycle.responses().phase(sticks[:-1] / float(cycle.period))
+    assert np.all(phase["v"] == 0) and np.all(np.abs(phase["x"]) > 1)
+    assert "2 faster modes left out" not in str(cycle.responses())
+
+
+def test_mathieus_equation_has_the_published_continuous_htf():
+    cycle = hj.find_limit_cycle(hj.models.Mathieu())
+    htf = cycle.htf(0.25, (-1, 0, 1), "x")
+    published = [
+        -0.435292031202 - 0.119838440991j,
+        1.085149865188 - 0.060008477233j,
+        0.333649918824 + 0.129840711721j,
+    ]
+    np.testing.assert_allclose(htf.H[:, 0, 0, 0], published, rtol=0, atol=1e-11)
+    assert "continuous time" in str(htf) and htf[1].shape == (1, 1, 1)
+    with pytest.raises(hj.DefinitionError, match="takes HTFs between sections"):
+        htf.predict(np.ones((32, 1)))
+
+
+def test_the_continuous_htf_of_a_juggler_is_that_of_simulated_sines():
+    """With the impulse of the speed at an impact whose time moves."""
+    f, m, size = 0.25, 1, 1e-3
+    system = Measured(2 * np.pi * (f + m))
+    plain = hj.find_limit_cycle(Juggler(), hj.Guess("flight", (0.2, 4.5), time=0.1))
+    H = plain.htf(f, (m, -m), ("v", "y"))
+
+    def mean(amplitude, wave):
+        """The Fourier integral of the speed over four periods, after 60."""
+        push = lambda t: amplitude * jnp.atleast_1d(wave(2 * jnp.pi * f * t))
+        q, tight = [*np.asarray(plain.anchor.q[:2, 0]), 0.0, 0.0], hj.Settings(1e-12, 1e-13)
+        whole = [
+            hj.simulate(system, "flight", q, time, time=0.1, input=push, settings=tight).after[-1]
+            for time in (60.0, 64.0)
+        ]
+        return (whole[1][2:] - whole[0][2:]) @ [1, 1j] / 4
+
+    slope = lambda h, wave: (mean(h, wave) - mean(-h, wave)) / (2 * h)
+    by = lambda wave: (4 * slope(size / 2, wave) - slope(size, wave)) / 3
+    response = by(jnp.cos) + 1j * by(jnp.sin)
+    np.testing.assert_allclose(H[m][0, 0, 0], response, rtol=1e-6)
+
+
+def _shifted(cycle, name, step):
+    system = eqx.tree_at(
+        lambda x: getattr(x, name), cycle.system, getattr(cycle.system, name) + step
+    )
+    return hj.find_limit_cycle(system, cycle)
+
+
+@pytest.mark.parametrize(
+    "system, name",
+    [(hj.models.VerticalHopper(), "omega"), (hj.models.BuckConverter(), "Vin")],
+    ids=["a clock that changes", "an event by the clock"],
+)
+def test_sensitivities_are_differences_of_cycles(system, name):
+    cycle = hj.find_limit_cycle(system)
+    change, step = cycle.sensitivity(name), 1e-3 * float(getattr(system, name))
+
+    def numbers(step):
+        other = _shifted(cycle, name, step)
+        events = [x.time for x in other.trajectory().events]
+        _, states = (
+            other._course()
+            .linear_flow()
+            .at(PHASES[1:], other.period, other._course().linear_flow().q)
+        )
+        return np.concatenate(
+            [[float(other.period)], np.array(events) - float(other.anchor.t[0]), states[:, 0]]
+        )
+
+    central = lambda h: (numbers(h) - numbers(-h)) / (2 * h)
+    difference = (4 * central(step / 2) - central(step)) / 3
+    name = cycle.structure.charts[0].states[0]
+    begin = float(cycle.anchor.t[0]) / float(cycle.period) * change.period
+    exact = [[change.period], np.array(change.times) - begin, change.shape(PHASES[1:])[name]]
+    np.testing.assert_allclose(np.concatenate(exact), difference, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_results_have_derivatives_in_forward_and_reverse_mode():
+    guess = hj.find_limit_cycle(Neuron())
+
+    def result(current):
+        cycle = hj.find_limit_cycle(Neuron(current=current), guess)
+        phase = cycle.responses(modes=0).phase(jnp.array([0.3]))["u"][0]
+        htf = jnp.abs(cycle.htf(0.3, 1, "v").H[0, 0, 0, 0])
+        return phase + htf + cycle.sensitivity("current").period
+
+    begin, h = jnp.asarray(1.2), 1e-3
+    forward = jax.jvp(result, (begin,), (jnp.ones(()),))[1]
+    central = lambda h: (result(1.2 + h) - result(1.2 - h)) / (2 * h)
+    difference = (4 * central(h / 2) - central(h)) / 3
+    np.testing.assert_allclose(forward, difference, rtol=1e-7)
+    np.testing.assert_allclose(jax.grad(result)(begin), forward, rtol=1e-10)
+
+
+def test_bad_questions_are_refused_in_one_sentence():
+    hopper, wheel = (hj.find_limit_cycle(x()) for x in (hj.models.VerticalHopper, Neuron))
+    with pytest.raises(hj.DefinitionError, match="has no phase response: its phase is that"):
+        hopper.responses().phase([0.1])
+    with pytest.raises(hj.DefinitionError, match="there is no mode 2; 2 modes have amplitudes"):
+        hopper.responses().amplitude(2, [0.1])
+    with pytest.raises(hj.DefinitionError, match="3 modes were asked for; 2 have amplitudes"):
+        hopper.responses(modes=3)
+    with pytest.raises(hj.DefinitionError, match="pole of the cycle, which lie at every whole"):
+        wheel.htf([0.3, 2.0])
+    with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
+        wheel.htf(0.3, inputs="force")
+    with pytest.raises(hj.DefinitionError, match="has no parameter 'speed'"):
+        wheel.sensitivity("speed")
+    with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
+        wheel.responses().curve("force")
+    apex = hj.Crossing("vy", "falling")
+    family = dict(section=apex, conserved={"energy": 1784.8})
+    runner = hj.find_limit_cycle(hj.models.SLIPRunner(), **family)
+    with pytest.raises(hj.ComputationError, match="has no phase of its own: its multiplier 1 is"):
+        runner.responses()
