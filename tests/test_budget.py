@@ -24,8 +24,8 @@ PRONOUNS = set(
     "found own known one seen here some there these those it them others rest thing things".split()
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
-# a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and 890
-# the responses of cycles.
+# a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
+# 890 the responses of cycles.
 LIMITS = {
     "code": 25_650,
     "files": 222,
@@ -36,7 +36,7 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_600,
+    "test_lines": 16_610,
     "doc_words": 36_000,
 }
 

@@ -249,8 +249,9 @@ class _Walk:
     def _class(self, x: type) -> None:
         self.classes += 1
         for base in inspect.getmro(x):
-            self._origin(base.__module__, base.__qualname__)
-            if not _is_installed(base.__module__):
+            module = str(base.__module__)  # (of a metaclass it may be a descriptor)
+            self._origin(module, base.__qualname__)
+            if not _is_installed(module):
                 self.visit({k: v for k, v in vars(base).items() if not _is_description(k, v)})
         self.visit(type(x))
         self.classes -= 1

@@ -48,11 +48,11 @@ class Varied(Derived):
         self.system, self.parameter, self.solver = system, parameter, system.solver
 
     @property
-    def inputs(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def inputs(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # type: ignore[override]
         return (self.parameter,)
 
     @property
-    def input_units(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def input_units(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # type: ignore[override]
         unit = unit_of_parameter(self.system, self.parameter)
         return (unit,) if unit else ()
 

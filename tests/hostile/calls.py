@@ -77,6 +77,10 @@ def cycles(t):
     yield t.cycles.__getitem__, dict(i=0)
     yield t.cycles.summary, {}
     yield hj.continuation, dict(cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05)
+    yield t.cycle.responses, dict(modes=0)
+    yield t.cycle.htf, dict(f=np.array([0.3]), harmonics=0, outputs=STATES)
+    yield t.cycle.sensitivity, dict(parameter="mu")
+    yield t.cycle.sensitivity("mu").shape, dict(phase=np.array([0.3]))
     yield t.branch.__getitem__, dict(k=0)
     yield t.branch.find, dict(kind="fold")
     yield t.branch.largest, dict(output="x")
@@ -95,6 +99,7 @@ def linear(t):
         yield getattr(t.model, name), dict(u=v, periods=2)
     yield t.model.impulse_response, dict(n_lags=3)
     yield t.model.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.model.feedback, dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs))))
     yield t.model.monodromy, {}
     yield t.model.rank, {}
     f, H = (np.asarray(t.estimate.f), np.asarray(t.estimate.H))
@@ -104,6 +109,13 @@ def linear(t):
     yield hj.HTF, dict(f=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors
     yield hj.Scatter, dict(freedom=f, roundness=size)
     yield scatter.quantile, dict(level=0.9)
+    yield scatter.sources, dict(f=f)
+    lines = np.arange(12) / 4 + 0.125
+    signals = dict(inputs=t.model.outputs, outputs=t.model.inputs)
+    gain = np.zeros((6, len(t.model.inputs), len(t.model.outputs)))
+    still = hj.LDTP(np.zeros((6, 1, 1)), 0 * gain[:, :1], 0 * gain[:, :, :1], gain, **signals)
+    yield t.model.htf(lines).feedback, dict(controller=still.htf(lines))
+    yield t.estimate.require_sampled, dict(name="a fit")
     htf = t.estimate
     yield htf.__getitem__, dict(m=0)
     yield htf.select, dict(harmonics=0)
@@ -152,6 +164,7 @@ def experiments(t):
 
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
+    yield hj.identify.loop, dict(data=t.data, at_input=t.data.inputs[1])
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
     yield hj.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))

@@ -244,6 +244,7 @@ def test_mathieus_equation_has_the_published_continuous_htf():
         htf.predict(np.ones((32, 1)))
 
 
+@pytest.mark.slow
 def test_the_continuous_htf_of_a_juggler_is_that_of_simulated_sines():
     """With the impulse of the speed at an impact whose time moves."""
     f, m, size = 0.25, 1, 1e-3
