@@ -48,11 +48,11 @@ class Varied(Derived):
         self.system, self.parameter, self.solver = system, parameter, system.solver
 
     @property
-    def inputs(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # type: ignore[override]
+    def inputs(self) -> tuple[str, ...]:  # type: ignore[override]  # pyright: ignore[reportIncompatibleVariableOverride]
         return (self.parameter,)
 
     @property
-    def input_units(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # type: ignore[override]
+    def input_units(self) -> tuple[str, ...]:  # type: ignore[override]  # pyright: ignore[reportIncompatibleVariableOverride]
         unit = unit_of_parameter(self.system, self.parameter)
         return (unit,) if unit else ()
 
