@@ -10,7 +10,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.meaning import current
-from hybridjax.orbits.jumps import check_jumps
+from hybridjax.orbits.checks import check_jumps
 
 
 hj.enable_x64()
