@@ -32,7 +32,7 @@ def test_fold_and_flip_of_the_juggler(juggling):
     s = 2 * (1 + a**2) / (1 + a) ** 2 * float(p.g)
     flip = np.hypot(speed / (2 * np.pi), s / (2 * np.pi) ** 2)
 
-    branch = hj.continuation(juggling, "A", (0.1, 0.2, 0.35))
+    branch = hj.continuation(juggling, "A", (0.13, 0.2, 0.3))
     assert [x.kind for x in branch.points] == ["fold", "flip"]
     np.testing.assert_allclose([x.value for x in branch.points], [fold, flip], rtol=1e-11)
     np.testing.assert_allclose(branch.points[0].multipliers, [1, a**2], atol=2e-6)
