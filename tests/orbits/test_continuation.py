@@ -11,6 +11,7 @@ import pytest
 from hypothesis import Phase, given, settings, strategies as st
 
 import hybridjax as hj
+from hybridjax._core import compilation
 
 from ..toys import Field
 
@@ -23,8 +24,10 @@ def juggling():
     return hj.find_limit_cycle(m.PaddleJuggler())
 
 
-def test_fold_and_flip_of_the_juggler(juggling):
+def test_fold_and_flip_of_the_juggler(juggling, monkeypatch):
     """Small amplitudes of the paddle end in a fold, large ones in a flip."""
+    # (Along a branch a compiled program soon pays.)
+    monkeypatch.setattr(compilation, "_WORTH_COMPILING", 0.5)
     p = juggling.system
     a, v = float(p.restitution), float(p.g * p.T / 2)
     speed = (1 - a) * v / (1 + a)
