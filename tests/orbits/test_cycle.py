@@ -81,7 +81,9 @@ def test_the_two_legged_bar():
     np.testing.assert_allclose(list(events[3].after.values()), landed, atol=1e-9)
 
 
-@pytest.mark.parametrize("mu", [3.0, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "mu", [3.0, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.5, 1.0))]
+)
 def test_van_der_pol(mu):
     amplitude, period, multiplier = VANDERPOL[mu]
     cycle = vanderpol(mu)
