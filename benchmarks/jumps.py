@@ -442,8 +442,7 @@ def verdicts(form: Form, x: Numbers) -> dict[str, Any]:
 
     def of_cycle(cycle):
         if form.argument in ("clock", "phase", "ramp", "pulse", "box") and not has_clock:
-            if form.place not in ("field", "gain") or form.kind:
-                return np.inf  # it needs a clock
+            return np.inf  # it needs a clock
         t, q, period = (
             float(cycle.anchor.t[0]),
             np.asarray(cycle.anchor.q[:, 0]),

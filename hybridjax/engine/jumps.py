@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from .._core.compilation import quick_jit
 from .._core.meaning import is_of_package
@@ -24,12 +24,17 @@ _SMOOTH = frozenset(
     "dynamic_slice squeeze stack unstack split transpose".split()
 )
 _CALLS = frozenset("jit pjit closed_call core_call".split())
-# Pieces of a step, each with four points. Fewer: short pulses are missed. More: time.
+# Pieces of a step, each with four points, and four times as many on cycles. Fewer: short pulses are
+# missed. More: time.
 _PIECES = 64
-# The integrals of a rate over a step, at all these points and at eight, may differ by so many times
-# the accuracy, and those of a gain, whose kinks no step meets, by this part of the integral over
-# all steps. Smaller: kinks are refused. Larger: pulses with this effect are passed over.
+# In a step, the integrals of a rate and of a polynomial through eight of its values may differ by
+# so many times the accuracy, and those of a gain, whose kinks no step meets, by this part of the
+# integral over all steps. Smaller: kinks are refused. Larger: pulses with this effect are missed.
 _SAME, _SAME_GAIN = 1e3, 1e-5
+# On a cycle, a rate differs from that polynomial by at most so many times the root of the accuracy
+# (as at a kink) in its largest values. Smaller: kinks are refused. Larger: multipliers are wrong
+# beside steep functions that steps do not resolve.
+_ROUGH = 1.0
 # A guard falls below zero by this part of its largest value. Smaller: one that comes near to zero
 # is taken to fall. Larger: such falls between steps are missed.
 _NEAR = 1e-5
@@ -44,9 +49,9 @@ _KINKS = _DECISIONS | frozenset("max min abs clamp select_n cond".split())
 # errors of multipliers are as large. Farther points: steep functions are refused that steps
 # resolve. Closer: beside those that they do not resolve, multipliers are wrong.
 _JUMP, _STEEP = 1e-8, 1e7
-# Intervals of a step in which jumps are looked for, and how often the quarter is taken in which the
-# field changes most unlike in the others. Fewer: jumps are missed behind other changes. More: time.
-PER_STEP, _QUARTERS = 16, 20
+# How often the quarter of an interval is taken in which the field changes most unlike in the
+# others. Fewer: jumps are missed behind other changes. More: time.
+_QUARTERS = 20
 
 Points = Float[np.ndarray, "P 1+n"]
 """Times and states."""
@@ -88,47 +93,54 @@ def _is_smooth(equation: Any, moves: list[bool]) -> bool:
 
 
 def passed_over(
-    path: Any, u: Float[np.ndarray, " nu"], settings: Settings
+    path: Any, u: Float[np.ndarray, " nu"], settings: Settings, linear: bool = False
 ) -> tuple[int, str] | None:
     """The first step of a `Trajectory` that passes over a pulse of a field, a gain or a guard, and
-    the name of that."""
+    the name of that.
+
+    **Arguments:** `linear`: whether the path is linearized, so that steps must resolve jumps, too.
+    """
     s, passed = path.structure, []
     for a in np.unique(path.chart[:-1]).tolist():
         rows = np.flatnonzero((path.chart[:-1] == a) & (np.diff(path.t) > 0))
         if len(rows) and may_have_pulses(s, a):
-            wrong = np.argwhere(_passing(path, a, rows, u, settings))[:1].tolist()
+            wrong = np.argwhere(_passing(path, a, rows, u, settings, linear))[:1].tolist()
             passed += [(int(rows[k]), column_name(s, a, j)) for k, j in wrong]
     return min(passed, default=None)
 
 
-def _passing(path: Any, a: int, rows, u, settings: Settings) -> Bool[np.ndarray, "K _"]:
+def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np.ndarray:
     """Test which of the steps that begin at some rows, in chart a, pass over a pulse of each rate,
-    gain and guard."""
-    s, n = path.structure, path.structure.dims[a]
-    m = n * (1 + s.nu)
-    x, w = np.polynomial.legendre.leggauss(8)
-    y, v = np.polynomial.legendre.leggauss(4)
-    fine = (np.arange(_PIECES)[:, None] + (y + 1) / 2).ravel() / _PIECES
-    nodes = np.concatenate([(x + 1) / 2, fine])[:, None]
-    weights = np.zeros((2, len(nodes)))
-    weights[0, :8], weights[1, 8:] = w / 2, np.tile(v / 2 / _PIECES, _PIECES)
+    gain and guard: over what a polynomial through eight of its values in the step lacks."""
+    s, n, legendre = path.structure, path.structure.dims[a], np.polynomial.legendre
+    m, pieces = n * (1 + s.nu), 4 * _PIECES if linear else _PIECES
+    (x, _), (y, w) = legendre.leggauss(8), legendre.leggauss(4)
+    fine = 2 * (np.arange(pieces)[:, None] + (y + 1) / 2).ravel() / pieces - 1
+    polynomial = legendre.legvander(fine, 7) @ np.linalg.inv(legendre.legvander(x, 7))
+    weights, nodes = np.tile(w / 2 / pieces, pieces), (np.append(x, fine)[:, None] + 1) / 2
     ends = path.after[:-1], path.before[1:], path.slope_after[:-1], path.slope_before[1:]
-    sums, falls = [], []
+    parts = []
     for k in np.split(rows, range(_POINTS, len(rows), _POINTS)):
         h = np.diff(path.t)[k, None, None]
         q = interpolate(nodes, h, *(x[k, None, :n] for x in ends))
         points = np.concatenate([path.t[k, None, None] + h * nodes, q], axis=2)
         values = values_at(s, a, points.reshape(-1, 1 + n), u).reshape(*points.shape[:2], -1)
-        sums.append(h * np.einsum("wp,kpj->kwj", weights, values[:, :, :m]))
-        guards, enabled = np.split(values[:, 8:, m:], 2, axis=2)
+        rates, (guards, enabled) = values[:, 8:, :m], np.split(values[:, 8:, m:], 2, axis=2)
+        beside = rates - polynomial @ values[:, :8, :m]
         low = guards < -_NEAR * np.abs(guards).max(axis=(0, 1))
-        falls.append((low & (np.maximum.accumulate(guards, 1) > 0) & (enabled > 0)).any(axis=1))
-    coarse, exact = np.concatenate(sums).transpose(1, 0, 2)
-    size, largest = np.abs(exact).sum(axis=0), np.abs(path.after[rows, :n]).max(axis=0)
-    size[:n] = np.maximum(size[:n], largest if settings.scale is None else settings.scale[a, :n])
-    same = np.repeat([_SAME * np.max(np.asarray(settings.rtol)), _SAME_GAIN], [n, m - n])
-    wrong = np.abs(exact - coarse) > same * size + ROUNDING * size.max()
-    return np.concatenate([wrong, np.concatenate(falls)], axis=1)
+        falls = (low & (np.maximum.accumulate(guards, 1) > 0) & (enabled > 0)).any(axis=1)
+        moved, passed = h[:, 0] * (weights @ np.abs(rates)), h[:, 0] * np.abs(weights @ beside)
+        parts.append((moved, passed, *(np.abs(x).max(axis=1) for x in (beside, rates)), falls))
+    moved, passed, missed, largest, falls = map(np.concatenate, zip(*parts, strict=True))
+    size, accuracy = moved.sum(axis=0), np.max(np.asarray(settings.rtol))
+    usual = np.abs(path.after[rows]).max(axis=0) if settings.scale is None else settings.scale[a]
+    size[:n] = np.maximum(size[:n], usual[:n])
+    same = np.repeat([_SAME * accuracy, _SAME_GAIN], [n, m - n])
+    wrong = passed > same * size + ROUNDING * size.max()
+    if linear:
+        fastest = np.maximum(largest[:, :n].max(axis=0), usual[:n] / np.ptp(path.t))
+        wrong[:, :n] |= missed[:, :n] > _ROUGH * np.sqrt(accuracy) * fastest
+    return np.concatenate([wrong, falls], axis=1)
 
 
 def column_name(s: Structure, a: int, j: int) -> str:
@@ -198,7 +210,7 @@ def jumps(s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarr
         for i, j in np.argwhere(steep[worst, here]):
             yield low[i, 0], j, change[worst[i], i, j] * limit[j]
         keep = uneven.max(axis=(0, 2)) > _JUMP
-        low, high, first, last = low[keep], high[keep], first[keep], last[keep]
+        low, high, first, last = (x[keep] for x in (low, high, first, last))
         if not keep.any():
             return
 

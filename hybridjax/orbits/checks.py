@@ -14,7 +14,6 @@ from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.jumps import (
-    PER_STEP,
     column_name,
     jumps,
     lines_of_jumps,
@@ -208,14 +207,15 @@ def check_jumps(cycle: LimitCycle, tapes: Tape | None = None) -> None:
     if not charts:
         return
     scale, path = np.asarray(cycle.settings.scale), orbit(cycle.return_map, tapes)
-    if (pulse := passed_over(path, np.zeros(s.nu), to_host(cycle.settings))) is not None:
+    pulse = passed_over(path, np.zeros(s.nu), to_host(cycle.settings), linear=True)
+    if pulse is not None:
         a, begin = int(path.chart[pulse[0]]), path.t[pulse[0]]
         raise DefinitionError(
             f"the {pulse[1]} in chart '{s.names[a]}' has a pulse, or another sudden change, over "
             f"which the step from t = {begin:.6g} on passes{','.join(lines_of_jumps(s, a))}. Begin "
             "and end it by transitions (`hj.Scheduled` at known times)."
         )
-    t, chart, q = path.dense(PER_STEP)
+    t, chart, q = path.dense(16)  # (fewer: jumps are missed behind kinks; more: time)
     events = path.t[path.event >= 0]
     if path.event[-1] < 0:  # the cycle may begin where the field jumps
         t, chart, q = (np.concatenate([x, x[1:2]]) for x in (t, chart, q))
