@@ -101,8 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="hybridjax",
-        description="Identify the dynamics of rhythmic hybrid systems.",
+        prog="hybridjax", description="Identify the dynamics of rhythmic hybrid systems."
     )
     parser.add_argument("--version", action="version", version=f"hybridjax {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")

@@ -8,7 +8,6 @@ import json
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from .._core.archive import options_of, put_together, restored, signals_in, taken_apart
@@ -24,7 +23,7 @@ from ..orbits.continuation import Branch
 from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
-from ..systems.system import unit_of_parameter
+from ..systems.system import arrays_of, unit_of_parameter
 
 
 # The attribute with all that has no place elsewhere, as JSON.
@@ -188,9 +187,7 @@ def _from_limit_cycles(cycles: LimitCycles, dimension: str) -> Any:
     }
     variables["multipliers"] = (dimension, "multiplier"), cycles.multipliers
     parameters = {}
-    leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(cycles.systems, eqx.is_array))[0]
-    for path, leaf in leaves:
-        name = ".".join(str(getattr(x, "name", x)) for x in path)
+    for name, leaf in arrays_of(cycles.systems).items():
         if leaf.shape == (len(cycles),):
             unit = unit_of_parameter(cycles.systems, name)
             parameters[name] = _variable(dimension, np.asarray(leaf), unit)

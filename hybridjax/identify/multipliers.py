@@ -288,10 +288,7 @@ class OrderSelection(eqx.Module):
 @checked
 @one_blas_thread()
 def select_order(
-    htf: HTF,
-    max_order: Order = 5,
-    *,
-    overhang: Index | None = None,
+    htf: HTF, max_order: Order = 5, *, overhang: Index | None = None
 ) -> OrderSelection:
     r"""Compare numbers of multipliers, from none to `max_order`.
 

@@ -52,10 +52,7 @@ class TransientFit(eqx.Module):
 
 @checked
 def remove_transient(
-    data: ExperimentData,
-    order: Order | None = None,
-    *,
-    skip: Index = 1,
+    data: ExperimentData, order: Order | None = None, *, skip: Index = 1
 ) -> TransientFit:
     """Fit the decay of the initial condition's response, and subtract it.
 

@@ -126,10 +126,7 @@ def whiteness_test(
 
 
 def independence_test(
-    u: Float[np.ndarray, "S T N nu"],
-    error: Float[np.ndarray, "S T N ny"],
-    lags: int,
-    level: float,
+    u: Float[np.ndarray, "S T N nu"], error: Float[np.ndarray, "S T N ny"], lags: int, level: float
 ) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
     """Test the part of residuals that present and past inputs explain, section by section.
 

@@ -170,12 +170,7 @@ def _at_anchor(map: ReturnMap):
 
 
 def _go(
-    map: ReturnMap,
-    doing: str,
-    lanes: Lanes,
-    target: Target,
-    advice: str = "",
-    if_late: str = "",
+    map: ReturnMap, doing: str, lanes: Lanes, target: Target, advice: str = "", if_late: str = ""
 ) -> Lanes:
     """The lane at a target, however many steps it takes.
 

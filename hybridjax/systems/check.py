@@ -14,7 +14,7 @@ from .chart import Chart
 from .quotient import Quotient
 from .solver import ByChart
 from .structure import Structure, quoted
-from .system import HybridSystem, Output
+from .system import HybridSystem, Output, arrays_of
 from .transition import Scheduled, Transition
 
 
@@ -30,11 +30,11 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
 
     **Raises:** `DefinitionError`, naming the chart, transition or parameter that is wrong.
     """
-    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
+    for name, leaf in arrays_of(system).items():
         real = jnp.issubdtype(leaf.dtype, jnp.inexact) and not is_traced(leaf)
         if real and not np.all(np.isfinite(leaf)):
             raise DefinitionError(
-                f"parameter `{jax.tree_util.keystr(path)[1:]}` of {type(system).__name__} is "
+                f"parameter `{name}` of {type(system).__name__} is "
                 f"{np.asarray(leaf)}; every parameter must be finite."
             )
     form = _form(system)

@@ -344,11 +344,7 @@ def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _from_states(
-    sections: list[_Section],
-    to_state: list[np.ndarray],
-    past: int,
-    innovations: bool,
-    direct: bool,
+    sections: list[_Section], to_state: list[np.ndarray], past: int, innovations: bool, direct: bool
 ) -> PeriodicModel:
     N, nu = len(sections), sections[0].u.shape[1]
     C, D, A, B, K = [], [], [], [], []

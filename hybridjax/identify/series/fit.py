@@ -306,9 +306,7 @@ _WHITE_DRAWS, _FILTERED_DRAWS = 4, 16
 
 
 def coefficient_covariance(
-    problem: OutputErrorProblem,
-    solution: Linearization,
-    errors: Literal["residuals", "white"],
+    problem: OutputErrorProblem, solution: Linearization, errors: Literal["residuals", "white"]
 ) -> Covariance:
     """Return the covariance of c; with "residuals" errors may depend on each other and on u."""
 
