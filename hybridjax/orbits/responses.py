@@ -10,15 +10,21 @@ Ch. 8; D. Wilson, J. Moehlis, Phys. Rev. E 94, 2016).
 from typing import Annotated, Literal, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, Numbers
 from .._core.boundary.values import Reals
-from .._core.executor import Array, is_traced, namespace, on_host, singular_values, to_host
+from .._core.executor import (
+    Array,
+    is_traced,
+    namespace,
+    on_host,
+    singular_values,
+    stop_gradient,
+    to_host,
+)
 from .._core.text import number
 from ..engine import kernels
 from ..engine.lanes import for_each_chart, only
@@ -206,9 +212,7 @@ def responses(course: Course, modes: int | None) -> Responses:
     _, map, _, period, events, _ = to_host(course) if host else course
     xp, clocked = namespace(flow.t), map.base is None
     free, _ = flow.forward()
-    valid = map.valid
-    whole = xp.where(valid[:, None] & valid, flow.monodromy(free), 0.0)
-    size = xp.where(valid, map.sizes, 1.0)
+    whole = flow.monodromy(free, map.valid)
     if not clocked:
         f = flow.field[0, 0]
         closed, along = loop(map, whole, f)
@@ -216,7 +220,7 @@ def responses(course: Course, modes: int | None) -> Responses:
         whole = whole - f[:, None] * Z
     if modes is None and not host:
         raise DefinitionError("inside of jit and grad, `responses` needs the number of `modes`.")
-    values, right, left = _modes(whole, size, modes)
+    values, right, left = _modes(whole, map.sizes, modes)
     exponents = xp.log(values) / period
     adjoint, to_go = flow.adjoint(), period - (flow.t - flow.t[0, 0])
 
@@ -232,7 +236,7 @@ def responses(course: Course, modes: int | None) -> Responses:
             amplitudes = amplitudes - slip[..., None] * phase
     if host and not np.any(np.iscomplex(exponents)):
         amplitudes, right = np.real(amplitudes), np.real(right)
-    total = int(np.sum(valid)) - (not clocked) if host else len(values)
+    total = int(np.sum(map.valid)) - (not clocked) if host else len(values)
     surface = _surface(map.structure, flow)
     return Responses(
         map.structure, flow, period, values, exponents, right, total - len(values),
@@ -246,7 +250,7 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
     **Raises:** `ComputationError` if it is not simple.
     """
     xp = namespace(f)
-    size = xp.where(map.valid, map.sizes, 1.0)
+    size = map.sizes
     along = f / size**2
     along = along / (along @ f)
     closed = monodromy - xp.eye(len(f)) + f[:, None] * along
@@ -267,10 +271,7 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
     """
     xp = namespace(M)
     scaled = M * size / size[:, None]
-    if on_host(M):
-        values, right = np.linalg.eig(scaled)
-    else:
-        values, right = jnp.linalg.eig(jax.lax.stop_gradient(scaled))
+    values, right = xp.linalg.eig(stop_gradient(scaled))
     order = xp.argsort(-xp.abs(values) + 1e-9 * (xp.imag(values) < 0), stable=True)
     if on_host(M):
         kept = int(np.sum(np.abs(values) > _LEAST))
@@ -301,7 +302,7 @@ def _eigenpairs(M: Float[Array, "d d"], value, right):
     """An eigenvalue with its right and left eigenvectors near an approximation, by one Newton step,
     which also carries derivatives."""
     xp, n = namespace(M), len(M)
-    still = M if on_host(M) else jax.lax.stop_gradient(M)
+    still = stop_gradient(M)
 
     def pair(M, still, x, value):
         matrix = xp.concatenate([still - value * np.eye(n), xp.conj(x)[None]])
@@ -310,17 +311,10 @@ def _eigenpairs(M: Float[Array, "d d"], value, right):
         step = xp.linalg.solve(xp.concatenate([matrix, column], axis=1), off)
         return x - step[:n], value - step[n]
 
-    left, *_ = _null(still.T - value * np.eye(n))
+    *_, rows = xp.linalg.svd(still.T - value * np.eye(n))  # the last is contracted most
     right, root = pair(M, still, right, value)
-    left, _ = pair(M.T, still.T, left, value)
+    left, _ = pair(M.T, still.T, xp.conj(rows[-1]), value)
     return root, right, left
-
-
-def _null(matrix):
-    """The direction that a matrix contracts most."""
-    xp = namespace(matrix)
-    *_, rows = xp.linalg.svd(matrix if on_host(matrix) else jax.lax.stop_gradient(matrix))
-    return (xp.conj(rows[-1]),)
 
 
 def _surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:

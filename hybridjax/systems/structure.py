@@ -370,6 +370,11 @@ class Structure:
                 names[name] = name
         return tuple(names.values())
 
+    def states_everywhere(self) -> list[str]:
+        """The states that every chart defines."""
+        charts = range(len(self.charts))
+        return [x for x in self.state_names() if all(self.state_function(x, a) for a in charts)]
+
     def states(self, a: int) -> tuple[Signal, ...]:
         """The names of chart a's states, with their units."""
         return signals(self.charts[a].states, self.charts[a].units)
