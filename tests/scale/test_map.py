@@ -124,8 +124,6 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
 
 
 WRONG = {
-    "too many": (dict.fromkeys(("slope", "spokes", "rate"), np.ones(1000)), {},
-                 "1e.09 points, .* hours .* GB: say `force=True`"),
     "no model": ({"x": [1.0]}, {"model": lambda x: x}, "a function of parameters that returns one"),
     "no axis": ({"x": [1.0]}, {"model": lambda x, y: x}, "needs `y`: give it an axis"),
 }  # fmt: skip
