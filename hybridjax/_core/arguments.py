@@ -56,6 +56,18 @@ def require_same(
             )
 
 
+def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
+    """Return the index of an input or output that is given by its name or index.
+
+    **Raises:** `DefinitionError` if it is not there.
+    """
+    if isinstance(wanted, str) and wanted in names:
+        return names.index(wanted)
+    if not isinstance(wanted, str) and 0 <= wanted < len(names):
+        return int(wanted)
+    raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")
+
+
 def package(name: str) -> ModuleType:
     """A library, or a module of one.
 

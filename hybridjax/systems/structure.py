@@ -189,11 +189,7 @@ class Structure:
     ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
         """Names of inputs (Default: all) and their indices."""
         names = self.inputs if names is None else names
-        for name in names:
-            if name not in self.inputs:
-                known = ", ".join(self.inputs)
-                raise DefinitionError(f"there is no input '{name}'; inputs are {known}.")
-        columns = np.array([self.inputs.index(n) for n in names], int)
+        columns = np.array([_index("input", name, self.inputs) for name in names], int)
         return tuple(self.inputs[k] for k in columns), columns
 
     @ft.cached_property
