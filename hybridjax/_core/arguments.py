@@ -56,6 +56,19 @@ def require_same(
             )
 
 
+def require_among(
+    kind: str, names: Iterable[str], allowed: Collection[str], where: str = ""
+) -> None:
+    """**Raises:** `DefinitionError` for the first name that is not among those of a kind (a noun).
+
+    **Arguments:** `where`: how the sentence begins. Default: nothing.
+    """
+    for name in names:
+        if name not in allowed:
+            known = ", ".join(allowed) or "none"
+            raise DefinitionError(f"{where}there is no {kind} '{name}'; {kind}s are {known}.")
+
+
 def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
     """Return the index of an input or output that is given by its name or index.
 

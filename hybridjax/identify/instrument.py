@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Int
 
+from .._core.arguments import require_among
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record, RecordedData, uninterrupted_records
@@ -47,10 +48,7 @@ class Roles(NamedTuple):
     ) -> "Roles":
         """**Raises:** `DefinitionError` unless references are some, not all, of the inputs, and
         `fewest` or more. Default: as many as the others."""
-        if unknown := [name for name in reference if name not in names]:
-            raise DefinitionError(
-                f"there is no reference {unknown[0]!r} among the inputs {', '.join(names)}."
-            )
+        require_among("input", reference, names, "`reference`: ")
         references = [list(names).index(name) for name in reference]
         inputs = [i for i in range(len(names)) if i not in references]
         if not inputs:

@@ -142,10 +142,9 @@ class Responses(eqx.Module):
         cycle that is driven by a clock, and inside of transformations of JAX.
         """
         of_phase = self._covector(None)
-        names = self.structure.inputs
-        signal = next((x for x in names if input in (None, x)), None)
-        if signal is None:
-            raise DefinitionError(f"there is no input '{input}'; inputs are {', '.join(names)}.")
+        (signal, *_), (column, *_) = self.structure.inputs_among(
+            input if input is None else [input]
+        )
         if is_traced(self):
             raise DefinitionError("`curve` is a figure's: use `phase` inside of jit and grad.")
         if any(x.weight[signal] != 0 for x in self.impulses()):
@@ -154,7 +153,7 @@ class Responses(eqx.Module):
             )
         flow = to_host(self.flow)
         values = np.einsum("pki,pkiu->pku", of_phase, flow.by_input)
-        values = values[..., names.index(signal)] / float(self.period)
+        values = values[..., column] / float(self.period)
         phase = (flow.t - flow.t[0, 0]) / float(self.period)
         broken = flow.event >= 0
         tail = np.where(broken, np.nan, values[:, -1])[:, None]

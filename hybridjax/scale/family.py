@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import Numbers
+from .._core.arguments import Numbers, require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed
 from .._core.boundary.values import Reals
@@ -116,12 +116,8 @@ class Family:
     def __init__(self, model: HybridSystem | Callable[..., HybridSystem], names: Sequence[str]):
         self.model, self.names = model, tuple(names)
         allowed, required = _parameters(model)
-        for name in self.names:
-            if allowed is not None and name not in allowed:
-                raise DefinitionError(
-                    f"`{name}` is no parameter of the model; its parameters are "
-                    f"{', '.join(allowed) or 'none'}."
-                )
+        if allowed is not None:
+            require_among("parameter", self.names, allowed, "`model`: ")
         for name in required:
             if name not in self.names:
                 raise DefinitionError(f"the model needs `{name}`: give it an axis.")

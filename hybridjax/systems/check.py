@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
+from .._core.arguments import require_among
 from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
@@ -80,11 +81,7 @@ def _check_functions(s: Structure) -> Iterator[str]:
         s.chart_index(name)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
         _check_names(f"chart '{name}'", "inputs", chart.inputs or ())
-        for unknown in set(chart.inputs or ()) - set(system.inputs):
-            raise DefinitionError(
-                f"chart '{name}' uses input '{unknown}', which the system does not have; inputs "
-                f"are {quoted(system.inputs)}."
-            )
+        require_among("input", chart.inputs or (), system.inputs, f"chart '{name}': ")
         _check_names(f"chart '{name}'", "states", (*chart.states, *chart.absent))
         _check_names(f"chart '{name}'", "states", chart.states, chart.units)
         s.method(a)

@@ -23,6 +23,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Int
 
+from .._core.arguments import require_among
 from .._core.compilation import kernel
 from .._core.executor import Array
 from .._core.lanes import PerLane, by_lane, one_lane, shared
@@ -123,8 +124,7 @@ def stacked(parts: Sequence[jax.Array]) -> jax.Array:
 
 
 def _index(what: str, name: str, names: Sequence[str]) -> int:
-    if name not in names:
-        raise DefinitionError(f"there is no {what} '{name}'; {what}s are {quoted(names)}.")
+    require_among(what, [name], names)
     return names.index(name)
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
+from .._core.arguments import require_among
 from .._core.executor import Array
-from ..errors import DefinitionError
 from .chart import DerivedChart
 from .system import Derived, HybridSystem, parameters_of, unit_of_parameter
 from .transition import Scheduled
@@ -21,11 +21,7 @@ def parameter_of(system: HybridSystem, parameter: str) -> Array:
     **Raises:** `DefinitionError` if there is none.
     """
     numbers = parameters_of(system)
-    if parameter not in numbers:
-        raise DefinitionError(
-            f"{type(system).__name__} has no parameter '{parameter}' (a number declared by "
-            f"hj.parameter); those are {', '.join(numbers)}."
-        )
+    require_among("parameter", [parameter], numbers, f"{type(system).__name__}: ")
     return numbers[parameter]
 
 

@@ -138,7 +138,7 @@ def test_a_plant_that_is_stable_in_its_loop_only():
 def test_what_does_not_fit_is_refused(plant):
     data, record = experiments(plant, 0, 2), series(plant, 0)
     refused = lambda text: pytest.raises(hj.DefinitionError, match=text)  # noqa: E731
-    with refused("there is no reference 'q' among the inputs u, r, d"):
+    with refused("there is no input 'q'; inputs are u, r, d"):
         hj.estimate_htf(data, reference="q")
     with refused("2 inputs of the plant need as many references"):
         hj.estimate_htf(data, reference="r")

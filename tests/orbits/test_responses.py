@@ -334,7 +334,7 @@ def test_bad_questions_are_refused_in_one_sentence():
         wheel.htf([0.3, 2.0])
     with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
         wheel.htf(0.3, inputs="force")
-    with pytest.raises(hj.DefinitionError, match="has no parameter 'speed'"):
+    with pytest.raises(hj.DefinitionError, match="there is no parameter 'speed'"):
         wheel.sensitivity("speed")
     with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
         wheel.responses().curve("force")

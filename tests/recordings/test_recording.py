@@ -20,7 +20,7 @@ GOOD = {"a": T, "b": 2 * T}
         (T, {"a": T[1:]}, {}, "a has 4 samples, but time has 5"),
         (T, {"a": [0, 1, np.inf, 0, 0]}, {}, "a is infinite at sample 2"),
         (T, {"a": list("abcde")}, {}, "a must be real numbers"),
-        (T, GOOD, {"units": {"c": "N"}}, "a unit for 'c', but the signals are a, b"),
+        (T, GOOD, {"units": {"c": "N"}}, "there is no signal 'c'; signals are a, b"),
         (T, GOOD, {"events": {"e": [np.inf]}}, "e is infinite at sample 0"),
         (T, GOOD, {"events": {"e": [9.0]}}, "events 'e' .* are outside of the recording"),
         (T, GOOD, {"events": {"a": [1.0]}}, "'a' is a signal and an event"),
