@@ -1,10 +1,11 @@
 """Numbers and names, as users give them, and whether things belong together."""
 
 import importlib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
 import numpy.typing as npt
 
 from ..errors import DefinitionError
@@ -54,6 +55,18 @@ def require_same(
             raise DefinitionError(
                 f"{what} have different {name}: {getattr(a, name)} and {getattr(b, name)}."
             )
+
+
+def require_axes(what: str, array: Any, *axes: Mapping[str, int]) -> None:
+    """**Raises:** `DefinitionError` for an array of another shape.
+
+    **Arguments:** `axes`: a shape that is allowed, as the number of entries along each named axis;
+    empty for a single number.
+    """
+    if np.shape(array) not in [tuple(x.values()) for x in axes]:
+        written = (", ".join(f"{n} {axis}" for axis, n in x.items()) for x in axes)
+        allowed = " or ".join(f"of shape ({x})" if x else "one number" for x in written)
+        raise DefinitionError(f"{what} must be {allowed}, not of shape {np.shape(array)}.")
 
 
 def require_among(

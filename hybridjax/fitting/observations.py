@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from .._core.arguments import Numbers
+from .._core.arguments import Numbers, require_axes
 from .._core.boundary.checked import checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar
@@ -243,9 +243,9 @@ class ObservedCycle(AbstractObservation):
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         N, ny = self.sections.n_sections, len(self.outputs)
         given = {
-            "values": (values, std, (N, ny)),
-            "times": (times, times_std, (N,)),
-            "period": (period, period_std, ()),
+            "values": (values, std, {"sections": N, "outputs": ny}),
+            "times": (times, times_std, {"sections": N}),
+            "period": (period, period_std, {}),
         }
         given = {name: entry for name, entry in given.items() if entry[0] is not None}
         if not given or ("values" in given) != bool(ny):
@@ -253,7 +253,9 @@ class ObservedCycle(AbstractObservation):
                 "give `outputs` with their `values`, `times`, or the `period` of the cycle."
             )
         self.which = tuple(given)
-        self.measured = tuple(_shaped(name, x, shape) for name, (x, _, shape) in given.items())
+        for name, (x, _, axes) in given.items():
+            require_axes(f"`{name}`", x, axes)
+        self.measured = tuple(jnp.asarray(x, float) for x, *_ in given.values())
         self.scales = tuple(
             _scale(name, std, x)
             for x, (name, (_, std, _)) in zip(self.measured, given.items(), strict=True)
@@ -298,13 +300,6 @@ def _times(placed: PlacedSections) -> Float[Array, " N"]:
     return t if placed.cycle.clocked else t - t[0]
 
 
-def _shaped(name: str, x: Numbers, shape: tuple[int, ...]) -> Float[Array, "..."]:
-    x = jnp.asarray(x, float)
-    if x.shape != shape:
-        raise DefinitionError(f"`{name}` must have the shape {shape}, not {x.shape}.")
-    return x
-
-
 def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
     if std is None:
         size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))  # of the shape seen.shape[1:]
@@ -315,9 +310,6 @@ def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
             )
         return size
     std = jnp.asarray(std, float)
-    if std.shape not in ((), seen.shape[1:]):
-        raise DefinitionError(
-            f"the standard deviation of `{name}` must be one number, or one for each output, not "
-            f"of shape {std.shape}."
-        )
+    outputs = ({"outputs": n} for n in seen.shape[1:])
+    require_axes(f"the standard deviation of `{name}`", std, {}, *outputs)
     return jnp.broadcast_to(std, seen.shape[1:])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .._core.arguments import Numbers, names, require_same
+from .._core.arguments import Numbers, names, require_axes, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, PeriodCount, Vector
 from .._core.boundary.values import Integers, Reals
@@ -426,8 +426,7 @@ class LDTP(eqx.Module):
 def _dimensions(dims, n_sections, d):
     if dims is None:
         return jnp.full(n_sections, d)
-    if len(dims) != n_sections:
-        raise DefinitionError(f"`dims` must hold {n_sections} integers, one per section.")
+    require_axes("`dims`", dims, {"sections": n_sections})
     if not is_traced(dims):
         dims = np.asarray(dims)
         if np.any((dims < 1) | (dims > d)):

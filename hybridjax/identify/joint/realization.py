@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 from scipy import special
 
-from ..._core.arguments import Numbers, names
+from ..._core.arguments import Numbers, names, require_axes
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Order, SignalNames
 from ..._core.boundary.values import Integers, Reals
@@ -125,8 +125,7 @@ def given_dims(dims: Any, N: int, name: str = "dims") -> list[int] | None:
     if dims is None:
         return None
     chosen = np.broadcast_to(np.asarray(dims), N) if np.ndim(dims) == 0 else np.asarray(dims)
-    if chosen.shape != (N,):
-        raise DefinitionError(f"`{name}` must be one for each of {N} sections, not {len(chosen)}.")
+    require_axes(f"`{name}`", chosen, {"sections": N})
     return [int(d) for d in chosen]
 
 
