@@ -22,6 +22,7 @@ from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from .._core.results import Result
+from .._core.text import number
 from ..errors import DefinitionError
 from .batches import front
 from .coincidence import SAME, coincident
@@ -127,8 +128,7 @@ class Branch(eqx.Module):
         begin, end = self.ends
         lines = [f"from {self.parameter} = {begin.value:.9g}: {begin.message}"]
         for p in self.points:
-            at = (f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.9g}" for z in p.critical)
-            at = ", ".join(at)
+            at = ", ".join(map(number, p.critical))
             lines.append(f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})")
         lines.append(f"to {self.parameter} = {end.value:.9g}: {end.message}")
         return "\n  ".join(lines)

@@ -166,7 +166,7 @@ class Responses(eqx.Module):
         if is_traced(self):
             return f"Responses({name}, traced)"
         kinds = ["no phase (driven by a clock)" if self.of_phase is None else "phase"]
-        kinds += [f"amplitude {k}: exponent {_text(x)}" for k, x in enumerate(self.exponents)]
+        kinds += [f"amplitude {k}: exponent {number(x)}" for k, x in enumerate(self.exponents)]
         if self.left_out:
             kinds.append(f"{self.left_out} faster modes left out")
         has_any = self.of_phase is not None or len(self.exponents)
@@ -342,7 +342,3 @@ def _returned(a: int, s: Structure, t, q, u):
     chart = s.charts[a]
     assert isinstance(chart, SlidingChart)
     return chart.returned(t, q, s.chart_input(a, t, u)).ravel()
-
-
-def _text(z) -> str:
-    return f"{z.real:.6g}" if np.imag(z) == 0 else f"{z.real:.6g}{np.imag(z):+.6g}j"
