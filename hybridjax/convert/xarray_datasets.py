@@ -13,7 +13,6 @@ import numpy as np
 from .._core.archive import options_of, put_together, restored, signals_in, taken_apart
 from .._core.arguments import package
 from .._core.boundary.checked import checked
-from .._core.executor import is_traced
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError, HybridJaxError
@@ -61,8 +60,6 @@ def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> 
     **Raises:** `DefinitionError` where xarray is not installed, for traced or batched objects, and
     for signals that are called like a coordinate; `PrecisionError` in single precision.
     """
-    if is_traced(thing):
-        raise DefinitionError("to_xarray needs values: call it outside of jit and derivatives.")
     require_x64()
     if isinstance(thing, Recording):
         return _from_recording(thing)

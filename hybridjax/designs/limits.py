@@ -15,7 +15,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import require_among
+from .._core.arguments import require_among, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count
 from .._core.boundary.values import Number
@@ -301,11 +301,7 @@ def products(
     sections; `ComputationError` as `place_sections`.
     """
     sections = as_family(limit.sections)
-    if sections.n_sections != cosines.n_sections:
-        raise DefinitionError(
-            f"`limit` has the distortion between {sections.n_sections} sections, the model has "
-            f"{cosines.n_sections}."
-        )
+    require_same("the distortion of `limit` and the model", sections, cosines, ("n_sections",))
     outputs = tuple(str(n) for n in limit.rms)
     quadratic = second_order(limit.cycle, sections, outputs, inputs)
     pairs = quadratic.products(cosines.f, cosines.channel)

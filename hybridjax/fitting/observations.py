@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from .._core.arguments import Numbers, require_axes
+from .._core.arguments import Numbers, require_axes, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar
@@ -113,11 +113,7 @@ class ObservedHTF(AbstractObservation):
         """
         self.f, self.H, self.sections = htf.f, htf.H, as_family(sections)
         self.harmonics, self.inputs, self.outputs = htf.harmonics, htf.inputs, htf.outputs
-        if self.sections.n_sections != htf.n_sections:
-            raise DefinitionError(
-                f"the HTFs belong to {htf.n_sections} sections, the family has "
-                f"{self.sections.n_sections}."
-            )
+        require_same("HTFs and `sections`", htf, self.sections, ("n_sections",))
         self.weights = jnp.asarray(error_weights(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
 
@@ -161,10 +157,7 @@ class ObservedSeries(AbstractObservation):
         an `std` that is not one for each output.
         """
         self.sections = as_family(sections)
-        if self.sections.n_sections != data.n_sections:
-            raise DefinitionError(
-                f"the data have {data.n_sections} sections, the family {self.sections.n_sections}."
-            )
+        require_same("data and `sections`", data, self.sections, ("n_sections",))
         if not data.ok.any():
             raise DefinitionError("no experiment ran well, so there is nothing to fit to.")
         self.inputs, self.outputs = data.inputs, data.outputs

@@ -16,7 +16,6 @@ from scipy.optimize import brentq
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Numbers, Share
 from .._core.boundary.values import Reals
-from .._core.executor import is_traced
 from .._core.html import COLORS, Curve as Line, card, complex_number, picture, table
 from .._core.memo import remembered
 from .._core.precision import require_x64
@@ -224,11 +223,6 @@ def continuation(
 
 
 def _check(cycle, values) -> np.ndarray:
-    if is_traced(cycle):
-        raise DefinitionError(
-            "a branch is followed where values are known: call `continuation` outside of "
-            "JAX transformations, and differentiate `find_limit_cycle` at its points."
-        )
     require_x64(cycle)
     cycle.require_current()
     if int(cycle.result) != Result.OK:

@@ -8,13 +8,12 @@ N. M. Wereley, Analysis and control of linear periodically time varying systems,
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import SignalNames
 from .._core.compilation import at_ease
-from .._core.executor import Array, is_traced, namespace, on_host, scan, to_host
+from .._core.executor import Array, namespace, on_host, scan, to_host
 from ..engine import kernels
 from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics, check_harmonics
@@ -69,11 +68,7 @@ def continuous_htf(
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
     s, harmonics = course.map.structure, check_harmonics(harmonics, 0)
-    frequencies = f if isinstance(f, jax.Array) else np.asarray(f, float)
-    frequencies = frequencies.reshape(-1)
-    if is_traced(frequencies):
-        raise DefinitionError("`htf` must know `f`: make it outside of jit and grad.")
-    frequencies = np.asarray(frequencies)
+    frequencies = np.asarray(f, float).reshape(-1)
     visited = {s.transitions[g].source for g in course.events}
     z = s.resolve_outputs(s.states_everywhere() if outputs is None else outputs)
     for x in (x for x in z.items if isinstance(x, Output)):

@@ -145,8 +145,6 @@ class Responses(eqx.Module):
         (signal, *_), (column, *_) = self.structure.inputs_among(
             input if input is None else [input]
         )
-        if is_traced(self):
-            raise DefinitionError("`curve` is a figure's: use `phase` inside of jit and grad.")
         if any(x.weight[signal] != 0 for x in self.impulses()):
             raise DefinitionError(
                 f"the input '{signal}' acts at events, which no curve shows: see `impulses()`."

@@ -49,7 +49,7 @@ def records(**options):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS), "16 sections, the family has 8"),
+        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS), "different n_sections: 16 and 8"),
         (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS), "variance"),
         (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "8 sections, the family 4"),
         (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
