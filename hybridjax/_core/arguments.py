@@ -51,10 +51,9 @@ def require_same(
 ) -> None:
     """**Raises:** `DefinitionError` if two things ("model and data") differ in a field."""
     for name in fields:
-        if getattr(a, name) != getattr(b, name):
-            raise DefinitionError(
-                f"{what} have different {name}: {getattr(a, name)} and {getattr(b, name)}."
-            )
+        x, y = getattr(a, name), getattr(b, name)
+        if x != y:
+            raise DefinitionError(f"{what} have different {name}: {x} and {y}.")
 
 
 def require_axes(what: str, array: Any, *axes: Mapping[str, int]) -> None:

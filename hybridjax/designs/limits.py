@@ -113,7 +113,7 @@ class Limits(eqx.Module):
             )
         if count > cosines:
             raise DefinitionError(
-                f"{count} experiments are more than the {cosines} cosines of the `design`."
+                f"{count} experiments exceed the {cosines} cosines of the `design`."
             )
         return count
 

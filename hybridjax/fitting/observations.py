@@ -181,10 +181,7 @@ class ObservedSeries(AbstractObservation):
         return ((y - self.y) / self.scale).ravel()
 
     def prepare(self, cycle: LimitCycle) -> "ObservedSeries":
-        if self.inputs != cycle.system.inputs:
-            raise DefinitionError(
-                f"the data have the inputs {self.inputs}, the system {cycle.system.inputs}."
-            )
+        require_same("data and system", self, cycle.system, ("inputs",))
         stepping = response_function(cycle, self.sections, self.outputs).stepping
         flow = stepping.plan, stepping.settings
         return eqx.tree_at(lambda o: o.flow, self, flow, is_leaf=lambda x: x is None)
@@ -242,9 +239,7 @@ class ObservedCycle(AbstractObservation):
         }
         given = {name: entry for name, entry in given.items() if entry[0] is not None}
         if not given or ("values" in given) != bool(ny):
-            raise DefinitionError(
-                "give `outputs` with their `values`, `times`, or the `period` of the cycle."
-            )
+            raise DefinitionError("give `outputs` with their `values`, `times`, or a `period`.")
         self.which = tuple(given)
         for name, (x, _, axes) in given.items():
             require_axes(f"`{name}`", x, axes)

@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Int
 
-from .._core.arguments import require_among
+from .._core.arguments import require_among, require_same
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record, RecordedData, uninterrupted_records
@@ -144,15 +144,11 @@ def htf_by_reference(
         roles = Roles.of(part.inputs, reference)
         require_loop(roles, [part.u], part.inputs)
         sums = spectral_products(part, repeats)
-        if total is None:
-            total = sums
-        elif total.setup != sums.setup:
-            raise DefinitionError(
-                f"these experiments do not belong together: {total.setup}, {sums.setup}."
-            )
-        else:
+        if total is not None:
+            require_same("experiments", total, sums, ("setup",))
             both = (total.total + sums.total, total.between + sums.between)
-            total = Sums(*both, total.experiments + sums.experiments, total.setup)
+            sums = Sums(*both, total.experiments + sums.experiments, sums.setup)
+        total = sums
     if total is None or not total.experiments:
         raise DefinitionError("`data` holds no experiment that ran to its end.")
     inputs, references = (tuple(total.setup.inputs[i] for i in part) for part in roles)

@@ -147,9 +147,7 @@ def fit_multipliers(
     order = order.rank() if isinstance(order, LDTP) else order
     rms = check_values(htf)
     if errors == "variance" and htf.variance is None:
-        raise DefinitionError(
-            "errors='variance' needs HTFs with variances; these have none: take 'residuals'."
-        )
+        raise DefinitionError("errors='variance' needs HTFs with variances: take 'residuals'.")
     size = numerator_size(htf, order, overhang)
     f, H = np.asarray(htf.f), np.asarray(htf.H)
     groups = group_htf(htf, error_weights(htf, rms), size)

@@ -415,9 +415,7 @@ def _combined(
     for x in operands:
         _require_same_lines(first, x)
         if x.harmonics != every:
-            raise DefinitionError(
-                f"the algebra of HTFs takes all {N} harmonics, not {x.harmonics}."
-            )
+            raise DefinitionError(f"algebra of HTFs takes all {N} harmonics, not {x.harmonics}.")
     lines = algebra.Lines.of(np.asarray(first.f), N)
     to_matrices = lambda x: lines.matrices(x, N // 2)  # noqa: E731
     result, pairs = operation(*(to_matrices(x.H) for x in operands))

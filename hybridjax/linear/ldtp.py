@@ -96,7 +96,7 @@ class LDTP(eqx.Module):
         require_x64(matrices)
         if coordinates is not None and len(coordinates) != n_sections:
             raise DefinitionError(
-                f"`coordinates` names {len(coordinates)} sections, but there are {n_sections}."
+                f"`coordinates` names {len(coordinates)} sections, not {n_sections}."
             )
         self.A, self.B, self.C, self.D = A, B, C, through
         self.dims = _dimensions(dims, n_sections, d)

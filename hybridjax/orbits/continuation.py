@@ -226,13 +226,11 @@ def _check(cycle, values) -> np.ndarray:
     require_x64(cycle)
     cycle.require_current()
     if int(cycle.result) != Result.OK:
-        raise DefinitionError(
-            f"the cycle to follow was not found: {Result(int(cycle.result)).message}."
-        )
+        raise DefinitionError(f"the cycle was not found: {Result(int(cycle.result)).message}.")
     steps = np.diff(np.asarray(values))
     if not len(steps) or abs(np.sign(steps).sum()) < len(steps):
         raise DefinitionError(
-            f"the values must be two or more numbers, ascending or descending; got {values}."
+            f"the values must be two or more, ascending or descending; got {values}."
         )
     return np.asarray(values)
 

@@ -400,9 +400,8 @@ def log_determinant(map: ReturnMap) -> float:
 
     Steps of an implicit method lose a mode that decays within them; this gives its decay.
     """
-    return float(
-        np.sum(_pieces(to_host(map), lambda s, lanes, _, tape: divergence(s, lanes, tape)))
-    )
+    each = _pieces(to_host(map), lambda s, lanes, _, tape: divergence(s, lanes, tape))
+    return float(np.sum(each))
 
 
 def _pieces(map: ReturnMap, measure: Callable, tangents: bool = False) -> list:

@@ -147,7 +147,7 @@ class Responses(eqx.Module):
         )
         if any(x.weight[signal] != 0 for x in self.impulses()):
             raise DefinitionError(
-                f"the input '{signal}' acts at events, which no curve shows: see `impulses()`."
+                f"'{signal}' acts at events, which no curve has: see `impulses()`."
             )
         flow = to_host(self.flow)
         values = np.einsum("pki,pkiu->pku", of_phase, flow.by_input)

@@ -178,9 +178,7 @@ def _moments(data: SectionData, order: int) -> _Moments:
     size = np.nanstd(np.concatenate([x.y for x in data.records]), axis=0)
     y = [r.y / size for r in data.records]
     if order > _EACH * len(size):
-        raise DefinitionError(
-            f"`order` is {order}, but the state at a section has {_EACH * len(size)} numbers."
-        )
+        raise DefinitionError(f"`order` is {order}, but states have {_EACH * len(size)} numbers.")
     rows = np.array([
         (s, (r.first_section + k) // N, (r.first_section + k) % N, k)
         for s, r in enumerate(data.records)

@@ -176,7 +176,7 @@ class Recording(eqx.Module):
         recordings = list(recordings)
         if len({len(x.trials) for x in recordings}) != 1:
             raise DefinitionError(
-                "`recordings` must hold one or more recordings with the same number of trials."
+                "`recordings` must hold recordings with the same number of trials."
             )
         names = [name for x in recordings for name in x.signals]
         units = dict(zip(names, (unit for x in recordings for unit in x.units), strict=True))
@@ -278,9 +278,7 @@ def signal_of(crossing: Crossing) -> str:
     **Raises:** `DefinitionError` for a crossing of a function or in charts.
     """
     if not isinstance(crossing.function, str) or crossing.charts is not None:
-        raise DefinitionError(
-            "a recording holds samples: the Crossing of one names a signal, and no charts."
-        )
+        raise DefinitionError("the Crossing of a recording names a signal, and no charts.")
     return crossing.function
 
 

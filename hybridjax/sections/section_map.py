@@ -102,9 +102,7 @@ def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -
     placed = as_placed(cycle, sections)
     for k in (i, j):
         if k >= placed.n_sections:
-            raise DefinitionError(
-                f"section {k} does not exist; sections are 0..{placed.n_sections - 1}."
-            )
+            raise DefinitionError(f"there is no section {k}: the last is {placed.n_sections - 1}.")
     s, chart = placed.structure(), placed.lanes.chart
     dims = (s.d, s.d) if is_traced(chart) else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
     return SectionMap(placed, i, j, dims)

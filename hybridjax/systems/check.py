@@ -89,9 +89,7 @@ def _check_functions(s: Structure) -> Iterator[str]:
         field = lambda *x, a=a: s.field(a, *x)  # noqa: E731
         yield from _check_shape(s, a, f"field of chart '{name}'", field, (s.dims[a],), states)
     if len(set(map(str, s.state_names()))) < len(s.state_names()):
-        raise DefinitionError(
-            f"charts of {kind} give a state different units: {quoted(s.state_names())}."
-        )
+        raise DefinitionError(f"{kind} gives a state two units: {quoted(s.state_names())}.")
     _check_names(kind, "transitions", [tr.name for tr in s.transitions])
     # Transitions of one kind are one program; the first and the last may index beyond the states.
     for g in sorted({g for kind in s.kinds for g in (kind[0], kind[-1])}):

@@ -55,7 +55,7 @@ def records(**options):
         (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
         (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), "one for each output"),
         (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "zero throughout"),
-        (lambda: hj.ObservedCycle(SECTIONS), "`times`, or the `period`"),
+        (lambda: hj.ObservedCycle(SECTIONS), "`times`, or a `period`"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM"), "`outputs` with their `values`"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))), r"the shape \(8, 1\)"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))), "zero throughout"),

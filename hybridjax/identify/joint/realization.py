@@ -253,9 +253,7 @@ def subspace_model(
         root = np.linalg.qr(section.past(past), mode="r")
         _, s, vh = np.linalg.svd(root @ ahead, full_matrices=False)
         if dims[n] > len(s):
-            raise DefinitionError(
-                f"the past shows {len(s)} dimensions of the state, not {dims[n]}."
-            )
+            raise DefinitionError(f"the past shows {len(s)} dimensions, not {dims[n]}.")
         kept = np.maximum(s[: dims[n]], _SHRINKAGE * s[0])
         to_state.append(ahead @ (vh[: dims[n]].T / kept * np.sqrt(len(section.y))))
     return _from_states(sections, to_state, past, innovations, direct)
