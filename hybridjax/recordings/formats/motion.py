@@ -1,4 +1,7 @@
-"""Text files with or without the layouts of OpenSim, Motion Analysis and Vicon."""
+"""Text files with or without the layouts of OpenSim, Motion Analysis and Vicon.
+
+`read_text` recognizes a layout by its first lines; that of another maker (Noraxon, say) belongs here.
+"""
 
 from collections.abc import Iterator
 from itertools import zip_longest
