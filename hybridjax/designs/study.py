@@ -109,8 +109,7 @@ class Study(eqx.Module):
             )
         if goal.estimator == "fit_ldtp":
             raise DefinitionError(
-                "a study estimates multipliers by fit_multipliers: `goal` may have no other "
-                "estimator."
+                "a study estimates multipliers by fit_multipliers: `goal` has another estimator."
             )
         if goal.which is not None and goal.which >= self.order:
             raise DefinitionError(

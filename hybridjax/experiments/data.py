@@ -117,8 +117,7 @@ class ExperimentData(eqx.Module):
             )
         if n < N * P:
             raise DefinitionError(
-                f"the window of P = {P} periods is longer than the record, {n // N} periods of "
-                f"{N} sections."
+                f"the window of P = {P} periods is longer than the record, {n // N} periods."
             )
         for name in ("result", "failed_at", "error"):
             require_axes(f"`{name}`", getattr(self, name), {"experiments": S})

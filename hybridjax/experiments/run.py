@@ -393,13 +393,12 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
         finite = np.isfinite(np.asarray(u[k : k + CHUNK], float)).all(axis=(1, 2))
         if not finite.all():
             raise DefinitionError(
-                "`design` has NaN or infinity in the input of experiment "
-                f"{k + int(np.argmin(finite))}."
+                f"`design` has NaN or infinity in experiment {k + int(np.argmin(finite))}."
             )
     cycles = u.shape[1] // n_sections
     if discard >= cycles:
         raise DefinitionError(
-            f"inputs of {cycles} cycles less {discard} discarded ones leave none for estimation."
+            f"inputs of {cycles} cycles less {discard} discarded ones leave none."
         )
     return Inputs(u, cycles, cycles - discard)
 

@@ -53,8 +53,7 @@ class Roles(NamedTuple):
         inputs = [i for i in range(len(names)) if i not in references]
         if not inputs:
             raise DefinitionError(
-                "all inputs are references: name the signals that the controller makes as inputs, "
-                "too."
+                "all inputs are references: name the inputs that the controller makes, too."
             )
         if len(references) < (len(inputs) if fewest is None else fewest):
             raise DefinitionError(
@@ -90,8 +89,7 @@ def require_loop(roles: Roles, signals: Sequence[np.ndarray], names: Sequence[st
         for k in roles.references:
             if all(np.array_equal(x[..., i], x[..., k]) for x in signals):
                 raise DefinitionError(
-                    f"{names[i]} and {names[k]} are the same signal: there is no loop, leave "
-                    "`reference` out."
+                    f"{names[i]} and {names[k]} are equal: there is no loop, leave `reference` out."
                 )
 
 

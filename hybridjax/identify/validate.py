@@ -303,9 +303,8 @@ def validate(
     N, outputs, ny = records[0].n_sections, records[0].outputs, len(records[0].outputs)
     if not compared:
         raise DefinitionError(
-            f"the longest of {len(records)} uninterrupted records has "
-            f"{max(len(r.u) for r in records) / N:.3g} cycles: too few to tell the model from an "
-            "unknown start."
+            f"the longest of {len(records)} uninterrupted records has {max(len(r.u) for r in records) / N:.3g} "
+            "cycles: too few to tell the model from an unknown start."
         )
     grid = CycleGrid.from_records(compared)
     first = np.array([r.first_section for r in compared])
@@ -323,8 +322,7 @@ def validate(
             raise DefinitionError(f"the output {name} is constant or missing at every sample.")
         if few < FEWEST_SAMPLES:
             raise DefinitionError(
-                f"a section was sampled {few} times only; the tests need {FEWEST_SAMPLES} or more "
-                "cycles."
+                f"a section was sampled {few} times only; the tests need {FEWEST_SAMPLES} cycles."
             )
     # One period, less for few cycles.
     tried = range(1, min(N, int(sampled.min()) // _SAMPLES_PER_LAG) + 1)

@@ -313,7 +313,7 @@ class SectionList(AbstractSections):
         self.items = tuple(items)
         if not self.items:
             raise DefinitionError(
-                "a list of sections needs at least one Crossing or AtEvent, but `items` is empty."
+                "`items` is empty: a list of sections needs a Crossing or AtEvent."
             )
 
     @property  # type: ignore[misc]

@@ -112,7 +112,7 @@ def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
     [
         (dict(design=hj.multisine(16, band=(0, 7.0))), "for 16 sections, but"),
         (dict(design=np.zeros((2, 33, 1))), "multiple of the 32 sections"),
-        (dict(design=np.zeros((2, 64, 1)), discard=2), "leave none for estimation"),
+        (dict(design=np.zeros((2, 64, 1)), discard=2), "leave none"),
         (dict(start="steady", discard=7), "a steady start needs inputs of a whole number"),
     ],
 )

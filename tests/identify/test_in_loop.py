@@ -145,7 +145,7 @@ def test_what_does_not_fit_is_refused(plant):
     with refused("all inputs are references"):
         hj.fit_ldtp(record, 2, reference=("u", "r"))
     same = hj.Record(record.u[:, [1, 1]], record.y, n_sections=N, inputs=("u", "r"))
-    with refused("u and r are the same signal"):
+    with refused("u and r are equal"):
         hj.fit_ldtp(same, 2, reference="r")
     with refused("name those that enter at the plant's input"):
         hj.identify.loop(data)

@@ -232,7 +232,7 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
     except FileNotFoundError:
         if sizes:
             raise DefinitionError(
-                f"'{address}' is there, and is no store of results: choose another name."
+                f"'{address}' is no store of results: choose another name."
             ) from None
         return None
     except Exception as error:

@@ -1,6 +1,6 @@
 """Text files with or without the layouts of OpenSim, Motion Analysis and Vicon.
 
-`read_text` recognizes a layout by its first lines; that of another maker (Noraxon, say) belongs here.
+`read_text` recognizes a layout by its first lines; those of other makers (Noraxon) belong here.
 """
 
 from collections.abc import Iterator
