@@ -323,6 +323,7 @@ def _check_alike(models: list[Model], design: Design) -> None:
         require_same(f"model {k} and model 0", model, first)
     if design.n_sections != first.n_sections or design.input_names != first.inputs:
         raise DefinitionError(
-            f"the design has {design.n_sections} sections and the inputs {listed(design.input_names)}, "
-            f"the model {first.n_sections} and {listed(first.inputs)}."
+            f"the design has {design.n_sections} sections and the inputs "
+            f"{listed(design.input_names)}, the model {first.n_sections} and "
+            f"{listed(first.inputs)}."
         )

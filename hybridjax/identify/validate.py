@@ -303,8 +303,9 @@ def validate(
     N, outputs, ny = records[0].n_sections, records[0].outputs, len(records[0].outputs)
     if not compared:
         raise DefinitionError(
-            f"the longest of {len(records)} uninterrupted records has {max(len(r.u) for r in records) / N:.3g} "
-            "cycles: too few to tell the model from an unknown start."
+            f"the longest of {len(records)} uninterrupted records has "
+            f"{max(len(r.u) for r in records) / N:.3g} cycles: too few to tell the model from an "
+            "unknown start."
         )
     grid = CycleGrid.from_records(compared)
     first = np.array([r.first_section for r in compared])

@@ -92,7 +92,7 @@ class Phase(eqx.Module):
         """
         if len(self.stretches) != len(recording.trials):
             raise DefinitionError(
-                f"the phase has {len(self.stretches)} trials, the recording {len(recording.trials)}."
+                f"the phase has {len(self.stretches)} trials, not {len(recording.trials)}."
             )
         return list(zip(recording.trials, self.stretches, strict=True))
 
