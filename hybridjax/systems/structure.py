@@ -392,9 +392,8 @@ class Outputs:
         for item in outputs:
             if isinstance(item, str) and item in defined:
                 item = defined[item]
-            if isinstance(item, str) and item not in structure.state_names():
-                names = (*structure.state_names(), *defined)
-                raise DefinitionError(f"there is no output {item!r}; outputs are {quoted(names)}.")
+            if isinstance(item, str):
+                require_among("output", [item], (*structure.state_names(), *defined))
             self.items.append(item)
         states = {str(name): name for name in structure.state_names()}
         self.names = tuple(

@@ -114,5 +114,5 @@ def test_outputs_by_name_by_function_and_by_chart():
     assert z.defined(0) and not z.defined(1)
     with pytest.raises(hj.DefinitionError, match="output 'x' is not defined in chart 'b'"):
         z.require(1)
-    with pytest.raises(hj.DefinitionError, match="there is no output 'y'; outputs are 'x', 'v'"):
+    with pytest.raises(hj.DefinitionError, match="there is no output 'y'; outputs are x, v"):
         s.resolve_outputs("y")
