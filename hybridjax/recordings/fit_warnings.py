@@ -5,7 +5,7 @@ Warnings about the signals themselves are made in `inspection/`.
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -22,11 +22,6 @@ from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validate import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import Finding, print_findings
-
-
-if TYPE_CHECKING:
-    from .beats.response import PhaseResponse
-    from .natural import NaturalMultipliers
 
 
 # Fraction of samples: if fewer remain beyond the number of unknowns, strides are few; if more are
@@ -189,8 +184,8 @@ def _about_residuals(validation: Validation) -> Iterator[Finding]:
         yield Finding("left over", f"{of_input}it remains, raise the `order`.")
 
 
-def about_natural_multipliers(result: "NaturalMultipliers") -> Iterator[Finding]:
-    """Limits of multipliers of a rhythm that nobody perturbed."""
+def about_natural_multipliers(result: Any) -> Iterator[Finding]:
+    """Limits of a result of `natural_multipliers`."""
     low, high = result.interval()[0]
     modulus, plain = abs(result.multipliers[0]), abs(result.plain[0])
     text = f"the largest modulus lies between {low:.2f} and {high:.2f} (95 %), from {result.cycles}"
@@ -210,8 +205,8 @@ def about_natural_multipliers(result: "NaturalMultipliers") -> Iterator[Finding]
     yield Finding("noise", f"{text} {more}.")
 
 
-def about_phase_response(r: "PhaseResponse") -> Iterator[Finding]:
-    """Limits of a phase response curve from the times of events alone."""
+def about_phase_response(r: Any) -> Iterator[Finding]:
+    """Limits of a result of `phase_response`."""
     mean, flat = abs(r.coefficients[0]), r.left_out_flat
     text = f"it adds {r.left_out - flat:.3f} to the R2 of intervals left out; a flat curve has "
     text += f"{flat:.3f} of {r.left_out:.3f}."
