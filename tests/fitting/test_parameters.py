@@ -57,7 +57,10 @@ def records(**options):
         (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "zero throughout"),
         (lambda: hj.ObservedCycle(SECTIONS), "`times`, or a `period`"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM"), "`outputs` with their `values`"),
-        (lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))), r"of shape \(8 sections, 1 outputs\)"),
+        (
+            lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))),
+            r"of shape \(8 sections, 1 outputs\)",
+        ),
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))), "zero throughout"),
     ],
 )
