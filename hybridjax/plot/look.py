@@ -77,7 +77,6 @@ def style() -> contextlib.AbstractContextManager:
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
 
 
-"""Dots per inch."""
 AxesLike = Axes | np.ndarray | Sequence
 """Axes to draw on: one, or a grid of them."""
 
