@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive, Seed
 from ..errors import DefinitionError
@@ -147,10 +148,9 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
     outputs, N = model.outputs, model.n_sections
     if noise is None:
         noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}
-    unknown = [name for name in noise if name not in outputs]
-    if unknown or not noise:
-        problem = f"names '{unknown[0]}'" if unknown else "names no output"
-        raise DefinitionError(f"`noise` {problem}; the outputs are {', '.join(outputs)}.")
+    require_among("output", noise, outputs, "`noise`: ")
+    if not noise:
+        raise DefinitionError(f"`noise` names no output; outputs are {', '.join(outputs)}.")
     measured = {name: noise[name] for name in outputs if name in noise}
 
     def spectrum(f: np.ndarray, harmonics: tuple[int, ...]) -> np.ndarray:
@@ -195,18 +195,13 @@ def measured_htfs(
         members = np.flatnonzero(cosines.channel == i)
         htf = model.htf(cosines.f[members], harmonics)
         spectrum = noise.spectrum(cosines.f[members], htf.harmonics)
-        variance = 2 * spectrum[..., None] / (cosines.n_sections * cosines.strides)
-        yield Measured(with_variance(htf, noise, variance, int(i)), members, int(i))
-
-
-def with_variance(
-    htf: HTF, noise: Noise, variance: Float[np.ndarray, "M F ny 1"], channel: int
-) -> HTF:
-    """Return the HTFs from one input to the measured outputs, with these variances."""
-    H: Any = np.asarray(htf.H)[:, :, noise.outputs, channel : channel + 1]
-    inputs, outputs = (htf.inputs[channel],), tuple(htf.outputs[k] for k in noise.outputs)
-    other: Any = variance
-    return dataclasses.replace(htf, H=H, variance=other, inputs=inputs, outputs=outputs)
+        variance: Any = 2 * spectrum[..., None] / (cosines.n_sections * cosines.strides)
+        H: Any = np.asarray(htf.H)[:, :, noise.outputs, i : i + 1]
+        outputs = tuple(htf.outputs[k] for k in noise.outputs)
+        htf = dataclasses.replace(
+            htf, H=H, variance=variance, inputs=htf.inputs[i : i + 1], outputs=outputs
+        )
+        yield Measured(htf, members, int(i))
 
 
 @checked

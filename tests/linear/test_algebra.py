@@ -114,7 +114,7 @@ def test_what_does_not_fit_is_refused(pair):
         system(2, (2, 2, 2, 2), through=0).inverse()
     with refused("no response at section 2"):
         eqx.tree_at(lambda x: x.D, K, K.D.at[2].set(-np.linalg.inv(P.D[2]))).feedback(P)
-    with refused(r"shape \(2, 2\), or \(4, 2, 2\)"):
+    with refused(r"of shape \(2 inputs, 2 outputs\) or of shape \(4 sections"):
         P.feedback(np.eye(3))
     with refused("do not hold f = 1.3"):
         P.htf([0.3, 0.7]).inverse()
