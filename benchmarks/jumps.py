@@ -13,6 +13,7 @@ multipliers, C and (with a clock) B of a linearization, and the end of a simulat
 
 import argparse
 import collections
+import functools as ft
 import sys
 from typing import Any, NamedTuple
 
@@ -307,9 +308,12 @@ class Truth:
         return (1 - h) * (2 * (held.turns % 2) - 1) if self.form.argument == "box" else h
 
     def value(self, t, q, held):
-        h = self.number(t, q, held)
-        smooth = self.form.argument in ("pulse", "bump")
-        return self.x.amount * (np.exp(-h * h) if smooth else self.kind.held(h, held.floor))
+        """The term; far from its middle, as it would be if that were not near."""
+        h, is_far = self.number(t, q, held), held.zone in (-2, 1)
+        if self.form.argument in ("pulse", "bump"):
+            return self.x.amount * (0.0 if is_far else np.exp(-h * h))
+        h = np.minimum(h, 1 - NARROW) if self.narrow and is_far else h
+        return self.x.amount * self.kind.held(h, held.floor)
 
     def decide(self, t, q, armed):
         held = Held(np.floor(half_turns(self.x, t)), 0, 0, armed)
@@ -321,6 +325,9 @@ class Truth:
 
     def field(self, t, q, u, held):
         return np.array(field_of(self.form, self.x, t, q, u, self.value(t, q, held), np))
+
+    def output(self, t, held, q):
+        return q[0] * (1 + (self.value(t, q, held) if self.form.place == "output" else 0.0))
 
     def edges(self, held):
         """Functions that fall through zero where a decision ends; the last is the guard."""
@@ -461,13 +468,11 @@ def verdicts(form: Form, x: Numbers) -> dict[str, Any]:
         return max(min(far(mine, values), far(mine, values[::-1])), far(states[1:], [q] * 3))
 
     def of_model(model):
-        lanes, period, errors = hj.place_sections(said["cycle"], hj.ClockPhase(3)).lanes, 0.0, []
+        lanes, errors = hj.place_sections(said["cycle"], hj.ClockPhase(3)).lanes, []
         t, period = np.asarray(lanes.t), float(said["cycle"].period)
         for n, q in enumerate(np.asarray(lanes.q).T):
             held, end = truth.decide(t[n], q, True), t[n + 1] if n < 2 else t[0] + period
-            at = lambda q: (
-                q[0] * (1 + (truth.value(t[n], q, held) if form.place == "output" else 0))
-            )  # noqa: B023, E501, E731
+            at = ft.partial(truth.output, t[n], held)
             C = [(at(q + d) - at(q - d)) / 2e-6 for d in 1e-6 * np.eye(2)]
             errors.append(far(np.asarray(model.C[n])[1], C))
             if has_clock:

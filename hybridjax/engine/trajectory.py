@@ -1,6 +1,5 @@
 """Single trajectories with their events, dense enough to plot."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple
 
@@ -76,9 +75,11 @@ class Trajectory(eqx.Module):
 
     def until(self, k: int, result: Result) -> "Trajectory":
         """The trajectory up to row k, where it ends for this reason."""
-        cut = lambda x: x[: k + 1]  # noqa: E731
-        rows = jax.tree_util.tree_map(cut, dataclasses.replace(self, structure=None))
-        return dataclasses.replace(rows, structure=self.structure, result=result)
+        to = slice(k + 1)
+        return Trajectory(
+            self.structure, self.t[to], self.chart[to], self.before[to], self.after[to],
+            self.slope_before[to], self.slope_after[to], self.event[to], result,
+        )  # fmt: skip
 
     @property
     def events(self) -> list[Event]:

@@ -57,7 +57,6 @@ def test_guards():
 
 
 def test_pulses_of_another_period():
-    """One in two periods that the system states, with a width of 1e-3 of them."""
     pulse = lambda t, x: jnp.exp(-((((t / 2 + 0.15) % 1.0 - 0.5) / 1e-3) ** 2))  # noqa: E731
     with pytest.raises(hj.DefinitionError, match="does not have the period 1"):
         find(Oscillator(pulse, 1.0))
