@@ -20,7 +20,7 @@ import sys
 import sysconfig
 import types
 import weakref
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar, cast
 
 import equinox as eqx
@@ -38,9 +38,10 @@ _HIDDEN = re.compile("eval|exec|globals|__import__|import_module|getenv|check_ou
 _READING = re.compile("open|(read|open|load)_.+|load|loadtxt|loadmat|genfromtxt|fromfile|memmap")
 _FRAMES = {"__globals__", "f_globals", "f_locals"}
 _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range
-_PACKAGE = str(pathlib.Path(__file__).parents[1])
+_PACKAGE = os.path.join(pathlib.Path(__file__).parents[1], "")
 _MODELS = os.path.join(_PACKAGE, "models")
-_FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib", "purelib"))
+_FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib"))
+_INSTALLED = re.compile(r"[\\/](site|dist)-packages[\\/]")  # of a user, a distribution, or Python
 
 
 Thing = TypeVar("Thing")
@@ -262,10 +263,11 @@ class _Walk:
             self.visit_all(part for item in x.items() for part in item)
         is_wrapped = isinstance(x, eqx.Module) or hasattr(x, "__wrapped__")
         if _is_installed(type(x).__module__) and not is_wrapped:
+            parts = None
             with contextlib.suppress(Exception):  # whatever an object raises that cannot be pickled
-                _, arguments, *parts = x.__reduce_ex__(4)
-                state, *items = parts or [None]
-                return self.visit_all([arguments, state, *(list(y or ()) for y in items)])
+                parts = [list(y) if isinstance(y, Iterator) else y for y in x.__reduce_ex__(4)[1:]]
+            if parts is not None:
+                return self.visit_all(parts)
         items = sorted(getattr(x, "__dict__", {}).items())
         state = {k: v for k, v in items if not _is_description(k, v)}
         if isinstance(x, Definition):
@@ -332,4 +334,5 @@ def _is_installed(module: str | None) -> bool:
 @ft.cache
 def is_of_package(path: str) -> bool:
     """Test whether a file belongs to Python or to a package, `hybridjax.models` excepted."""
-    return path.startswith(_FOLDERS) and not path.startswith(_MODELS)
+    is_installed = path.startswith(_FOLDERS) or _INSTALLED.search(path) is not None
+    return is_installed and not path.startswith(_MODELS)
