@@ -12,7 +12,6 @@ from pathlib import Path
 from ._core.archive import read_module, write_module
 from ._core.boundary.checked import checked
 from ._core.boundary.kinds import FilePath
-from ._core.executor import is_traced
 from ._core.precision import require_x64
 from .errors import DefinitionError
 from .experiments.data import ExperimentData
@@ -51,8 +50,6 @@ def save(path: FilePath, thing: Saved) -> None:
         raise DefinitionError(f"save takes {', '.join(KINDS)}; it cannot write a {kind}.")
     if path.suffix != ".npz":
         raise DefinitionError(f"save writes npz files: let the name '{path.name}' end in '.npz'.")
-    if is_traced(thing):
-        raise DefinitionError("save needs values: call it outside of jit, vmap and derivatives.")
     require_x64(thing)
     write_module(path, thing)
 

@@ -1,4 +1,5 @@
 import contextlib
+import gc
 import importlib.metadata
 import os
 import pathlib
@@ -62,6 +63,11 @@ def pytest_xdist_auto_num_workers(config):
     return None
 
 
+# Tracing makes a million objects that live until a program is compiled: by default the collector
+# visits all of them many times, which is a tenth of the time of the tests.
+gc.freeze()
+gc.set_threshold(100_000, 20, 20)
+
 # (A plugin of pytest may have loaded NumPy before this file.)
 for library in libraries():
     library.set(1)
@@ -95,6 +101,9 @@ def unchecked_host():
 compilation.at_ease = unchecked_host
 # Results of one test come from one program.
 compilation._WORTH_OPTIMIZING = np.inf
+# The tests of a process find many cycles of one kind, and few that take longer on the host than
+# compiling them would.
+compilation._WORTH_COMPILING = 10.0
 
 
 # Programs that a worker keeps, of some 5 MB each. Doubled: twice the memory.

@@ -77,13 +77,19 @@ def read_section(tmp_path_factory, hopper_cycle):
     pyplot.close("all")
 
 
+# (What they begin with takes as long as each: `.ci/run` gives them to one worker.)
+in_one_worker = pytest.mark.xdist_group("readme")
+
+
 @pytest.mark.slow
+@in_one_worker
 @pytest.mark.parametrize("heading", ["Many of them, and derivatives", "Fewer strides"])
 def test_the_section_runs(heading, read_section):
     read_section(heading)
 
 
 @pytest.mark.slow
+@in_one_worker
 def test_the_section_on_fits_finds_the_parameters(read_section):
     made = read_section("Along a parameter, and from data to parameters")
     for name in ("M", "k", "b"):  # up to the distortion that the experiments hold
@@ -92,6 +98,7 @@ def test_the_section_on_fits_finds_the_parameters(read_section):
 
 
 @pytest.mark.slow
+@in_one_worker
 def test_the_section_on_recordings_finds_the_multipliers(read_section):
     made = read_section("From a recording")
     found = made.result.fit.compare(made.cycle.multipliers)

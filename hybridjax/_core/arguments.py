@@ -1,10 +1,11 @@
 """Numbers and names, as users give them, and whether things belong together."""
 
 import importlib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
 import numpy.typing as npt
 
 from ..errors import DefinitionError
@@ -50,10 +51,46 @@ def require_same(
 ) -> None:
     """**Raises:** `DefinitionError` if two things ("model and data") differ in a field."""
     for name in fields:
-        if getattr(a, name) != getattr(b, name):
-            raise DefinitionError(
-                f"{what} have different {name}: {getattr(a, name)} and {getattr(b, name)}."
-            )
+        x, y = getattr(a, name), getattr(b, name)
+        if x != y:
+            raise DefinitionError(f"{what} have different {name}: {x} and {y}.")
+
+
+def require_axes(what: str, array: Any, *axes: Mapping[str, int]) -> None:
+    """**Raises:** `DefinitionError` for an array of another shape.
+
+    **Arguments:** `axes`: a shape that is allowed, as the number of entries along each named axis;
+    empty for a single number.
+    """
+    if np.shape(array) not in [tuple(x.values()) for x in axes]:
+        written = (", ".join(f"{n} {axis}" for axis, n in x.items()) for x in axes)
+        allowed = " or ".join(f"of shape ({x})" if x else "one number" for x in written)
+        raise DefinitionError(f"{what} must be {allowed}, not of shape {np.shape(array)}.")
+
+
+def require_among(
+    kind: str, names: Iterable[str], allowed: Collection[str], where: str = ""
+) -> None:
+    """**Raises:** `DefinitionError` for the first name that is not among those of a kind (a noun).
+
+    **Arguments:** `where`: how the sentence begins. Default: nothing.
+    """
+    for name in names:
+        if name not in allowed:
+            known = ", ".join(allowed) or "none"
+            raise DefinitionError(f"{where}there is no {kind} '{name}'; {kind}s are {known}.")
+
+
+def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
+    """Return the index of an input or output that is given by its name or index.
+
+    **Raises:** `DefinitionError` if it is not there.
+    """
+    if isinstance(wanted, str) and wanted in names:
+        return names.index(wanted)
+    if not isinstance(wanted, str) and 0 <= wanted < len(names):
+        return int(wanted)
+    raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")
 
 
 def package(name: str) -> ModuleType:

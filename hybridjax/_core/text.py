@@ -62,7 +62,11 @@ def value(x: Any) -> str:
 
 def number(x: Any, digits: int = 6, unit: str = "") -> str:
     """One number with its unit; what JAX traces by its kind."""
-    return f"{value(x) if is_traced(x) else f'{float(x):.{digits}g}'} {unit}".rstrip()
+    if is_traced(x):
+        return f"{value(x)} {unit}".rstrip()
+    z = complex(x)
+    imaginary = f"{z.imag:+.{digits}g}j" if z.imag else ""
+    return f"{z.real:.{digits}g}{imaginary} {unit}".rstrip()
 
 
 def signal_values(names: Iterable[str], values: Iterable[Any]) -> str:

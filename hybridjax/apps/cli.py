@@ -101,8 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="hybridjax",
-        description="Identify the dynamics of rhythmic hybrid systems.",
+        prog="hybridjax", description="Identify the dynamics of rhythmic hybrid systems."
     )
     parser.add_argument("--version", action="version", version=f"hybridjax {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -188,10 +187,9 @@ def _add_sweep(commands) -> None:
     add("--over", required=True, action="append", type=_axis, metavar="NAME=LOW:HIGH:COUNT",
         help="values of a parameter, evenly spaced; may be repeated")  # fmt: skip
     add("--want", type=_names, default=("spectral_radius", "period"), metavar="NAMES",
-        help="period, state, multipliers, spectral_radius, events, residual; with "
-        "commas (default: spectral_radius,period)")  # fmt: skip
+        help="period, state, multipliers, spectral_radius, residual; with commas "
+        "(default: spectral_radius,period)")  # fmt: skip
     add("--out", required=True, type=_place, metavar="STORE", help="the Zarr store, e.g. map.zarr")
-    add("--force", action="store_true", help="also more than 50 million points")
     sweep.set_defaults(run=_sweep, parser=sweep)
 
 
@@ -210,7 +208,7 @@ def _begin(*, cache: bool) -> None:
 
 def _sweep(options) -> int:
     _begin(cache=True)
-    from .sweep_command import run
+    from .sweep import run
 
     return run(options)
 
@@ -219,36 +217,9 @@ def _identify(options) -> int:
     if options.phase is None and (options.center or options.scale):
         options.parser.error("--center and --scale are of the angle of --phase, which is not given")
     _begin(cache=False)
-    from .._core.results import Result
-    from ..recordings.identification import identify_recording
-    from ..recordings.read import read_recording
-    from ..sections.families import AtEvent, Crossing, KinematicPhase
-    from .recording_report import PAGE, report_folder, write_results
+    from .identify import run
 
-    with report_folder(options.out, options.input, options.formats) as folder:
-        named = (*options.input, *options.outputs, *(options.phase or (options.crossing or ())[:1]))
-        signals = tuple(dict.fromkeys(named))
-        recording = read_recording(*options.files, time=options.time, signals=signals)
-        print(recording)
-        if options.phase is not None:
-            position, velocity = options.phase
-            sections: Any = KinematicPhase(
-                options.sections, position=position, velocity=velocity,
-                center=options.center, scale=options.scale,
-            )  # fmt: skip
-        elif options.crossing is not None:
-            sections = Crossing(*options.crossing)
-        else:
-            sections = AtEvent(options.event)
-        result = identify_recording(
-            recording, sections, inputs=options.input, outputs=options.outputs,
-            n_sections=options.sections, order=options.order, bandwidth=options.bandwidth,
-            timing=options.timing, drift=options.drift,
-        )  # fmt: skip
-        print(result)
-        write_results(folder, result, options.formats)
-    print(os.path.join(options.out, PAGE))
-    return _status(result.fit.result == Result.OK)
+    return _status(run(options))
 
 
 def _reproduce(options) -> int:

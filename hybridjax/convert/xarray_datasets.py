@@ -8,13 +8,11 @@ import json
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from .._core.archive import options_of, put_together, restored, signals_in, taken_apart
 from .._core.arguments import package
 from .._core.boundary.checked import checked
-from .._core.executor import is_traced
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError, HybridJaxError
@@ -24,7 +22,7 @@ from ..orbits.continuation import Branch
 from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
-from ..systems.system import unit_of_parameter
+from ..systems.system import arrays_of, unit_of_parameter
 
 
 # The attribute with all that has no place elsewhere, as JSON.
@@ -62,8 +60,6 @@ def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> 
     **Raises:** `DefinitionError` where xarray is not installed, for traced or batched objects, and
     for signals that are called like a coordinate; `PrecisionError` in single precision.
     """
-    if is_traced(thing):
-        raise DefinitionError("to_xarray needs values: call it outside of jit and derivatives.")
     require_x64()
     if isinstance(thing, Recording):
         return _from_recording(thing)
@@ -188,9 +184,7 @@ def _from_limit_cycles(cycles: LimitCycles, dimension: str) -> Any:
     }
     variables["multipliers"] = (dimension, "multiplier"), cycles.multipliers
     parameters = {}
-    leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(cycles.systems, eqx.is_array))[0]
-    for path, leaf in leaves:
-        name = ".".join(str(getattr(x, "name", x)) for x in path)
+    for name, leaf in arrays_of(cycles.systems).items():
         if leaf.shape == (len(cycles),):
             unit = unit_of_parameter(cycles.systems, name)
             parameters[name] = _variable(dimension, np.asarray(leaf), unit)
@@ -217,9 +211,7 @@ def _signals(data: Recording | SectionData, values: np.ndarray) -> dict[str, Any
     """
     reserved = _RESERVED & set(data.signals)
     if reserved:
-        raise DefinitionError(
-            f"the signal '{min(reserved)}' is called like a coordinate: rename it."
-        )
+        raise DefinitionError(f"the signal '{min(reserved)}' is named as a coordinate: rename it.")
     triples = zip(data.signals, data.units, values.T, strict=True)
     return {str(name): _variable("sample", x, unit) for name, unit, x in triples}
 

@@ -61,10 +61,7 @@ class Certificate(NamedTuple):
 
 
 def certify(
-    bound: Bound,
-    power: Powers,
-    limits: PowerLimits,
-    level: Float[np.ndarray, " O"] | float = 1.0,
+    bound: Bound, power: Powers, limits: PowerLimits, level: Float[np.ndarray, " O"] | float = 1.0
 ) -> Certificate:
     """Return the certificate of powers with this bound.
 
@@ -149,12 +146,7 @@ def worthwhile(cosines: Candidates, gain: Powers, experiments: int) -> Kept:
 
 
 def to_design(
-    cosines: Candidates,
-    power: Powers,
-    use: Powers,
-    experiments: int,
-    usual: Design,
-    seed: int,
+    cosines: Candidates, power: Powers, use: Powers, experiments: int, usual: Design, seed: int
 ) -> Design:
     """Return experiments in which each cosine has this power on the average, and which all take the
     same share of the limits. Strong cosines occur in several experiments, weak ones in one.

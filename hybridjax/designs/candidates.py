@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive, Seed
 from ..errors import DefinitionError
@@ -147,10 +148,9 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
     outputs, N = model.outputs, model.n_sections
     if noise is None:
         noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}
-    unknown = [name for name in noise if name not in outputs]
-    if unknown or not noise:
-        problem = f"names '{unknown[0]}'" if unknown else "names no output"
-        raise DefinitionError(f"`noise` {problem}; the outputs are {', '.join(outputs)}.")
+    require_among("output", noise, outputs, "`noise`: ")
+    if not noise:
+        raise DefinitionError(f"`noise` names no output; outputs are {', '.join(outputs)}.")
     measured = {name: noise[name] for name in outputs if name in noise}
 
     def spectrum(f: np.ndarray, harmonics: tuple[int, ...]) -> np.ndarray:

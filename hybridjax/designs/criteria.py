@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from .._core.arguments import require_among
 from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
@@ -123,9 +124,7 @@ def _parameters(
 ) -> LinearCriterion:
     free = tuple(goal.free)
     wanted = free if goal.wanted is None else tuple(goal.wanted)
-    unknown = [name for name in wanted if name not in free]
-    if unknown:
-        raise DefinitionError(f"`goal`: '{unknown[0]}' is wanted, but not one of `free`, {free}.")
+    require_among("free parameter", wanted, free, "`wanted` of `goal`: ")
     channels = []
     for htf, members, _ in measured_htfs(model, cosines, goal.harmonics, noise):
         observed = ObservedHTF(htf, goal.sections)

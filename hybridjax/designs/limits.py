@@ -15,6 +15,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.arguments import require_among, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count
 from .._core.boundary.values import Number
@@ -96,11 +97,7 @@ class Limits(eqx.Module):
     def require_inputs(self, inputs: tuple[str, ...]) -> None:
         """**Raises:** `DefinitionError` for rates and peaks of signals that are no inputs."""
         for word, given in (("rate", self.rate), ("peak", self.peak)):
-            unknown = [n for n in given if n not in inputs]
-            if unknown:
-                raise DefinitionError(
-                    f"`limit` has the {word} of '{unknown[0]}'; the inputs are {', '.join(inputs)}."
-                )
+            require_among("input", given, inputs, f"`{word}` of `limit`: ")
 
     def experiments(self, design: Design, cosines: int) -> int:
         """Return the number of experiments that the strides allow.
@@ -116,7 +113,7 @@ class Limits(eqx.Module):
             )
         if count > cosines:
             raise DefinitionError(
-                f"{count} experiments are more than the {cosines} cosines of the `design`."
+                f"{count} experiments exceed the {cosines} cosines of the `design`."
             )
         return count
 
@@ -201,11 +198,9 @@ def power_limits(
         names = inputs if limits.rms == "input" else outputs
         levels = [{n: float(np.sqrt(square[n] @ usual)) for n in names} for square in squares]
     else:
-        unknown = [n for n in limits.rms if n not in (*inputs, *outputs)]
-        if unknown or not (limits.rms or limits.rate or limits.peak or limits.distortion):
-            problem = f"has '{unknown[0]}'" if unknown else "limits nothing"
-            allowed = ", ".join((*inputs, *outputs))
-            raise DefinitionError(f"`limit` {problem}; rms values can be limited of {allowed}.")
+        require_among("signal", limits.rms, (*inputs, *outputs), "`limit`: ")
+        if not (limits.rms or limits.rate or limits.peak or limits.distortion):
+            raise DefinitionError("`limit` limits nothing: name a signal.")
         levels = [{str(n): float(x) for n, x in limits.rms.items()} for _ in squares]
     limits.require_inputs(inputs)
     for level in levels:
@@ -306,11 +301,7 @@ def products(
     sections; `ComputationError` as `place_sections`.
     """
     sections = as_family(limit.sections)
-    if sections.n_sections != cosines.n_sections:
-        raise DefinitionError(
-            f"`limit` has the distortion between {sections.n_sections} sections, the model has "
-            f"{cosines.n_sections}."
-        )
+    require_same("the distortion of `limit` and the model", sections, cosines, ("n_sections",))
     outputs = tuple(str(n) for n in limit.rms)
     quadratic = second_order(limit.cycle, sections, outputs, inputs)
     pairs = quadratic.products(cosines.f, cosines.channel)

@@ -58,8 +58,7 @@ class Matrices(NamedTuple):
         )
         if (hidden > _MISSED * (shown + hidden)).any():
             raise DefinitionError(
-                "the usual design does not determine what `goal` asks for: measure more harmonics "
-                "or lines."
+                "the usual design does not determine the `goal`: measure more harmonics or lines."
             )
         wanted = wanted @ self.spread.root
         unknowns = tuple(f"combination {k} of the matrices" for k in range(wanted.shape[1]))

@@ -105,22 +105,19 @@ class Study(eqx.Module):
         first, goal = self.first, self.goal
         if len(first.input_names) > 1:
             raise DefinitionError(
-                f"`first` has the inputs {', '.join(first.input_names)}: study one at a time."
+                f"`first` has {len(first.input_names)} inputs: study one at a time."
             )
         if goal.estimator == "fit_ldtp":
             raise DefinitionError(
-                "a study estimates multipliers by fit_multipliers: `goal` may have no other "
-                "estimator."
+                "a study estimates multipliers by fit_multipliers: `goal` has another estimator."
             )
         if goal.which is not None and goal.which >= self.order:
             raise DefinitionError(
-                f"`goal`: there is no multiplier {goal.which}, the order is {self.order}."
+                f"there is no multiplier {goal.which}: the order is {self.order}."
             )
         limits = as_limits(self.limit)
         if limits.strides is not None:
-            raise DefinitionError(
-                "`limit` limits the strides, but a study ends at a precision: end it yourself."
-            )
+            raise DefinitionError("`limit` limits the strides, but a study ends at a precision.")
         limits.require_inputs(first.input_names)
         signals = (*first.input_names, *self.outputs)
         named = () if isinstance(limits.rms, str) else limits.rms

@@ -12,12 +12,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..identify.multipliers import StructuredFit, fit_multipliers, require_order
 from ..identify.spectral_sums import spectral_sums
-from ..identify.variable_projection import (
-    HTFGroup,
-    grouped,
-    maximum_likelihood,
-    misfit_of,
-)
+from ..identify.variable_projection import HTFGroup, grouped, maximum_likelihood, misfit_of
 from ..linear.htf import HTF
 from .allocation import ENOUGH
 from .goals import Multipliers
@@ -126,10 +121,7 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
 
 
 def _relative_noise(
-    groups: list[HTFGroup],
-    c: Float[np.ndarray, " d"],
-    member: np.ndarray,
-    shape: tuple[int, ...],
+    groups: list[HTFGroup], c: Float[np.ndarray, " d"], member: np.ndarray, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "B ny"]:
     """Return the rms residual of each block and output, in units of the supposed noise."""
     square, freedom = np.zeros(shape), np.zeros(shape)

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.arguments import Numbers, input_and_output_names
+from .._core.arguments import Numbers, input_and_output_names, require_axes
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
 from .._core.boundary.values import Integers, Reals
@@ -117,18 +117,12 @@ class ExperimentData(eqx.Module):
             )
         if n < N * P:
             raise DefinitionError(
-                f"the window of P = {P} periods is longer than the record, {n // N} periods of "
-                f"{N} sections."
+                f"the window of P = {P} periods is longer than the record, {n // N} periods."
             )
-        if any(x.shape != (S,) for x in (self.result, self.failed_at, self.error)):
-            raise DefinitionError(
-                f"result, failed_at and error must have one entry for each of {S} experiments."
-            )
-        if self.cycle_outputs is not None and self.cycle_outputs.shape != (N, ny):
-            raise DefinitionError(
-                f"cycle_outputs must have the shape (sections, outputs) = ({N}, {ny}), not "
-                f"{self.cycle_outputs.shape}."
-            )
+        for name in ("result", "failed_at", "error"):
+            require_axes(f"`{name}`", getattr(self, name), {"experiments": S})
+        if self.cycle_outputs is not None:
+            require_axes("`cycle_outputs`", self.cycle_outputs, {"sections": N, "outputs": ny})
         for name, values in (("u", self.u), ("y", self.y)):
             finite = np.isfinite(values)
             if finite.all():  # (along the last, short axis it takes ten times as long)

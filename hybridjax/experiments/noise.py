@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .._core.arguments import require_axes
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, NonNegative, Numbers, SectionCount, Seed
 from .._core.boundary.values import Reals
@@ -65,11 +66,7 @@ class ProcessNoise:
 
     def require(self, n_sections: SectionCount) -> None:
         """**Raises:** `DefinitionError` if `std` has entries for another number of sections."""
-        if np.shape(self.std) not in ((), (n_sections,)):
-            raise DefinitionError(
-                f"`process_noise` has a `std` for each of {np.size(self.std)} sections, but the "
-                f"experiments have {n_sections} in a cycle."
-            )
+        require_axes("`std` of `process_noise`", self.std, {}, {"sections": n_sections})
 
 
 def with_memory(
@@ -164,11 +161,7 @@ def add_noise(
             raise DefinitionError("no experiment ran well, so there is no signal to compare with.")
         std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
     std, N, ny = np.asarray(std), data.n_sections, data.y.shape[2]
-    if np.shape(std) not in ((), (ny,), (N, ny)):
-        raise DefinitionError(
-            f"`std` must be one number or {ny}, one for each output, or of shape ({N}, {ny}), not "
-            f"of shape {np.shape(std)}."
-        )
+    require_axes("`std`", std, {}, {"outputs": ny}, {"sections": N, "outputs": ny})
     white = np.random.default_rng(seed).normal(size=data.y.shape)
     each = np.resize(np.broadcast_to(std, (N, ny)), data.y.shape[1:])
     return eqx.tree_at(lambda d: d.y, data, data.y + each * with_memory(white, memory, N))

@@ -70,8 +70,7 @@ class Record(eqx.Module):
             )
         if first_section >= n_sections:
             raise DefinitionError(
-                f"`first_section` must be one of the sections 0..{n_sections - 1}, not "
-                f"{first_section}."
+                f"`first_section` must be one of 0..{n_sections - 1}, not {first_section}."
             )
         self.n_sections, self.first_section, self.lead = n_sections, first_section, lead
         self.drift = drift
@@ -134,8 +133,7 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     other = [x for x in about if x != about[0]]
     if other:
         raise DefinitionError(
-            f"`data` holds records that do not belong together: some have {about[0]}, others "
-            f"{other[0]}."
+            f"`data` holds records that do not belong together: {about[0]}, {other[0]}."
         )
     usable = [part for record in records for part in _with_known_inputs(record)]
     if not usable:

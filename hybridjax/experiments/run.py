@@ -328,9 +328,7 @@ def prepare(
     if noise is not None:
         noise.require(N)
     if start != "cycle" and inputs.cycles % inputs.periods:
-        raise DefinitionError(
-            f"a {start} start needs inputs of a whole number of windows: use `discard=0`."
-        )
+        raise DefinitionError(f"a {start} start needs inputs of whole windows: use `discard=0`.")
     together = len(inputs) if chunk is None else min(chunk, len(inputs))
     execution = divide(together, options.execution or Execution())
     return Campaign(
@@ -382,11 +380,11 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
     if isinstance(design, Design):
         if design.n_sections != n_sections:
             raise DefinitionError(
-                f"the design is for {design.n_sections} sections, but the family has {n_sections}."
+                f"the design has {design.n_sections} sections, the family {n_sections}."
             )
         if len(design.input_names) != nu:
             raise DefinitionError(
-                f"the design has {len(design.input_names)} inputs, but the system has {nu}."
+                f"the design has {len(design.input_names)} inputs, the system {nu}."
             )
         return Inputs(design, discard + design.periods, design.periods)
     u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
@@ -395,13 +393,12 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
         finite = np.isfinite(np.asarray(u[k : k + CHUNK], float)).all(axis=(1, 2))
         if not finite.all():
             raise DefinitionError(
-                "`design` has NaN or infinity in the input of experiment "
-                f"{k + int(np.argmin(finite))}."
+                f"`design` has NaN or infinity in experiment {k + int(np.argmin(finite))}."
             )
     cycles = u.shape[1] // n_sections
     if discard >= cycles:
         raise DefinitionError(
-            f"inputs of {cycles} cycles less {discard} discarded ones leave none for estimation."
+            f"inputs of {cycles} cycles less {discard} discarded ones leave none."
         )
     return Inputs(u, cycles, cycles - discard)
 

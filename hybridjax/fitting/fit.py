@@ -18,14 +18,7 @@ from ..orbits.find import find_limit_cycle
 from ..systems.system import Guess, HybridSystem
 from .model_fit import Identifiability, ModelFit, ParameterGuess, diagnose
 from .observations import AbstractObservation
-from .problem import (
-    FitProblem,
-    Free,
-    Parameters,
-    descend,
-    evaluate,
-    free_parameters,
-)
+from .problem import FitProblem, Free, Parameters, descend, evaluate, free_parameters
 
 
 Data = AbstractObservation | Sequence[AbstractObservation]

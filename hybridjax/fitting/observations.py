@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from .._core.arguments import Numbers
+from .._core.arguments import Numbers, require_axes, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar
@@ -113,11 +113,7 @@ class ObservedHTF(AbstractObservation):
         """
         self.f, self.H, self.sections = htf.f, htf.H, as_family(sections)
         self.harmonics, self.inputs, self.outputs = htf.harmonics, htf.inputs, htf.outputs
-        if self.sections.n_sections != htf.n_sections:
-            raise DefinitionError(
-                f"the HTFs belong to {htf.n_sections} sections, the family has "
-                f"{self.sections.n_sections}."
-            )
+        require_same("HTFs and `sections`", htf, self.sections, ("n_sections",))
         self.weights = jnp.asarray(error_weights(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
 
@@ -161,10 +157,7 @@ class ObservedSeries(AbstractObservation):
         an `std` that is not one for each output.
         """
         self.sections = as_family(sections)
-        if self.sections.n_sections != data.n_sections:
-            raise DefinitionError(
-                f"the data have {data.n_sections} sections, the family {self.sections.n_sections}."
-            )
+        require_same("data and `sections`", data, self.sections, ("n_sections",))
         if not data.ok.any():
             raise DefinitionError("no experiment ran well, so there is nothing to fit to.")
         self.inputs, self.outputs = data.inputs, data.outputs
@@ -188,10 +181,7 @@ class ObservedSeries(AbstractObservation):
         return ((y - self.y) / self.scale).ravel()
 
     def prepare(self, cycle: LimitCycle) -> "ObservedSeries":
-        if self.inputs != cycle.system.inputs:
-            raise DefinitionError(
-                f"the data have the inputs {self.inputs}, the system {cycle.system.inputs}."
-            )
+        require_same("data and system", self, cycle.system, ("inputs",))
         stepping = response_function(cycle, self.sections, self.outputs).stepping
         flow = stepping.plan, stepping.settings
         return eqx.tree_at(lambda o: o.flow, self, flow, is_leaf=lambda x: x is None)
@@ -243,17 +233,17 @@ class ObservedCycle(AbstractObservation):
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         N, ny = self.sections.n_sections, len(self.outputs)
         given = {
-            "values": (values, std, (N, ny)),
-            "times": (times, times_std, (N,)),
-            "period": (period, period_std, ()),
+            "values": (values, std, {"sections": N, "outputs": ny}),
+            "times": (times, times_std, {"sections": N}),
+            "period": (period, period_std, {}),
         }
         given = {name: entry for name, entry in given.items() if entry[0] is not None}
         if not given or ("values" in given) != bool(ny):
-            raise DefinitionError(
-                "give `outputs` with their `values`, `times`, or the `period` of the cycle."
-            )
+            raise DefinitionError("give `outputs` with their `values`, `times`, or a `period`.")
         self.which = tuple(given)
-        self.measured = tuple(_shaped(name, x, shape) for name, (x, _, shape) in given.items())
+        for name, (x, _, axes) in given.items():
+            require_axes(f"`{name}`", x, axes)
+        self.measured = tuple(jnp.asarray(x, float) for x, *_ in given.values())
         self.scales = tuple(
             _scale(name, std, x)
             for x, (name, (_, std, _)) in zip(self.measured, given.items(), strict=True)
@@ -298,13 +288,6 @@ def _times(placed: PlacedSections) -> Float[Array, " N"]:
     return t if placed.cycle.clocked else t - t[0]
 
 
-def _shaped(name: str, x: Numbers, shape: tuple[int, ...]) -> Float[Array, "..."]:
-    x = jnp.asarray(x, float)
-    if x.shape != shape:
-        raise DefinitionError(f"`{name}` must have the shape {shape}, not {x.shape}.")
-    return x
-
-
 def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
     if std is None:
         size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))  # of the shape seen.shape[1:]
@@ -315,9 +298,6 @@ def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
             )
         return size
     std = jnp.asarray(std, float)
-    if std.shape not in ((), seen.shape[1:]):
-        raise DefinitionError(
-            f"the standard deviation of `{name}` must be one number, or one for each output, not "
-            f"of shape {std.shape}."
-        )
+    outputs = ({"outputs": n} for n in seen.shape[1:])
+    require_axes(f"the standard deviation of `{name}`", std, {}, *outputs)
     return jnp.broadcast_to(std, seen.shape[1:])

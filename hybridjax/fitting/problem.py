@@ -1,7 +1,6 @@
 """Weighted residuals of data as a function of free parameters, and their minimization."""
 
 import dataclasses
-import operator
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -16,6 +15,7 @@ from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..orbits.newton import MAX_STEPS as NEWTON_STEPS, root
 from ..systems.system import HybridSystem
+from ..systems.varied import parameter_of, with_parameters
 from .observations import AbstractObservation
 
 
@@ -58,12 +58,11 @@ class Parameters(eqx.Module):
 
     def read(self, system: HybridSystem) -> Float[Array, " p"]:
         """Return the values of a system."""
-        return jnp.stack([operator.attrgetter(name)(system) for name in self.names])
+        return jnp.stack([parameter_of(system, name) for name in self.names])
 
     def insert(self, system: HybridSystem, values: Float[Array, " p"]) -> HybridSystem:
         """Return the system with other values."""
-        where = lambda s: [operator.attrgetter(name)(s) for name in self.names]  # noqa: E731
-        return eqx.tree_at(where, system, list(values))
+        return with_parameters(system, dict(zip(self.names, values, strict=True)))
 
     def encode(self, values: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
         """Return coordinates of values, NaN for those outside of their bounds."""
@@ -97,7 +96,7 @@ def free_parameters(system: HybridSystem, free: Free) -> Parameters:
         raise DefinitionError(f"`free` names parameters, each once, and at least one: {names}.")
     low, high, size = [], [], []
     for name in names:
-        value = _number(system, name)
+        value = float(parameter_of(system, name))
         bounds = free[name] if isinstance(free, Mapping) else None
         if bounds is None:  # it keeps its sign
             bounds = (0.0 if value > 0 else -jnp.inf, 0.0 if value < 0 else jnp.inf)
@@ -110,20 +109,6 @@ def free_parameters(system: HybridSystem, free: Free) -> Parameters:
         high.append(float(bounds[1]))
         size.append(abs(value) if value else 1.0)
     return Parameters(names, jnp.array(low), jnp.array(high), jnp.array(size))
-
-
-def _number(system: HybridSystem, name: str) -> float:
-    try:
-        value = operator.attrgetter(name)(system)
-    except AttributeError:
-        value = None
-    if value is None or not eqx.is_inexact_array(value) or value.shape != ():
-        declared = [n for n, v in vars(system).items() if eqx.is_inexact_array(v) and v.shape == ()]
-        raise DefinitionError(
-            f"'{name}' is no parameter of {type(system).__name__} (a number declared by "
-            f"hj.parameter); those are {', '.join(declared)}."
-        )
-    return float(value)
 
 
 def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:

@@ -79,8 +79,7 @@ def estimate_htf(
     """
     if variance == "noise" and repeats < 2:
         raise DefinitionError(
-            "the variance of noise alone needs two windows or more: record P periods more, and "
-            "pass repeats=2."
+            "the variance of noise alone needs two windows: record P periods more, pass repeats=2."
         )
     require_x64()
     if reference is not None:

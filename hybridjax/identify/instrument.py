@@ -20,13 +20,14 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Int
 
+from .._core.arguments import require_among, require_same
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.algebra import Lines
 from ..linear.frequency_response import check_harmonics
 from ..linear.htf import HTF, Scatter
-from .spectral_sums import SILENT_LINE, Experiments
+from .spectral_sums import SILENT_LINE, Experiments, Setup
 
 
 # Smallest singular value of the inputs' answer to the references, relative to the largest, with
@@ -47,16 +48,12 @@ class Roles(NamedTuple):
     ) -> "Roles":
         """**Raises:** `DefinitionError` unless references are some, not all, of the inputs, and
         `fewest` or more. Default: as many as the others."""
-        if unknown := [name for name in reference if name not in names]:
-            raise DefinitionError(
-                f"there is no reference {unknown[0]!r} among the inputs {', '.join(names)}."
-            )
+        require_among("input", reference, names, "`reference`: ")
         references = [list(names).index(name) for name in reference]
         inputs = [i for i in range(len(names)) if i not in references]
         if not inputs:
             raise DefinitionError(
-                "all inputs are references: name the signals that the controller makes as inputs, "
-                "too."
+                "all inputs are references: name the inputs that the controller makes, too."
             )
         if len(references) < (len(inputs) if fewest is None else fewest):
             raise DefinitionError(
@@ -92,8 +89,7 @@ def require_loop(roles: Roles, signals: Sequence[np.ndarray], names: Sequence[st
         for k in roles.references:
             if all(np.array_equal(x[..., i], x[..., k]) for x in signals):
                 raise DefinitionError(
-                    f"{names[i]} and {names[k]} are the same signal: there is no loop, leave "
-                    "`reference` out."
+                    f"{names[i]} and {names[k]} are equal: there is no loop, leave `reference` out."
                 )
 
 
@@ -105,6 +101,13 @@ class Sums(NamedTuple):
     between: Complex[np.ndarray, "K n n"]
     """Sums of the covariances of these means between windows."""
     experiments: int
+    setup: Setup
+
+    def rows(self, names: Sequence[str]) -> Int[np.ndarray, " a"]:
+        """Return the rows of signals, for all components."""
+        signals = [*self.setup.outputs, *self.setup.inputs]
+        columns = np.array([signals.index(x) for x in names], int)
+        return np.add.outer(np.arange(self.setup.n_sections) * len(signals), columns).ravel()
 
 
 def spectral_products(data: ExperimentData, repeats: int) -> Sums:
@@ -118,7 +121,8 @@ def spectral_products(data: ExperimentData, repeats: int) -> Sums:
     mean = spectra.sum(axis=0) / repeats
     apart = spectra - mean
     between = (apart @ apart.conj().swapaxes(2, 3)).sum(axis=0) / max(repeats - 1, 1) / repeats
-    return Sums(mean @ mean.conj().swapaxes(1, 2), between, len(z))
+    setup = Setup(N, P, data.inputs, data.outputs)
+    return Sums(mean @ mean.conj().swapaxes(1, 2), between, len(z), setup)
 
 
 def htf_by_reference(
@@ -138,46 +142,22 @@ def htf_by_reference(
         roles = Roles.of(part.inputs, reference)
         require_loop(roles, [part.u], part.inputs)
         sums = spectral_products(part, repeats)
-        about = (part.n_sections, part.periods, part.inputs, part.outputs)
-        if total is None:
-            total, setup = sums, about
-        elif setup != about:
-            raise DefinitionError(f"these experiments do not belong together: {setup}, {about}.")
-        else:
-            between = total.between + sums.between
-            total = Sums(total.total + sums.total, between, total.experiments + sums.experiments)
+        if total is not None:
+            require_same("experiments", total, sums, ("setup",))
+            both = (total.total + sums.total, total.between + sums.between)
+            sums = Sums(*both, total.experiments + sums.experiments, sums.setup)
+        total = sums
     if total is None or not total.experiments:
         raise DefinitionError("`data` holds no experiment that ran to its end.")
-    N, P, names, outputs = setup
-    ny = len(outputs)
-    columns = [list(range(ny)), *([ny + i for i in part] for part in roles)]
-    y, u, r = Ports.rows(N, ny + len(names), *columns)
-    ports = Ports(y, u, r, N)
-    classes = excited_classes(total, ports, P)
-    inputs = tuple(names[i] for i in roles.inputs)
-    return solve(total, ports, classes, P, inputs, outputs, (repeats, variance))
+    inputs, references = (tuple(total.setup.inputs[i] for i in part) for part in roles)
+    return solve(total, total.setup.outputs, inputs, references, (repeats, variance))
 
 
-class Ports(NamedTuple):
-    """Rows of the sums, for the outputs, inputs and references of a system."""
-
-    outputs: Int[np.ndarray, " a"]
-    inputs: Int[np.ndarray, " b"]
-    references: Int[np.ndarray, " c"]
-    N: int
-
-    @staticmethod
-    def rows(N: int, signals: int, *roles: list[int]) -> list[Int[np.ndarray, " a"]]:
-        """Return the rows of signals, for all components."""
-        return [np.add.outer(np.arange(N) * signals, np.array(x, int)).ravel() for x in roles]
-
-
-def excited_classes(sums: Sums, ports: Ports, P: int) -> Int[np.ndarray, " k"]:
-    """Return the classes in which all lines of all references are excited.
+def excited_classes(sums: Sums, r: Int[np.ndarray, " c"]) -> Int[np.ndarray, " k"]:
+    """Return the classes in which all lines of all references, of the rows r, are excited.
 
     **Raises:** `DefinitionError` if there is none.
     """
-    r = ports.references
     power = sums.total[:, r[:, None], r]
     size = np.sqrt(np.einsum("kii->ki", power).real)
     strong = size > SILENT_LINE * size.max()
@@ -188,8 +168,8 @@ def excited_classes(sums: Sums, ports: Ports, P: int) -> Int[np.ndarray, " k"]:
         return np.flatnonzero(whole)
     best = int(strong.sum(axis=1).argmax())
     raise DefinitionError(
-        f"the reference excites too little: at f = {best / P:g} + integers it tells "
-        f"{int(np.linalg.matrix_rank(power[best], SILENT_LINE * size.max() ** 2, True))} of "
+        f"the reference excites too little: at f = {best / sums.setup.periods:g} + integers it "
+        f"tells {int(np.linalg.matrix_rank(power[best], SILENT_LINE * size.max() ** 2, True))} of "
         f"{len(r)} components apart. Excite all lines up to N/2 (`hj.multisine(N, P, band=(0, "
         "N / 2))`), or use `fit_ldtp` with `reference`, which takes any signal."
     )
@@ -197,15 +177,17 @@ def excited_classes(sums: Sums, ports: Ports, P: int) -> Int[np.ndarray, " k"]:
 
 def solve(
     sums: Sums,
-    ports: Ports,
-    classes: Int[np.ndarray, " k"],
-    P: int,
-    inputs: tuple[str, ...],
     outputs: tuple[str, ...],
+    inputs: tuple[str, ...],
+    references: Sequence[str],
     how: tuple[int, str],
 ) -> HTF:
-    """Return the HTFs from the inputs to the outputs in some classes."""
-    y, u, r, N = ports
+    """Return the HTFs from the inputs to the outputs in the classes that the references excite.
+
+    **Raises:** `DefinitionError` if there are none, or the inputs do not answer the references.
+    """
+    y, u, r = map(sums.rows, (outputs, inputs, references))
+    classes, (N, P, *_) = excited_classes(sums, r), sums.setup
     G, (repeats, kind) = sums.total[classes], how
 
     def block(rows, columns, G=G):

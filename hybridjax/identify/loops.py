@@ -11,7 +11,7 @@ from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..linear.htf import HTF
-from .instrument import Ports, Roles, Sums, excited_classes, solve, spectral_products
+from .instrument import Roles, Sums, solve, spectral_products
 
 
 class Loop(eqx.Module):
@@ -82,16 +82,8 @@ def loop(
     products = spectral_products(data, repeats)
 
     def estimate(outputs: Sequence[str], inputs: Sequence[str], reference: Sequence[str]) -> HTF:
-        names = (*data.outputs, *data.inputs)
-        left_out = [x for x in (*r, *d) if x not in reference]
-        rows = [[names.index(x) for x in part] for part in (outputs, inputs, reference, left_out)]
-        after, before, outside, other = Ports.rows(data.n_sections, len(names), *rows)
-        system = Ports(after, before, outside, data.n_sections)
-        sums = _without(products, other)
-        classes = excited_classes(sums, system, data.periods)
-        return solve(
-            sums, system, classes, data.periods, tuple(inputs), tuple(outputs), (repeats, "auto")
-        )
+        sums = _without(products, products.rows([x for x in (*r, *d) if x not in reference]))
+        return solve(sums, tuple(outputs), tuple(inputs), reference, (repeats, "auto"))
 
     plant = estimate(y, u, r) if r else None
     controller = None
@@ -122,4 +114,4 @@ def _without(sums: Sums, known: np.ndarray) -> Sums:
     total = sums.total
     power = total[:, known[:, None], known]
     left = total[:, :, known] @ np.linalg.pinv(power, hermitian=True) @ total[:, known]
-    return Sums(total - left, sums.between, sums.experiments - len(known))
+    return sums._replace(total=total - left, experiments=sums.experiments - len(known))

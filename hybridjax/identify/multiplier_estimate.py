@@ -1,6 +1,5 @@
 """Estimated Floquet multipliers: their confidence regions, and comparison with true ones."""
 
-from collections.abc import Sequence
 from typing import Annotated
 
 import equinox as eqx
@@ -71,18 +70,6 @@ def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComp
     rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
     order = np.lexsort((-np.imag(truth[columns]), -np.abs(truth[columns])))
     return MultiplierComparison(true=truth[columns][order], estimated=values[rows][order])
-
-
-def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
-    """Return the index of an input or output that is given by its name or index.
-
-    **Raises:** `DefinitionError` if it is not there.
-    """
-    if isinstance(wanted, str) and wanted in names:
-        return names.index(wanted)
-    if not isinstance(wanted, str) and 0 <= wanted < len(names):
-        return int(wanted)
-    raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")
 
 
 class MultiplierEstimate(eqx.Module):
@@ -175,9 +162,7 @@ class MultiplierEstimate(eqx.Module):
         **Raises:** `DefinitionError` for an index that is not there.
         """
         if not -len(self.multipliers) <= index < len(self.multipliers):
-            raise DefinitionError(
-                f"there is no multiplier {index}: the fit has {len(self.multipliers)}."
-            )
+            raise DefinitionError(f"there is no multiplier {index} of {len(self.multipliers)}.")
         degrees = 1 if self.multipliers[index].imag == 0 else 2
         values, vectors = np.linalg.eigh(self.multiplier_covariances[index])
         angle = np.linspace(0, 2 * np.pi, points)

@@ -147,9 +147,7 @@ def fit_multipliers(
     order = order.rank() if isinstance(order, LDTP) else order
     rms = check_values(htf)
     if errors == "variance" and htf.variance is None:
-        raise DefinitionError(
-            "errors='variance' needs HTFs with variances; these have none: take 'residuals'."
-        )
+        raise DefinitionError("errors='variance' needs HTFs with variances: take 'residuals'.")
     size = numerator_size(htf, order, overhang)
     f, H = np.asarray(htf.f), np.asarray(htf.H)
     groups = group_htf(htf, error_weights(htf, rms), size)
@@ -288,10 +286,7 @@ class OrderSelection(eqx.Module):
 @checked
 @one_blas_thread()
 def select_order(
-    htf: HTF,
-    max_order: Order = 5,
-    *,
-    overhang: Index | None = None,
+    htf: HTF, max_order: Order = 5, *, overhang: Index | None = None
 ) -> OrderSelection:
     r"""Compare numbers of multipliers, from none to `max_order`.
 

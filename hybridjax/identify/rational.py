@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from .._core.arguments import channel_index
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Order, Scalar, Vector
 from .._core.html import card, text, unit_circle
@@ -16,12 +17,7 @@ from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
 from .descent import ROUNDING, least_squares
-from .multiplier_estimate import (
-    MultiplierComparison,
-    Multipliers,
-    channel_index,
-    compare_multipliers,
-)
+from .multiplier_estimate import MultiplierComparison, Multipliers, compare_multipliers
 from .variable_projection import (
     HTFGroup,
     delayed_columns,

@@ -107,8 +107,7 @@ def spectral_sums(
         setup = Setup(part.n_sections, part.periods, part.inputs, part.outputs)
         if total is not None and setup != total.setup:
             raise DefinitionError(
-                f"these experiments do not belong together: some have {total.setup}, others "
-                f"{setup}."
+                f"these experiments do not belong together: {total.setup}, {setup}."
             )
         chosen = () if harmonics == () else check_harmonics(harmonics, part.n_sections)
         sums = _sums_of_part(part, setup, chosen, threshold, repeats, count)

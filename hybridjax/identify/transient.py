@@ -52,10 +52,7 @@ class TransientFit(eqx.Module):
 
 @checked
 def remove_transient(
-    data: ExperimentData,
-    order: Order | None = None,
-    *,
-    skip: Index = 1,
+    data: ExperimentData, order: Order | None = None, *, skip: Index = 1
 ) -> TransientFit:
     """Fit the decay of the initial condition's response, and subtract it.
 
@@ -80,9 +77,7 @@ def remove_transient(
     S, n, ny = data.y.shape
     cycles = n // N - skip
     if order is not None and order > cycles // 2:
-        raise DefinitionError(
-            f"`order` must be at most half of the {cycles} cycles, but is {order}."
-        )
+        raise DefinitionError(f"`order` must be at most half of the {cycles} cycles, not {order}.")
     if cycles < P:
         raise DefinitionError(
             f"the record has {n // N} cycles, but to remove a transient it must hold the "

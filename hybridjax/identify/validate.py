@@ -126,10 +126,7 @@ def whiteness_test(
 
 
 def independence_test(
-    u: Float[np.ndarray, "S T N nu"],
-    error: Float[np.ndarray, "S T N ny"],
-    lags: int,
-    level: float,
+    u: Float[np.ndarray, "S T N nu"], error: Float[np.ndarray, "S T N ny"], lags: int, level: float
 ) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
     """Test the part of residuals that present and past inputs explain, section by section.
 
@@ -326,8 +323,7 @@ def validate(
             raise DefinitionError(f"the output {name} is constant or missing at every sample.")
         if few < FEWEST_SAMPLES:
             raise DefinitionError(
-                f"a section was sampled {few} times only; the tests need {FEWEST_SAMPLES} or more "
-                "cycles."
+                f"a section was sampled {few} times only; the tests need {FEWEST_SAMPLES} cycles."
             )
     # One period, less for few cycles.
     tried = range(1, min(N, int(sampled.min()) // _SAMPLES_PER_LAG) + 1)

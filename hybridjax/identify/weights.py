@@ -1,4 +1,7 @@
-"""The errors of harmonic transfer functions, known or supposed, as weights of fits."""
+"""The errors of harmonic transfer functions, known or supposed, as weights of fits.
+
+Experiments that measure the same lines are weighted by their power, in `spectral_sums.py`.
+"""
 
 import numpy as np
 from jaxtyping import Float, Int

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from .._core.arguments import require_axes
 from .._core.compilation import host_first
 from .._core.executor import Array, is_traced, namespace
 from ..errors import DefinitionError
@@ -41,12 +42,9 @@ def static_gain(gain: Float[Array, "*N ny nu"], n_sections: int, shape: tuple[in
 
     **Raises:** `DefinitionError` for another shape.
     """
-    if gain.shape not in (shape, (n_sections, *shape)):
-        raise DefinitionError(
-            f"a gain must have the shape {shape}, or {(n_sections, *shape)} for each section, not "
-            f"{gain.shape}."
-        )
     xp, N, (ny, nu) = namespace(gain), n_sections, shape
+    one = {"inputs": ny, "outputs": nu}  # of the plant that it controls
+    require_axes("a gain", gain, one, {"sections": N} | one)
     D = xp.broadcast_to(gain, (N, ny, nu))
     A, B, C = xp.zeros((N, 0, 0)), xp.zeros((N, 0, nu)), xp.zeros((N, ny, 0))
     return Matrices(A, B, C, D, xp.zeros(N, int))

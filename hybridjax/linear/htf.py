@@ -310,8 +310,6 @@ class HTF(eqx.Module):
         **Raises:** `DefinitionError` if `n` is no multiple of `N`, if the harmonics are not
         symmetric about 0, or if `u` holds a frequency that is not on the grid `f` (up to sign).
         """
-        if is_traced(self.f, u):
-            raise DefinitionError("`predict` must know `u` and `f`: call it outside of jit.")
         self.require_sampled("`predict`")
         (n, nu), N, u = u.shape, self.n_sections, np.asarray(u)
         if n == 0 or n % N or nu != len(self.inputs):
@@ -414,14 +412,10 @@ def _combined(
     first = operands[0]
     first.require_sampled("the algebra of HTFs")
     N, every = first.n_sections, check_harmonics(None, first.n_sections)
-    if is_traced(first.f):
-        raise DefinitionError("the algebra of HTFs must know `f`: call it outside of jit.")
     for x in operands:
         _require_same_lines(first, x)
         if x.harmonics != every:
-            raise DefinitionError(
-                f"the algebra of HTFs takes all {N} harmonics, not {x.harmonics}."
-            )
+            raise DefinitionError(f"algebra of HTFs takes all {N} harmonics, not {x.harmonics}.")
     lines = algebra.Lines.of(np.asarray(first.f), N)
     to_matrices = lambda x: lines.matrices(x, N // 2)  # noqa: E731
     result, pairs = operation(*(to_matrices(x.H) for x in operands))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .._core.arguments import Numbers, names, require_same
+from .._core.arguments import Numbers, names, require_axes, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, PeriodCount, Vector
 from .._core.boundary.values import Integers, Reals
@@ -85,22 +85,18 @@ class LDTP(eqx.Module):
         n_sections, d = A.shape[:2]
         ny, nu = C.shape[1], B.shape[2]
         through = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
-        expected = {
-            "A": (A, (n_sections, d, d)),
-            "B": (B, (n_sections, d, nu)),
-            "C": (C, (n_sections, ny, d)),
-            "D": (through, (n_sections, ny, nu)),
-        }
-        for name, (array, shape) in expected.items():
+        matrices = {"A": A, "B": B, "C": C, "D": through}
+        for name, sizes in {"A": (d, d), "B": (d, nu), "C": (ny, d), "D": (ny, nu)}.items():
+            array, shape = matrices[name], (n_sections, *sizes)
             if array.shape != shape or 0 in shape:
                 raise DefinitionError(
                     f"`{name}` has shape {array.shape}, but with A {A.shape}, B {B.shape} and "
                     f"C {C.shape} it should be {shape}, without empty axes."
                 )
-        require_x64({"A": A, "B": B, "C": C, "D": through})
+        require_x64(matrices)
         if coordinates is not None and len(coordinates) != n_sections:
             raise DefinitionError(
-                f"`coordinates` names {len(coordinates)} sections, but there are {n_sections}."
+                f"`coordinates` names {len(coordinates)} sections, not {n_sections}."
             )
         self.A, self.B, self.C, self.D = A, B, C, through
         self.dims = _dimensions(dims, n_sections, d)
@@ -426,8 +422,7 @@ class LDTP(eqx.Module):
 def _dimensions(dims, n_sections, d):
     if dims is None:
         return jnp.full(n_sections, d)
-    if len(dims) != n_sections:
-        raise DefinitionError(f"`dims` must hold {n_sections} integers, one per section.")
+    require_axes("`dims`", dims, {"sections": n_sections})
     if not is_traced(dims):
         dims = np.asarray(dims)
         if np.any((dims < 1) | (dims > d)):

@@ -24,10 +24,7 @@ def tips(arms: Arms, q: Float[Array, " n"]) -> Float[Array, "2 k"]:
 
 
 def chain(
-    arms: Arms,
-    masses: Float[Array, " k"],
-    inertias: Float[Array, " n"] | float,
-    g: Parameter,
+    arms: Arms, masses: Float[Array, " k"], inertias: Float[Array, " n"] | float, g: Parameter
 ) -> Mechanism:
     """A chain of n links in a plane, by their angles and the place (x, y) of its foot, or by their
     angles alone, with its foot at the origin."""

@@ -16,12 +16,12 @@ from scipy.optimize import brentq
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Numbers, Share
 from .._core.boundary.values import Reals
-from .._core.executor import is_traced
 from .._core.html import COLORS, Curve as Line, card, complex_number, picture, table
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from .._core.results import Result
+from .._core.text import number
 from ..errors import DefinitionError
 from .batches import front
 from .coincidence import SAME, coincident
@@ -127,8 +127,7 @@ class Branch(eqx.Module):
         begin, end = self.ends
         lines = [f"from {self.parameter} = {begin.value:.9g}: {begin.message}"]
         for p in self.points:
-            at = (f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.9g}" for z in p.critical)
-            at = ", ".join(at)
+            at = ", ".join(map(number, p.critical))
             lines.append(f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})")
         lines.append(f"to {self.parameter} = {end.value:.9g}: {end.message}")
         return "\n  ".join(lines)
@@ -224,21 +223,14 @@ def continuation(
 
 
 def _check(cycle, values) -> np.ndarray:
-    if is_traced(cycle):
-        raise DefinitionError(
-            "a branch is followed where values are known: call `continuation` outside of "
-            "JAX transformations, and differentiate `find_limit_cycle` at its points."
-        )
     require_x64(cycle)
     cycle.require_current()
     if int(cycle.result) != Result.OK:
-        raise DefinitionError(
-            f"the cycle to follow was not found: {Result(int(cycle.result)).message}."
-        )
+        raise DefinitionError(f"the cycle was not found: {Result(int(cycle.result)).message}.")
     steps = np.diff(np.asarray(values))
     if not len(steps) or abs(np.sign(steps).sum()) < len(steps):
         raise DefinitionError(
-            f"the values must be two or more numbers, ascending or descending; got {values}."
+            f"the values must be two or more, ascending or descending; got {values}."
         )
     return np.asarray(values)
 

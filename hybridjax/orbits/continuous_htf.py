@@ -8,15 +8,13 @@ N. M. Wereley, Analysis and control of linear periodically time varying systems,
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import SignalNames
 from .._core.compilation import at_ease
-from .._core.executor import Array, is_traced, namespace, on_host, put, scan, to_host
+from .._core.executor import Array, namespace, on_host, scan, to_host
 from ..engine import kernels
-from ..engine.lanes import for_each_chart, only
 from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics, check_harmonics
 from ..linear.htf import HTF
@@ -24,7 +22,7 @@ from ..systems.check import check_output
 from ..systems.structure import Outputs, Structure
 from ..systems.system import Output, OutputNames
 from .linear_flow import Course, LinearFlow, rule
-from .return_map import ReturnMap
+from .return_map import ReturnMap, with_derivatives
 
 
 # Largest angle by which an input, or a harmonic of the output, turns within a piece. Larger:
@@ -47,18 +45,8 @@ def observed(s: Structure, flow: LinearFlow, z: Outputs) -> Parts:
     """Outputs at the nodes."""
     xp, (P, K, d), ny = namespace(flow.q), flow.q.shape, len(z.names)
     chart, t, q = xp.repeat(flow.chart, K), flow.t.ravel(), flow.q.reshape(P * K, d).T
-
-    def work(a, here, out):
-        n = s.dims[a]
-        if not z.defined(a):
-            return out
-        point = only(here, t), only(here, q[:n]), xp.zeros((s.nu, 1))
-        by = kernels.outputs(s, a, tuple(z.items), *point)
-        index = np.ix_(np.arange(ny), np.r_[: 2 + n, 2 + d : 2 + d + s.nu])
-        return put(out, index, xp.where(here, by, out[index]))
-
-    begin = xp.zeros((ny, 2 + d + s.nu, P * K))
-    by = for_each_chart(s, chart, xp.ones(P * K, bool), work, begin)
+    outputs = lambda a, *point: kernels.outputs(s, a, tuple(z.items), *point)  # noqa: E731
+    by = with_derivatives(s, outputs, chart, t, q, ny)
     by = xp.moveaxis(by, -1, 0).reshape(P, K, ny, -1)
     return Parts(by[..., 0], by[..., 2 : 2 + d], by[..., 2 + d :])
 
@@ -80,17 +68,9 @@ def continuous_htf(
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
     s, harmonics = course.map.structure, check_harmonics(harmonics, 0)
-    frequencies = f if isinstance(f, jax.Array) else np.asarray(f, float)
-    frequencies = frequencies.reshape(-1)
-    if is_traced(frequencies):
-        raise DefinitionError("`htf` must know `f`: make it outside of jit and grad.")
-    frequencies = np.asarray(frequencies)
+    frequencies = np.asarray(f, float).reshape(-1)
     visited = {s.transitions[g].source for g in course.events}
-    if outputs is None:
-        charts = range(len(s.charts))
-        names = s.state_names()
-        outputs = [x for x in names if all(s.state_function(x, a) is not None for a in charts)]
-    z = s.resolve_outputs(outputs)
+    z = s.resolve_outputs(s.states_everywhere() if outputs is None else outputs)
     for x in (x for x in z.items if isinstance(x, Output)):
         list(check_output(s, x))
     for name in visited or s.names:
@@ -132,9 +112,8 @@ def _transfer(
     zero = xp.zeros(driven.shape[1:], driven.dtype)
     total, _ = scan(advance, zero, (through + 0j, driven))
     # Deviations at the beginning: X(T) = exp(i w T) X(0).
-    size = xp.where(map.valid, map.sizes, 1.0)
-    whole = xp.where(map.valid[:, None] & map.valid, flow.monodromy(free), 0.0)
-    whole = whole * size / size[:, None]
+    size = map.sizes
+    whole = flow.monodromy(free, map.valid) * size / size[:, None]
     if on_host(whole):
         apart = np.abs(np.exp(2j * np.pi * f)[:, None] - np.linalg.eigvals(whole)).min(axis=1)
         if (apart < _POLE).any():
@@ -163,12 +142,6 @@ def _transfer(
     delay = xp.einsum("pa,pfau->pfu", jumps.delay_by_state, last)
     delay = delay * back[:, :, -1, None] + jumps.delay_by_input[:, None]
     step = y.values[:, -1] - xp.roll(y.values[:, 0], -1, axis=0)
-    step = xp.where(
-        xp.any(jumps.delay_by_state != 0, axis=1)[:, None]
-        | xp.any(jumps.delay_by_input != 0, axis=1)[:, None],
-        step,
-        0.0,
-    )
     impulse = step[:, None, :, None] * delay[:, :, None]
     waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / T))
     H = xp.tensordot(waves, response, ((1, 2), (0, 2)))

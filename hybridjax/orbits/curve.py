@@ -15,7 +15,7 @@ from .._core.compilation import quick_jit
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..systems.system import HybridSystem
-from ..systems.varied import parameter_of, with_parameter
+from ..systems.varied import parameter_of, with_parameters
 from .coincidence import SAME
 from .cycle import LimitCycle
 from .newton import FEW_STEPS, newton_steps
@@ -108,10 +108,10 @@ class Curve:
         flat = jax.tree_util.tree_map(
             lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else x, cycle.system
         )
-        self.direction = with_parameter(flat, parameter, 1.0)
+        self.direction = with_parameters(flat, {parameter: 1.0})
 
     def system_at(self, value: float) -> HybridSystem:
-        return with_parameter(self.cycle.system, self.parameter, value)
+        return with_parameters(self.cycle.system, {self.parameter: value})
 
     def first(self) -> Point | Result:
         """The cycle itself."""

@@ -273,7 +273,8 @@ class LimitCycle(eqx.Module):
         if is_traced(self):
             return f"LimitCycle({type(self.system).__name__}, traced)"
         least = "1e-10" if has_implicit(self.structure) else "1e-308"
-        multipliers = ", ".join(_format(z, least) for z in self.multipliers) or "none but zero"
+        shown = (number(z, 9) if z else f"below {least}" for z in self.multipliers)
+        multipliers = ", ".join(shown) or "none but zero"
         if self.conserved:
             multipliers += f" (1: conserved {', '.join(self.conserved)})"
         lines = (
@@ -324,12 +325,6 @@ def _require_values(cycle: LimitCycle, name: str) -> None:
             f"`{name}` of a limit cycle needs its values, which a JAX transformation hides: use "
             "its arrays (`anchor`, `period`, `factors`) there, or `linearize(...).monodromy()`."
         )
-
-
-def _format(z: complex, least: str) -> str:
-    if z == 0:
-        return f"below {least}"
-    return f"{z.real:.9g}" if z.imag == 0 else f"{z.real:.9g}{z.imag:+.9g}j"
 
 
 def rough(cycle: LimitCycle) -> dict[str, Any]:
@@ -405,9 +400,8 @@ def log_determinant(map: ReturnMap) -> float:
 
     Steps of an implicit method lose a mode that decays within them; this gives its decay.
     """
-    return float(
-        np.sum(_pieces(to_host(map), lambda s, lanes, _, tape: divergence(s, lanes, tape)))
-    )
+    each = _pieces(to_host(map), lambda s, lanes, _, tape: divergence(s, lanes, tape))
+    return float(np.sum(each))
 
 
 def _pieces(map: ReturnMap, measure: Callable, tangents: bool = False) -> list:

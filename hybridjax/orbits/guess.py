@@ -63,7 +63,7 @@ def return_map_near(
     guess = system.guess() if guess is None else guess
     if guess is None:
         raise DefinitionError(
-            f"{type(system).__name__} has no guess of its own: pass `guess=Guess(chart, state)`."
+            f"{type(system).__name__} has no guess: pass `guess=Guess(chart, state)`."
         )
     a, time = s.chart_index(guess.chart), np.array([guess.time])
     if guess.state.shape != (s.dims[a],):
@@ -170,12 +170,7 @@ def _at_anchor(map: ReturnMap):
 
 
 def _go(
-    map: ReturnMap,
-    doing: str,
-    lanes: Lanes,
-    target: Target,
-    advice: str = "",
-    if_late: str = "",
+    map: ReturnMap, doing: str, lanes: Lanes, target: Target, advice: str = "", if_late: str = ""
 ) -> Lanes:
     """The lane at a target, however many steps it takes.
 

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Inexact, Int
+from jaxtyping import Bool, Float, Inexact, Int
 
 from .._core.compilation import at_ease
 from .._core.executor import (
@@ -22,7 +22,6 @@ from .._core.executor import (
     is_traced,
     namespace,
     on_host,
-    put,
     scan,
     to_host,
 )
@@ -35,7 +34,7 @@ from ..engine.target import Target, toward, until
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled
-from .return_map import ReturnMap
+from .return_map import ReturnMap, with_derivatives
 
 
 # Nodes of a piece, both ends among them. Fewer: polynomials through them lose digits of responses.
@@ -166,12 +165,15 @@ class LinearFlow(eqx.Module):
         mixed = (xp.einsum("pk,pk...->p...", mix, xp.asarray(y)[k]) for y in values)
         return xp.asarray(self.chart)[k], *mixed
 
-    def monodromy(self, free: Float[Array, "P K d d"]) -> Float[Array, "d d"]:
-        """Derivative of the state at the end of the turn by that at its beginning, at fixed
-        times."""
+    def monodromy(
+        self, free: Float[Array, "P K d d"], valid: Bool[Array, " d"]
+    ) -> Float[Array, "d d"]:
+        """Derivative of the state at the end of the turn by that at its beginning, at fixed times;
+        zero outside of the `valid` rows and columns."""
         xp = namespace(self.q)
         step = lambda product, piece: (piece[0] @ (piece[1] @ product), None)  # noqa: E731
-        return scan(step, xp.eye(self.q.shape[2]), (self.jumps.by_state, free[:, -1]))[0]
+        whole, _ = scan(step, xp.eye(self.q.shape[2]), (self.jumps.by_state, free[:, -1]))
+        return xp.where(valid[:, None] & valid, whole, 0.0)
 
 
 _flows = Memory()
@@ -293,7 +295,7 @@ def _linearized(
     time, charts = many(t) + ahead, many(chart)
     states = _ahead(s, many(t), charts, many(q), ahead)
     code = xp.where(part == divide[whole] - 1, xp.maximum(code, -1), -1)
-    by = _linear_field(of, time, charts, states)
+    by = with_derivatives(of, ft.partial(kernels.field, of), charts, time, states, s.d)
     d = s.d
     field, by_state, by_input = (
         x.reshape(*x.shape[:-1], P, K) for x in (by[:, 0], by[:, 2 : 2 + d], by[:, 2 + d :])
@@ -324,21 +326,6 @@ def _ahead(s: Structure, t, chart, q, h) -> Float[Array, "d L"]:
         return out
 
     return for_each_chart(s, chart, xp.ones(L, bool), work, xp.zeros_like(q))
-
-
-def _linear_field(s: Structure, t, chart, q) -> Float[Array, "d c L"]:
-    """The field and its derivatives by time, states and inputs, padded."""
-    xp, L = namespace(t), len(t)
-
-    def work(a, here, out):
-        n = s.dims[a]
-        by = kernels.field(s, a, only(here, t), only(here, q[:n]), xp.zeros((s.nu, 1)))
-        columns = np.r_[: 2 + n, 2 + s.d : 2 + s.d + s.nu]
-        index = np.ix_(np.arange(n), columns)
-        return put(out, index, xp.where(here, by, out[index]))
-
-    begin = xp.zeros((s.d, 2 + s.d + s.nu, L))
-    return for_each_chart(s, chart, xp.ones(L, bool), work, begin)
 
 
 def _jumps(s: Structure, end, after, code, events) -> Jumps:

@@ -10,15 +10,21 @@ Ch. 8; D. Wilson, J. Moehlis, Phys. Rev. E 94, 2016).
 from typing import Annotated, Literal, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, Numbers
 from .._core.boundary.values import Reals
-from .._core.executor import Array, is_traced, namespace, on_host, singular_values, to_host
+from .._core.executor import (
+    Array,
+    is_traced,
+    namespace,
+    on_host,
+    singular_values,
+    stop_gradient,
+    to_host,
+)
 from .._core.text import number
 from ..engine import kernels
 from ..engine.lanes import for_each_chart, only
@@ -136,19 +142,16 @@ class Responses(eqx.Module):
         cycle that is driven by a clock, and inside of transformations of JAX.
         """
         of_phase = self._covector(None)
-        names = self.structure.inputs
-        signal = next((x for x in names if input in (None, x)), None)
-        if signal is None:
-            raise DefinitionError(f"there is no input '{input}'; inputs are {', '.join(names)}.")
-        if is_traced(self):
-            raise DefinitionError("`curve` is a figure's: use `phase` inside of jit and grad.")
+        (signal, *_), (column, *_) = self.structure.inputs_among(
+            input if input is None else [input]
+        )
         if any(x.weight[signal] != 0 for x in self.impulses()):
             raise DefinitionError(
-                f"the input '{signal}' acts at events, which no curve shows: see `impulses()`."
+                f"'{signal}' acts at events, which no curve has: see `impulses()`."
             )
         flow = to_host(self.flow)
         values = np.einsum("pki,pkiu->pku", of_phase, flow.by_input)
-        values = values[..., names.index(signal)] / float(self.period)
+        values = values[..., column] / float(self.period)
         phase = (flow.t - flow.t[0, 0]) / float(self.period)
         broken = flow.event >= 0
         tail = np.where(broken, np.nan, values[:, -1])[:, None]
@@ -161,7 +164,7 @@ class Responses(eqx.Module):
         if is_traced(self):
             return f"Responses({name}, traced)"
         kinds = ["no phase (driven by a clock)" if self.of_phase is None else "phase"]
-        kinds += [f"amplitude {k}: exponent {_text(x)}" for k, x in enumerate(self.exponents)]
+        kinds += [f"amplitude {k}: exponent {number(x)}" for k, x in enumerate(self.exponents)]
         if self.left_out:
             kinds.append(f"{self.left_out} faster modes left out")
         has_any = self.of_phase is not None or len(self.exponents)
@@ -206,9 +209,7 @@ def responses(course: Course, modes: int | None) -> Responses:
     _, map, _, period, events, _ = to_host(course) if host else course
     xp, clocked = namespace(flow.t), map.base is None
     free, _ = flow.forward()
-    valid = map.valid
-    whole = xp.where(valid[:, None] & valid, flow.monodromy(free), 0.0)
-    size = xp.where(valid, map.sizes, 1.0)
+    whole = flow.monodromy(free, map.valid)
     if not clocked:
         f = flow.field[0, 0]
         closed, along = loop(map, whole, f)
@@ -216,7 +217,7 @@ def responses(course: Course, modes: int | None) -> Responses:
         whole = whole - f[:, None] * Z
     if modes is None and not host:
         raise DefinitionError("inside of jit and grad, `responses` needs the number of `modes`.")
-    values, right, left = _modes(whole, size, modes)
+    values, right, left = _modes(whole, map.sizes, modes)
     exponents = xp.log(values) / period
     adjoint, to_go = flow.adjoint(), period - (flow.t - flow.t[0, 0])
 
@@ -232,7 +233,7 @@ def responses(course: Course, modes: int | None) -> Responses:
             amplitudes = amplitudes - slip[..., None] * phase
     if host and not np.any(np.iscomplex(exponents)):
         amplitudes, right = np.real(amplitudes), np.real(right)
-    total = int(np.sum(valid)) - (not clocked) if host else len(values)
+    total = int(np.sum(map.valid)) - (not clocked) if host else len(values)
     surface = _surface(map.structure, flow)
     return Responses(
         map.structure, flow, period, values, exponents, right, total - len(values),
@@ -246,7 +247,7 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
     **Raises:** `ComputationError` if it is not simple.
     """
     xp = namespace(f)
-    size = xp.where(map.valid, map.sizes, 1.0)
+    size = map.sizes
     along = f / size**2
     along = along / (along @ f)
     closed = monodromy - xp.eye(len(f)) + f[:, None] * along
@@ -267,10 +268,7 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
     """
     xp = namespace(M)
     scaled = M * size / size[:, None]
-    if on_host(M):
-        values, right = np.linalg.eig(scaled)
-    else:
-        values, right = jnp.linalg.eig(jax.lax.stop_gradient(scaled))
+    values, right = xp.linalg.eig(stop_gradient(scaled))
     order = xp.argsort(-xp.abs(values) + 1e-9 * (xp.imag(values) < 0), stable=True)
     if on_host(M):
         kept = int(np.sum(np.abs(values) > _LEAST))
@@ -301,7 +299,7 @@ def _eigenpairs(M: Float[Array, "d d"], value, right):
     """An eigenvalue with its right and left eigenvectors near an approximation, by one Newton step,
     which also carries derivatives."""
     xp, n = namespace(M), len(M)
-    still = M if on_host(M) else jax.lax.stop_gradient(M)
+    still = stop_gradient(M)
 
     def pair(M, still, x, value):
         matrix = xp.concatenate([still - value * np.eye(n), xp.conj(x)[None]])
@@ -310,17 +308,10 @@ def _eigenpairs(M: Float[Array, "d d"], value, right):
         step = xp.linalg.solve(xp.concatenate([matrix, column], axis=1), off)
         return x - step[:n], value - step[n]
 
-    left, *_ = _null(still.T - value * np.eye(n))
+    *_, rows = xp.linalg.svd(still.T - value * np.eye(n))  # the last is contracted most
     right, root = pair(M, still, right, value)
-    left, _ = pair(M.T, still.T, left, value)
+    left, _ = pair(M.T, still.T, xp.conj(rows[-1]), value)
     return root, right, left
-
-
-def _null(matrix):
-    """The direction that a matrix contracts most."""
-    xp = namespace(matrix)
-    *_, rows = xp.linalg.svd(matrix if on_host(matrix) else jax.lax.stop_gradient(matrix))
-    return (xp.conj(rows[-1]),)
 
 
 def _surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
@@ -349,7 +340,3 @@ def _returned(a: int, s: Structure, t, q, u):
     chart = s.charts[a]
     assert isinstance(chart, SlidingChart)
     return chart.returned(t, q, s.chart_input(a, t, u)).ravel()
-
-
-def _text(z) -> str:
-    return f"{z.real:.6g}" if np.imag(z) == 0 else f"{z.real:.6g}{np.imag(z):+.6g}j"

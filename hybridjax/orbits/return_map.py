@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.executor import Array, namespace, on_host, scan, singular_values, stop_gradient
+from .._core.executor import Array, namespace, on_host, put, scan, singular_values, stop_gradient
 from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.events import arm
-from ..engine.lanes import Lanes, Tape, start_lanes
+from ..engine.lanes import Lanes, Tape, for_each_chart, only, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, move, tape_jacobian
 from ..engine.replay import replay
 from ..engine.search.state import Recorded
@@ -215,7 +215,7 @@ class ReturnMap(eqx.Module):
             moves = None
             if along is not None:
                 other = along  # (known to be a function in the function below, too)
-                moves = _derivative(lambda step: self._end(other(step), lanes, target, tape))
+                moves = derivative_at_zero(lambda step: self._end(other(step), lanes, target, tape))
             steps = Tape(tape.h, tape.code, tape.t, None, None, None)
             recorded = None if on_host(q) else Recorded(moved, steps)
             return moved, (lanes, jacobian[0, 1:], moves, tape.code, tape.t, recorded)
@@ -229,7 +229,7 @@ class ReturnMap(eqx.Module):
         if along is not None:
             add = lambda total, leg: (leg[0] @ total + leg[1], None)  # noqa: E731
             total, _ = scan(add, jnp.zeros_like(q), (factors, moves))
-            held = _derivative(lambda step: along(step).held(q)[0])
+            held = derivative_at_zero(lambda step: along(step).held(q)[0])
             jacobian = jnp.column_stack([jacobian, jnp.where(valid, total, 0.0) - held])
         if self.base is not None:
             factors = self._across(legs, factors)
@@ -289,17 +289,10 @@ class ReturnMap(eqx.Module):
         self, q: Float[Array, " d"], names: tuple[str, ...]
     ) -> tuple[Float[Array, " c"], Float[Array, "c d"]]:
         """Outputs at the anchor's time in its chart, and their derivatives by the state."""
-        s, t = self.structure, self.anchor.t[0]
-        if on_host(q):
-            a = int(self.anchor.chart[0])
-            n = s.dims[a]
-            point = t[None], q[:n, None], np.zeros((s.nu, 1))
-            rows = kernels.outputs(s, a, names, *point)[..., 0]
-            return rows[:, 0], np.pad(rows[:, 2 : 2 + n], [(0, 0), (0, s.d - n)])
-        outputs, u = s.resolve_outputs(names), jnp.zeros(s.nu)
-        branches = [lambda q, a=a: outputs(a, t, q[: s.dims[a]], u) for a in range(len(s.charts))]
-        values = lambda q: jax.lax.switch(self.anchor.chart[0], branches, q)  # noqa: E731
-        return values(q), jax.jacfwd(values)(q)
+        s, (t, chart, *_) = self.structure, self.anchor
+        outputs = lambda a, *point: kernels.outputs(s, a, names, *point)  # noqa: E731
+        by = with_derivatives(s, outputs, chart, t, q[:, None], len(names))[..., 0]
+        return by[:, 0], by[:, 2 : 2 + s.d]
 
     def travel(
         self, q: Float[Array, " d"], flow: Callable, record: Recorded | None = None
@@ -364,11 +357,31 @@ class ReturnMap(eqx.Module):
         return xp.roll(project, -1, axis=0) @ factors @ project
 
 
+def with_derivatives(
+    s: Structure, function: Callable, chart: Int[Array, " L"], t: Array, q: Array, rows: int
+) -> Float[Array, "rows columns L"]:
+    """Evaluate a function and its derivatives by the time, the d states and the inputs at points of
+    any charts; rows and columns that a chart does not have are zero.
+
+    **Arguments:** `function`: of chart, t, q and u, as those of `engine.kernels`.
+    """
+    xp, L = namespace(t), len(t)
+
+    def work(a, here, out):
+        n = s.dims[a]
+        by = function(a, only(here, t), only(here, q[:n]), xp.zeros((s.nu, 1)))
+        index = np.ix_(np.arange(len(by)), np.r_[: 2 + n, 2 + s.d : 2 + s.d + s.nu])
+        return put(out, index, xp.where(here, by, out[index]))
+
+    begin = xp.zeros((rows, 2 + s.d + s.nu, L))
+    return for_each_chart(s, chart, xp.ones(L, bool), work, begin)
+
+
 def turn_product(factors: Float[np.ndarray, "S K d d"]) -> Float[np.ndarray, "S d d"]:
     """Products of the factors of S turns, on the host."""
     return ft.reduce(lambda product, factor: factor @ product, np.moveaxis(factors, 1, 0))
 
 
-def _derivative(function: Callable[[Array], Array]) -> Array:
+def derivative_at_zero(function: Callable[[Array], Array]) -> Array:
     """The derivative of a function of one number, at zero."""
     return jax.jvp(function, (jnp.zeros(()),), (jnp.ones(()),))[1]

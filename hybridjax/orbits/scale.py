@@ -15,10 +15,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from .._core.arguments import require_among
 from .._core.precision import real
 from ..engine import kernels
 from ..engine.lanes import Lanes
-from ..errors import DefinitionError
 from ..systems.structure import Structure
 
 
@@ -93,13 +93,8 @@ def given_sizes(s: Structure, scale: Mapping[str, float] | None) -> Sizes:
 
     **Raises:** `DefinitionError` for a state that does not exist.
     """
-    given, names = dict(scale or {}), s.state_names()
-    for name in given:
-        if name not in names:
-            raise DefinitionError(
-                f"`scale` names {name!r}, which is no state; states are {', '.join(names)}."
-            )
-    return given
+    require_among("state", scale or (), s.state_names(), "`scale`: ")
+    return dict(scale or {})
 
 
 def scale_of(

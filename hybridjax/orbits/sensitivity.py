@@ -6,7 +6,6 @@ Wang, J. P. Gill, H. J. Chiel, P. J. Thomas, SIAM J. Appl. Dyn. Syst. 20, 2021).
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -24,7 +23,7 @@ from ..systems.varied import Varied
 from .crossing import AtEvent, ListLevels
 from .linear_flow import Course, LinearFlow, by_name
 from .responses import Phases, loop
-from .return_map import SINGULAR
+from .return_map import SINGULAR, derivative_at_zero
 
 
 @checked_methods
@@ -90,7 +89,7 @@ def _sensitivity(course: Course, flow: LinearFlow, s: Structure, varied: Varied)
     through = jumps.by_state @ free[:, -1]
     advance = lambda x, piece: (piece[0] @ x + piece[1], x)  # noqa: E731
     total, _ = scan(advance, xp.zeros_like(f0), (through, driven))
-    whole = xp.where(map.valid[:, None] & map.valid, flow.monodromy(free), 0.0)
+    whole = flow.monodromy(free, map.valid)
     if clocked:
         longer = map.multiplicity * _derivative(varied, lambda x: x.period())
         closed = whole - xp.eye(len(f0))
@@ -122,9 +121,7 @@ def _sensitivity(course: Course, flow: LinearFlow, s: Structure, varied: Varied)
 
 def _derivative(varied: Varied, value):
     """The derivative of a number of the system by the parameter."""
-    zero = jnp.zeros(())
-    of = lambda k: jnp.asarray(value(varied.at(k)), float)  # noqa: E731
-    return jax.jvp(of, (zero,), (jnp.ones(()),))[1]
+    return derivative_at_zero(lambda k: jnp.asarray(value(varied.at(k)), float))
 
 
 def _due(flow: LinearFlow, events: tuple[int, ...], varied: Varied) -> Float[Array, " P"]:

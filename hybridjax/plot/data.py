@@ -5,6 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
+from .._core.arguments import channel_index
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
 from .._core.results import Result
@@ -95,30 +96,29 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
 
 @checked
 def impulse_responses(
-    found: ImpulseResponses, *, input: int = 0, ax: AxesLike | None = None
+    found: ImpulseResponses, *, input: str | int = 0, ax: AxesLike | None = None
 ) -> Plot:
     """Left: responses to a push against its phase and the time since. Right: some of them with
     bands of 95 %."""
     ny, N = len(found.outputs), len(found.phase)
-    if not 0 <= input < len(found.inputs):
-        raise DefinitionError(f"there is no `input` {input}; the inputs are {found.inputs}.")
+    pushing = channel_index("input", input, found.inputs)
     chosen = [0, N // 4, N // 2, 3 * N // 4]
     with panels(ax, ny, 2, width=PAGE, height=0.4 + 1.9 * ny) as axes:
         for i, name in enumerate(found.outputs):
             plane, curves = axes[i]
-            values = found.values[:, :, i, input]
+            values = found.values[:, :, i, pushing]
             top = np.abs(values).max()
             image = plane.pcolormesh(
                 found.lag, found.phase, values, cmap="RdBu_r", vmin=-top, vmax=top,
                 rasterized=True, shading="nearest",
             )  # fmt: skip
-            pushed = found.inputs[input]
+            pushed = found.inputs[pushing]
             impulse = Signal(pushed, unit_of(pushed) and f"{unit_of(pushed)} s")
             label = with_unit(f"{name} / impulse", ratio(name, impulse))
             plane.get_figure().colorbar(image, ax=plane, label=label)
             plane.set_ylabel("phase of the push")
             for k, m in enumerate(dict.fromkeys(chosen)):
-                band = 1.96 * found.errors[m, :, i, input]
+                band = 1.96 * found.errors[m, :, i, pushing]
                 line = {"color": CYCLE[k % len(CYCLE)]}
                 curves.plot(found.lag, values[m], label=f"phase {found.phase[m]:.2f}", **line)
                 curves.fill_between(

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from .._core.arguments import channel_index
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive, SignalNames
 from .._core.signal import ratio, with_unit
@@ -57,7 +58,7 @@ def magnitude(
                 )
                 panel.plot(f, size, **line)
                 _band(panel, f, size, radius, line["color"], 0.3 * np.min(size))
-        name, pushed = _pick(htf.outputs, output), _pick(htf.inputs, input)
+        name, pushed = _pick("output", output, htf.outputs), _pick("input", input, htf.inputs)
         label = with_unit(f"$|H_m|$, {name}", ratio(name, pushed))
         panel.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
         _frequency_limits(panel, f)
@@ -121,7 +122,8 @@ def bode(
     """
     first, *_ = _exact_first(htfs)
     names = first.outputs if outputs is None else outputs
-    units = [ratio(_pick(first.outputs, name), _pick(first.inputs, input)) for name in names]
+    pushed = _pick("input", input, first.inputs)
+    units = [ratio(_pick("output", name, first.outputs), pushed) for name in names]
     same = units[0] if len(set(units)) == 1 else ""  # else the label of each curve has its own
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
@@ -214,16 +216,8 @@ def _exact_first(htfs: Sequence[HTF]) -> list[HTF]:
     return sorted(htfs, key=lambda htf: htf.source != "exact")
 
 
-def _index(names: Sequence[str], which: str | int) -> int:
-    if isinstance(which, str) and which in names:
-        return names.index(which)
-    if not isinstance(which, str) and -len(names) <= which < len(names):
-        return int(which)
-    raise DefinitionError(f"there is no {which!r} among {', '.join(names)}.")
-
-
-def _pick(names: Sequence[str], which: str | int) -> str:
-    return names[_index(names, which)]
+def _pick(kind: str, which: str | int, names: Sequence[str]) -> str:
+    return names[channel_index(kind, which, names)]
 
 
 def _values(
@@ -231,7 +225,8 @@ def _values(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
     hold the true values; None without a variance."""
-    order, at = np.argsort(htf.f), (_index(htf.outputs, output), _index(htf.inputs, input))
+    order = np.argsort(htf.f)
+    at = channel_index("output", output, htf.outputs), channel_index("input", input, htf.inputs)
     values, radius = np.asarray(htf[m])[(order, *at)], None
     if htf.variance is not None:
         radius = np.asarray(htf.select(m).confidence_radius())[(0, order, *at)]
@@ -281,9 +276,10 @@ def _phase(f, values, known, reference: tuple | None) -> np.ndarray:
 
 
 def _evaluate(fit: Fit, f, harmonic: int, output: str, input: str | int) -> np.ndarray:
-    i = _index(fit.outputs, output)
+    i = channel_index("output", output, fit.outputs)
     if isinstance(fit, StructuredFit):
-        return np.asarray(fit.htf(f, harmonic).H)[0, :, i, _index(fit.inputs, input)]
+        k = channel_index("input", input, fit.inputs)
+        return np.asarray(fit.htf(f, harmonic).H)[0, :, i, k]
     if fit.harmonic != harmonic:
         raise DefinitionError(f"the rational fit is of H_{fit.harmonic}, not of H_{harmonic}.")
     return np.asarray(fit.htf(f).H)[0, :, i, 0]

@@ -5,7 +5,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Any, cast, get_args
 
 import matplotlib
 import numpy as np
@@ -16,7 +16,6 @@ from matplotlib.rcsetup import cycler
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath
-from .._core.boundary.values import Whole
 from .._core.signal import unit_of, with_unit
 from .._core.writing import Format, replacing
 from ..errors import DefinitionError
@@ -78,8 +77,6 @@ def style() -> contextlib.AbstractContextManager:
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
 
 
-Resolution = Annotated[int, Whole(10, 10_000)]
-"""Dots per inch."""
 AxesLike = Axes | np.ndarray | Sequence
 """Axes to draw on: one, or a grid of them."""
 
@@ -151,12 +148,11 @@ def save(
     path: FilePath,
     plot: Plot | Figure | Axes,
     formats: Sequence[Format] = ("png",),
-    dpi: Resolution = 150,
 ) -> tuple[Path, ...]:
     """Write a figure, in one file for each format.
 
     **Arguments:** `path` without suffix (a suffix of a format is dropped); `plot`, or any figure or
-    Axes of matplotlib; `formats`, of "png", "pdf" and "svg"; `dpi` of a PNG.
+    Axes of matplotlib; `formats`, of "png" (150 dots per inch), "pdf" and "svg".
 
     **Returns:** the paths.
 
@@ -173,5 +169,5 @@ def save(
     with matplotlib.rc_context(_FONTS_IN_FILES):
         for target, format in zip(paths, formats, strict=True):
             with replacing(target) as new:
-                figure.savefig(new, format=format, dpi=dpi)
+                figure.savefig(new, format=format, dpi=_STYLE["figure.dpi"])
     return paths

@@ -88,15 +88,9 @@ def cycle(
 
 
 def _plane(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
-    everywhere = [
-        n
-        for n in s.state_names()
-        if all(s.state_function(n, a) is not None for a in range(len(s.charts)))
-    ]
+    everywhere = s.states_everywhere()
     if (x is None or y is None) and len(everywhere) < 2:
-        raise DefinitionError(
-            "no two states are defined in every chart: say what to draw with `x` and `y`."
-        )
+        raise DefinitionError("no two states are defined in every chart: give `x` and `y`.")
     x = everywhere[0] if x is None else x
     y = next(n for n in everywhere if n != x) if y is None else y
     x, y = s.resolve_outputs((x, y)).names

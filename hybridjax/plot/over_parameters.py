@@ -37,7 +37,7 @@ def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = N
     names = {b.parameter for b in branches}
     if len(names) != 1:
         raise DefinitionError(
-            f"branches to be drawn together need the same parameter; these have {sorted(names)}."
+            f"branches in one figure need one parameter; these have {sorted(names)}."
         )
     with panels(ax) as axes:
         panel = axes[0, 0]

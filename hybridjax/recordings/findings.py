@@ -1,7 +1,6 @@
 """`Finding`: a warning about data, by its cause.
 
-Findings are made in `inspection/` (signals), `beats/` (events alone), `advice.py` and
-`natural.py` (estimates).
+Findings about signals are made in `inspection/`, those about estimates in `fit_warnings.py`.
 """
 
 import textwrap

@@ -13,7 +13,7 @@ from ..identify.series.fit import (
     SeriesFit,
     assemble,
     delayed_outputs,
-    fit_records,
+    fit_series,
     total_least_squares,
 )
 from ..identify.series.linearization import linearize
@@ -74,7 +74,7 @@ class Split(NamedTuple):
 
     def fit(self, order: int) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
-        fit = fit_records(self.early, order, check=False)
+        fit = fit_series(self.early, order, check=False)
         return HeldOut(fit, validate(fit, self.late))
 
 

@@ -9,10 +9,10 @@ from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNam
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..identify.series.fit import SeriesFit, fit_series
-from .advice import Advice, advise, undamped
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import Finding, refuse
+from .fit_warnings import Advice, advise, undamped
 from .held_out import HeldOut, split
 from .impulse import ImpulseResponses, impulse_responses
 from .inspection.inspect import inspect, inspect_cycles
@@ -111,6 +111,7 @@ def identify_recording(
     of_events = all(w.linear for parts in phase.stretches for w in parts)
     if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:
         curve = phase_response(recording, phase, input=data.inputs[0])
+        findings = (*findings, *curve.warnings)
     responses = impulse_responses(fit, data)
-    advice = advise(data, fit, held.validation, findings, curve)
+    advice = advise(data, fit, held.validation, findings)
     return Identification(recording, findings, phase, data, fit, held, responses, curve, advice)

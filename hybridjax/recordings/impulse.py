@@ -87,7 +87,7 @@ def impulse_responses(
     reach = int(np.ceil(_PUSH_REACH * width * N))
     if reach >= lags:
         raise DefinitionError(
-            f"`width` is {width:g} periods, too wide for responses of {cycles:g} cycles."
+            f"`width`, {width:g}, is too wide for responses of {cycles:g} cycles."
         )
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
     # Responses to inputs of one section continue by the recursion from cycle to cycle.

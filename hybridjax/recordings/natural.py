@@ -10,7 +10,6 @@ $$J = E[z_{k+1} q_k^T] \, E[z_k q_k^T]^{+}$$
 has no such bias (instrumental variables, two-stage least squares: Söderström and Stoica 1983).
 """
 
-from collections.abc import Iterator
 from typing import Annotated, NamedTuple
 
 import equinox as eqx
@@ -25,6 +24,7 @@ from .._core.progress import working
 from ..errors import DefinitionError
 from .data import SectionData
 from .findings import Finding, print_findings
+from .fit_warnings import about_natural_multipliers
 
 
 # Draws of the bootstrap. More: time. Fewer: the ends of intervals scatter.
@@ -36,9 +36,6 @@ _SHORTEST_BLOCK = 4
 # combinations of the instruments per dimension of the state. More: weak instruments, and a first
 # stage that follows noise. Fewer: smoothing correlates their noise, and directions are missed.
 _EACH = 2
-# Cycles per record below which there are few. Larger: every result comes with the warning.
-# Smaller: a user trusts biased multipliers.
-_FEW = 50
 
 Draws = Complex[np.ndarray, "B d"]
 MultiplierCount = Annotated[int, Whole(1, 12)]
@@ -85,7 +82,7 @@ class NaturalMultipliers(eqx.Module):
     @property
     def warnings(self) -> tuple[Finding, ...]:
         """Limits of what the data support."""
-        return tuple(_warnings(self))
+        return tuple(about_natural_multipliers(self))
 
     def __repr__(self) -> str:
         lines = [
@@ -181,9 +178,7 @@ def _moments(data: SectionData, order: int) -> _Moments:
     size = np.nanstd(np.concatenate([x.y for x in data.records]), axis=0)
     y = [r.y / size for r in data.records]
     if order > _EACH * len(size):
-        raise DefinitionError(
-            f"`order` is {order}, but the state at a section has {_EACH * len(size)} numbers."
-        )
+        raise DefinitionError(f"`order` is {order}, but states have {_EACH * len(size)} numbers.")
     rows = np.array([
         (s, (r.first_section + k) // N, (r.first_section + k) % N, k)
         for s, r in enumerate(data.records)
@@ -264,23 +259,3 @@ def _resampled(
         drawn = (starts[:, None] + np.arange(length)).ravel()[:count]
         np.add.at(weights, np.flatnonzero(records == record)[drawn], 1.0)
     return weights
-
-
-def _warnings(result: NaturalMultipliers) -> Iterator[Finding]:
-    low, high = result.interval()[0]
-    modulus, plain = abs(result.multipliers[0]), abs(result.plain[0])
-    text = f"the largest modulus lies between {low:.2f} and {high:.2f} (95 %), from {result.cycles}"
-    yield Finding("width", f"{text} cycles; four times as many would halve that.")
-    each = result.cycles / result.records
-    if each < _FEW:
-        bias = f"a bias of about {(1 + 3 * modulus) / each:.2f} was corrected to first order only."
-        yield Finding("few cycles", f"{each:.3g} in each of {result.records} records; {bias}")
-    if result.strength < 0.5:
-        text = f"earlier sections explain {100 * result.strength:.0f} % of the states' variance."
-        yield Finding("weak instruments", text)
-    if high >= 1:
-        text = f"the interval of the largest modulus reaches {high:.2f}, beyond 1."
-        yield Finding("stability", text)
-    more = "less" if modulus > plain else "more"
-    text = f"least squares gives {plain:.3f} for the largest modulus, {abs(modulus - plain):.3f}"
-    yield Finding("noise", f"{text} {more}.")

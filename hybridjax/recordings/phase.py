@@ -72,9 +72,7 @@ class Phase(eqx.Module):
     def __check_init__(self):
         """**Raises:** `DefinitionError` for stretches that hold fewer than two whole cycles."""
         if self.cycles < 2:
-            raise DefinitionError(
-                f"the recording holds {self.cycles} whole cycles: two are needed."
-            )
+            raise DefinitionError(f"the recording has {self.cycles} whole cycles: two are needed.")
 
     @remembered
     def periods(self) -> tuple[Float[np.ndarray, " _"], ...]:
@@ -94,8 +92,7 @@ class Phase(eqx.Module):
         """
         if len(self.stretches) != len(recording.trials):
             raise DefinitionError(
-                f"the phase is of {len(self.stretches)} trials, the recording has "
-                f"{len(recording.trials)}."
+                f"the phase has {len(self.stretches)} trials, not {len(recording.trials)}."
             )
         return list(zip(recording.trials, self.stretches, strict=True))
 

@@ -6,6 +6,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..orbits.crossing import AtEvent, Crossing
@@ -208,9 +209,7 @@ def _from_events(recording: Recording, name: str) -> Phase:
     """Return a phase with one cycle per event."""
     times = []
     for trial in recording.trials:
-        if name not in trial.events:
-            text = f"no event '{name}'; its events are: {', '.join(trial.events) or 'none'}."
-            raise DefinitionError(f"trial '{trial.name}' has {text}")
+        require_among("event", [name], trial.events, f"trial '{trial.name}': ")
         times.append(trial.events[name])
     intervals = np.concatenate([np.diff(t) for t in times])
     if len(intervals) < 2:

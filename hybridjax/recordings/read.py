@@ -85,9 +85,7 @@ def read_tables(path: Path, wanted: Wanted) -> list[Columns]:
     reader = read_bag if path.is_dir() else _READERS.get(path.suffix.lower())
     if reader is None:
         kinds = ", ".join(_READERS)
-        raise DefinitionError(
-            f"'{path}' ends in '{path.suffix}'; recordings are read from {kinds}."
-        )
+        raise DefinitionError(f"'{path}' ends in '{path.suffix}'; formats are {kinds}.")
     try:
         if path.stat().st_size == 0:
             raise FileFormatError(f"'{path}' is empty.")

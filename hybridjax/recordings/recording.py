@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.optimize.elementwise import find_root
 
 from .._core import limits
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from .._core.signal import with_unit
 from ..errors import DefinitionError
@@ -96,9 +97,7 @@ class Recording(eqx.Module):
                 f"({time[bad - 1]:.10g}, then {time[bad]:.10g}): sort the samples, export more "
                 "digits, or make a trial of each part."
             )
-        if unknown := set(units) - set(columns):
-            text = f"there is a unit for '{min(unknown)}', but the signals are "
-            raise DefinitionError(f"{where}: {text}{', '.join(columns)}.")
+        require_among("signal", units, columns, f"{where}, `units`: ")
         if both := set(happened) & set(columns):
             raise DefinitionError(f"{where}: '{min(both)}' is a signal and an event: rename one.")
         happened = {key: np.sort(values[~np.isnan(values)]) for key, values in happened.items()}
@@ -177,7 +176,7 @@ class Recording(eqx.Module):
         recordings = list(recordings)
         if len({len(x.trials) for x in recordings}) != 1:
             raise DefinitionError(
-                "`recordings` must hold one or more recordings with the same number of trials."
+                "`recordings` must hold recordings with the same number of trials."
             )
         names = [name for x in recordings for name in x.signals]
         units = dict(zip(names, (unit for x in recordings for unit in x.units), strict=True))
@@ -245,9 +244,7 @@ class Recording(eqx.Module):
 
         **Raises:** `DefinitionError` if there is none of that name.
         """
-        if name not in self.signals:
-            text = f"the recording has {', '.join(self.signals)}."
-            raise DefinitionError(f"there is no signal '{name}'; {text}")
+        require_among("signal", [name], self.signals)
         return self.signals.index(name)
 
     def samples(self, name: str) -> list[tuple[Trial, Series]]:
@@ -281,9 +278,7 @@ def signal_of(crossing: Crossing) -> str:
     **Raises:** `DefinitionError` for a crossing of a function or in charts.
     """
     if not isinstance(crossing.function, str) or crossing.charts is not None:
-        raise DefinitionError(
-            "a recording holds samples: the Crossing of one names a signal, and no charts."
-        )
+        raise DefinitionError("the Crossing of a recording names a signal, and no charts.")
     return crossing.function
 
 

@@ -122,8 +122,7 @@ class Draws:
         other = {name for values in drawn for name in values.keys() ^ lost.keys()}
         if other:
             raise DefinitionError(
-                f"`function` must always give the same names, but `{min(other)}` only in some "
-                "draws."
+                f"`function` must always give the same names: `{min(other)}` is in some draws only."
             )
         return {
             name: stacked(name, [values[name] for values in drawn], x)

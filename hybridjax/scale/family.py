@@ -3,16 +3,14 @@
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
 from typing import Annotated, Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import Numbers
+from .._core.arguments import Numbers, require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed
 from .._core.boundary.values import Reals
@@ -21,7 +19,8 @@ from .._core.pieces.store import Constant
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..orbits.checks import check_periodic
-from ..systems.system import HybridSystem, describe, unit_of_parameter
+from ..systems.system import HybridSystem, describe, parameters_of, unit_of_parameter
+from ..systems.varied import with_parameters
 
 
 Axes = Mapping[str, Annotated[Numbers, Reals("n")]]
@@ -117,12 +116,8 @@ class Family:
     def __init__(self, model: HybridSystem | Callable[..., HybridSystem], names: Sequence[str]):
         self.model, self.names = model, tuple(names)
         allowed, required = _parameters(model)
-        for name in self.names:
-            if allowed is not None and name not in allowed:
-                raise DefinitionError(
-                    f"`{name}` is no parameter of the model; its parameters are "
-                    f"{', '.join(allowed) or 'none'}."
-                )
+        if allowed is not None:
+            require_among("parameter", self.names, allowed, "`model`: ")
         for name in required:
             if name not in self.names:
                 raise DefinitionError(f"the model needs `{name}`: give it an axis.")
@@ -131,11 +126,7 @@ class Family:
         """Return the system at one point."""
         if not isinstance(self.model, HybridSystem):
             return self.model(**values)
-        return eqx.tree_at(
-            lambda system: [reduce(getattr, x.split("."), system) for x in self.names],
-            self.model,
-            [jnp.asarray(values[name], float) for name in self.names],
-        )
+        return with_parameters(self.model, {name: values[name] for name in self.names})
 
     def systems(self, values: Mapping[str, np.ndarray]) -> HybridSystem:
         """Return the systems at several points as one, whose arrays have a leading axis."""
@@ -179,9 +170,7 @@ class Family:
 def _parameters(model: Any) -> tuple[list[str] | None, list[str]]:
     """Return the names of all parameters (None: any name) and of those without a default."""
     if isinstance(model, HybridSystem):
-        leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(model, eqx.is_inexact_array))[0]
-        scalars = [path for path, leaf in leaves if leaf.shape == ()]
-        return [".".join(str(getattr(x, "name", x)) for x in path) for path in scalars], []
+        return list(parameters_of(model)), []
     parameters = inspect.signature(model).parameters.values()
     if any(x.kind is x.VAR_KEYWORD for x in parameters):
         return None, []

@@ -29,9 +29,6 @@ from .family import Axes, Family, Points, Space
 from .wanted import Measure, Want, Wanted
 
 
-# Sweeps of more points have to be asked for by `force`: an hour on two cores. Fewer: sweeps of
-# minutes do, too. More: a slip of a digit costs a day.
-LARGE = 50_000_000
 # Points of a piece at most, and pieces of a large sweep at least. Smaller pieces: many small files,
 # and worse first guesses. Larger ones: more is lost with a worker.
 _MOST, _PIECES = 4000, 64
@@ -54,7 +51,6 @@ def sweep(
     chunk: Count | None = None,
     store: FilePath | None = None,
     client: DaskClient | None = None,
-    force: bool = False,
 ) -> Any:
     """Find limit cycles over a space of parameters, as a labelled array.
 
@@ -86,7 +82,6 @@ def sweep(
     - `store`: a folder, or an address for fsspec, of a Zarr group. Points that are in it already
         are not computed again: after an interruption, repeat the call.
     - `client`: a `distributed.Client`, whose workers compute the pieces.
-    - `force`: whether to compute more than 50 million points. Default: False.
 
     **Returns:** an `xarray.Dataset`, whose coordinates are the parameters with their units. With a
     store, values are read when they are used.
@@ -103,12 +98,6 @@ def sweep(
     system = family.check(middle)
     wanted = Wanted(want, system)
     total = math.prod(space.shape)
-    if total > LARGE and not force:
-        size = 8e-9 * total * (1 + len(wanted.names) + len(wanted.measures))
-        raise DefinitionError(
-            f"these are {total:.3g} points, about {total / 5000 / 3600:.3g} hours of one core and "
-            f"{size:.3g} GB: say `force=True` if that is meant."
-        )
     most = chunk or (BATCH if wanted.measures else min(max(total // _PIECES, BATCH), _MOST))
     blocks = Blocks(space.shape, near_cube(space.shape, most))
     description = {

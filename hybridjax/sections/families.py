@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
+from .._core.arguments import require_axes
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, Scalar, SectionCount, SignalNames
 from .._core.boundary.values import Reals
@@ -184,8 +185,7 @@ class ArcLength(_Anchored):
     ):
         self.n_sections, self.signals, self.anchor = n_sections, tuple(signals), anchor
         self.scale = real([1.0] * len(self.signals) if scale is None else scale)
-        if self.scale.shape != (len(self.signals),):
-            raise DefinitionError(f"`scale` must have one number for each of {self.signals}.")
+        require_axes("`scale`", self.scale, {"signals": len(self.signals)})
 
     def check(self, s: Structure) -> None:
         super().check(s)
@@ -313,7 +313,7 @@ class SectionList(AbstractSections):
         self.items = tuple(items)
         if not self.items:
             raise DefinitionError(
-                "a list of sections needs at least one Crossing or AtEvent, but `items` is empty."
+                "`items` is empty: a list of sections needs a Crossing or AtEvent."
             )
 
     @property  # type: ignore[misc]

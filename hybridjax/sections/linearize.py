@@ -1,21 +1,19 @@
 """From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
 from .._core.compilation import host_first
-from .._core.executor import Array, is_traced, namespace, on_host
-from .._core.lanes import by_lane
+from .._core.executor import Array, is_traced, namespace
 from .._core.progress import working
 from ..engine import kernels
-from ..engine.lanes import for_each_chart, only
 from ..linear.ldtp import LDTP
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
+from ..orbits.return_map import with_derivatives
 from ..systems.system import Output, OutputNames
 from .place import as_placed
 from .placed import PlacedSections, SectionsLike
@@ -53,10 +51,7 @@ def linearize(
     """
     placed = as_placed(cycle, sections)
     s, traced, charts = placed.structure(), is_traced(placed), range(len(cycle.system.charts()))
-    if outputs is None:
-        states = s.state_names()
-        outputs = [x for x in states if all(s.state_function(x, a) is not None for a in charts)]
-    z = check_outputs(cycle, outputs)
+    z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
     for a in charts if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
     names, columns = s.inputs_among(inputs)
@@ -78,27 +73,8 @@ def _output_jacobians(
     placed: PlacedSections, outputs: tuple[str | Output, ...]
 ) -> tuple[Float[Array, "N ny c"], Float[Array, "N ny nu"]]:
     """C and D, padded: derivatives of the outputs with respect to (t, q, u), at u = 0."""
-    s, lanes, xp, N = placed.structure(), placed.lanes, namespace(placed.lanes.t), placed.n_sections
-    z, n, ny = s.resolve_outputs(outputs), 1 + s.d, len(outputs)
-
-    def work(a, mask, out):
-        if not z.defined(a):
-            return out
-        d = s.dims[a]
-        t, q = only(mask, lanes.t), only(mask, lanes.q[:d])
-
-        def jacobian(t, q):
-            J = jax.jacfwd(lambda t, q, u: z(a, t, q, u), argnums=(0, 1, 2))
-            t, q, u = J(t, q, jnp.zeros(s.nu))
-            return jnp.concatenate([t[:, None], q, u], axis=1)
-
-        if on_host(t):
-            J = kernels.outputs(s, a, tuple(z.items), t, q, np.zeros((s.nu, 1)))[:, 1:]
-        else:
-            J = by_lane(jacobian)(t, q)
-        J = xp.concatenate([J[:, : 1 + d], xp.zeros((ny, s.d - d, N)), J[:, 1 + d :]], axis=1)
-        return xp.where(mask, J, out)
-
-    zeros = xp.zeros((ny, n + s.nu, N))
-    J = xp.moveaxis(for_each_chart(s, lanes.chart, xp.ones(N, bool), work, zeros), -1, 0)
+    s, lanes, items = placed.structure(), placed.lanes, tuple(outputs)
+    values = lambda a, *point: kernels.outputs(s, a, items, *point)  # noqa: E731
+    by = with_derivatives(s, values, lanes.chart, lanes.t, lanes.q, len(items))
+    J, n = namespace(by).moveaxis(by[:, 1:], -1, 0), 1 + s.d
     return J[:, :, :n] @ placed.frames()[0], J[:, :, n:]

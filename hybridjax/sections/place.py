@@ -283,8 +283,7 @@ def _check(placed: PlacedSections, first: int) -> None:
     short = int(np.argmin(duration))
     if duration[short] <= TOGETHER * period:
         raise ComputationError(
-            f"{name((short + 1) % N)} coincides with section {short} on the cycle; sections "
-            "must be distinct."
+            f"{name((short + 1) % N)} coincides with section {short} on the cycle: leave one out."
         )
     for i, (count, steepness) in enumerate(zip(*_crossings(placed), strict=True)):
         if steepness < _LEAST_STEEPNESS:

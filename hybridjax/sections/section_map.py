@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._core.arguments import require_axes
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Numbers, Scalar
 from .._core.boundary.values import Reals
@@ -75,10 +76,7 @@ class SectionMap(eqx.Module):
             )
         nu = len(self.placed.cycle.system.inputs)
         held = np.zeros(nu) if u is None else u
-        if held.shape not in ((), (nu,)):
-            raise DefinitionError(
-                f"`u` must be {nu} numbers, one for each input; got {held.shape}."
-            )
+        require_axes("`u`", held, {}, {"inputs": nu})
         arrival = _map(self, q, held, t)
         if not is_traced(arrival) and (code := Result(int(arrival.result))) != Result.OK:
             raise ComputationError(
@@ -104,9 +102,7 @@ def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -
     placed = as_placed(cycle, sections)
     for k in (i, j):
         if k >= placed.n_sections:
-            raise DefinitionError(
-                f"section {k} does not exist; sections are 0..{placed.n_sections - 1}."
-            )
+            raise DefinitionError(f"there is no section {k}: the last is {placed.n_sections - 1}.")
     s, chart = placed.structure(), placed.lanes.chart
     dims = (s.d, s.d) if is_traced(chart) else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
     return SectionMap(placed, i, j, dims)

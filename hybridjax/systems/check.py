@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
+from .._core.arguments import require_among
 from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
 from .quotient import Quotient
 from .solver import ByChart
 from .structure import Structure, quoted
-from .system import HybridSystem, Output
+from .system import HybridSystem, Output, arrays_of
 from .transition import Scheduled, Transition
 
 
@@ -30,11 +31,11 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
 
     **Raises:** `DefinitionError`, naming the chart, transition or parameter that is wrong.
     """
-    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
+    for name, leaf in arrays_of(system).items():
         real = jnp.issubdtype(leaf.dtype, jnp.inexact) and not is_traced(leaf)
         if real and not np.all(np.isfinite(leaf)):
             raise DefinitionError(
-                f"parameter `{jax.tree_util.keystr(path)[1:]}` of {type(system).__name__} is "
+                f"parameter `{name}` of {type(system).__name__} is "
                 f"{np.asarray(leaf)}; every parameter must be finite."
             )
     form = _form(system)
@@ -80,11 +81,7 @@ def _check_functions(s: Structure) -> Iterator[str]:
         s.chart_index(name)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
         _check_names(f"chart '{name}'", "inputs", chart.inputs or ())
-        for unknown in set(chart.inputs or ()) - set(system.inputs):
-            raise DefinitionError(
-                f"chart '{name}' uses input '{unknown}', which the system does not have; inputs "
-                f"are {quoted(system.inputs)}."
-            )
+        require_among("input", chart.inputs or (), system.inputs, f"chart '{name}': ")
         _check_names(f"chart '{name}'", "states", (*chart.states, *chart.absent))
         _check_names(f"chart '{name}'", "states", chart.states, chart.units)
         s.method(a)
@@ -92,9 +89,7 @@ def _check_functions(s: Structure) -> Iterator[str]:
         field = lambda *x, a=a: s.field(a, *x)  # noqa: E731
         yield from _check_shape(s, a, f"field of chart '{name}'", field, (s.dims[a],), states)
     if len(set(map(str, s.state_names()))) < len(s.state_names()):
-        raise DefinitionError(
-            f"charts of {kind} give a state different units: {quoted(s.state_names())}."
-        )
+        raise DefinitionError(f"{kind} gives a state two units: {quoted(s.state_names())}.")
     _check_names(kind, "transitions", [tr.name for tr in s.transitions])
     # Transitions of one kind are one program; the first and the last may index beyond the states.
     for g in sorted({g for kind in s.kinds for g in (kind[0], kind[-1])}):

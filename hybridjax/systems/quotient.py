@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
 from .._core.executor import is_traced
@@ -83,17 +84,10 @@ class Quotient(Derived):
 
     def __check_init__(self):
         charts = self.system.charts()
-        for name in (*self.swap, *self.swap.values()):
-            if name not in charts:
-                raise DefinitionError(
-                    f"Quotient: there is no chart '{name}' to swap; charts are {[*charts]}."
-                )
-        states = {state for chart in charts.values() for state in chart.states}
-        for name in (*self.relabel, *self.relabel.values(), *self.flipped, *self.translation):
-            if name not in states:
-                raise DefinitionError(
-                    f"Quotient: there is no state '{name}'; states are {sorted(states)}."
-                )
+        require_among("chart", (*self.swap, *self.swap.values()), charts, "Quotient: ")
+        states = sorted({state for chart in charts.values() for state in chart.states})
+        named = (*self.relabel, *self.relabel.values(), *self.flipped, *self.translation)
+        require_among("state", named, states, "Quotient: ")
         for kept, left_out in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[left_out].states):

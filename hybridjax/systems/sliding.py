@@ -64,8 +64,7 @@ def sliding(
     (above, f), (below, g) = charts.items()
     if f.states != g.states or f.inputs != g.inputs:
         raise DefinitionError(
-            f"charts '{above}' and '{below}' must have the same states and inputs for a surface "
-            "between them."
+            f"charts '{above}' and '{below}' must have the same states and inputs."
         )
     middle = SlidingChart(f, g, surface)
     height = lambda t, q, u: surface(t, q)  # noqa: E731

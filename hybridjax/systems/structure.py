@@ -23,6 +23,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Int
 
+from .._core.arguments import require_among
 from .._core.compilation import kernel
 from .._core.executor import Array
 from .._core.lanes import PerLane, by_lane, one_lane, shared
@@ -123,8 +124,7 @@ def stacked(parts: Sequence[jax.Array]) -> jax.Array:
 
 
 def _index(what: str, name: str, names: Sequence[str]) -> int:
-    if name not in names:
-        raise DefinitionError(f"there is no {what} '{name}'; {what}s are {quoted(names)}.")
+    require_among(what, [name], names)
     return names.index(name)
 
 
@@ -189,11 +189,7 @@ class Structure:
     ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
         """Names of inputs (Default: all) and their indices."""
         names = self.inputs if names is None else names
-        for name in names:
-            if name not in self.inputs:
-                known = ", ".join(self.inputs)
-                raise DefinitionError(f"there is no input '{name}'; inputs are {known}.")
-        columns = np.array([self.inputs.index(n) for n in names], int)
+        columns = np.array([_index("input", name, self.inputs) for name in names], int)
         return tuple(self.inputs[k] for k in columns), columns
 
     @ft.cached_property
@@ -370,6 +366,11 @@ class Structure:
                 names[name] = name
         return tuple(names.values())
 
+    def states_everywhere(self) -> list[str]:
+        """The states that every chart defines."""
+        charts = range(len(self.charts))
+        return [x for x in self.state_names() if all(self.state_function(x, a) for a in charts)]
+
     def states(self, a: int) -> tuple[Signal, ...]:
         """The names of chart a's states, with their units."""
         return signals(self.charts[a].states, self.charts[a].units)
@@ -391,9 +392,8 @@ class Outputs:
         for item in outputs:
             if isinstance(item, str) and item in defined:
                 item = defined[item]
-            if isinstance(item, str) and item not in structure.state_names():
-                names = (*structure.state_names(), *defined)
-                raise DefinitionError(f"there is no output {item!r}; outputs are {quoted(names)}.")
+            if isinstance(item, str):
+                require_among("output", [item], (*structure.state_names(), *defined))
             self.items.append(item)
         states = {str(name): name for name in structure.state_names()}
         self.names = tuple(

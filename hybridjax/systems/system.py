@@ -76,12 +76,22 @@ def unit_of_parameter(system: Any, path: str) -> str:
     return type(system).__dataclass_fields__[name].metadata.get("unit", "")
 
 
+def arrays_of(system: "HybridSystem") -> dict[str, Array]:
+    """The arrays of a system by name, those of its parts by a path with dots."""
+    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array))
+    return {".".join(str(getattr(x, "name", x)) for x in path): leaf for path, leaf in leaves}
+
+
+def parameters_of(system: "HybridSystem") -> dict[str, Array]:
+    """The single floating-point numbers of a system by name."""
+    arrays = arrays_of(system).items()
+    return {name: x for name, x in arrays if eqx.is_inexact_array(x) and x.shape == ()}
+
+
 def describe(system: "HybridSystem") -> dict[str, Any]:
     """The class of a system, its numbers by name, and a digest of its code, for stored results."""
-    numbers = {}
-    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
-        name = ".".join(str(getattr(x, "name", x)) for x in path)
-        numbers[name] = float(leaf) if np.ndim(leaf) == 0 else digest_of(leaf)
+    arrays = arrays_of(system).items()
+    numbers = {name: float(x) if np.ndim(x) == 0 else digest_of(x) for name, x in arrays}
     return {"class": type(system).__qualname__, "numbers": numbers, "code": code_digest(system)}
 
 

@@ -2,16 +2,16 @@
 
 import dataclasses
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
+from .._core.arguments import require_among
 from .._core.executor import Array
-from ..errors import DefinitionError
 from .chart import DerivedChart
-from .system import Derived, HybridSystem, unit_of_parameter
+from .system import Derived, HybridSystem, parameters_of, unit_of_parameter
 from .transition import Scheduled
 
 
@@ -20,22 +20,15 @@ def parameter_of(system: HybridSystem, parameter: str) -> Array:
 
     **Raises:** `DefinitionError` if there is none.
     """
-    leaves = jax.tree_util.tree_leaves_with_path(system)
-    is_number = lambda x: eqx.is_inexact_array(x) and x.shape == ()  # noqa: E731
-    names = (jax.tree_util.keystr(path).lstrip(".") for path, x in leaves if is_number(x))
-    name, text = type(system).__name__, f"parameters are {', '.join(names)}."
-    try:
-        value = operator.attrgetter(parameter)(system)
-    except (AttributeError, TypeError) as error:
-        raise DefinitionError(f"{name} has no parameter '{parameter}'; {text}") from error
-    if not is_number(value):
-        raise DefinitionError(f"'{parameter}' of {name} is no single floating-point number; {text}")
-    return value
+    numbers = parameters_of(system)
+    require_among("parameter", [parameter], numbers, f"{type(system).__name__}: ")
+    return numbers[parameter]
 
 
-def with_parameter(system: HybridSystem, parameter: str, value: Any) -> HybridSystem:
-    """The system with another value of a parameter."""
-    return eqx.tree_at(operator.attrgetter(parameter), system, jnp.asarray(value, float))
+def with_parameters(system: HybridSystem, values: Mapping[str, Any]) -> HybridSystem:
+    """The system with other values of some parameters."""
+    where = lambda x: [operator.attrgetter(name)(x) for name in values]  # noqa: E731
+    return eqx.tree_at(where, system, [jnp.asarray(x, float) for x in values.values()])
 
 
 class Varied(Derived):
@@ -59,7 +52,7 @@ class Varied(Derived):
     def at(self, change: Array) -> HybridSystem:
         """The system after a change of the parameter."""
         value = parameter_of(self.system, self.parameter)
-        return with_parameter(self.system, self.parameter, value + change)
+        return with_parameters(self.system, {self.parameter: value + change})
 
     def charts(self):
         return {name: _Varied(x, self, name) for name, x in self.system.charts().items()}

@@ -53,8 +53,7 @@ def random_force(
     """
     if bandwidth >= rate / 2:
         raise DefinitionError(
-            f"`bandwidth` must be less than half of the {rate:g} samples per second, but is "
-            f"{bandwidth:g}."
+            f"`bandwidth` must be less than half of `rate`, {rate / 2:g}, but is {bandwidth:g}."
         )
     transient = 4 * rate / bandwidth  # samples cut off at either end, where the filter starts
     samples = (duration * rate + 2 * transient) * inputs

@@ -72,7 +72,7 @@ HOSTILE = {
 }
 DECLARED = {
     "sections": (dict(n_sections=10**12), "n_sections is 1000000000000"),
-    "experiments that are not there": (dict(experiments=10**6), "at least one frequency"),
+    "experiments that are not there": (dict(experiments=10**6), "needs a frequency"),
     "a window": (dict(n_sections=10**5, periods=10**6), "more samples than an experiment"),
     "a name that is none": (dict(input_names=[["u"]]), "input_names is"),
 }

@@ -250,7 +250,7 @@ def test_bad_distortions(toy):
     cycle, sections, model = toy
     twice = hj.LDTP(model.A, 2 * model.B, model.C, outputs="x")
     for family, message in (
-        (hj.ClockPhase(8), "between 8 sections, the model has 4"),
+        (hj.ClockPhase(8), "different n_sections: 8 and 4"),
         (sections, "another system .* to x differs by 50%"),
     ):
         limit = Limits(distortion=Distortion(cycle, family, {"x": 1.0}))

@@ -110,7 +110,7 @@ BAD = {
     "experiment 0: f = -0.25 lies outside": [[-0.25]],
     "f = 0.3 is not a multiple of 1/8": [[0.3]],
     "`frequencies.0.` must be finite, but is nan": [[np.nan]],
-    "needs at least one frequency": [[0.25], []],
+    "needs a frequency": [[0.25], []],
 }
 
 

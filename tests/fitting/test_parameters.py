@@ -49,15 +49,18 @@ def records(**options):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS), "16 sections, the family has 8"),
+        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS), "different n_sections: 16 and 8"),
         (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS), "variance"),
-        (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "8 sections, the family 4"),
+        (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "different n_sections: 8 and 4"),
         (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
-        (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), "one for each output"),
+        (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), r"of shape \(1 outputs\)"),
         (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "zero throughout"),
-        (lambda: hj.ObservedCycle(SECTIONS), "`times`, or the `period`"),
+        (lambda: hj.ObservedCycle(SECTIONS), "`times`, or a `period`"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM"), "`outputs` with their `values`"),
-        (lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))), r"the shape \(8, 1\)"),
+        (
+            lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))),
+            r"of shape \(8 sections, 1 outputs\)",
+        ),
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))), "zero throughout"),
     ],
 )

@@ -51,8 +51,8 @@ CALLED = {"frequencies": "f =", "line": "f =", "frame": "column|signals", "defin
 SLOW = {
     "LimitCycle.trajectory", "ObservedCycle.of", "ResponseFunction", "SectionMap", "continuation",
     "find_limit_cycle", "find_limit_cycles", "fit_model", "identifiability", "identify_recording",
-    "linearize", "place_sections", "response_function", "run_experiments", "section_map",
-    "simulate", "simulate_recording", "stream_experiments", "sweep", "monte_carlo",
+    "linearize", "optimize_phases", "place_sections", "response_function", "run_experiments",
+    "section_map", "simulate", "simulate_recording", "stream_experiments", "sweep", "monte_carlo",
     "write_report", "ObservedCycle.prepare", "ObservedCycle.residuals", "ObservedHTF.prepare",
     "ObservedHTF.residuals", "enable_vector_math", "enable_compilation_cache",
 }  # fmt: skip

@@ -104,7 +104,9 @@ MAKE = {
         t.recording, t.phase, inputs="f", outputs=("x",), order=1, n_sections=2
     ),
     "htf": lambda t: hj.linearize(t.cycle, PHASE, NAMES).htf([0.1, 0.2], (0,)),
-    "series": lambda t: hj.run_experiments(t.cycle, PHASE, t.one_input, NAMES),
+    "series": lambda t: hj.experiments.simulate_experiments(
+        hj.linearize(t.cycle, PHASE, NAMES), t.one_input
+    ),
     "observed": lambda t: hj.ObservedCycle.of(t.cycle, PHASE, NAMES),
     "plot": plot,
 }  # fmt: skip

@@ -138,14 +138,14 @@ def test_a_plant_that_is_stable_in_its_loop_only():
 def test_what_does_not_fit_is_refused(plant):
     data, record = experiments(plant, 0, 2), series(plant, 0)
     refused = lambda text: pytest.raises(hj.DefinitionError, match=text)  # noqa: E731
-    with refused("there is no reference 'q' among the inputs u, r, d"):
+    with refused("there is no input 'q'; inputs are u, r, d"):
         hj.estimate_htf(data, reference="q")
     with refused("2 inputs of the plant need as many references"):
         hj.estimate_htf(data, reference="r")
     with refused("all inputs are references"):
         hj.fit_ldtp(record, 2, reference=("u", "r"))
     same = hj.Record(record.u[:, [1, 1]], record.y, n_sections=N, inputs=("u", "r"))
-    with refused("u and r are the same signal"):
+    with refused("u and r are equal"):
         hj.fit_ldtp(same, 2, reference="r")
     with refused("name those that enter at the plant's input"):
         hj.identify.loop(data)

@@ -176,7 +176,7 @@ def test_bad_records(small):
     good = record(small, 400)
     cases = {
         "section 0 was sampled 10 times, too few": record(small, 40),
-        "output y1 is zero or missing": with_outputs(good, good.y * [1, np.nan]),
+        "y1 is zero or missing": with_outputs(good, good.y * [1, np.nan]),
         "do not belong together": [good, hj.Record(good.u, good.y, n_sections=5)],
     }
     for message, data in cases.items():

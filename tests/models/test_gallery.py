@@ -55,12 +55,8 @@ CASES = {
         0.25946315221826, [0.9365565991540, 0.2106146374910, 0.01714336047405,
         *pair(0.005638528689762 + 0.004702903938051j), 0.004783922552855, 0.001857583000819,
         0.001466407402454, 4.28e-07], accuracy=1e-7),
-    "juggler": lambda: Case(m.PaddleJuggler(), None, {}, 1.0,
-        pair(0.399920196836063 + 0.574511824214789j)),
     "Hopf": lambda: Case(m.HopfOscillator(), hj.Crossing("y", "rising"), {"x": 0.1**0.5}, 1.0,
         [0.818730753077982]),
-    "van der Pol, 0.5": lambda: Case(m.VanDerPol(mu=0.5), hj.Crossing("v", "falling"),
-        {"x": 2.00248793044711}, 6.38067580177359, [0.0391769202592733]),
     "buck, 20 V": lambda: Case(m.BuckConverter(), None, {"v": 11.9695115388150,
         "i": 0.591571935915189}, 400e-6, pair(-0.691894155835222 + 0.447746968999235j)),
     # benchmarks/circuits_truth.py
@@ -92,9 +88,7 @@ CASES = {
 
 
 # The others compile for as long again.
-QUICK = {
-    "wheel, 8 spokes", "compass gait", "juggler", "buck, 20 V",
-}  # fmt: skip
+QUICK = {"wheel, 8 spokes", "compass gait", "buck, 20 V"}
 
 
 def marks(name):

@@ -81,7 +81,7 @@ def test_what_is_no_phase(wave):
     for definition, message in [
         (dataclasses.replace(CIRCLE, center=(0, 0), scale=(1, 1)), "the phase does not wind"),
         (dataclasses.replace(CIRCLE, velocity="c"), "needs a c that varies"),
-        (hj.AtEvent("strike"), "no event 'strike'; its events are: none"),
+        (hj.AtEvent("strike"), "there is no event 'strike'; events are none"),
         (hj.Crossing("x", "falling", value=3.0), "x is never seen to cross 3, falling"),
         (hj.Crossing(lambda t, q: q[0], "falling"), "names a signal, and no charts"),
     ]:

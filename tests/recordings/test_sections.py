@@ -117,7 +117,7 @@ def test_slow_drift_is_taken_out(wave):
     assert sample(flat).with_drift(9).records[0].drift == 9
     for phase, cycles, message in [
         (rough, 3, "four cycles or more, not 3"),
-        (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "phase is of 0 trials"),
+        (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "phase has 0 trials"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
             without_drift(wave, phase, "x", cycles)

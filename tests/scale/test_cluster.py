@@ -104,7 +104,7 @@ def test_draws_must_stay_alike():
     for function, message in (
         (lambda rng: np.ones(rng.integers(1, 1000)), "arrays of one shape: first"),
         (lambda rng: next(turns), "always complex .* first <f8"),
-        (lambda rng: next(turns), "same names, but `value` only"),
+        (lambda rng: next(turns), "same names: `value` is in some draws only"),
     ):
         with pytest.raises(hj.DefinitionError, match=message):
             hj.monte_carlo(function, 2)

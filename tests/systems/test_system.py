@@ -84,7 +84,7 @@ def replaced(**changes):
         (Anything({"a": Field("xv", lambda t, q, u: q)}), "must be a tuple of names, not 'xv'"),
         (Anything(ROOM, named=(SUM, SUM)), "states and outputs of the same name"),
         (Anything(ROOM, named=SUM), r"outputs\(\) must return several `hj.Output`"),
-        (replaced(source="c"), "there is no chart 'c'; charts are 'a', 'b'"),
+        (replaced(source="c"), "there is no chart 'c'; charts are a, b"),
         (replaced(reset=lambda t, q, u: q), r"reset of transition 'go' \(a -> b\) returns shape"),
         (replaced(guard=lambda t, q, u: q), r"guard of transition 'go' \(a -> b\) returns shape"),
         (replaced(enabled=lambda t, q, u: q > 0), r"`enabled` of transition 'go' .* returns shape"),
@@ -114,5 +114,5 @@ def test_outputs_by_name_by_function_and_by_chart():
     assert z.defined(0) and not z.defined(1)
     with pytest.raises(hj.DefinitionError, match="output 'x' is not defined in chart 'b'"):
         z.require(1)
-    with pytest.raises(hj.DefinitionError, match="there is no output 'y'; outputs are 'x', 'v'"):
+    with pytest.raises(hj.DefinitionError, match="there is no output 'y'; outputs are x, v"):
         s.resolve_outputs("y")

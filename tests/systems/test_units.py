@@ -53,5 +53,5 @@ class System(hj.HybridSystem):
 
 
 def test_units_that_do_not_fit_are_refused():
-    with pytest.raises(hj.DefinitionError, match=r"different units: 'y' \(m\), .*'y' \(mm\)"):
+    with pytest.raises(hj.DefinitionError, match=r"two units: 'y' \(m\), .*'y' \(mm\)"):
         hj.simulate(System(), "a", (1.0, 0.0), 1.0)

@@ -143,9 +143,7 @@ class ZarrStore:
         chunk = max(math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values())
         for path, size in sizes.items():
             if size > max(limits.TEXT, chunk + _CHECKSUM):
-                raise DefinitionError(
-                    f"'{path}' is larger than all chunks of its store: delete it."
-                )
+                raise DefinitionError(f"'{path}' exceeds all chunks of its store: delete it.")
 
     @property
     def start(self) -> list[np.ndarray]:
@@ -234,7 +232,7 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
     except FileNotFoundError:
         if sizes:
             raise DefinitionError(
-                f"'{address}' is there, and is no store of results: choose another name."
+                f"'{address}' is no store of results: choose another name."
             ) from None
         return None
     except Exception as error:

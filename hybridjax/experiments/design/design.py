@@ -99,7 +99,7 @@ class Design(eqx.Module):
         sizes = [np.size(f) for f in frequencies]
         if len(sizes) == 0 or min(sizes) == 0:
             raise DefinitionError(
-                "every experiment needs at least one frequency: `frequencies` has none for some."
+                "every experiment needs a frequency: `frequencies` has none for some."
             )
 
         def flat(name, values, dtype):
@@ -150,7 +150,7 @@ class Design(eqx.Module):
         numbers = np.unique(self.experiment)
         if self.experiments != len(numbers) or not np.array_equal(numbers, np.arange(len(numbers))):
             raise DefinitionError(
-                "every experiment needs at least one frequency: `frequencies` has none for some."
+                "every experiment needs a frequency: `frequencies` has none for some."
             )
         self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)

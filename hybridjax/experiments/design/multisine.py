@@ -160,8 +160,7 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
     f_min, f_max = band
     if not f_min <= f_max <= n_sections / 2:
         raise DefinitionError(
-            f"the band from {f_min} to {f_max} must lie in [0, N/2 = {n_sections / 2}] cycles per "
-            "period."
+            f"the band from {f_min} to {f_max} must lie in [0, N/2 = {n_sections / 2}]."
         )
     low, high = int(np.ceil(f_min * periods - OFF_LINE)), int(np.floor(f_max * periods + OFF_LINE))
     j = np.arange(low, high + 1)

@@ -161,9 +161,7 @@ def _hits(classes: list[int], products: list[list[int]]) -> int:
 
 
 def check_sharing(
-    experiment: Int[np.ndarray, " K"],
-    line: Int[np.ndarray, " K"],
-    periods: int,
+    experiment: Int[np.ndarray, " K"], line: Int[np.ndarray, " K"], periods: int
 ) -> None:
     """Check that no two lines of one experiment have the same class.
 

@@ -30,13 +30,7 @@ from ..weights import SMALLEST_ERROR, check_values, error_weights
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
-from .realization import (
-    answers_at_once,
-    default_horizon,
-    given_dims,
-    realize,
-    subspace_model,
-)
+from .realization import answers_at_once, default_horizon, given_dims, realize, subspace_model
 
 
 Problem = FrequencyProblem | SeriesProblem

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 from scipy import special
 
-from ..._core.arguments import Numbers, names
+from ..._core.arguments import Numbers, names, require_axes
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Order, SignalNames
 from ..._core.boundary.values import Integers, Reals
@@ -125,8 +125,7 @@ def given_dims(dims: Any, N: int, name: str = "dims") -> list[int] | None:
     if dims is None:
         return None
     chosen = np.broadcast_to(np.asarray(dims), N) if np.ndim(dims) == 0 else np.asarray(dims)
-    if chosen.shape != (N,):
-        raise DefinitionError(f"`{name}` must be one for each of {N} sections, not {len(chosen)}.")
+    require_axes(f"`{name}`", chosen, {"sections": N})
     return [int(d) for d in chosen]
 
 
@@ -254,9 +253,7 @@ def subspace_model(
         root = np.linalg.qr(section.past(past), mode="r")
         _, s, vh = np.linalg.svd(root @ ahead, full_matrices=False)
         if dims[n] > len(s):
-            raise DefinitionError(
-                f"the past shows {len(s)} dimensions of the state, not {dims[n]}."
-            )
+            raise DefinitionError(f"the past shows {len(s)} dimensions, not {dims[n]}.")
         kept = np.maximum(s[: dims[n]], _SHRINKAGE * s[0])
         to_state.append(ahead @ (vh[: dims[n]].T / kept * np.sqrt(len(section.y))))
     return _from_states(sections, to_state, past, innovations, direct)
@@ -344,11 +341,7 @@ def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _from_states(
-    sections: list[_Section],
-    to_state: list[np.ndarray],
-    past: int,
-    innovations: bool,
-    direct: bool,
+    sections: list[_Section], to_state: list[np.ndarray], past: int, innovations: bool, direct: bool
 ) -> PeriodicModel:
     N, nu = len(sections), sections[0].u.shape[1]
     C, D, A, B, K = [], [], [], [], []

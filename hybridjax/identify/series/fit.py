@@ -123,6 +123,7 @@ class SeriesFit(MultiplierEstimate):
 
 
 @checked
+@one_blas_thread()
 def fit_series(
     data: RecordedData,
     order: Order | LDTP,
@@ -159,19 +160,7 @@ def fit_series(
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
-    return fit_records(PreparedRecords(data), order, overhang, start, errors, check)
-
-
-@one_blas_thread()
-def fit_records(
-    records: PreparedRecords,
-    order: int,
-    overhang: int | None = None,
-    start: Literal["free", "cycle"] = "free",
-    errors: Literal["residuals", "white"] = "residuals",
-    check: bool = True,
-) -> SeriesFit:
-    """Fit records that are prepared; see `fit_series`."""
+    records = data if isinstance(data, PreparedRecords) else PreparedRecords(data)
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
     delayed = delayed_outputs(problem, order)
@@ -306,9 +295,7 @@ _WHITE_DRAWS, _FILTERED_DRAWS = 4, 16
 
 
 def coefficient_covariance(
-    problem: OutputErrorProblem,
-    solution: Linearization,
-    errors: Literal["residuals", "white"],
+    problem: OutputErrorProblem, solution: Linearization, errors: Literal["residuals", "white"]
 ) -> Covariance:
     """Return the covariance of c; with "residuals" errors may depend on each other and on u."""
 

@@ -68,19 +68,19 @@ def drift_waves(record: Record) -> Float[np.ndarray, "T K"]:
 class PreparedRecords:
     """Records as grids of similar lengths.
 
-    **Fields:** `n_sections`, `lead`, `inputs`, `outputs`: as in `Record`. `grids`: the grids.
-    `cycles`: number of cycles of the longest record. `sampled` (N, ny): number of samples. `scale`
-    (ny,): rms of the outputs.
+    **Fields:** `records`, without unknown inputs. `n_sections`, `lead`, `inputs`, `outputs`: as in
+    `Record`. `grids`: the grids. `cycles`: number of cycles of the longest record. `sampled` (N,
+    ny): number of samples. `scale` (ny,): rms of the outputs.
     """
 
     def __init__(self, data: RecordedData):
         """**Raises:** `DefinitionError` as `uninterrupted_records`, and for signals that are zero
         or missing at every sample."""
-        self._records = uninterrupted_records(data)
-        about = self._records[0]
+        self.records = uninterrupted_records(data)
+        about = self.records[0]
         self.n_sections, self.lead = about.n_sections, about.lead
         self.inputs, self.outputs = about.inputs, about.outputs
-        self.grids = _grids(self._records)
+        self.grids = _grids(self.records)
         self.cycles = 0
         self.sampled = np.zeros((self.n_sections, len(self.outputs)), int)
         excited, square = np.zeros(len(self.inputs), bool), np.zeros(len(self.outputs))
@@ -89,17 +89,14 @@ class PreparedRecords:
             self.sampled += grid.sampled.sum(axis=(0, 1))
             excited |= grid.u.any(axis=(0, 1, 2))
             square += (grid.y**2).sum(axis=(0, 1, 2))
-        for name, nonzero in zip(self.inputs, excited, strict=True):
-            if not nonzero:
-                raise DefinitionError(f"the input {name} is zero at every sample.")
-        for name, size in zip(self.outputs, square, strict=True):
+        for name, size in zip(self.inputs + self.outputs, [*excited, *square], strict=True):
             if not size:
-                raise DefinitionError(f"the output {name} is zero or missing at every sample.")
+                raise DefinitionError(f"{name} is zero or missing at every sample.")
         self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / self.sampled.sum(axis=0))
 
     def whole(self) -> CycleGrid:
         """Return all records on one grid."""
-        return CycleGrid.from_records(self._records)
+        return CycleGrid.from_records(self.records)
 
 
 def _grids(records: Sequence[Record]) -> list[CycleGrid]:

@@ -1,6 +1,5 @@
 """The phase response curve of a rhythm, from the times of its events under a known input."""
 
-from collections.abc import Iterator
 from typing import Annotated
 
 import equinox as eqx
@@ -15,10 +14,10 @@ from ..._core.boundary.values import Reals
 from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.signal import Signal, unit_of, with_unit
-from ..._core.text import p_value
 from ...errors import DefinitionError
 from ...orbits.crossing import AtEvent, Crossing
 from ..findings import Finding, print_findings
+from ..fit_warnings import about_phase_response
 from ..phase import Phase
 from ..phase_estimation import estimate_phase
 from ..recording import Recording
@@ -26,11 +25,6 @@ from ..smoothing import Series
 from .estimation import WAVES, CurveFit, accuracy_of, fit_curve, plain_curve
 from .model import Intervals, basis, intervals_of
 
-
-# Limits of warnings: correlation of neighboring residuals, and level of the test for a flat curve.
-# Larger (the level: smaller): a user trusts what the data do not support. Smaller: every curve
-# comes with warnings.
-_MEMORY, _LEVEL = 0.2, 0.01
 
 Phases = Annotated[Numbers, Reals("n")]
 
@@ -87,7 +81,7 @@ class PhaseResponse(eqx.Module):
     @property
     def warnings(self) -> tuple[Finding, ...]:
         """Limits of what the data support."""
-        return tuple(_warnings(self))
+        return tuple(about_phase_response(self))
 
     def __call__(self, phase: Phases) -> Series:
         """Return the curve at some phases, in cycles."""
@@ -205,36 +199,3 @@ def _memory(intervals: Intervals, fit: CurveFit) -> float:
     if follows.sum() < 3:
         return 0.0
     return float(np.corrcoef(missed[1:][follows], missed[:-1][follows])[0, 1])
-
-
-def _warnings(r: PhaseResponse) -> Iterator[Finding]:
-    mean, flat = abs(r.coefficients[0]), r.left_out_flat
-    text = f"it adds {r.left_out - flat:.3f} to the R2 of intervals left out; a flat curve has "
-    text += f"{flat:.3f} of {r.left_out:.3f}."
-    if r.p_flat > _LEVEL:
-        text = f"nothing is seen of it ({p_value(r.p_flat)} for a flat one, with R2 {flat:.3f})."
-    yield Finding("shape", text)
-    low, high = r.interval(r.phase)
-    half = (high - low) / 2
-    if half.max() > mean / 2:
-        worst = int(np.argmax(half))
-        text = f"at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
-        yield Finding("wide", f"{text}either side, more than half of the mean.")
-    off = np.sqrt(np.mean((r.plain - r.values) ** 2))
-    if off > np.sqrt(np.mean(r.errors**2)):
-        text = f"at phases that grow linearly it would be off by {off:.2g} (rms, of a mean of "
-        yield Finding("plain regression", f"{text}{mean:.2g}); do not use it here.")
-    finest = max(1, round(1 / (np.pi * max(r.jitter, 1e-6))))
-    text = f"the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than harmonic "
-    yield Finding("resolution", f"{text}{finest} at the end of a cycle.")
-    if r.excess > 2:
-        text = f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
-        yield Finding("misfit", f"{text}independent errors: the phase model lacks something.")
-    if abs(r.memory) > _MEMORY:
-        text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the phase"
-        yield Finding("memory", f"{text} is not all of the state. Standard errors allow for it.")
-    if r.miscounted:
-        text = f"{r.miscounted} of {r.intervals} intervals miss the model by half a cycle or more"
-        yield Finding("miscounted", f"{text}, as if an event had been missed; they are not used.")
-    if r.result != Result.OK:
-        yield Finding("no convergence", f"{Result(r.result).message}.")

@@ -50,8 +50,7 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
         if node.dtype.kind in "fiu" and not text:
             if node.external or node.is_virtual:
                 raise FileFormatError(
-                    f"'{path}': '{name}' lies in other files, which are not read: copy its values "
-                    "into this file."
+                    f"'{path}': '{name}' lies in other files: copy its values into this file."
                 )
             unit = node.attrs.get("units", "")
             leaves[place] = Leaf(node, unit.decode() if isinstance(unit, bytes) else str(unit))

@@ -184,9 +184,7 @@ def two_columns(path: Path, names: Sequence[str]) -> None:
 def check_rows(path: Path, rows: int, declared: Any, what: str) -> None:
     """**Raises:** `FileFormatError` for another number of rows than the header declares."""
     if declared is not None and str(declared) != str(rows):
-        raise FileFormatError(
-            f"'{path}' has {rows} {what}, but its header says {declared}: it is damaged."
-        )
+        raise FileFormatError(f"'{path}' is damaged: {rows} {what}, but a header of {declared}.")
 
 
 @contextmanager

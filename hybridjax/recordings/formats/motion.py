@@ -1,4 +1,7 @@
-"""Text files with or without the layouts of OpenSim, Motion Analysis and Vicon."""
+"""Text files with or without the layouts of OpenSim, Motion Analysis and Vicon.
+
+`read_text` recognizes a layout by its first lines; those of other makers (Noraxon) belong here.
+"""
 
 from collections.abc import Iterator
 from itertools import zip_longest
@@ -82,9 +85,7 @@ def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
         yield Columns({"time (s)": time} | table.values, table.notes)
         rates.add(rate / parts)
     if len(rates) > 1:
-        raise FileFormatError(
-            f"'{path}' has blocks whose frames differ in rate: export them one by one."
-        )
+        raise FileFormatError(f"'{path}' has blocks of different rates: export them one by one.")
 
 
 def _names(devices: list[str], components: list[str], units: list[str]) -> list[str]:

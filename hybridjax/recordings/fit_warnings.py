@@ -1,7 +1,11 @@
-"""Reasons to doubt a fit to recorded data, and how many strides a better one needs."""
+"""Reasons to doubt what is estimated from recordings, and how many strides a better fit needs.
+
+Warnings about the signals themselves are made in `inspection/`.
+"""
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -16,7 +20,6 @@ from ..identify.series.fit import SeriesFit, delayed_outputs, ordinary_least_squ
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validate import Validation
-from .beats.response import PhaseResponse
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import Finding, print_findings
 
@@ -31,6 +34,13 @@ _SAME_OUTPUTS = 0.98
 # Least modulus of a multiplier that may be that of a tone, and what is left of its mode at the end
 # of a record. Larger: hum passes. Smaller: slow modes are called hum.
 _DAMPED, _DECAYED = 0.9, 0.1
+# Cycles per record below which there are few. Larger: every result comes with the warning.
+# Smaller: a user trusts biased multipliers.
+_FEW_CYCLES = 50
+# Limits of warnings: correlation of neighboring residuals, and level of the test for a flat curve.
+# Larger (the level: smaller): a user trusts what the data do not support. Smaller: every curve
+# comes with warnings.
+_MEMORY, _LEVEL = 0.2, 0.01
 
 
 class Advice(eqx.Module):
@@ -61,7 +71,6 @@ def advise(
     fit: SeriesFit,
     validation: Validation | None = None,
     findings: Sequence[Finding] = (),
-    curve: PhaseResponse | None = None,
 ) -> Advice:
     """List the reasons to doubt a fit to recorded data.
 
@@ -72,8 +81,7 @@ def advise(
 
     **Arguments:** `data`: the data at the sections. `fit`: the result of `fit_series`.
     `validation`: a validation on held-out strides, whose tests are reported. `findings`: findings
-    of an inspection, which come first. `curve`: a phase response curve estimated from events alone;
-    its warnings come last. Default: None.
+    of an inspection and of other estimates, which come first. Default: none.
     """
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
@@ -112,7 +120,6 @@ def advise(
         if count:
             text = f"{count} samples of {name} stuck out of all around them, and were left out."
             warnings.append(Finding("spikes", text))
-    warnings += () if curve is None else curve.warnings
     # Variances decrease with the number of strides beyond that of the unknowns.
     strides = (100, 300, 1000, 3000)
     later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
@@ -175,3 +182,58 @@ def _about_residuals(validation: Validation) -> Iterator[Finding]:
         of_input = f"{text}depend on the input ({p_value(validation.independence.min())}), as with "
         of_input += "few strides or pushes beyond the linear range: record more, or push less; if "
         yield Finding("left over", f"{of_input}it remains, raise the `order`.")
+
+
+def about_natural_multipliers(result: Any) -> Iterator[Finding]:
+    """Limits of a result of `natural_multipliers`."""
+    low, high = result.interval()[0]
+    modulus, plain = abs(result.multipliers[0]), abs(result.plain[0])
+    text = f"the largest modulus lies between {low:.2f} and {high:.2f} (95 %), from {result.cycles}"
+    yield Finding("width", f"{text} cycles; four times as many would halve that.")
+    each = result.cycles / result.records
+    if each < _FEW_CYCLES:
+        bias = f"a bias of about {(1 + 3 * modulus) / each:.2f} was corrected to first order only."
+        yield Finding("few cycles", f"{each:.3g} in each of {result.records} records; {bias}")
+    if result.strength < 0.5:
+        text = f"earlier sections explain {100 * result.strength:.0f} % of the states' variance."
+        yield Finding("weak instruments", text)
+    if high >= 1:
+        text = f"the interval of the largest modulus reaches {high:.2f}, beyond 1."
+        yield Finding("stability", text)
+    more = "less" if modulus > plain else "more"
+    text = f"least squares gives {plain:.3f} for the largest modulus, {abs(modulus - plain):.3f}"
+    yield Finding("noise", f"{text} {more}.")
+
+
+def about_phase_response(r: Any) -> Iterator[Finding]:
+    """Limits of a result of `phase_response`."""
+    mean, flat = abs(r.coefficients[0]), r.left_out_flat
+    text = f"it adds {r.left_out - flat:.3f} to the R2 of intervals left out; a flat curve has "
+    text += f"{flat:.3f} of {r.left_out:.3f}."
+    if r.p_flat > _LEVEL:
+        text = f"nothing is seen of it ({p_value(r.p_flat)} for a flat one, with R2 {flat:.3f})."
+    yield Finding("shape", text)
+    low, high = r.interval(r.phase)
+    half = (high - low) / 2
+    if half.max() > mean / 2:
+        worst = int(np.argmax(half))
+        text = f"at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
+        yield Finding("wide", f"{text}either side, more than half of the mean.")
+    off = np.sqrt(np.mean((r.plain - r.values) ** 2))
+    if off > np.sqrt(np.mean(r.errors**2)):
+        text = f"at phases that grow linearly it would be off by {off:.2g} (rms, of a mean of "
+        yield Finding("plain regression", f"{text}{mean:.2g}); do not use it here.")
+    finest = max(1, round(1 / (np.pi * max(r.jitter, 1e-6))))
+    text = f"the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than harmonic "
+    yield Finding("resolution", f"{text}{finest} at the end of a cycle.")
+    if r.excess > 2:
+        text = f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
+        yield Finding("misfit", f"{text}independent errors: the phase model lacks something.")
+    if abs(r.memory) > _MEMORY:
+        text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the phase"
+        yield Finding("memory", f"{text} is not all of the state. Standard errors allow for it.")
+    if r.miscounted:
+        text = f"{r.miscounted} of {r.intervals} intervals miss the model by half a cycle or more"
+        yield Finding("miscounted", f"{text}, as if an event had been missed; they are not used.")
+    if r.result != Result.OK:
+        yield Finding("no convergence", f"{Result(r.result).message}.")

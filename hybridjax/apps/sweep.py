@@ -22,7 +22,7 @@ def run(options: Any) -> int:
     if len(over) < len(options.over):
         raise DefinitionError("a parameter has two axes: give each `--over` another name.")
     file, name = options.model
-    maps = sweep(_load(file, name), over, options.want, store=options.out, force=options.force)
+    maps = sweep(_load(file, name), over, options.want, store=options.out)
     print(maps)
     converged = int((maps.result == 0).sum())
     print(f"{converged} of {maps.result.size} points have a limit cycle")

@@ -1,9 +1,13 @@
-"""The results of a recording in files, and in one page of HTML that needs no other file."""
+"""The command `hybridjax identify`: what it prints, and the files and the report that it writes.
+
+(The text about a result is that of `recordings.identification.Identification`.)
+"""
 
 import base64
 import contextlib
 import csv
 import json
+import os
 import re
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -16,12 +20,16 @@ from .. import __version__, plot
 from .._core import html
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath
+from .._core.results import Result
 from .._core.text import listed
 from .._core.writing import Format, results_folder
 from ..io import save
 from ..linear.htf import HTF
+from ..orbits.crossing import AtEvent, Crossing
 from ..plot import look
-from ..recordings.identification import Identification
+from ..recordings.identification import Identification, identify_recording
+from ..recordings.read import read_recording
+from ..sections.families import KinematicPhase
 from .paper_report import complex_pairs
 
 
@@ -45,6 +53,35 @@ _CAPTIONS = {
     "sections": "Average cycle; deviations with twice their standard deviation; power of inputs, "
     "and outputs from cycle to cycle at the section where they vary most.",
 }
+
+
+def run(options: Any) -> bool:
+    """Identify, print and write a report, from the options of the command; whether the fit has
+    converged."""
+    with report_folder(options.out, options.input, options.formats) as folder:
+        named = (*options.input, *options.outputs, *(options.phase or (options.crossing or ())[:1]))
+        signals = tuple(dict.fromkeys(named))
+        recording = read_recording(*options.files, time=options.time, signals=signals)
+        print(recording)
+        if options.phase is not None:
+            position, velocity = options.phase
+            sections: Any = KinematicPhase(
+                options.sections, position=position, velocity=velocity,
+                center=options.center, scale=options.scale,
+            )  # fmt: skip
+        elif options.crossing is not None:
+            sections = Crossing(*options.crossing)
+        else:
+            sections = AtEvent(options.event)
+        result = identify_recording(
+            recording, sections, inputs=options.input, outputs=options.outputs,
+            n_sections=options.sections, order=options.order, bandwidth=options.bandwidth,
+            timing=options.timing, drift=options.drift,
+        )  # fmt: skip
+        print(result)
+        write_results(folder, result, options.formats)
+    print(os.path.join(options.out, PAGE))
+    return result.fit.result == Result.OK
 
 
 @checked
