@@ -2,11 +2,11 @@
 
 python benchmarks/orders.py [--runs 4]
 
-Each run is a process that computes the cycle, its linearization and two experiments of all systems, in
-an order of its own: the first two in opposite orders, so that of each pair either comes first, the
-others in random ones. For each system: the largest difference between two runs of states on the
-cycle and of outputs in experiments, relative to the states' scales; of the matrices of the
-linearization, relative to the largest; and the error that the experiments state.
+Each run is a process that computes the cycle, its linearization and two experiments of all systems,
+in an order of its own: the first two in opposite orders, so that each of the 300 pairs comes in
+both, the others in random ones. For each system: the largest difference between two runs of states
+on the cycle and of outputs in experiments, and of the matrices of the linearization, each relative
+to the largest; and the error that the experiments state.
 """
 
 import argparse
@@ -43,11 +43,11 @@ def results(case: Case) -> dict[str, np.ndarray]:
     )
     u = design.inputs(cycles=4)[:2]
     data = hj.run_experiments(cycle, placed, u, case.output, start="cycle", discard=0)
-    scale = np.asarray(cycle.settings.scale)
+    q, y = np.asarray(placed.lanes.q), np.nan_to_num(data.y)
     return {
-        "cycle": np.asarray(placed.lanes.q) / scale[np.asarray(placed.lanes.chart)].T,
+        "cycle": q / (np.abs(q).max(axis=1, keepdims=True) + 1e-300),
         "linearization": np.concatenate([np.ravel(x) for x in (*model.A, *model.B, *model.C)]),
-        "experiments": data.y / (np.abs(data.y).max() + np.abs(data.cycle_outputs).max()),
+        "experiments": y / (np.abs(y).max() + np.abs(data.cycle_outputs).max()),
         "stated": np.asarray(data.error),
     }
 

@@ -41,7 +41,8 @@ _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), rang
 _PACKAGE = os.path.join(pathlib.Path(__file__).parents[1], "")
 _MODELS = os.path.join(_PACKAGE, "models")
 _FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib"))
-_INSTALLED = re.compile(r"[\\/](site|dist)-packages[\\/]")  # of a user, a distribution, or Python
+# Packages of a user and of a distribution lie elsewhere than those of Python.
+_INSTALLED = re.compile("|".join([*map(re.escape, _FOLDERS), r".*[\\/](site|dist)-packages[\\/]"]))
 
 
 Thing = TypeVar("Thing")
@@ -184,8 +185,7 @@ class _Walk:
         wrapped = getattr(x, "__wrapped__", None)
         # A wrapper of a package may remember what it has been called with.
         registered = vars(x).get("registry")  # the functions of one that dispatches by type
-        is_wrapper = is_installed and wrapped
-        self.visit_all((wrapped, registered) if is_wrapper else (x.__closure__ or ()))
+        self.visit_all((wrapped, registered) if is_installed and wrapped else x.__closure__ or ())
         self.visit_all((x.__defaults__, x.__kwdefaults__))
         if not is_installed:
             self.visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})
@@ -197,7 +197,7 @@ class _Walk:
         modules = {x: sys.modules.get(x, sys.modules.get(f"{package}.{x}")) for x in imported}
         if _FRAMES & {*names}:
             self._refuse_hidden(x, (), globals)
-        if not self.classes and "read_text" in names:
+        if not self.classes and {"read_text", "read_bytes"} & {*names}:
             self._refuse_hidden(x, (), pathlib.Path.read_text)
         for path in (*paths, *((name, "") for name in imported)):
             value = modules[path[0]] if path[0] in modules else x.__globals__.get(path[0])
@@ -334,5 +334,4 @@ def _is_installed(module: str | None) -> bool:
 @ft.cache
 def is_of_package(path: str) -> bool:
     """Test whether a file belongs to Python or to a package, `hybridjax.models` excepted."""
-    is_installed = path.startswith(_FOLDERS) or _INSTALLED.search(path) is not None
-    return is_installed and not path.startswith(_MODELS)
+    return _INSTALLED.match(path) is not None and not path.startswith(_MODELS)
