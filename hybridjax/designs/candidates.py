@@ -195,18 +195,13 @@ def measured_htfs(
         members = np.flatnonzero(cosines.channel == i)
         htf = model.htf(cosines.f[members], harmonics)
         spectrum = noise.spectrum(cosines.f[members], htf.harmonics)
-        variance = 2 * spectrum[..., None] / (cosines.n_sections * cosines.strides)
-        yield Measured(with_variance(htf, noise, variance, int(i)), members, int(i))
-
-
-def with_variance(
-    htf: HTF, noise: Noise, variance: Float[np.ndarray, "M F ny 1"], channel: int
-) -> HTF:
-    """Return the HTFs from one input to the measured outputs, with these variances."""
-    H: Any = np.asarray(htf.H)[:, :, noise.outputs, channel : channel + 1]
-    inputs, outputs = (htf.inputs[channel],), tuple(htf.outputs[k] for k in noise.outputs)
-    other: Any = variance
-    return dataclasses.replace(htf, H=H, variance=other, inputs=inputs, outputs=outputs)
+        variance: Any = 2 * spectrum[..., None] / (cosines.n_sections * cosines.strides)
+        H: Any = np.asarray(htf.H)[:, :, noise.outputs, i : i + 1]
+        outputs = tuple(htf.outputs[k] for k in noise.outputs)
+        htf = dataclasses.replace(
+            htf, H=H, variance=variance, inputs=htf.inputs[i : i + 1], outputs=outputs
+        )
+        yield Measured(htf, members, int(i))
 
 
 @checked

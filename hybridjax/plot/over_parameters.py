@@ -36,14 +36,13 @@ def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = N
     """
     names = {b.parameter for b in branches}
     if len(names) != 1:
-        raise DefinitionError(
-            f"branches in one figure need one parameter; these have {sorted(names)}."
-        )
+        raise DefinitionError(f"branches in one figure need one parameter, not {sorted(names)}.")
     with panels(ax) as axes:
         panel = axes[0, 0]
         shown = set()
         for b, color in zip(branches, itertools.cycle(CYCLE)):
-            name = _first_state(b) if output is None else output
+            first = b[0].structure.charts[int(b[0].anchor.chart[0])].states[0]
+            name = first if output is None else output
             height = b.largest(name)
             for part, stable in _parts(b):
                 panel.plot(b.values[part], height[part], "-" if stable else "--", color=color)
@@ -64,11 +63,6 @@ def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = N
         panel.locator_params(axis="x", nbins=6)
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return Plot(axes)
-
-
-def _first_state(branch: Branch) -> str:
-    cycle = branch[0]
-    return cycle.structure.charts[int(cycle.anchor.chart[0])].states[0]
 
 
 def _parts(branch: Branch) -> list[tuple[slice, bool]]:
