@@ -317,7 +317,7 @@ def validate(
         """Return how often each section was sampled with so many samples before it."""
         return (grid.sampled & (before >= lags)[..., None]).sum(axis=(0, 1))
 
-    sampled, sizes = count(0), [*grid.u.any(axis=(0, 1, 2)), *spread]
+    sampled, sizes = count(0), [*np.abs(grid.u).max(axis=(0, 1, 2)), *spread]
     for name, size in zip(records[0].inputs + outputs, sizes, strict=True):
         if not size:
             raise DefinitionError(f"{name} is constant or missing at every sample.")
