@@ -24,6 +24,7 @@ CASES = {
     "designs": ("designs.py --draws 40", 25, "strides that optimal designs save"),
     "parameters": ("fitting.py --seeds 10 --draws 40", 10, "physical parameters from data"),
     "second-order": ("second_order.py", 2, "second-order products on lines, and draws without"),
+    "jumps": ("jumps.py --draws 200", 6, "random systems with jumps and pulses, right or refused"),
     "scale": ("scale.py", 30, "sweeps and experiments on several processes"),
     "boundary": ("boundary.py", 1, "the cost of checking arguments"),
     "truth-chain": ("chain_truth.py", 1, "ground truth, independent of the package"),

@@ -1,4 +1,5 @@
 import json
+import os
 import pickle
 
 import jax
@@ -172,8 +173,10 @@ def test_where_nothing_can_be_written_or_read(folder, things):
     (folder / "taken.npz").mkdir()
     with pytest.raises(hj.DefinitionError, match="cannot write .*Is a directory"):
         hj.save(folder / "taken.npz", things[0])
-    with pytest.raises(hj.DefinitionError, match="cannot read .*No such file or directory"):
-        hj.load(folder / "absent.npz")
+    os.mkfifo(folder / "pipe.npz")
+    for name, problem in (("absent", "cannot read .*No such file"), ("pipe", "is empty")):
+        with pytest.raises(hj.errors.HybridJaxError, match=problem):
+            hj.load(folder / f"{name}.npz")
     assert not [p for p in folder.iterdir() if p.name.startswith(".")]
 
 

@@ -221,6 +221,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     **Raises:** `OSError` if the file cannot be read; `FileFormatError` if it is damaged, no npz
     file, holds Python objects, or declares more than `limits` allow.
     """
+    if path.stat().st_size == 0:  # also of a pipe or device, which may have no end
+        raise FileFormatError(f"'{path}' is empty.")
     with open(path, "rb") as file:
         if not zipfile.is_zipfile(file):
             raise FileFormatError(f"'{path}' is not an npz file, or is damaged.")

@@ -90,14 +90,14 @@ def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
     if not stat.S_ISDIR(here.st_mode):
         raise PermissionError(f"'{programs}' is no folder")
     _refuse_others(programs, is_above=False)
-    entries = {path: path.lstat() for path in programs.iterdir()}
-    for path, about in entries.items():
+    marks = [path.name for path in programs.glob(f"{_MARK}*")]
+    if marks != [f"{_MARK}{here.st_ino}"]:
+        raise PermissionError(f"'{programs}' was not made in this place: move it away")
+    for path in programs.iterdir():
+        about = path.lstat()
         is_ours = about.st_uid == here.st_uid and about.st_nlink == 1  # and no link to others'
         if not (stat.S_ISREG(about.st_mode) and about.st_size <= _LARGEST and is_ours):
-            raise PermissionError(f"'{path}' is no compiled program: delete it")
-    marks = [path.name for path in entries if path.name.startswith(_MARK)]
-    if marks != [f"{_MARK}{here.st_ino}"]:
-        raise PermissionError(f"'{programs}' was not made in this place: delete it")
+            raise PermissionError(f"'{path}' is no compiled program: move it away")
     return programs
 
 
@@ -115,9 +115,8 @@ def _refuse_others(path: pathlib.Path, is_above: bool) -> None:
         return
     about, user = path.lstat(), os.geteuid()
     is_open = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    if is_above and is_open == stat.S_IWGRP and _is_alone(about.st_gid):
-        is_open = False
-    if is_above and about.st_mode & stat.S_ISVTX:
+    is_alone = is_open == stat.S_IWGRP and _is_alone(about.st_gid)
+    if is_above and (about.st_mode & stat.S_ISVTX or is_alone):
         is_open = False
     if is_open or about.st_uid not in (user, 0 if is_above else user):
         raise PermissionError(f"other users can write to '{path}'")

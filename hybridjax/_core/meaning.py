@@ -20,7 +20,7 @@ import sys
 import sysconfig
 import types
 import weakref
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar, cast
 
 import equinox as eqx
@@ -38,9 +38,11 @@ _HIDDEN = re.compile("eval|exec|globals|__import__|import_module|getenv|check_ou
 _READING = re.compile("open|(read|open|load)_.+|load|loadtxt|loadmat|genfromtxt|fromfile|memmap")
 _FRAMES = {"__globals__", "f_globals", "f_locals"}
 _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range
-_PACKAGE = str(pathlib.Path(__file__).parents[1])
+_PACKAGE = os.path.join(pathlib.Path(__file__).parents[1], "")
 _MODELS = os.path.join(_PACKAGE, "models")
-_FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib", "purelib"))
+_FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib"))
+# Packages of a user and of a distribution lie elsewhere than those of Python.
+_INSTALLED = re.compile("|".join([*map(re.escape, _FOLDERS), r".*[\\/](site|dist)-packages[\\/]"]))
 
 
 Thing = TypeVar("Thing")
@@ -183,8 +185,7 @@ class _Walk:
         wrapped = getattr(x, "__wrapped__", None)
         # A wrapper of a package may remember what it has been called with.
         registered = vars(x).get("registry")  # the functions of one that dispatches by type
-        is_wrapper = is_installed and wrapped
-        self.visit_all((wrapped, registered) if is_wrapper else (x.__closure__ or ()))
+        self.visit_all((wrapped, registered) if is_installed and wrapped else x.__closure__ or ())
         self.visit_all((x.__defaults__, x.__kwdefaults__))
         if not is_installed:
             self.visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})
@@ -196,7 +197,7 @@ class _Walk:
         modules = {x: sys.modules.get(x, sys.modules.get(f"{package}.{x}")) for x in imported}
         if _FRAMES & {*names}:
             self._refuse_hidden(x, (), globals)
-        if not self.classes and "read_text" in names:
+        if not self.classes and {"read_text", "read_bytes"} & {*names}:
             self._refuse_hidden(x, (), pathlib.Path.read_text)
         for path in (*paths, *((name, "") for name in imported)):
             value = modules[path[0]] if path[0] in modules else x.__globals__.get(path[0])
@@ -262,10 +263,11 @@ class _Walk:
             self.visit_all(part for item in x.items() for part in item)
         is_wrapped = isinstance(x, eqx.Module) or hasattr(x, "__wrapped__")
         if _is_installed(type(x).__module__) and not is_wrapped:
+            parts = None
             with contextlib.suppress(Exception):  # whatever an object raises that cannot be pickled
-                _, arguments, *parts = x.__reduce_ex__(4)
-                state, *items = parts or [None]
-                return self.visit_all([arguments, state, *(list(y or ()) for y in items)])
+                parts = [list(y) if isinstance(y, Iterator) else y for y in x.__reduce_ex__(4)[1:]]
+            if parts is not None:
+                return self.visit_all(parts)
         items = sorted(getattr(x, "__dict__", {}).items())
         state = {k: v for k, v in items if not _is_description(k, v)}
         if isinstance(x, Definition):
@@ -332,4 +334,4 @@ def _is_installed(module: str | None) -> bool:
 @ft.cache
 def is_of_package(path: str) -> bool:
     """Test whether a file belongs to Python or to a package, `hybridjax.models` excepted."""
-    return path.startswith(_FOLDERS) and not path.startswith(_MODELS)
+    return _INSTALLED.match(path) is not None and not path.startswith(_MODELS)

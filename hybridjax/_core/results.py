@@ -27,6 +27,7 @@ class Result(enum.IntEnum):
     STEP_COLLAPSE = 14
     FIELD_NOT_FINITE = 15
     GUARD_PASSED = 16
+    PULSE_PASSED = 17
 
     @property
     def message(self) -> str:
@@ -56,6 +57,10 @@ _MESSAGES = {
     Result.GUARD_PASSED: (
         "a reset put the state on a guard, through which it then went without an event: what comes "
         "to rest there needs a chart of its own"
+    ),
+    Result.PULSE_PASSED: (
+        "the field or a guard has a pulse, or another sudden change, over which steps pass: begin "
+        "and end it by transitions (`hj.Scheduled` at known times)"
     ),
     Result.STEP_COLLAPSE: (
         "steps shrank to nothing although the state hardly moves: a field that jumps must do so at "

@@ -128,7 +128,7 @@ def _listed(folder: Path, kind: str) -> dict[str, list[str]]:
     if not os.path.lexists(path):
         return {}
     try:
-        if path.is_symlink() or path.stat().st_size > limits.TEXT:
+        if path.is_symlink() or not path.is_file() or path.stat().st_size > limits.TEXT:
             raise ValueError
         listed = json.loads(path.read_text())
         return {str(name): list(map(str, digests)) for name, digests in listed.items()}

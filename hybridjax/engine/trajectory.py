@@ -1,6 +1,6 @@
 """Single trajectories with their events, dense enough to plot."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
@@ -23,7 +23,8 @@ from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
 from .cubic import interpolate
-from .lanes import IDLE, start_lanes
+from .jumps import passed_over
+from .lanes import IDLE, Lanes, Tape, start_lanes
 from .move import Options, move
 from .settings import SIMULATION, Settings
 from .target import until
@@ -71,6 +72,14 @@ class Trajectory(eqx.Module):
     @property
     def system(self) -> HybridSystem:
         return self.structure.system
+
+    def until(self, k: int, result: Result) -> "Trajectory":
+        """The trajectory up to row k, where it ends for this reason."""
+        to = slice(k + 1)
+        return Trajectory(
+            self.structure, self.t[to], self.chart[to], self.before[to], self.after[to],
+            self.slope_before[to], self.slope_after[to], self.event[to], result,
+        )  # fmt: skip
 
     @property
     def events(self) -> list[Event]:
@@ -175,37 +184,49 @@ def simulate(
     u, end = constant[:, None], np.asarray(start.time) + np.array([duration], float)
     q = np.zeros((s.d, 1))
     q[: s.dims[a], 0] = start.state
-    lanes = start_lanes(s, np.array([start.time]), np.full(1, a, np.int32), q)
-    rows, steps, h = [(lanes.t, q.T, q.T, lanes.chart, np.full(1, -1))], 0, None
+    lanes = begin = start_lanes(s, np.array([start.time]), np.full(1, a, np.int32), q)
+    tapes, steps, h = [], 0, None
     while True:
         moved, tape = _piece(s, lanes, u, end, settings, h)
-        tape = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
-        columns = tape.t, tape.before, tape.after, tape.chart, tape.code
-        rows.append(tuple(x[tape.code != IDLE] for x in columns))
+        tapes.append(tape)
         lanes, h, steps = moved.lanes, moved.h, steps + settings.max_steps
         result = Result(int(np.asarray(moved.result)[0]))
         if result != Result.STEP_LIMIT or steps >= max_steps:
             break
-    t, before, after, charts, event = (np.concatenate(x) for x in zip(*rows, strict=True))
-    passed = _passed(s, t, charts, before, after, event, u)
+    path = recorded(s, begin, tapes, u, result)
+    passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
     if passed is not None:
-        rows, result = slice(passed + 1), Result.GUARD_PASSED
-        t, before, after, charts, event = (x[rows] for x in (t, before, after, charts, event))
+        path = path.until(passed, Result.GUARD_PASSED)
+    if (pulse := passed_over(path, constant, settings)) is not None:
+        path = path.until(pulse[0], Result.PULSE_PASSED)
+    if throw and path.result != Result.OK:
+        raise ComputationError(
+            f"the trajectory stopped at t = {path.t[-1]:.6g} in chart '{s.names[path.chart[-1]]}': "
+            f"{path.result.message}. `throw=False` returns it up to there."
+        )
+    return path
+
+
+def recorded(
+    s: Structure, begin: Lanes, tapes: Sequence[Tape], u: np.ndarray, result: Result
+) -> Trajectory:
+    """The trajectory of one lane, from the tapes of its pieces, under a constant input (nu, 1)."""
+    rows = [(begin.t, begin.q.T, begin.q.T, begin.chart, np.full(1, -1))]
+    for tape in tapes:
+        tape = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
+        columns = tape.t, tape.before, tape.after, tape.chart, tape.code
+        rows.append(tuple(x[tape.code != IDLE] for x in columns))
+    t, before, after, chart, event = (np.concatenate(x) for x in zip(*rows, strict=True))
 
     def rates(chart, q):
         # Filled up to whole pieces, so that few lengths are compiled.
-        fill = -len(t) % settings.max_steps
+        fill = -len(t) % len(tapes[0].code)
         end, chart, q = (np.concatenate([x, np.repeat(x[-1:], fill, 0)]) for x in (t, chart, q))
         return np.asarray(_slopes(s, end, chart, q.T, u))[:, : len(t)].T
 
-    source = np.concatenate([charts[:1], charts[:-1]])
-    left, right = rates(source, before), rates(charts, after)
-    if throw and result != Result.OK:
-        raise ComputationError(
-            f"the trajectory stopped at t = {t[-1]:.6g} in chart '{s.names[charts[-1]]}': "
-            f"{result.message}. `throw=False` returns it up to there."
-        )
-    return Trajectory(s, t, charts, before, after, left, right, event, result)
+    source = np.concatenate([chart[:1], chart[:-1]])
+    left, right = rates(source, before), rates(chart, after)
+    return Trajectory(s, t, chart, before, after, left, right, event, result)
 
 
 def _constant_input(system: HybridSystem, input) -> np.ndarray:

@@ -317,16 +317,14 @@ def validate(
         """Return how often each section was sampled with so many samples before it."""
         return (grid.sampled & (before >= lags)[..., None]).sum(axis=(0, 1))
 
-    sampled = count(0)
-    for name, few, size in zip(outputs, sampled.min(axis=0), spread, strict=True):
+    sampled, sizes = count(0), [*np.abs(grid.u).max(axis=(0, 1, 2)), *spread]
+    for name, size in zip(records[0].inputs + outputs, sizes, strict=True):
         if not size:
-            raise DefinitionError(f"the output {name} is constant or missing at every sample.")
-        if few < FEWEST_SAMPLES:
-            raise DefinitionError(
-                f"a section was sampled {few} times only; the tests need {FEWEST_SAMPLES} cycles."
-            )
+            raise DefinitionError(f"{name} is constant or missing at every sample.")
+    if (few := int(sampled.min())) < FEWEST_SAMPLES:
+        raise DefinitionError(f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles.")
     # One period, less for few cycles.
-    tried = range(1, min(N, int(sampled.min()) // _SAMPLES_PER_LAG) + 1)
+    tried = range(1, min(N, few // _SAMPLES_PER_LAG) + 1)
     enough = [count(lag).min() >= FEWEST_SAMPLES for lag in tried]
     lags = max(sum(map(bool, enough)), 1)
     if (count(lags).max(axis=0) < FEWEST_SAMPLES).any():

@@ -52,7 +52,7 @@ def _turn(systems, map: ReturnMap, anchor: Lanes, period, wanted):
         each = _one(map, *system)
         turned = each.turn_with_jacobian(each.anchor.q[:, 0], wanted)
         events = turned.codes.ravel(), turned.times.ravel()
-        turned = turned._replace(codes=None, times=None, record=None)
+        turned = turned._replace(codes=None, times=None, record=None, tapes=None)
         return each.anchor, each.expected, turned, *events
 
     return eqx.filter_vmap(turn)(systems, anchor, period)

@@ -1,6 +1,7 @@
 """Checks of a system's clock and of conserved quantities; the reasons of a search that failed."""
 
 import dataclasses
+import functools as ft
 import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, cast
@@ -12,6 +13,16 @@ from .._core.compilation import at_ease
 from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
 from ..engine import kernels
+from ..engine.jumps import (
+    column_name,
+    jumps,
+    lines_of_jumps,
+    may_have_pulses,
+    passed_over,
+    program_of,
+    sudden,
+)
+from ..engine.lanes import Tape
 from ..engine.trajectory import simulate
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
@@ -20,8 +31,7 @@ from ..systems.structure import Outputs, Structure
 from ..systems.system import HybridSystem, Output, OutputNames
 from ..systems.transition import Scheduled
 from .coincidence import SAME, coincident, events_of
-from .cycle import LimitCycle
-from .jumps import lines_of_decisions
+from .cycle import LimitCycle, orbit
 from .return_map import Turn
 from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 
@@ -29,6 +39,9 @@ from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 # The time at which functions are compared with those a period later, in parts of the period after
 # each point: fields that jump with a clock do not jump there.
 _BASE = 0.0729
+# Times of a period at which functions are compared that may have pulses. Fewer: short pulses of
+# another period are missed. More: time.
+_TIMES = 1024
 
 
 def check_periodic(system: HybridSystem) -> None:
@@ -83,8 +96,8 @@ def check_times(
     scale: Float[Array, "A d"],
     time: float,
 ) -> None:
-    """Compare fields, guards, resets, predicates and outputs with those one period of the clock
-    later, at K points.
+    """Compare fields, guards, resets, predicates and outputs with those one to three periods of the
+    clock later, at K points.
 
     **Arguments:** `scale`, sizes of the states by chart; `time`, a rough period.
 
@@ -93,11 +106,14 @@ def check_times(
     """
     if s.system.period() is None:
         return
-    for a in np.unique(chart):
+    for a in np.unique(chart).tolist():
         n, rows = s.dims[a], np.flatnonzero(chart == a)
         sizes = np.concatenate([[time], np.asarray(scale)[a, :n]])
-        for name, function in _functions(s, int(a)):
-            _compare(s, name, function, t[rows] + _BASE * time, q[:n, rows], sizes)
+        is_sudden = any(sudden(program_of(s, a, ft.partial(_all, s, a))))
+        every = -(-_TIMES // len(rows)) if is_sudden else 1
+        times = t[rows, None] + time * (_BASE + np.arange(every) / every)
+        for name, function in _functions(s, a):
+            _compare(s, name, function, times.ravel(), q[:n, rows].repeat(every, axis=1), sizes)
 
 
 def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
@@ -125,17 +141,25 @@ def _compare(s: Structure, name: str, function, t, q, size: Float[np.ndarray, " 
     by more than rounding, for times and states of this `size`."""
     clock: Any = s.system.period()
     period = float(clock)
-    now, later = function(t, q), function(t + period, q)
+    now, later = function(t, q), [function(t + k * period, q) for k in (1, 2, 3)]
+    change = np.abs(np.stack(later) - now).max(axis=0)
     slope = np.sum(np.abs(now[:, 1 : 1 + len(size)]) * size[:, None], axis=1)
-    differs = np.abs(later - now)[:, 0] > SAME * np.abs(now[:, 0]) + ROUNDING * slope
+    differs = change[:, 0] > SAME * np.abs(now[:, 0]) + ROUNDING * slope
     gains = slice(1 + len(size), None)  # derivatives by inputs
-    if np.any(differs) or np.any(
-        np.abs(later - now)[:, gains] > SAME * np.abs(now)[:, gains].max(initial=0.0)
-    ):
+    if np.any(differs) or np.any(change[:, gains] > SAME * np.abs(now)[:, gains].max(initial=0.0)):
         raise DefinitionError(
             f"{name} does not have the period {period:.6g} that {type(s.system).__name__}.period() "
             "states."
         )
+
+
+def _all(s: Structure, a: int, *point: Array) -> list[Array]:
+    """Values of all of the user's functions of chart a."""
+    watched = [s.guard(g, *point) for g in s.guards(a)]
+    after = [(s.reset(g, *point), s.enabled(g, *point)) for g in s.guards(a) + s.schedules(a)]
+    outputs = [s.resolve_outputs(x) for x in s.system.outputs()]
+    values = [x(a, *point) for x in outputs if x.defined(a)]
+    return [s.field(a, *point), *watched, *after, *values]
 
 
 def _functions(s: Structure, a: int) -> Iterator:
@@ -170,6 +194,46 @@ def _no_period(system: HybridSystem, problem: str) -> str:
         f"{problem}, but {type(system).__name__} states no period: give it a method `period()` "
         "that returns the time after which everything that depends on t repeats."
     )
+
+
+def check_jumps(cycle: LimitCycle, tapes: Tape | None = None) -> None:
+    """**Raises:** `DefinitionError` if the field of a chart jumps on the cycle without an event, or
+    has a pulse that is shorter than a step.
+
+    **Arguments:** `tapes`: see `orbit`.
+    """
+    s, period = cycle.structure, float(cycle.period)
+    charts = [a for a in range(len(s.charts)) if may_have_pulses(s, a)]
+    if not charts:
+        return
+    scale, path = np.asarray(cycle.settings.scale), orbit(cycle.return_map, tapes)
+    pulse = passed_over(path, np.zeros(s.nu), to_host(cycle.settings), linear=True)
+    if pulse is not None:
+        a, begin = int(path.chart[pulse[0]]), path.t[pulse[0]]
+        raise DefinitionError(
+            f"the {pulse[1]} in chart '{s.names[a]}' has a pulse, or another sudden change, over "
+            f"which the step from t = {begin:.6g} on passes{','.join(lines_of_jumps(s, a))}. Begin "
+            "and end it by transitions (`hj.Scheduled` at known times)."
+        )
+    t, chart, q = path.dense(16)  # (fewer: jumps are missed behind kinks; more: time)
+    events = path.t[path.event >= 0]
+    if path.event[-1] < 0:  # the cycle may begin where the field jumps
+        t, chart, q = (np.concatenate([x, x[1:2]]) for x in (t, chart, q))
+        t[-1] += period
+    for a in charts:
+        k = np.flatnonzero((chart[1:] == a) & (chart[:-1] == a) & (np.diff(t) > 0))
+        points = np.column_stack([t, q[:, : s.dims[a]]])
+        sizes = np.append(period, scale[a, : s.dims[a]])
+        for time, j, jump in jumps(s, a, points[k], points[k + 1], sizes) if len(k) else ():
+            apart = np.abs(time - events + period / 2) % period - period / 2
+            if np.abs(apart).min(initial=np.inf) > SAME * period:
+                raise DefinitionError(
+                    f"the {column_name(s, a, j)} in chart '{s.names[a]}' jumps by {jump:.3g} at "
+                    f"t = {time:.6g}{','.join(lines_of_jumps(s, a))}, where the cycle has no "
+                    "event: linearizations would lack the saltation. Write a chart for each side "
+                    "and a `Transition` between them, or `hj.sliding` for a surface along which "
+                    "the state may slide."
+                )
 
 
 def closes_early(cycle: LimitCycle) -> bool:
@@ -236,6 +300,11 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
         )
     if code == Result.NOT_CONVERGED and np.isnan(cycle.residual):
         reason = "Newton came to a state from where one period ends in another chart"
+    elif code == Result.NOT_CONVERGED and not np.all(np.isfinite(turn.factors)):
+        reason = (
+            "derivatives of the flow over one period are not finite: a function has none where the "
+            "cycle meets it, such as `sqrt(x)` and `x**0.0` at 0"
+        )
     elif code == Result.NOT_CONVERGED:
         reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
         if cycle.conserved:
@@ -278,7 +347,7 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
 
 def _about_decisions(s: Structure) -> str:
     """The lines at which fields may jump."""
-    lines = dict.fromkeys(x for a in range(len(s.charts)) for x in lines_of_decisions(s, a) if x)
+    lines = dict.fromkeys(x for a in range(len(s.charts)) for x in lines_of_jumps(s, a))
     if not lines:
         return ""
     return (

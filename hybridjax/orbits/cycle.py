@@ -18,11 +18,11 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
-from ..engine.lanes import Lanes
+from ..engine.lanes import Lanes, Tape
 from ..engine.move import Options, move
 from ..engine.replay import Link, divergence, links
 from ..engine.settings import Settings
-from ..engine.trajectory import Trajectory, simulate
+from ..engine.trajectory import Trajectory, recorded, simulate
 from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics
 from ..linear.htf import HTF
@@ -402,6 +402,19 @@ def log_determinant(map: ReturnMap) -> float:
     """
     each = _pieces(to_host(map), lambda s, lanes, _, tape: divergence(s, lanes, tape))
     return float(np.sum(each))
+
+
+def orbit(map: ReturnMap, tapes: Tape | None = None) -> Trajectory:
+    """One turn from the anchor, in the steps by which it is linearized, which its `tapes` may hold
+    already, one for each piece."""
+    map = to_host(map)
+    pieces = (
+        _pieces(map, lambda *x: x[3], tangents=True)
+        if tapes is None
+        else [Tape(*x) for x in zip(*to_host(tapes), strict=True)]
+    )
+    begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
+    return recorded(map.structure, begin, pieces, u, Result.OK)
 
 
 def _pieces(map: ReturnMap, measure: Callable, tangents: bool = False) -> list:

@@ -16,17 +16,25 @@ from .._core.executor import is_traced, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
+from ..engine.jumps import has_kinks
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..errors import ComputationError, DefinitionError
 from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, integrated
-from .checks import check_clock, check_conserved, check_periodic, check_times, closes_early, explain
+from .checks import (
+    check_clock,
+    check_conserved,
+    check_jumps,
+    check_periodic,
+    check_times,
+    closes_early,
+    explain,
+)
 from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
 from .guess import return_map_near
-from .jumps import check_jumps, has_kinks
 from .newton import Solution, search, solve
 from .return_map import PATIENCE, ReturnMap
 from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_on, stiff_charts
@@ -177,7 +185,7 @@ def find_limit_cycle(
     check_times(s, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
         check_begin(cycle.return_map)
-        check_jumps(cycle)
+        check_jumps(cycle, solution.turn.tapes)
         if conserved:
             check_conserved(cycle)
     if throw and code != Result.OK:

@@ -23,11 +23,10 @@ from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem
 from .batches import Rounds, Tiles
-from .checks import check_periodic, closes_early
+from .checks import check_jumps, check_periodic, closes_early
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
-from .jumps import check_jumps
 from .return_map import ReturnMap, turn_product
 from .scale import given_sizes, scale_of
 

@@ -90,6 +90,8 @@ class Turn(NamedTuple):
     """Number of crossings of the section on which the turn ended, as far as its pieces show."""
     record: Recorded | None
     """The pieces, and the lengths, ends and events of their steps (K each). (None on the host.)"""
+    tapes: Tape | None
+    """All of their steps, by piece. (None in sweeps.)"""
 
     @property
     def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
@@ -218,11 +220,11 @@ class ReturnMap(eqx.Module):
                 moves = derivative_at_zero(lambda step: self._end(other(step), lanes, target, tape))
             steps = Tape(tape.h, tape.code, tape.t, None, None, None)
             recorded = None if on_host(q) else Recorded(moved, steps)
-            return moved, (lanes, jacobian[0, 1:], moves, tape.code, tape.t, recorded)
+            return moved, (lanes, jacobian[0, 1:], moves, tape, recorded)
 
-        end, (legs, factors, moves, codes, times, recorded) = self.travel(q, flow, record)
+        end, (legs, factors, moves, tapes, recorded) = self.travel(q, flow, record)
         legs = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), legs)
-        codes, valid = codes[..., 0], self.valid
+        codes, valid = tapes.code[..., 0], self.valid
         off, by_state = self.held(q)
         returned = xp.where(valid[:, None], monodromy(factors), 0.0)
         jacobian = returned - np.eye(len(q)) - by_state
@@ -235,9 +237,9 @@ class ReturnMap(eqx.Module):
             factors = self._across(legs, factors)
         defect = xp.abs(end.residual) + xp.abs(off)
         return Turn(
-            end.residual, jacobian, legs, factors, codes, times[..., 0],
+            end.residual, jacobian, legs, factors, codes, tapes.t[..., 0],
             end.period, xp.max(defect / self.sizes), end.result, self._meetings(legs, codes),
-            recorded,
+            recorded, tapes,
         )  # fmt: skip
 
     def _end(self, other: "ReturnMap", lanes: Lanes, target: Target, tape) -> Float[Array, " d"]:
@@ -256,7 +258,7 @@ class ReturnMap(eqx.Module):
         smallest = xp.min(xp.where(np.arange(len(q)) < valid.sum(), singular, np.inf))
         code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
         closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
-        code = xp.where(turn.closed, closed, code)
+        code = xp.where(turn.closed & ~xp.isnan(smallest), closed, code)
         if self.base is not None:
             same = turn.legs.chart == self.anchor.chart
             apart = xp.max(xp.abs(turn.legs.q - q[:, None]) / sizes[:, None], axis=0)

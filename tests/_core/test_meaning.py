@@ -5,22 +5,16 @@ import types
 
 import pytest
 
-from hybridjax._core.meaning import meaning
+from hybridjax._core.meaning import is_of_package, meaning
 from hybridjax.errors import DefinitionError
 
 
 # What a function computes, before and after one statement.
 WAYS = {
     "a global": ("K = 1.0\ndef f(x): return K * x", "K = 2.0"),
-    "a global that is read in a helper": (
-        "K = 1.0\ndef h(x): return K * x\ndef f(x): return h(x)",
-        "K = 2.0",
-    ),
+    "a global of a helper": ("K = 1.0\ndef h(x): return K * x\ndef f(x): return h(x)", "K = 2.0"),
     "a global in an inner function": ("K = 1\ndef f(x): return (lambda y: K * y)(x)", "K = 2"),
-    "a helper written anew": (
-        "def h(x): return x\ndef f(x): return h(x)",
-        "def h(x): return 2 * x",
-    ),
+    "a helper anew": ("def h(x): return x\ndef f(x): return h(x)", "def h(x): return 2 * x"),
     "an entry of a list": ("K = [1.0]\ndef f(x): return K[0] * x", "K[0] = 2.0"),
     "an entry of a dict": ("K = {'k': [1.0]}\ndef f(x): return K['k'][0]", "K['k'][0] = 2.0"),
     "an array in place": ("import numpy as np\nK = np.ones(3)\ndef f(x): return K * x", "K[1] = 2"),
@@ -182,7 +176,9 @@ def test_a_change_is_noticed(way, monkeypatch):
 
 
 def test_what_is_not_read_is_not_noticed(monkeypatch):
-    """A global, or a module of Python, that has the name of an attribute."""
+    """A global, or a module of Python, that has the name of an attribute; code of packages."""
+    assert is_of_package("/home/a/.local/lib/python3.11/site-packages/jax/x.py")
+    assert is_of_package("/usr/lib/python3/dist-packages/x.py") and not is_of_package("/home/x.py")
     space = {"__name__": "users_module", "m": 1.0}
     exec("class A:\n    m = 1\na = A()\ndef f(x): return a.m * x", space)
     digest = meaning(space["f"])
@@ -194,11 +190,12 @@ def test_what_is_not_read_is_not_noticed(monkeypatch):
 @pytest.mark.parametrize(
     "code",
     ["eval('K')", "importlib.import_module('K')", "open('K').read()", "np.loadtxt('K')",
-     "sys.modules['K']", "os.getenv('K')", "pathlib.Path('K').read_text()",
+     "sys.modules['K']", "os.getenv('K')", "pathlib.Path('K').read_bytes()", "P()",
      "f.__globals__['K']", "sys._getframe().f_globals['K']"],
 )  # fmt: skip
 def test_values_that_are_not_named_are_refused(code):
     space = {"__name__": "users_module"}
-    exec(f"import importlib, os, pathlib, sys, numpy as np\ndef f(x): return {code} * x", space)
-    with pytest.raises(DefinitionError, match="`f` uses `"):
+    exec("import functools, importlib, os, pathlib, sys, numpy as np", space)
+    exec(f"P = functools.partial(lambda: eval('K'))\ndef f(x): return {code} * x", space)
+    with pytest.raises(DefinitionError, match="` uses `"):
         meaning(space["f"])

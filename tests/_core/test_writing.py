@@ -101,6 +101,7 @@ BLOCKS = {
     "folder": lambda folder: (folder / "report.html").mkdir(),
     "linked folder": link_to_away,
     "linked list": lambda folder: os.symlink(folder / "notes.txt", folder / LIST),
+    "pipe as list": lambda folder: os.mkfifo(folder / LIST),
 }
 
 

@@ -1,4 +1,4 @@
-"""A field that jumps on the cycle is refused with its line; a continuous one is not."""
+"""A field that jumps, or has a pulse over which steps pass, is refused; others are not."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.meaning import current
-from hybridjax.orbits.jumps import check_jumps
+from hybridjax.orbits.checks import check_jumps
 
 
 hj.enable_x64()
@@ -63,6 +63,10 @@ def is_refused(cycle, further):
         lambda x: jnp.where(jnp.abs(x - 0.5) < 3e-4, 1e-2, 0.0),  # a narrow pulse
         lambda x: jax.lax.cond(x > 0, lambda: jnp.where(x > 0.7, 1e-6, 0.0), lambda: 0.0),
         pytest.param(lambda x: 1e-6 * jnp.sin(GRID)[jnp.searchsorted(GRID, x)], marks=SLOW),
+        lambda x: 1e-4 * x / jnp.abs(x),
+        pytest.param(lambda x: 1e-3 * jnp.arctan2(x, -1.0), marks=SLOW),
+        lambda x: 1e-4 * jnp.tanh(1e11 * x),
+        lambda x: 1e-3 * jnp.exp(-(((x - 0.5) / 1e-4) ** 2)),
     ],
 )
 def test_a_jump_is_refused(smooth, further):
@@ -73,6 +77,7 @@ def test_a_jump_is_refused(smooth, further):
     "further",
     [
         lambda x: jnp.where(x > 0, 1e-3 * x, 0.0) + 1e-3 * jnp.abs(jnp.mod(x, 1.0) - 0.5),
+        lambda x: 1e-6 * jnp.tanh(50 * x) + 1e-6 * x / jnp.sqrt(x**2 + 1e-4),
         pytest.param(lambda x: 1e-3 * jnp.interp(x, GRID, jnp.sin(GRID)), marks=SLOW),
     ],
 )
@@ -84,6 +89,17 @@ def test_a_continuous_field_is_not(smooth, further):
 def test_kinks_have_the_steps_that_they_need():
     kinked = hj.find_limit_cycle(Turns(lambda x: 1e-2 * jnp.interp(x, GRID, jnp.sin(GRID))))
     assert kinked.result == hj.Result.OK
+
+
+def test_simulations_end_at_what_steps_pass_over():
+    """A pulse of the field, and a guard that falls and rises again between two steps."""
+    pulse = Turns(lambda x: jnp.exp(-(((x - 0.5) / 1e-4) ** 2)))
+    dip = lambda t, q, u: 1.0 - 2.0 * jnp.exp(-(((t - 0.4321) / 1e-3) ** 2))  # noqa: E731
+    event = hj.Transition("dip", "on", "on", dip, "falling", lambda t, q, u: q)
+    dips = type("Dips", (Turns,), {"transitions": lambda self: [event]})(lambda x: 0.0)
+    for system in (pulse, dips):
+        path = hj.simulate(system, "on", (2.0, -0.1), 6.0, throw=False)
+        assert path.result == hj.Result.PULSE_PASSED
 
 
 class Switched(Turns):

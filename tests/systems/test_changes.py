@@ -6,6 +6,8 @@ import pytest
 
 import hybridjax as hj
 
+from ..toys import Field
+
 
 hj.enable_x64()
 DRAG = 0.7
@@ -79,17 +81,6 @@ def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
             use()
 
 
-class Turning(hj.Chart):
-    states = ("x", "v")
-    push: hj.Parameter
-    gain: hj.Parameter
-
-    def field(self, t, q, u):
-        x, v = q
-        pulse = jnp.exp(-(((t % 5.0 - 2.5) / 0.004) ** 2))
-        return v, (1 - x**2) * v - x + self.push * pulse + (1 + self.gain * pulse) * u[0]
-
-
 class Turns(hj.HybridSystem):
     """Van der Pol's oscillator, pushed by a pulse that 16 samples of a period miss."""
 
@@ -97,7 +88,12 @@ class Turns(hj.HybridSystem):
     gain: hj.Parameter = hj.parameter(0.0)
 
     def charts(self):
-        return {"on": Turning(self.push, self.gain)}
+        def field(t, q, u):
+            pulse = jnp.exp(-(((t % 5.0 - 2.5) / 0.004) ** 2))
+            force = self.push * pulse + (1 + self.gain * pulse) * u[0]
+            return q[1], (1 - q[0] ** 2) * q[1] - q[0] + force
+
+        return {"on": Field(("x", "v"), field)}
 
     def guess(self):
         return hj.Guess("on", (2.0, 0.0))
@@ -120,15 +116,7 @@ class Pushed(Slowed):
     """The input acts with another period than the clock's."""
 
     def charts(self):
-        field = lambda t, q, u: (-q[0] + u[0] * jnp.cos(1.3 * t),)  # noqa: E731
-
-        class Chart(hj.Chart):
-            states = ("x",)
-
-            def field(self, t, q, u):
-                return field(t, q, u)
-
-        return {"air": Chart()}
+        return {"air": Field(("x",), lambda t, q, u: (-q[0] + u[0] * jnp.cos(1.3 * t),))}
 
 
 def test_the_gain_of_an_input_has_the_clocks_period():

@@ -1,0 +1,238 @@
+"""Fields that jump, or have pulses so short that the steps of an integration pass over them."""
+
+import functools as ft
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core as jex
+from jaxtyping import Float
+
+from .._core.compilation import quick_jit
+from .._core.meaning import is_of_package
+from ..systems.structure import Member, Structure, stacked
+from .cubic import interpolate
+from .settings import ROUNDING, Settings
+
+
+# Operations on real numbers without kinks, jumps and pulses.
+_SMOOTH = frozenset(
+    "add sub mul neg sin cos square add_any dot_general reduce_sum copy "
+    "broadcast_in_dim concatenate convert_element_type expand_dims gather pad reshape slice "
+    "dynamic_slice squeeze stack unstack split transpose".split()
+)
+_CALLS = frozenset("jit pjit closed_call core_call".split())
+# Pieces of a step, each with four points, and four times as many on cycles. Fewer: short pulses are
+# missed. More: time.
+_PIECES = 64
+# In a step, the integrals of a rate and of a polynomial through eight of its values may differ by
+# so many times the accuracy, and those of a gain, whose kinks no step meets, by this part of the
+# integral over all steps. Smaller: kinks are refused. Larger: pulses with this effect are missed.
+_SAME, _SAME_GAIN = 1e3, 1e-5
+# On a cycle, a rate differs from that polynomial by at most so many times the root of the accuracy
+# (as at a kink) in its largest values. Smaller: kinks are refused. Larger: multipliers are wrong
+# beside steep functions that steps do not resolve.
+_ROUGH = 1.0
+# A guard falls below zero by this part of its largest value. Smaller: one that comes near to zero
+# is taken to fall. Larger: such falls between steps are missed.
+_NEAR = 1e-5
+# Points of a call, and steps whose points are kept at once. Fewer: more calls. More: few points
+# take longer, and many more memory.
+_POINTS = 1024
+# Operations with jumps, and with kinks.
+_DECISIONS = frozenset("sign floor ceil round rem atan2 gt lt ge le eq ne is_finite".split())
+_KINKS = _DECISIONS | frozenset("max min abs clamp select_n cond".split())
+# A field jumps if it changes by this part of itself between points that are so many times closer,
+# in parts of the period and sizes of the states. Smaller changes: rounding is refused. Larger:
+# errors of multipliers are as large. Farther points: steep functions are refused that steps
+# resolve. Closer: beside those that they do not resolve, multipliers are wrong.
+_JUMP, _STEEP = 1e-8, 1e7
+# How often the quarter of an interval is taken in which the field changes most unlike in the
+# others. Fewer: jumps are missed behind other changes. More: time.
+_QUARTERS = 20
+
+Points = Float[np.ndarray, "P 1+n"]
+"""Times and states."""
+
+
+def program_of(s: Structure, a: int, function: Callable | None = None) -> jex.Jaxpr:
+    """The program of a function of chart a. Default: its field."""
+    real = jnp.result_type(float)
+    point = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (s.dims[a],), (s.nu,))]
+    return jax.make_jaxpr(function or ft.partial(s.field, a))(*point).jaxpr
+
+
+def sudden(program: jex.Jaxpr) -> Iterator[tuple[str, Any]]:
+    """Names of the operations of a program that depend on its arguments, and may jump or have
+    pulses, each with the equation, or the call, by which the program does it."""
+    moving = set(program.invars)
+    for equation in program.eqns:
+        moves = [isinstance(x, jex.Var) and x in moving for x in equation.invars]
+        if any(moves):
+            moving.update(equation.outvars)
+            calls = jex.jaxprs_in_params(equation.params)
+            yield from ((name, equation) for call in calls for name, _ in sudden(call))
+            if not _is_smooth(equation, moves):
+                yield equation.primitive.name, equation
+
+
+def _is_smooth(equation: Any, moves: list[bool]) -> bool:
+    """Test whether an equation neither jumps nor has pulses, if these of its arguments move."""
+    match equation.primitive.name:
+        case "div":
+            return not moves[1]
+        case "select_n":
+            return not moves[0]
+        case "integer_pow":
+            return equation.params["y"] > 0
+        case name:
+            real = jnp.issubdtype(equation.outvars[0].aval.dtype, jnp.inexact)
+            return name in _CALLS or (name in _SMOOTH and real)
+
+
+def passed_over(
+    path: Any, u: Float[np.ndarray, " nu"], settings: Settings, linear: bool = False
+) -> tuple[int, str] | None:
+    """The first step of a `Trajectory` that passes over a pulse of a field, a gain or a guard, and
+    the name of that.
+
+    **Arguments:** `linear`: whether the path is linearized, so that steps must resolve jumps, too.
+    """
+    s, passed = path.structure, []
+    for a in np.unique(path.chart[:-1]).tolist():
+        rows = np.flatnonzero((path.chart[:-1] == a) & (np.diff(path.t) > 0))
+        if len(rows) and may_have_pulses(s, a):
+            wrong = np.argwhere(_passing(path, a, rows, u, settings, linear))[:1].tolist()
+            passed += [(int(rows[k]), column_name(s, a, j)) for k, j in wrong]
+    return min(passed, default=None)
+
+
+def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np.ndarray:
+    """Test which of the steps that begin at some rows, in chart a, pass over a pulse of each rate,
+    gain and guard: over what a polynomial through eight of its values in the step lacks."""
+    s, n, legendre = path.structure, path.structure.dims[a], np.polynomial.legendre
+    m, pieces = n * (1 + s.nu), 4 * _PIECES if linear else _PIECES
+    (x, _), (y, w) = legendre.leggauss(8), legendre.leggauss(4)
+    fine = 2 * (np.arange(pieces)[:, None] + (y + 1) / 2).ravel() / pieces - 1
+    polynomial = legendre.legvander(fine, 7) @ np.linalg.inv(legendre.legvander(x, 7))
+    weights, nodes = np.tile(w / 2 / pieces, pieces), (np.append(x, fine)[:, None] + 1) / 2
+    ends = path.after[:-1], path.before[1:], path.slope_after[:-1], path.slope_before[1:]
+    parts = []
+    for k in np.split(rows, range(_POINTS, len(rows), _POINTS)):
+        h = np.diff(path.t)[k, None, None]
+        q = interpolate(nodes, h, *(x[k, None, :n] for x in ends))
+        points = np.concatenate([path.t[k, None, None] + h * nodes, q], axis=2)
+        values = values_at(s, a, points.reshape(-1, 1 + n), u).reshape(*points.shape[:2], -1)
+        rates, (guards, enabled) = values[:, 8:, :m], np.split(values[:, 8:, m:], 2, axis=2)
+        beside = rates - polynomial @ values[:, :8, :m]
+        low = guards < -_NEAR * np.abs(guards).max(axis=(0, 1))
+        falls = (low & (np.maximum.accumulate(guards, 1) > 0) & (enabled > 0)).any(axis=1)
+        moved, passed = h[:, 0] * (weights @ np.abs(rates)), h[:, 0] * np.abs(weights @ beside)
+        parts.append((moved, passed, *(np.abs(x).max(axis=1) for x in (beside, rates)), falls))
+    moved, passed, missed, largest, falls = map(np.concatenate, zip(*parts, strict=True))
+    size, accuracy = moved.sum(axis=0), np.max(np.asarray(settings.rtol))
+    usual = np.abs(path.after[rows]).max(axis=0) if settings.scale is None else settings.scale[a]
+    size[:n] = np.maximum(size[:n], usual[:n])
+    same = np.repeat([_SAME * accuracy, _SAME_GAIN], [n, m - n])
+    wrong = passed > same * size + ROUNDING * size.max()
+    if linear:
+        fastest = np.maximum(largest[:, :n].max(axis=0), usual[:n] / np.ptp(path.t))
+        wrong[:, :n] |= missed[:, :n] > _ROUGH * np.sqrt(accuracy) * fastest
+    return np.concatenate([wrong, falls], axis=1)
+
+
+def column_name(s: Structure, a: int, j: int) -> str:
+    """The name of a column of `values_at`."""
+    n, states = s.dims[a], s.charts[a].states
+    if j < n:
+        return f"rate of '{states[j]}'"
+    row, column = divmod(j - n, max(s.nu, 1))
+    if row < n and s.nu:
+        return f"gain from '{s.system.inputs[column]}' to the rate of '{states[row]}'"
+    return f"guard of '{s.transitions[s.guards(a)[j - n * (1 + s.nu)]].name}'"
+
+
+def values_at(s: Structure, a: int, points: Points, u: Float[np.ndarray, " nu"]):
+    """The field of chart a at points, its derivatives by the inputs, the guards, and whether their
+    predicates hold."""
+    calls = np.split(points, range(_POINTS, len(points), _POINTS))
+    fill = lambda x: np.pad(x, [(0, _POINTS - len(x)), (0, 0)], "edge")  # noqa: E731
+    return np.concatenate([np.asarray(_values(s, a, fill(x), u))[: len(x)] for x in calls])
+
+
+def may_have_pulses(s: Structure, a: int) -> bool:
+    """Test whether the field or a guard of chart a may jump or have pulses."""
+    kinds = s.guard_kinds(a)
+    both = lambda *x: stacked([s.field(a, *x), *s.guard_values(kinds, *x)])  # noqa: E731
+    return any(sudden(program_of(s, a, both)))
+
+
+@quick_jit
+def _values(s: Structure, a: int, points, u):
+    kinds = s.guard_kinds(a)
+
+    def at(x):
+        point, field = (x[0], x[1:], u), lambda u: s.field(a, x[0], x[1:], u)
+        holds = lambda kind: lambda k: s.enabled(Member(kind, k), *point) * 1.0  # noqa: E731
+        enabled = [jax.vmap(holds(kind))(np.arange(len(kind))) for kind in kinds]
+        gains = jnp.ravel(jax.jacfwd(field)(u))
+        return stacked([field(u), gains, *s.guard_values(kinds, *point), *enabled])
+
+    return jax.vmap(at)(points)
+
+
+def jumps(s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarray, " 1+n"]):
+    """Yield times at which the field or a gain jumps within intervals of an orbit, the column of
+    `values_at` that jumps, and the jump."""
+    n, m, parts = s.dims[a], s.dims[a] * (1 + s.nu), np.arange(1, 4)[:, None, None] / 4
+    at = lambda points: values_at(s, a, points, np.zeros(s.nu))[:, :m]  # noqa: E731
+    first, last = at(low), at(high)
+    shifted = low * (1 + 2e-15 * (-1.0) ** np.arange(1 + n))
+    rounding = np.nanquantile(np.abs(at(shifted) - first), 0.9, axis=0)  # (not at a jump)
+    limit = np.maximum(np.nanmax(np.abs(first), axis=0), rounding / _JUMP)
+    limit[:n] = np.maximum(limit[:n], sizes[1:] / sizes[0])
+    limit[n:] = (
+        np.maximum(limit[n:], _SAME_GAIN * limit[n:].max(initial=0.0)) + np.finfo(float).tiny
+    )
+    for _ in range(_QUARTERS):
+        points = np.stack([low, *(low + parts * (high - low)), high])
+        inside = at(np.concatenate(points[1:-1])).reshape(3, *first.shape)
+        values = np.nan_to_num(np.stack([first, *inside, last]))
+        change = np.abs(np.diff(values, axis=0)) / limit
+        near = np.abs(np.diff(points, axis=0) / sizes).max(axis=2, keepdims=True)
+        uneven = np.abs(np.diff(values, axis=0) - np.diff(values, axis=0).mean(axis=0)) / limit
+        worst, here = uneven.max(axis=2).argmax(axis=0), np.arange(len(low))
+        low, high = points[worst, here], points[worst + 1, here]
+        first, last = values[worst, here], values[worst + 1, here]
+        steep = (change > _JUMP) & (change > _STEEP * near)
+        for i, j in np.argwhere(steep[worst, here]):
+            yield low[i, 0], j, change[worst[i], i, j] * limit[j]
+        keep = uneven.max(axis=(0, 2)) > _JUMP
+        low, high, first, last = (x[keep] for x in (low, high, first, last))
+        if not keep.any():
+            return
+
+
+def has_kinks(s: Structure) -> bool:
+    """Test whether a field has operations with kinks or jumps, where many steps are rejected."""
+    programs = (program_of(s, a) for a in range(len(s.charts)))
+    return any(name in _KINKS for program in programs for name, _ in sudden(program))
+
+
+def lines_of_jumps(s: Structure, a: int) -> list[str]:
+    """The lines of code by which the field of a chart may jump: those that decide, if there are
+    any."""
+    lines = [(name, _line_of(x)) for name, x in sudden(program_of(s, a))]
+    decisions = [x for x in lines if x[0] in _DECISIONS]
+    return [line for line in dict.fromkeys(line for _, line in decisions or lines) if line]
+
+
+def _line_of(equation: Any) -> str:
+    """The line of a user's file that wrote an equation, for messages."""
+    traceback = equation.source_info.traceback
+    for frame in traceback.frames if traceback else ():
+        if not is_of_package(frame.file_name):
+            return f" ({frame.file_name}:{frame.line_num})"
+    return ""
