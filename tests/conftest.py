@@ -64,7 +64,7 @@ def pytest_xdist_auto_num_workers(config):
 
 
 # Tracing makes a million objects that live until a program is compiled: by default the collector
-# visits all of them many times, which is a tenth of the time of the tests.
+# visits all of them many times, a twentieth of the time of the tests.
 gc.freeze()
 gc.set_threshold(100_000, 20, 20)
 

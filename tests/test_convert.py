@@ -221,7 +221,7 @@ def test_what_is_refused(model, monkeypatch):
     with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray({"a": 1})
     clash = hj.Recording([0.0, 1.0], {"trial": [0.0, 1.0]})
-    with pytest.raises(hj.DefinitionError, match="'trial' is named as a coordinate"):
+    with pytest.raises(hj.DefinitionError, match="'trial' is also the name of a coordinate"):
         convert.to_xarray(clash)
     for call, name in ((convert.to_control, "control"), (convert.to_xarray, "xarray")):
         monkeypatch.setitem(__import__("sys").modules, name, None)

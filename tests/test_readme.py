@@ -77,11 +77,12 @@ def read_section(tmp_path_factory, hopper_cycle):
     pyplot.close("all")
 
 
-# (What they begin with takes as long as each: `.ci/run` gives them to one worker.)
+# (What they begin with takes as long as each, so one worker gets them.)
 in_one_worker = pytest.mark.xdist_group("readme")
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @in_one_worker
 @pytest.mark.parametrize("heading", ["Many of them, and derivatives", "Fewer strides"])
 def test_the_section_runs(heading, read_section):
@@ -89,6 +90,7 @@ def test_the_section_runs(heading, read_section):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @in_one_worker
 def test_the_section_on_fits_finds_the_parameters(read_section):
     made = read_section("Along a parameter, and from data to parameters")
@@ -98,6 +100,7 @@ def test_the_section_on_fits_finds_the_parameters(read_section):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @in_one_worker
 def test_the_section_on_recordings_finds_the_multipliers(read_section):
     made = read_section("From a recording")
@@ -135,10 +138,12 @@ def test_claims_name_tests_that_exist():
 
 PAGES = ["docs/index.md", "docs/experiments.md"]
 PAGES += [f"docs/how-to/{p.name}" for p in (ROOT / "docs/how-to").glob("*.md")]
+long_or_not = lambda x: [pytest.mark.long] * (Path(x).stem in LONG)  # noqa: E731
+LONG = "experiments figures fit-parameters identify-from-recordings models scale sweep".split()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", sorted(PAGES))
+@pytest.mark.parametrize("page", [pytest.param(x, marks=long_or_not(x)) for x in sorted(PAGES)])
 def test_the_page_runs_and_prints_what_it_shows(page, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     session, printed = Session(page, monkeypatch), ""

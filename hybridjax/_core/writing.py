@@ -40,7 +40,7 @@ def replacing(path: Path) -> Iterator[Path]:
 def _refuse_link(path: Path) -> None:
     if path.is_symlink():
         raise DefinitionError(
-            f"'{path}' is a link, which is not written through: choose another name."
+            f"'{path}' is a link: choose another name, since nothing is written through links."
         )
 
 

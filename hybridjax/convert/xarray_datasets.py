@@ -211,7 +211,7 @@ def _signals(data: Recording | SectionData, values: np.ndarray) -> dict[str, Any
     """
     reserved = _RESERVED & set(data.signals)
     if reserved:
-        raise DefinitionError(f"the signal '{min(reserved)}' is named as a coordinate: rename it.")
+        raise DefinitionError(f"'{min(reserved)}' is also the name of a coordinate: rename it.")
     triples = zip(data.signals, data.units, values.T, strict=True)
     return {str(name): _variable("sample", x, unit) for name, unit, x in triples}
 

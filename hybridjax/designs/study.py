@@ -117,7 +117,7 @@ class Study(eqx.Module):
             )
         limits = as_limits(self.limit)
         if limits.strides is not None:
-            raise DefinitionError("`limit` limits the strides, but a study ends at a precision.")
+            raise DefinitionError("a study ends at a precision, so `limit` may not be of strides.")
         limits.require_inputs(first.input_names)
         signals = (*first.input_names, *self.outputs)
         named = () if isinstance(limits.rms, str) else limits.rms

@@ -162,7 +162,8 @@ class MultiplierEstimate(eqx.Module):
         **Raises:** `DefinitionError` for an index that is not there.
         """
         if not -len(self.multipliers) <= index < len(self.multipliers):
-            raise DefinitionError(f"there is no multiplier {index} of {len(self.multipliers)}.")
+            count = len(self.multipliers)
+            raise DefinitionError(f"there is no multiplier {index}: the fit has {count}.")
         degrees = 1 if self.multipliers[index].imag == 0 else 2
         values, vectors = np.linalg.eigh(self.multiplier_covariances[index])
         angle = np.linspace(0, 2 * np.pi, points)

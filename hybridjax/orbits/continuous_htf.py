@@ -31,6 +31,9 @@ _INPUT_TURNS, _OUTPUT_TURNS = 1.5, 4.0
 # Distance in cycles per period from a pole on the unit circle at which a frequency lies on it.
 # Smaller: responses are rounding errors. Larger: frequencies beside it are rejected.
 _POLE = 1e-9
+# Pieces times frequencies of one call. More: gigabytes of memory. Fewer: calls are refused that a
+# machine can do.
+_LARGEST = 2**21
 
 
 class Parts(NamedTuple):
@@ -56,7 +59,13 @@ def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> flo
     that calls with similar frequencies share a linearization."""
     inputs = _INPUT_TURNS / (2 * np.pi * max(np.max(np.abs(f), initial=0.0), 0.1))
     outputs = _OUTPUT_TURNS / (2 * np.pi * max(np.max(np.abs(harmonics)), 0.1))
-    return float(2.0 ** np.floor(np.log2(min(inputs, outputs, 1.0))))
+    longest = float(2.0 ** np.floor(np.log2(min(inputs, outputs, 1.0))))
+    if max(len(f), 64) / longest > _LARGEST:
+        raise DefinitionError(
+            f"{len(f)} frequencies up to {np.abs(f).max():.3g} per period and harmonics up to "
+            f"{np.abs(harmonics).max()} need {1 / longest:.1e} pieces of the cycle: lower them."
+        )
+    return longest
 
 
 def continuous_htf(

@@ -146,9 +146,7 @@ class Responses(eqx.Module):
             input if input is None else [input]
         )
         if any(x.weight[signal] != 0 for x in self.impulses()):
-            raise DefinitionError(
-                f"'{signal}' acts at events, which no curve has: see `impulses()`."
-            )
+            raise DefinitionError(f"'{signal}' acts at events alone: see `impulses()`.")
         flow = to_host(self.flow)
         values = np.einsum("pki,pkiu->pku", of_phase, flow.by_input)
         values = values[..., column] / float(self.period)

@@ -146,7 +146,7 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     (impulse,) = leaky.impulses()
     np.testing.assert_allclose(impulse.weight["u"], 1.5 + 0.25, rtol=1e-12)
     assert "inputs act at spike" in str(leaky)
-    with pytest.raises(hj.DefinitionError, match="acts at events, which no curve has"):
+    with pytest.raises(hj.DefinitionError, match="acts at events alone"):
         leaky.curve("u")
     # v' = I + v^2: v = tan(t + arctan v0) for I = 1.
     system = Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
@@ -334,6 +334,8 @@ def test_bad_questions_are_refused_in_one_sentence():
         wheel.htf([0.3, 2.0])
     with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
         wheel.htf(0.3, inputs="force")
+    with pytest.raises(hj.DefinitionError, match=r"need 6.9e\+10 pieces of the cycle: lower"):
+        wheel.htf(1e10)
     with pytest.raises(hj.DefinitionError, match="there is no parameter 'speed'"):
         wheel.sensitivity("speed")
     with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):

@@ -92,7 +92,7 @@ def test_what_is_refused(noisy):
         ("u is constant", {"u": 0 * t}, BEAT),
         ("has no samples of the input u", {"u": np.nan * t}, BEAT),
         ("8 intervals are too few", wave, BEAT),
-        ("must be of events", wave, angle),
+        ("needs events or crossings", wave, angle),
     ]:
         recording = hj.Recording(t, signals, events=beat)
         phase = phase if phase is not angle else hj.recordings.estimate_phase(recording, angle)

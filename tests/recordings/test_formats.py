@@ -196,7 +196,7 @@ def test_trc(tmp_path):
     np.testing.assert_array_equal(samples(found, "L.ASIS.z"), [[0, 0.02], [6, 6.5]])
     assert hj.read_recording(path, signals="L.ASIS").signals[0] == "L.ASIS.x"
     path.write_text(TRC.replace("100.00\t3", "100.00\t4"))
-    refused("3 frames, but a header of 4", path)
+    refused("3 frames, its header 4", path)
     path.write_text(TRC.replace("Frame#", "Number"))
     refused("does not name 'Frame#'", path)
 
@@ -242,7 +242,7 @@ def test_c3d(tmp_path):
     assert analog.signals == ("Fz1",) and "Left Strike" in analog.trials[0].events
     refused("no signal 'EMG1'; it has LASI.x", path, signals="EMG1", kind=hj.DefinitionError)
     path.write_bytes(path.read_bytes()[:2500])
-    refused("frames, but a header of 20", path)
+    refused("frames, its header 20", path)
     write_c3d(tmp_path / "late.c3d", first=10)
     found = hj.read_recording(tmp_path / "late.c3d")
     np.testing.assert_allclose(found.trials[0].events["Left Strike"], [0.1], atol=1e-7)

@@ -121,7 +121,7 @@ def test_opensim(tmp_path, blanks):
     assert found.notes == ("angles are in degrees",)
     np.testing.assert_array_equal(found.trials[0].values, [[1, 2], [-0.25, 3]])
     path.write_text(OPENSIM.replace("nRows=2", "nRows=3"))
-    with pytest.raises(FileFormatError, match="2 rows, but a header of 3"):
+    with pytest.raises(FileFormatError, match="2 rows, its header 3"):
         hj.read_recording(path)
 
 

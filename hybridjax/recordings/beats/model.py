@@ -78,7 +78,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     samples = recording.samples(name)
     pairs = phase.by_trial(recording)
     if not all(w.linear for _, parts in pairs for w in parts):
-        raise DefinitionError("`phase` must be of events or crossings: an angle has no intervals.")
+        raise DefinitionError("`phase` needs events or crossings: an angle has no intervals.")
     starts, durations, steps, inputs = [], [], [], []
     for (trial, x), (_, parts) in zip(samples, pairs, strict=True):
         finite = np.isfinite(x)

@@ -184,7 +184,7 @@ def two_columns(path: Path, names: Sequence[str]) -> None:
 def check_rows(path: Path, rows: int, declared: Any, what: str) -> None:
     """**Raises:** `FileFormatError` for another number of rows than the header declares."""
     if declared is not None and str(declared) != str(rows):
-        raise FileFormatError(f"'{path}' is damaged: {rows} {what}, but a header of {declared}.")
+        raise FileFormatError(f"'{path}' is damaged: it has {rows} {what}, its header {declared}.")
 
 
 @contextmanager
