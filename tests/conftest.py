@@ -103,7 +103,7 @@ compilation.at_ease = unchecked_host
 compilation._WORTH_OPTIMIZING = np.inf
 # The tests of a process find many cycles of one kind, and few that take longer on the host than
 # compiling them would.
-compilation._WORTH_COMPILING = 10.0
+compilation._WORTH_COMPILING = 5.0
 
 
 # Programs that a worker keeps, of some 5 MB each. Doubled: twice the memory.

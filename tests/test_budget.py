@@ -25,7 +25,7 @@ PRONOUNS = set(
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
 # a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
-# 890 the responses of cycles.
+# 890 the responses of cycles; of the tests, 630 are those of both.
 LIMITS = {
     "code": 25_380,
     "files": 222,
@@ -36,7 +36,7 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_620,
+    "test_lines": 16_630,
     "doc_words": 36_000,
 }
 

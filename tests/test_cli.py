@@ -80,6 +80,7 @@ def alone(*_):
     return AtOnce()
 
 
+@pytest.mark.slow  # (`.ci/run` draws them)
 def test_reproduce_draws_its_figures(tmp_path):
     reproduce(tmp_path, Protocol(20, 28, 8), ("png",), alone())
     names = ["fig1_cycle_isochron", "fig1_cycle_kinematic", "fig3_harmonics", "fig4_bode"]

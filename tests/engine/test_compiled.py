@@ -5,6 +5,7 @@ import re
 
 import jax
 import numpy as np
+import pytest
 
 import hybridjax as hj
 from hybridjax._core import compilation
@@ -40,6 +41,7 @@ def compiled():
         jax.monitoring.unregister_event_duration_listener(listen)
 
 
+@pytest.mark.slow
 def test_no_operation_outside_of_programs_compiles_one(monkeypatch):
     # (However much the host has done in tests before.)
     monkeypatch.setattr(compilation, "_WORTH_COMPILING", np.inf)

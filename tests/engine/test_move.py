@@ -97,6 +97,7 @@ def juggler_exact(x):
     return jnp.stack(fall(y, v, x[5] - 0.56 - t))
 
 
+@pytest.mark.slow
 def test_reverse_mode_through_an_impact_on_a_moving_paddle():
     x = jnp.array([1.3, 0.1, 0.15, 0.7, 0.05, 1.3])
     found, value = jax.jit(jax.jacrev(lambda x: (juggler(x),) * 2, has_aux=True))(x)

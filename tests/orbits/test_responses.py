@@ -277,7 +277,10 @@ def _shifted(cycle, name, step):
 
 @pytest.mark.parametrize(
     "system, name",
-    [(hj.models.VerticalHopper(), "omega"), (hj.models.BuckConverter(), "Vin")],
+    [
+        pytest.param(hj.models.VerticalHopper(), "omega", marks=pytest.mark.slow),
+        (hj.models.BuckConverter(), "Vin"),
+    ],
     ids=["a clock that changes", "an event by the clock"],
 )
 def test_sensitivities_are_differences_of_cycles(system, name):
