@@ -96,10 +96,10 @@ def first_calls(model: str, family: str, repetition: int = 0):
 
 def defined_here() -> type:
     """The class of the hopper as if it had been written in this process's main module."""
-    from hybridjax.models import hopper
+    from hybridjax.models import hoppers
 
     main = sys.modules["__main__"].__dict__
-    exec(inspect.getsource(hopper).replace("from ..", "from hybridjax."), main)
+    exec(inspect.getsource(hoppers).replace("from ..", "from hybridjax."), main)
     return main["VerticalHopper"]
 
 
