@@ -85,7 +85,7 @@ class Problem:
         lanes = self.placed.lanes
         start = jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
         start = jnp.repeat(start, len(self.u), axis=1)
-        z = tuple(prepared.outputs.items)
+        z = tuple(prepared.outputs)
         stepping = prepared.stepping
         return self.placed, stepping.plan, start, jnp.asarray(self.u), z, stepping.settings
 

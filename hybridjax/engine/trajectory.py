@@ -23,11 +23,11 @@ from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
 from .cubic import interpolate
-from .jumps import passed_over
 from .lanes import IDLE, Lanes, Tape, start_lanes
 from .move import Options, move
 from .settings import SIMULATION, Settings
 from .target import until
+from .unresolved import passed_over
 from .watch import slopes
 
 

@@ -13,7 +13,9 @@ from .._core.compilation import at_ease
 from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.jumps import (
+from ..engine.lanes import Tape
+from ..engine.trajectory import simulate
+from ..engine.unresolved import (
     column_name,
     jumps,
     lines_of_jumps,
@@ -22,8 +24,6 @@ from ..engine.jumps import (
     program_of,
     sudden,
 )
-from ..engine.lanes import Tape
-from ..engine.trajectory import simulate
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
 from ..systems.check import check_output, check_system

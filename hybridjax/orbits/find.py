@@ -16,8 +16,8 @@ from .._core.executor import is_traced, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
-from ..engine.jumps import has_kinks
 from ..engine.settings import LIMIT_CYCLE, Settings
+from ..engine.unresolved import has_kinks
 from ..errors import ComputationError, DefinitionError
 from ..systems.solver import Radau
 from ..systems.structure import Structure
