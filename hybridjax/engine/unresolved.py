@@ -31,10 +31,6 @@ _PIECES = 64
 # so many times the accuracy, and those of a gain, whose kinks no step meets, by this part of the
 # integral over all steps. Smaller: kinks are refused. Larger: pulses with this effect are missed.
 _SAME, _SAME_GAIN = 1e3, 1e-5
-# On a cycle, a rate differs from that polynomial by at most so many times the root of the accuracy
-# (as at a kink) in its largest values. Smaller: kinks are refused. Larger: multipliers are wrong
-# beside steep functions that steps do not resolve.
-_ROUGH = 1.0
 # A guard falls below zero by this part of its largest value. Smaller: one that comes near to zero
 # is taken to fall. Larger: such falls between steps are missed.
 _NEAR = 1e-5
@@ -139,7 +135,9 @@ def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np
     wrong = passed > same * size + ROUNDING * size.max()
     if linear:
         fastest = np.maximum(largest[:, :n].max(axis=0), usual[:n] / np.ptp(path.t))
-        wrong[:, :n] |= missed[:, :n] > _ROUGH * np.sqrt(accuracy) * fastest
+        # (The root of the accuracy, as at a kink. Less: kinks are refused. More: multipliers are
+        # wrong beside steep functions that steps do not resolve.)
+        wrong[:, :n] |= missed[:, :n] > np.sqrt(accuracy) * fastest
     return np.concatenate([wrong, falls], axis=1)
 
 

@@ -211,9 +211,10 @@ def check_jumps(cycle: LimitCycle, tapes: Tape | None = None) -> None:
     if pulse is not None:
         a, begin = int(path.chart[pulse[0]]), path.t[pulse[0]]
         raise DefinitionError(
-            f"the {pulse[1]} in chart '{s.names[a]}' has a pulse, or another sudden change, over "
-            f"which the step from t = {begin:.6g} on passes{','.join(lines_of_jumps(s, a))}. Begin "
-            "and end it by transitions (`hj.Scheduled` at known times)."
+            f"the {pulse[1]} in chart '{s.names[a]}' has a pulse, a jump or another sudden change, "
+            f"over which the step from t = {begin:.6g} on passes{','.join(lines_of_jumps(s, a))}. "
+            "Begin and end a pulse by transitions (`hj.Scheduled` at known times); for a jump, "
+            "write a chart for each side and a `Transition` between them."
         )
     t, chart, q = path.dense(16)  # (fewer: jumps are missed behind kinks; more: time)
     events = path.t[path.event >= 0]

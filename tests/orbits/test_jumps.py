@@ -113,3 +113,5 @@ def test_a_jump_beside_a_cycle_without_one_is_refused():
     first = hj.find_limit_cycle(Switched(None), section=RISES)
     with pytest.raises(hj.DefinitionError, match="jumps by .*test_jumps.py"):
         hj.continuation(first, "height", (0.0, 0.01))
+    with pytest.raises(hj.DefinitionError, match="in chart 'on' (jumps by|has a pulse, a jump)"):
+        hj.find_limit_cycles([Switched(None, x) for x in (0.0, 0.01, 0.0)], guess=first)
