@@ -111,7 +111,7 @@ class Switched(Turns):
 @SLOW
 def test_a_jump_beside_a_cycle_without_one_is_refused():
     first = hj.find_limit_cycle(Switched(None), section=RISES)
-    with pytest.raises(hj.DefinitionError, match="jumps by .*test_jumps.py"):
+    with pytest.raises(hj.DefinitionError, match="has a pulse, a jump .*test_jumps.py"):
         hj.continuation(first, "height", (0.0, 0.01))
-    with pytest.raises(hj.DefinitionError, match="in chart 'on' (jumps by|has a pulse, a jump)"):
+    with pytest.raises(hj.DefinitionError, match="has a pulse, a jump .*test_jumps.py"):
         hj.find_limit_cycles([Switched(None, x) for x in (0.0, 0.01, 0.0)], guess=first)
