@@ -114,4 +114,4 @@ def test_a_jump_beside_a_cycle_without_one_is_refused():
     with pytest.raises(hj.DefinitionError, match="has a pulse, a jump .*test_jumps.py"):
         hj.continuation(first, "height", (0.0, 0.01))
     with pytest.raises(hj.DefinitionError, match="has a pulse, a jump .*test_jumps.py"):
-        hj.find_limit_cycles([Switched(None, x) for x in (0.0, 0.01, 0.0)], guess=first)
+        hj.find_limit_cycles([Switched(None, x) for x in (0.0, 1e-3, 0.0)], guess=first)
