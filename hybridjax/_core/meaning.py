@@ -74,9 +74,39 @@ _marked = Memory()  # an object that is given again has the same copy, which oth
 def code_digest(x: Definition) -> str:
     """Return the digest of all of a definition but the values of its arrays.
 
+    If a function computes something else than when it was last seen, JAX's caches are cleared.
+
     **Raises:** `DefinitionError`, as `meaning`.
     """
-    return meaning(jax.tree_util.tree_map(lambda x: None if eqx.is_array(x) else x, x))
+    walk = _Walk()
+    walk.visit_all((jax.tree_util.tree_map(lambda x: None if eqx.is_array(x) else x, x),))
+    digest = walk.digest.hexdigest()
+    if digest not in _traced:
+        _clear_old_traces(walk.alive)
+        _traced.add(digest)
+    return digest
+
+
+_traced: set[str] = set()  # digests of definitions since a function last changed
+_meanings: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
+
+
+def _clear_old_traces(things: Iterable[Any]) -> None:
+    """Clear JAX's caches if a function, or an object whose method is one, has changed: `jax.jit`,
+    `lax.cond`, `lax.scan` and others remember the trace of a function by its identity."""
+    changed = False
+    for x in things:
+        is_compared_by_identity = type(x).__hash__ is object.__hash__ and type(x).__weakrefoffset__
+        if is_compared_by_identity and not _is_installed(getattr(x, "__module__", None)):
+            walk = _Walk()
+            walk.classes = 1  # (hidden reads have been refused before)
+            walk.visit(x)
+            digest = walk.digest.hexdigest()
+            changed |= _meanings.get(x, digest) != digest
+            _meanings[x] = digest
+    if changed:
+        _traced.clear()
+        jax.clear_caches()
 
 
 def meaning(*things: Any) -> str:
