@@ -18,7 +18,7 @@ import hybridjax as hj
 distributed = pytest.importorskip("distributed")
 pytest.importorskip("zarr")
 
-DRAWS = 24
+DRAWS, STEPS = 24, 100
 
 
 class Plane(hj.Chart):
@@ -41,7 +41,7 @@ class Driven(hj.HybridSystem):
 def walk(rng):
     """A random computation that takes a while."""
     time.sleep(0.02)
-    steps = rng.normal(size=(100, 2)).cumsum(axis=0)
+    steps = rng.normal(size=(STEPS, 2)).cumsum(axis=0)
     return {"end": steps[-1], "far": np.abs(steps).max()}
 
 
@@ -176,6 +176,17 @@ def test_workers_with_another_version_are_refused(client, whole, monkeypatch):
     versions["client"]["packages"]["jax"] = "9.9"
     monkeypatch.setattr(client, "get_versions", lambda packages: versions)
     with pytest.raises(hj.DefinitionError, match="has jax .*, and this process has 9.9"):
+        hj.monte_carlo(walk, DRAWS, client=client)
+
+
+def test_workers_with_other_code_are_refused(client, monkeypatch):
+    class Mine(Driven):
+        """One that workers cannot import."""
+
+    with pytest.raises(hj.DefinitionError, match="`Mine` is defined in the script or notebook"):
+        hj.monte_carlo(lambda rng: Mine().period(), 2, client=client)
+    monkeypatch.setitem(globals(), "STEPS", 50)
+    with pytest.raises(hj.DefinitionError, match="`walk` on a Dask worker is not what it is in"):
         hj.monte_carlo(walk, DRAWS, client=client)
 
 
