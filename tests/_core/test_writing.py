@@ -192,5 +192,9 @@ def test_nothing_is_written_through_a_link(tmp_path, writer, name):
     assert (tmp_path / "away").read_text() == "mine" and (folder / name).is_symlink()
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
     (folder / name).unlink()
+    os.mkfifo(folder / name)
+    with pytest.raises(hj.DefinitionError, match="is a link or a device"):
+        writer(folder / name)
+    (folder / name).unlink()
     writer(folder / name)
     assert (folder / name).stat().st_size > 100

@@ -118,7 +118,9 @@ def test_a_store_knows_its_function(tmp_path):
         hj.monte_carlo(other, 2, store=tmp_path / "draws.zarr")
 
 
-@pytest.mark.parametrize("harm", ["link", "linked folder", "pipe", "large", "shape", "absent"])
+@pytest.mark.parametrize(
+    "harm", ["link", "linked folder", "pipe", "large", "shape", "absent", "start"]
+)
 def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
     """A store that was made to look like that of the call."""
     first, victim, store = partial(np.random.Generator.normal), tmp_path / "x", tmp_path / "s.zarr"
@@ -134,6 +136,8 @@ def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
         (values / "zarr.json").write_text(re.sub(r"\b4\b", f"{10**12}", about, count=1))
     elif harm == "absent":
         shutil.rmtree(values)
+    elif harm == "start":
+        (store / "start/zarr.json").write_bytes(b"\xff\xfe")
     elif harm == "large":
         os.truncate(values / "c/1", 30 * 2**30)
     else:

@@ -138,17 +138,14 @@ class ZarrStore:
             self.layout = Layout(
                 tuple(about["dims"]), blocks, variables, {}, (), about["description"]
             )
+            kept = self._group[_START]
+            self.start = [np.asarray(kept[f"{i}"][...]) for i, _ in enumerate(kept.array_keys())]
         except Exception as error:  # (of many kinds)
             raise DefinitionError(f"cannot open '{address}' as a store: {error}") from error
         chunk = max(math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values())
         for path, size in sizes.items():
             if size > max(limits.TEXT, chunk + _CHECKSUM):
                 raise DefinitionError(f"'{path}' exceeds all chunks of its store: delete it.")
-
-    @property
-    def start(self) -> list[np.ndarray]:
-        kept = self._group[_START]
-        return [np.asarray(kept[f"{i}"][...]) for i in range(len(list(kept.array_keys())))]
 
     def missing(self) -> list[int]:
         """Return the pieces of which a chunk is missing."""
@@ -183,8 +180,14 @@ class ZarrStore:
         return values
 
     def array(self, name: str) -> np.ndarray | None:
-        """Return a variable of all pieces, or a constant; None if there is none of this name."""
-        return np.asarray(self._group[name][...]) if name in self._group else None
+        """Return a variable of all pieces, or a constant; None if there is none of this name.
+
+        **Raises:** `FileFormatError` if it is damaged.
+        """
+        try:
+            return np.asarray(self._group[name][...]) if name in self._group else None
+        except Exception as error:  # (of many kinds)
+            raise FileFormatError(f"'{self.address}' is damaged in `{name}`: delete it.") from error
 
     def discard_damaged(self) -> None:
         """Delete pieces whose checksums are wrong."""
