@@ -313,10 +313,8 @@ class _Walk:
 
 @ft.lru_cache(4096)
 def _code(code: types.CodeType) -> str:
-    walk = _Walk()
-    walk.note(code.co_code, code.co_names, code.co_varnames, code.co_freevars, code.co_argcount)
-    walk.visit_all(code.co_consts)
-    return walk.digest.hexdigest()
+    names = (code.co_names, code.co_varnames, code.co_freevars)
+    return meaning(code.co_code, *names, code.co_argcount, *code.co_consts)
 
 
 @ft.lru_cache(4096)

@@ -131,10 +131,8 @@ def _piece(k: int, packed: bytes, x64: bool) -> dict[str, np.ndarray] | None:
     """Compute a piece on a worker, which writes it if the job has a store and else returns it."""
     with _lock:
         job, store = _unpacked(packed, x64)
-    if store is None:
-        return job.run(k, 1)
-    store.write(k, job.run(k, 1))
-    return None
+    values = job.run(k, 1)
+    return values if store is None else store.write(k, values)
 
 
 @functools.lru_cache(maxsize=4)  # a job keeps its compiled programs from piece to piece

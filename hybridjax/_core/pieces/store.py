@@ -231,21 +231,13 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
     """
     sizes = _sizes(address)
     try:
-        group = _group(address, "r")
-    except FileNotFoundError:
-        if sizes:
-            raise DefinitionError(
-                f"'{address}' is no store of results: choose another name."
-            ) from None
-        return None
-    except Exception as error:
-        raise DefinitionError(f"cannot open '{address}' as a Zarr store: {error}") from error
-    try:
-        theirs = json.loads(group.attrs[_ABOUT])["description"]
-    except (KeyError, TypeError, ValueError) as error:
+        theirs = json.loads(_group(address, "r").attrs[_ABOUT])["description"]
+    except Exception as error:  # (of many kinds)
+        if isinstance(error, FileNotFoundError) and not sizes:
+            return None
         raise DefinitionError(
-            f"'{address}' was not written by hybridjax, or not to its end: choose another store, "
-            "or delete it."
+            f"'{address}' is no store of results, or was not written to its end: choose another "
+            f"name, or delete it ({error!r})."
         ) from error
     change = difference(json.loads(json.dumps(job.description)), theirs)
     if change is not None:
