@@ -83,7 +83,7 @@ def code_digest(x: Definition) -> str:
     return walk.result
 
 
-_JITTED = type(jax.jit(len))
+_JITTED: Any = type(jax.jit(len))
 # Of functions, since JAX's caches were last cleared: their digests by those of definitions.
 _meanings: weakref.WeakKeyDictionary[Any, dict[str, str]] = weakref.WeakKeyDictionary()
 
