@@ -90,9 +90,9 @@ def estimate_htf(
     setup, (tried, ran) = sums.setup, sums.experiments
     if len(rows) == 0:
         raise DefinitionError(
-            f"no frequency is left to estimate: {ran}/{tried} ok; a frequency must have been "
-            f"measured from each of the {len(setup.inputs)} inputs, a multiple of 1/2 with two "
-            "phases."
+            f"no frequency can be estimated from these {ran} experiments ({tried - ran} failed): "
+            f"excite each frequency by each of the {len(setup.inputs)} inputs, and a multiple of "
+            "1/2 with two phases."
         )
     f, lines = sums.f[rows], _solve_lines(sums, rows)
     why_not = _why_not_total(sums, rows)

@@ -43,7 +43,7 @@ def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, 
             f"{every[0]} to {every[-1]}."
         )
     if len(set(integers)) < len(integers) or not integers:
-        raise DefinitionError(f"`harmonics` must be distinct and at least one: {integers}.")
+        raise DefinitionError(f"`harmonics` must be one or more different integers: {integers}.")
     return integers
 
 

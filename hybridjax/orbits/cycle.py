@@ -190,8 +190,7 @@ class LimitCycle(eqx.Module):
         """The state at `anchor`, by name."""
         _require_values(self, "state")
         anchor = to_host(self.anchor)
-        chart = self.structure.charts[int(anchor.chart[0])]
-        return dict(zip(chart.states, anchor.q[:, 0].tolist(), strict=False))
+        return self.structure.by_name(int(anchor.chart[0]), anchor.q[:, 0])
 
     def trajectory(self, periods: Positive = 1.0) -> Trajectory:
         """The orbit from `anchor` on, with its events, dense enough to plot.

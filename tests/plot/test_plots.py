@@ -58,7 +58,7 @@ def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
     figure = hj.plot.bodes(families, fits={"b": rational}).figure
     assert [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]] == [4, 4]
-    with pytest.raises(hj.DefinitionError, match="fits of 'c', but the HTFs are"):
+    with pytest.raises(hj.DefinitionError, match="`fits`: there is no name 'c'"):
         hj.plot.bodes(families, fits={"c": rational})
 
 

@@ -83,7 +83,7 @@ def replaced(**changes):
         ),
         (Anything({"a": Field("xv", lambda t, q, u: q)}), "must be a tuple of names, not 'xv'"),
         (Anything(ROOM, named=(SUM, SUM)), "states and outputs of the same name"),
-        (Anything(ROOM, named=SUM), r"outputs\(\) must return several `hj.Output`"),
+        (Anything(ROOM, named=SUM), r"outputs\(\) must return a list, each item of the class `hj.Output`"),
         (replaced(source="c"), "there is no chart 'c'; charts are a, b"),
         (replaced(reset=lambda t, q, u: q), r"reset of transition 'go' \(a -> b\) returns shape"),
         (replaced(guard=lambda t, q, u: q), r"guard of transition 'go' \(a -> b\) returns shape"),
