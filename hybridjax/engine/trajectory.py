@@ -94,7 +94,7 @@ class Trajectory(eqx.Module):
             events.append(Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after))
         return events
 
-    def dense(self, per_step: Count = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def dense(self, per_step: Count = 32) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times (p,), charts (p,) and states (p, d), with `per_step` points in every step.
 
         Between steps the cubic Hermite interpolant is used. At an event both sides appear, with
@@ -111,7 +111,7 @@ class Trajectory(eqx.Module):
         keep[1:, 0] = self.event[1:-1] >= 0  # a step's start repeats the last end, but for resets
         return t[keep], chart[keep], q[keep]
 
-    def __call__(self, *names: str, per_step: Count = 8) -> tuple[np.ndarray, ...]:
+    def __call__(self, *names: str, per_step: Count = 32) -> tuple[np.ndarray, ...]:
         """Times and the named states or outputs (at zero input), dense enough to plot.
 
         Values are NaN in charts where they are not defined.

@@ -55,7 +55,7 @@ def estimate_htf(
 
     - `data`: the experiments, or an iterable of parts of them, as `stream_experiments` and
       `StoredExperiments` return; only sums over experiments are kept in memory.
-    - `harmonics`: the harmonics to estimate. Default: all N.
+    - `harmonics`: m of the H_m to estimate, one integer or several: 2 is H_2 alone. Default: all N.
     - `repeats`: number of the last windows of P periods that are averaged. Default: 1.
     - `variance`: "noise" is computed from the repeats, "total" from the realizations; each raises
       an error if it is not available. "auto" is "total" if available, else "noise". Default:

@@ -15,7 +15,7 @@ from .time_response import monodromy
 Frequencies = Vector | Scalar
 """Cycles per period: (F,), or one."""
 Harmonics = int | Iterable[int]
-"""One harmonic, or several."""
+"""m of H_m, or several: 2 is H_2 alone."""
 
 
 def all_harmonics(n_sections: int) -> tuple[int, ...]:

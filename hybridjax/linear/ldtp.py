@@ -206,7 +206,8 @@ class LDTP(eqx.Module):
         **Arguments:**
 
         - `f` (F,): input frequencies in cycles per period.
-        - `harmonics`: which ones; `None` means all `N`.
+        - `harmonics`: m of the H_m, one integer or several: 2 is H_2 alone, `range(-2, 3)` all
+          up to it. Default: all `N`.
 
         **Raises:** `DefinitionError` if a harmonic does not exist, or a multiplier lies within
         `1e-8` of $e^{2 \\pi i f}$, where the response is unbounded. (Inside `jit` and other

@@ -239,7 +239,8 @@ class LimitCycle(eqx.Module):
         **Arguments:**
 
         - `f`: input frequencies, in cycles per period.
-        - `harmonics`: any integers m. Default: 0.
+        - `harmonics`: m of the H_m, one integer or several: 2 is H_2 alone, `range(-2, 3)` all up
+          to it. Default: 0.
         - `outputs`: names or `Output`s. Default: all states that every chart defines.
         - `inputs`: names. Default: all.
 
@@ -348,7 +349,7 @@ def orbit_picture(
 
     **Arguments:** `sections`: times, charts and states at sections, as of `Trajectory.dense`.
     """
-    s, turn = orbit.structure, orbit.dense()
+    s, turn = orbit.structure, orbit.dense(8)
     names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
     if not names:
         return ""
