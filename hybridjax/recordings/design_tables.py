@@ -77,7 +77,7 @@ def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording
     """
     columns = read_tables(Path(path), Wanted("time"))[0].values
     if not set(_BY_PHASE) <= set(columns):
-        raise FileFormatError(f"'{path}' must have the columns {', '.join(_BY_PHASE)} of a design.")
+        raise FileFormatError(f"'{path}' must be a table by phase: leave out `period` and `rate`.")
     experiment, N = columns["experiment"], int(columns["section"].max()) + 1
     count = np.unique(experiment, return_counts=True)[1]
     if (count != count[0]).any() or (np.diff(experiment) < 0).any():

@@ -84,7 +84,7 @@ def section_data(
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
     if None not in (n_sections, phase.n_sections):
-        require_equal("`n_sections` and `phase`", "numbers", n_sections, phase.n_sections)
+        require_equal("`n_sections` and phase", "n_sections", n_sections, phase.n_sections)
     N = n_sections or phase.n_sections or HARMONICS
     bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
     nu, columns = len(inputs), [recording.column(x) for x in (*inputs, *outputs)]

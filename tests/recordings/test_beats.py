@@ -90,7 +90,7 @@ def test_what_is_refused(noisy):
     for message, signals, phase in [
         ("no event 'spike'", wave, hj.AtEvent("spike")),
         ("u is constant", {"u": 0 * t}, BEAT),
-        ("has no samples of the input u", {"u": np.nan * t}, BEAT),
+        ("has no samples of u", {"u": np.nan * t}, BEAT),
         ("8 intervals are too few", wave, BEAT),
         ("needs events or crossings", wave, angle),
     ]:
