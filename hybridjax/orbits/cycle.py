@@ -349,7 +349,7 @@ def orbit_picture(
 
     **Arguments:** `sections`: times, charts and states at sections, as of `Trajectory.dense`.
     """
-    s, turn = orbit.structure, orbit.dense(8)
+    s, turn = orbit.structure, orbit.dense()
     names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
     if not names:
         return ""
