@@ -43,7 +43,7 @@ def write_module(path: Path, thing: eqx.Module) -> None:
     """
     kind = type(thing).__name__
     if (wrong := _wrong_field(thing)) is not None:
-        raise DefinitionError(f"this {kind} cannot be saved: its {wrong}, of a wrong type.")
+        raise DefinitionError(f"this {kind} cannot be saved: its {wrong}, a wrong type or shape.")
     static, arrays = taken_apart(thing)
     header = {
         "format": _FORMAT,

@@ -153,9 +153,11 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
 
     def covered(turn: float) -> int:
         x, y = np.cos(inwards + turn), np.sin(inwards + turn)
-        note.set_position((9 * x, 9 * y))
-        note.set_ha("left" if x > 0.35 else "right" if x < -0.35 else "center")
-        note.set_va("bottom" if y > 0.35 else "top" if y < -0.35 else "center")
+        note.set(
+            position=(9 * x, 9 * y),
+            ha="left" if x > 0.35 else "right" if x < -0.35 else "center",
+            va="bottom" if y > 0.35 else "top" if y < -0.35 else "center",
+        )
         return note.get_window_extent().padded(4).count_contains(drawn)
 
     covered(min(_TURNS, key=covered))
