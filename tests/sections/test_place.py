@@ -112,6 +112,12 @@ def test_sections_of_another_cycle(placed_isochrons, lossy_cycle):
         hj.linearize(lossy_cycle, placed_isochrons)
 
 
+def test_equal_sections_are_located_once(hopper_cycle):
+    at = lambda phase: hj.place_sections(hopper_cycle, hj.ClockPhase(2, phase))  # noqa: E731
+    assert at(0.3) is at(0.3)
+    assert at(0.4) is not at(0.3)
+
+
 def test_sections_that_move_on_an_autonomous_cycle(vanderpol_cycle):
     period = float(vanderpol_cycle.period)
     moving = hj.Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / period), "falling")
