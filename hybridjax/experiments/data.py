@@ -140,10 +140,8 @@ class ExperimentData(eqx.Module):
     def require_ok(self) -> None:
         """**Raises:** `DefinitionError` if no experiment ran to its end."""
         if not self.ok.any():
-            raise DefinitionError(
-                f"no experiment ran to its end ({self.summary()}): look at the causes, and make "
-                "the inputs smaller."
-            )
+            causes = self.summary()
+            raise DefinitionError(f"no experiment ran to its end ({causes}): lower the inputs.")
 
     @property
     def records(self) -> tuple[Record, ...]:

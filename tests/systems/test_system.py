@@ -22,8 +22,6 @@ ROOM = {
     "b": Field(("z",), lambda t, q, u: -q),
 }
 TO_B = hj.Transition("go", "a", "b", lambda t, q, u: q[0], reset=lambda t, q, u: (q[0],))
-
-
 SUM = hj.Output("sum", lambda t, q, u: q.sum())
 HOPPER = hj.models.VerticalHopper()
 
