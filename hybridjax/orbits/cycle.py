@@ -193,8 +193,7 @@ class LimitCycle(eqx.Module):
         """The state at `anchor`, by name."""
         _require_values(self, "state")
         anchor = to_host(self.anchor)
-        chart = self.structure.charts[int(anchor.chart[0])]
-        return dict(zip(chart.states, anchor.q[:, 0].tolist(), strict=False))
+        return self.structure.by_name(int(anchor.chart[0]), anchor.q[:, 0])
 
     def trajectory(self, periods: Positive = 1.0) -> Trajectory:
         """The orbit from `anchor` on, with its events, dense enough to plot.
@@ -243,7 +242,8 @@ class LimitCycle(eqx.Module):
         **Arguments:**
 
         - `f`: input frequencies, in cycles per period.
-        - `harmonics`: any integers m. Default: 0.
+        - `harmonics`: m of the H_m, one integer or several: 2 is H_2 alone, `range(-2, 3)` all up
+          to it. Default: 0.
         - `outputs`: names or `Output`s. Default: all states that every chart defines.
         - `inputs`: names. Default: all.
 

@@ -91,7 +91,8 @@ TOP = Crossing("v", "falling")
             [TOP, Crossing(hj.Output("xv", lambda t, q, u: q[0] * q[1]), "falling")],
             r"section 1 \(xv falling\) is crossed 2 times in one period",
         ),
-        (hj.ClockPhase(4, anchor=Crossing("x", "rising", value=9.0)), "no point where x rising"),
+        (hj.ClockPhase(4, anchor=Crossing("x", "rising", value=9.0)), "at its anchor, x rising"),
+        (hj.KinematicPhase(8, "x", "v", (5.0, 0.0)), r"turn about the `center` \(5.0, 0.0\)"),
     ],
 )
 def test_what_is_wrong_with_a_section_is_said(sections, message, vanderpol_cycle):
