@@ -100,7 +100,8 @@ def test_derivatives_are_those_of_jax(model):
 def test_exact_htfs_give_the_exact_model(model, exact, variance):
     htf = with_values(exact, exact.H, variance)
     fit = hj.fit_ldtp(htf, shaken(model, np.random.default_rng(1)))
-    assert fit.result == hj.Result.OK
+    assert fit.result == hj.Result.OK and "too few dimensions" not in repr(fit)
+    assert "too few dimensions" in repr(hj.fit_ldtp(htf, 1))
     off = 1e-8 if variance is None else 1e-5  # (where they are known, 0.1 standard errors do)
     assert fit.compare(model.multipliers).max_error < off
     assert np.max(fit.model.htf(F).error(exact)) < off

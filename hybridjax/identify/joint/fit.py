@@ -68,7 +68,9 @@ class LDTPFit(MultiplierEstimate):
     - `cost`: sum of squares of the residuals in units of the errors' standard deviations, and
       `freedom`, its expectation. A larger cost means too few dimensions, or a local minimum.
       Without variances, as always for time series, the unit follows from the residuals, and the two
-      are equal: use `hj.validate`.
+      are equal: see `correlation`, and use `hj.validate`.
+    - `correlation`: of the residuals of HTFs at neighboring frequencies; about 0 for enough
+      dimensions. None for time series.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `harmonics` (M,): harmonics that were fitted; for time series, all N.
     - `noise`: an `LDTP` whose response to independent white inputs of variance one is the noise of
@@ -78,6 +80,7 @@ class LDTPFit(MultiplierEstimate):
     model: LDTP
     cost: float = eqx.field(static=True)
     freedom: int = eqx.field(static=True)
+    correlation: float | None = eqx.field(static=True)
     result: int = eqx.field(static=True)
     harmonics: tuple[int, ...] = eqx.field(static=True)
     noise: LDTP | None
@@ -157,10 +160,11 @@ class LDTPFit(MultiplierEstimate):
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         about = f"misfit {self.cost:.6g}, expected {self.freedom}"
-        if self.cost > 2 * self.freedom:
+        alike = self.correlation or 0.0
+        if self.cost > 2 * self.freedom or alike > max(1 / 3, 5 / np.sqrt(self.freedom)):
             about += (
-                " (errors are larger than their variances: too few dimensions, or a local minimum "
-                "that another guess avoids)"
+                " (errors are larger than their variances, or alike at neighboring frequencies: "
+                "too few dimensions, or a local minimum that another guess avoids)"
             )
         if self.noise is not None:
             size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
@@ -403,10 +407,15 @@ def _finished(
     freedom: int,
 ) -> LDTPFit:
     """Return the fit at a minimum, with the outputs in their own units, which are `scale`."""
-    model, known, noise = point.coordinates.model, False, None
+    model, known, noise, correlation = point.coordinates.model, False, None, None
     harmonics = all_harmonics(data.n_sections)
     if isinstance(data, HTF):
         known, harmonics = data.variance is not None, data.harmonics
+        problem = cast(FrequencyProblem, point.problem)
+        e, size = problem.errors(model)[:, np.argsort(data.f)], problem.weight * problem.target
+        rounding = np.finfo(float).eps * (np.abs(size) ** 2).mean()
+        neighbors = (e[:, 1:] * e[:, :-1].conj()).real.mean()
+        correlation = float(neighbors / np.maximum((np.abs(e) ** 2).mean(), rounding))
     else:
         noise = noise_model(model, cast(SeriesProblem, point.problem).S, scale, data.outputs)
     c, slopes = characteristic_slopes(point.coordinates)
@@ -419,6 +428,7 @@ def _finished(
         covariance_freedom=np.inf if known else float(freedom),
         cost=point.cost if known else float(freedom),
         freedom=freedom,
+        correlation=correlation,
         result=Result.OK if converged else Result.NOT_CONVERGED,
         harmonics=harmonics,
         noise=noise,
