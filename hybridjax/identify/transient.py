@@ -20,6 +20,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
 from .denominator import multipliers_of
+from .series.records import start_responses
 from .spectral_sums import SILENT_LINE
 
 
@@ -148,12 +149,7 @@ def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows c
 
 def _decays(c: Float[np.ndarray, " d"], cycles: int) -> Float[np.ndarray, "cycles d"]:
     """Return a basis of the solutions of `v[p] + c_1 v[p-1] + ... + c_d v[p-d] = 0`."""
-    d = len(c)
-    v = np.zeros((cycles, d))
-    v[:d] = np.eye(d)
-    for p in range(d, cycles):
-        v[p] = -c @ v[p - d : p][::-1]
-    return v
+    return start_responses(c, np.zeros(1, int), cycles, len(c))[0]
 
 
 def _start(y, free, d: int) -> Float[np.ndarray, " d"]:

@@ -170,14 +170,15 @@ def _slopes(
 
 
 def _after(model: PeriodicModel, f: Float[np.ndarray, " F"], m: Int[np.ndarray, " M"]):
-    """Return derivatives of the HTFs by the state after each section, (d, M, F, ny)."""
+    """Return derivatives of the HTFs by the state after each section, (d, M, F, ny).
+
+    They are the states of the transposed system, whose sections come in the other order.
+    """
     N, ny = model.n_sections, len(model.C[0])
-    z = np.exp(2j * np.pi / N * (m[:, None] + f))
-    mu = adjoints(model, z.ravel())
-    factors = [(_waves(m, n, N)[:, None] / z)[..., None] for n in range(N)]
-    return [
-        mu[(n + 1) % N].reshape(-1, len(m), len(f), ny) * factor for n, factor in enumerate(factors)
-    ]
+    dual = model._replace(A=[A.T for A in model.A[::-1]], B=[C.T for C in model.C[::-1]])
+    states = states_at(dual, np.add.outer(m, f).ravel())[::-1]
+    waves = [_waves(m, n, N)[:, None, None] for n in range(N)]
+    return [x.reshape(-1, len(m), len(f), ny) * w for x, w in zip(states, waves, strict=True)]
 
 
 def _waves(m: Int[np.ndarray, " M"], n: int, N: int):
@@ -199,27 +200,8 @@ def states_at(
         return states, x
 
     _, forced = around(np.zeros((len(phi), len(f), nu), complex))
-    return around(np.einsum("fab,bfj->afj", _resolvent(phi, np.exp(-2j * np.pi * f)), forced))[0]
-
-
-def adjoints(
-    model: PeriodicModel, z: Complex[np.ndarray, " F"]
-) -> list[Complex[np.ndarray, "_ F ny"]]:
-    r"""Return $\mu$ at each section, transposed: (d, F, ny)."""
-    ny, phi = len(model.C[0]), model.monodromy()
-    back = 1 / z[:, None]
-
-    def around(mu):
-        out = []
-        for A, C in zip(reversed(model.A), reversed(model.C), strict=True):
-            mu = _real_times(A.T, mu)
-            mu *= back
-            mu += C.T[:, None, :]
-            out.append(mu)
-        return out[::-1]
-
-    forced = around(np.zeros((len(phi), len(z), ny), complex))[0]
-    return around(np.einsum("fba,bfi->afi", _resolvent(phi, z**-model.n_sections), forced))
+    turn = phi * np.exp(-2j * np.pi * f)[:, None, None]
+    return around(np.einsum("fab,bfj->afj", np.linalg.inv(np.eye(len(phi)) - turn), forced))[0]
 
 
 def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
@@ -227,7 +209,3 @@ def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *res
     parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
     return (matrix @ parts).view(complex).reshape(len(matrix), *x.shape[1:])
 
-
-def _resolvent(phi: Float[np.ndarray, "d d"], z_N: Complex[np.ndarray, " F"]):
-    r"""Return $(I - \Phi z^{-N})^{-1}$, given $z^{-N}$."""
-    return np.linalg.inv(np.eye(len(phi)) - phi * z_N[:, None, None])
