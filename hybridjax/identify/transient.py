@@ -111,7 +111,10 @@ def remove_transient(
             "(`multisine(lines='odd')`)."
         )
     tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
-    blocks = _compressed(free, left, everything)
+    # Pairs (Q, z) with no more columns of z than rows, and the same residuals.
+    whole = [np.concatenate(left, axis=1)] if everything else left
+    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T)[1].T for z in whole]
+    blocks = list(zip(free, fewer, strict=False))  # (with everything, all Q are the same)
     count = sum(z.size for z in left)
     fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
     c = min(fits, key=lambda fit: fit[0])[1]
@@ -164,14 +167,6 @@ def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
         normal += np.einsum("ikl,jkl->ij", lags[1:], lags[1:])
         right -= np.einsum("ikl,kl->i", lags[1:], lags[0])
     return np.linalg.lstsq(normal, right, rcond=None)[0]
-
-
-def _compressed(free, left, everything: bool):
-    """Return pairs (Q, z) with no more columns of z than rows, and the same residuals."""
-    if everything:
-        free, left = free[:1], [np.concatenate(left, axis=1)]
-    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T)[1].T for z in left]
-    return list(zip(free, fewer, strict=True))
 
 
 def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):

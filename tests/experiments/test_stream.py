@@ -158,8 +158,7 @@ def test_another_process_can_run_a_piece(arguments, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")
     options = Options(start=start, discard=8)
-    campaign = prepare(*arguments, options, 2, one_program=True)
-    job = ExperimentJob(campaign, Blocks((COUNT,), (2,)))
+    job = ExperimentJob(prepare(*arguments, options, 2, one_program=True), Blocks((COUNT,), (2,)))
     _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
     mine, theirs = job.run(0, None), sent.run(0, 1)
