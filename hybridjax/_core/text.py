@@ -75,7 +75,7 @@ def signal_values(names: Iterable[str], values: Iterable[Any]) -> str:
     return ", ".join(f"{name} {number(x, 3, unit_of(name))}" for name, x in pairs)
 
 
-def fields(module: Any) -> str:
+def fields(module: Any, /) -> str:
     """A module by its fields, without those that are None."""
     shown_fields = (field for field in dataclasses.fields(module) if field.repr)
     named = ((field.name, getattr(module, field.name)) for field in shown_fields)

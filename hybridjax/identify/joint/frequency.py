@@ -73,8 +73,8 @@ class FrequencyProblem(NamedTuple):
 
         **Raises:** `LinAlgError` for a model that is resonant or overflows.
         """
-        still = ([np.zeros((len(x), 0)) for x in blocks] for blocks in (model.A, model.C))
-        coordinates = LocalCoordinates(model, *still, direct)
+        to_A, to_C = ([np.zeros((len(x), 0)) for x in blocks] for blocks in (model.A, model.C))
+        coordinates = LocalCoordinates(model, to_A, to_C, direct)
         return coordinates.moved(self.linearize(coordinates).step(0.0)[0])
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
