@@ -386,7 +386,9 @@ def _kernel_program(function, form, static, structure, static_leaves, lanes):
         return form(ft.partial(function, *static), *trees)(*arguments)
 
     # (One for each number of lanes, as it is for arrays of one shape.)
-    return jax.jit(run, compiler_options=compiler_options() | {"xla_cpu_parallel_codegen_split_count": 1})
+    return jax.jit(
+        run, compiler_options=compiler_options() | {"xla_cpu_parallel_codegen_split_count": 1}
+    )
 
 
 def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:
