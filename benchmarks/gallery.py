@@ -108,16 +108,17 @@ def draw(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | Non
 
 
 def sticks(case: Case, cycle: hj.LimitCycle, ax) -> None:
-    """One turn of a walker, lighter where it is earlier."""
+    """One turn of a walker at equal times, lighter where it is earlier, up to the touchdown (not to
+    the exchange of its legs)."""
     links = len(case.sticks[0][0])
     names = cycle.system.charts()["step"].states[:links]
-    _, *angles = cycle.trajectory()(*names)
-    angles = np.stack(angles)
-    for k in np.linspace(0, angles.shape[1] - 1, 7).astype(int):
-        way = np.stack([np.sin(angles[:, k]), np.cos(angles[:, k])])
+    t, *angles = cycle.trajectory()(*names)
+    for part in np.linspace(0, 1, 7):
+        now = np.stack(angles)[:, np.searchsorted(t, part * (1 - 1e-9) * t[-1])]
+        way = np.stack([np.sin(now), np.cos(now)])
         for line, color in zip(case.sticks, ("C0", "C1", "0.3"), strict=True):
             x, y = way @ np.array(line, float).T
-            ax.plot(x, y, color=color, alpha=0.25 + 0.75 * k / (angles.shape[1] - 1), lw=1)
+            ax.plot(x, y, color=color, alpha=0.25 + 0.75 * part, lw=1)
     ax.axhline(0, color="0.7", lw=0.5, zorder=0)
     ax.set(aspect="equal", xlabel="m", ylabel="m")
 

@@ -135,8 +135,8 @@ def rewrite(path, header=None, arrays=None):
     ("change", "says"),
     [
         ({"header": {"format_version": 9, "package_version": "9.0"}}, "version 9 .hybridjax 9.0"),
-        ({"header": {"format": "other"}}, "not written by hybridjax.save"),
-        ({"header": {"kind": "os.system"}}, "holds a 'os.system'; load knows Design"),
+        ({"header": {"format": "other"}}, "not written by `hj.save`"),
+        ({"header": {"kind": "os.system"}}, "holds a 'os.system'; `load` reads Design"),
         ({"header": {"kind": "LDTP"}}, "not those of LDTP"),
         ({"header": {"static": 3}}, "header is incomplete"),
         ({"header": {"arrays": {}}}, "header lists"),
@@ -188,5 +188,5 @@ def test_traced_and_batched_objects(folder, ldtp):
     with pytest.raises(hj.DefinitionError, match="outside of jit"):
         jax.jit(inside)(np.zeros(1))
     batch = jax.vmap(lambda f: ldtp.htf(f))(np.linspace(0.1, 0.4, 4).reshape(2, 2))
-    with pytest.raises(hj.DefinitionError, match="cannot be saved: f is float64"):
+    with pytest.raises(hj.DefinitionError, match="cannot be saved: its f is float64"):
         hj.save(folder / "x.npz", batch)

@@ -43,7 +43,7 @@ def write_module(path: Path, thing: eqx.Module) -> None:
     """
     kind = type(thing).__name__
     if (wrong := _wrong_field(thing)) is not None:
-        raise DefinitionError(f"this {kind} cannot be saved: {wrong}.")
+        raise DefinitionError(f"this {kind} cannot be saved: its {wrong}, a wrong type or shape.")
     static, arrays = taken_apart(thing)
     header = {
         "format": _FORMAT,
@@ -155,7 +155,7 @@ def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
     except (AttributeError, ValueError, TypeError, KeyError, RecursionError):
         name = None
     if name != _FORMAT:
-        raise FileFormatError(f"'{path}' was not written by hybridjax.save.")
+        raise FileFormatError(f"'{path}' was not written by `hj.save`, whose files alone are read.")
     if version != _VERSION:
         raise FileFormatError(
             f"'{path}' has format version {version} (hybridjax {header.get('package_version')}), "
@@ -163,7 +163,7 @@ def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
         )
     kind = header.get("kind")
     if not isinstance(kind, str) or kind not in kinds:
-        raise FileFormatError(f"'{path}' holds a {kind!r}; load knows {', '.join(kinds)}.")
+        raise FileFormatError(f"'{path}' holds a {kind!r}; `load` reads {', '.join(kinds)} only.")
     header.setdefault("units", {})  # (files written before units were kept)
     if not all(isinstance(header.get(part), dict) for part in ("static", "arrays", "units")):
         raise damaged(path, "its header is incomplete")
@@ -222,10 +222,10 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     file, holds Python objects, or declares more than `limits` allow.
     """
     if path.stat().st_size == 0:  # also of a pipe or device, which may have no end
-        raise FileFormatError(f"'{path}' is empty.")
+        raise FileFormatError(f"'{path}' is empty: write it again.")
     with open(path, "rb") as file:
         if not zipfile.is_zipfile(file):
-            raise FileFormatError(f"'{path}' is not an npz file, or is damaged.")
+            raise FileFormatError(f"'{path}' is not an npz file of `hj.save`, or is damaged.")
         try:
             with zipfile.ZipFile(file) as archive:
                 members = archive.infolist()
@@ -236,7 +236,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def damaged(path: Path, reason: str) -> FileFormatError:
-    return FileFormatError(f"'{path}' is damaged: {reason.rstrip('.')}.")
+    return FileFormatError(f"'{path}' is damaged: {reason.rstrip('.')}. Write it again.")
 
 
 def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:

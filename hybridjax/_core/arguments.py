@@ -51,9 +51,19 @@ def require_same(
 ) -> None:
     """**Raises:** `DefinitionError` if two things ("model and data") differ in a field."""
     for name in fields:
-        x, y = getattr(a, name), getattr(b, name)
-        if x != y:
-            raise DefinitionError(f"{what} have different {name}: {x} and {y}.")
+        require_equal(what, name, getattr(a, name), getattr(b, name))
+
+
+def require_equal(what: str, name: str, x: Any, y: Any) -> None:
+    """**Raises:** `DefinitionError` if numbers or names of two things ("model and data") differ."""
+    if x != y:
+        raise DefinitionError(f"{what} have different {name}: {x} and {y}; they must be the same.")
+
+
+def require_index(kind: str, index: int, count: int) -> None:
+    """**Raises:** `DefinitionError` for an index of a kind of which there are only `count`."""
+    if not -count <= index < count:
+        raise DefinitionError(f"there is no {kind} {index}: there are {count}, counted from 0.")
 
 
 def require_axes(what: str, array: Any, *axes: Mapping[str, int]) -> None:

@@ -13,6 +13,7 @@ import functools as ft
 import gc
 import hashlib
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
@@ -44,8 +45,8 @@ _QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusi
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 _WORTH_COMPILING = 3.0
-# Seconds in a quick executable after which the optimized one is compiled, in about as much time.
-# Less: a script waits at its end for the compiling thread longer than it has computed. More:
+# Seconds in a quick executable after which a script compiles the optimized one, in about as much
+# time. Less: it waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
 _WORTH_OPTIMIZING = 8.0
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
@@ -201,8 +202,9 @@ class TwoTiers:
     """`function(*arguments)` for one job, all of which is done by one executable.
 
     A job that is `large` waits for the fully optimized executable, so its results do not depend on
-    time. Another job uses it if it is there, and else the one that compiles in a third of the time;
-    after `_WORTH_OPTIMIZING` seconds of use a thread compiles the optimized one for later jobs.
+    time. Another job uses it if it is there, and else the one that compiles in a third of the time.
+    A thread compiles the optimized one for later jobs: in Jupyter and other interactive sessions
+    after the first use, in scripts after `_WORTH_OPTIMIZING` seconds of use.
     """
 
     def __init__(self, function: Callable, large: bool):
@@ -287,7 +289,9 @@ class _Program:
         if executable is self._quick and self._thread is None:
             with self._lock:
                 self._seconds += time.perf_counter() - begin
-                if self._seconds > _WORTH_OPTIMIZING and self._thread is None:
+                # (`ps1`, the prompt, exists in interactive sessions only.)
+                is_worth = hasattr(sys, "ps1") or self._seconds > _WORTH_OPTIMIZING
+                if is_worth and self._thread is None:
                     self._thread = threading.Thread(target=self._optimize)
                     self._thread.start()
         return results

@@ -150,20 +150,21 @@ class _Walk:
         self.alive.append(x)
         self.note(type(x).__qualname__)
         match x:
-            case np.ndarray() | np.generic() | jax.Array():
-                self._array(x)
+            case list() | tuple():
+                self.visit_all(x)
+            case dict() if type(x) is dict:
+                self.visit_all(part for item in x.items() for part in item)
             case types.FunctionType():
                 self._function(x)
             case types.CodeType():
-                self.note(x.co_code, x.co_names, x.co_varnames, x.co_freevars, x.co_argcount)
-                self.visit_all(x.co_consts)
+                self.note(_code(x))
+            case np.ndarray() | np.generic() | jax.Array():
+                self._array(x)
             case types.CellType():
                 with contextlib.suppress(ValueError):  # an empty cell
                     self.visit(x.cell_contents)
             case type():
                 self._class(x)
-            case list() | tuple():
-                self.visit_all(x)
             case set() | frozenset():
                 self.note(sorted(map(meaning, x)))
             case property():
@@ -306,6 +307,14 @@ class _Walk:
         slots = [vars(base).get("__slots__", ()) for base in type(x).__mro__]
         names = [y for z in slots for y in ((z,) if isinstance(z, str) else z)]
         self.visit_all(getattr(x, y, None) for y in names if y not in ("__dict__", "__weakref__"))
+
+
+@ft.lru_cache(4096)
+def _code(code: types.CodeType) -> str:
+    walk = _Walk()
+    walk.note(code.co_code, code.co_names, code.co_varnames, code.co_freevars, code.co_argcount)
+    walk.visit_all(code.co_consts)
+    return walk.digest.hexdigest()
 
 
 @ft.lru_cache(4096)

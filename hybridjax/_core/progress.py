@@ -37,6 +37,8 @@ class Call:
     done: int = 0
     step: str = ""
     compiling: bool = False
+    compared: Any = None
+    """Whose code has been compared with what it was, once for the whole call."""
 
     def __str__(self) -> str:
         """The current step."""
@@ -47,6 +49,11 @@ class Call:
 # The calls that are running, each inside of the one before.
 _running: list[Call] = []
 _enabled: bool | None = None
+
+
+def whole_call() -> Call:
+    """The call that a user made; a new one outside of all."""
+    return _running[0] if _running else Call("")
 
 
 @checked

@@ -159,7 +159,8 @@ def table(summary: dict) -> str:
     for item in summary["observations"]:
         rows.append(f"  [{'yes' if item['holds'] else 'no ':3}] {item['claim']}")
         rows.append(f"        {item['measured']}")
-    return "\n".join([*rows, "", f"Time: {summary['seconds']:.1f} s", ""])
+    end = f"Time: {summary['seconds']:.1f} s. docs/paper-errata.md explains each [no ]."
+    return "\n".join([*rows, "", end, ""])
 
 
 def complex_pairs(values) -> list[list[float]]:

@@ -18,7 +18,6 @@ from .._core.precision import enable_x64
 from .._core.writing import Format, results_folder
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
-from ..errors import ComputationError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import paper_design
 from ..experiments.run import run_experiments
@@ -108,9 +107,7 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process
     _set_up()
     begin = time.time()
     # Lines without second-order products on them need many experiments.
-    division: Literal["random", "sum-free"] = "sum-free"
-    if protocol.experiments < 80:
-        division = "random"
+    division: Literal["random", "sum-free"] = "sum-free" if protocol.experiments >= 80 else "random"
     design = paper_design(
         periods=protocol.keep, seed=protocol.seed, division=division,
         experiments=protocol.experiments,
@@ -165,8 +162,7 @@ def _identify(name: str, cycle: LimitCycle, design: Design, discard: int, begin:
     data = run_experiments(cycle, placed, design, OUTPUTS, discard=discard)
     experiments = data.summary()
     _log(begin, f"{name}: experiments, {experiments}")
-    if not data.ok.any():
-        raise ComputationError(f"no experiment on {name} sections ran to its end: {experiments}.")
+    data.require_ok()
     estimate = estimate_htf(data)
     rational, rational_exact = fit_rational(estimate), fit_rational(exact)
     structured = fit_multipliers(estimate, ldtp)

@@ -100,7 +100,8 @@ def from_xarray(dataset: Any) -> Saved:
         }
         return put_together(kind, static, arrays)
     except (HybridJaxError, IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DefinitionError(f"the dataset is no {header['kind']}: {error}") from error
+        text = f"was changed since `to_xarray` made it of a {header['kind']}: {error}"
+        raise DefinitionError(f"`dataset` {text}") from error
 
 
 def _from_module(module: eqx.Module) -> Any:

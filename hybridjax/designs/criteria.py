@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from .._core.arguments import require_among
+from .._core.arguments import require_among, require_index
 from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
@@ -47,7 +47,7 @@ def criterion_of(
     that do not exist, and combinations that the data do not identify, which are named.
     """
     if isinstance(goal, Parameters) and len(models) > 1:
-        raise DefinitionError("a goal of parameters holds its own cycle: give one `model`.")
+        raise DefinitionError("a `goal` of parameters is for one cycle: give a single `model`.")
     each = []
     for model in models:
         if isinstance(goal, Multipliers):
@@ -71,8 +71,8 @@ def _multipliers(
             apart = np.abs(minimal - multipliers[goal.which])
             if not apart.min() < _SAME * np.abs(multipliers).max():
                 raise DefinitionError(
-                    f"no input excites, or no measured output depends on, the multiplier "
-                    f"{multipliers[goal.which]:.4g}."
+                    f"no input excites the multiplier {multipliers[goal.which]:.4g}, or no output "
+                    "depends on it: add an input or an output."
                 )
             goal = dataclasses.replace(goal, which=int(np.argmin(apart)))
         wanted, names = wanted_parts(goal, minimal, c)
@@ -91,9 +91,8 @@ def wanted_parts(
     """Return derivatives of real and imaginary parts, or moduli, by c, and their names."""
     d = len(c)
     if d == 0:
-        raise DefinitionError("the model has no multipliers but zero: there is nothing to design.")
-    if goal.which is not None and goal.which >= d:
-        raise DefinitionError(f"`goal`: there is no multiplier {goal.which}, the model has {d}.")
+        raise DefinitionError("all multipliers of the model are zero: choose another `goal`.")
+    require_index("multiplier", goal.which or 0, d)
     slope = np.polyval(np.polyder(np.array([1.0, *c])), multipliers)
     wanted, names = [], []
     for k in range(d) if goal.which is None else [goal.which]:
@@ -102,8 +101,8 @@ def wanted_parts(
             continue
         if abs(slope[k]) < _SAME:
             raise DefinitionError(
-                f"the multiplier {z:.4g} is not simple: its variance is infinite to first "
-                "order, so no design can be made for it."
+                f"the multiplier {z:.4g} is double, so that its variance is infinite to first "
+                "order: choose another `goal`."
             )
         gradient = -(z ** np.arange(d - 1, -1, -1)) / slope[k]
         name = f"{z.real:.4g}" if z.imag == 0 else f"{z.real:.4g}{z.imag:+.4g}i"

@@ -145,12 +145,14 @@ def _root(
     size = np.sqrt(np.diag(information))
     lost = np.flatnonzero(~(size > 0))
     if len(lost):
-        raise DefinitionError(f"the data do not depend on {unknowns[lost[0]]} at all.")
+        text = f"no response depends on {unknowns[lost[0]]}: leave it out, or add an output."
+        raise DefinitionError(text)
     values, vectors = np.linalg.eigh(information / size / size[:, None])
     if not values[0] > SINGULAR:
         direction = vectors[:, 0] / size
         largest = np.abs(direction).max()
         named = zip(direction, unknowns, strict=True)
         parts = [f"{x:+.2g} {name}" for x, name in named if abs(x) > 1e-3 * largest]
-        raise DefinitionError(f"the data do not identify this combination: {' '.join(parts)}.")
+        text = "do not change with this combination of unknowns: fix one, or add an output"
+        raise DefinitionError(f"the responses {text}: {' '.join(parts)}.")
     return vectors / np.sqrt(values) / size[:, None]

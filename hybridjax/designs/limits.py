@@ -65,7 +65,7 @@ class Distortion(eqx.Module):
     def __check_init__(self):
         as_family(self.sections)
         if not self.rms:
-            raise DefinitionError("`rms` of a distortion limits nothing: name an output.")
+            raise DefinitionError("`rms` is empty: name an output, such as {'y': 1e-3}.")
         self.cycle.structure.resolve_outputs(tuple(map(str, self.rms)))
 
 
@@ -112,9 +112,8 @@ class Limits(eqx.Module):
                 "allow more, or take shorter experiments."
             )
         if count > cosines:
-            raise DefinitionError(
-                f"{count} experiments exceed the {cosines} cosines of the `design`."
-            )
+            text = f"take a `design` with more lines, or fewer experiments than {count}"
+            raise DefinitionError(f"the `design` has {cosines} cosines: {text}.")
         return count
 
 
@@ -179,8 +178,8 @@ class PowerLimits(NamedTuple):
         free = np.concatenate([self.cost, alone]).max(axis=0) == 0
         if free.any():
             raise DefinitionError(
-                f"no limit applies to cosine {int(np.argmax(free))} of the design (a distortion "
-                "does not where nothing is distorted): limit the input, too."
+                f"`limit` leaves cosine {int(np.argmax(free))} of the design free, because it "
+                "moves no limited signal: limit the input, too."
             )
 
 
@@ -200,7 +199,7 @@ def power_limits(
     else:
         require_among("signal", limits.rms, (*inputs, *outputs), "`limit`: ")
         if not (limits.rms or limits.rate or limits.peak or limits.distortion):
-            raise DefinitionError("`limit` limits nothing: name a signal.")
+            raise DefinitionError("`limit` is empty: name a signal, such as rms={'u': 0.1}.")
         levels = [{str(n): float(x) for n, x in limits.rms.items()} for _ in squares]
     limits.require_inputs(inputs)
     for level in levels:
@@ -208,7 +207,7 @@ def power_limits(
         level |= {peak_of(n): float(x) for n, x in limits.peak.items()}
     silent = [n for level in levels for n, rms in level.items() if rms == 0]
     if silent:
-        raise DefinitionError(f"the `design` does not move {silent[0]}, so it cannot be limited.")
+        raise DefinitionError(f"the `design` does not move {silent[0]}: leave it out of `limit`.")
     names = [n for level in levels for n in level]
     rows = [
         square[n.removeprefix(peak_of(""))] / rms**2

@@ -8,12 +8,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import require_same
+from .._core.arguments import require_equal, require_same
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Positive, Seed
 from .._core.execution import one_blas_thread
 from .._core.progress import working
-from .._core.text import listed
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
@@ -258,7 +257,7 @@ def optimal_design(
     """
     models = [model] if isinstance(model, Model) else list(model)
     if not models:
-        raise DefinitionError("`model` holds no model.")
+        raise DefinitionError("`model` must be one model or more, not an empty list.")
     usual = multisine(models[0].n_sections, inputs=models[0].inputs) if design is None else design
     _check_alike(models, usual)
     given = as_limits(limit)
@@ -321,9 +320,5 @@ def _check_alike(models: list[Model], design: Design) -> None:
     first = models[0]
     for k, model in enumerate(models):
         require_same(f"model {k} and model 0", model, first)
-    if design.n_sections != first.n_sections or design.input_names != first.inputs:
-        raise DefinitionError(
-            f"the design has {design.n_sections} sections and the inputs "
-            f"{listed(design.input_names)}, the model {first.n_sections} and "
-            f"{listed(first.inputs)}."
-        )
+    require_equal("design and model", "n_sections", design.n_sections, first.n_sections)
+    require_equal("design and model", "inputs", design.input_names, first.inputs)

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import require_same
+from .._core.arguments import require_equal, require_index, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, OptionalNames, Order, Positive, Seed
 from .._core.execution import one_blas_thread
@@ -104,20 +104,13 @@ class Study(eqx.Module):
     def __check_init__(self):
         first, goal = self.first, self.goal
         if len(first.input_names) > 1:
-            raise DefinitionError(
-                f"`first` has {len(first.input_names)} inputs: study one at a time."
-            )
+            raise DefinitionError("`first` must have a single input: study one at a time.")
         if goal.estimator == "fit_ldtp":
-            raise DefinitionError(
-                "a study estimates multipliers by fit_multipliers: `goal` has another estimator."
-            )
-        if goal.which is not None and goal.which >= self.order:
-            raise DefinitionError(
-                f"there is no multiplier {goal.which}: the order is {self.order}."
-            )
+            raise DefinitionError("`goal` of a study needs estimator='fit_multipliers'.")
+        require_index("multiplier", goal.which or 0, self.order)
         limits = as_limits(self.limit)
         if limits.strides is not None:
-            raise DefinitionError("a study ends at a precision, so `limit` may not be of strides.")
+            raise DefinitionError("a study ends at `standard_error`: leave strides out of `limit`.")
         limits.require_inputs(first.input_names)
         signals = (*first.input_names, *self.outputs)
         named = () if isinstance(limits.rms, str) else limits.rms
@@ -192,11 +185,8 @@ class Study(eqx.Module):
         initial transient, relative to the response, exceeds `standard_error` (tested if there are
         cycles before the window); as `estimate_htf`, `fit_multipliers` and `optimal_design`.
         """
-        if data.n_sections != self.first.n_sections or len(data.inputs) > 1:
-            raise DefinitionError(
-                f"`data` have {data.n_sections} sections and {len(data.inputs)} inputs, the study "
-                f"{self.first.n_sections} and 1."
-            )
+        require_equal("data and study", "n_sections", data.n_sections, self.first.n_sections)
+        require_equal("data and study", "numbers of inputs", len(data.inputs), 1)
         block = block_of(data, self.goal, repeats)
         for earlier in self._history.blocks[:1]:
             require_same("blocks of one study", earlier.htf, block.htf, ("inputs", "outputs"))

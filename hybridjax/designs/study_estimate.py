@@ -38,13 +38,12 @@ class Block(NamedTuple):
 
 def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     """**Raises:** `DefinitionError` as `estimate_htf`, and if no experiment ran to its end."""
+    data.require_ok()
     each = []
     for s in np.flatnonzero(data.ok):
         u, y = data.u[s : s + 1], data.y[s : s + 1]
         single = dataclasses.replace(data, u=u, y=y, result=data.result[s : s + 1], simulated=None)
         each.append(spectral_sums(single, goal.fitted_harmonics, repeats=repeats))
-    if not each:
-        raise DefinitionError(f"no experiment ran well: {data.summary()}.")
     N, P, f = data.n_sections, data.periods, np.concatenate([sums.line for sums in each])
     power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])[:, None]
     H = np.concatenate([sums.along[:, 0] for sums in each], axis=0).swapaxes(0, 1) / power

@@ -77,7 +77,7 @@ class Settings(eqx.Module):
         rtol: PositiveScalar | None = None,
         atol: PositiveScalar | None = None,
         max_steps: StepCount = 256,
-        scale: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None = None,
+        scale: Annotated[Numbers, Reals("charts states", sign="nonnegative")] | None = None,
         solver: Solver | Mapping[str, Solver] | Literal["auto"] | None = None,
     ):
         self.rtol, self.atol, self.scale = _kept(rtol), _kept(atol), _kept(scale)

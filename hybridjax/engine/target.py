@@ -58,9 +58,7 @@ class Target(eqx.Module):
 
 
 def toward(
-    time: Float[Array, " L"],
-    event: int,
-    limit: Float[Array, " L"] | Float[Array, ""],
+    time: Float[Array, " L"], event: int, limit: Float[Array, " L"] | Float[Array, ""]
 ) -> Target:
     """The target of lanes that end at times, or where `time` is infinite, at an event (or at a
     level that is filled in later), giving up at `limit`."""

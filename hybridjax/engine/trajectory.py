@@ -18,7 +18,7 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
 from ..errors import ComputationError, DefinitionError
-from ..systems.check import check_system
+from ..systems.check import check_system, evaluating
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
@@ -88,13 +88,13 @@ class Trajectory(eqx.Module):
         for k in np.flatnonzero(self.event >= 0):
             tr = s.transitions[self.event[k]]
             before, after = (
-                dict(zip(s.charts[s.chart_index(name)].states, q[k].tolist(), strict=False))
+                s.by_name(s.chart_index(name), q[k])
                 for name, q in ((tr.source, self.before), (tr.target, self.after))
             )
             events.append(Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after))
         return events
 
-    def dense(self, per_step: Count = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def dense(self, per_step: Count = 32) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times (p,), charts (p,) and states (p, d), with `per_step` points in every step.
 
         Between steps the cubic Hermite interpolant is used. At an event both sides appear, with
@@ -111,7 +111,7 @@ class Trajectory(eqx.Module):
         keep[1:, 0] = self.event[1:-1] >= 0  # a step's start repeats the last end, but for resets
         return t[keep], chart[keep], q[keep]
 
-    def __call__(self, *names: str, per_step: Count = 8) -> tuple[np.ndarray, ...]:
+    def __call__(self, *names: str, per_step: Count = 32) -> tuple[np.ndarray, ...]:
         """Times and the named states or outputs (at zero input), dense enough to plot.
 
         Values are NaN in charts where they are not defined.
@@ -228,13 +228,14 @@ def _constant_input(system: HybridSystem, input) -> np.ndarray:
     """The constant part of an input of the right shape; zero for a function of time."""
     nu, value = len(system.inputs), np.asarray(0.0)
     if callable(input):
-        shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), value).shape
+        with evaluating("input"):
+            shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), value).shape
     else:
         value = value if input is None else np.asarray(input, float)
         shape = value.shape
     if shape not in ((), (nu,)):
         raise DefinitionError(
-            f"the input has shape {shape}, but {type(system).__name__} has the {nu} inputs "
+            f"the input has shape {shape}, but {type(system).__name__} has the inputs "
             f"({', '.join(system.inputs)}): give one number for each."
         )
     return np.broadcast_to(value, (nu,))

@@ -72,16 +72,16 @@ class ExperimentData(eqx.Module):
 
     def __init__(
         self,
-        u: Annotated[Numbers, Reals("S n nu", missing=True, infinite=True)],
-        y: Annotated[Numbers, Reals("S n ny", missing=True, infinite=True)],
+        u: Annotated[Numbers, Reals("experiments samples inputs", missing=True, infinite=True)],
+        y: Annotated[Numbers, Reals("experiments samples outputs", missing=True, infinite=True)],
         *,
         n_sections: SectionCount,
         periods: PeriodCount,
         inputs: NewNames | None = None,
         outputs: NewNames | None = None,
-        result: Annotated[Numbers, Integers("S")] | None = None,
+        result: Annotated[Numbers, Integers("experiments")] | None = None,
         simulated: Simulated | None = None,
-        cycle_outputs: Annotated[Numbers, Reals("N ny")] | None = None,
+        cycle_outputs: Annotated[Numbers, Reals("sections outputs")] | None = None,
     ):
         """**Arguments:** the fields. Default of `result`: all OK. Default names: `u` and `y`, or
         `u0`, `u1`, ... for several.
@@ -93,14 +93,12 @@ class ExperimentData(eqx.Module):
         self.u, self.y = np.array(u), np.array(y)
         shapes = self.u.shape, self.y.shape
         if any(0 in s for s in shapes) or shapes[0][:2] != shapes[1][:2]:
-            raise DefinitionError(
-                "u must have the shape (experiments, samples, inputs) and y (experiments, "
-                f"samples, outputs), not {shapes[0]} and {shapes[1]}."
-            )
+            text = "the same experiments and samples (their first two axes)"
+            raise DefinitionError(f"`u` {shapes[0]} and `y` {shapes[1]} must have {text}.")
         S = len(self.u)
         self.result = np.zeros(S, int) if result is None else np.asarray(result, int)
         if not np.isin(self.result, list(Result)).all():
-            raise DefinitionError("`result` must hold codes of `Result`.")
+            raise DefinitionError("`result` must hold codes of `Result`, such as 0 for OK.")
         self.simulated = simulated
         self.cycle_outputs = None if cycle_outputs is None else np.array(cycle_outputs)
         self.n_sections, self.periods = n_sections, periods
@@ -116,9 +114,8 @@ class ExperimentData(eqx.Module):
                 "periods, beginning at section 0."
             )
         if n < N * P:
-            raise DefinitionError(
-                f"the window of P = {P} periods is longer than the record, {n // N} periods."
-            )
+            text = f"longer than the record, {n // N} periods: record more, or lower `periods`"
+            raise DefinitionError(f"the window of P = {P} periods is {text}.")
         for name in ("result", "failed_at", "error"):
             require_axes(f"`{name}`", getattr(self, name), {"experiments": S})
         if self.cycle_outputs is not None:
@@ -139,6 +136,12 @@ class ExperimentData(eqx.Module):
     def ok(self) -> Bool[np.ndarray, " S"]:
         """True for experiments that ran to their end."""
         return self.result == Result.OK
+
+    def require_ok(self) -> None:
+        """**Raises:** `DefinitionError` if no experiment ran to its end."""
+        if not self.ok.any():
+            causes = self.summary()
+            raise DefinitionError(f"no experiment ran to its end ({causes}): lower the inputs.")
 
     @property
     def records(self) -> tuple[Record, ...]:
@@ -209,7 +212,7 @@ class ExperimentData(eqx.Module):
         """
         plus, minus = self.u[::2], self.u[1::2]
         if len(self.u) % 2:
-            raise DefinitionError(f"{len(self.u)} experiments are not pairs: one has no partner.")
+            raise DefinitionError(f"{len(self.u)} experiments are not pairs: leave one out.")
         total, size = (np.abs(x).max(axis=(1, 2)) for x in (plus + minus, plus))
         apart = ~(total <= _OPPOSITE * size)
         if apart.any():

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import require_axes
+from .._core.arguments import require_axes, require_equal
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, NonNegative, Numbers, SectionCount, Seed
 from .._core.boundary.values import Reals
@@ -108,11 +108,9 @@ def simulate_experiments(
     **Raises:** `DefinitionError` if N (also of the process noise) or the number of inputs differ,
     or if a periodic response does not exist (a multiplier that is a P-th root of one).
     """
-    if ldtp.n_sections != design.n_sections or len(ldtp.inputs) != len(design.input_names):
-        raise DefinitionError(
-            f"the design is for N = {design.n_sections} and {len(design.input_names)} inputs, the "
-            f"model has N = {ldtp.n_sections} and {len(ldtp.inputs)}."
-        )
+    require_equal("design and model", "n_sections", design.n_sections, ldtp.n_sections)
+    numbers = len(design.input_names), len(ldtp.inputs)
+    require_equal("design and model", "numbers of inputs", *numbers)
     if discard is None:
         discard = DISCARD if start == "cycle" else 0
     u = applied = design.inputs(design.periods + discard)
@@ -157,8 +155,7 @@ def add_noise(
     if (std is None) == (snr is None):
         raise DefinitionError("add_noise needs either `std` or `snr`.")
     if snr is not None:
-        if not data.ok.any():
-            raise DefinitionError("no experiment ran well, so there is no signal to compare with.")
+        data.require_ok()
         std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
     std, N, ny = np.asarray(std), data.n_sections, data.y.shape[2]
     require_axes("`std`", std, {}, {"outputs": ny}, {"sections": N, "outputs": ny})

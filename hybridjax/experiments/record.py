@@ -51,8 +51,8 @@ class Record(eqx.Module):
 
     def __init__(
         self,
-        u: Annotated[Numbers, Reals("n nu", missing=True)],
-        y: Annotated[Numbers, Reals("n ny", missing=True)],
+        u: Annotated[Numbers, Reals("samples inputs", missing=True)],
+        y: Annotated[Numbers, Reals("samples outputs", missing=True)],
         *,
         n_sections: SectionCount,
         first_section: Index = 0,
@@ -64,10 +64,8 @@ class Record(eqx.Module):
         """**Raises:** `DefinitionError` for shapes that do not fit together."""
         self.u, self.y = np.array(u), np.array(y)
         if len(self.u) != len(self.y) or 0 in (len(self.u), *self.y.shape):
-            raise DefinitionError(
-                "u must have the shape (samples, inputs) and y (samples, outputs), not "
-                f"{self.u.shape} and {self.y.shape}."
-            )
+            text = f"`u` {self.u.shape} and `y` {self.y.shape} must have the same samples"
+            raise DefinitionError(f"{text} (their first axes), one or more.")
         if first_section >= n_sections:
             raise DefinitionError(
                 f"`first_section` must be one of 0..{n_sections - 1}, not {first_section}."
@@ -123,7 +121,7 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     parts = [data] if isinstance(data, HasRecords) else data
     records = [record for part in parts for record in part.records]
     if not records:
-        raise DefinitionError("`data` holds no experiment that ran to its end.")
+        raise DefinitionError("`data` holds no experiment that ran well: see `data.summary()`.")
     if not all(record.inputs for record in records):
         raise DefinitionError(
             "`data` holds no input: name the signals that acted, or use what needs none "
@@ -133,11 +131,12 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     other = [x for x in about if x != about[0]]
     if other:
         raise DefinitionError(
-            f"`data` holds records that do not belong together: {about[0]}, {other[0]}."
+            "`data` holds records of different sections, inputs, outputs, lead or drift: "
+            f"{about[0]}, {other[0]}."
         )
     usable = [part for record in records for part in _with_known_inputs(record)]
     if not usable:
-        raise DefinitionError("the input is NaN at every sample.")
+        raise DefinitionError("an input is NaN at every sample: give the input that acted.")
     return usable
 
 

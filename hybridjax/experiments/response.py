@@ -181,7 +181,7 @@ class ResponseFunction(eqx.Module):
 
     def __call__(
         self,
-        u: Annotated[Numbers, Reals("S n nu")],
+        u: Annotated[Numbers, Reals("experiments samples inputs")],
         start: Float[Array, "m S"] | None = None,
         system: HybridSystem | None = None,
     ) -> Response:

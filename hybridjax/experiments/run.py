@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import names
+from .._core.arguments import names, require_equal
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index
 from .._core.boundary.values import Reals
@@ -39,7 +39,10 @@ from .start import StartName, linearized, periodic_start, predict, settle_batch
 
 
 DesignLike = (
-    Design | Annotated[np.ndarray | jax.Array, Reals("S n nu", missing=True, infinite=True)]
+    Design
+    | Annotated[
+        np.ndarray | jax.Array, Reals("experiments samples inputs", missing=True, infinite=True)
+    ]
 )
 """A design, or inputs. (Arrays may lie on disk: their values are checked part by part.)"""
 
@@ -297,8 +300,7 @@ class Campaign:
         for a in np.unique(self.placed.lanes.chart):
             self.at_sections.outputs.require(int(a))
         raise DefinitionError(
-            "an output is NaN although its experiment ran well: it is not defined everywhere "
-            "that the experiments go."
+            "an output is NaN where experiments go: define it there, or make the inputs smaller."
         )
 
 
@@ -328,7 +330,7 @@ def prepare(
     if noise is not None:
         noise.require(N)
     if start != "cycle" and inputs.cycles % inputs.periods:
-        raise DefinitionError(f"a {start} start needs inputs of whole windows: use `discard=0`.")
+        raise DefinitionError(f"start='{start}' needs inputs of whole windows: use `discard=0`.")
     together = len(inputs) if chunk is None else min(chunk, len(inputs))
     execution = divide(together, options.execution or Execution())
     return Campaign(
@@ -354,8 +356,8 @@ def _controller(
     """
     if options.start != "cycle":
         raise DefinitionError(
-            f"a {options.start} start is that of the system without feedback: start on the cycle, "
-            "and discard cycles."
+            f"with `feedback` experiments cannot begin with start='{options.start}': use "
+            "start='cycle', and discard cycles."
         )
     model, F = linearize(placed.cycle, placed, outputs=outputs), options.feedback
     loop = model.feedback(F)  # type: ignore[arg-type]  # (not None)
@@ -378,14 +380,8 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
     **Raises:** `DefinitionError` if they do not fit, or hold NaN.
     """
     if isinstance(design, Design):
-        if design.n_sections != n_sections:
-            raise DefinitionError(
-                f"the design has {design.n_sections} sections, the family {n_sections}."
-            )
-        if len(design.input_names) != nu:
-            raise DefinitionError(
-                f"the design has {len(design.input_names)} inputs, the system {nu}."
-            )
+        require_equal("design and `sections`", "n_sections", design.n_sections, n_sections)
+        require_equal("design and system", "numbers of inputs", len(design.input_names), nu)
         return Inputs(design, discard + design.periods, design.periods)
     u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
     require_shape(u.shape, n_sections, nu)
@@ -398,7 +394,8 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
     cycles = u.shape[1] // n_sections
     if discard >= cycles:
         raise DefinitionError(
-            f"inputs of {cycles} cycles less {discard} discarded ones leave none."
+            f"of {cycles} cycles of inputs, discard={discard} leaves none: give longer inputs, or "
+            "a smaller `discard`."
         )
     return Inputs(u, cycles, cycles - discard)
 

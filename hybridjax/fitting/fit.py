@@ -119,7 +119,8 @@ def identifiability(
     x = parameters.encode(parameters.read(system))
     residuals, jacobian = evaluate(problem, x, cycle)
     if not np.isfinite(residuals).all():
-        raise ComputationError("the system has a limit cycle, but cannot produce such data.")
+        text = "predicts NaN or infinity for these data: change its parameters."
+        raise ComputationError(f"the system has a limit cycle, but {text}")
     return diagnose(parameters.names, _relative(parameters, x, jacobian))
 
 
@@ -130,7 +131,7 @@ def _prepare(
     parameters = free_parameters(system, free)
     observations = [data] if isinstance(data, AbstractObservation) else data
     if not observations:
-        raise DefinitionError("`data` holds no observation, but one or more are needed.")
+        raise DefinitionError("`data` must be one observation or more, not an empty list.")
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
     near = _anchored(near)
     prepared = tuple(observation.prepare(near) for observation in observations)

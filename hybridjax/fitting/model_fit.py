@@ -201,7 +201,7 @@ class ModelFit(eqx.Module):
             true = {name: operator.attrgetter(name)(true) for name in self.names}
         missing = [name for name in self.names if name not in true]
         if missing:
-            raise DefinitionError(f"there is no true value of '{missing[0]}'.")
+            raise DefinitionError(f"`true` must have a value of '{missing[0]}', which was fitted.")
         values = jnp.array([float(true[name]) for name in self.names])
         x = self.problem.parameters.encode(values)
         r, _ = evaluate(self.problem, x, self.cycle)

@@ -158,8 +158,7 @@ class ObservedSeries(AbstractObservation):
         """
         self.sections = as_family(sections)
         require_same("data and `sections`", data, self.sections, ("n_sections",))
-        if not data.ok.any():
-            raise DefinitionError("no experiment ran well, so there is nothing to fit to.")
+        data.require_ok()
         self.inputs, self.outputs = data.inputs, data.outputs
         y = data.y[data.ok]
         self.scale = _scale("outputs", std, jnp.asarray(y.reshape(-1, y.shape[2])))
@@ -210,9 +209,9 @@ class ObservedCycle(AbstractObservation):
         self,
         sections: FamilyLike,
         outputs: AnyNames = (),
-        values: Annotated[Numbers, Reals("N ny")] | None = None,
+        values: Annotated[Numbers, Reals("sections outputs")] | None = None,
         *,
-        times: Annotated[Numbers, Reals("N")] | None = None,
+        times: Annotated[Numbers, Reals("sections")] | None = None,
         period: PositiveScalar | None = None,
         std: Deviations | None = None,
         times_std: Deviations | None = None,

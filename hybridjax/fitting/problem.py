@@ -93,7 +93,7 @@ def free_parameters(system: HybridSystem, free: Free) -> Parameters:
     free = (free,) if isinstance(free, str) else free
     names = tuple(free)
     if not names or len(set(names)) < len(names):
-        raise DefinitionError(f"`free` names parameters, each once, and at least one: {names}.")
+        raise DefinitionError(f"`free` must name one parameter or more, each once, not {names}.")
     low, high, size = [], [], []
     for name in names:
         value = float(parameter_of(system, name))

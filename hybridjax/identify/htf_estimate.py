@@ -55,7 +55,7 @@ def estimate_htf(
 
     - `data`: the experiments, or an iterable of parts of them, as `stream_experiments` and
       `StoredExperiments` return; only sums over experiments are kept in memory.
-    - `harmonics`: the harmonics to estimate. Default: all N.
+    - `harmonics`: m of the H_m to estimate, one integer or several: 2 is H_2 alone. Default: all N.
     - `repeats`: number of the last windows of P periods that are averaged. Default: 1.
     - `variance`: "noise" is computed from the repeats, "total" from the realizations; each raises
       an error if it is not available. "auto" is "total" if available, else "noise". Default:
@@ -90,9 +90,9 @@ def estimate_htf(
     setup, (tried, ran) = sums.setup, sums.experiments
     if len(rows) == 0:
         raise DefinitionError(
-            f"no frequency is left to estimate: {ran}/{tried} ok; a frequency must have been "
-            f"measured from each of the {len(setup.inputs)} inputs, a multiple of 1/2 with two "
-            "phases."
+            f"no frequency can be estimated from these {ran} experiments ({tried - ran} failed): "
+            f"excite each frequency by each of the {len(setup.inputs)} inputs, and a multiple of "
+            "1/2 with two phases."
         )
     f, lines = sums.f[rows], _solve_lines(sums, rows)
     why_not = _why_not_total(sums, rows)

@@ -148,7 +148,7 @@ def htf_by_reference(
             sums = Sums(*both, total.experiments + sums.experiments, sums.setup)
         total = sums
     if total is None or not total.experiments:
-        raise DefinitionError("`data` holds no experiment that ran to its end.")
+        raise DefinitionError("`data` holds no experiment that ran well: see `data.summary()`.")
     inputs, references = (tuple(total.setup.inputs[i] for i in part) for part in roles)
     return solve(total, total.setup.outputs, inputs, references, (repeats, variance))
 

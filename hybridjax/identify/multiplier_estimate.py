@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from .._core.arguments import Numbers
+from .._core.arguments import Numbers, require_index
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Probability
 from .._core.boundary.values import Complexes
@@ -161,9 +161,7 @@ class MultiplierEstimate(eqx.Module):
 
         **Raises:** `DefinitionError` for an index that is not there.
         """
-        if not -len(self.multipliers) <= index < len(self.multipliers):
-            count = len(self.multipliers)
-            raise DefinitionError(f"there is no multiplier {index}: the fit has {count}.")
+        require_index("multiplier", index, len(self.multipliers))
         degrees = 1 if self.multipliers[index].imag == 0 else 2
         values, vectors = np.linalg.eigh(self.multiplier_covariances[index])
         angle = np.linspace(0, 2 * np.pi, points)

@@ -217,7 +217,8 @@ def exact_htf(model: LDTP, htf: HTF) -> HTF:
     """
     require_same("model and HTFs", model, htf)
     if htf.variance is None:
-        raise DefinitionError("a bound needs the variances of the HTFs, and these have none.")
+        text = "estimate them from several realizations or windows (`repeats`)."
+        raise DefinitionError(f"a bound needs HTFs with variances: {text}")
     return dataclasses.replace(model.htf(htf.f, htf.harmonics), variance=htf.variance)
 
 

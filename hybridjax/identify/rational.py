@@ -160,7 +160,7 @@ def fit_rational(
     if 2 * len(H) < poles + zeros + 1:
         raise DefinitionError(
             f"{poles} poles and {zeros} zeros have {poles + zeros + 1} coefficients, too many for "
-            f"{len(H)} frequencies."
+            f"{len(H)} frequencies: take fewer poles, or measure more frequencies."
         )
     # The denominator of a system with one section.
     f = np.asarray(htf.f) / htf.n_sections
@@ -170,10 +170,10 @@ def fit_rational(
         h = H[:, row]
         name = f"H_{harmonic} of {htf.outputs[row]}"
         if not np.isfinite(h).all():
-            raise DefinitionError(f"{name} holds NaN or infinity.")
+            raise DefinitionError(f"{name} holds NaN or infinity: leave these frequencies out.")
         rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
         if rms == 0 or (weighting == "relative" and np.abs(h).min() < ROUNDING * rms):
-            raise DefinitionError(f"{name} is zero at a frequency: there is nothing to fit there.")
+            raise DefinitionError(f"{name} is zero at a frequency: leave it out.")
         weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
         entry = (0, -1, 1.0, (row, column), h / rms, weight / np.sqrt(len(h)))
         (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [entry])

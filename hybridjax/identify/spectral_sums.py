@@ -107,16 +107,17 @@ def spectral_sums(
         setup = Setup(part.n_sections, part.periods, part.inputs, part.outputs)
         if total is not None and setup != total.setup:
             raise DefinitionError(
-                f"these experiments do not belong together: {total.setup}, {setup}."
+                "`data` holds experiments of different sections, periods or signals: "
+                f"{total.setup}, {setup}."
             )
         chosen = () if harmonics == () else check_harmonics(harmonics, part.n_sections)
         sums = _sums_of_part(part, setup, chosen, threshold, repeats, count)
         total = sums if total is None else _add(total, sums)
         count += len(part.ok)
     if total is None:
-        raise DefinitionError("`data` holds no experiments.")
+        raise DefinitionError("`data` must be experiments, not an empty list.")
     if len(total.line) == 0:
-        raise DefinitionError("the inputs are zero in the window: there is nothing to estimate.")
+        raise DefinitionError("the inputs are zero in the window: give the inputs that acted.")
     return total
 
 

@@ -83,15 +83,13 @@ def remove_transient(
             f"the record has {n // N} cycles, but to remove a transient it must hold the "
             f"window of P = {P} and the {skip} skipped ones before it: record some more."
         )
-    if not data.ok.any():
-        raise DefinitionError(f"no experiment ran well: {data.summary()}.")
+    data.require_ok()
     change = np.abs(data.u[data.ok, N * P :] - data.u[data.ok, : -N * P]).max(axis=(1, 2))
     worst = int(np.argmax(change))
     if change[worst] > SILENT_LINE * np.abs(data.u[data.ok][worst]).max():
         raise DefinitionError(
-            f"experiment {np.flatnonzero(data.ok)[worst]}: the input does not repeat after P = "
-            f"{P} periods over all of the record, so that response and transient cannot be told "
-            "apart."
+            f"the input of experiment {np.flatnonzero(data.ok)[worst]} does not repeat after P = "
+            f"{P} periods over all of the record: cut off the part in which it does not."
         )
 
     size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))

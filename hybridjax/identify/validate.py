@@ -304,8 +304,8 @@ def validate(
     if not compared:
         raise DefinitionError(
             f"the longest of {len(records)} uninterrupted records has "
-            f"{max(len(r.u) for r in records) / N:.3g} cycles: too few to tell the model from an "
-            "unknown start."
+            f"{max(len(r.u) for r in records) / N:.3g} cycles, too few for an unknown initial "
+            "state: record longer without gaps, or use start='cycle'."
         )
     grid = CycleGrid.from_records(compared)
     first = np.array([r.first_section for r in compared])
@@ -320,7 +320,7 @@ def validate(
     sampled, sizes = count(0), [*np.abs(grid.u).max(axis=(0, 1, 2)), *spread]
     for name, size in zip(records[0].inputs + outputs, sizes, strict=True):
         if not size:
-            raise DefinitionError(f"{name} is constant or missing at every sample.")
+            raise DefinitionError(f"{name} is constant or missing at every sample: leave it out.")
     if (few := int(sampled.min())) < FEWEST_SAMPLES:
         raise DefinitionError(f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles.")
     # One period, less for few cycles.
@@ -329,8 +329,8 @@ def validate(
     lags = max(sum(map(bool, enough)), 1)
     if (count(lags).max(axis=0) < FEWEST_SAMPLES).any():
         raise DefinitionError(
-            f"the records are too short: no section was sampled {FEWEST_SAMPLES} times with {lags} "
-            "samples before it in its record."
+            "the records are too short: record longer without gaps, until each section was sampled "
+            f"{FEWEST_SAMPLES} times with {lags} samples before it in its record."
         )
     simulated = simulate(tested, grid, free_start)
     error = y - simulated

@@ -24,7 +24,7 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
     htf.require_sampled("a fit")
     H = np.asarray(htf.H)
     if not np.isfinite(H).all():
-        raise DefinitionError("the HTFs hold NaN or infinity.")
+        raise DefinitionError("the HTFs hold NaN or infinity: leave these frequencies out.")
     rms = np.sqrt(np.mean(np.abs(H) ** 2, axis=(0, 1, 3)))
     if (rms == 0).any():
         name = htf.outputs[int(np.argmin(rms))]

@@ -15,7 +15,7 @@ from .time_response import monodromy
 Frequencies = Vector | Scalar
 """Cycles per period: (F,), or one."""
 Harmonics = int | Iterable[int]
-"""One harmonic, or several."""
+"""m of H_m, or several: 2 is H_2 alone."""
 
 
 def all_harmonics(n_sections: int) -> tuple[int, ...]:
@@ -43,7 +43,7 @@ def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, 
             f"{every[0]} to {every[-1]}."
         )
     if len(set(integers)) < len(integers) or not integers:
-        raise DefinitionError(f"`harmonics` must be distinct and at least one: {integers}.")
+        raise DefinitionError(f"`harmonics` must be one or more different integers: {integers}.")
     return integers
 
 

@@ -25,6 +25,9 @@ from .algebra import SAME_FREQUENCY
 from .frequency_response import Harmonics, check_harmonics
 
 
+_ENTRIES = "harmonics frequencies outputs inputs"
+
+
 @checked
 class Scatter(eqx.Module):
     r"""Degrees of freedom of an estimated `HTF.variance`, and shape of the sample that it was
@@ -48,8 +51,8 @@ class Scatter(eqx.Module):
 
     def __init__(
         self,
-        freedom: Annotated[Numbers, Reals("F", sign="positive")],
-        roundness: Annotated[Numbers, Reals("M F ny nu", sign="nonnegative")] | None = None,
+        freedom: Annotated[Numbers, Reals("frequencies", sign="positive")],
+        roundness: Annotated[Numbers, Reals(_ENTRIES, sign="nonnegative")] | None = None,
         shared: bool = False,
     ):
         require_x64()
@@ -81,7 +84,7 @@ class Scatter(eqx.Module):
         return freedom * jnp.expm1(-jnp.log(miss) / freedom)
 
 
-Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=True)]
+Variance = Annotated[Numbers, Reals(_ENTRIES, sign="nonnegative", infinite=True)]
 
 # Outputs, and harmonics (the largest ones), that a notebook shows. More: larger pages. Fewer: parts
 # of the response are hidden.
@@ -139,7 +142,7 @@ class HTF(eqx.Module):
     def __init__(
         self,
         f: Vector,
-        H: Annotated[Numbers, Complexes("M F ny nu")],
+        H: Annotated[Numbers, Complexes(_ENTRIES)],
         harmonics: Harmonics,
         n_sections: Annotated[int, Whole(0, limits.SECTIONS)],
         inputs: NewNames | None = None,
@@ -149,7 +152,7 @@ class HTF(eqx.Module):
         variance: Variance | None = None,
         noise_variance: Variance | None = None,
         scatter: Scatter | None = None,
-        power: Annotated[Numbers, Reals("F nu", sign="positive")] | None = None,
+        power: Annotated[Numbers, Reals("frequencies inputs", sign="positive")] | None = None,
     ):
         require_x64()
         self.f, self.H = from_host((f, H.astype(complex)))
@@ -253,9 +256,7 @@ class HTF(eqx.Module):
         **Raises:** `DefinitionError` as `feedback`, and for different numbers of both.
         """
         if len(self.inputs) != len(self.outputs):
-            raise DefinitionError(
-                f"{len(self.outputs)} outputs of {len(self.inputs)} inputs have no inverse."
-            )
+            raise DefinitionError("an inverse needs as many inputs as outputs: leave some out.")
         return _combined(algebra.inverse, [self], self.outputs, self.inputs)
 
     def feedback(self, controller: "HTF | HasHTF") -> "HTF":
@@ -298,7 +299,7 @@ class HTF(eqx.Module):
             return jnp.sqrt(-np.log1p(-level) * self.variance)
         return jnp.sqrt(self.scatter.quantile(level) * self.variance)
 
-    def predict(self, u: Annotated[Numbers, Reals("n nu")]) -> Float[Array, "time ny"]:
+    def predict(self, u: Annotated[Numbers, Reals("samples inputs")]) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
 
         Harmonics that are not stored count as zero. Differentiable with respect to `H`.
@@ -328,7 +329,7 @@ class HTF(eqx.Module):
         if lost.any():
             raise DefinitionError(
                 f"`u` holds the frequency f = {abs(self._circle(lines[lost][0] / periods)):g} "
-                "cycles per period, where the HTFs are not known."
+                "cycles per period, at which there are no HTFs: compute or estimate them there."
             )
         parts = jnp.einsum("mkij,kj->mki", H[:, distance.argmin(axis=1)], U[lines])
         places = (lines + periods * np.array(self.harmonics)[:, None]) % n
@@ -371,7 +372,7 @@ class HTF(eqx.Module):
     def _index(self, m):
         (m,) = check_harmonics(int(self._circle(m)), self.n_sections)
         if m not in self.harmonics:
-            raise DefinitionError(f"Harmonic {m} is not stored; those are {self.harmonics}.")
+            raise DefinitionError(f"harmonic {m} is not there; harmonics are {self.harmonics}.")
         return self.harmonics.index(m)
 
 
@@ -399,7 +400,7 @@ def _require_same_lines(a: HTF, b: HTF) -> None:
     if a.f.shape != b.f.shape or not (
         is_traced(a.f, b.f) or np.allclose(a.f, b.f, rtol=0, atol=SAME_FREQUENCY)
     ):
-        raise DefinitionError("Two HTFs at different frequencies cannot be compared.")
+        raise DefinitionError("two HTFs have different frequencies: compute both at one `f`.")
 
 
 def _combined(
@@ -415,7 +416,7 @@ def _combined(
     for x in operands:
         _require_same_lines(first, x)
         if x.harmonics != every:
-            raise DefinitionError(f"algebra of HTFs takes all {N} harmonics, not {x.harmonics}.")
+            raise DefinitionError(f"algebra needs all {N} harmonics: leave `harmonics` out.")
     lines = algebra.Lines.of(np.asarray(first.f), N)
     to_matrices = lambda x: lines.matrices(x, N // 2)  # noqa: E731
     result, pairs = operation(*(to_matrices(x.H) for x in operands))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .._core.arguments import Numbers, names, require_axes, require_same
+from .._core.arguments import Numbers, names, require_axes, require_equal, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, PeriodCount, Vector
 from .._core.boundary.values import Integers, Reals
@@ -25,7 +25,7 @@ from .multipliers import product_eigenvalues, product_rank
 
 
 Matrix = Annotated[Numbers, Reals("rows columns")]
-Signals = Annotated[Numbers, Reals("n nu")]
+Signals = Annotated[Numbers, Reals("samples inputs")]
 Gain = Annotated[Numbers, Reals()]
 
 # Singular values of a factor below this part of its largest one are zero. Smaller: rounding is
@@ -71,11 +71,11 @@ class LDTP(eqx.Module):
 
     def __init__(
         self,
-        A: Annotated[Numbers, Reals("N d d")],
-        B: Annotated[Numbers, Reals("N d nu")],
-        C: Annotated[Numbers, Reals("N ny d")],
-        D: Annotated[Numbers, Reals("N ny nu")] | None = None,
-        dims: Annotated[Numbers, Integers("N")] | None = None,
+        A: Annotated[Numbers, Reals("sections states states")],
+        B: Annotated[Numbers, Reals("sections states inputs")],
+        C: Annotated[Numbers, Reals("sections outputs states")],
+        D: Annotated[Numbers, Reals("sections outputs inputs")] | None = None,
+        dims: Annotated[Numbers, Integers("sections")] | None = None,
         inputs: NewNames | None = None,
         outputs: NewNames | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
@@ -94,10 +94,8 @@ class LDTP(eqx.Module):
                     f"C {C.shape} it should be {shape}, without empty axes."
                 )
         require_x64(matrices)
-        if coordinates is not None and len(coordinates) != n_sections:
-            raise DefinitionError(
-                f"`coordinates` names {len(coordinates)} sections, not {n_sections}."
-            )
+        if coordinates is not None:
+            require_equal("`A` and `coordinates`", "lengths", n_sections, len(coordinates))
         self.A, self.B, self.C, self.D = A, B, C, through
         self.dims = _dimensions(dims, n_sections, d)
         self.inputs, self.outputs = names("inputs", inputs, nu), names("outputs", outputs, ny)
@@ -124,8 +122,7 @@ class LDTP(eqx.Module):
         """
         given = {"A": A, "B": B, "C": C} | ({} if D is None else {"D": D})
         for name, blocks in given.items():
-            if len(blocks) != len(A) or len(A) == 0:
-                raise DefinitionError(f"`A` has {len(A)} matrices, `{name}` {len(blocks)}.")
+            require_equal(f"`A` and `{name}`", "numbers of matrices", len(A) or 1, len(blocks))
         dims = [np.shape(block)[1] for block in A]
         after, d = [*dims[1:], dims[0]], max(dims)
         ny, nu = np.shape(C[0])[0], np.shape(B[0])[1]
@@ -209,7 +206,8 @@ class LDTP(eqx.Module):
         **Arguments:**
 
         - `f` (F,): input frequencies in cycles per period.
-        - `harmonics`: which ones; `None` means all `N`.
+        - `harmonics`: m of the H_m, one integer or several: 2 is H_2 alone, `range(-2, 3)` all
+          up to it. Default: all `N`.
 
         **Raises:** `DefinitionError` if a harmonic does not exist, or a multiplier lies within
         `1e-8` of $e^{2 \\pi i f}$, where the response is unbounded. (Inside `jit` and other
@@ -346,15 +344,13 @@ class LDTP(eqx.Module):
         return self.periodic_states(self._input(u)[None], periods)[0]
 
     def periodic_states(
-        self, u: Annotated[Numbers, Reals("S n nu")], periods: PeriodCount
+        self, u: Annotated[Numbers, Reals("experiments samples inputs")], periods: PeriodCount
     ) -> Float[Array, "S d"]:
         """The states of `periodic_state` for S inputs (S, P N, nu)."""
         u = self._input(u)
         if u.shape[1] != periods * self.n_sections:
-            raise DefinitionError(
-                f"`u` has {u.shape[1]} samples, but {periods} periods of {self.n_sections} "
-                f"sections are {periods * self.n_sections}."
-            )
+            text = f"{periods} periods of {self.n_sections} sections, not {u.shape[1]}"
+            raise DefinitionError(f"`u` must have the samples of {text}.")
         self._refuse_resonance(np.arange(periods) / periods)
         by_period = u.reshape(len(u), periods, self.n_sections, -1)
         return time_response.periodic_states(self.A, self.B, by_period)

@@ -64,7 +64,7 @@ def _balanced(factors):
     factors = [np.array(factor, float) for factor in factors]
     for n, factor in enumerate(factors):
         if not np.all(np.isfinite(factor)):
-            raise ComputationError(f"Factor {n} of the monodromy holds NaN or infinity.")
+            raise ComputationError(f"A[{n}] holds NaN or infinity, so there are no multipliers.")
     for _ in range(8):  # more rounds change nothing
         for n in range(len(factors)):
             incoming = np.linalg.norm(factors[n - 1], axis=1)

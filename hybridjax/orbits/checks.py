@@ -59,10 +59,10 @@ def check_clock(s: Structure) -> None:
     """**Raises:** `DefinitionError` for a clock that is none, or schedules that do not fit it."""
     given: Any = s.system.period()
     if given is not None and np.shape(given):
-        raise DefinitionError(f"the clock's period must be one number; it is {given}.")
+        raise DefinitionError(f"`period()` must return one number, not {given}.")
     period = np.nan if given is None else float(given)
     if given is not None and not (np.isfinite(period) and period > 0):
-        raise DefinitionError(f"the clock's period must be positive; it is {period}.")
+        raise DefinitionError(f"`period()` must return a positive number, not {period}.")
     for transition in s.transitions:
         if isinstance(transition.guard, Scheduled):
             if given is None:

@@ -226,7 +226,7 @@ def _check(cycle, values) -> np.ndarray:
     require_x64(cycle)
     cycle.require_current()
     if int(cycle.result) != Result.OK:
-        raise DefinitionError(f"the cycle was not found: {Result(int(cycle.result)).message}.")
+        raise DefinitionError(f"`cycle` was not found ({Result(int(cycle.result)).message}).")
     steps = np.diff(np.asarray(values))
     if not len(steps) or abs(np.sign(steps).sum()) < len(steps):
         raise DefinitionError(

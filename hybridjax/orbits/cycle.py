@@ -15,6 +15,7 @@ from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, 
 from .._core.meaning import code_digest
 from .._core.memo import remembered
 from .._core.precision import require_x64
+from .._core.progress import whole_call
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
@@ -97,11 +98,13 @@ class LimitCycle(eqx.Module):
     def require_current(self) -> None:
         """**Raises:** `DefinitionError` if the system's code has changed since the cycle was
         found."""
-        if not self._is_current():
+        call = whole_call()
+        if call.compared is not self and not self._is_current():
             raise DefinitionError(
                 f"the functions of {type(self.system).__name__}, or values that they read, have "
                 "changed since this limit cycle was found: find it again."
             )
+        call.compared = self
 
     def _is_current(self) -> bool:
         return self.system.code_digest == code_digest(self.system)
@@ -190,8 +193,7 @@ class LimitCycle(eqx.Module):
         """The state at `anchor`, by name."""
         _require_values(self, "state")
         anchor = to_host(self.anchor)
-        chart = self.structure.charts[int(anchor.chart[0])]
-        return dict(zip(chart.states, anchor.q[:, 0].tolist(), strict=False))
+        return self.structure.by_name(int(anchor.chart[0]), anchor.q[:, 0])
 
     def trajectory(self, periods: Positive = 1.0) -> Trajectory:
         """The orbit from `anchor` on, with its events, dense enough to plot.
@@ -240,7 +242,8 @@ class LimitCycle(eqx.Module):
         **Arguments:**
 
         - `f`: input frequencies, in cycles per period.
-        - `harmonics`: any integers m. Default: 0.
+        - `harmonics`: m of the H_m, one integer or several: 2 is H_2 alone, `range(-2, 3)` all up
+          to it. Default: 0.
         - `outputs`: names or `Output`s. Default: all states that every chart defines.
         - `inputs`: names. Default: all.
 

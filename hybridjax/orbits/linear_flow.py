@@ -16,15 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
 from .._core.compilation import at_ease
-from .._core.executor import (
-    Array,
-    is_inside_program,
-    is_traced,
-    namespace,
-    on_host,
-    scan,
-    to_host,
-)
+from .._core.executor import Array, is_inside_program, is_traced, namespace, on_host, scan, to_host
 from .._core.memo import Memory
 from ..engine import kernels
 from ..engine.lanes import IDLE, Lanes, Tape, for_each_chart, only

@@ -13,6 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
+from .._core.arguments import require_index
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, Numbers
 from .._core.boundary.values import Reals
@@ -181,10 +182,7 @@ class Responses(eqx.Module):
                     "that of its clock; use `amplitude`."
                 )
             return self.of_phase
-        if mode >= len(self.exponents):
-            raise DefinitionError(
-                f"there is no mode {mode}; {len(self.exponents)} modes have amplitudes."
-            )
+        require_index("mode with an amplitude", mode, len(self.exponents))
         return self.of_amplitudes[mode]
 
     def _named(

@@ -5,13 +5,12 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
-from .._core.arguments import channel_index
+from .._core.arguments import channel_index, require_index
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
 from .._core.results import Result
 from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from .._core.text import p_value
-from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..identify.validate import Validation
 from ..recordings.beats.response import PhaseResponse, curve_unit
@@ -161,8 +160,7 @@ def experiment(data: ExperimentData, index: int = 0, *, ax: AxesLike | None = No
     **Raises:** `DefinitionError` for an experiment that does not exist.
     """
     S, n, _ = data.u.shape
-    if not -S <= index < S:
-        raise DefinitionError(f"there is no experiment {index}; there are {S}.")
+    require_index("experiment", index, S)
     index = index % S
     time = np.arange(n) / data.n_sections
     rows = [(name, data.u[index, :, k], True) for k, name in enumerate(data.inputs)]

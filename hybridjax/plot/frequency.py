@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from .._core.arguments import channel_index
+from .._core.arguments import channel_index, require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive, SignalNames
 from .._core.signal import ratio, with_unit
@@ -52,10 +52,8 @@ def magnitude(
         for htf in _exact_first(htfs):
             for m in harmonics:
                 f, values, radius = _values(htf, m, output, input)
-                size, line = (
-                    np.abs(values),
-                    _line(htf, htfs, _harmonic_style(m, harmonics), _name(m)),
-                )
+                size, style = np.abs(values), _harmonic_style(m, harmonics)
+                line = _line(htf, htfs, style, _name(m))
                 panel.plot(f, size, **line)
                 _band(panel, f, size, radius, line["color"], 0.3 * np.min(size))
         name, pushed = _pick("output", output, htf.outputs), _pick("input", input, htf.inputs)
@@ -177,9 +175,7 @@ def bodes(
     **Raises:** `DefinitionError` for fits of a family that is not there.
     """
     columns, fits = _columns(families), dict(fits or {})
-    for name in fits:
-        if name not in families:
-            raise DefinitionError(f"there are fits of '{name}', but the HTFs are {list(families)}.")
+    require_among("name", fits, families, "`fits`: ")
     with _grid(columns, 2, 3.4, ax) as axes:
         for k, (family, htfs) in enumerate(columns.items()):
             bode(*htfs, fits=fits.get(family, ()), harmonic=harmonic, input=input, ax=axes[:, k])

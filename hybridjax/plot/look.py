@@ -145,9 +145,7 @@ def letters(axes: Any) -> None:
 
 @checked
 def save(
-    path: FilePath,
-    plot: Plot | Figure | Axes,
-    formats: Sequence[Format] = ("png",),
+    path: FilePath, plot: Plot | Figure | Axes, formats: Sequence[Format] = ("png",)
 ) -> tuple[Path, ...]:
     """Write a figure, in one file for each format.
 
@@ -156,13 +154,16 @@ def save(
 
     **Returns:** the paths.
 
-    **Raises:** `DefinitionError` if they cannot be written.
+    **Raises:** `DefinitionError` if they cannot be written, and for a suffix of another format.
     """
     figure = cast(Figure, plot.get_figure(root=True)) if isinstance(plot, Axes) else plot
     figure = figure.figure if isinstance(figure, Plot) else figure
     path = Path(path)
     if path.suffix[1:] in get_args(Format):
         path = path.with_suffix("")
+    elif path.suffix[1:].isalpha():
+        suffixes = ", ".join(get_args(Format))
+        raise DefinitionError(f"'{path}': formats are {suffixes}, not '{path.suffix}'.")
     if not path.name:
         raise DefinitionError(f"'{path}' is a folder: add the name of a file without its suffix.")
     paths = tuple(path.with_name(f"{path.name}.{format}") for format in formats)

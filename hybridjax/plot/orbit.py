@@ -20,6 +20,7 @@ from .look import COLORS, AxesLike, Plot, axis_of, panels
 _CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
 # Half of a section's bar, and the distance from its end to its number, in widths of the picture.
 _BAR = 0.035
+_TURNS = np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
 _NUMBER: dict[str, Any] = {
     "fontsize": "x-small", "color": "0.35", "ha": "center", "va": "center", "zorder": 6,
     "path_effects": [withStroke(linewidth=2, foreground="white")],
@@ -73,9 +74,8 @@ def cycle(
             panel.plot(px, py, color=color, lw=1.8, label=label, zorder=3, solid_capstyle="butt")
         _, px, py = orbit(x, y)
         center = np.array([(np.nanmin(v) + np.nanmax(v)) / 2 for v in (px, py)])
+        panel.margins(0.1)
         _events(panel, s, orbit, (x, y), center)
-        panel.autoscale_view()
-        panel.margins(0.08)
         panel.locator_params(axis="x", nbins=6)
         if sections is not None:
             _sections(panel, s, sections, (x, y), center)
@@ -135,21 +135,34 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
         ax.plot(*before, "o", ms=4, color="black", zorder=5)
         if not any(transition.name in there for there in texts.values()):
             texts.setdefault(tuple(before.round(9)), {})[transition.name] = None
+    ax.autoscale_view()
+    drawn = [*ax.transData.transform(np.transpose(orbit(*names)[1:]))]
     for point, there in texts.items():
-        _text(ax, "\n".join(there), point, center)
+        _text(ax, "\n".join(there), point, center, drawn)
 
 
-def _text(ax: Axes, text: str, point, center) -> None:
-    """A text beside `point`, towards `center`."""
-    span = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())])
-    x, y = (center - np.asarray(point)) / span
-    x, y = np.array([x, y]) / (np.hypot(x, y) or 1.0)
-    ax.annotate(
-        text, point, xytext=(9 * x, 9 * y), textcoords="offset points", zorder=6,
+def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
+    """A text beside `point`, rather towards `center`, that covers the fewest of the pixels drawn,
+    to which its own are added."""
+    note = ax.annotate(
+        text, point, xytext=(0, 0), textcoords="offset points", zorder=6,
         path_effects=[withStroke(linewidth=2, foreground="white")],
-        ha="left" if x > 0.35 else "right" if x < -0.35 else "center",
-        va="bottom" if y > 0.35 else "top" if y < -0.35 else "center",
     )  # fmt: skip
+    to, at = ax.transData.transform([center, point])
+    inwards = np.arctan2(*(to - at)[::-1])
+
+    def covered(turn: float) -> int:
+        x, y = np.cos(inwards + turn), np.sin(inwards + turn)
+        note.set(
+            position=(9 * x, 9 * y),
+            ha="left" if x > 0.35 else "right" if x < -0.35 else "center",
+            va="bottom" if y > 0.35 else "top" if y < -0.35 else "center",
+        )
+        return note.get_window_extent().padded(4).count_contains(drawn)
+
+    covered(min(_TURNS, key=covered))
+    box = note.get_window_extent()
+    drawn += [(x, y) for x in np.linspace(box.x0, box.x1, 20) for y in (box.y0, box.y1)]
 
 
 def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> None:

@@ -77,11 +77,11 @@ def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording
     """
     columns = read_tables(Path(path), Wanted("time"))[0].values
     if not set(_BY_PHASE) <= set(columns):
-        raise FileFormatError(f"'{path}' has no columns {', '.join(_BY_PHASE)}: no table by phase.")
+        raise FileFormatError(f"'{path}' must be a table by phase: leave out `period` and `rate`.")
     experiment, N = columns["experiment"], int(columns["section"].max()) + 1
     count = np.unique(experiment, return_counts=True)[1]
     if (count != count[0]).any() or (np.diff(experiment) < 0).any():
-        raise FileFormatError(f"'{path}' has experiments of different lengths, or out of order.")
+        raise FileFormatError(f"'{path}' must have experiments of one length, in order.")
     if len(count) != len(recording.trials):
         text = f"{len(recording.trials)} trials, but the table has {len(count)} experiments."
         raise DefinitionError(f"there are {text}")

@@ -86,9 +86,8 @@ def impulse_responses(
         raise DefinitionError(f"`cycles` must hold one section or more, but is {cycles:g}.")
     reach = int(np.ceil(_PUSH_REACH * width * N))
     if reach >= lags:
-        raise DefinitionError(
-            f"`width`, {width:g}, is too wide for responses of {cycles:g} cycles."
-        )
+        text = f"responses of {cycles:g} cycles: lower it, or raise `cycles`"
+        raise DefinitionError(f"`width` {width:g} is too large for {text}.")
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
     # Responses to inputs of one section continue by the recursion from cycle to cycle.
     recursion = np.zeros(len(fit.coefficients) * N + 1)

@@ -178,7 +178,7 @@ def _moments(data: SectionData, order: int) -> _Moments:
     size = np.nanstd(np.concatenate([x.y for x in data.records]), axis=0)
     y = [r.y / size for r in data.records]
     if order > _EACH * len(size):
-        raise DefinitionError(f"`order` is {order}, but states have {_EACH * len(size)} numbers.")
+        raise DefinitionError(f"`order` must be at most {_EACH * len(size)}, the size of a state.")
     rows = np.array([
         (s, (r.first_section + k) // N, (r.first_section + k) % N, k)
         for s, r in enumerate(data.records)
@@ -188,7 +188,7 @@ def _moments(data: SectionData, order: int) -> _Moments:
     K, needed = len(names), 2 * (_EACH * order + 2)
     if K < needed:
         text = f"{K} cycles that are followed by another one are too few for {order} multipliers"
-        raise DefinitionError(f"{text}: {needed} are needed at least.")
+        raise DefinitionError(f"{text}: record {needed} or more.")
 
     def values(shift: int, count: int) -> Float[np.ndarray, "rows k"]:
         return np.array([y[s][k - shift - np.arange(count)].ravel() for s, _, _, k in rows])
@@ -202,7 +202,7 @@ def _moments(data: SectionData, order: int) -> _Moments:
     for n in range(N):
         at = np.flatnonzero(finite & (rows[:, 2] == n))
         if len(at) <= r + 1:
-            raise DefinitionError(f"section {n} was seen in {len(at)} cycles only: too few.")
+            raise DefinitionError(f"section {n} was seen in {len(at)} cycles only: record longer.")
         x, z = _principal(state[at], after[at], order)
         q, _ = _principal(instruments[at], instruments[at], r)
         for part, (a, b) in zip(parts, ((x, x), (z, x), (q, q), (x, q), (z, q)), strict=True):

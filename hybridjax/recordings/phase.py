@@ -6,6 +6,7 @@ from jaxtyping import Float
 from scipy import signal
 from scipy.interpolate import PchipInterpolator
 
+from .._core.arguments import require_equal
 from .._core.memo import remembered
 from ..errors import DefinitionError
 from .recording import Recording, Trial
@@ -72,7 +73,7 @@ class Phase(eqx.Module):
     def __check_init__(self):
         """**Raises:** `DefinitionError` for stretches that hold fewer than two whole cycles."""
         if self.cycles < 2:
-            raise DefinitionError(f"the recording has {self.cycles} whole cycles: two are needed.")
+            raise DefinitionError(f"the recording has {self.cycles} whole cycles: record more.")
 
     @remembered
     def periods(self) -> tuple[Float[np.ndarray, " _"], ...]:
@@ -90,10 +91,8 @@ class Phase(eqx.Module):
 
         **Raises:** `DefinitionError` for a recording with another number of trials.
         """
-        if len(self.stretches) != len(recording.trials):
-            raise DefinitionError(
-                f"the phase has {len(self.stretches)} trials, not {len(recording.trials)}."
-            )
+        numbers = len(self.stretches), len(recording.trials)
+        require_equal("phase and recording", "numbers of trials", *numbers)
         return list(zip(recording.trials, self.stretches, strict=True))
 
     @property

@@ -69,7 +69,7 @@ def estimate_phase(
         marked = recording.mark(event.name, definition, bandwidth=bandwidth)
         return _from_events(marked, event.name)
     if bandwidth is not None:
-        raise DefinitionError("events are not smoothed: no `bandwidth`.")
+        raise DefinitionError("events are not smoothed: leave `bandwidth` out.")
     return _from_events(recording, definition.name)
 
 
@@ -123,7 +123,7 @@ def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | Non
         signals = _at_common_times(trial.time, np.stack(columns, axis=1))
         both = np.isfinite(signals).all(axis=1)
         if both.sum() < FEWEST:
-            text = f"{int(both.sum())} samples of {' and '.join(names)}: too few for a phase."
+            text = f"{int(both.sum())} samples of {' and '.join(names)}: too few: leave it out."
             raise DefinitionError(f"trial '{trial.name}' has {text}")
         samples.append((trial.time[both], (signals[both] - center) / scale))
     anchor = family.anchor
@@ -167,10 +167,10 @@ def _plane(
     for name in (family.position, family.velocity):
         values = np.concatenate([x[np.isfinite(x)] for _, x in recording.samples(name)])
         if not len(values):
-            raise DefinitionError(f"{name} is missing at every sample.")
+            raise DefinitionError(f"{name} is missing at every sample: define the phase by others.")
         limits.append(np.quantile(values, [0.01, 0.99]))
         if family.scale is None and limits[-1][0] == limits[-1][1]:
-            raise DefinitionError(f"the phase needs a {name} that varies.")
+            raise DefinitionError(f"{name} is constant: define the phase by a signal that varies.")
     low, high = np.transpose(limits)
     center = (low + high) / 2 if family.center is None else np.asarray(family.center)
     return center, (high - low) / 2 if family.scale is None else np.asarray(family.scale)
@@ -213,7 +213,7 @@ def _from_events(recording: Recording, name: str) -> Phase:
         times.append(trial.events[name])
     intervals = np.concatenate([np.diff(t) for t in times])
     if len(intervals) < 2:
-        raise DefinitionError(f"there are too few events '{name}' for two cycles.")
+        raise DefinitionError(f"two cycles need three events '{name}' in a trial: record longer.")
     common, dropped, missed, stretches = _period(intervals), 0, 0, []
     for trial, t in zip(recording.trials, times, strict=True):
         period, doubled, longest = common, 0.5, 1.5

@@ -60,7 +60,7 @@ def read_recording(
     that cannot be read, with the line.
     """
     if not paths:
-        raise DefinitionError("there is no file to read.")
+        raise DefinitionError("`read_recording` needs the name of one file or more.")
     wanted = Wanted(time, None if signals is None else tuple(signals))
     return Recording.join([_recording(x, wanted, dict(units or {})) for x in map(Path, paths)])
 
@@ -88,7 +88,7 @@ def read_tables(path: Path, wanted: Wanted) -> list[Columns]:
         raise DefinitionError(f"'{path}' ends in '{path.suffix}'; formats are {kinds}.")
     try:
         if path.stat().st_size == 0:
-            raise FileFormatError(f"'{path}' is empty.")
+            raise FileFormatError(f"'{path}' is empty: export it again.")
         return reader(path, wanted)
     except OSError as error:
         raise DefinitionError(f"cannot read '{path}': {error.strerror}.") from error
@@ -111,7 +111,7 @@ def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
             parts.append(Recording(table.time, signals, units=given, name=path.stem, notes=notes))
     wanted.require(path, names)
     if not parts:
-        raise DefinitionError(f"'{path}' has no signals.")
+        raise DefinitionError(f"'{path}' has no signals beside its times: export some.")
     whole = Recording.beside(parts)
     (trial,), notes = whole.trials, list(whole.notes)
     for name, at in events.items():

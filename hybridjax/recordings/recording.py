@@ -89,7 +89,7 @@ class Recording(eqx.Module):
                 text = f"{key} is infinite at sample {int(np.argmax(np.isinf(values)))}"
                 raise DefinitionError(f"{where}: {text}; put NaN where a sample is bad.")
         if len(time) < 2:
-            raise DefinitionError(f"{where} has {len(time)} samples: nothing was recorded.")
+            raise DefinitionError(f"{where} has {len(time)} samples, but two or more are needed.")
         if not (np.diff(time) > 0).all() or np.isinf(time).any():
             bad = 1 + int(np.argmin(np.diff(np.where(np.isinf(time), np.nan, time)) > 0))
             raise DefinitionError(
@@ -141,7 +141,7 @@ class Recording(eqx.Module):
         """
         recordings = list(recordings)
         if not recordings:
-            raise DefinitionError("`recordings` holds no recording to join.")
+            raise DefinitionError("`recordings` must be one recording or more.")
         first = recordings[0]
         units = dict(zip(first.signals, first.units, strict=True))
         trials: list[Trial] = []
@@ -175,15 +175,13 @@ class Recording(eqx.Module):
         """
         recordings = list(recordings)
         if len({len(x.trials) for x in recordings}) != 1:
-            raise DefinitionError(
-                "`recordings` must hold recordings with the same number of trials."
-            )
+            raise DefinitionError("`recordings` must have the same number of trials each.")
         names = [name for x in recordings for name in x.signals]
         units = dict(zip(names, (unit for x in recordings for unit in x.units), strict=True))
         notes = [note for x in recordings for note in x.notes]
         if len(units) < len(names):
             twice = next(x for x in names if names.count(x) > 1)
-            raise DefinitionError(f"two of the recordings have a signal '{twice}'.")
+            raise DefinitionError(f"two recordings have a signal '{twice}': rename one.")
         joined = []
         for trials in zip(*(x.trials for x in recordings), strict=True):
             name = trials[0].name
@@ -278,7 +276,7 @@ def signal_of(crossing: Crossing) -> str:
     **Raises:** `DefinitionError` for a crossing of a function or in charts.
     """
     if not isinstance(crossing.function, str) or crossing.charts is not None:
-        raise DefinitionError("the Crossing of a recording names a signal, and no charts.")
+        raise DefinitionError("the Crossing of a recording must name a signal, and no charts.")
     return crossing.function
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._core.arguments import require_equal
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, SectionCount, SignalNames
 from .._core.boundary.values import Number
@@ -77,14 +78,13 @@ def section_data(
     for name in (*inputs, *outputs):
         values = [x[np.isfinite(x)] for _, x in recording.samples(name)]
         if not any(len(x) and np.ptp(x) for x in values):
-            raise DefinitionError(f"{name} is constant in all trials.")
+            raise DefinitionError(f"{name} is constant in all trials: leave it out.")
     if not outputs and timing is None:
         timing = "duration"
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
-    if None not in (n_sections, phase.n_sections) and n_sections != phase.n_sections:
-        text = f"but the phase is that of a family of {phase.n_sections} sections: give it once."
-        raise DefinitionError(f"n_sections is {n_sections}, {text}")
+    if None not in (n_sections, phase.n_sections):
+        require_equal("`n_sections` and phase", "n_sections", n_sections, phase.n_sections)
     N = n_sections or phase.n_sections or HARMONICS
     bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
     nu, columns = len(inputs), [recording.column(x) for x in (*inputs, *outputs)]
@@ -104,7 +104,7 @@ def section_data(
         trials += [number] * len(sections)
         cycles += [mean] * len(sections)
     if not parts:
-        raise DefinitionError("the recording holds no whole cycle to sample.")
+        raise DefinitionError("the recording holds no whole cycle without gaps: record longer.")
     names = [Signal(x, recording.unit(x)) for x in (*inputs, *outputs)]
     if timing is not None:
         names.append(Signal("time" if timing == "clock" else "duration", "s"))

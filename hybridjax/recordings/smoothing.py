@@ -58,7 +58,7 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     """
     finite = np.isfinite(values)
     if finite.sum() < FEWEST:
-        raise DefinitionError(f"{int(finite.sum())} samples are too few for a spline.")
+        raise DefinitionError(f"a spline needs {FEWEST} samples, not {int(finite.sum())}.")
     time, values = time[finite], values[finite]
     step = float(np.median(np.diff(time)))
     h = np.diff(time) / step

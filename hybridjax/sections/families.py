@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from .._core.arguments import require_axes
+from .._core.arguments import require_among, require_axes
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, Scalar, SectionCount, SignalNames
 from .._core.boundary.values import Reals
@@ -247,7 +247,8 @@ class KinematicPhase(_Anchored):
         self.anchor = _as_anchor(anchor)
 
     def check(self, s: Structure) -> None:
-        s.resolve_outputs((self.position, self.velocity))
+        where, names = "KinematicPhase(position, velocity): ", (self.position, self.velocity)
+        require_among("output", names, s.output_names(), where)
         super().check(s)
 
     def _scaled(self, z: Float[Array, "2"]) -> Float[Array, "2"]:
@@ -312,9 +313,7 @@ class SectionList(AbstractSections):
         """**Raises:** `DefinitionError` for an empty list."""
         self.items = tuple(items)
         if not self.items:
-            raise DefinitionError(
-                "`items` is empty: a list of sections needs a Crossing or AtEvent."
-            )
+            raise DefinitionError("a list of sections needs one Crossing or AtEvent, or more.")
 
     @property  # type: ignore[misc]
     def n_sections(self) -> int:  # type: ignore[override]

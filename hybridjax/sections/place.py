@@ -27,6 +27,7 @@ from ..orbits.crossing import Crossing, to_section
 from ..orbits.cycle import LimitCycle
 from ..orbits.return_map import PATIENCE, ReturnMap
 from ..systems.structure import Structure
+from . import families
 from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
 from .placed import PlacedSections, SectionsLike
 
@@ -58,8 +59,8 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     family = as_family(sections)
     require_x64(cycle, family)
     cycle.require_current()
-    for placed in list(_recent):
-        if placed.cycle is cycle and placed.family is family:
+    for placed in () if is_traced((cycle, family)) else list(_recent):
+        if placed.cycle is cycle and eqx.tree_equal(*jax.device_get((placed.family, family))):
             return placed
     map = cycle.return_map
     family.check(map.structure)
@@ -254,10 +255,13 @@ def _check(placed: PlacedSections, first: int) -> None:
         hint = " Give them to the search for the cycle, or place more sections."
         return f"{Result(code).message}.{hint if code == Result.STEP_LIMIT else ''}"
 
+    results = np.asarray(placed.result).tolist()
+    if isinstance(placed.family, families.KinematicPhase) and any([first, *results]):
+        _check_center(placed.family, placed.cycle)
     if first != Result.OK:
-        place = f"point where {anchor}" if isinstance(anchor, Crossing) else "point at its anchor"
-        raise ComputationError(f"the cycle has no {place}, for {name(0)}: {reason(first)}")
-    for i, code in enumerate(np.asarray(placed.result).tolist()):
+        place = f" at its anchor, {anchor}" if isinstance(anchor, Crossing) else ""
+        raise ComputationError(f"the cycle does not reach {name(0)}{place}: {reason(first)}")
+    for i, code in enumerate(results):
         if code != Result.OK:
             hint = " Does it lie on an event of the cycle? Then move it a little."
             raise ComputationError(
@@ -293,6 +297,23 @@ def _check(placed: PlacedSections, first: int) -> None:
             )
         if count > 1:
             raise ComputationError(f"{name(i)} is crossed {count} times in one period; {again}")
+
+
+def _check_center(phase: families.KinematicPhase, cycle: LimitCycle) -> None:
+    """**Raises:** `ComputationError` for an orbit that does not turn about the center."""
+    names = phase.position, phase.velocity
+    center = (0.0, 0.0) if phase.center is None else tuple(phase.center.tolist())
+    p, v = (x[~np.isnan(x)] for x in cycle.trajectory()(*names)[1:])
+    angle = np.unwrap(np.arctan2(v - center[1], p - center[0]))
+    if abs(angle[-1] - angle[0]) < np.pi:
+        spans = (
+            f"{x} from {min(y):.4g} to {max(y):.4g}" for x, y in zip(names, (p, v), strict=True)
+        )
+        raise ComputationError(
+            f"the orbit does not turn about the `center` {center} of the KinematicPhase: it has "
+            f"{' and '.join(spans)}. Give a `center` inside of it, or another `position` and "
+            "`velocity`."
+        )
 
 
 def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._core.arguments import require_axes
+from .._core.arguments import require_axes, require_index
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Numbers, Scalar
 from .._core.boundary.values import Reals
@@ -101,8 +101,7 @@ def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -
     """
     placed = as_placed(cycle, sections)
     for k in (i, j):
-        if k >= placed.n_sections:
-            raise DefinitionError(f"there is no section {k}: the last is {placed.n_sections - 1}.")
+        require_index("section", k, placed.n_sections)
     s, chart = placed.structure(), placed.lanes.chart
     dims = (s.d, s.d) if is_traced(chart) else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
     return SectionMap(placed, i, j, dims)

@@ -1,5 +1,7 @@
 """Checks of a system: names, shapes of every function, finite parameters."""
 
+import contextlib
+import functools as ft
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 
 import equinox as eqx
@@ -70,10 +72,9 @@ def _check_functions(s: Structure) -> Iterator[str]:
         ("outputs", system.outputs(), Output),
     ):
         if not isinstance(items, Iterable) or not all(isinstance(x, type_) for x in items):
-            several = "a dict of" if type_ is Chart else "several"
-            raise DefinitionError(
-                f"{kind}.{name}() must return {several} `hj.{type_.__name__}`, not {items}."
-            )
+            several = "a dict {name: chart}, each" if type_ is Chart else "a list, each item"
+            item = f"`hj.{type_.__name__}`"
+            raise DefinitionError(f"{kind}.{name}() must return {several} of the class {item}.")
     if not s.charts:
         raise DefinitionError(f"{kind} has no charts.")
     _check_names(kind, "inputs", system.inputs, system.input_units)
@@ -85,8 +86,8 @@ def _check_functions(s: Structure) -> Iterator[str]:
         _check_names(f"chart '{name}'", "states", (*chart.states, *chart.absent))
         _check_names(f"chart '{name}'", "states", chart.states, chart.units)
         s.method(a)
-        states = f"the chart has the {s.dims[a]} states {quoted(chart.states)}"
-        field = lambda *x, a=a: s.field(a, *x)  # noqa: E731
+        states = f"the chart has the states {quoted(chart.states)}: return one rate for each"
+        field = lambda s, *x, a=a: s.field(a, *x)  # noqa: E731
         yield from _check_shape(s, a, f"field of chart '{name}'", field, (s.dims[a],), states)
     if len(set(map(str, s.state_names()))) < len(s.state_names()):
         raise DefinitionError(f"{kind} gives a state two units: {quoted(s.state_names())}.")
@@ -104,11 +105,11 @@ def check_output(s: Structure, output: Output) -> Iterator[str]:
     """Check an output in each chart; yield its name in those where it uses the time."""
     for name in () if callable(output.function) else output.function:
         s.chart_index(name)
-    values = s.resolve_outputs(output)
     for a, name in enumerate(s.names):
-        if values.defined(a):
+        if s.resolve_outputs(output).defined(a):
             what = f"output '{output.name}' in chart '{name}'"
-            yield from _check_shape(s, a, what, lambda *x, a=a: values(a, *x), (1,), "")
+            values = lambda s, *x, a=a: s.resolve_outputs(output)(a, *x)  # noqa: E731
+            yield from _check_shape(s, a, what, values, (1,), "")
 
 
 def _check_transition(s: Structure, g: int) -> Iterator[str]:
@@ -117,33 +118,29 @@ def _check_transition(s: Structure, g: int) -> Iterator[str]:
     of = f"of transition '{tr.name}' ({tr.source} -> {tr.target})"
     if not isinstance(tr.guard, Scheduled):
         yield from _check_shape(
-            s, a, f"guard {of}", lambda *x: s.guard(g, *x), (), "it must be one number"
+            s, a, f"guard {of}", lambda s, *x: s.guard(g, *x), (), "it must be one number"
         )
-    holds = lambda *x: s.enabled(g, *x)  # noqa: E731
+    holds = lambda s, *x: s.enabled(g, *x)  # noqa: E731
     yield from _check_shape(s, a, f"`enabled` {of}", holds, (), "it must be one truth value")
-    states = f"chart '{tr.target}' has the {s.dims[b]} states {quoted(s.charts[b].states)}"
-    yield from _check_shape(s, a, f"reset {of}", lambda *x: s.reset(g, *x), (s.dims[b],), states)
+    states = f"chart '{tr.target}' has the states {quoted(s.charts[b].states)}: return one for each"
+    yield from _check_shape(s, a, f"reset {of}", lambda s, *x: s.reset(g, *x), (s.dims[b],), states)
 
 
 def _check_shape(
     s: Structure, a: int, what: str, function: Callable, shape: tuple[int, ...], reason: str
 ) -> Iterator[str]:
-    """Check the shape of a function of (t, q, u) in chart a. `reason`: why it must be this one.
-    Yield its name, `what`, if it uses t."""
+    """Check the shape of a function of a structure and (t, q, u) in chart a. `reason`: why it must
+    be this one. Yield its name, `what`, if it uses t."""
     shapes = (), (s.dims[a],), (s.nu,)
-    try:
+    with evaluating(what, " (t is a number, q and u are arrays: write `u[0]`)"):
         points = [jax.ShapeDtypeStruct(x, jnp.result_type(float)) for x in shapes]
-        program = jax.make_jaxpr(function)(*points)
-        _check_indices(function, *(np.full(x, 0.5) for x in shapes))
-    except DefinitionError:
-        raise
-    except Exception as error:
-        raise DefinitionError(f"the {what} cannot be evaluated: {error}") from error
+        program, *_ = eqx.filter_make_jaxpr(function)(s, *points)
+        _check_indices(ft.partial(function, s), *(np.full(x, 0.5) for x in shapes))
     (actual,) = (x.shape for x in program.out_avals)
     if actual != shape:
         raise DefinitionError(f"the {what} returns shape {actual}, but {reason}.")
-    _, (uses_time, *_) = dce_jaxpr(program.jaxpr, [True])
-    if uses_time:
+    _, uses = dce_jaxpr(program.jaxpr, [True])
+    if uses[-3]:
         yield what
 
 
@@ -157,6 +154,27 @@ def _check_indices(function: Callable, *point: np.ndarray) -> None:
             raise
         except Exception:  # functions for arrays of JAX only
             return
+
+
+@contextlib.contextmanager
+def evaluating(what: str, takes: str = "") -> Iterator[None]:
+    """A context in which JAX traces a user's function, of which errors say what to write instead.
+
+    **Raises:** `DefinitionError`.
+    """
+    try:
+        yield
+    except DefinitionError:
+        raise
+    except Exception as error:
+        problem = f"{str(error).rstrip('.')}{takes}."
+        if isinstance(error, jax.errors.JAXTypeError):
+            problem = (
+                "it uses a value that JAX does not know yet: write `jnp.where(a > 0, x, y)` for "
+                "`if a > 0`, `jnp.maximum` for `max`, `jnp.sin` for `math.sin` and `np.sin`, and "
+                "no `float`."
+            )
+        raise DefinitionError(f"the {what} cannot be evaluated: {problem}") from error
 
 
 def _check_names(what: str, kind: str, names: Sequence[str], units: Sequence[str] = ()) -> None:

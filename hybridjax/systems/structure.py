@@ -128,6 +128,13 @@ def _index(what: str, name: str, names: Sequence[str]) -> int:
     return names.index(name)
 
 
+class ByName(dict):
+    """Numbers by names. An error for another name lists them."""
+
+    def __missing__(self, name: str):
+        raise KeyError(f"there is no '{name}'; names are {', '.join(self)}")
+
+
 _kinds = Memory()
 
 
@@ -366,6 +373,10 @@ class Structure:
                 names[name] = name
         return tuple(names.values())
 
+    def output_names(self) -> tuple[str, ...]:
+        """The names of all states and outputs."""
+        return (*self.state_names(), *(x.name for x in self.system.outputs()))
+
     def states_everywhere(self) -> list[str]:
         """The states that every chart defines."""
         charts = range(len(self.charts))
@@ -374,6 +385,10 @@ class Structure:
     def states(self, a: int) -> tuple[Signal, ...]:
         """The names of chart a's states, with their units."""
         return signals(self.charts[a].states, self.charts[a].units)
+
+    def by_name(self, a: int, q: np.ndarray) -> dict[str, float]:
+        """A state of chart a by names."""
+        return ByName(zip(self.charts[a].states, q.tolist(), strict=False))
 
     def resolve_outputs(self, outputs: Sequence[str | Output] | str | Output) -> "Outputs":
         """Outputs by name or by `Output`, checked and ready to evaluate in any chart."""
@@ -393,7 +408,7 @@ class Outputs:
             if isinstance(item, str) and item in defined:
                 item = defined[item]
             if isinstance(item, str):
-                require_among("output", [item], (*structure.state_names(), *defined))
+                require_among("output", [item], structure.output_names())
             self.items.append(item)
         states = {str(name): name for name in structure.state_names()}
         self.names = tuple(

@@ -19,6 +19,7 @@ from .._core.meaning import code_digest, current
 from .._core.pieces.description import digest_of
 from .._core.precision import real
 from .._core.text import columns, fields, value
+from ..errors import DefinitionError
 from .chart import Chart, attribute_of
 from .solver import ByChart, Method, Solver, solvers
 from .transition import Transition
@@ -157,6 +158,15 @@ class HybridSystem(Definition):
     solver: Solver | Method | ByChart | None = eqx.field(
         static=True, default=None, kw_only=True, converter=solvers
     )
+
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        for name in ("charts", "transitions", "period", "outputs", "guess"):
+            if not callable(vars(cls).get(name, callable)):
+                raise DefinitionError(
+                    f"{cls.__name__}: `{name}` must be a method, not a value or parameter: write "
+                    f"`def {name}(self): return ...`."
+                )
 
     def __new__(cls, *args, **kwargs):
         check_fields(cls, args, kwargs)

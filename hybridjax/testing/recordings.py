@@ -72,7 +72,7 @@ def random_force(
 @checked
 def simulate_recording(
     cycle: LimitCycle,
-    force: Annotated[Numbers, Reals("S n nu")],
+    force: Annotated[Numbers, Reals("trials samples inputs")],
     outputs: OutputNames,
     *,
     rate: Positive = 500,
@@ -184,7 +184,7 @@ def spoil(
 @checked
 def simulate_beats(
     curve: Annotated[Numbers, Reals("n")],
-    force: Annotated[Numbers, Reals("S m")],
+    force: Annotated[Numbers, Reals("trials samples")],
     *,
     rate: Positive = 500,
     rhythm: Positive | Sequence[Positive] = 1.0,

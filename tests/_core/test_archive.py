@@ -110,10 +110,10 @@ def test_hostile_headers(tmp_path, static, says):
 def test_headers_are_nested_and_long(tmp_path, monkeypatch):
     path = tmp_path / "hostile.npz"
     np.savez(path, header=np.array("[" * 100_000))
-    refused(hj.load, path, "not written by hybridjax.save")
+    refused(hj.load, path, "not written by `hj.save`")
     monkeypatch.setattr(limits, "TEXT", 100)
     saved(path, {})
-    refused(hj.load, path, "not written by hybridjax.save")
+    refused(hj.load, path, "not written by `hj.save`")
 
 
 def test_a_parquet_file_that_declares_more_than_it_holds(tmp_path):

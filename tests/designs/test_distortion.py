@@ -237,7 +237,7 @@ def test_without_distortion(toy):
     usual = hj.multisine(4, periods=16).scaled(0.01)
     linear = Distortion(cycle, sections, {"x": 1e-3})
     options = dict(noise={"x": 1e-4}, goal=GOAL)
-    with pytest.raises(hj.DefinitionError, match="where nothing is distorted.: limit the input"):
+    with pytest.raises(hj.DefinitionError, match="moves no limited signal: limit the input"):
         hj.optimal_design(model, usual, limit=Limits(distortion=linear), **options)
     both = Limits(rms={"u": 0.01}, distortion=linear)
     plan = hj.optimal_design(model, usual, limit=both, **options)

@@ -101,8 +101,8 @@ def test_bad_data(model, first):
     study, data = hj.designs.Study(first, 2, 1e-4), measured(model, first)
     for change, message in (
         (dict(outputs=("a", "b")), "blocks of one study have different outputs"),
-        (dict(result=[3] * len(data.u)), "no experiment ran well: 0/8 ok"),
-        (dict(n_sections=4), "4 sections and 1 inputs, the study 8 and 1"),
+        (dict(result=[3] * len(data.u)), "no experiment ran to its end \\(0/8 ok"),
+        (dict(n_sections=4), "have different n_sections: 4 and 8"),
     ):
         with pytest.raises(hj.DefinitionError, match=message):
             study.add(data).add(dataclasses.replace(data, **change))

@@ -110,10 +110,10 @@ def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (dict(design=hj.multisine(16, band=(0, 7.0))), "the design has 16 sections, the family 32"),
+        (dict(design=hj.multisine(16, band=(0, 7.0))), "different n_sections: 16 and 32"),
         (dict(design=np.zeros((2, 33, 1))), "multiple of the 32 sections"),
-        (dict(design=np.zeros((2, 64, 1)), discard=2), "leave none"),
-        (dict(start="steady", discard=7), "a steady start needs inputs of whole windows"),
+        (dict(design=np.zeros((2, 64, 1)), discard=2), "leaves none"),
+        (dict(start="steady", discard=7), "needs inputs of whole windows"),
     ],
 )
 def test_bad_input(hopper_cycle, placed_isochrons, design, change, message):

@@ -59,7 +59,7 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
     parts = [DESIGN.inputs(9, slice(k, k + 5)) for k in range(0, COUNT, 5)]
     np.testing.assert_array_equal(np.concatenate(parts), u)
     for wrong in (slice(3, 3), slice(0, 9, 2), slice(COUNT, None)):
-        with pytest.raises(hj.DefinitionError, match="no consecutive experiments"):
+        with pytest.raises(hj.DefinitionError, match="a slice of consecutive experiments"):
             DESIGN.inputs(experiments=wrong)
 
 
@@ -172,8 +172,8 @@ def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(whole, arg
     good, high = np.cos(2 * np.pi * n / 64 * 3), np.cos(2 * np.pi * n / 64 * 19)
     good, bad = (hj.ExperimentData(u, u, n_sections=4, periods=16) for u in (good, good + high))
     for parts, message in (
-        ([whole, other], "do not belong together"),
-        ([], "no experiments"),
+        ([whole, other], "different sections, periods or signals"),
+        ([], "not an empty list"),
         ([good, good, bad], "experiment 2: f = "),
     ):
         with pytest.raises(hj.DefinitionError, match=message):

@@ -52,7 +52,7 @@ def records(**options):
         (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS), "different n_sections: 16 and 8"),
         (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS), "variance"),
         (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "different n_sections: 8 and 4"),
-        (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
+        (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran to"),
         (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), r"of shape \(1 outputs\)"),
         (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "zero throughout"),
         (lambda: hj.ObservedCycle(SECTIONS), "`times`, or a `period`"),

@@ -154,5 +154,5 @@ def test_what_does_not_fit_is_refused(plant):
             data.u[:2, :, :2], data.y[:2], n_sections=N, periods=8, inputs=("u", "r")
         )
         hj.estimate_htf(part, reference="r")
-    with refused("HTFs have no reference any more"):
+    with refused("`reference` is for time series"):
         hj.fit_ldtp(plant.htf([0.3]), 2, reference="r")

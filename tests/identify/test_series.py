@@ -177,7 +177,7 @@ def test_bad_records(small):
     cases = {
         "section 0 was sampled 10 times, too few": record(small, 40),
         "y1 is zero or missing": with_outputs(good, good.y * [1, np.nan]),
-        "do not belong together": [good, hj.Record(good.u, good.y, n_sections=5)],
+        "different sections, inputs": [good, hj.Record(good.u, good.y, n_sections=5)],
     }
     for message, data in cases.items():
         with pytest.raises(hj.DefinitionError, match=message):

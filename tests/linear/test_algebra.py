@@ -118,5 +118,5 @@ def test_what_does_not_fit_is_refused(pair):
         P.feedback(np.eye(3))
     with refused("do not hold f = 1.3"):
         P.htf([0.3, 0.7]).inverse()
-    with refused("takes all 4 harmonics"):
+    with refused("needs all 4 harmonics"):
         P.htf(F, (0, 1)) @ K.htf(F, (0, 1))

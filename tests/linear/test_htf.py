@@ -27,11 +27,7 @@ def exact(hopper, reference):
 def test_hopper_at_all_frequencies_and_harmonics(exact, reference):
     truth = reference("htf_exact_isochron")
     expected = hj.HTF(
-        truth["f"],
-        np.moveaxis(truth["H"], 0, 1)[..., None],
-        truth["m"],
-        32,
-        outputs=("yM", "vM"),
+        truth["f"], np.moveaxis(truth["H"], 0, 1)[..., None], truth["m"], 32, outputs=("yM", "vM")
     )
     assert exact.H.shape == (32, 620, 2, 1) and exact.harmonics == tuple(range(-16, 16))
     assert np.max(exact.error(expected)) < 1e-12

@@ -329,7 +329,7 @@ def test_bad_questions_are_refused_in_one_sentence():
     hopper, wheel = (hj.find_limit_cycle(x()) for x in (hj.models.VerticalHopper, Neuron))
     with pytest.raises(hj.DefinitionError, match="has no phase response: its phase is that"):
         hopper.responses().phase([0.1])
-    with pytest.raises(hj.DefinitionError, match="there is no mode 2; 2 modes have amplitudes"):
+    with pytest.raises(hj.DefinitionError, match="no mode with an amplitude 2: there are 2"):
         hopper.responses().amplitude(2, [0.1])
     with pytest.raises(hj.DefinitionError, match="3 modes were asked for; 2 have amplitudes"):
         hopper.responses(modes=3)

@@ -58,7 +58,7 @@ def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
     figure = hj.plot.bodes(families, fits={"b": rational}).figure
     assert [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]] == [4, 4]
-    with pytest.raises(hj.DefinitionError, match="fits of 'c', but the HTFs are"):
+    with pytest.raises(hj.DefinitionError, match="`fits`: there is no name 'c'"):
         hj.plot.bodes(families, fits={"c": rational})
 
 
@@ -126,6 +126,8 @@ def test_saved_in_several_formats(tmp_path):
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
     with pytest.raises(hj.DefinitionError, match="cannot write"):
         hj.plot.save(tmp_path / "absent" / "x", plot.ax)
+    with pytest.raises(hj.DefinitionError, match="png, pdf, svg, not '.bmp'"):
+        hj.plot.save(tmp_path / "x.bmp", plot)
 
 
 def test_bands_hold_the_values(estimate):

@@ -90,9 +90,9 @@ def test_what_is_refused(noisy):
     for message, signals, phase in [
         ("no event 'spike'", wave, hj.AtEvent("spike")),
         ("u is constant", {"u": 0 * t}, BEAT),
-        ("has no samples of the input u", {"u": np.nan * t}, BEAT),
+        ("has no samples of u", {"u": np.nan * t}, BEAT),
         ("8 intervals are too few", wave, BEAT),
-        ("needs events or crossings", wave, angle),
+        ("must be of events or a Crossing", wave, angle),
     ]:
         recording = hj.Recording(t, signals, events=beat)
         phase = phase if phase is not angle else hj.recordings.estimate_phase(recording, angle)

@@ -39,7 +39,7 @@ def test_a_circle(wave):
     assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
     timed = sample(wave, timing="clock")
     assert timed.outputs == ("x", "v", "time") and timed.rms()[1][2] < 1e-4
-    with pytest.raises(hj.DefinitionError, match="n_sections is 16, but .* family of 8"):
+    with pytest.raises(hj.DefinitionError, match="different n_sections: 16 and 8"):
         sample(wave, n_sections=16)
     assert "SectionData(19.75 cycles of 8 sections in 1 records; period 1;" in repr(data)
 
@@ -117,7 +117,7 @@ def test_slow_drift_is_taken_out(wave):
     assert sample(flat).with_drift(9).records[0].drift == 9
     for phase, cycles, message in [
         (rough, 3, "four cycles or more, not 3"),
-        (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "phase has 0 trials"),
+        (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "numbers of trials: 0 and 1"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
             without_drift(wave, phase, "x", cycles)
@@ -131,7 +131,7 @@ def test_designs_as_tables(tmp_path, wave):
         hj.recordings.write_design(tmp_path / "time.csv", design, period=0.5)
     # Applied at the phases of the recording, and found again in its section data.
     phase = hj.recordings.estimate_phase(wave, CIRCLE)
-    with pytest.raises(hj.errors.FileFormatError, match="no table by phase"):
+    with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):
         hj.recordings.add_command(wave, phase, tmp_path / "time.csv")
     lines = (tmp_path / "phase.csv").read_text().splitlines()
     (tmp_path / "one.csv").write_text("\n".join(lines[: 1 + 19 * 8]))

@@ -91,7 +91,8 @@ TOP = Crossing("v", "falling")
             [TOP, Crossing(hj.Output("xv", lambda t, q, u: q[0] * q[1]), "falling")],
             r"section 1 \(xv falling\) is crossed 2 times in one period",
         ),
-        (hj.ClockPhase(4, anchor=Crossing("x", "rising", value=9.0)), "no point where x rising"),
+        (hj.ClockPhase(4, anchor=Crossing("x", "rising", value=9.0)), "at its anchor, x rising"),
+        (hj.KinematicPhase(8, "x", "v", (5.0, 0.0)), r"turn about the `center` \(5.0, 0.0\)"),
     ],
 )
 def test_what_is_wrong_with_a_section_is_said(sections, message, vanderpol_cycle):
@@ -109,6 +110,12 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
 def test_sections_of_another_cycle(placed_isochrons, lossy_cycle):
     with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
         hj.linearize(lossy_cycle, placed_isochrons)
+
+
+def test_equal_sections_are_located_once(hopper_cycle):
+    at = lambda phase: hj.place_sections(hopper_cycle, hj.ClockPhase(2, phase))  # noqa: E731
+    assert at(0.3) is at(0.3)
+    assert at(0.4) is not at(0.3)
 
 
 def test_sections_that_move_on_an_autonomous_cycle(vanderpol_cycle):

@@ -14,11 +14,7 @@ hj.enable_x64()
 DRAG = 0.7
 SECTIONS, DESIGN = hj.ClockPhase(2), hj.multisine(2, periods=4).scaled(rms=0.01)
 TURN = hj.Crossing("v", "falling")
-
-
-@jax.jit  # whose trace JAX keeps
-def drag(speed):
-    return -DRAG * speed
+drag = jax.jit(lambda speed: -DRAG * speed)  # whose trace JAX keeps
 
 
 class Slowing(hj.Chart):

@@ -1,6 +1,7 @@
 """Systems as users write them: names, shapes and numbers checked, each error in one sentence."""
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
@@ -21,8 +22,6 @@ ROOM = {
     "b": Field(("z",), lambda t, q, u: -q),
 }
 TO_B = hj.Transition("go", "a", "b", lambda t, q, u: q[0], reset=lambda t, q, u: (q[0],))
-
-
 SUM = hj.Output("sum", lambda t, q, u: q.sum())
 HOPPER = hj.models.VerticalHopper()
 
@@ -62,6 +61,10 @@ def test_parameters_are_arrays_that_can_be_mapped_and_differentiated():
     np.testing.assert_allclose(period.omega, -1 / (2 * np.pi), rtol=1e-14)
     many = eqx.filter_vmap(lambda M: hj.models.VerticalHopper(M=M))(jnp.arange(1.0, 4.0))
     np.testing.assert_array_equal(many.M, [1.0, 2.0, 3.0])
+    with pytest.raises(hj.DefinitionError, match="no parameter 'K'; parameters are m, M, k"):
+        hj.models.VerticalHopper(K=1.0)
+    with pytest.raises(hj.DefinitionError, match="`period` must be a method"):
+        type("Fixed", (hj.HybridSystem,), {"period": 1.0})
 
 
 def replaced(**changes):
@@ -69,34 +72,34 @@ def replaced(**changes):
     return Anything(ROOM, (dataclasses.replace(TO_B, **changes),))
 
 
+def moved(field, states=("x", "v")):
+    return Anything({"a": Field(states, field)})
+
+
+class Early(hj.models.VerticalHopper):
+    def charts(self):
+        return super().charts() if self.k > 0 else {}
+
+
 @pytest.mark.parametrize(
     "system, message",
     [
         (Anything({}), "has no charts"),
-        (
-            Anything({"a": Field(("x",), lambda t, q, u: (q[0], 1.0))}),
-            r"field of chart 'a' returns",
-        ),
-        (
-            Anything({"a": Field(("x", "x"), lambda t, q, u: q)}),
-            "states of the same name: 'x', 'x'",
-        ),
-        (Anything({"a": Field("xv", lambda t, q, u: q)}), "must be a tuple of names, not 'xv'"),
+        (moved(lambda t, q, u: (q[0], 1.0), ("x",)), r"field of chart 'a' returns"),
+        (moved(lambda t, q, u: q, ("x", "x")), "states of the same name: 'x', 'x'"),
+        (moved(lambda t, q, u: q, "xv"), "must be a tuple of names, not 'xv'"),
+        (moved(lambda t, q, u: (q[1], math.sin(q[0]))), "write .* `jnp.sin` for `math.sin`"),
+        (moved(lambda t, q, u: (q[1], u - q[0])), r"q and u are arrays: write `u\[0\]`"),
+        (Early(), "uses a value that JAX does not know yet"),
         (Anything(ROOM, named=(SUM, SUM)), "states and outputs of the same name"),
-        (Anything(ROOM, named=SUM), r"outputs\(\) must return several `hj.Output`"),
+        (Anything(ROOM, named=SUM), r"outputs\(\) must return a list"),
         (replaced(source="c"), "there is no chart 'c'; charts are a, b"),
         (replaced(reset=lambda t, q, u: q), r"reset of transition 'go' \(a -> b\) returns shape"),
         (replaced(guard=lambda t, q, u: q), r"guard of transition 'go' \(a -> b\) returns shape"),
         (replaced(enabled=lambda t, q, u: q > 0), r"`enabled` of transition 'go' .* returns shape"),
-        (
-            Anything({"a": Field(("x", "v"), lambda t, q, u: (q[1], -q[2]))}),
-            "field of chart 'a' cannot be evaluated: index 2 is out of bounds",
-        ),
+        (moved(lambda t, q, u: (q[1], -q[2])), "field of chart 'a' cannot .* index 2 is out of"),
         (Anything(ROOM, (TO_B, TO_B)), "transitions of the same name: 'go', 'go'"),
-        (
-            eqx.tree_at(lambda s: s.k, HOPPER, jnp.array(np.inf)),
-            "parameter `k` of VerticalHopper is inf",
-        ),
+        (eqx.tree_at(lambda s: s.k, HOPPER, jnp.array(np.inf)), "`k` of VerticalHopper is inf"),
     ],
 )
 def test_what_is_wrong_is_said(system, message):

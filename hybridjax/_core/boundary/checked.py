@@ -10,6 +10,7 @@ from typing import Annotated, Any, TypeVar, cast
 import jax
 
 from ...errors import DefinitionError
+from ..arguments import require_among
 from ..executor import is_inside_program, is_traced
 from ..memo import Memory
 from .kinds import kind_of
@@ -68,10 +69,13 @@ def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
     """Check what the constructor of a class is given for those of its fields whose converters say
     by a `Kind` what they take. (Its other annotations are its author's business.)
 
-    **Raises:** `DefinitionError`.
+    **Raises:** `DefinitionError`, also for a name that is none of its fields.
     """
     constructor = cls.__init__  # type: ignore[misc]
     fields = _fields.recall(cls, None, lambda: _Fields(constructor, cls))
+    unknown = [name for name in kwargs if name not in fields.by_name]
+    if unknown and inspect.getfullargspec(constructor).varkw is None:
+        require_among("parameter", unknown, list(fields.by_name)[1:], f"{cls.__name__}: ")
     try:
         fields.take((None, *args), dict(kwargs))
     except Misfit as misfit:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..._core import limits
-from ..._core.arguments import Numbers, names
+from ..._core.arguments import Numbers, names, require_equal
 from ..._core.boundary.checked import checked
 from ..._core.boundary.containers import Names
 from ..._core.boundary.kinds import (
@@ -97,10 +97,6 @@ class Design(eqx.Module):
         **Raises:** `DefinitionError` as `check` does, or for lists that do not fit together.
         """
         sizes = [np.size(f) for f in frequencies]
-        if len(sizes) == 0 or min(sizes) == 0:
-            raise DefinitionError(
-                "every experiment needs a frequency: `frequencies` has none for some."
-            )
 
         def flat(name, values, dtype):
             if np.isscalar(values):
@@ -110,7 +106,7 @@ class Design(eqx.Module):
                     f"`{name}` must be one number or have as many entries as `frequencies` in "
                     f"each of the {len(sizes)} experiments."
                 )
-            return np.concatenate([np.ravel(v) for v in values]).astype(dtype)
+            return np.concatenate([[], *map(np.ravel, values)]).astype(dtype)
 
         lines = to_lines(flat("frequencies", frequencies, float), periods)
         experiment = np.repeat(np.arange(len(sizes)), sizes)
@@ -142,13 +138,10 @@ class Design(eqx.Module):
         P, N = self.periods, self.n_sections
         check_window(N, P)
         for name in ("line", "channel", "amplitude", "phase"):
-            if getattr(self, name).shape != self.experiment.shape:
-                raise DefinitionError(
-                    f"`{name}` must hold as many entries as `experiment`, "
-                    f"{len(self.experiment)}, not {len(getattr(self, name))}."
-                )
+            shapes = self.experiment.shape, getattr(self, name).shape
+            require_equal(f"`experiment` and `{name}`", "shapes", *shapes)
         numbers = np.unique(self.experiment)
-        if self.experiments != len(numbers) or not np.array_equal(numbers, np.arange(len(numbers))):
+        if not np.array_equal(numbers, np.arange(max(1, self.experiments))):
             raise DefinitionError(
                 "every experiment needs a frequency: `frequencies` has none for some."
             )
@@ -231,7 +224,8 @@ class Design(eqx.Module):
         cycles = self.periods if cycles is None else cycles
         first, last, step = (experiments or slice(None)).indices(self.experiments)
         if step != 1 or last <= first:
-            raise DefinitionError(f"{experiments} holds no consecutive experiments.")
+            text = f"consecutive experiments, such as slice(0, 10), not {experiments}"
+            raise DefinitionError(f"`experiments` must be a slice of {text}.")
         k = slice(*np.searchsorted(self.experiment, (first, last)))
         experiment, line, channel = self.experiment[k], self.line[k], self.channel[k]
         length = self.n_sections * self.periods

@@ -34,7 +34,7 @@ from .realization import answers_at_once, default_horizon, given_dims, realize, 
 
 
 Problem = FrequencyProblem | SeriesProblem
-Guess = LDTP | Order | Annotated[Numbers, Integers("N", sign="positive")]
+Guess = LDTP | Order | Annotated[Numbers, Integers("sections", sign="positive")]
 
 # Expected decrease of the cost at the minimum, for each unknown, in units of the errors' variance.
 # Larger: rms errors grow, by 0.5 % for 2e-2; smaller: steps without effect.
@@ -244,13 +244,13 @@ def fit_ldtp(
         return _fit_to_series(records, guess, innovations, start == "free", check, direct)
     if reference is not None:
         raise DefinitionError(
-            "HTFs have no reference any more: estimate those of the plant, by "
-            "`estimate_htf(data, reference=...)`."
+            "`reference` is for time series: estimate the HTFs by "
+            "`estimate_htf(data, reference=...)`, and leave `reference` out here."
         )
     if noise == "innovations":
-        raise DefinitionError("HTFs tell nothing of innovations: give the series.")
+        raise DefinitionError("noise='innovations' needs time series: give the data, not HTFs.")
     if start == "cycle":
-        raise DefinitionError("HTFs have no start, the response is periodic: leave `start` out.")
+        raise DefinitionError("HTFs are of periodic responses, without a start: leave `start` out.")
     return _fit_to_htf(data, guess, check)
 
 
@@ -265,11 +265,10 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
     unknowns = local_coordinates(model, direct).size
     freedom = problem.residuals - unknowns
     if freedom < 1:
-        raise DefinitionError(
-            f"the HTFs hold {problem.residuals} numbers, too few for {unknowns} unknowns."
-        )
+        text = f"{problem.residuals} numbers, too few for {unknowns} unknowns"
+        raise DefinitionError(f"the HTFs hold {text}: give more frequencies, or smaller `guess`.")
     if not np.isfinite(problem.cost(model)):
-        raise DefinitionError("the guess is resonant at a frequency of the HTFs.")
+        raise DefinitionError("`guess` has an infinite response at a frequency: give a stable one.")
     point, converged = descend(ModelPoint(problem, model, direct), FIRST_DAMPING)
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
@@ -323,7 +322,7 @@ def _fit_to_series(
             f"the sections, too few for {unknowns} unknowns: record more, or fit fewer dimensions."
         )
     if not np.isfinite(problem.cost(model)):
-        raise DefinitionError("the predictions of the guess grow beyond all numbers.")
+        raise DefinitionError("the responses of `guess` are infinite: give a stable model.")
     start = ModelPoint(problem.reweighted(model), model, direct)
     point, converged = descend(start, FIRST_DAMPING)
     if check and not innovations:

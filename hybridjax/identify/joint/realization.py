@@ -36,8 +36,8 @@ _SHORTEST_HORIZON = 8
 
 @checked
 def realize(
-    source: HTF | SeriesFit | Annotated[Numbers, Reals("N lags ny nu")],
-    dims: Order | Annotated[Numbers, Integers("N", sign="positive")] | None = None,
+    source: HTF | SeriesFit | Annotated[Numbers, Reals("sections lags outputs inputs")],
+    dims: Order | Annotated[Numbers, Integers("sections", sign="positive")] | None = None,
     *,
     order: Order = 1,
     outputs: SignalNames | None = None,
@@ -158,11 +158,11 @@ def _shifted(bases: list[np.ndarray], ny: int) -> tuple[list[np.ndarray], list[n
 def _from_htf(htf: HTF, dims: Any, order: int) -> LDTP:
     f, N = np.asarray(htf.f), htf.n_sections
     if not np.isfinite(htf.H).all():
-        raise DefinitionError("the HTFs hold NaN or infinity.")
+        raise DefinitionError("the HTFs hold NaN or infinity: leave these frequencies out.")
     F, ny, nu = htf.H.shape[1:]
     p = min(default_horizon(N), F - 1)
     if p < 1:
-        raise DefinitionError("one frequency is too few: 2 or more are needed.")
+        raise DefinitionError("one frequency is too few: give HTFs at two or more.")
     m = np.array(all_harmonics(N))
     H = np.zeros((N, F, ny, nu), complex)
     H[np.isin(m, htf.harmonics)] = htf.H
@@ -253,7 +253,8 @@ def subspace_model(
         root = np.linalg.qr(section.past(past), mode="r")
         _, s, vh = np.linalg.svd(root @ ahead, full_matrices=False)
         if dims[n] > len(s):
-            raise DefinitionError(f"the past shows {len(s)} dimensions, not {dims[n]}.")
+            text = f"the data show {len(s)} dimensions of section {n}, not {dims[n]}"
+            raise DefinitionError(f"{text}: lower `guess`.")
         kept = np.maximum(s[: dims[n]], _SHRINKAGE * s[0])
         to_state.append(ahead @ (vh[: dims[n]].T / kept * np.sqrt(len(section.y))))
     return _from_states(sections, to_state, past, innovations, direct)

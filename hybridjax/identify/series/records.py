@@ -91,7 +91,7 @@ class PreparedRecords:
             square += (grid.y**2).sum(axis=(0, 1, 2))
         for name, size in zip(self.inputs + self.outputs, [*excited, *square], strict=True):
             if not size:
-                raise DefinitionError(f"{name} is zero or missing at every sample.")
+                raise DefinitionError(f"{name} is zero or missing at every sample: leave it out.")
         self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / self.sampled.sum(axis=0))
 
     def whole(self) -> CycleGrid:

@@ -78,12 +78,12 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     samples = recording.samples(name)
     pairs = phase.by_trial(recording)
     if not all(w.linear for _, parts in pairs for w in parts):
-        raise DefinitionError("`phase` needs events or crossings: an angle has no intervals.")
+        raise DefinitionError("`phase` must be of events or a Crossing, not a KinematicPhase.")
     starts, durations, steps, inputs = [], [], [], []
     for (trial, x), (_, parts) in zip(samples, pairs, strict=True):
         finite = np.isfinite(x)
         if finite.sum() < 2:
-            raise DefinitionError(f"trial '{trial.name}' has no samples of the input {name}.")
+            raise DefinitionError(f"trial '{trial.name}' has no samples of {name}: leave it out.")
         start = np.concatenate([np.zeros(0), *(w.time[:-1] for w in parts)])
         duration = np.concatenate([np.zeros(0), *(np.diff(w.time) for w in parts)])
         holes = gaps(trial.time[finite], bridgeable(trial.time[finite]))
@@ -99,9 +99,9 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
         durations.append(duration)
         steps.append(np.full(len(start), step))
     if not starts:
-        raise DefinitionError(f"no interval between events lies where {name} was recorded.")
+        raise DefinitionError(f"{name} has no samples between two events: record both.")
     if not any(np.ptp(x) > 0 for x in inputs):
-        raise DefinitionError(f"the input {name} is constant in all trials.")
+        raise DefinitionError(f"the input {name} is constant: name the signal that acted.")
     longest = max(map(len, inputs))
     inputs = [np.pad(x, ((0, longest - len(x)), (0, 0)), "edge") for x in inputs]
     trial = np.repeat(np.arange(len(starts)), list(map(len, starts)))
