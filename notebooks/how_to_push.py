@@ -96,7 +96,8 @@ hj.plot.strides(study.plan, {"this study": study})
 # ## Comparison with the truth
 #
 # The data determined when the study stopped. The region still contains the true multipliers in 95 %
-# of studies (`docs/experiments.md`).
+# of studies (`docs/experiments.md`). This study is one of the others: its error is twice the
+# standard error.
 
 # %%
 print("in the region of 95 %:", study.fit.contains(cycle.multipliers))

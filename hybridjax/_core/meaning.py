@@ -78,35 +78,37 @@ def code_digest(x: Definition) -> str:
 
     **Raises:** `DefinitionError`, as `meaning`.
     """
-    walk = _Walk()
-    walk.visit_all((jax.tree_util.tree_map(lambda x: None if eqx.is_array(x) else x, x),))
-    digest = walk.digest.hexdigest()
-    if digest not in _traced:
-        _clear_old_traces(walk.alive)
-        _traced.add(digest)
-    return digest
+    walk = _Walk(jax.tree_util.tree_map(lambda x: None if eqx.is_array(x) else x, x))
+    _clear_old_traces(walk.alive, walk.result)
+    return walk.result
 
 
-_traced: set[str] = set()  # digests of definitions since a function last changed
-_meanings: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
+_JITTED: Any = type(jax.jit(len))
+# Of functions, since JAX's caches were last cleared: their digests by those of definitions.
+_meanings: weakref.WeakKeyDictionary[Any, dict[str, str]] = weakref.WeakKeyDictionary()
 
 
-def _clear_old_traces(things: Iterable[Any]) -> None:
+def _clear_old_traces(things: Iterable[Any], definition: str) -> None:
     """Clear JAX's caches if a function, or an object whose method is one, has changed: `jax.jit`,
     `lax.cond`, `lax.scan` and others remember the trace of a function by its identity."""
-    changed = False
-    for x in things:
-        is_compared_by_identity = type(x).__hash__ is object.__hash__ and type(x).__weakrefoffset__
-        if is_compared_by_identity and not _is_installed(getattr(x, "__module__", None)):
-            walk = _Walk()
-            walk.classes = 1  # (hidden reads have been refused before)
-            walk.visit(x)
-            digest = walk.digest.hexdigest()
-            changed |= _meanings.get(x, digest) != digest
-            _meanings[x] = digest
-    if changed:
-        _traced.clear()
+    now: dict[Any, dict[str, str]] = {}
+    for x in filter(_is_traced_by_identity, things):
+        seen = _meanings.setdefault(x, {})
+        if not seen and isinstance(x, _JITTED):
+            x.clear_cache()  # which a call by the user may have filled
+        if definition not in seen:
+            seen[definition] = _Walk(x, classes=1).result  # (hidden reads have been refused before)
+        now[x] = {definition: seen[definition]}
+    if any(len({*_meanings[x].values()}) > 1 for x in now):
+        _meanings.clear()
+        _meanings.update(now)
         jax.clear_caches()
+
+
+def _is_traced_by_identity(x: Any) -> bool:
+    if type(x).__hash__ is not object.__hash__ or not type(x).__weakrefoffset__:
+        return False
+    return isinstance(x, _JITTED) or not is_packaged(getattr(x, "__module__", None))
 
 
 def meaning(*things: Any) -> str:
@@ -119,18 +121,18 @@ def meaning(*things: Any) -> str:
     **Raises:** `DefinitionError` if code uses `eval`, `exec`, `globals`, `__import__`,
     `import_module`, `sys.modules` or `getenv`, or if a function that is no method reads a file.
     """
-    walk = _Walk()
-    walk.visit_all(things)
-    return walk.digest.hexdigest()
+    return _Walk(*things).result
 
 
 class _Walk:
-    def __init__(self):
+    def __init__(self, *things: Any, classes: int = 0):
         self.digest = hashlib.blake2b(digest_size=16)
         self.number: dict[int, int] = {}
         self.attributes: set[tuple[int, Names]] = set()
-        self.classes = 0  # around what is visited
+        self.classes = classes  # around what is visited
         self.alive: list[Any] = []  # an id belongs to an object while this lives
+        self.visit_all(things)
+        self.result = self.digest.hexdigest()
 
     def note(self, *words: Any) -> None:
         self.digest.update(repr(words).encode())
@@ -174,7 +176,7 @@ class _Walk:
             case types.ModuleType():  # read by other means than the names of its attributes
                 self._origin(x.__name__)
                 self.visit(type(x))
-                if not _is_installed(x.__name__):
+                if not is_packaged(x.__name__):
                     self.visit({k: v for k, v in vars(x).items() if not _is_description(k, v)})
             case types.BuiltinFunctionType():
                 self.note(x.__name__)
@@ -249,7 +251,7 @@ class _Walk:
                 value = getattr(value, name, None)
         name = str(getattr(value, "__name__", "")) if callable(value) else ""
         is_hidden = _HIDDEN.fullmatch(name) or (not self.classes and _READING.fullmatch(name))
-        is_hidden = is_hidden and _is_installed(getattr(value, "__module__", None))
+        is_hidden = is_hidden and is_packaged(getattr(value, "__module__", None))
         if is_hidden or value is sys.modules:
             raise DefinitionError(
                 f"`{x.__qualname__}` uses `{name or 'sys.modules'}`, so that a change of what it "
@@ -263,7 +265,7 @@ class _Walk:
         self.attributes.add((id(module), names))
         self._origin(module.__name__)
         self.visit(type(module))
-        is_installed = _is_installed(module.__name__)
+        is_installed = is_packaged(module.__name__)
         if not is_installed and hasattr(module, "__getattr__"):
             self.visit(module)
         for name in names:
@@ -283,7 +285,7 @@ class _Walk:
         for base in inspect.getmro(x):
             module = str(base.__module__)  # (of a metaclass it may be a descriptor)
             self._origin(module, base.__qualname__)
-            if not _is_installed(module):
+            if not is_packaged(module):
                 self.visit({k: v for k, v in vars(base).items() if not _is_description(k, v)})
         self.visit(type(x))
         self.classes -= 1
@@ -293,7 +295,7 @@ class _Walk:
         if isinstance(x, Mapping):
             self.visit_all(part for item in x.items() for part in item)
         is_wrapped = isinstance(x, eqx.Module) or hasattr(x, "__wrapped__")
-        if _is_installed(type(x).__module__) and not is_wrapped:
+        if is_packaged(type(x).__module__) and not is_wrapped:
             parts = None
             with contextlib.suppress(Exception):  # whatever an object raises that cannot be pickled
                 parts = [list(y) if isinstance(y, Iterator) else y for y in x.__reduce_ex__(4)[1:]]
@@ -311,10 +313,8 @@ class _Walk:
 
 @ft.lru_cache(4096)
 def _code(code: types.CodeType) -> str:
-    walk = _Walk()
-    walk.note(code.co_code, code.co_names, code.co_varnames, code.co_freevars, code.co_argcount)
-    walk.visit_all(code.co_consts)
-    return walk.digest.hexdigest()
+    names = (code.co_names, code.co_varnames, code.co_freevars)
+    return meaning(code.co_code, *names, code.co_argcount, *code.co_consts)
 
 
 @ft.lru_cache(4096)
@@ -361,7 +361,8 @@ def _lazy_names(module: types.ModuleType) -> frozenset[str]:
     return frozenset(dir(module)) if hasattr(module, "__getattr__") else frozenset()
 
 
-def _is_installed(module: str | None) -> bool:
+def is_packaged(module: str | None) -> bool:
+    """Test whether a module belongs to Python or to a package, `hybridjax.models` excepted."""
     name = module or "builtins"
     if name.startswith("hybridjax.models"):
         return False
@@ -373,4 +374,13 @@ def _is_installed(module: str | None) -> bool:
 @ft.cache
 def is_of_package(path: str) -> bool:
     """Test whether a file belongs to Python or to a package, `hybridjax.models` excepted."""
-    return _INSTALLED.match(path) is not None and not path.startswith(_MODELS)
+    file = pathlib.Path(path)
+    recorded = (file.parts[-k] in _recorded(x) for k, x in enumerate(file.parents, 1))
+    return not path.startswith(_MODELS) and (_INSTALLED.match(path) is not None or any(recorded))
+
+
+@ft.cache
+def _recorded(folder: pathlib.Path) -> frozenset[str]:
+    """Names of what pip has put into a folder (with `--target`)."""
+    records = [x.read_text("RECORD") for x in importlib.metadata.distributions(path=[str(folder)])]
+    return frozenset(re.split("[/,]", y)[0] for x in records for y in (x or "").splitlines())

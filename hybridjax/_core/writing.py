@@ -23,7 +23,7 @@ from . import limits
 def replacing(path: Path) -> Iterator[Path]:
     """A name in the folder of `path`, for a file that takes the place of `path` at the end.
 
-    **Raises:** `DefinitionError` if the file cannot be written, or `path` is a link.
+    **Raises:** `DefinitionError` if the file cannot be written, or `path` is a link or a pipe.
     """
     _refuse_link(path)
     temporary = path.parent / temporary_name()
@@ -38,9 +38,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _refuse_link(path: Path) -> None:
-    if path.is_symlink():
+    if path.is_symlink() or (path.exists() and not (path.is_file() or path.is_dir())):
         raise DefinitionError(
-            f"'{path}' is a link: choose another name, since nothing is written through links."
+            f"'{path}' is a link or a device: choose another name, since nothing is written there."
         )
 
 

@@ -162,8 +162,7 @@ def save(
     if path.suffix[1:] in get_args(Format):
         path = path.with_suffix("")
     elif path.suffix[1:].isalpha():
-        suffixes = ", ".join(get_args(Format))
-        raise DefinitionError(f"'{path}': formats are {suffixes}, not '{path.suffix}'.")
+        raise DefinitionError(f"cannot write '{path}': formats are {', '.join(get_args(Format))}.")
     if not path.name:
         raise DefinitionError(f"'{path}' is a folder: add the name of a file without its suffix.")
     paths = tuple(path.with_name(f"{path.name}.{format}") for format in formats)

@@ -158,7 +158,9 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
             ha="left" if x > 0.35 else "right" if x < -0.35 else "center",
             va="bottom" if y > 0.35 else "top" if y < -0.35 else "center",
         )
-        return note.get_window_extent().padded(4).count_contains(drawn)
+        box = note.get_window_extent()
+        outside = 4 - ax.bbox.count_contains(box.corners())  # a corner counts as five points
+        return 5 * outside + box.padded(4).count_contains(drawn)
 
     covered(min(_TURNS, key=covered))
     box = note.get_window_extent()

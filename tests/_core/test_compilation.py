@@ -203,6 +203,8 @@ def test_a_cache_of_others_is_refused(tmp_path, attack, cache_setting):
     if "user" in attack or "owner" in attack:
         os.geteuid() == 0 or pytest.skip("only root gives files away")
     hj.enable_compilation_cache(tmp_path / "x")
+    (tmp_path / "x/programs/notes").symlink_to(__file__)  # which JAX does not read
+    hj.enable_compilation_cache(tmp_path / "x")
     ATTACKS[attack](tmp_path / "x")
     with pytest.raises(hj.DefinitionError, match="give another folder"):
         hj.enable_compilation_cache(tmp_path / "x")

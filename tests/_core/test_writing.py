@@ -122,7 +122,7 @@ def test_what_is_in_the_way_stays(full, block, early):
 
 def test_nothing_is_written_through_a_link_to_a_folder(full):
     before = tree(full.parent / "away")
-    with pytest.raises(hj.DefinitionError, match="nothing is written through links"):
+    with pytest.raises(hj.DefinitionError, match="is a link or a device"):
         write(full / "link", RESULTS)
     assert tree(full.parent / "away") == before
 
@@ -191,6 +191,10 @@ def test_nothing_is_written_through_a_link(tmp_path, writer, name):
         writer(folder / name)
     assert (tmp_path / "away").read_text() == "mine" and (folder / name).is_symlink()
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    with pytest.raises(hj.DefinitionError, match="is a link or a device"):
+        writer(folder / name)
     (folder / name).unlink()
     writer(folder / name)
     assert (folder / name).stat().st_size > 100

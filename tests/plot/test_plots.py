@@ -126,7 +126,7 @@ def test_saved_in_several_formats(tmp_path):
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
     with pytest.raises(hj.DefinitionError, match="cannot write"):
         hj.plot.save(tmp_path / "absent" / "x", plot.ax)
-    with pytest.raises(hj.DefinitionError, match="png, pdf, svg, not '.bmp'"):
+    with pytest.raises(hj.DefinitionError, match="x.bmp': formats are png"):
         hj.plot.save(tmp_path / "x.bmp", plot)
 
 

@@ -18,7 +18,7 @@ import hybridjax as hj
 distributed = pytest.importorskip("distributed")
 pytest.importorskip("zarr")
 
-DRAWS = 24
+DRAWS, STEPS = 24, 100
 
 
 class Plane(hj.Chart):
@@ -41,7 +41,7 @@ class Driven(hj.HybridSystem):
 def walk(rng):
     """A random computation that takes a while."""
     time.sleep(0.02)
-    steps = rng.normal(size=(100, 2)).cumsum(axis=0)
+    steps = rng.normal(size=(STEPS, 2)).cumsum(axis=0)
     return {"end": steps[-1], "far": np.abs(steps).max()}
 
 
@@ -118,7 +118,9 @@ def test_a_store_knows_its_function(tmp_path):
         hj.monte_carlo(other, 2, store=tmp_path / "draws.zarr")
 
 
-@pytest.mark.parametrize("harm", ["link", "linked folder", "pipe", "large", "shape", "absent"])
+@pytest.mark.parametrize(
+    "harm", ["link", "linked folder", "pipe", "large", "shape", "absent", "start"]
+)
 def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
     """A store that was made to look like that of the call."""
     first, victim, store = partial(np.random.Generator.normal), tmp_path / "x", tmp_path / "s.zarr"
@@ -134,6 +136,8 @@ def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
         (values / "zarr.json").write_text(re.sub(r"\b4\b", f"{10**12}", about, count=1))
     elif harm == "absent":
         shutil.rmtree(values)
+    elif harm == "start":
+        (store / "start/zarr.json").write_bytes(b"\xff\xfe")
     elif harm == "large":
         os.truncate(values / "c/1", 30 * 2**30)
     else:
@@ -176,6 +180,17 @@ def test_workers_with_another_version_are_refused(client, whole, monkeypatch):
     versions["client"]["packages"]["jax"] = "9.9"
     monkeypatch.setattr(client, "get_versions", lambda packages: versions)
     with pytest.raises(hj.DefinitionError, match="has jax .*, and this process has 9.9"):
+        hj.monte_carlo(walk, DRAWS, client=client)
+
+
+def test_workers_with_other_code_are_refused(client, monkeypatch):
+    class Mine(Driven):
+        """One that workers cannot import."""
+
+    with pytest.raises(hj.DefinitionError, match="`Mine` is defined in the script or notebook"):
+        hj.monte_carlo(lambda rng: Mine().period(), 2, client=client)
+    monkeypatch.setitem(globals(), "STEPS", 50)
+    with pytest.raises(hj.DefinitionError, match="`walk` on a Dask worker is not what it is in"):
         hj.monte_carlo(walk, DRAWS, client=client)
 
 

@@ -49,6 +49,24 @@ def test_a_constant_of_the_notebook_is_changed(monkeypatch):
         np.testing.assert_allclose(end - start, np.exp(-value), rtol=1e-7)
 
 
+def test_functions_that_are_made_anew_have_traces_of_their_own(monkeypatch):
+    def made():
+        drag = jax.jit(lambda speed: -DRAG * speed)
+        drag(jnp.ones(1)[0])  # a call by the user
+
+        class Anew(hj.HybridSystem):
+            period = lambda self: 1.0  # noqa: E731
+            charts = lambda self: {"air": Field(("x",), lambda t, q, u: (drag(q[0]),))}  # noqa: E731
+
+        return Anew()
+
+    first, second = made(), made()
+    for system, value in ((first, 0.7), (second, 1.3), (second, 0.7)):
+        monkeypatch.setitem(globals(), "DRAG", value)
+        cycle = hj.find_limit_cycle(system, hj.Guess("air", (0.0,)))
+        np.testing.assert_allclose(cycle.multipliers, [np.exp(-value)], rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     "use",
     [

@@ -3,12 +3,15 @@
 import contextlib
 import ctypes
 import functools
+import io
 import threading
+import types
 from collections.abc import Sequence
 from concurrent.futures import CancelledError
 from typing import Any
 
 import cloudpickle
+import equinox as eqx
 import jax
 import numpy as np
 from distributed import Client, as_completed
@@ -16,6 +19,7 @@ from distributed.scheduler import KilledWorker
 
 from ...errors import ComputationError, DefinitionError, HybridJaxError
 from ..cache import enable_compilation_cache
+from ..meaning import is_packaged, meaning
 from ..progress import counted, say
 from .store import ZarrStore
 
@@ -58,7 +62,7 @@ def run_on(client: Any, job: Any, store: ZarrStore, missing: Sequence[int]) -> N
 def _run(client: Client, job: Any, store: ZarrStore, missing: Sequence[int]) -> None:
     address = store.address if isinstance(store.address, str) else None
     # (As bytes: arrays keep their digits only if the precision is set before they are made.)
-    packed = cloudpickle.dumps((job, address))
+    packed = _packed((job, address))
     x64 = bool(jax.config.read("jax_enable_x64"))
     # Dask gives out the tasks again that a lost worker had, and what they need.
     needed = client.submit(bytes, packed, pure=False)
@@ -82,6 +86,32 @@ def _run(client: Client, job: Any, store: ZarrStore, missing: Sequence[int]) -> 
             client.cancel(list(pieces))
 
 
+class _Packer(cloudpickle.Pickler):
+    """A pickler that lists what workers will import from users' modules, with digests."""
+
+    imported: list[tuple[Any, str]]
+
+    def reducer_override(self, obj: Any) -> Any:
+        way = super().reducer_override(obj)
+        if way is not NotImplemented and isinstance(obj, type) and issubclass(obj, eqx.Module):
+            raise DefinitionError(
+                f"`{obj.__name__}` is defined in the script or notebook that runs: workers need it "
+                "in a module that they can import."
+            )
+        if way is NotImplemented and isinstance(obj, types.FunctionType | types.ModuleType | type):
+            if not is_packaged(getattr(obj, "__module__", obj.__name__)):
+                with contextlib.suppress(DefinitionError):  # of a module's other functions
+                    self.imported.append((obj, meaning(obj)))
+        return way
+
+
+def _packed(job: Any) -> bytes:
+    packer = _Packer(file := io.BytesIO())
+    packer.imported = []
+    packer.dump(job)
+    return cloudpickle.dumps((packer.imported, file.getvalue()))
+
+
 def _check_packages(client: Client) -> None:
     """**Raises:** `DefinitionError` for workers that would compute other numbers, or none."""
     versions: Any = client.get_versions(packages=_PACKAGES)
@@ -101,10 +131,8 @@ def _piece(k: int, packed: bytes, x64: bool) -> dict[str, np.ndarray] | None:
     """Compute a piece on a worker, which writes it if the job has a store and else returns it."""
     with _lock:
         job, store = _unpacked(packed, x64)
-    if store is None:
-        return job.run(k, 1)
-    store.write(k, job.run(k, 1))
-    return None
+    values = job.run(k, 1)
+    return values if store is None else store.write(k, values)
 
 
 @functools.lru_cache(maxsize=4)  # a job keeps its compiled programs from piece to piece
@@ -117,5 +145,12 @@ def _unpacked(packed: bytes, x64: bool) -> tuple[Any, ZarrStore | None]:
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, _KEPT)
         library.mallopt(_TRIM_THRESHOLD, _KEPT)
+    imported, packed = cloudpickle.loads(packed)
+    for x, digest in imported:
+        if meaning(x) != digest:
+            raise DefinitionError(
+                f"`{x.__name__}` on a Dask worker is not what it is in this process: after changes "
+                "of a module, call `client.restart()`, and change no values from outside of it."
+            )
     job, address = cloudpickle.loads(packed)
     return job, None if address is None else ZarrStore(address)

@@ -138,17 +138,14 @@ class ZarrStore:
             self.layout = Layout(
                 tuple(about["dims"]), blocks, variables, {}, (), about["description"]
             )
+            kept = self._group[_START]
+            self.start = [np.asarray(kept[f"{i}"][...]) for i, _ in enumerate(kept.array_keys())]
         except Exception as error:  # (of many kinds)
             raise DefinitionError(f"cannot open '{address}' as a store: {error}") from error
         chunk = max(math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values())
         for path, size in sizes.items():
             if size > max(limits.TEXT, chunk + _CHECKSUM):
                 raise DefinitionError(f"'{path}' exceeds all chunks of its store: delete it.")
-
-    @property
-    def start(self) -> list[np.ndarray]:
-        kept = self._group[_START]
-        return [np.asarray(kept[f"{i}"][...]) for i in range(len(list(kept.array_keys())))]
 
     def missing(self) -> list[int]:
         """Return the pieces of which a chunk is missing."""
@@ -183,8 +180,14 @@ class ZarrStore:
         return values
 
     def array(self, name: str) -> np.ndarray | None:
-        """Return a variable of all pieces, or a constant; None if there is none of this name."""
-        return np.asarray(self._group[name][...]) if name in self._group else None
+        """Return a variable of all pieces, or a constant; None if there is none of this name.
+
+        **Raises:** `FileFormatError` if it is damaged.
+        """
+        try:
+            return np.asarray(self._group[name][...]) if name in self._group else None
+        except Exception as error:  # (of many kinds)
+            raise FileFormatError(f"'{self.address}' is damaged in `{name}`: delete it.") from error
 
     def discard_damaged(self) -> None:
         """Delete pieces whose checksums are wrong."""
@@ -228,21 +231,13 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
     """
     sizes = _sizes(address)
     try:
-        group = _group(address, "r")
-    except FileNotFoundError:
-        if sizes:
-            raise DefinitionError(
-                f"'{address}' is no store of results: choose another name."
-            ) from None
-        return None
-    except Exception as error:
-        raise DefinitionError(f"cannot open '{address}' as a Zarr store: {error}") from error
-    try:
-        theirs = json.loads(group.attrs[_ABOUT])["description"]
-    except (KeyError, TypeError, ValueError) as error:
+        theirs = json.loads(_group(address, "r").attrs[_ABOUT])["description"]
+    except Exception as error:  # (of many kinds)
+        if isinstance(error, FileNotFoundError) and not sizes:
+            return None
         raise DefinitionError(
-            f"'{address}' was not written by hybridjax, or not to its end: choose another store, "
-            "or delete it."
+            f"'{address}' is no store of results, or was not written to its end: choose another "
+            f"name, or delete it ({error!r})."
         ) from error
     change = difference(json.loads(json.dumps(job.description)), theirs)
     if change is not None:
