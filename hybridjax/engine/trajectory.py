@@ -266,4 +266,3 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
 @host_first
 def _piece(s, lanes, u, end, settings, h):
     return move(s, lanes, u, until(end), settings, h, options=Options(tape=True))
-

@@ -203,18 +203,15 @@ class ReturnMap(eqx.Module):
         otherwise they are meaningless. `along`: the map after a step of the parameters. `record`:
         see `turn`.
         """
-        s, xp = self.structure, namespace(q)
+        s, xp, settings = self.structure, namespace(q), self.settings
 
         def flow(lanes, target, h, result, piece):
             if on_host(q):  # (all pieces are linearized together)
-                options = Options(tape=True, new_input=False, tangents=wanted)
-                u = np.zeros((s.nu, 1))
-                moved, tape = move(s, lanes, u, target, self.settings, h, result, options)
+                u, options = np.zeros((s.nu, 1)), Options(True, new_input=False, tangents=wanted)
+                moved, tape = move(s, lanes, u, target, settings, h, result, options)
                 return moved, (lanes, None, None, tape, None)
             if piece is None:
-                jacobian, moved, tape = flow_jacobian(
-                    s, lanes, target, self.settings, h, result, new_input=False, wanted=wanted
-                )
+                jacobian, moved, tape = flow_jacobian(s, lanes, target, settings, h, result, wanted)
             else:
                 moved, tape = piece
                 jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
