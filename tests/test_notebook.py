@@ -78,7 +78,7 @@ def neurons(found):
 
 def robot(found):
     low, high = found.natural.interval()[0]
-    assert high - low > 0.3 and "feedback" in {f.cause for f in found.findings}
+    assert high - low > 0.3 and "feedback" in {f.cause for f in found.looked.findings}
 
 
 def walking(found):

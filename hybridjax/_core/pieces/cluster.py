@@ -95,8 +95,7 @@ class _Packer(cloudpickle.Pickler):
         way = super().reducer_override(obj)
         if way is not NotImplemented and isinstance(obj, type) and issubclass(obj, eqx.Module):
             raise DefinitionError(
-                f"`{obj.__name__}` is defined in the script or notebook that runs: workers need it "
-                "in a module that they can import."
+                f"`{obj.__name__}` is defined in the script or notebook: put it into a module."
             )
         if way is NotImplemented and isinstance(obj, types.FunctionType | types.ModuleType | type):
             if not is_packaged(getattr(obj, "__module__", obj.__name__)):
@@ -131,8 +130,10 @@ def _piece(k: int, packed: bytes, x64: bool) -> dict[str, np.ndarray] | None:
     """Compute a piece on a worker, which writes it if the job has a store and else returns it."""
     with _lock:
         job, store = _unpacked(packed, x64)
-    values = job.run(k, 1)
-    return values if store is None else store.write(k, values)
+    if store is None:
+        return job.run(k, 1)
+    store.write(k, job.run(k, 1))
+    return None
 
 
 @functools.lru_cache(maxsize=4)  # a job keeps its compiled programs from piece to piece
