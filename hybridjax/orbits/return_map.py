@@ -225,9 +225,8 @@ class ReturnMap(eqx.Module):
 
         end, (legs, factors, moves, tapes, recorded) = self.travel(q, flow, record)
         as_lanes = lambda x: xp.moveaxis(x[..., 0], 0, -1)  # noqa: E731
-        legs = jax.tree_util.tree_map(as_lanes, legs)
+        legs, tape = jax.tree_util.tree_map(as_lanes, (legs, tapes))
         if on_host(q):
-            tape = jax.tree_util.tree_map(as_lanes, tapes)
             factors = tape_jacobian(s, legs, self._ends(), tape, of_states=True)[0][:, 1:]
         codes, valid = tapes.code[..., 0], self.valid
         off, by_state = self.held(q)
