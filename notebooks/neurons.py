@@ -63,8 +63,7 @@ figure = hj.plot.phase(phase)
 # ## The curve
 #
 # The result lists the limits of the data. R2 is the predicted fraction of the variance of intervals
-# within trials, for blocks of intervals that were left out of the fit. Dashed: plain regression of
-# intervals on the current at phases that grow linearly.
+# within trials, for blocks of intervals that were left out of the fit.
 
 # %%
 found = hj.recordings.phase_response(recording, phase, input="current")
@@ -82,11 +81,9 @@ legend = panel.legend(fontsize="x-small")
 
 # %% [markdown]
 # The published curve was estimated from stimulation with noise currents. The smoothness of our
-# curve is determined by the data (marginal likelihood). Plain regression assumes that the phase
-# grows linearly from spike to spike, so that its regressors depend on the time of the next spike,
-# which biases the curve. The residuals of neighboring intervals are correlated, so that the phase
-# alone is not the complete state of the neuron. The confidence intervals are valid only for the
-# phase model.
+# curve is determined by the data (marginal likelihood). The residuals of neighboring intervals are
+# correlated, so that the phase alone is not the complete state of the neuron. The confidence
+# intervals are valid only for the phase model.
 #
 # ## Predictions of the next spike
 #

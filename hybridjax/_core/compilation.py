@@ -42,6 +42,8 @@ from .vector_math import rewrite
 # No optimization passes of LLVM, and the older of XLA's two code generators: compiles in a third of
 # the time.
 _QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+# XLA divides a program among its threads: dividing a small one takes a fifth longer.
+_UNDIVIDED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 _WORTH_COMPILING = 3.0
@@ -96,13 +98,14 @@ def _loops_are_kernels() -> bool:
 
 
 @ft.cache
-def compiler_options() -> dict[str, Any]:
-    """Return XLA's options for quick compilation."""
+def compiler_options(small: bool = False) -> dict[str, Any]:
+    """Return XLA's options for quick compilation, also of a `small` program."""
+    options = _QUICK | _UNDIVIDED if small else _QUICK
     try:
-        jax.jit(lambda: 0, compiler_options=_QUICK)()
+        jax.jit(lambda: 0, compiler_options=options)()
     except Exception:  # an XLA without one of them; the type depends on the version
         return {}
-    return _QUICK
+    return options
 
 
 @contextlib.contextmanager
@@ -390,7 +393,7 @@ def _kernel_program(function, form, static, structure, static_leaves, lanes):
         return form(ft.partial(function, *static), *trees)(*arguments)
 
     # (One for each number of lanes, as it is for arrays of one shape.)
-    return jax.jit(run, compiler_options=compiler_options())
+    return jax.jit(run, compiler_options=compiler_options(small=True))
 
 
 def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:

@@ -75,12 +75,12 @@ def signal_values(names: Iterable[str], values: Iterable[Any]) -> str:
     return ", ".join(f"{name} {number(x, 3, unit_of(name))}" for name, x in pairs)
 
 
-def fields(module: Any) -> str:
-    """A module by its fields, without those that are None."""
-    shown_fields = (field for field in dataclasses.fields(module) if field.repr)
-    named = ((field.name, getattr(module, field.name)) for field in shown_fields)
+def fields(self: Any) -> str:
+    """A module by its fields, without those that are None (a `__repr__`)."""
+    shown_fields = (field for field in dataclasses.fields(self) if field.repr)
+    named = ((field.name, getattr(self, field.name)) for field in shown_fields)
     shown = [f"{name}={value(x)}" for name, x in named if x is not None]
-    kind, line = type(module).__name__, ", ".join(shown)
+    kind, line = type(self).__name__, ", ".join(shown)
     if len(kind) + len(line) + 2 <= _WIDTH:
         return f"{kind}({line})"
     inside = textwrap.indent(",\n".join(shown), "  ")

@@ -126,13 +126,12 @@ def flow_jacobian(
     lanes: Lanes,
     target: Target,
     settings: Settings,
-    h: Times | None = None,
-    result: Index | None = None,
-    new_input: bool = True,
-    wanted: Wanted = True,
+    h: Times,
+    result: Index,
+    wanted: Wanted,
 ) -> tuple[Jacobians, Moved, Tape]:
-    """Derivative of (t, q) at the targets with respect to q at the start, without input. If it is
-    not `wanted`, zeros: only the flow is computed then.
+    """Derivative of (t, q) at the targets with respect to q at the start, without input that may
+    have jumped, in JAX. If it is not `wanted`, zeros: only the flow is computed then.
 
     Exact, through every event on the way, and differentiable once more. Each column is one
     forward-mode tangent; all columns and lanes are pushed forward in one pass. (Linearizing first
@@ -140,9 +139,8 @@ def flow_jacobian(
 
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
-    u = namespace(lanes.t).zeros((s.nu, lanes.t.shape[0]))
-    still, start, goal = (s, lanes, target) if on_host(lanes.t) else constant((s, lanes, target))
-    options = Options(tape=True, new_input=new_input, tangents=wanted)
+    still, start, goal = constant((s, lanes, target))
+    u, options = jnp.zeros((s.nu, 1)), Options(tape=True, new_input=False, tangents=wanted)
     moved, tape = move(still, start, u, goal, settings, h, result, options)
     assert tape is not None
     jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True, wanted=wanted)

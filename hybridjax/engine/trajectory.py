@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
-from .._core.compilation import host_first
+from .._core.compilation import at_ease, host_first
 from .._core.meaning import current
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -218,14 +218,9 @@ def recorded(
         rows.append(tuple(x[tape.code != IDLE] for x in columns))
     t, before, after, chart, event = (np.concatenate(x) for x in zip(*rows, strict=True))
 
-    def rates(chart, q):
-        # Filled up to whole pieces, so that few lengths are compiled.
-        fill = -len(t) % len(tapes[0].code)
-        end, chart, q = (np.concatenate([x, np.repeat(x[-1:], fill, 0)]) for x in (t, chart, q))
-        return np.asarray(_slopes(s, end, chart, q.T, u))[:, : len(t)].T
-
     source = np.concatenate([chart[:1], chart[:-1]])
-    left, right = rates(source, before), rates(chart, after)
+    with at_ease():
+        left, right = slopes(s, t, source, before.T, u).T, slopes(s, t, chart, after.T, u).T
     return Trajectory(s, t, chart, before, after, left, right, event, result)
 
 
@@ -271,6 +266,3 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
 @host_first
 def _piece(s, lanes, u, end, settings, h):
     return move(s, lanes, u, until(end), settings, h, options=Options(tape=True))
-
-
-_slopes = host_first(slopes)

@@ -38,8 +38,7 @@ class Simulated(eqx.Module):
     error: Float[np.ndarray, " S"] | None = None
     label: str = eqx.field(static=True, default="")
 
-    def __repr__(self) -> str:
-        return fields(self)
+    __repr__ = fields
 
 
 @checked

@@ -154,35 +154,22 @@ def stream_experiments(
     written, or if the workers of the client cannot run them; `ComputationError` if the cluster is
     lost.
     """
-    if store is not None:
-        with working("stream_experiments"):
-            job = experiment_job(cycle, sections, design, outputs, options, chunk)
-            fill(job, store, client)
-        return StoredExperiments(store)
-    if client is not None:
-        raise DefinitionError("a `client` needs a `store` to put records into.")
-    campaign = prepare(cycle, sections, design, outputs, options, chunk)
-    S = len(campaign.inputs)
-    return (campaign.run(slice(k, min(k + chunk, S))) for k in range(0, S, chunk))
-
-
-def experiment_job(
-    cycle: LimitCycle,
-    sections: SectionsLike,
-    design: DesignLike,
-    outputs: OutputNames,
-    options: Options,
-    chunk: int,
-) -> "ExperimentJob":
-    """Return the experiments as pieces whose results do not depend on the number of threads."""
+    if store is None:
+        if client is not None:
+            raise DefinitionError("a `client` needs a `store` to put records into.")
+        campaign = prepare(cycle, sections, design, outputs, options, chunk)
+        S = len(campaign.inputs)
+        return (campaign.run(slice(k, min(k + chunk, S))) for k in range(0, S, chunk))
     if options.feedback is not None:
         raise DefinitionError("a store keeps no experiments with feedback: leave `store` out.")
     # (Batches as for one thread: their size does not depend on the machine.)
     execution = dataclasses.replace(options.execution or Execution(), workers=1)
     options = dataclasses.replace(options, execution=execution)
-    campaign = prepare(cycle, sections, design, outputs, options, chunk, one_program=True)
-    S = len(campaign.inputs)
-    return ExperimentJob(campaign, Blocks((S,), (min(chunk, S),)))
+    with working("stream_experiments"):
+        campaign = prepare(cycle, sections, design, outputs, options, chunk, one_program=True)
+        S = len(campaign.inputs)
+        fill(ExperimentJob(campaign, Blocks((S,), (min(chunk, S),))), store, client)
+    return StoredExperiments(store)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -82,8 +82,7 @@ class AbstractObservation(eqx.Module):
         """
         return self
 
-    def __repr__(self):
-        return fields(self)
+    __repr__ = fields
 
 
 @checked

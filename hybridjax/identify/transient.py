@@ -20,6 +20,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
 from .denominator import multipliers_of
+from .series.records import start_responses
 from .spectral_sums import SILENT_LINE
 
 
@@ -110,7 +111,10 @@ def remove_transient(
             "(`multisine(lines='odd')`)."
         )
     tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
-    blocks = _compressed(free, left, everything)
+    # Pairs (Q, z) with no more columns of z than rows, and the same residuals.
+    whole = [np.concatenate(left, axis=1)] if everything else left
+    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T)[1].T for z in whole]
+    blocks = list(zip(free, fewer, strict=False))  # (with everything, all Q are the same)
     count = sum(z.size for z in left)
     fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
     c = min(fits, key=lambda fit: fit[0])[1]
@@ -148,12 +152,7 @@ def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows c
 
 def _decays(c: Float[np.ndarray, " d"], cycles: int) -> Float[np.ndarray, "cycles d"]:
     """Return a basis of the solutions of `v[p] + c_1 v[p-1] + ... + c_d v[p-d] = 0`."""
-    d = len(c)
-    v = np.zeros((cycles, d))
-    v[:d] = np.eye(d)
-    for p in range(d, cycles):
-        v[p] = -c @ v[p - d : p][::-1]
-    return v
+    return start_responses(c, np.zeros(1, int), cycles, len(c))[0]
 
 
 def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
@@ -168,14 +167,6 @@ def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
         normal += np.einsum("ikl,jkl->ij", lags[1:], lags[1:])
         right -= np.einsum("ikl,kl->i", lags[1:], lags[0])
     return np.linalg.lstsq(normal, right, rcond=None)[0]
-
-
-def _compressed(free, left, everything: bool):
-    """Return pairs (Q, z) with no more columns of z than rows, and the same residuals."""
-    if everything:
-        free, left = free[:1], [np.concatenate(left, axis=1)]
-    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T)[1].T for z in left]
-    return list(zip(free, fewer, strict=True))
 
 
 def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):

@@ -60,8 +60,7 @@ class Crossing(Definition):
             name = getattr(name, "name", getattr(name, "__name__", "function"))
         return f"{name} {self.direction}"
 
-    def __repr__(self):
-        return fields(self)
+    __repr__ = fields
 
     def check(self, s: Structure) -> None:
         """**Raises:** `DefinitionError` for charts or outputs that do not exist, and for
@@ -109,8 +108,7 @@ class AtEvent(eqx.Module):
     def __str__(self):
         return f"after {self.name}"
 
-    def __repr__(self):
-        return fields(self)
+    __repr__ = fields
 
     def check(self, s: Structure) -> None:
         """**Raises:** `DefinitionError` for an event that the system does not have."""

@@ -1,7 +1,7 @@
 """Limit cycles of many systems at once: the points of a parameter sweep side by side."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import SupportsIndex
 
 import equinox as eqx
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
-from .._core.boundary.kinds import Index, Positive
+from .._core.boundary.kinds import Index
 from .._core.execution import Execution
 from .._core.executor import from_host
 from .._core.memo import remembered
@@ -28,7 +28,6 @@ from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
 from .return_map import ReturnMap, turn_product
-from .scale import given_sizes, scale_of
 
 
 # Largest number of systems for programs that are compiled in half the time and run longer. Larger:
@@ -128,7 +127,6 @@ def find_limit_cycles(
     systems: HybridSystem | Sequence[HybridSystem],
     guess: LimitCycle,
     *,
-    scale: Mapping[str, Positive] | None = None,
     settings: Settings | None = None,
     execution: Execution | None = None,
 ) -> LimitCycles:
@@ -145,7 +143,6 @@ def find_limit_cycles(
         axis, as `equinox.filter_vmap` makes it:
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
-    - `scale`: characteristic magnitudes of states by name. Default: those of the guess.
     - `settings`: accuracy of the flow (Default: 1e-9 per step) and its `solver`.
     - `execution`: systems per compiled call (`batch`, Default: 250) and threads (`workers`).
 
@@ -162,19 +159,17 @@ def find_limit_cycles(
     arrays, static = eqx.partition(systems, eqx.is_array)
     S = len(jax.tree_util.tree_leaves(arrays)[0])
     check_periodic(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
-    map = map_for_sweep(guess, scale, settings)
+    map = map_for_sweep(guess, settings)
     size = min(execution.batch or BATCH, S)
     tiles = Tiles(systems, map, size, execution.threads, S > SMALL)
     return as_cycles(tiles, tiles.solve(S))
 
 
-def map_for_sweep(
-    guess: LimitCycle, scale: Mapping[str, float] | None, settings: Settings | None
-) -> ReturnMap:
+def map_for_sweep(guess: LimitCycle, settings: Settings) -> ReturnMap:
     """The return map of `guess`, with the settings of a sweep."""
-    settings, s = (Settings() if settings is None else settings).filled(SWEEP), guess.structure
-    rough = guess.settings.scale if settings.scale is None else settings.scale
-    settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), rough))
+    settings = settings.filled(SWEEP)
+    if settings.scale is None:
+        settings = dataclasses.replace(settings, scale=guess.settings.scale)
     return dataclasses.replace(guess.return_map, settings=settings)
 
 

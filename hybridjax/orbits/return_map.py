@@ -203,13 +203,15 @@ class ReturnMap(eqx.Module):
         otherwise they are meaningless. `along`: the map after a step of the parameters. `record`:
         see `turn`.
         """
-        s, xp = self.structure, namespace(q)
+        s, xp, settings = self.structure, namespace(q), self.settings
 
         def flow(lanes, target, h, result, piece):
+            if on_host(q):  # (all pieces are linearized together)
+                u, options = np.zeros((s.nu, 1)), Options(True, new_input=False, tangents=wanted)
+                moved, tape = move(s, lanes, u, target, settings, h, result, options)
+                return moved, (lanes, None, None, tape, None)
             if piece is None:
-                jacobian, moved, tape = flow_jacobian(
-                    s, lanes, target, self.settings, h, result, new_input=False, wanted=wanted
-                )
+                jacobian, moved, tape = flow_jacobian(s, lanes, target, settings, h, result, wanted)
             else:
                 moved, tape = piece
                 jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
@@ -219,11 +221,13 @@ class ReturnMap(eqx.Module):
                 other = along  # (known to be a function in the function below, too)
                 moves = derivative_at_zero(lambda step: self._end(other(step), lanes, target, tape))
             steps = Tape(tape.h, tape.code, tape.t, None, None, None)
-            recorded = None if on_host(q) else Recorded(moved, steps)
-            return moved, (lanes, jacobian[0, 1:], moves, tape, recorded)
+            return moved, (lanes, jacobian[0, 1:], moves, tape, Recorded(moved, steps))
 
         end, (legs, factors, moves, tapes, recorded) = self.travel(q, flow, record)
-        legs = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), legs)
+        as_lanes = lambda x: xp.moveaxis(x[..., 0], 0, -1)  # noqa: E731
+        legs, tape = jax.tree_util.tree_map(as_lanes, (legs, tapes))
+        if on_host(q):
+            factors = tape_jacobian(s, legs, self._ends(), tape, of_states=True)[0][:, 1:]
         codes, valid = tapes.code[..., 0], self.valid
         off, by_state = self.held(q)
         returned = xp.where(valid[:, None], monodromy(factors), 0.0)
@@ -303,21 +307,7 @@ class ReturnMap(eqx.Module):
 
         The pieces end at K - 1 times, then on the section on which the turn began.
         """
-        xp, t0, expected = namespace(q), self.anchor.t[0], self.expected
-        k = xp.arange(1, LEGS + 1)
-        if self.base is None:
-            ends = toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
-        else:
-            free = 1 - (1 - _FREE) / self.multiplicity
-            time = xp.where(k < LEGS, t0 + free * expected * k / (LEGS - 1), np.inf)
-            ends = toward(time, -1, t0 + 3 * expected)
-            section = to_section(ends, self.base, self.event)
-            last = k == LEGS
-            ends = dataclasses.replace(
-                section,
-                event=xp.where(last, section.event, -1).astype(np.int32),
-                index=xp.where(last, section.index, -1).astype(np.int32),
-            )
+        xp, ends = namespace(q), self._ends()
 
         def leg(carry, end):
             lanes, h, result = carry
@@ -327,13 +317,29 @@ class ReturnMap(eqx.Module):
             moved, extra = flow(lanes, target, h, result, piece)
             return (moved.lanes, moved.h, moved.result), extra
 
-        begin = self.departure(q), (0.5 * expected / LEGS)[None], xp.zeros(1, xp.int32)
+        begin = self.departure(q), (0.5 * self.expected / LEGS)[None], xp.zeros(1, xp.int32)
         each = ends.time, ends.index, ends.event, ends.limit, record
         (end, _, result), extra = scan(leg, begin, each)
         same = (result[0] == Result.OK) & (end.chart[0] == self.anchor.chart[0])
         residual = xp.where(self.valid, end.q[:, 0], 0.0) - q - self.held(q)[0]
         residual = xp.where(same, residual, np.nan)
-        return Return(residual, end.t[0] - t0, result[0]), extra
+        return Return(residual, end.t[0] - self.anchor.t[0], result[0]), extra
+
+    def _ends(self) -> Target:
+        """The ends of the pieces, as lanes."""
+        t0, expected, xp = self.anchor.t[0], self.expected, namespace(self.expected)
+        k = xp.arange(1, LEGS + 1)
+        if self.base is None:
+            return toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
+        free = 1 - (1 - _FREE) / self.multiplicity
+        time = xp.where(k < LEGS, t0 + free * expected * k / (LEGS - 1), np.inf)
+        section = to_section(toward(time, -1, t0 + 3 * expected), self.base, self.event)
+        last = k == LEGS
+        return dataclasses.replace(
+            section,
+            event=xp.where(last, section.event, -1).astype(np.int32),
+            index=xp.where(last, section.index, -1).astype(np.int32),
+        )
 
     def _meetings(self, legs: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
         xp = namespace(codes)

@@ -134,13 +134,12 @@ def impulse_responses(
 
 @checked
 def phase_response(found: PhaseResponse, *, ax: AxesLike | None = None) -> Plot:
-    """The curve with its 95 % band, and that of plain regression, which is biased."""
+    """The curve with its 95 % band."""
     with panels(ax, height=2.8) as axes:
         curve = axes[0, 0]
         low, high = found.interval(found.phase)
         curve.fill_between(found.phase, low, high, color=CYCLE[0], alpha=0.25, lw=0)
         curve.plot(found.phase, found.values, color=CYCLE[0], label="estimated, 95 %")
-        curve.plot(found.phase, found.plain, "--", color=COLORS["gray"], label="plain regression")
         curve.axhline(0, color="black", lw=0.4)
         name = f"response to {found.input}"
         curve.set(

@@ -219,10 +219,6 @@ def about_phase_response(r: Any) -> Iterator[Finding]:
         worst = int(np.argmax(half))
         text = f"at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
         yield Finding("wide", f"{text}either side, more than half of the mean.")
-    off = np.sqrt(np.mean((r.plain - r.values) ** 2))
-    if off > np.sqrt(np.mean(r.errors**2)):
-        text = f"at phases that grow linearly it would be off by {off:.2g} (rms, of a mean of "
-        yield Finding("plain regression", f"{text}{mean:.2g}); do not use it here.")
     finest = max(1, round(1 / (np.pi * max(r.jitter, 1e-6))))
     text = f"the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than harmonic "
     yield Finding("resolution", f"{text}{finest} at the end of a cycle.")

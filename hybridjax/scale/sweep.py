@@ -18,6 +18,7 @@ from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable, near_cube
 from .._core.precision import require_x64
 from .._core.progress import say, working
+from ..engine.settings import Settings
 from ..errors import ComputationError, DefinitionError
 from ..orbits.batches import Known, Tiles
 from ..orbits.cycle import LimitCycle, rough
@@ -214,7 +215,7 @@ class SweepJob:
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""
-        map = _rounded(map_for_sweep(self._guess(), None, None))
+        map = _rounded(map_for_sweep(self._guess(), Settings()))
         unit = qmc.Halton(len(self.blocks.shape), scramble=False).random(_COARSE + 1)[1:]
         index = tuple(np.unique((unit * np.array(self.blocks.shape)).astype(int), axis=0).T)
         n, d = len(index[0]), map.anchor.q.shape[0]

@@ -98,8 +98,7 @@ class AbstractSections(Definition):
     def describe(self, i: int) -> str:
         """A name of section i for errors."""
 
-    def __repr__(self):
-        return fields(self)
+    __repr__ = fields
 
 
 class _Anchored(AbstractSections):

@@ -42,8 +42,7 @@ class Output(Definition):
     function: Callable[..., Any] | Mapping[str, Callable[..., Any]]
     unit: str = eqx.field(static=True, default="")
 
-    def __repr__(self):
-        return fields(self)
+    __repr__ = fields
 
 
 OutputNames = Annotated[Sequence[str | Output] | str | Output, Names(Output)]
@@ -121,8 +120,7 @@ class Guess(eqx.Module):
     def __init__(self, chart: str, state: Vector, time: Scalar = 0.0, *, after: str | None = None):
         self.chart, self.state, self.time, self.after = chart, real(state), real(time), after
 
-    def __repr__(self):
-        return fields(self)
+    __repr__ = fields
 
 
 class HybridSystem(Definition):

@@ -39,8 +39,7 @@ class Scheduled(eqx.Module):
                 )
         self.period, self.offset = real(period), real(offset)
 
-    def __repr__(self):
-        return fields(self)
+    __repr__ = fields
 
     def numbers(self, t: Array) -> tuple[Array, Array]:
         """`offset` and `period`, as arrays of the kind of t."""

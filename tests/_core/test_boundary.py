@@ -33,7 +33,6 @@ TAKEN = [
     (float, 3, 3.0),
     (float, jnp.array(0.5), 0.5),
     (Annotated[float, Number("no bound or a positive number", above=0, infinite=True)], INF, INF),
-    (complex, 2, 2 + 0j),
     (bool, np.True_, True),
     (Literal["a", "b"], "b", "b"),
     (Sequence[int], np.arange(2), [0, 1]),

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.pieces.store import Blocks
 from hybridjax.experiments import Options, StoredExperiments
-from hybridjax.experiments.run import divide
-from hybridjax.experiments.stored import experiment_job
+from hybridjax.experiments.run import divide, prepare
+from hybridjax.experiments.stored import ExperimentJob
 
 from ..conftest import no_compilation
 
@@ -157,7 +158,7 @@ def test_another_process_can_run_a_piece(arguments, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")
     options = Options(start=start, discard=8)
-    job = experiment_job(*arguments, options, 2)
+    job = ExperimentJob(prepare(*arguments, options, 2, one_program=True), Blocks((COUNT,), (2,)))
     _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
     mine, theirs = job.run(0, None), sent.run(0, 1)

@@ -128,7 +128,7 @@ def linear(t):
 def designs(t):
     lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
-    yield hj.paper_design, lines | dict(experiments=8)
+    yield hj.paper_design, dict(n_sections=20, periods=16, experiments=40, division="random")
     cosines = dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0)
     yield hj.Design.from_lines, cosines | dict(n_sections=6, periods=16)
     good = {name: getattr(t.one_input, name) for name in t.one_input.__dataclass_fields__}

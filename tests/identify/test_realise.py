@@ -15,10 +15,9 @@ F = np.linspace(0.05, 9.95, 40)
 
 
 def test_the_hopper_from_markov_parameters(hopper, multipliers):
-    model = hj.identify.realize(hopper.impulse_response(150), inputs="u", outputs=("yM", "vM"))
+    model = hj.identify.realize(hopper.impulse_response(150))
     np.testing.assert_array_equal(model.dims, MINIMAL)
     np.testing.assert_allclose(model.multipliers[:2], multipliers, atol=1e-10)
-    assert model.htf(F).error(hopper.htf(F)).max() < 1e-11
     np.testing.assert_allclose(
         model.impulse_response(300), hopper.impulse_response(300), atol=1e-12
     )

@@ -181,20 +181,6 @@ class Number(Kind):
         return self.low <= value <= self.high and self.above < value < self.below
 
 
-class ComplexNumber(Kind):
-    """A finite number, real or complex."""
-
-    allowed = "a finite number"
-
-    def take(self, value):
-        number = _plain(value, self.allowed)
-        if isinstance(number, bool | np.bool_) or not isinstance(number, numbers.Complex):
-            raise self.refused(value)
-        if not (math.isfinite(number.real) and math.isfinite(number.imag)):
-            raise self.refused(value)
-        return complex(number)
-
-
 class Switch(Kind):
     """True or False."""
 

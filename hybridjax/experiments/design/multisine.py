@@ -191,8 +191,6 @@ def _orthogonal(division, j, phase):
 def paper_design(
     n_sections: SectionCount = 32,
     periods: PeriodCount = 64,
-    band: Band = (0.0, 10.0),
-    amplitude: Positive = 0.01,
     seed: Seed = 0,
     *,
     division: Literal["random", "sum-free"] = "sum-free",
@@ -207,10 +205,10 @@ def paper_design(
 
     **Raises:** `DefinitionError` as `multisine`.
     """
+    band = 0.0, 10.0
     return multisine(
-        n_sections, periods, band, amplitude, seed,
-        division=division, experiments=experiments,
-    )  # fmt: skip
+        n_sections, periods, band, seed=seed, division=division, experiments=experiments
+    )
 
 
 @checked

@@ -414,7 +414,7 @@ def _finished(
         problem = cast(FrequencyProblem, point.problem)
         e, size = problem.errors(model)[:, np.argsort(data.f)], problem.weight * problem.target
         rounding = np.finfo(float).eps * (np.abs(size) ** 2).mean()
-        neighbors = (e[:, 1:] * e[:, :-1].conj()).real.mean()
+        neighbors = np.real(e[:, 1:] * e[:, :-1].conj()).mean()
         correlation = float(neighbors / np.maximum((np.abs(e) ** 2).mean(), rounding))
     else:
         noise = noise_model(model, cast(SeriesProblem, point.problem).S, scale, data.outputs)

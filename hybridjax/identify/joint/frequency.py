@@ -16,11 +16,10 @@ $\mu_m[n] = C[n] + z_m^{-1} \mu_m[n+1] A[n]$.
 """
 
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 
 from ...linear.htf import HTF
 from ..descent import NormalEquations
@@ -74,30 +73,9 @@ class FrequencyProblem(NamedTuple):
 
         **Raises:** `LinAlgError` for a model that is resonant or overflows.
         """
-        N, (ny, nu) = model.n_sections, model.D[0].shape
-        m = np.array(self.harmonics)
-        ends = np.cumsum([0, *[len(B) for B in model.B]]).tolist()
-        waves = np.exp(-2j * np.pi / N * np.outer(np.arange(N), m)) / N
-        size = ends[-1] + (N * ny if direct else 0)
-        gram, along = np.zeros((nu, size, size)), np.zeros((nu, size))
-        error = self.errors(model)
-        for rows in _chunks(len(self.f), size * len(m) * ny):
-            J = np.zeros((size, len(m), rows.stop - rows.start, ny), complex)
-            np.concatenate(_after(model, self.f[rows], m), out=J[: ends[-1]])
-            if direct:
-                D = J[ends[-1] :].reshape(N, ny, *J.shape[1:])
-                for i in range(ny):
-                    D[:, i, :, :, i] = waves[:, :, None]
-            for j in range(nu):
-                columns = (J * self.weight[:, rows, :, j]).reshape(size, -1).view(float)
-                gram[j] += columns @ columns.T
-                along[j] += columns @ np.ascontiguousarray(error[:, rows, :, j]).ravel().view(float)
-        each = [NormalEquations(g, a).step(0.0)[0] for g, a in zip(gram, along, strict=True)]
-        change = np.stack(each, axis=1)
-        B = [B + change[a:b] for B, (a, b) in zip(model.B, pairwise(ends), strict=True)]
-        changes = change[ends[-1] :].reshape(-1, ny, nu)
-        D = [D + x for D, x in zip(model.D, changes, strict=True)] if direct else model.D
-        return model._replace(B=B, D=D)
+        to_A, to_C = ([np.zeros((len(x), 0)) for x in blocks] for blocks in (model.A, model.C))
+        coordinates = LocalCoordinates(model, to_A, to_C, direct)
+        return coordinates.moved(self.linearize(coordinates).step(0.0)[0])
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P, error = coordinates.size, self.errors(coordinates.model)
@@ -150,38 +128,26 @@ def _slopes(
     """Return derivatives of the HTFs times weights."""
     model, places, m = coordinates.model, coordinates.places, np.array(harmonics)
     N, (ny, nu) = model.n_sections, model.D[0].shape
-    states, after = states_at(model, f), _after(model, f, m)
+    # Derivatives by later states are those of the transposed system, in the other order.
+    dual = model._replace(A=[A.T for A in model.A[::-1]], B=[C.T for C in model.C[::-1]])
+    states, later = states_at(model, f), states_at(dual, np.add.outer(m, f).ravel())[::-1]
     J = np.zeros((coordinates.size, *weight.shape), complex)
     for n, at in enumerate(places):
-        wave = _waves(m, n, N)[:, None, None]
+        wave = (np.exp(-2j * np.pi / N * n * m) / N)[:, None, None]
+        after = later[n].reshape(-1, len(m), len(f), ny) * wave  # (d, M, F, ny)
         shapes = dict(coordinates.blocks(n))
-        left = _real_times(coordinates.to_A[n].T, after[n])  # (q, M, F, ny)
+        left = _real_times(coordinates.to_A[n].T, after)  # (q, M, F, ny)
         left += coordinates.to_C[n].T[:, None, None, :] * wave
         Y, B = (J[at[name]].reshape(*shapes[name], *weight.shape) for name in ("Y", "B"))
         for j in range(nu):
             x = states[n][None, :, None, :, None, j]  # (1, d, 1, F, 1)
             np.multiply((left * weight[..., j])[:, None], x, out=Y[..., j])
-            B[:, j, ..., j] = after[n] * weight[..., j]
+            B[:, j, ..., j] = after * weight[..., j]
         if coordinates.direct:
             D = J[at["D"]].reshape(*shapes["D"], *weight.shape)
             for i, j in np.ndindex(ny, nu):
                 D[i, j, ..., i, j] = wave[..., 0] * weight[..., i, j]
     return J
-
-
-def _after(model: PeriodicModel, f: Float[np.ndarray, " F"], m: Int[np.ndarray, " M"]):
-    """Return derivatives of the HTFs by the state after each section, (d, M, F, ny)."""
-    N, ny = model.n_sections, len(model.C[0])
-    z = np.exp(2j * np.pi / N * (m[:, None] + f))
-    mu = adjoints(model, z.ravel())
-    factors = [(_waves(m, n, N)[:, None] / z)[..., None] for n in range(N)]
-    return [
-        mu[(n + 1) % N].reshape(-1, len(m), len(f), ny) * factor for n, factor in enumerate(factors)
-    ]
-
-
-def _waves(m: Int[np.ndarray, " M"], n: int, N: int):
-    return np.exp(-2j * np.pi / N * n * m) / N
 
 
 def states_at(
@@ -199,35 +165,11 @@ def states_at(
         return states, x
 
     _, forced = around(np.zeros((len(phi), len(f), nu), complex))
-    return around(np.einsum("fab,bfj->afj", _resolvent(phi, np.exp(-2j * np.pi * f)), forced))[0]
-
-
-def adjoints(
-    model: PeriodicModel, z: Complex[np.ndarray, " F"]
-) -> list[Complex[np.ndarray, "_ F ny"]]:
-    r"""Return $\mu$ at each section, transposed: (d, F, ny)."""
-    ny, phi = len(model.C[0]), model.monodromy()
-    back = 1 / z[:, None]
-
-    def around(mu):
-        out = []
-        for A, C in zip(reversed(model.A), reversed(model.C), strict=True):
-            mu = _real_times(A.T, mu)
-            mu *= back
-            mu += C.T[:, None, :]
-            out.append(mu)
-        return out[::-1]
-
-    forced = around(np.zeros((len(phi), len(z), ny), complex))[0]
-    return around(np.einsum("fba,bfi->afi", _resolvent(phi, z**-model.n_sections), forced))
+    turn = phi * np.exp(-2j * np.pi * f)[:, None, None]
+    return around(np.einsum("fab,bfj->afj", np.linalg.inv(np.eye(len(phi)) - turn), forced))[0]
 
 
 def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
     """Return the product with a real matrix, (a, *rest)."""
     parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
     return (matrix @ parts).view(complex).reshape(len(matrix), *x.shape[1:])
-
-
-def _resolvent(phi: Float[np.ndarray, "d d"], z_N: Complex[np.ndarray, " F"]):
-    r"""Return $(I - \Phi z^{-N})^{-1}$, given $z^{-N}$."""
-    return np.linalg.inv(np.eye(len(phi)) - phi * z_N[:, None, None])

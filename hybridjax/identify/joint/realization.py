@@ -1,15 +1,15 @@
 """State-space models from measured responses, and first models of time series."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 from scipy import special
 
-from ..._core.arguments import Numbers, names, require_axes
+from ..._core.arguments import Numbers, require_axes
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Order, SignalNames
+from ..._core.boundary.kinds import Order
 from ..._core.boundary.values import Integers, Reals
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
@@ -25,8 +25,6 @@ from .frequency import FrequencyProblem
 from .model import PeriodicModel
 
 
-Names = tuple[str, ...] | None
-
 # Factor by which a singular value must exceed the largest that noise alone makes, on average.
 # Larger: weak states are missed; smaller: noise makes states.
 _NOISE_MARGIN = 1.1
@@ -40,8 +38,6 @@ def realize(
     dims: Order | Annotated[Numbers, Integers("sections", sign="positive")] | None = None,
     *,
     order: Order = 1,
-    outputs: SignalNames | None = None,
-    inputs: SignalNames | None = None,
 ) -> LDTP:
     r"""Return a minimal periodic state-space model with given responses.
 
@@ -67,7 +63,6 @@ def realize(
     - `dims`: dimension of the state at all sections, or at each. Default: the number of singular
       values above rounding errors or, if the source has variances, above noise.
     - `order`: the number of multipliers expected, a lower bound of dimensions. Default: 1.
-    - `outputs`, `inputs`: names, for an array.
 
     **Raises:** `DefinitionError` for too few lags or frequencies, or more dimensions than these
     support.
@@ -76,10 +71,10 @@ def realize(
     if isinstance(source, HTF):
         source.require_sampled("`realize`")
         return _from_htf(source, dims, order)
-    spread = None
+    spread = inputs = outputs = None
     if isinstance(source, SeriesFit):
         N, R = source.numerators.shape[:2]
-        outputs, inputs = source.outputs, source.inputs
+        inputs, outputs = source.inputs, source.outputs
         p = default_horizon(N)
         markov = source.impulse_response(2 * p + 1)
         spread = np.sqrt((source.roots**2).sum(axis=4).mean(axis=(0, 2, 3))) * source.noise
@@ -89,8 +84,6 @@ def realize(
         p = min(default_horizon(N), (lags - 1) // 2)
         if p < 1:
             raise DefinitionError(f"{lags} lags are too few: 3 or more are needed.")
-        outputs = names("outputs", cast(Names, outputs), markov.shape[2])
-        inputs = names("inputs", cast(Names, inputs), markov.shape[3])
     ny, nu = markov.shape[2:]
     scale = _scale(np.sqrt(np.mean(markov**2, axis=(0, 1, 3))) if spread is None else spread)
     markov = markov / scale[:, None]

@@ -342,7 +342,8 @@ def gradient_covariance(
         def backward(x):  # its product with white noise is that of x with filtered noise
             return divide_by_chi(memory, (sampled * x)[:, ::-1])
 
-        bases = regression.input_basis(fit.root), regression.basis
+        rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)
+        bases = rows, regression.basis
         inputs, starts = (in_blocks(basis, count) for basis in bases)
         weights = inverse_of_remainder(inputs @ inputs.swapaxes(1, 2))
         x = outputs(k, part, n)[:, :, fit.outputs]

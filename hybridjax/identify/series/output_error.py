@@ -68,10 +68,6 @@ class SectionRegression(NamedTuple):
         """Samples less unknown initial conditions and drift."""
         return float((self.weight > 0).sum() - (self.basis**2).sum())
 
-    def input_basis(self, root: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "S T k"]:
-        """Return the rows of this grid in an orthonormal basis of the inputs' rows of all grids."""
-        return (self.remainder @ root).reshape(*self.basis.shape[:2], -1)
-
     def reduced(self, x: Float[np.ndarray, "S T *columns"]) -> Float[np.ndarray, "rows *columns"]:
         """Return outputs, weighted, without the part in the basis."""
         left = self.weight * x.reshape(*x.shape[:2], -1)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import optimize
 
 from ...identify.denominator import Covariance, sandwich
-from .model import Forecast, Intervals, Table, basis, forecast, tabulated
+from .model import Forecast, Intervals, Table, forecast, tabulated
 
 
 # Half waves of a curve. More: time, for detail that the smoothness removes. Fewer: curves that jump
@@ -220,25 +220,3 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float,
     covariance = sandwich(curvature, meat, shares + smooth / count)
     detail = float(np.trace(np.linalg.lstsq(curvature, data)[0]))
     return covariance, float(left_out.sum()), detail
-
-
-def plain_curve(intervals: Intervals, fit: CurveFit) -> Float[np.ndarray, " p"]:
-    """Return coefficients by regression of durations on the input at phases that grow linearly from
-    event to event, as smooth as those of the fit.
-
-    An interval that ends late has other regressors than it would have had: they contain its noise,
-    so that the curve is biased.
-    """
-    waves = len(fit.coefficients) - 1
-    across = np.zeros((len(intervals.start), waves + 1))
-    for k, u in enumerate(intervals.inputs):
-        phase = k * intervals.step / 2 / intervals.duration
-        acting = np.where(phase < 1, u, 0.0) * intervals.step / 2
-        across += acting[:, None] * basis(phase, waves)
-    across *= (-1 / fit.rates)[intervals.trial, None] * fit.used[:, None]
-    count = np.maximum(intervals.sums(1.0 * fit.used), 1.0)
-    both = np.column_stack([across, intervals.duration * fit.used])
-    mean = np.stack([intervals.sums(x) for x in both.T], axis=1) / count[:, None]
-    both -= mean[intervals.trial] * fit.used[:, None]
-    across, deviation = both[:, :-1], both[:, -1]
-    return np.linalg.lstsq(across.T @ across + np.diag(fit.penalty), across.T @ deviation)[0]

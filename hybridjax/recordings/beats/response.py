@@ -22,7 +22,7 @@ from ..phase import Phase
 from ..phase_estimation import estimate_phase
 from ..recording import Recording
 from ..smoothing import Series
-from .estimation import WAVES, CurveFit, accuracy_of, fit_curve, plain_curve
+from .estimation import WAVES, CurveFit, accuracy_of, fit_curve
 from .model import Intervals, basis, intervals_of
 
 
@@ -41,9 +41,7 @@ class PhaseResponse(eqx.Module):
     - `coefficients` (K + 1,): coefficients of $\cos(\pi k \varphi)$. `covariance`, and the degrees
       of `freedom` with which it was estimated. `detail`: number of coefficients that the data
       determine, while the smoothness of the curve determines the others.
-    - `phase` (P,), `values` (P,), `errors` (P,): the curve and its standard errors. `plain` (P,):
-      the curve by regression of durations on the input at phases that grow linearly from event to
-      event, which is biased.
+    - `phase` (P,), `values` (P,), `errors` (P,): the curve and its standard errors.
     - `rates` (trials,): w, in cycles per second.
     - `jitter`: standard deviation of the phase at the end of a cycle, in cycles.
     - `left_out`: fraction of the variance of durations within trials (R2) that is forecast in
@@ -65,7 +63,6 @@ class PhaseResponse(eqx.Module):
     phase: Float[np.ndarray, " P"]
     values: Float[np.ndarray, " P"]
     errors: Float[np.ndarray, " P"]
-    plain: Float[np.ndarray, " P"]
     rates: Float[np.ndarray, " trials"]
     jitter: float = eqx.field(static=True)
     left_out: float = eqx.field(static=True)
@@ -168,7 +165,6 @@ def phase_response(
         phase=x,
         values=waves @ fit.coefficients,
         errors=np.sqrt(np.einsum("ni,ij,nj->n", waves, matrix, waves)),
-        plain=waves @ plain_curve(intervals, fit),
         rates=fit.rates,
         jitter=fit.jitter,
         left_out=_explained(intervals, fit, left_out),
