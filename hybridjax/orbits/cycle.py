@@ -302,7 +302,8 @@ class LimitCycle(eqx.Module):
         """The printed lines, by their headings."""
         s, time, anchor = self.structure, self.system.time_unit, to_host(self.anchor)
         names = [tr.name for tr in s.transitions]
-        units = map(unit_of, s.states(int(anchor.chart[0])))
+        units, scale = map(unit_of, s.states(int(anchor.chart[0]))), self.scale
+        rounding = np.finfo(float).eps
         stiff = stiff_charts(s, to_host(self.legs), float(self.period))
         sentences = (
             f"chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps of an explicit "
@@ -312,7 +313,7 @@ class LimitCycle(eqx.Module):
         return {
             "period": number(self.period, 12, time),
             f"at t = {number(anchor.t[0], 6, time)}": ", ".join(
-                f"{name} = {number(x, 9, unit)}"
+                f"{name} = {number(0.0 if abs(x) <= rounding * scale[name] else x, 9, unit)}"
                 for (name, x), unit in zip(self.state.items(), units, strict=True)
             ),
             "events": ", ".join(names[g] for g in self.event_sequence) or "none",
