@@ -78,7 +78,7 @@ _PLAIN = {
     bool: Switch(),
     int: Whole(),
     float: Number(),
-    complex: Number(),
+    complex: Number(),  # (in jaxtyping's `ArrayLike`; no number of this package is complex)
     str: TEXT,
     type(None): NOTHING,
     typing.SupportsIndex: Whole(),
