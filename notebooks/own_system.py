@@ -191,7 +191,8 @@ def multiplier(robot):
 slopes = jax.jit(jax.jacfwd(multiplier))(robot)
 for name in ("m", "g", "l0", "k", "b", "thrust"):
     value = getattr(robot, name)
-    print(f"1 % more {name:6s} changes it by {0.01 * value * getattr(slopes, name):+.1e}")
+    change = round(float(0.01 * value * getattr(slopes, name)), 12) or 0.0  # beyond that is rounding
+    print(f"1 % more {name:6s} changes it by {change:+.1e}")
 
 # %% [markdown]
 # ## When something is wrong
