@@ -191,7 +191,7 @@ def multiplier(robot):
 slopes = jax.jit(jax.jacfwd(multiplier))(robot)
 for name in ("m", "g", "l0", "k", "b", "thrust"):
     value = getattr(robot, name)
-    change = round(float(0.01 * value * getattr(slopes, name)), 12) or 0.0  # beyond that is rounding
+    change = round(float(0.01 * value * getattr(slopes, name)), 12) or 0.0  # less is rounding
     print(f"1 % more {name:6s} changes it by {change:+.1e}")
 
 # %% [markdown]
