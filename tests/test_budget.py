@@ -27,7 +27,7 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
 # 890 the responses of cycles; of the tests, 630 are those of both.
 LIMITS = {
-    "code": 25_346,
+    "code": 25_370,
     "files": 222,
     "longest": 500,
     "public_names": 170,

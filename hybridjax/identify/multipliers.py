@@ -33,7 +33,15 @@ from .variable_projection import (
     summarize,
     unfold,
 )
-from .weights import SMALLEST_ERROR, check_values, error_weights, line_variances, weights_of
+from .weights import (
+    SMALLEST_ERROR,
+    are_alike,
+    check_values,
+    correlation_of_neighbors,
+    error_weights,
+    line_variances,
+    weights_of,
+)
 
 
 # Fits of HTFs without variances whose weights come from the last misfit. Fewer: weights of the
@@ -56,7 +64,8 @@ class StructuredFit(MultiplierEstimate):
     - `multipliers` (d,): by decreasing modulus. `coefficients` (d,): c_1 to c_d, real.
     - `covariance` (d, d): that of the coefficients, estimated with `covariance_freedom` degrees of
       freedom. `standard_errors`, `contains` and `ellipse` follow from it.
-    - `residual` (ny,): rms misfit of each output's HTFs relative to their rms.
+    - `residual` (ny,): rms misfit of each output's HTFs relative to their rms, and `correlation`,
+      that of the misfit at neighboring frequencies: about 0 if the order is large enough.
     - `cost`: sum of squares of the misfit in units of the errors' standard deviations, and
       `freedom`, its expected value. Without variances the unit is estimated from the misfit, and
       the two are equal.
@@ -67,6 +76,7 @@ class StructuredFit(MultiplierEstimate):
     """
 
     residual: Float[np.ndarray, " ny"]
+    correlation: float = eqx.field(static=True)
     numerators: Complex[np.ndarray, "M coefficients ny nu"]
     cost: float = eqx.field(static=True)
     freedom: int = eqx.field(static=True)
@@ -92,6 +102,8 @@ class StructuredFit(MultiplierEstimate):
             f"{name} {x:.1e}" for name, x in zip(self.outputs, self.residual, strict=True)
         )
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
+        if are_alike(self.correlation, self.freedom):
+            state += "; the misfit is alike at neighboring frequencies: `order` is too low"
         return (
             f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}{state}"
@@ -163,13 +175,14 @@ def fit_multipliers(
 
     b = [numerators_of(group, c) for group in groups]
     B = unfold(htf, groups, b, [x.conj() for x in b])
-    misfit = np.abs(_evaluate(B, c, f, htf.n_sections) - H) ** 2
+    misfit, scale = _evaluate(B, c, f, htf.n_sections) - H, rms[:, None]
     return StructuredFit(
         multipliers=multipliers_of(c),
         coefficients=c,
         covariance=covariance.matrix,
         covariance_freedom=covariance.freedom,
-        residual=np.sqrt(np.mean(misfit, axis=(0, 1, 3))) / rms,
+        residual=np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms,
+        correlation=correlation_of_neighbors(misfit / scale, H / scale, f),
         numerators=B,
         cost=cost,
         freedom=freedom,

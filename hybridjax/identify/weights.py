@@ -4,7 +4,7 @@ Experiments that measure the same lines are weighted by their power, in `spectra
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
 from ..errors import DefinitionError
 from ..linear.htf import HTF
@@ -91,3 +91,21 @@ def _product_of_factors(
         by_harmonic = np.tensordot(share, variance / by_line, axes=(0, 1))
         size = np.stack([by_harmonic[same == k].mean(axis=0) for k in range(len(size))])[:, None]
     return size[same] * by_line
+
+
+def correlation_of_neighbors(
+    error: Complex[np.ndarray, "M F ny nu"],
+    values: Complex[np.ndarray, "M F ny nu"],
+    f: Float[np.ndarray, " F"],
+) -> float:
+    """Return the correlation of errors at neighboring frequencies, in which errors that are
+    rounding beside the `values` count as zero."""
+    ordered = error[:, np.argsort(f)]
+    rounding = np.finfo(float).eps * (np.abs(values) ** 2).mean()
+    neighbors = np.real(ordered[:, 1:] * ordered[:, :-1].conj()).mean()
+    return float(neighbors / np.maximum((np.abs(error) ** 2).mean(), rounding))
+
+
+def are_alike(correlation: float, freedom: float) -> bool:
+    """Test for a correlation of errors that is not chance, and large: the model is too simple."""
+    return correlation > max(1 / 3, 5 / np.sqrt(freedom))

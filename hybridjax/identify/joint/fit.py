@@ -26,7 +26,13 @@ from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
-from ..weights import SMALLEST_ERROR, check_values, error_weights
+from ..weights import (
+    SMALLEST_ERROR,
+    are_alike,
+    check_values,
+    correlation_of_neighbors,
+    error_weights,
+)
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
@@ -160,8 +166,7 @@ class LDTPFit(MultiplierEstimate):
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         about = f"misfit {self.cost:.6g}, expected {self.freedom}"
-        alike = self.correlation or 0.0
-        if self.cost > 2 * self.freedom or alike > max(1 / 3, 5 / np.sqrt(self.freedom)):
+        if self.cost > 2 * self.freedom or are_alike(self.correlation or 0.0, self.freedom):
             about += (
                 " (errors are larger than their variances, or alike at neighboring frequencies: "
                 "too few dimensions, or a local minimum that another guess avoids)"
@@ -412,10 +417,8 @@ def _finished(
     if isinstance(data, HTF):
         known, harmonics = data.variance is not None, data.harmonics
         problem = cast(FrequencyProblem, point.problem)
-        e, size = problem.errors(model)[:, np.argsort(data.f)], problem.weight * problem.target
-        rounding = np.finfo(float).eps * (np.abs(size) ** 2).mean()
-        neighbors = np.real(e[:, 1:] * e[:, :-1].conj()).mean()
-        correlation = float(neighbors / np.maximum((np.abs(e) ** 2).mean(), rounding))
+        size = problem.weight * problem.target
+        correlation = correlation_of_neighbors(problem.errors(model), size, np.asarray(data.f))
     else:
         noise = noise_model(model, cast(SeriesProblem, point.problem).S, scale, data.outputs)
     c, slopes = characteristic_slopes(point.coordinates)
