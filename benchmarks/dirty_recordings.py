@@ -132,8 +132,6 @@ MORE = {
         (t - s.trial.time[0]) / s.period / 20)),
     "push read with inertia": signals("u", lambda x, s: x + 0.02 * np.gradient(
         s.values(s.outputs[-1]), s.trial.time)),
-    "push feels an output": signals("u", lambda x, s: x + 0.3 * x.std() * (
-        s.values(s.outputs[0]) - s.values(s.outputs[0]).mean()) / s.values(s.outputs[0]).std()),
     "an output is noise": signals("y0", strange),
     "noise grows": signals("y", lambda x, s: x + 0.02 * (ramp(s) + 0.5) * strange(x, s)),
     "noise as large as the signal": signals("y", lambda x, s: x * (1 + 0.02 * s.normal())),

@@ -1,4 +1,4 @@
-"""Compile functions of users and of this package: which options, which tier, what is kept on disk.
+"""Compile functions of users and of this package: which options, and which tier.
 
 - `quick_jit` compiles with few optimizations: for functions that run a few times.
 - `host_first` runs a function on the host until compiling it is worth its time.

@@ -51,8 +51,8 @@ _MESSAGES = {
     Result.EXTRA_TURNS: "the cycle closes sooner, or meets its section more often, than asked",
     Result.COINCIDENCE: "two events coincide on the cycle: their order is not fixed beside it",
     Result.FIELD_NOT_FINITE: (
-        "the field or a reset returned NaN or infinity: a division by zero, say, or a mass matrix "
-        "that is singular there"
+        "the field, a guard, its derivative or a reset is NaN or infinite: a division by zero, or "
+        "a mass matrix that is singular there"
     ),
     Result.GUARD_PASSED: (
         "a reset put the state on a guard, through which it then went without an event: what comes "

@@ -113,7 +113,7 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
     objection = ""
     try:
-        require_order(groups, htf, len(fit.coefficients), fit.cost / fit.freedom)
+        require_order(groups, htf, order, fit.cost / fit.freedom, fit.residual)
     except DefinitionError as error:
         objection = str(error)
     return Estimate(fit, by_level, noise, objection)

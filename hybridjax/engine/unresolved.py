@@ -2,6 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable, Iterator
+from itertools import product
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ from jaxtyping import Float
 
 from .._core.compilation import quick_jit
 from .._core.meaning import is_of_package
+from ..systems.solver import Method
 from ..systems.structure import Member, Structure, stacked
 from .cubic import interpolate
 from .settings import ROUNDING, Settings
@@ -114,6 +116,7 @@ def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np
     fine = 2 * (np.arange(pieces)[:, None] + (y + 1) / 2).ravel() / pieces - 1
     polynomial = legendre.legvander(fine, 7) @ np.linalg.inv(legendre.legvander(x, 7))
     weights, nodes = np.tile(w / 2 / pieces, pieces), (np.append(x, fine)[:, None] + 1) / 2
+    probes = _probes(s.method(a), (fine + 1) / 2, weights)
     ends = path.after[:-1], path.before[1:], path.slope_after[:-1], path.slope_before[1:]
     parts = []
     for k in np.split(rows, range(_POINTS, len(rows), _POINTS)):
@@ -126,6 +129,11 @@ def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np
         low = guards < -_NEAR * np.abs(guards).max(axis=(0, 1))
         falls = (low & (np.maximum.accumulate(guards, 1) > 0) & (enabled > 0)).any(axis=1)
         moved, passed = h[:, 0] * (weights @ np.abs(rates)), h[:, 0] * np.abs(weights @ beside)
+        if linear and len(k) > 1:
+            pairs = np.concatenate([rates[:-1, :, n:], rates[1:, :, n:]], axis=1)
+            off = np.abs(np.einsum("pf,kfj->kpj", probes, pairs)).max(axis=1, initial=0.0)
+            off = np.where(np.diff(k)[:, None] == 1, h[:-1, 0] * off, 0.0)
+            passed[:-1, n:] = np.maximum(passed[:-1, n:], off)
         parts.append((moved, passed, *(np.abs(x).max(axis=1) for x in (beside, rates)), falls))
     moved, passed, missed, largest, falls = map(np.concatenate, zip(*parts, strict=True))
     size, accuracy = moved.sum(axis=0), np.max(np.asarray(settings.rtol))
@@ -139,6 +147,21 @@ def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np
         # wrong beside steep functions that steps do not resolve.)
         wrong[:, :n] |= missed[:, :n] > np.sqrt(accuracy) * fastest
     return np.concatenate([wrong, falls], axis=1)
+
+
+def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Errors of a method's integrals over parts of two steps, as weights of samples in these steps:
+    experiments and linearizations have other steps than the cycle, up to half as long again."""
+    t, rows = np.concatenate([within, 1 + within]), []
+    for begin, length in product(np.arange(5) / 4, (1.0, 1.5)):
+        stages, inside = begin + length * np.array(method.c), (t > begin) & (t < begin + length)
+        left = np.clip(np.searchsorted(t, stages) - 1, 0, len(t) - 2)
+        part = length * np.array(method.b) * (stages - t[left]) / (t[left + 1] - t[left])
+        row = -np.tile(weights, 2) * inside
+        np.add.at(row, left, length * np.array(method.b) - part)
+        np.add.at(row, left + 1, part)
+        rows += [row] if begin + length <= 2 else []
+    return np.stack(rows)
 
 
 def column_name(s: Structure, a: int, j: int) -> str:

@@ -92,13 +92,15 @@ class MultiplierEstimate(eqx.Module):
 
     @property
     def multiplier_covariances(self) -> Float[np.ndarray, "d 2 2"]:
-        r"""Covariance of (Re, Im) of each multiplier, to first order.
+        r"""Covariance of (Re, Im) of each multiplier, to first order; infinite if it is unknown.
 
         From $d\lambda / dc_j = -\lambda^{d-j} / p'(\lambda)$. The imaginary part of a real
         multiplier has no variance. Where two multipliers nearly coincide, the first order is too
         small: `contains` does not use it.
         """
         d = len(self.coefficients)
+        if not np.isfinite(self.covariance).all():
+            return np.full((d, 2, 2), np.inf)
         powers = self.multipliers[:, None] ** np.arange(d - 1, -1, -1)
         slope = np.polyval(np.polyder([1.0, *self.coefficients]), self.multipliers)
         with np.errstate(all="ignore"):
@@ -157,7 +159,8 @@ class MultiplierEstimate(eqx.Module):
     ) -> Complex[np.ndarray, " points"]:
         """Return the border of a multiplier's confidence region, to first order: a closed curve.
 
-        For a real multiplier it is an interval, drawn forth and back.
+        For a real multiplier it is an interval, drawn forth and back. NaN if the covariance is
+        unknown.
 
         **Raises:** `DefinitionError` for an index that is not there.
         """

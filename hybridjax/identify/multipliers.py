@@ -170,18 +170,19 @@ def fit_multipliers(
             groups = group_htf(htf, np.broadcast_to(weights_of(variance, rms), H.shape), size)
             c, converged = maximum_likelihood(groups, order, c)
     covariance, cost, freedom = summarize(groups, c, errors)
-    if check:
-        require_order(groups, htf, order, cost / freedom)
-
     b = [numerators_of(group, c) for group in groups]
     B = unfold(htf, groups, b, [x.conj() for x in b])
     misfit, scale = _evaluate(B, c, f, htf.n_sections) - H, rms[:, None]
+    residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
+    if check:
+        require_order(groups, htf, order, cost / freedom, residual)
+
     return StructuredFit(
         multipliers=multipliers_of(c),
         coefficients=c,
         covariance=covariance.matrix,
         covariance_freedom=covariance.freedom,
-        residual=np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms,
+        residual=residual,
         correlation=correlation_of_neighbors(misfit / scale, H / scale, f),
         numerators=B,
         cost=cost,
@@ -332,9 +333,7 @@ def select_order(
         noise = np.maximum(np.sqrt(square / number), SMALLEST_ERROR)
         weights = weights / noise[:, None]
         largest = group_htf(htf, weights, size)
-    values, deviation = _noise_ratios(largest, max_order)
-    if noise.max() < ROUNDING:  # rounding errors differ by orders of magnitude
-        values = values / _ROUNDING_VARIES
+    values, deviation = _noise_ratios(largest, max_order, noise)
 
     costs, freedoms = [], []
     for d in range(max_order + 1):
@@ -358,14 +357,20 @@ def select_order(
     )
 
 
-def _noise_ratios(groups: list[HTFGroup], order: int) -> tuple[Float[np.ndarray, " d1"], float]:
+def _noise_ratios(
+    groups: list[HTFGroup], order: int, noise: Float[np.ndarray, " ny"]
+) -> tuple[Float[np.ndarray, " d1"], float]:
     """Return the squared singular values of the numerators' residuals of $z^{-jN} H$, j = 0..d.
 
     They ascend, in units of the noise (1 where only noise is left); then the standard deviation of
     each where it is noise.
+
+    **Arguments:** `noise`: that of each output, relative to its rms.
     """
     whitened, _ = delayed_responses(groups, np.zeros(order))
     values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2
+    if noise.max() < ROUNDING:  # rounding errors differ by orders of magnitude
+        values = values / _ROUNDING_VARIES
     return values, float(np.sqrt(2 / sum(group.freedom * group.size for group in groups)))
 
 
@@ -400,15 +405,23 @@ def _largest_of_noise(size: int) -> float:
     return float(np.quantile(np.linalg.eigvalsh(symmetric)[:, -1], 1 - _FALSE_ALARMS))
 
 
-def require_order(groups: list[HTFGroup], htf: HTF, order: int, misfit: float) -> None:
+def require_order(
+    groups: list[HTFGroup],
+    htf: HTF,
+    order: int,
+    misfit: float,
+    residual: Float[np.ndarray, " ny"],
+) -> None:
     """Check that HTFs carry so many multipliers.
 
-    **Arguments:** `misfit`: cost of the fit relative to its expected value.
+    **Arguments:** `misfit`: cost of the fit relative to its expected value. `residual`: the rms
+    misfit of each output's HTFs relative to their rms.
 
     **Raises:** `DefinitionError` if noise alone could account for one of the multipliers.
     """
     level, tails = _estimated_noise(htf, misfit)
-    values, deviation = _noise_ratios(groups, order)
+    noise = residual if htf.variance is None else np.ones(len(residual))
+    values, deviation = _noise_ratios(groups, order, noise)
     refuse_invented(values / level, tails * deviation)
 
 

@@ -101,7 +101,12 @@ def identify_recording(
     refuse(findings)
     say("order")
     parts = split(data)
-    order = parts.best_order() if order is None else order
+    best = parts.best_order(most=4 if order is None else order + 2)
+    order = best if order is None else order
+    if best > order:
+        text = f"held-out strides are predicted better with {best} multipliers than with {order}: "
+        text += f"{order} may be biased, and their intervals too narrow. Compare order={best}."
+        findings = (*findings, Finding("order", text))
     say("fit to the first three quarters")
     held = parts.fit(order)
     say("fit to all")

@@ -12,7 +12,7 @@ from .formats.arrays import read_arrow, read_excel, read_hdf5, read_matlab, read
 from .formats.bag import read_bag
 from .formats.c3d import read_c3d
 from .formats.columns import Columns, Wanted, parse_table, time_unit
-from .formats.motion import read_text
+from .formats.layouts import read_text
 from .recording import Recording, check_events
 
 

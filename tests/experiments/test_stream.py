@@ -134,6 +134,15 @@ def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_pa
     assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
 
 
+@pytest.mark.parametrize("lost", ["cycle_outputs/c/0/0", "start/0"])
+def test_a_store_without_what_it_began_with_is_refused(lost, stored, tmp_path):
+    """(Zarr reads a chunk that is not there as zeros.)"""
+    path = tmp_path / "records.zarr" / lost
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    with pytest.raises(hj.DefinitionError, match="holds no experiments"):
+        StoredExperiments(stored.address)
+
+
 def test_other_experiments_are_refused(made, arguments):
     cycle, placed, _, _ = arguments
     other = eqx.tree_at(lambda p: p.cycle.system.damping, placed, jnp.asarray(0.11, float))

@@ -57,3 +57,12 @@ def test_what_noise_hides_is_not_reported(small, variance):
     _, htf = small
     with pytest.raises(hj.DefinitionError, match="the data support [01] multipliers, not 2"):
         hj.fit_multipliers(noisy(htf, 1e6 * variance, np.random.default_rng(0)), 2)
+
+
+def test_exact_htfs_have_no_more_multipliers(small):
+    _, htf = small
+    with pytest.raises(hj.DefinitionError, match="the data support 2 multipliers, not 3"):
+        hj.fit_multipliers(htf, 3)
+    spurious = hj.fit_multipliers(htf, 3, check=False)
+    assert np.isinf(spurious.standard_errors).all() and "± inf" in repr(spurious)
+    assert spurious.contains(0.5).all()

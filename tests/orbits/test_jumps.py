@@ -99,6 +99,30 @@ def test_simulations_end_at_what_steps_pass_over():
         assert path.result == hj.Result.PULSE_PASSED
 
 
+def test_a_guard_without_derivative_does_not_pass_as_one_that_never_falls():
+    level = lambda t, q, u: 1.5 + 0.1 * jnp.maximum(0.5 - q[0], 0.0) ** 0.0 - q[0]  # noqa: E731
+    event = hj.Transition("stop", "on", "on", level, "falling", lambda t, q, u: q)
+    stops = type("Stops", (Turns,), {"transitions": lambda self: [event]})(lambda x: 0.0)
+    path = hj.simulate(stops, "on", (0.6, 2.0), 6.0, throw=False)
+    assert path.result == hj.Result.FIELD_NOT_FINITE
+
+
+class Pushed(Turning):
+    """The input acts in a short pulse, which its neighborhood of steps does not resolve."""
+
+    def field(self, t, q, u):
+        x, v = q
+        pulse = 0.4 * jnp.exp(-(((t % 1.3 - 0.33) / 0.0055) ** 2))
+        return v, -3 * x - 0.7 * v + 2 * jnp.cos(2 * jnp.pi * t / 1.3) + u[0] * (1 + pulse)
+
+
+def test_a_pulse_in_the_gain_of_an_input_is_refused():
+    make = {"charts": lambda self: {"on": Pushed(None)}, "period": lambda self: 1.3}
+    system = type("Pushes", (Turns,), make)(None)
+    with pytest.raises(hj.DefinitionError, match="the gain from 'u' to the rate of 'v' .* pulse"):
+        hj.find_limit_cycle(system, hj.Guess("on", (1.0, 0.0)), settle=10.0)
+
+
 class Switched(Turns):
     """A relay of a height that is zero in the first system."""
 

@@ -290,6 +290,8 @@ MISHAPS = {
     "push early": late(-10),
     "push late in one trial": late(25, SECOND),
     "clock of the push is fast": signals("u", other_clock),
+    "push feels an output": signals("u", lambda x, s: x + 0.3 * x.std() * (
+        s.values(s.outputs[0]) - s.values(s.outputs[0]).mean()) / s.values(s.outputs[0]).std()),
 }  # fmt: skip
 EVENT_MISHAPS = {
     "events lost and doubled": misjudged(lost=0.05, doubled=0.05),

@@ -8,7 +8,7 @@ from scipy import signal
 
 import hybridjax as hj
 
-from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle
+from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle, signals
 
 
 STRIDES, TRIALS, RATE = 60, 3, 64
@@ -71,6 +71,7 @@ CAUSES = {
     "another zero": ["other zero in one trial"],
     "swapped columns": ["columns swapped in one trial"],
     "a signal twice": ["an output twice"],
+    "feedback": ["push feels an output"],
     "foreign input": ["push of another trial", "push late in one trial"],
     "no answer": ["push unrelated in all"],
     "disturbed": ["push switched on late"],
@@ -92,6 +93,17 @@ def test_causes_are_named(cause, mishap):
     phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
     named = causes(mishandle(made_up(0), mishap, **NAMES), phase)
     assert cause in named if cause else not named
+
+
+def test_an_order_that_is_too_low_is_named():
+    """Sensors with a high-pass filter add a mode to that of the system."""
+    edge = signal.butter(1, 0.1, "high", fs=RATE)
+    filtered = signals("y", lambda x, s: signal.lfilter(*edge, x - x.mean()))
+    names = {"inputs": "f", "outputs": ("x", "v"), "n_sections": 8, "order": 1}
+    for recording, named in ((made_up(0), 0), (mishandle(made_up(0), filtered, **NAMES), 1)):
+        result = hj.identify_recording(recording, TOP, **names)
+        order = [x for x in result.advice.warnings if "Compare order=2" in x.text]
+        assert len(order) == named
 
 
 APEX = hj.Crossing("vM", "falling")

@@ -138,8 +138,12 @@ class ZarrStore:
             self.layout = Layout(
                 tuple(about["dims"]), blocks, variables, {}, (), about["description"]
             )
-            kept = self._group[_START]
-            self.start = [np.asarray(kept[f"{i}"][...]) for i, _ in enumerate(kept.array_keys())]
+            # (Zarr would read a chunk that was deleted as zeros.)
+            whole = {name: self._group[name] for name in about["whole"]}
+            lost = {_key(x) for x in whole.values() if x.size} - self._present()
+            if lost:
+                raise FileNotFoundError(f"{min(lost)} is missing")
+            self.start = [x[...] for name, x in whole.items() if name.startswith(f"{_START}/")]
         except Exception as error:  # (of many kinds)
             raise DefinitionError(f"cannot open '{address}' as a store: {error}") from error
         chunk = max(math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values())
@@ -150,12 +154,14 @@ class ZarrStore:
     def missing(self) -> list[int]:
         """Return the pieces of which a chunk is missing."""
 
+        present, pieces = self._present(), range(len(self.layout.blocks))
+        return [k for k in pieces if not present.issuperset(self._chunks(k))]
+
+    def _present(self) -> set[str]:
         async def listed() -> set[str]:
             return {key async for key in self._group.store.list()}
 
-        present = package("zarr.core.sync").sync(listed())
-        pieces = range(len(self.layout.blocks))
-        return [k for k in pieces if not present.issuperset(self._chunks(k))]
+        return package("zarr.core.sync").sync(listed())
 
     def write(self, k: int, values: Mapping[str, np.ndarray]) -> None:
         """Keep piece k."""
@@ -217,10 +223,13 @@ class ZarrStore:
     def _chunks(self, k: int) -> list[str]:
         """Return the keys of the chunks of piece k, one along all axes but those of the points."""
         place = self.layout.blocks.place(k)
-        return [
-            f"{x.path}/{x.metadata.encode_chunk_key((*place, *(0,) * (x.ndim - len(place))))}"
-            for x in self._arrays.values()
-        ]
+        return [_key(x, place) for x in self._arrays.values()]
+
+
+def _key(array: Any, place: tuple[int, ...] = ()) -> str:
+    """Return the key of the chunk of a Zarr array at this place of its first axes, 0 on others."""
+    zeros = (0,) * (array.ndim - len(place))
+    return f"{array.path}/{array.metadata.encode_chunk_key((*place, *zeros))}"
 
 
 def open_store(address: str, job: Any) -> ZarrStore | None:
@@ -290,6 +299,7 @@ def make_store(address: str | None, layout: Layout, start: list[np.ndarray]) -> 
             "description": layout.description,
             "dims": layout.dims,
             "variables": list(layout.variables),
+            "whole": [*layout.constants, *(f"{_START}/{i}" for i in range(len(start)))],
         }
         group.attrs[_ABOUT] = json.dumps(about)  # last: from now on it is a store
     return ZarrStore(place)

@@ -221,8 +221,8 @@ def _errors(
 def _bent(
     flow: ChartFlow, before: Watch, after: Watch, start, end: Landing, t, moved, span
 ) -> Mask:
-    """Test whether the cubic interpolant misses a watched function halfway. `start`: the state
-    and the field at the start of the step."""
+    """Test whether the cubic interpolant misses a watched function halfway, or there is none.
+    `start`: the state and the field at the start of the step."""
     xp, (q, f0) = namespace(moved), start
     middle = 0.5 * (q + end.q) + 0.125 * moved * (f0 - end.f)
     true = flow.watch(t + 0.5 * moved, middle, end.f).value
@@ -230,7 +230,8 @@ def _bent(
     cubic = cubic + 0.125 * (moved * before.rate - moved * after.rate)
     size = xp.abs(before.value) + xp.abs(after.value) + xp.abs(true)
     fastest = xp.maximum(xp.abs(before.rate), xp.abs(after.rate))
-    return (xp.abs(true - cubic) > _BEND * size + width(t, span, fastest)).any(axis=0)
+    bent = xp.abs(true - cubic) > _BEND * size + width(t, span, fastest)
+    return (bent | xp.isnan(after.value) | xp.isnan(after.rate)).any(axis=0)
 
 
 def _clearance(

@@ -60,10 +60,12 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     # Failures; the first one counts.
     grazes = verdict.touch | (slow & ~zeno) | (stuck & (verdict.refine | verdict.lost))
     # (Any part between rounding errors and a tenth tells a field that jumps from a blow-up.)
-    still = xp.max(xp.abs(new.q - lanes.q), axis=0) <= 1e-3 * xp.max(xp.abs(lanes.q), axis=0)
+    change, size = (xp.max(xp.abs(x), axis=0) for x in (new.q - lanes.q, lanes.q))
+    still = (change <= 1e-3 * size) | ((size == 0) & xp.isfinite(change))
     unexpected = (fired >= 0) & ~_expected(target.event_sequence, lanes.events, fired)
-    result = state.result
+    result, unknown = state.result, xp.isnan(sum(new.watched)).any(axis=0)
     for failed, code in (
+        (stuck & unknown, Result.FIELD_NOT_FINITE),
         (grazes, Result.GRAZING),
         (stuck & still, Result.STEP_COLLAPSE),
         (stuck & ~xp.isfinite(new.q).all(axis=0), Result.FIELD_NOT_FINITE),

@@ -298,15 +298,16 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
 
 
 def feedback(data: SectionData) -> Iterator[Finding]:
-    """Find inputs that repeat with the rhythm.
+    """Find inputs that repeat with the rhythm, or whose average cycle is shaped as the outputs'.
 
     An input chosen without regard to the rhythm averages out over many cycles. One whose average
     cycle holds most of its variance was made from the rhythm's phase or state, by a controller or a
     trigger: its deviations then depend on those of the outputs, and on their disturbances, and no
     regression on it is unbiased (Söderström and Stoica, *System Identification*, 1989, ch. 10:
-    direct identification in closed loop).
+    direct identification in closed loop). The same holds if an output leaks into the input.
     """
     deviations, _ = data.rms()
+    shapes = np.nan_to_num(data.cycle_outputs - np.nanmean(data.cycle_outputs, axis=0))
     for i, name in enumerate(data.inputs if data.cycles >= 6 else ()):
         repeated = float(np.nanvar(data.cycle_inputs[:, i]))
         share = repeated / max(repeated + float(deviations[i]) ** 2, np.finfo(float).tiny)
@@ -314,3 +315,13 @@ def feedback(data: SectionData) -> Iterator[Finding]:
             text = f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: fits "
             text += "are biased. Add a perturbation, and name it as the input."
             yield Finding("feedback", text)
+        elif share > CLEAR**2 / data.cycles and data.n_sections > 2 * shapes.shape[1]:
+            mean = np.nan_to_num(data.cycle_inputs[:, i] - np.nanmean(data.cycle_inputs[:, i]))
+            left = mean - shapes @ np.linalg.lstsq(shapes, mean)[0]
+            if left @ left < 0.1 * (mean @ mean):
+                text = (
+                    f"{name} contains the outputs ({100 * share:.0f} % of its variance repeats as "
+                )
+                text += "they do), as by feedback or crosstalk: fits are biased. Remove these from "
+                text += "the input, or name the perturbation as the input."
+                yield Finding("feedback", text)
