@@ -23,6 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import eval_context
 
 from ..errors import ComputationError
 from .executor import (
@@ -160,26 +161,28 @@ def quick_jit(function: Callable) -> Callable:
     return call
 
 
-def host_first(function: Callable) -> Callable:
+def host_first(function: Callable, along: Callable | None = None) -> Callable:
     """A function of few lanes, run on the host (see `executor.py`) while that is faster in total;
     compiled by `quick_jit` once the host has spent as much on arguments of the same kind as
     compiling takes. Both give the same result up to rounding.
 
-    Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`.
+    Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`; but
+    derivatives outside of programs are those of `along`, if it is given (see `_by_columns`).
     """
     compiled = quick_jit(function)
     spent: dict[tuple, float] = collections.defaultdict(float)
+    derived = compiled if along is None else _by_columns(compiled, along)
 
     @ft.wraps(function)
     def call(*arguments):
         if not on_cpu() or is_traced(arguments) or is_inside_program():
-            return compiled(*arguments)
+            return derived(*arguments)
         key, begin = kind(arguments), time.thread_time()
         left = _WORTH_COMPILING - spent[key]
         if left <= 0:
             return compiled(*arguments)
         try:
-            with uncollected(), at_ease(), at_most(left):
+            with eval_context(), uncollected(), at_ease(), at_most(left):
                 return from_host(function(*to_host(arguments)))
         except OutOfTimeError:
             return compiled(*arguments)
@@ -187,6 +190,56 @@ def host_first(function: Callable) -> Callable:
             spent[key] += time.thread_time() - begin
 
     return call
+
+
+class NotOnHostError(Exception):
+    """The host has no derivatives for these arguments."""
+
+
+# Directions in which the host computes derivatives. Fewer: many parameters compile. More: a compiled
+# program in reverse mode is faster.
+_DIRECTIONS = 32
+
+
+def _by_columns(compiled: Callable, along: Callable) -> Callable:
+    """`compiled`, whose derivatives outside of programs come from the host.
+
+    `along(arguments, directions)` returns the result and its derivatives in P directions. A
+    direction moves single numbers of the arguments: `directions` is a tree of their form with
+    arrays (P, ...), and `None` for what does not move; so is the second result. Values are
+    concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
+    raises `NotOnHostError`, the derivatives are compiled, as inside of programs.
+    """
+    derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
+
+    @derived.def_jvp
+    def rule(arguments, tangents):
+        moving = jax.tree_util.tree_map(
+            lambda t, x: None if t is None else x, tangents, arguments, is_leaf=lambda t: t is None
+        )
+        leaves, structure = jax.tree_util.tree_flatten(moving)
+        ends = np.cumsum([x.size for x in leaves])
+        is_small = len(leaves) and ends[-1] <= _DIRECTIONS
+        if not on_cpu() or is_traced(arguments) or is_inside_program() or not is_small:
+            return eqx.filter_jvp(compiled, arguments, tangents)
+        parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
+        parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
+        try:
+            with eval_context(), uncollected(), at_ease():
+                result, columns = along(
+                    to_host(arguments), jax.tree_util.tree_unflatten(structure, parts)
+                )
+        except NotOnHostError:
+            return eqx.filter_jvp(compiled, arguments, tangents)
+        return from_host(result), _combined(from_host(columns), jax.tree_util.tree_leaves(tangents))
+
+    return derived
+
+
+@jax.jit
+def _combined(columns, tangents):
+    weights = jnp.concatenate([jnp.ravel(x) for x in tangents])
+    return jax.tree_util.tree_map(lambda x: jnp.tensordot(weights, x, 1), columns)
 
 
 def at_ease() -> contextlib.AbstractContextManager:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._core.compilation import kernel
 from .._core.executor import on_host
 from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method, Radau, as_method
@@ -195,6 +196,67 @@ def _columns(function: Callable, trees: int = 2) -> Callable:
         return jnp.concatenate([value[:, None], columns], axis=1)
 
     return expand
+
+
+class Tangents(Structure):
+    """A structure whose numbers, and those of `levels`, move in P directions, for complex lanes of
+    the host: the derivatives of their real parts, times `TINY`, are their imaginary parts.
+
+    Its functions take the inputs `unpushed`. Trees of directions have arrays (P, ...), or `None`
+    for what does not move.
+    """
+
+    def __init__(self, s: Structure, along: Any, levels: Any, levels_along: Any, directions: int):
+        super().__init__(s.source)
+        self.directions, self._levels = directions, levels
+        self._along = Structure(along), levels_along
+
+    def at_rest(self, lane: Int[np.ndarray, " L"]) -> Inputs:
+        """Inputs of zero, and the directions of lanes, one after the other."""
+        return np.eye(self.nu + self.directions)[:, self.nu + lane % self.directions]
+
+    def kernel(self, function, form, *static, trees=(), lanes=1):
+        still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
+        along = [self._along[1] if x is self._levels else still(x) for x in trees]
+        every, along = (Structure(self.source), *trees), (self._along[0], *along)
+        of_lanes = kernel(function, _Tangent(form), static, (every, along), 16 * _POINTS)
+
+        def call(t, q, u, *others, some=None):
+            tangents = t.imag / TINY, q.imag / TINY, u[self.nu :]
+            both = of_lanes(t.real, q.real, u[: self.nu], *others, *tangents)
+            return both[0] + 1j * TINY * both[1]
+
+        return call
+
+
+# Scale of tangents as imaginary parts. Their products vanish beside real parts.
+TINY = np.sqrt(np.finfo(float).tiny)
+
+
+def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
+    """Inputs of lanes of the host without any input."""
+    return s.at_rest(lane) if isinstance(s, Tangents) else np.zeros((s.nu, len(lane)))
+
+
+class _Tangent(NamedTuple):
+    """A form, and its derivative along tangents of (t, q) and of the numbers in all trees."""
+
+    form: Callable
+
+    def __call__(self, function: Callable, trees: tuple, along: tuple) -> Callable:
+        def moved(trees, along, *point):
+            *point, x = point
+            step = lambda y, dy: y if dy is None else y + jnp.tensordot(x, dy, 1)  # noqa: E731
+            return function(*jax.tree_util.tree_map(step, trees, along), *point)
+
+        lanes = self.form(moved, trees, along)
+
+        def both(t, q, u, *others):
+            *others, dt, dq, dx = others
+            of = lambda t, q, x: lanes(t, q, u, *others, x)  # noqa: E731
+            return jnp.stack(jax.jvp(of, (t, q, jnp.zeros_like(dx)), (dt, dq, dx)))
+
+        return both
 
 
 class _ByMethod(NamedTuple):

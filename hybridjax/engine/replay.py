@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._core.compilation import NotOnHostError
 from ..systems.structure import Member, Structure
 from ..systems.transition import Scheduled
 from . import kernels
@@ -163,20 +164,72 @@ def chain(
     direction of the flow has no meaning: it is projected out of every move, so that it does not
     drown the other directions, however strongly the flow contracts.
     """
-    n, L = 1 + s.d, len(lanes.t)
-    moves = _moves(lanes, tape)
+    n, moves = 1 + s.d, _moves(lanes, tape)
     end, by = _linear_moves(s, moves, target)
     if across is not None:
         by[:, :, 1:n] = by[:, :, 1:n] @ _across(s, moves, across)
-    columns = np.tile(np.eye(n, n + s.nu), (L, 1, 1))
-    ends = np.concatenate([lanes.t[None], lanes.q]).T
+    columns, ends = _products(moves, by, len(lanes.t)), np.concatenate([lanes.t[None], lanes.q])
+    ends[:, moves.lane] = end.T  # (the last move of a lane comes last)
+    return columns[:, :, 1:n] if of_states else columns, ends
+
+
+def _products(moves: "_Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndarray:
+    """Derivatives of (t, q) at the ends of lanes by (t, q, u) at their starts."""
+    n, m = by.shape[1:]
+    columns = np.tile(np.eye(n, m, dtype=by.dtype), (L, 1, 1))
     for order in range(1 + max(moves.order, default=-1)):
         now = moves.order == order
         lane = moves.lane[now]
         columns[lane] = by[now, :, :n] @ columns[lane]
         columns[lane, :, n:] += by[now, :, n:]
-        ends[lane] = end[now]
-    return columns[:, :, 1:n] if of_states else columns, ends.T
+    return columns
+
+
+class Orbit:
+    """Recorded lanes that follow each other, each beginning where the last one ended, in P
+    directions: those of `s`, and of the `times` (P, L) of their targets."""
+
+    def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times):
+        moves, P = _moves(lanes, tape), s.directions
+        if any(np.isin(moves.code, s.schedules(a)).any() for a in range(len(s.charts))):
+            raise NotOnHostError
+        self.s, self.first = s, np.flatnonzero(moves.order == 0)
+        many = lambda x: np.repeat(x, P, axis=-1)  # noqa: E731
+        self._moves = _Moves(*map(many, moves))
+        lane = self._moves.lane * P + np.arange(len(self._moves.t)) % P
+        self._moves = self._moves._replace(lane=lane)
+        index = many(np.broadcast_to(target.index, target.time.shape))
+        time = many(target.time) + 1j * kernels.TINY * times.T.ravel()
+        self._target = dataclasses.replace(target, time=time, index=index)
+        end, by = _linear_moves(s, self._moves, self._target)
+        n = 1 + s.d
+        self._by = by[::P, :, :n].real
+        self._kick = np.moveaxis(end.imag.reshape(-1, P, n) / kernels.TINY, 1, 2)
+
+    def tangents(self, begin: Float[np.ndarray, "n P"]) -> Float[np.ndarray, "moves n P"]:
+        """Tangents of (t, q) where moves start, and at the last end."""
+        starts = [begin]
+        for by, kick in zip(self._by, self._kick, strict=True):
+            starts.append(by @ starts[-1] + kick)
+        return np.stack(starts)
+
+    def jacobians(self, tangents: Float[np.ndarray, "moves n P"]) -> np.ndarray:
+        """Derivatives (L, P, n, m) of (t, q) at the ends of lanes by (t, q, u) at their starts, and
+        their own in each direction, as complex numbers."""
+        moves, L, P = self._aside(tangents), len(self.first), tangents.shape[2]
+        by = _linear_moves(self.s, moves, self._target).by
+        return _products(moves, by, L * P).reshape(L, P, *by.shape[1:])
+
+    def points(self, tangents: Float[np.ndarray, "moves n P"]) -> tuple:
+        """Times, charts, states and inputs where lanes start, in each direction."""
+        moves = self._aside(tangents)
+        first = moves.order == 0
+        u = kernels.unpushed(self.s, moves.lane[first])
+        return moves.t[first], moves.chart[first], moves.q[:, first], u
+
+    def _aside(self, tangents) -> _Moves:
+        aside = 1j * kernels.TINY * np.moveaxis(tangents[:-1], 1, 0).reshape(1 + self.s.d, -1)
+        return self._moves._replace(t=self._moves.t + aside[0], q=self._moves.q + aside[1:])
 
 
 class Link(NamedTuple):
@@ -209,7 +262,8 @@ def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
 
 def _linear_moves(s: Structure, moves: _Moves, target: Target) -> _Linear:
     n, M = 1 + s.d, len(moves.t)
-    linear = _Linear(np.zeros((M, n)), np.zeros((M, n, n + s.nu)))
+    number = target.time.dtype
+    linear = _Linear(np.zeros((M, n), number), np.zeros((M, n, n + s.nu), number))
     for a in np.unique(moves.chart):
         in_chart = np.flatnonzero(moves.chart == a)
         of_chart = _linear(s, int(a), _Moves(*(x[..., in_chart] for x in moves)), target)
@@ -248,7 +302,7 @@ def _moves(lanes: Lanes, tape: Tape) -> _Moves:
 def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
     """Moves that start in chart a."""
     n, M, code = s.dims[a], len(moves.t), moves.code
-    u = np.zeros((s.nu, M))
+    u = kernels.unpushed(s, moves.lane)
     by_clock, on_time = np.isin(code, s.schedules(a)), code == ARRIVE_TIME
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
     goal = target.time[moves.lane]
@@ -256,7 +310,7 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
     q, dq, f = _step(s, a, moves.t, moves.q[:n], u, h)
     t = np.where(on_time, goal, moves.t + h)
     # By (t, q, u), with the length of the step as the last; that to a known time shrinks with t.
-    dt = np.zeros((M, 1, dq.shape[2]))
+    dt = np.zeros((M, 1, dq.shape[2]), dq.dtype)
     dt[:, 0, [0, -1]] = 1.0
     shrinks = (by_clock | on_time)[:, None]
     dq[:, :, 0] -= shrinks * dq[:, :, -1]
@@ -271,19 +325,24 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
         zero = flow.locate(*point, which[lands])
         t[lands] += zero.past
         q[:, lands] = zero.q
-        f = kernels.field(s, a, t[lands], q[:, lands], u[:, lands])[:, 0].T[:, :, None]
+        by_field = np.moveaxis(kernels.field(s, a, t[lands], q[:, lands], u[:, lands]), -1, 0)
+        f, (f_t, f_q, f_u) = by_field[:, :, :1], _split(by_field, n)
         rows = kernels.watched(
             s, a, target.levels, t[lands], q[:, lands], u[:, lands], index[lands]
         )
         row = np.argmax(np.array(flow.rows)[:, None] == which[lands], axis=0)
         by_t, by_q, by_u = _split(rows[row, :, np.arange(len(lands))][:, None], n)
-        change = by_t @ dt[lands] + by_q @ dq[lands]
+        # (Over the time past: nothing but rounding errors, with derivatives.)
+        past, moved = zero.past[:, None, None], dq[lands]
+        moved = moved + past * (f_t @ dt[lands] + f_q @ moved)
+        moved[:, :, 1 + n :] += past * f_u
+        change = by_t @ dt[lands] + by_q @ moved
         change[:, :, 1 + n :] += by_u
         delay = -change / (by_t + by_q @ f)
         dt[lands] += delay
-        dq[lands] += f @ delay
+        dq[lands] = moved + f @ delay
 
-    end, by = np.zeros((M, 1 + s.d)), np.zeros((M, 1 + s.d, 1 + s.d + s.nu))
+    end, by = np.zeros((M, 1 + s.d), dq.dtype), np.zeros((M, 1 + s.d, 1 + s.d + s.nu), dq.dtype)
     columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
     for kind in [(-1,), *s.kinds]:
         now = np.flatnonzero(np.isin(np.maximum(code, -1), kind))
@@ -311,11 +370,13 @@ def _step(s: Structure, a: int, t, q, u, h):
     n, M = q.shape
     m = 2 + n + s.nu
     method = s.method(a)
+    if method.implicit and isinstance(s, kernels.Tangents):
+        raise NotOnHostError
     if method.implicit:
         expanded = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h), -1, 0))
         return expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     stages = len(method.b) + 1
-    K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
+    K, dK = np.zeros((stages, n, M), h.dtype), np.zeros((stages, M, n, m), h.dtype)
     straight = np.zeros((M, n, m))
     straight[:, :, 1 : 1 + n] = np.eye(n)
     rows = [*(row[:i] for i, row in enumerate(np.array(method.a))), np.array(method.b)]
