@@ -167,11 +167,11 @@ def host_first(function: Callable, along: Callable | None = None) -> Callable:
     compiling takes. Both give the same result up to rounding.
 
     Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`; but
-    derivatives outside of programs are those of `along`, if it is given (see `_by_columns`).
+    derivatives outside of programs are those of `along`, if it is given (see `by_columns`).
     """
     compiled = quick_jit(function)
     spent: dict[tuple, float] = collections.defaultdict(float)
-    derived = compiled if along is None else _by_columns(compiled, along)
+    derived = compiled if along is None else by_columns(compiled, along)
 
     @ft.wraps(function)
     def call(*arguments):
@@ -201,22 +201,26 @@ class NotOnHostError(Exception):
 _DIRECTIONS = 32
 
 
-def _by_columns(compiled: Callable, along: Callable) -> Callable:
+def by_columns(
+    compiled: Callable, along: Callable, relevant: Callable = lambda tangents: tangents
+) -> Callable:
     """`compiled`, whose derivatives outside of programs come from the host.
 
     `along(arguments, directions)` returns the result and its derivatives in P directions. A
-    direction moves single numbers of the arguments: `directions` is a tree of their form with
+    direction moves a single number of the arguments: `directions` is a tree of their form with
     arrays (P, ...), and `None` for what does not move; so is the second result. Values are
     concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
-    raises `NotOnHostError`, the derivatives are compiled, as inside of programs.
+    raises `NotOnHostError`, the derivatives are compiled, as inside of programs. `relevant` replaces
+    tangents that make no difference by `None`.
     """
     derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
 
     @derived.def_jvp
     def rule(arguments, tangents):
         moving = jax.tree_util.tree_map(
-            lambda t, x: None if t is None else x, tangents, arguments, is_leaf=lambda t: t is None
-        )
+            lambda t, x: None if t is None else x,
+            relevant(tangents), arguments, is_leaf=lambda t: t is None,
+        )  # fmt: skip
         leaves, structure = jax.tree_util.tree_flatten(moving)
         ends = np.cumsum([x.size for x in leaves])
         is_small = len(leaves) and ends[-1] <= _DIRECTIONS
@@ -231,7 +235,9 @@ def _by_columns(compiled: Callable, along: Callable) -> Callable:
                 )
         except NotOnHostError:
             return eqx.filter_jvp(compiled, arguments, tangents)
-        return from_host(result), _combined(from_host(columns), jax.tree_util.tree_leaves(tangents))
+        return from_host(result), _combined(
+            from_host(columns), jax.tree_util.tree_leaves(relevant(tangents))
+        )
 
     return derived
 

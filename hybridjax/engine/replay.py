@@ -185,7 +185,7 @@ def _products(moves: "_Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.nda
     return columns
 
 
-class Orbit:
+class Variation:
     """Recorded lanes that follow each other, each beginning where the last one ended, in P
     directions: those of `s`, and of the `times` (P, L) of their targets."""
 

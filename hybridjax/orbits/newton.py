@@ -20,7 +20,7 @@ from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Lanes
-from ..engine.replay import Orbit
+from ..engine.replay import Variation
 from ..engine.watch import slopes
 from .crossing import ListLevels
 from .return_map import SINGULAR, ReturnMap, Turn, across
@@ -98,7 +98,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     part = np.where(np.isfinite(ends.time), (ends.time - map.anchor.t) / map.expected, 0.0)
     times = begin[0][:, None] * np.isfinite(ends.time) + longer[:, None] * part
     tapes = jax.tree_util.tree_map(lambda x: np.moveaxis(x[..., 0], 0, -1), turn.tapes)
-    orbit = Orbit(s, turn.legs, ends, tapes, times)
+    orbit = Variation(s, turn.legs, ends, tapes, times)
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
     moved = np.where(map.valid, orbit.tangents(begin)[-1, 1:].T, 0.0) / sizes
     jacobian = turn.jacobian * sizes / sizes[:, None]
@@ -115,7 +115,8 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
         factors=np.moveaxis(factors.imag / kernels.TINY, 1, 0),
         period=tangents[-1, 0] - begin[0],
     )
-    anchor = nothing.anchor._replace(t=begin[0][:, None], q=begin[1:].T[..., None])
+    t_anchor = None if by.anchor.t is None else begin[0][:, None]
+    anchor = nothing.anchor._replace(t=t_anchor, q=begin[1:].T[..., None])
     return solution, nothing._replace(anchor=anchor, turn=moving)
 
 

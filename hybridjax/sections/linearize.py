@@ -1,12 +1,14 @@
 """From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
 
+import dataclasses
+
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
-from .._core.compilation import host_first
+from .._core.compilation import by_columns, host_first
 from .._core.executor import Array, is_traced, namespace
 from .._core.progress import working
 from ..engine import kernels
@@ -15,7 +17,8 @@ from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..orbits.return_map import with_derivatives
 from ..systems.system import Output, OutputNames
-from .place import as_placed
+from .families import AbstractSections, as_family
+from .place import as_placed, place_along, place_sections
 from .placed import PlacedSections, SectionsLike
 
 
@@ -49,23 +52,63 @@ def linearize(
     lies, or uses the time without having the period of a clock, or an input that does not exist;
     `ComputationError` as `place_sections`.
     """
-    placed = as_placed(cycle, sections)
-    s, traced, charts = placed.structure(), is_traced(placed), range(len(cycle.system.charts()))
+    s, charts, placed = cycle.structure, range(len(cycle.system.charts())), None
     z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
-    for a in charts if traced else np.unique(placed.lanes.chart):
+    traced = is_traced(cycle, sections)
+    if not traced or isinstance(sections, PlacedSections):
+        placed = as_placed(cycle, sections)
+    for a in np.unique(placed.lanes.chart) if placed is not None and not traced else charts:
         z.require(int(a))
     names, columns = s.inputs_among(inputs)
-    A, B = placed.flow_jacobians
-    C, D = _output_jacobians(placed, tuple(z.items))
+    if placed is None:
+        A, B, C, D, dims = _placed_matrices(cycle, as_family(sections), tuple(z.items))
+    else:
+        (A, B), (C, D) = placed.flow_jacobians, _output_jacobians(placed, tuple(z.items))
+        dims = placed.dims
     d = s.d + 1
     if not traced:
         A, B, C, D = jax.device_get((A, B, C, D))
-        d = int(np.max(np.asarray(placed.dims)))
+        d = int(np.max(np.asarray(dims)))
     return LDTP(
-        A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
+        A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], dims,
         inputs=names, outputs=z.names,
         coordinates=None if traced else placed.coordinates(),
     )  # fmt: skip
+
+
+def _matrices(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str | Output, ...]):
+    placed = place_sections(cycle, family)
+    return *placed.flow_jacobians, *_output_jacobians(placed, outputs), placed.dims
+
+
+def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
+    """`_matrices` on the host, and its derivatives."""
+    (cycle, family, outputs), (by_cycle, by_family, _) = arguments, directions
+    placed, moved, s, jacobians = place_along(cycle, family, by_cycle, by_family)
+    (N, P, n, _), lanes = jacobians.shape, moved.lanes
+    embed, select = moved.frames()
+    after = np.roll(select.reshape(N, P, *select.shape[1:]), -1, axis=0)
+    A = after @ jacobians[..., :n] @ embed.reshape(N, P, *embed.shape[1:])
+    values = lambda a, *point: kernels.outputs(s, a, outputs, *point)  # noqa: E731
+    u = kernels.unpushed(s, np.arange(N * P))
+    by = with_derivatives(s, values, lanes.chart, lanes.t, lanes.q, len(outputs), u)
+    J = np.moveaxis(by[:, 1:], -1, 0)
+    C, D = (x.reshape(N, P, *x.shape[1:]) for x in (J[..., :n] @ embed, J[..., n:]))
+    each = A, after @ jacobians[..., n:], C, D
+    matrices = *placed.flow_jacobians, *_output_jacobians(placed, outputs), placed.dims
+    return matrices, (*(np.moveaxis(x.imag / kernels.TINY, 1, 0) for x in each), None)
+
+
+def _relevant(tangents: tuple) -> tuple:
+    """Tangents of what the matrices depend on."""
+    cycle, *others = tangents
+    nothing, anchor = jax.tree_util.tree_map(lambda _: None, cycle), cycle.anchor
+    anchor = nothing.anchor._replace(t=anchor.t, q=anchor.q)
+    moving = dict(system=cycle.system, period=cycle.period, anchor=anchor)
+    return dataclasses.replace(nothing, **moving), *others
+
+
+_placed_matrices = by_columns(_matrices, _matrices_along, _relevant)
 
 
 @host_first
