@@ -211,19 +211,22 @@ class Tangents(Structure):
         self.directions, self._levels = directions, levels
         self._along = Structure(along), levels_along
 
-    def at_rest(self, lane: Int[np.ndarray, " L"]) -> Inputs:
-        """Inputs of zero, and the directions of lanes, one after the other."""
-        return np.eye(self.nu + self.directions)[:, self.nu + lane % self.directions]
+    def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:
+        """Inputs of zero, and the directions of lanes; of negative index, none."""
+        along = np.arange(self.directions)[:, None] == direction
+        return np.concatenate([np.zeros((self.nu, len(direction))), along])
 
     def kernel(self, function, form, *static, trees=(), lanes=1):
         still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
         along = [self._along[1] if x is self._levels else still(x) for x in trees]
         every, along = (Structure(self.source), *trees), (self._along[0], *along)
-        of_lanes = kernel(function, _Tangent(form), static, (every, along), 16 * _POINTS)
+        moving = (0, 1, 3) if isinstance(form, _ByMethod) else (0, 1)
+        of_lanes = kernel(function, _Tangent(form, moving), static, (every, along), 16 * _POINTS)
 
-        def call(t, q, u, *others, some=None):
-            tangents = t.imag / TINY, q.imag / TINY, u[self.nu :]
-            both = of_lanes(t.real, q.real, u[: self.nu], *others, *tangents)
+        def call(*point, some=None):
+            tangents = [point[k].imag / TINY for k in moving]
+            (u, x), others = np.split(point[2], [self.nu]), [y.real for y in point[3:]]
+            both = of_lanes(point[0].real, point[1].real, u, *others, *tangents, x)
             return both[0] + 1j * TINY * both[1]
 
         return call
@@ -235,13 +238,17 @@ TINY = np.sqrt(np.finfo(float).tiny)
 
 def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
     """Inputs of lanes of the host without any input."""
-    return s.at_rest(lane) if isinstance(s, Tangents) else np.zeros((s.nu, len(lane)))
+    if not isinstance(s, Tangents):
+        return np.zeros((s.nu, len(lane)))
+    own = 1 + s.d  # directions of the start of a move come first
+    return s.pushed(lane % (own + s.directions) - own)
 
 
 class _Tangent(NamedTuple):
-    """A form, and its derivative along tangents of (t, q) and of the numbers in all trees."""
+    """A form, and its derivative along tangents of the arguments `moving` and of all trees."""
 
     form: Callable
+    moving: tuple[int, ...]
 
     def __call__(self, function: Callable, trees: tuple, along: tuple) -> Callable:
         def moved(trees, along, *point):
@@ -251,10 +258,16 @@ class _Tangent(NamedTuple):
 
         lanes = self.form(moved, trees, along)
 
-        def both(t, q, u, *others):
-            *others, dt, dq, dx = others
-            of = lambda t, q, x: lanes(t, q, u, *others, x)  # noqa: E731
-            return jnp.stack(jax.jvp(of, (t, q, jnp.zeros_like(dx)), (dt, dq, dx)))
+        def both(*arguments):
+            point = list(arguments[: -1 - len(self.moving)])
+            tangents = arguments[len(point) :]
+
+            def at(*moved):
+                now = dict(zip(self.moving, moved[:-1], strict=True))
+                return lanes(*(now.get(k, x) for k, x in enumerate(point)), moved[-1])
+
+            start = *(point[k] for k in self.moving), jnp.zeros_like(tangents[-1])
+            return jnp.stack(jax.jvp(at, start, tangents))
 
         return both
 
@@ -283,14 +296,14 @@ def _divergence(method: Method, field: Callable, t, q, u, h):
     return integrated_divergence(method, lambda t, q: field(t, q, u, h), t, q, h)
 
 
-def _linear_step(method: Method, field: Callable, t, q, u, h):
+def _linear_step(method: Method, field: Callable, t, q, u, h, *others):
     """The end of a step, the field there, and the derivatives of the end by time, states, inputs
     and h, as columns of one array."""
 
     def end(t, q, u, h):
         fixed = jax.lax.stop_gradient((u, h))
-        still = lambda t, q: field(t, q, *fixed)  # noqa: E731
-        step = take_step(method, lambda t, q: field(t, q, u, h), t, q, h, still=still)
+        still = lambda t, q: field(t, q, *fixed, *others)  # noqa: E731
+        step = take_step(method, lambda t, q: field(t, q, u, h, *others), t, q, h, still=still)
         return step.q, step.f1
 
     n, L = q.shape

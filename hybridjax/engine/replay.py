@@ -186,50 +186,57 @@ def _products(moves: "_Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.nda
 
 
 class Variation:
-    """Recorded lanes that follow each other, each beginning where the last one ended, in P
-    directions: those of `s`, and of the `times` (P, L) of their targets."""
+    """Recorded lanes that follow each other, each beginning where the last one ended, and their
+    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets."""
 
     def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times):
-        moves, P = _moves(lanes, tape), s.directions
+        moves, n, P = _moves(lanes, tape), 1 + s.d, s.directions
         if any(np.isin(moves.code, s.schedules(a)).any() for a in range(len(s.charts))):
             raise NotOnHostError
-        self.s, self.first = s, np.flatnonzero(moves.order == 0)
-        many = lambda x: np.repeat(x, P, axis=-1)  # noqa: E731
-        self._moves = _Moves(*map(many, moves))
-        lane = self._moves.lane * P + np.arange(len(self._moves.t)) % P
-        self._moves = self._moves._replace(lane=lane)
-        index = many(np.broadcast_to(target.index, target.time.shape))
-        time = many(target.time) + 1j * kernels.TINY * times.T.ravel()
-        self._target = dataclasses.replace(target, time=time, index=index)
-        end, by = _linear_moves(s, self._moves, self._target)
-        n = 1 + s.d
-        self._by = by[::P, :, :n].real
-        self._kick = np.moveaxis(end.imag.reshape(-1, P, n) / kernels.TINY, 1, 2)
+        self._s, self._moves, self.first = s, moves, np.flatnonzero(moves.order == 0)
+        # Every move in all directions: of its start, and the P ones.
+        many = lambda x: np.repeat(x, n + P, axis=-1)  # noqa: E731
+        aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), len(moves.t))
+        along = _Moves(*map(many, moves))
+        lane = along.lane * (n + P) + np.arange(len(along.t)) % (n + P)
+        along = along._replace(t=along.t + aside[0], q=along.q + aside[1:], lane=lane)
+        later = np.concatenate([np.zeros((n, len(lanes.t))), times]).T.ravel()
+        target = dataclasses.replace(
+            target, time=many(target.time) + 1j * kernels.TINY * later,
+            index=many(np.broadcast_to(target.index, target.time.shape)),
+        )  # fmt: skip
+        end, by = _linear_moves(s, along, target)
+        by = by.reshape(-1, n + P, *by.shape[1:])
+        self._by, self._change = by[:, 0].real, by.imag / kernels.TINY
+        kick = end.imag.reshape(-1, n + P, n)[:, n:] / kernels.TINY
+        self._kick = np.moveaxis(kick, 1, 2)
 
     def tangents(self, begin: Float[np.ndarray, "n P"]) -> Float[np.ndarray, "moves n P"]:
         """Tangents of (t, q) where moves start, and at the last end."""
         starts = [begin]
-        for by, kick in zip(self._by, self._kick, strict=True):
+        for by, kick in zip(self._by[:, :, : len(begin)], self._kick, strict=True):
             starts.append(by @ starts[-1] + kick)
         return np.stack(starts)
 
     def jacobians(self, tangents: Float[np.ndarray, "moves n P"]) -> np.ndarray:
         """Derivatives (L, P, n, m) of (t, q) at the ends of lanes by (t, q, u) at their starts, and
         their own in each direction, as complex numbers."""
-        moves, L, P = self._aside(tangents), len(self.first), tangents.shape[2]
-        by = _linear_moves(self.s, moves, self._target).by
-        return _products(moves, by, L * P).reshape(L, P, *by.shape[1:])
+        moves, (M, n, m), P = self._moves, self._by.shape, tangents.shape[2]
+        along = np.concatenate([tangents[:-1], np.tile(np.eye(P), (M, 1, 1))], axis=1)
+        change = np.moveaxis(along, 1, 2) @ self._change.reshape(*along.shape[:2], n * m)
+        by = self._by[:, None] + 1j * kernels.TINY * change.reshape(M, P, n, m)
+        lane, order = (np.repeat(x, P) for x in (moves.lane, moves.order))
+        moves = moves._replace(lane=lane * P + np.arange(M * P) % P, order=order)
+        columns = _products(moves, by.reshape(-1, n, m), len(self.first) * P)
+        return columns.reshape(-1, P, n, m)
 
     def points(self, tangents: Float[np.ndarray, "moves n P"]) -> tuple:
         """Times, charts, states and inputs where lanes start, in each direction."""
-        moves = self._aside(tangents)
-        first = moves.order == 0
-        u = kernels.unpushed(self.s, moves.lane[first])
-        return moves.t[first], moves.chart[first], moves.q[:, first], u
-
-    def _aside(self, tangents) -> _Moves:
-        aside = 1j * kernels.TINY * np.moveaxis(tangents[:-1], 1, 0).reshape(1 + self.s.d, -1)
-        return self._moves._replace(t=self._moves.t + aside[0], q=self._moves.q + aside[1:])
+        P, starts = tangents.shape[2], _Moves(*(x[..., self.first] for x in self._moves))
+        aside = np.moveaxis(tangents[self.first], 1, 0).reshape(tangents.shape[1], -1)
+        t, chart, q = (np.repeat(x, P, axis=-1) for x in (starts.t, starts.chart, starts.q))
+        u, aside = self._s.pushed(np.arange(len(t)) % P), 1j * kernels.TINY * aside
+        return t + aside[0], chart, q + aside[1:], u
 
 
 class Link(NamedTuple):
@@ -370,13 +377,11 @@ def _step(s: Structure, a: int, t, q, u, h):
     n, M = q.shape
     m = 2 + n + s.nu
     method = s.method(a)
-    if method.implicit and isinstance(s, kernels.Tangents):
-        raise NotOnHostError
-    if method.implicit:
+    if method.implicit or isinstance(s, kernels.Tangents):
         expanded = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h), -1, 0))
         return expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     stages = len(method.b) + 1
-    K, dK = np.zeros((stages, n, M), h.dtype), np.zeros((stages, M, n, m), h.dtype)
+    K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
     straight = np.zeros((M, n, m))
     straight[:, :, 1 : 1 + n] = np.eye(n)
     rows = [*(row[:i] for i, row in enumerate(np.array(method.a))), np.array(method.b)]

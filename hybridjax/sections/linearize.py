@@ -90,7 +90,7 @@ def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     after = np.roll(select.reshape(N, P, *select.shape[1:]), -1, axis=0)
     A = after @ jacobians[..., :n] @ embed.reshape(N, P, *embed.shape[1:])
     values = lambda a, *point: kernels.outputs(s, a, outputs, *point)  # noqa: E731
-    u = kernels.unpushed(s, np.arange(N * P))
+    u = s.pushed(np.arange(N * P) % P)
     by = with_derivatives(s, values, lanes.chart, lanes.t, lanes.q, len(outputs), u)
     J = np.moveaxis(by[:, 1:], -1, 0)
     C, D = (x.reshape(N, P, *x.shape[1:]) for x in (J[..., :n] @ embed, J[..., n:]))

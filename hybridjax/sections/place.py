@@ -193,7 +193,7 @@ def place_along(
         by_levels = None if levels is None else by_levels
         along = kernels.Tangents(s, by_cycle.system, levels, by_levels, P)
         flow = Variation(along, lanes, target, tape, times)
-        return flow, flow.tangents(x)
+        return flow, flow.tangents(x), along
 
     if isinstance(family.anchor, Crossing):
         x = follow(flows[:1], ListLevels((by_family.anchor,)), np.zeros((P, 1)))[1][-1]
@@ -202,7 +202,7 @@ def place_along(
     orbit = Orbit(cycle.period, start.t, start.chart, start.q.T)
     if M > 1:
         times = x[0][:, None] + longer[:, None] * np.arange(1, M + 1) / M
-        flow, points = follow(flows[:M], None, times)
+        flow, points, _ = follow(flows[:M], None, times)
         points, starts = points[flow.first], [lanes for lanes, *_ in flows[:M]]
         t, chart, q = (np.concatenate([getattr(y, k) for y in starts], -1) for k in "t chart q".split())
         orbit, flows = Orbit(cycle.period, t, chart, q.T), flows[M:]
@@ -213,7 +213,7 @@ def place_along(
     k = np.arange(N + 1)[-len(flows):]
     by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
     times = clock[k % N] * (by_time[:, k % N] + (late + k // N) * longer[:, None])
-    flow, tangents = follow(flows, by_bound.levels, times)
+    flow, tangents, along = follow(flows, by_bound.levels, times)
     t, chart, q, u = (y[..., -N * P :] for y in flow.points(tangents))
     many = lambda y: np.repeat(y, P)  # noqa: E731
     index, levels = many(np.arange(N, dtype=np.int32)), bound.levels
@@ -222,9 +222,9 @@ def place_along(
         n = 2 + s.dims[a] + s.nu
         if levels is None or not levels.present(s, a):
             return np.zeros((1, n, N * P))
-        return kernels.watched(flow.s, a, levels, *point, index)[-1:]
+        return kernels.watched(along, a, levels, *point, index)[-1:]
 
-    normal = with_derivatives(flow.s, gradient, chart, t, q, 1, u)[0, 1 : 2 + s.d].T
+    normal = with_derivatives(along, gradient, chart, t, q, 1, u)[0, 1 : 2 + s.d].T
     normal = np.where(many(np.isinf(bound.time) & (bound.event < 0))[:, None], normal, 0.0)
     moved = dataclasses.replace(
         placed, bound=dataclasses.replace(bound, time=many(bound.time)),
@@ -233,7 +233,7 @@ def place_along(
     )  # fmt: skip
     jacobians = flow.jacobians(tangents)[-N:]
     jacobians[placed.result != Result.OK] = np.nan
-    return placed, moved, flow.s, jacobians
+    return placed, moved, along, jacobians
 
 
 @quick_jit
