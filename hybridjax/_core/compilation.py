@@ -9,6 +9,7 @@
 
 import collections
 import contextlib
+import contextvars
 import functools as ft
 import gc
 import hashlib
@@ -37,6 +38,7 @@ from .executor import (
     on_cpu,
     to_host,
 )
+from .lanes import JACOBIAN_COLUMNS
 from .progress import say_compiling
 from .vector_math import rewrite
 
@@ -48,7 +50,7 @@ _QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusi
 _UNDIVIDED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
-_WORTH_COMPILING = 3.0
+WORTH_COMPILING = 3.0
 # Seconds in a quick executable after which a script compiles the optimized one, in about as much
 # time. Less: it waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
@@ -179,7 +181,7 @@ def host_first(function: Callable, along: Callable | None = None) -> Callable:
         if not on_cpu() or is_traced(arguments) or is_inside_program():
             return derived(*arguments)
         key, begin = kind(arguments), time.thread_time()
-        left = _WORTH_COMPILING - spent[key]
+        left = WORTH_COMPILING - spent[key]
         if left <= 0:
             return compiled(*arguments)
         try:
@@ -197,9 +199,24 @@ class NotOnHostError(Exception):
     """The host has no derivatives for these arguments."""
 
 
-# Directions in which the host computes derivatives. Fewer: many parameters compile. More: a compiled
-# program in reverse mode is faster.
-_DIRECTIONS = 32
+_only_on_host = contextvars.ContextVar("only on host", default=False)
+
+
+@contextlib.contextmanager
+def only_on_host() -> Iterator[None]:
+    """A context in which derivatives that the host does not have raise `NotOnHostError`."""
+    before = _only_on_host.set(True)
+    try:
+        yield
+    finally:
+        _only_on_host.reset(before)
+
+
+def require_program() -> None:
+    """**Raises:** `NotOnHostError` where derivatives must come from the host, and are to be compiled
+    in a program of their own."""
+    if _only_on_host.get() and not is_inside_program():
+        raise NotOnHostError
 
 
 def by_columns(
@@ -211,7 +228,7 @@ def by_columns(
     direction moves a single number of the arguments: `directions` is a tree of their form with
     arrays (P, ...), and `None` for what does not move; so is the second result. Values are
     concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
-    raises `NotOnHostError`, the derivatives are compiled, as inside of programs. `relevant` replaces
+    raises `NotOnHostError`, or many numbers move, derivatives are compiled, as inside of programs. `relevant` replaces
     tangents that make no difference by `None`.
     """
     derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
@@ -224,7 +241,7 @@ def by_columns(
         )  # fmt: skip
         leaves, structure = jax.tree_util.tree_flatten(moving)
         ends = np.cumsum([x.size for x in leaves])
-        is_small = len(leaves) and ends[-1] <= _DIRECTIONS
+        is_small = len(leaves) and ends[-1] <= JACOBIAN_COLUMNS
         if not on_cpu() or is_traced(arguments) or is_inside_program() or not is_small:
             return eqx.filter_jvp(compiled, arguments, tangents)
         parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
@@ -235,6 +252,7 @@ def by_columns(
                     to_host(arguments), jax.tree_util.tree_unflatten(structure, parts)
                 )
         except NotOnHostError:
+            require_program()
             return eqx.filter_jvp(compiled, arguments, tangents)
         return from_host(result), _combined(
             from_host(columns), jax.tree_util.tree_leaves(relevant(tangents))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.compilation import at_ease, host_first, quick_jit
+from .._core.compilation import at_ease, host_first, quick_jit, require_program
 from .._core.executor import Array, is_traced, namespace, on_host, put, scan, stop_gradient, to_host
 from .._core.lanes import by_lane
 from .._core.precision import require_x64
@@ -65,6 +65,8 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
         if placed.cycle is cycle and eqx.tree_equal(*jax.device_get((placed.family, family))):
             return placed
     family.check(cycle.structure)
+    if is_traced((cycle, family)):
+        require_program()
     first, fields = _place(_patient(cycle), family)
     placed = PlacedSections(cycle, family, *fields)
     if not is_traced((cycle, family)):
