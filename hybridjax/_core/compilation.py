@@ -213,8 +213,7 @@ def only_on_host() -> Iterator[None]:
 
 
 def require_program() -> None:
-    """**Raises:** `NotOnHostError` where derivatives must come from the host, and are to be compiled
-    in a program of their own."""
+    """**Raises:** `NotOnHostError` where a derivative must come from the host."""
     if _only_on_host.get() and not is_inside_program():
         raise NotOnHostError
 
@@ -228,8 +227,8 @@ def by_columns(
     direction moves a single number of the arguments: `directions` is a tree of their form with
     arrays (P, ...), and `None` for what does not move; so is the second result. Values are
     concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
-    raises `NotOnHostError`, or many numbers move, derivatives are compiled, as inside of programs. `relevant` replaces
-    tangents that make no difference by `None`.
+    raises `NotOnHostError`, or many numbers move, derivatives are compiled, as inside of programs.
+    `relevant` replaces tangents that make no difference by `None`.
     """
     derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
 

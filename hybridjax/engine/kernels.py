@@ -206,10 +206,12 @@ class Tangents(Structure):
     for what does not move.
     """
 
-    def __init__(self, s: Structure, along: Any, levels: Any, levels_along: Any, directions: int):
+    def __init__(
+        self, s: Structure, along: Structure, levels: Any, by_levels: Any, directions: int
+    ):
         super().__init__(s.source)
-        self.directions, self._levels = directions, levels
-        self._along = Structure(along), levels_along
+        self.directions, self._levels, self._plain = directions, levels, s
+        self._along = along, by_levels
 
     def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:
         """Inputs of zero, and the directions of lanes; of negative index, none."""
@@ -219,14 +221,14 @@ class Tangents(Structure):
     def kernel(self, function, form, *static, trees=(), lanes=1):
         still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
         along = [self._along[1] if x is self._levels else still(x) for x in trees]
-        every, along = (Structure(self.source), *trees), (self._along[0], *along)
+        every, along = (self._plain, *trees), (self._along[0], *along)
         moving = (0, 1, 3) if isinstance(form, _ByMethod) else (0, 1)
         of_lanes = kernel(function, _Tangent(form, moving), static, (every, along), 16 * _POINTS)
 
         def call(*point, some=None):
             tangents = [point[k].imag / TINY for k in moving]
-            (u, x), others = np.split(point[2], [self.nu]), [y.real for y in point[3:]]
-            both = of_lanes(point[0].real, point[1].real, u, *others, *tangents, x)
+            (u, x), further = np.split(point[2], [self.nu]), [y.real for y in point[3:]]
+            both = of_lanes(point[0].real, point[1].real, u, *further, *tangents, x)
             return both[0] + 1j * TINY * both[1]
 
         return call
@@ -240,8 +242,8 @@ def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
     """Inputs of lanes of the host without any input."""
     if not isinstance(s, Tangents):
         return np.zeros((s.nu, len(lane)))
-    own = 1 + s.d  # directions of the start of a move come first
-    return s.pushed(lane % (own + s.directions) - own)
+    n = 1 + s.d  # directions of the start of a move come first
+    return s.pushed(lane % (n + s.directions) - n)
 
 
 class _Tangent(NamedTuple):
@@ -296,14 +298,14 @@ def _divergence(method: Method, field: Callable, t, q, u, h):
     return integrated_divergence(method, lambda t, q: field(t, q, u, h), t, q, h)
 
 
-def _linear_step(method: Method, field: Callable, t, q, u, h, *others):
+def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
     """The end of a step, the field there, and the derivatives of the end by time, states, inputs
     and h, as columns of one array."""
 
     def end(t, q, u, h):
         fixed = jax.lax.stop_gradient((u, h))
-        still = lambda t, q: field(t, q, *fixed, *others)  # noqa: E731
-        step = take_step(method, lambda t, q: field(t, q, u, h, *others), t, q, h, still=still)
+        still = lambda t, q: field(t, q, *fixed, *x)  # noqa: E731
+        step = take_step(method, lambda t, q: field(t, q, u, h, *x), t, q, h, still=still)
         return step.q, step.f1
 
     n, L = q.shape

@@ -12,12 +12,12 @@ saltation formula.
 
 import dataclasses
 import functools as ft
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Inexact, Int
 
 from .._core.compilation import NotOnHostError
 from ..systems.structure import Member, Structure
@@ -145,8 +145,8 @@ class _Moves(NamedTuple):
 class _Linear(NamedTuple):
     """(t, q) after some moves, and its derivatives by (t, q, u) before them: moves come first."""
 
-    end: Float[np.ndarray, "M n"]
-    by: Float[np.ndarray, "M n m"]
+    end: Inexact[np.ndarray, "M n"]
+    by: Inexact[np.ndarray, "M n m"]
 
 
 def chain(
@@ -191,9 +191,11 @@ class Variation:
 
     def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times):
         moves, n, P = _moves(lanes, tape), 1 + s.d, s.directions
-        if any(np.isin(moves.code, s.schedules(a)).any() for a in range(len(s.charts))):
-            raise NotOnHostError
         self._s, self._moves, self.first = s, moves, np.flatnonzero(moves.order == 0)
+        due = [g for a in range(len(s.charts)) for g in s.schedules(a)]
+        if np.isin(moves.code, due).any() or len(self.first) < len(lanes.t):
+            raise NotOnHostError
+        self.starts = _Moves(*(x[..., self.first] for x in moves))
         # Every move in all directions: of its start, and the P ones.
         many = lambda x: np.repeat(x, n + P, axis=-1)  # noqa: E731
         aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), len(moves.t))
@@ -206,10 +208,9 @@ class Variation:
             index=many(np.broadcast_to(target.index, target.time.shape)),
         )  # fmt: skip
         end, by = _linear_moves(s, along, target)
-        by = by.reshape(-1, n + P, *by.shape[1:])
-        self._by, self._change = by[:, 0].real, by.imag / kernels.TINY
-        kick = end.imag.reshape(-1, n + P, n)[:, n:] / kernels.TINY
-        self._kick = np.moveaxis(kick, 1, 2)
+        by, end = by.reshape(-1, n + P, *by.shape[1:]), end.reshape(-1, n + P, n)[:, n:]
+        self._by, self._change = np.real(by[:, 0]), np.imag(by) / kernels.TINY
+        self._kick = np.moveaxis(np.imag(end) / kernels.TINY, 1, 2)
 
     def tangents(self, begin: Float[np.ndarray, "n P"]) -> Float[np.ndarray, "moves n P"]:
         """Tangents of (t, q) where moves start, and at the last end."""
@@ -218,7 +219,7 @@ class Variation:
             starts.append(by @ starts[-1] + kick)
         return np.stack(starts)
 
-    def jacobians(self, tangents: Float[np.ndarray, "moves n P"]) -> np.ndarray:
+    def jacobians(self, tangents: Float[np.ndarray, "moves n P"]) -> Any:
         """Derivatives (L, P, n, m) of (t, q) at the ends of lanes by (t, q, u) at their starts, and
         their own in each direction, as complex numbers."""
         moves, (M, n, m), P = self._moves, self._by.shape, tangents.shape[2]
@@ -232,7 +233,7 @@ class Variation:
 
     def points(self, tangents: Float[np.ndarray, "moves n P"]) -> tuple:
         """Times, charts, states and inputs where lanes start, in each direction."""
-        P, starts = tangents.shape[2], _Moves(*(x[..., self.first] for x in self._moves))
+        P, starts = tangents.shape[2], self.starts
         aside = np.moveaxis(tangents[self.first], 1, 0).reshape(tangents.shape[1], -1)
         t, chart, q = (np.repeat(x, P, axis=-1) for x in (starts.t, starts.chart, starts.q))
         u, aside = self._s.pushed(np.arange(len(t)) % P), 1j * kernels.TINY * aside

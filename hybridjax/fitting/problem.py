@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.compilation import WORTH_COMPILING, NotOnHostError, kind, only_on_host, quick_jit
+from .._core import compilation
+from .._core.compilation import NotOnHostError, kind, only_on_host, quick_jit
 from .._core.executor import is_inside_program, on_cpu
 from .._core.results import Result
 from ..errors import DefinitionError
@@ -176,11 +177,11 @@ _spent: dict[tuple, float] = collections.defaultdict(float)
 def evaluate(
     problem: FitProblem, x: Float[Array | np.ndarray, " p"], guess: LimitCycle
 ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
-    """Return residuals and Jacobian at x: from the host, until compiling has been worth its time."""
+    """Return residuals and Jacobian at x, from the host until compiling is worth its time."""
     arguments = problem, jnp.asarray(x), guess
     key, begin = kind(arguments), time.thread_time()
     # (The whole program takes about eight times as long to compile as that of a cycle.)
-    if _spent[key] < 8 * WORTH_COMPILING and on_cpu():
+    if _spent[key] < 8 * compilation.WORTH_COMPILING and on_cpu():
         try:
             with only_on_host():
                 return jax.device_get(_with_jacobian(*arguments))

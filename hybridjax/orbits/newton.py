@@ -88,11 +88,11 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     recorded turn."""
     (map, _), (by, _), solution = arguments, directions, _solve(*arguments)
     turn, ends, sizes = solution.turn, map.ends(), map.sizes
-    if map.conserved:
+    if map.conserved or not solution.is_fixed_point:
         raise NotOnHostError
     P = len(jax.tree_util.tree_leaves(by)[0])
     levels = None if ends.levels is None else ListLevels((by.base,))
-    s = kernels.Tangents(map.structure, by.system, ends.levels, levels, P)
+    s = kernels.Tangents(map.structure, by.structure, ends.levels, levels, P)
     begin = np.zeros((1 + len(sizes), P))
     begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
     longer = np.zeros(P) if by.expected is None else by.expected
@@ -106,7 +106,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     begin[1:] = (newton_steps(np.tile(jacobian, (P, 1, 1)), moved) * sizes).T
     tangents = orbit.tangents(begin)
     t_legs = np.moveaxis(tangents[orbit.first], 0, -1)
-    factors, legs = orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)], turn.legs
+    legs, factors = turn.legs, orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)]
     if map.base is not None:
         f = slopes(s, *orbit.points(tangents)).T.reshape(*factors.shape[:3])
         factors = across(f, map.scale[legs.chart][:, None], factors)

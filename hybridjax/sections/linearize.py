@@ -1,6 +1,7 @@
 """From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -52,20 +53,17 @@ def linearize(
     lies, or uses the time without having the period of a clock, or an input that does not exist;
     `ComputationError` as `place_sections`.
     """
-    s, charts, placed = cycle.structure, range(len(cycle.system.charts())), None
+    s, traced = cycle.structure, is_traced(cycle, sections)
+    of_family = traced and not isinstance(sections, PlacedSections)
+    placed: Any = sections if of_family else as_placed(cycle, sections)
     z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
-    traced = is_traced(cycle, sections)
-    if not traced or isinstance(sections, PlacedSections):
-        placed = as_placed(cycle, sections)
-    for a in np.unique(placed.lanes.chart) if placed is not None and not traced else charts:
+    for a in range(len(s.charts)) if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
-    names, columns = s.inputs_among(inputs)
-    if placed is None:
-        A, B, C, D, dims = _placed_matrices(cycle, as_family(sections), tuple(z.items))
+    (names, columns), d = s.inputs_among(inputs), s.d + 1
+    if of_family:
+        A, B, C, D, dims = _of_family(cycle, as_family(placed), tuple(z.items))
     else:
-        (A, B), (C, D) = placed.flow_jacobians, _output_jacobians(placed, tuple(z.items))
-        dims = placed.dims
-    d = s.d + 1
+        A, B, C, D, dims = _matrices_of(placed, tuple(z.items))
     if not traced:
         A, B, C, D = jax.device_get((A, B, C, D))
         d = int(np.max(np.asarray(dims)))
@@ -76,9 +74,12 @@ def linearize(
     )  # fmt: skip
 
 
-def _matrices(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str | Output, ...]):
-    placed = place_sections(cycle, family)
+def _matrices_of(placed: PlacedSections, outputs: tuple[str | Output, ...]) -> tuple[Any, ...]:
     return *placed.flow_jacobians, *_output_jacobians(placed, outputs), placed.dims
+
+
+def _matrices(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str | Output, ...]):
+    return _matrices_of(place_sections(cycle, family), outputs)
 
 
 def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
@@ -95,20 +96,22 @@ def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     J = np.moveaxis(by[:, 1:], -1, 0)
     C, D = (x.reshape(N, P, *x.shape[1:]) for x in (J[..., :n] @ embed, J[..., n:]))
     each = A, after @ jacobians[..., n:], C, D
-    matrices = *placed.flow_jacobians, *_output_jacobians(placed, outputs), placed.dims
-    return matrices, (*(np.moveaxis(x.imag / kernels.TINY, 1, 0) for x in each), None)
+    return _matrices_of(placed, outputs), (
+        *(np.moveaxis(x.imag / kernels.TINY, 1, 0) for x in each),
+        None,
+    )
 
 
 def _relevant(tangents: tuple) -> tuple:
     """Tangents of what the matrices depend on."""
-    cycle, *others = tangents
+    cycle, *definitions = tangents
     nothing, anchor = jax.tree_util.tree_map(lambda _: None, cycle), cycle.anchor
     anchor = nothing.anchor._replace(t=anchor.t, q=anchor.q)
     moving = dict(system=cycle.system, period=cycle.period, anchor=anchor)
-    return dataclasses.replace(nothing, **moving), *others
+    return dataclasses.replace(nothing, **moving), *definitions
 
 
-_placed_matrices = by_columns(_matrices, _matrices_along, _relevant)
+_of_family = by_columns(_matrices, _matrices_along, _relevant)
 
 
 @host_first

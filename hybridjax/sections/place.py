@@ -2,7 +2,7 @@
 
 import collections
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.compilation import at_ease, host_first, quick_jit, require_program
+from .._core.compilation import NotOnHostError, at_ease, host_first, quick_jit, require_program
 from .._core.executor import Array, is_traced, namespace, on_host, put, scan, stop_gradient, to_host
 from .._core.lanes import by_lane
 from .._core.precision import require_x64
@@ -111,7 +111,7 @@ def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tu
     return _locate(map, family, [])
 
 
-def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any, tuple]:
+def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any, Any]:
     """As `_place`; on the host `flows` gets the start, the target and the tape of every flow."""
     s, N = Structure(map.system), family.n_sections
     period, begin, xp = map.expected, map.anchor, namespace(map.expected)
@@ -175,12 +175,14 @@ def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any,
 
 def place_along(
     cycle: LimitCycle, family: AbstractSections, by_cycle: LimitCycle, by_family: AbstractSections
-) -> tuple[PlacedSections, PlacedSections, Structure, np.ndarray]:
+) -> tuple[PlacedSections, PlacedSections, kernels.Tangents, np.ndarray]:
     """Sections placed on the host; and in P directions, as complex numbers of N P sections (see
     `kernels.Tangents`): the same, the structure, and the Jacobians (N, P, n, m) of the flow."""
-    flows: list = []
+    flows: list[Any] = []
     map, N, M = _patient(cycle), family.n_sections, family.points
     placed = PlacedSections(cycle, family, *_locate(map, family, flows)[1])
+    if np.any(placed.result):
+        raise NotOnHostError
     (s, bound), P = (map.structure, placed.bound), len(jax.tree_util.tree_leaves(by_cycle)[0])
     x, longer = np.zeros((1 + s.d, P)), np.zeros(P) if by_cycle.period is None else by_cycle.period
     x[0] = 0.0 if by_cycle.anchor.t is None else by_cycle.anchor.t[:, 0]
@@ -193,26 +195,28 @@ def place_along(
         lanes, target, tape = _side_by_side(stacked)
         target = dataclasses.replace(target, levels=levels)
         by_levels = None if levels is None else by_levels
-        along = kernels.Tangents(s, by_cycle.system, levels, by_levels, P)
+        along = kernels.Tangents(s, by_cycle.structure, levels, by_levels, P)
         flow = Variation(along, lanes, target, tape, times)
         return flow, flow.tangents(x), along
 
     if isinstance(family.anchor, Crossing):
-        x = follow(flows[:1], ListLevels((by_family.anchor,)), np.zeros((P, 1)))[1][-1]
+        x = follow(flows[:1], ListLevels((cast(Crossing, by_family.anchor),)), np.zeros((P, 1)))[1][
+            -1
+        ]
         flows = flows[1:]
     start, points = flows[0][0], x[None]
     orbit = Orbit(cycle.period, start.t, start.chart, start.q.T)
     if M > 1:
         times = x[0][:, None] + longer[:, None] * np.arange(1, M + 1) / M
         flow, points, _ = follow(flows[:M], None, times)
-        points, starts = points[flow.first], [lanes for lanes, *_ in flows[:M]]
-        t, chart, q = (np.concatenate([getattr(y, k) for y in starts], -1) for k in "t chart q".split())
-        orbit, flows = Orbit(cycle.period, t, chart, q.T), flows[M:]
+        points, flows = points[flow.first], flows[M:]
+        orbit = Orbit(cycle.period, flow.starts.t, flow.starts.chart, flow.starts.q.T)
     moving = longer, np.moveaxis(points[:, 0], 1, 0), np.moveaxis(points[:, 1:], 2, 0)
-    raw, by_bound = to_host(_bind_along(map.system, family, orbit, by_cycle.system, by_family, moving))
+    directions = by_cycle.structure, by_family, moving
+    raw, by_bound = to_host(_bind_along(s, family, orbit, directions))
     clock = np.isfinite(bound.time)
     late = np.rint((bound.time[0] - raw.time[0]) / cycle.period) if clock[0] else 0.0
-    k = np.arange(N + 1)[-len(flows):]
+    k = np.arange(N + 1)[-len(flows) :]
     by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
     times = clock[k % N] * (by_time[:, k % N] + (late + k // N) * longer[:, None])
     flow, tangents, along = follow(flows, by_bound.levels, times)
@@ -220,11 +224,11 @@ def place_along(
     many = lambda y: np.repeat(y, P)  # noqa: E731
     index, levels = many(np.arange(N, dtype=np.int32)), bound.levels
 
-    def gradient(a, *point):
+    def gradient(a, t, q, u):
         n = 2 + s.dims[a] + s.nu
         if levels is None or not levels.present(s, a):
             return np.zeros((1, n, N * P))
-        return kernels.watched(along, a, levels, *point, index)[-1:]
+        return kernels.watched(along, a, levels, t, q, u, index)[-1:]
 
     normal = with_derivatives(along, gradient, chart, t, q, 1, u)[0, 1 : 2 + s.d].T
     normal = np.where(many(np.isinf(bound.time) & (bound.event < 0))[:, None], normal, 0.0)
@@ -233,21 +237,18 @@ def place_along(
         lanes=placed.lanes._replace(t=t, chart=chart, q=q), drop=many(placed.drop),
         dims=many(placed.dims), normal=normal,
     )  # fmt: skip
-    jacobians = flow.jacobians(tangents)[-N:]
-    jacobians[placed.result != Result.OK] = np.nan
-    return placed, moved, along, jacobians
+    return placed, moved, along, flow.jacobians(tangents)[-N:]
 
 
 @quick_jit
-def _bind_along(system, family: AbstractSections, orbit: Orbit, by_system, by_family, moving):
-    def bind(system, family, moving):
+def _bind_along(s: Structure, family: AbstractSections, orbit: Orbit, directions: tuple):
+    def bind(s, family, moving):
         period, t, q = moving
-        return family.bind(Structure(system), Orbit(period, t, orbit.chart, q))
+        return family.bind(s, Orbit(period, t, orbit.chart, q))
 
-    def push(tangents):
-        return eqx.filter_jvp(bind, (system, family, (orbit.period, orbit.t, orbit.q)), tangents)
-
-    return eqx.filter_vmap(push, out_axes=(None, 0))((by_system, by_family, moving))
+    begin = s, family, (orbit.period, orbit.t, orbit.q)
+    push = lambda tangents: eqx.filter_jvp(bind, begin, tangents)  # noqa: E731
+    return eqx.filter_vmap(push, out_axes=(None, 0))(directions)
 
 
 class _FromAnchor(AbstractLevels):
