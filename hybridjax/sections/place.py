@@ -183,7 +183,8 @@ def place_along(
     placed = PlacedSections(cycle, family, *_locate(map, family, flows)[1])
     if np.any(placed.result):
         raise NotOnHostError
-    (s, bound), P = (map.structure, placed.bound), len(jax.tree_util.tree_leaves(by_cycle)[0])
+    P = len(jax.tree_util.tree_leaves((by_cycle, by_family))[0])
+    s, bound = map.structure, placed.bound
     x, longer = np.zeros((1 + s.d, P)), np.zeros(P) if by_cycle.period is None else by_cycle.period
     x[0] = 0.0 if by_cycle.anchor.t is None else by_cycle.anchor.t[:, 0]
     x[1:] = 0.0 if by_cycle.anchor.q is None else by_cycle.anchor.q[..., 0].T

@@ -25,10 +25,11 @@ def measured(guess, family):
     def measure(system):
         cycle = hj.find_limit_cycle(system, guess)
         model = hj.linearize(cycle, family)
-        d = len(cycle.system.charts()[cycle.structure.names[0]].states)
-        parts = model.A[0, :d, :d].ravel(), model.B.ravel(), model.characteristic_polynomial()
-        more = cycle.period[None], cycle.anchor.q[:, 0], cycle.factors.ravel()
-        return jnp.concatenate([x[: 4 * d] for x in (*parts, *more)])
+        # (Under transformations, matrices are padded with zeros.)
+        matrices = model.A[:, :1, :1], model.B[:, :1], model.C[..., :1], cycle.factors
+        polynomial = model.characteristic_polynomial()[:2]
+        parts = *matrices, polynomial, cycle.period, cycle.anchor.q, cycle.legs.q
+        return jnp.concatenate([jnp.ravel(x) for x in parts])
 
     return measure
 
