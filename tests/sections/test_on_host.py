@@ -60,8 +60,11 @@ FAMILIES = {
 }
 
 
+SLOW = [pytest.param(x, marks=pytest.mark.slow) for x in ("clock", "arc", "event")]
+
+
 @pytest.mark.usefixtures("compiles_none")
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", ["angle", *SLOW])
 def test_a_hopper(hopper_cycle, family):
     """Two charts, clock; the sections move with the cycle."""
     agrees(hopper_cycle.system, measured(hopper_cycle, FAMILIES[family]), 1e-8)
