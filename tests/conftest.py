@@ -103,7 +103,7 @@ compilation.at_ease = unchecked_host
 compilation._WORTH_OPTIMIZING = np.inf
 # The tests of a process find many cycles of one kind, and few that take longer on the host than
 # compiling them would.
-compilation._WORTH_COMPILING = 5.0
+compilation.WORTH_COMPILING = 5.0
 
 
 # Programs that a worker keeps, of some 5 MB each. Doubled: twice the memory.
@@ -132,13 +132,13 @@ def forget_programs():
 def no_compilation(after):
     """A context in which nothing may be compiled, once `after()` has run. Functions of few lanes
     stay on the host in both: by default the seconds that earlier tests have spent there decide."""
-    count, patience = 0, compilation._WORTH_COMPILING
+    count, patience = 0, compilation.WORTH_COMPILING
 
     def listen(event, duration, **_):
         nonlocal count
         count += "backend_compile" in event
 
-    compilation._WORTH_COMPILING = np.inf
+    compilation.WORTH_COMPILING = np.inf
     try:
         after()
         jax.monitoring.register_event_duration_secs_listener(listen)
@@ -147,7 +147,7 @@ def no_compilation(after):
         finally:
             jax.monitoring.unregister_event_duration_listener(listen)
     finally:
-        compilation._WORTH_COMPILING = patience
+        compilation.WORTH_COMPILING = patience
     assert not count, f"{count} programs were compiled"
 
 

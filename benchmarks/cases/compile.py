@@ -10,6 +10,10 @@ what is traced or compiled again, and looks for host callbacks in all programs.
 sections; `bar` is the bar, with its four charts, on both families (`times_hopper`: as multiples of
 the hopper's).
 
+`derivatives`: the gradient of a coefficient of the characteristic polynomial by the hopper's nine
+parameters, in reverse mode and outside of `jit`, and a fit of two parameters to HTFs; `again`: the
+second of each.
+
 The same in seconds of the processor (`cpu`), and as multiples of a yardstick that is measured
 beside them, `diffeqsolve.cpu`: the first call, in a fresh process, of `diffrax.diffeqsolve` for the
 hopper's flight up to its touchdown.
@@ -49,6 +53,9 @@ def run(show, options) -> None:
                 hopper = seconds[label.removeprefix("bar."), state, what]
                 show(f"{label}.{state}.{what}.times_hopper", value / hopper)
 
+    for name, value in call("compile", "derivatives").items():
+        show(f"derivatives.{name}.cpu", value)
+        show(f"derivatives.{name}.times_diffeqsolve", value / yardstick)
     for _, family in HOPPER[:1] if options.quick else HOPPER:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "cached", "later"):
@@ -101,6 +108,37 @@ def defined_here() -> type:
     main = sys.modules["__main__"].__dict__
     exec(inspect.getsource(hoppers).replace("from ..", "from hybridjax."), main)
     return main["VerticalHopper"]
+
+
+def derivatives() -> dict[str, float]:
+    """CPU seconds of a gradient and a fit, after the cycle was found."""
+    import equinox as eqx
+    import numpy as np
+
+    import hybridjax as hj
+
+    from .problems import OUTPUTS, sections
+
+    hj.enable_x64()
+    hopper, outputs, seconds = hj.models.VerticalHopper(), OUTPUTS["hopper"], {}
+    family, cycle = sections("hopper", "kinematic"), hj.find_limit_cycle(hopper)
+    htf = hj.linearize(cycle, family, outputs).htf(np.linspace(0.01, 0.49, 40), (-1, 0, 1))
+
+    def coefficient(system):
+        neighbor = hj.find_limit_cycle(system, cycle)
+        return hj.linearize(neighbor, family, outputs).characteristic_polynomial()[2]
+
+    near, observed = hj.models.VerticalHopper(k=10.8, b=4.75), hj.ObservedHTF(htf, family)
+    jobs = {
+        "gradient": lambda: eqx.filter_grad(coefficient)(hopper).k.item(),
+        "fit": lambda: hj.fit_model(near, observed, ("k", "b"), guesses=4),
+    }
+    for name, job in jobs.items():
+        for state in ("", "_again"):
+            begin = time.process_time()
+            job()
+            seconds[name + state] = time.process_time() - begin
+    return seconds
 
 
 def diffeqsolve() -> float:
@@ -181,5 +219,7 @@ def main(model: str, family: str, folder: str | None) -> None:
 if __name__ == "__main__":
     if sys.argv[1] == "diffeqsolve":
         print(json.dumps(diffeqsolve()))
+    elif sys.argv[1] == "derivatives":
+        print(json.dumps(derivatives()))
     else:
         main(*sys.argv[1:3], sys.argv[3] if len(sys.argv) > 3 else None)

@@ -9,6 +9,7 @@
 
 import collections
 import contextlib
+import contextvars
 import functools as ft
 import gc
 import hashlib
@@ -23,6 +24,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import eval_context
+from jax.flatten_util import ravel_pytree
 
 from ..errors import ComputationError
 from .executor import (
@@ -35,6 +38,7 @@ from .executor import (
     on_cpu,
     to_host,
 )
+from .lanes import JACOBIAN_COLUMNS
 from .progress import say_compiling
 from .vector_math import rewrite
 
@@ -46,7 +50,7 @@ _QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusi
 _UNDIVIDED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
-_WORTH_COMPILING = 3.0
+WORTH_COMPILING = 3.0
 # Seconds in a quick executable after which a script compiles the optimized one, in about as much
 # time. Less: it waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
@@ -160,26 +164,28 @@ def quick_jit(function: Callable) -> Callable:
     return call
 
 
-def host_first(function: Callable) -> Callable:
+def host_first(function: Callable, along: Callable | None = None) -> Callable:
     """A function of few lanes, run on the host (see `executor.py`) while that is faster in total;
     compiled by `quick_jit` once the host has spent as much on arguments of the same kind as
     compiling takes. Both give the same result up to rounding.
 
-    Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`.
+    Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`; but
+    derivatives outside of programs are those of `along`, if it is given (see `by_columns`).
     """
     compiled = quick_jit(function)
     spent: dict[tuple, float] = collections.defaultdict(float)
+    derived = compiled if along is None else by_columns(compiled, along)
 
     @ft.wraps(function)
     def call(*arguments):
         if not on_cpu() or is_traced(arguments) or is_inside_program():
-            return compiled(*arguments)
+            return derived(*arguments)
         key, begin = kind(arguments), time.thread_time()
-        left = _WORTH_COMPILING - spent[key]
+        left = WORTH_COMPILING - spent[key]
         if left <= 0:
             return compiled(*arguments)
         try:
-            with uncollected(), at_ease(), at_most(left):
+            with eval_context(), uncollected(), at_ease(), at_most(left):
                 return from_host(function(*to_host(arguments)))
         except OutOfTimeError:
             return compiled(*arguments)
@@ -187,6 +193,79 @@ def host_first(function: Callable) -> Callable:
             spent[key] += time.thread_time() - begin
 
     return call
+
+
+class NotOnHostError(Exception):
+    """The host has no derivatives for these arguments."""
+
+
+_only_on_host = contextvars.ContextVar("only on host", default=False)
+
+
+@contextlib.contextmanager
+def only_on_host() -> Iterator[None]:
+    """A context in which derivatives that the host does not have raise `NotOnHostError`."""
+    before = _only_on_host.set(True)
+    try:
+        yield
+    finally:
+        _only_on_host.reset(before)
+
+
+def require_program() -> None:
+    """**Raises:** `NotOnHostError` where a derivative must come from the host."""
+    if _only_on_host.get() and not is_inside_program():
+        raise NotOnHostError
+
+
+def by_columns(
+    compiled: Callable, along: Callable, relevant: Callable = lambda tangents: tangents
+) -> Callable:
+    """`compiled`, whose derivatives outside of programs come from the host.
+
+    `along(arguments, directions)` returns the result and its derivatives in P directions. A
+    direction moves a single number of the arguments: `directions` is a tree of their form with
+    arrays (P, ...), and `None` for what does not move; so is the second result. Values are
+    concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
+    raises `NotOnHostError`, or many numbers move, derivatives are compiled, as inside of programs.
+    `relevant` replaces tangents that make no difference by `None`.
+    """
+    derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
+
+    @derived.def_jvp
+    def rule(arguments, tangents):
+        moving = jax.tree_util.tree_map(
+            lambda t, x: None if t is None else x,
+            relevant(tangents), arguments, is_leaf=lambda t: t is None,
+        )  # fmt: skip
+        leaves, structure = jax.tree_util.tree_flatten(moving)
+        ends = np.cumsum([x.size for x in leaves])
+        is_small = len(leaves) and ends[-1] <= JACOBIAN_COLUMNS
+        if not on_cpu() or is_traced(arguments) or is_inside_program() or not is_small:
+            return eqx.filter_jvp(compiled, arguments, tangents)
+        parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
+        parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
+        try:
+            with eval_context(), uncollected(), at_ease():
+                result, columns = along(
+                    to_host(arguments), jax.tree_util.tree_unflatten(structure, parts)
+                )
+        except NotOnHostError:
+            require_program()
+            return eqx.filter_jvp(compiled, arguments, tangents)
+        return from_host(result), _combined(
+            from_host(columns), jax.tree_util.tree_leaves(relevant(tangents))
+        )
+
+    return derived
+
+
+@jax.jit
+def _combined(columns, tangents):
+    """Tangents by the columns of derivatives. (One product: one for each array compiles longer.)"""
+    _, parts = ravel_pytree(jax.tree_util.tree_map(lambda x: x[0], columns))
+    matrix = jnp.concatenate([x.reshape(len(x), -1) for x in jax.tree_util.tree_leaves(columns)], 1)
+    return parts(jnp.concatenate([jnp.ravel(x) for x in tangents]) @ matrix)
 
 
 def at_ease() -> contextlib.AbstractContextManager:

@@ -143,7 +143,7 @@ def _join_common(tree, mapped, size: int, L: int):
 
 # Up to this many numbers that a lane's result depends on, its Jacobian is computed. Twice as many:
 # a Jacobian of 64 columns takes longer than the reverse mode that it spares.
-_JACOBIAN_COLUMNS = 32
+JACOBIAN_COLUMNS = 32
 
 
 def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -171,7 +171,7 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
 
     leaves = jax.tree_util.tree_leaves
     sizes = [math.prod(x.shape[:-1]) for x in leaves(moving)] + [x.size for x in leaves(common)]
-    if not sizes or sum(sizes) > _JACOBIAN_COLUMNS:
+    if not sizes or sum(sizes) > JACOBIAN_COLUMNS:
         return jax.jvp(of, (moving, common), (t_moving, t_common))
 
     total = sum(sizes)

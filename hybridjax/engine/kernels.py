@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._core.compilation import kernel
 from .._core.executor import on_host
 from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method, Radau, as_method
@@ -197,6 +198,82 @@ def _columns(function: Callable, trees: int = 2) -> Callable:
     return expand
 
 
+class Tangents(Structure):
+    """A structure whose numbers, and those of `levels`, move in P directions, for complex lanes of
+    the host: the derivatives of their real parts, times `TINY`, are their imaginary parts.
+
+    Its functions take the inputs `unpushed`. Trees of directions have arrays (P, ...), or `None`
+    for what does not move.
+    """
+
+    def __init__(
+        self, s: Structure, along: Structure, levels: Any, by_levels: Any, directions: int
+    ):
+        super().__init__(s.source)
+        self.directions, self._levels, self._plain = directions, levels, s
+        self._along = along, by_levels
+
+    def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:
+        """Inputs of zero, and the directions of lanes; of negative index, none."""
+        along = np.arange(self.directions)[:, None] == direction
+        return np.concatenate([np.zeros((self.nu, len(direction))), along])
+
+    def kernel(self, function, form, *static, trees=(), lanes=1):
+        still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
+        along = [self._along[1] if x is self._levels else still(x) for x in trees]
+        every, along = (self._plain, *trees), (self._along[0], *along)
+        moving = (0, 1, 3) if isinstance(form, _ByMethod) else (0, 1)
+        of_lanes = kernel(function, _Tangent(form, moving), static, (every, along), 16 * _POINTS)
+
+        def call(*point, some=None):
+            tangents = [point[k].imag / TINY for k in moving]
+            (u, x), further = np.split(point[2], [self.nu]), [y.real for y in point[3:]]
+            both = of_lanes(point[0].real, point[1].real, u, *further, *tangents, x)
+            return both[0] + 1j * TINY * both[1]
+
+        return call
+
+
+# Scale of tangents as imaginary parts. Their products vanish beside real parts.
+TINY = np.sqrt(np.finfo(float).tiny)
+
+
+def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
+    """Inputs of lanes of the host without any input."""
+    if not isinstance(s, Tangents):
+        return np.zeros((s.nu, len(lane)))
+    n = 1 + s.d  # directions of the start of a move come first
+    return s.pushed(lane % (n + s.directions) - n)
+
+
+class _Tangent(NamedTuple):
+    """A form, and its derivative along tangents of the arguments `moving` and of all trees."""
+
+    form: Callable
+    moving: tuple[int, ...]
+
+    def __call__(self, function: Callable, trees: tuple, along: tuple) -> Callable:
+        def moved(trees, along, *point):
+            *point, x = point
+            step = lambda y, dy: y if dy is None else y + jnp.tensordot(x, dy, 1)  # noqa: E731
+            return function(*jax.tree_util.tree_map(step, trees, along), *point)
+
+        lanes = self.form(moved, trees, along)
+
+        def both(*arguments):
+            point = list(arguments[: -1 - len(self.moving)])
+            tangents = arguments[len(point) :]
+
+            def at(*moved):
+                now = dict(zip(self.moving, moved[:-1], strict=True))
+                return lanes(*(now.get(k, x) for k, x in enumerate(point)), moved[-1])
+
+            start = *(point[k] for k in self.moving), jnp.zeros_like(tangents[-1])
+            return jnp.stack(jax.jvp(at, start, tangents))
+
+        return both
+
+
 class _ByMethod(NamedTuple):
     """Lanes of what a Runge-Kutta method computes of a field, from (t, q) over h under u."""
 
@@ -221,14 +298,14 @@ def _divergence(method: Method, field: Callable, t, q, u, h):
     return integrated_divergence(method, lambda t, q: field(t, q, u, h), t, q, h)
 
 
-def _linear_step(method: Method, field: Callable, t, q, u, h):
+def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
     """The end of a step, the field there, and the derivatives of the end by time, states, inputs
     and h, as columns of one array."""
 
     def end(t, q, u, h):
         fixed = jax.lax.stop_gradient((u, h))
-        still = lambda t, q: field(t, q, *fixed)  # noqa: E731
-        step = take_step(method, lambda t, q: field(t, q, u, h), t, q, h, still=still)
+        still = lambda t, q: field(t, q, *fixed, *x)  # noqa: E731
+        step = take_step(method, lambda t, q: field(t, q, u, h, *x), t, q, h, still=still)
         return step.q, step.f1
 
     n, L = q.shape

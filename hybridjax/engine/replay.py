@@ -12,13 +12,14 @@ saltation formula.
 
 import dataclasses
 import functools as ft
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Inexact, Int
 
+from .._core.compilation import NotOnHostError
 from ..systems.structure import Member, Structure
 from ..systems.transition import Scheduled
 from . import kernels
@@ -144,8 +145,8 @@ class _Moves(NamedTuple):
 class _Linear(NamedTuple):
     """(t, q) after some moves, and its derivatives by (t, q, u) before them: moves come first."""
 
-    end: Float[np.ndarray, "M n"]
-    by: Float[np.ndarray, "M n m"]
+    end: Inexact[np.ndarray, "M n"]
+    by: Inexact[np.ndarray, "M n m"]
 
 
 def chain(
@@ -163,20 +164,80 @@ def chain(
     direction of the flow has no meaning: it is projected out of every move, so that it does not
     drown the other directions, however strongly the flow contracts.
     """
-    n, L = 1 + s.d, len(lanes.t)
-    moves = _moves(lanes, tape)
+    n, moves = 1 + s.d, _moves(lanes, tape)
     end, by = _linear_moves(s, moves, target)
     if across is not None:
         by[:, :, 1:n] = by[:, :, 1:n] @ _across(s, moves, across)
-    columns = np.tile(np.eye(n, n + s.nu), (L, 1, 1))
-    ends = np.concatenate([lanes.t[None], lanes.q]).T
+    columns, ends = _products(moves, by, len(lanes.t)), np.concatenate([lanes.t[None], lanes.q])
+    ends[:, moves.lane] = end.T  # (the last move of a lane comes last)
+    return columns[:, :, 1:n] if of_states else columns, ends
+
+
+def _products(moves: "_Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndarray:
+    """Derivatives of (t, q) at the ends of lanes by (t, q, u) at their starts."""
+    n, m = by.shape[1:]
+    columns = np.tile(np.eye(n, m, dtype=by.dtype), (L, 1, 1))
     for order in range(1 + max(moves.order, default=-1)):
         now = moves.order == order
         lane = moves.lane[now]
         columns[lane] = by[now, :, :n] @ columns[lane]
         columns[lane, :, n:] += by[now, :, n:]
-        ends[lane] = end[now]
-    return columns[:, :, 1:n] if of_states else columns, ends.T
+    return columns
+
+
+class Variation:
+    """Recorded lanes that follow each other, each beginning where the last one ended, and their
+    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets."""
+
+    def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times):
+        moves, n, P = _moves(lanes, tape), 1 + s.d, s.directions
+        self._s, self._moves, self.first = s, moves, np.flatnonzero(moves.order == 0)
+        due = [g for a in range(len(s.charts)) for g in s.schedules(a)]
+        if np.isin(moves.code, due).any() or len(self.first) < len(lanes.t):
+            raise NotOnHostError
+        self.starts = _Moves(*(x[..., self.first] for x in moves))
+        # Every move in all directions: of its start, and the P ones.
+        many = lambda x: np.repeat(x, n + P, axis=-1)  # noqa: E731
+        aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), len(moves.t))
+        along = _Moves(*map(many, moves))
+        lane = along.lane * (n + P) + np.arange(len(along.t)) % (n + P)
+        along = along._replace(t=along.t + aside[0], q=along.q + aside[1:], lane=lane)
+        later = np.concatenate([np.zeros((n, len(lanes.t))), times]).T.ravel()
+        target = dataclasses.replace(
+            target, time=many(target.time) + 1j * kernels.TINY * later,
+            index=many(np.broadcast_to(target.index, target.time.shape)),
+        )  # fmt: skip
+        end, by = _linear_moves(s, along, target)
+        by, end = by.reshape(-1, n + P, *by.shape[1:]), end.reshape(-1, n + P, n)[:, n:]
+        self._by, self._change = np.real(by[:, 0]), np.imag(by) / kernels.TINY
+        self._kick = np.moveaxis(np.imag(end) / kernels.TINY, 1, 2)
+
+    def tangents(self, begin: Float[np.ndarray, "n P"]) -> Float[np.ndarray, "moves n P"]:
+        """Tangents of (t, q) where moves start, and at the last end."""
+        starts = [begin]
+        for by, kick in zip(self._by[:, :, : len(begin)], self._kick, strict=True):
+            starts.append(by @ starts[-1] + kick)
+        return np.stack(starts)
+
+    def jacobians(self, tangents: Float[np.ndarray, "moves n P"]) -> Any:
+        """Derivatives (L, P, n, m) of (t, q) at the ends of lanes by (t, q, u) at their starts, and
+        their own in each direction, as complex numbers."""
+        moves, (M, n, m), P = self._moves, self._by.shape, tangents.shape[2]
+        along = np.concatenate([tangents[:-1], np.tile(np.eye(P), (M, 1, 1))], axis=1)
+        change = np.moveaxis(along, 1, 2) @ self._change.reshape(*along.shape[:2], n * m)
+        by = self._by[:, None] + 1j * kernels.TINY * change.reshape(M, P, n, m)
+        lane, order = (np.repeat(x, P) for x in (moves.lane, moves.order))
+        moves = moves._replace(lane=lane * P + np.arange(M * P) % P, order=order)
+        columns = _products(moves, by.reshape(-1, n, m), len(self.first) * P)
+        return columns.reshape(-1, P, n, m)
+
+    def points(self, tangents: Float[np.ndarray, "moves n P"]) -> tuple:
+        """Times, charts, states and inputs where lanes start, in each direction."""
+        P, starts = tangents.shape[2], self.starts
+        aside = np.moveaxis(tangents[self.first], 1, 0).reshape(tangents.shape[1], -1)
+        t, chart, q = (np.repeat(x, P, axis=-1) for x in (starts.t, starts.chart, starts.q))
+        u, aside = self._s.pushed(np.arange(len(t)) % P), 1j * kernels.TINY * aside
+        return t + aside[0], chart, q + aside[1:], u
 
 
 class Link(NamedTuple):
@@ -209,7 +270,8 @@ def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
 
 def _linear_moves(s: Structure, moves: _Moves, target: Target) -> _Linear:
     n, M = 1 + s.d, len(moves.t)
-    linear = _Linear(np.zeros((M, n)), np.zeros((M, n, n + s.nu)))
+    number = target.time.dtype
+    linear = _Linear(np.zeros((M, n), number), np.zeros((M, n, n + s.nu), number))
     for a in np.unique(moves.chart):
         in_chart = np.flatnonzero(moves.chart == a)
         of_chart = _linear(s, int(a), _Moves(*(x[..., in_chart] for x in moves)), target)
@@ -248,7 +310,7 @@ def _moves(lanes: Lanes, tape: Tape) -> _Moves:
 def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
     """Moves that start in chart a."""
     n, M, code = s.dims[a], len(moves.t), moves.code
-    u = np.zeros((s.nu, M))
+    u = kernels.unpushed(s, moves.lane)
     by_clock, on_time = np.isin(code, s.schedules(a)), code == ARRIVE_TIME
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
     goal = target.time[moves.lane]
@@ -256,7 +318,7 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
     q, dq, f = _step(s, a, moves.t, moves.q[:n], u, h)
     t = np.where(on_time, goal, moves.t + h)
     # By (t, q, u), with the length of the step as the last; that to a known time shrinks with t.
-    dt = np.zeros((M, 1, dq.shape[2]))
+    dt = np.zeros((M, 1, dq.shape[2]), dq.dtype)
     dt[:, 0, [0, -1]] = 1.0
     shrinks = (by_clock | on_time)[:, None]
     dq[:, :, 0] -= shrinks * dq[:, :, -1]
@@ -271,19 +333,24 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
         zero = flow.locate(*point, which[lands])
         t[lands] += zero.past
         q[:, lands] = zero.q
-        f = kernels.field(s, a, t[lands], q[:, lands], u[:, lands])[:, 0].T[:, :, None]
+        by_field = np.moveaxis(kernels.field(s, a, t[lands], q[:, lands], u[:, lands]), -1, 0)
+        f, (f_t, f_q, f_u) = by_field[:, :, :1], _split(by_field, n)
         rows = kernels.watched(
             s, a, target.levels, t[lands], q[:, lands], u[:, lands], index[lands]
         )
         row = np.argmax(np.array(flow.rows)[:, None] == which[lands], axis=0)
         by_t, by_q, by_u = _split(rows[row, :, np.arange(len(lands))][:, None], n)
-        change = by_t @ dt[lands] + by_q @ dq[lands]
+        # (Over the time past: nothing but rounding errors, with derivatives.)
+        past, moved = zero.past[:, None, None], dq[lands]
+        moved = moved + past * (f_t @ dt[lands] + f_q @ moved)
+        moved[:, :, 1 + n :] += past * f_u
+        change = by_t @ dt[lands] + by_q @ moved
         change[:, :, 1 + n :] += by_u
         delay = -change / (by_t + by_q @ f)
         dt[lands] += delay
-        dq[lands] += f @ delay
+        dq[lands] = moved + f @ delay
 
-    end, by = np.zeros((M, 1 + s.d)), np.zeros((M, 1 + s.d, 1 + s.d + s.nu))
+    end, by = np.zeros((M, 1 + s.d), dq.dtype), np.zeros((M, 1 + s.d, 1 + s.d + s.nu), dq.dtype)
     columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
     for kind in [(-1,), *s.kinds]:
         now = np.flatnonzero(np.isin(np.maximum(code, -1), kind))
@@ -311,7 +378,7 @@ def _step(s: Structure, a: int, t, q, u, h):
     n, M = q.shape
     m = 2 + n + s.nu
     method = s.method(a)
-    if method.implicit:
+    if method.implicit or isinstance(s, kernels.Tangents):
         expanded = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h), -1, 0))
         return expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     stages = len(method.b) + 1

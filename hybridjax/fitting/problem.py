@@ -1,6 +1,8 @@
 """Weighted residuals of data as a function of free parameters, and their minimization."""
 
+import collections
 import dataclasses
+import time
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -9,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.compilation import quick_jit
+from .._core import compilation
+from .._core.compilation import NotOnHostError, kind, only_on_host, quick_jit
+from .._core.executor import is_inside_program, on_cpu
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
-from ..orbits.newton import MAX_STEPS as NEWTON_STEPS, root
+from ..orbits.newton import MAX_STEPS as NEWTON_STEPS, root, solve
 from ..systems.system import HybridSystem
 from ..systems.varied import parameter_of, with_parameters
 from .observations import AbstractObservation
@@ -118,14 +122,19 @@ def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
     flow, and take two thirds of the time of compilation.
     """
     map = guess.return_map.at_phase_of(system)
-    q, turn, steps = root(map, False, NEWTON_STEPS)
-    period = map.expected if map.base is None else map.turn(q, turn.record).period
+    if is_inside_program():
+        q, turn, steps = root(map, False, NEWTON_STEPS)
+        period, anchor = map.turn(q, turn.record).period, map.departure(q)
+    else:
+        anchor, turn, steps, _ = solve(map, True)
+        period = turn.period
+    period = map.expected if map.base is None else period
     code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)
     return dataclasses.replace(
         guess,
         system=system,
         period=period,
-        anchor=map.departure(q),
+        anchor=anchor,
         legs=guess.legs._replace(q=jnp.full_like(guess.legs.q, jnp.nan)),
         factors=jnp.full_like(guess.factors, jnp.nan),
         residual=turn.distance,
@@ -153,7 +162,6 @@ class FitProblem(eqx.Module):
         return jnp.where((cycle.result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
 
 
-@quick_jit
 def _with_jacobian(problem: FitProblem, x, guess):
     """Return residuals (r,) and Jacobian (r, p): all columns in one pass, in forward mode."""
     push = jax.vmap(
@@ -162,11 +170,26 @@ def _with_jacobian(problem: FitProblem, x, guess):
     return push(jnp.eye(x.shape[0]))
 
 
+_compiled = quick_jit(_with_jacobian)
+_spent: dict[tuple, float] = collections.defaultdict(float)
+
+
 def evaluate(
     problem: FitProblem, x: Float[Array | np.ndarray, " p"], guess: LimitCycle
 ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
-    """Return residuals and Jacobian at x."""
-    return jax.device_get(_with_jacobian(problem, jnp.asarray(x), guess))
+    """Return residuals and Jacobian at x, from the host until compiling is worth its time."""
+    arguments = problem, jnp.asarray(x), guess
+    key, begin = kind(arguments), time.thread_time()
+    # (The whole program takes about eight times as long to compile as that of a cycle.)
+    if _spent[key] < 8 * compilation.WORTH_COMPILING and on_cpu():
+        try:
+            with only_on_host():
+                return jax.device_get(_with_jacobian(*arguments))
+        except NotOnHostError:
+            _spent[key] = np.inf
+        finally:
+            _spent[key] += time.thread_time() - begin
+    return jax.device_get(_compiled(*arguments))
 
 
 def descend(

@@ -299,7 +299,7 @@ class LDTP(eqx.Module):
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
         """The padded product `A[i+N-1] ... A[i]` over one period from section `i`."""
         require_x64()
-        return time_response.monodromy(jnp.roll(self.A, -section, axis=0))
+        return time_response.monodromy_from(self.A, section)
 
     def characteristic_polynomial(self) -> Float[Array, " coefficients"]:
         r"""Coefficients $1, c_1, \ldots, c_d$ of $\det(\lambda I - \Phi)$, highest power first.

@@ -16,6 +16,13 @@ def monodromy(A: Float[Array, "N d d"]) -> Float[Array, "d d"]:
     return scan(_multiplied, namespace(A).eye(A.shape[-1], dtype=A.dtype), A)[0]
 
 
+@functools.partial(jax.jit, static_argnames="section")
+def monodromy_from(A: Float[Array, "N d d"], section: int) -> Float[Array, "d d"]:
+    """The product of one period from a section. (A loop outside of a program is compiled anew at
+    each of its derivatives.)"""
+    return monodromy(jnp.roll(A, -section, axis=0))
+
+
 def _multiplied(product, factor):
     return factor @ product, None
 

@@ -5,6 +5,7 @@ attempt of another kind, such as a restart from a random state, is added there.
 """
 
 import dataclasses
+import functools as ft
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,12 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.compilation import host_first, quick_jit
+from .._core.compilation import NotOnHostError, host_first, quick_jit
 from .._core.executor import Array, on_host
 from .._core.progress import say
 from .._core.results import Result
+from ..engine import kernels
 from ..engine.lanes import Lanes
-from .return_map import SINGULAR, ReturnMap, Turn
+from ..engine.replay import Variation
+from ..engine.watch import slopes
+from .crossing import ListLevels
+from .return_map import SINGULAR, ReturnMap, Turn, across
 
 
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
@@ -71,16 +76,59 @@ def search(map: ReturnMap, patient: bool = False) -> Solution:
     return solution
 
 
-@host_first
+def _solve(map: ReturnMap, once_more: bool = False) -> Solution:
+    q, turn, steps = root(map, False, MAX_STEPS)
+    if once_more and not on_host(q):  # (where the host's last turn begins, a step is rounding)
+        turn = map.turn_with_jacobian(q, record=turn.record)
+    return Solution(map.departure(q), turn._replace(record=None), steps, map.judge(q, turn))
+
+
+def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solution]:
+    """`solve` on the host, and its derivatives: implicit ones of the state, then those of the
+    recorded turn."""
+    (map, _), (by, _), solution = arguments, directions, _solve(*arguments)
+    turn, ends, sizes = solution.turn, map.ends(), map.sizes
+    if map.conserved or not solution.is_fixed_point:
+        raise NotOnHostError
+    P = len(jax.tree_util.tree_leaves(by)[0])
+    levels = None if ends.levels is None else ListLevels((by.base,))
+    s = kernels.Tangents(map.structure, by.structure, ends.levels, levels, P)
+    begin = np.zeros((1 + len(sizes), P))
+    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
+    longer = np.zeros(P) if by.expected is None else by.expected
+    part = np.where(np.isfinite(ends.time), (ends.time - map.anchor.t) / map.expected, 0.0)
+    times = begin[0][:, None] * np.isfinite(ends.time) + longer[:, None] * part
+    tapes = jax.tree_util.tree_map(lambda x: np.moveaxis(x[..., 0], 0, -1), turn.tapes)
+    orbit = Variation(s, turn.legs, ends, tapes, times)
+    # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
+    moved = np.where(map.valid, orbit.tangents(begin)[-1, 1:].T, 0.0) / sizes
+    jacobian = turn.jacobian * sizes / sizes[:, None]
+    begin[1:] = (newton_steps(np.tile(jacobian, (P, 1, 1)), moved) * sizes).T
+    tangents = orbit.tangents(begin)
+    t_legs = np.moveaxis(tangents[orbit.first], 0, -1)
+    legs, factors = turn.legs, orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)]
+    if map.base is not None:
+        f = slopes(s, *orbit.points(tangents)).T.reshape(*factors.shape[:3])
+        factors = across(f, map.scale[legs.chart][:, None], factors)
+    nothing = jax.tree_util.tree_map(lambda _: None, solution)
+    moving = nothing.turn._replace(
+        legs=nothing.turn.legs._replace(t=t_legs[0], q=np.moveaxis(t_legs[1:], 1, 0)),
+        factors=np.moveaxis(factors.imag / kernels.TINY, 1, 0),
+        period=tangents[-1, 0] - begin[0],
+    )
+    t_anchor = None if by.anchor.t is None else begin[0][:, None]
+    anchor = nothing.anchor._replace(t=t_anchor, q=begin[1:].T[..., None])
+    return solution, nothing._replace(anchor=anchor, turn=moving)
+
+
+@ft.partial(host_first, along=_solve_along)
 def solve(map: ReturnMap, once_more: bool = False) -> Solution:
     """Newton's method from the anchor's state.
 
     **Arguments:** `once_more`: whether to compute one more turn on the cycle, so that the result
     has the derivatives of the cycle.
     """
-    q, turn, steps = root(map, False, MAX_STEPS)
-    turn = map.turn_with_jacobian(q, record=turn.record) if once_more else turn
-    return Solution(map.departure(q), turn._replace(record=None), steps, map.judge(q, turn))
+    return _solve(map, once_more)
 
 
 @quick_jit

@@ -227,7 +227,7 @@ class ReturnMap(eqx.Module):
         as_lanes = lambda x: xp.moveaxis(x[..., 0], 0, -1)  # noqa: E731
         legs, tape = jax.tree_util.tree_map(as_lanes, (legs, tapes))
         if on_host(q):
-            factors = tape_jacobian(s, legs, self._ends(), tape, of_states=True)[0][:, 1:]
+            factors = tape_jacobian(s, legs, self.ends(), tape, of_states=True)[0][:, 1:]
         codes, valid = tapes.code[..., 0], self.valid
         off, by_state = self.held(q)
         returned = xp.where(valid[:, None], monodromy(factors), 0.0)
@@ -238,7 +238,7 @@ class ReturnMap(eqx.Module):
             held = derivative_at_zero(lambda step: along(step).held(q)[0])
             jacobian = jnp.column_stack([jacobian, jnp.where(valid, total, 0.0) - held])
         if self.base is not None:
-            factors = self._across(legs, factors)
+            factors = across(self.slopes(legs).T, self.scale[legs.chart], factors)
         defect = xp.abs(end.residual) + xp.abs(off)
         return Turn(
             end.residual, jacobian, legs, factors, codes, tapes.t[..., 0],
@@ -307,7 +307,7 @@ class ReturnMap(eqx.Module):
 
         The pieces end at K - 1 times, then on the section on which the turn began.
         """
-        xp, ends = namespace(q), self._ends()
+        xp, ends = namespace(q), self.ends()
 
         def leg(carry, end):
             lanes, h, result = carry
@@ -325,7 +325,7 @@ class ReturnMap(eqx.Module):
         residual = xp.where(same, residual, np.nan)
         return Return(residual, end.t[0] - self.anchor.t[0], result[0]), extra
 
-    def _ends(self) -> Target:
+    def ends(self) -> Target:
         """The ends of the pieces, as lanes."""
         t0, expected, xp = self.anchor.t[0], self.expected, namespace(self.expected)
         k = xp.arange(1, LEGS + 1)
@@ -351,37 +351,46 @@ class ReturnMap(eqx.Module):
         falls = (level[1:-1] > 0) & (level[2:] <= 0) & (legs.events[1:-1] == legs.events[2:])
         return 1 + xp.sum(falls, dtype=np.int32)
 
-    def _across(self, legs: Lanes, factors: Float[Array, "K d d"]) -> Float[Array, "K d d"]:
-        """The factors on the states modulo the direction of the flow.
 
-        Nothing contracts along the flow of an autonomous system. Projected out of every factor,
-        that direction cannot drown a strong contraction across it.
-        """
-        xp, sizes = namespace(factors), self.scale[legs.chart]
-        f = self.slopes(legs).T / sizes
-        f = f / xp.linalg.norm(f, axis=1, keepdims=True)
-        project = np.eye(f.shape[1]) - f[:, :, None] * f[:, None, :]
-        project = project * sizes[:, :, None] / sizes[:, None, :]
-        return xp.roll(project, -1, axis=0) @ factors @ project
+def across(
+    f: Float[Array, "K *b d"], sizes: Float[Array, "K *b d"], factors: Float[Array, "K *b d d"]
+) -> Float[Array, "K *b d d"]:
+    """Factors of an autonomous system on the states modulo the direction f of the flow.
+
+    Nothing contracts along the flow of an autonomous system. Projected out of every factor,
+    that direction cannot drown a strong contraction across it.
+    """
+    xp, f = namespace(factors), f / sizes
+    f = f / xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
+    project = np.eye(f.shape[-1]) - f[..., :, None] * f[..., None, :]
+    project = project * sizes[..., :, None] / sizes[..., None, :]
+    return xp.roll(project, -1, axis=0) @ factors @ project
 
 
 def with_derivatives(
-    s: Structure, function: Callable, chart: Int[Array, " L"], t: Array, q: Array, rows: int
+    s: Structure,
+    function: Callable,
+    chart: Int[Array, " L"],
+    t: Array,
+    q: Array,
+    rows: int,
+    u: Array | None = None,
 ) -> Float[Array, "rows columns L"]:
     """Evaluate a function and its derivatives by the time, the d states and the inputs at points of
     any charts; rows and columns that a chart does not have are zero.
 
-    **Arguments:** `function`: of chart, t, q and u, as those of `engine.kernels`.
+    **Arguments:** `function`: of chart, t, q and u, as those of `engine.kernels`. `u`: Default: 0.
     """
     xp, L = namespace(t), len(t)
+    u = xp.zeros((s.nu, 1)) if u is None else u
 
     def work(a, here, out):
         n = s.dims[a]
-        by = function(a, only(here, t), only(here, q[:n]), xp.zeros((s.nu, 1)))
+        by = function(a, only(here, t), only(here, q[:n]), only(here, u))
         index = np.ix_(np.arange(len(by)), np.r_[: 2 + n, 2 + s.d : 2 + s.d + s.nu])
         return put(out, index, xp.where(here, by, out[index]))
 
-    begin = xp.zeros((rows, 2 + s.d + s.nu, L))
+    begin = xp.zeros((rows, 2 + s.d + s.nu, L), t.dtype)
     return for_each_chart(s, chart, xp.ones(L, bool), work, begin)
 
 

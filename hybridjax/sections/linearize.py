@@ -1,12 +1,15 @@
 """From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
 
+import dataclasses
+from typing import Any
+
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
-from .._core.compilation import host_first
+from .._core.compilation import by_columns, host_first
 from .._core.executor import Array, is_traced, namespace
 from .._core.progress import working
 from ..engine import kernels
@@ -15,7 +18,8 @@ from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..orbits.return_map import with_derivatives
 from ..systems.system import Output, OutputNames
-from .place import as_placed
+from .families import AbstractSections, as_family
+from .place import as_placed, place_along, place_sections
 from .placed import PlacedSections, SectionsLike
 
 
@@ -49,23 +53,65 @@ def linearize(
     lies, or uses the time without having the period of a clock, or an input that does not exist;
     `ComputationError` as `place_sections`.
     """
-    placed = as_placed(cycle, sections)
-    s, traced, charts = placed.structure(), is_traced(placed), range(len(cycle.system.charts()))
+    s, traced = cycle.structure, is_traced(cycle, sections)
+    of_family = traced and not isinstance(sections, PlacedSections)
+    placed: Any = sections if of_family else as_placed(cycle, sections)
     z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
-    for a in charts if traced else np.unique(placed.lanes.chart):
+    for a in range(len(s.charts)) if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
-    names, columns = s.inputs_among(inputs)
-    A, B = placed.flow_jacobians
-    C, D = _output_jacobians(placed, tuple(z.items))
-    d = s.d + 1
+    (names, columns), d = s.inputs_among(inputs), s.d + 1
+    if of_family:
+        A, B, C, D, dims = _of_family(cycle, as_family(placed), tuple(z.items))
+    else:
+        A, B, C, D, dims = _matrices_of(placed, tuple(z.items))
     if not traced:
         A, B, C, D = jax.device_get((A, B, C, D))
-        d = int(np.max(np.asarray(placed.dims)))
+        d = int(np.max(np.asarray(dims)))
     return LDTP(
-        A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
+        A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], dims,
         inputs=names, outputs=z.names,
         coordinates=None if traced else placed.coordinates(),
     )  # fmt: skip
+
+
+def _matrices_of(placed: PlacedSections, outputs: tuple[str | Output, ...]) -> tuple[Any, ...]:
+    return *placed.flow_jacobians, *_output_jacobians(placed, outputs), placed.dims
+
+
+def _matrices(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str | Output, ...]):
+    return _matrices_of(place_sections(cycle, family), outputs)
+
+
+def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
+    """`_matrices` on the host, and its derivatives."""
+    (cycle, family, outputs), (by_cycle, by_family, _) = arguments, directions
+    placed, moved, s, jacobians = place_along(cycle, family, by_cycle, by_family)
+    (N, P, n, _), lanes = jacobians.shape, moved.lanes
+    embed, select = moved.frames()
+    after = np.roll(select.reshape(N, P, *select.shape[1:]), -1, axis=0)
+    A = after @ jacobians[..., :n] @ embed.reshape(N, P, *embed.shape[1:])
+    values = lambda a, *point: kernels.outputs(s, a, outputs, *point)  # noqa: E731
+    u = s.pushed(np.arange(N * P) % P)
+    by = with_derivatives(s, values, lanes.chart, lanes.t, lanes.q, len(outputs), u)
+    J = np.moveaxis(by[:, 1:], -1, 0)
+    C, D = (x.reshape(N, P, *x.shape[1:]) for x in (J[..., :n] @ embed, J[..., n:]))
+    each = A, after @ jacobians[..., n:], C, D
+    return _matrices_of(placed, outputs), (
+        *(np.moveaxis(x.imag / kernels.TINY, 1, 0) for x in each),
+        None,
+    )
+
+
+def _relevant(tangents: tuple) -> tuple:
+    """Tangents of what the matrices depend on."""
+    cycle, *definitions = tangents
+    nothing, anchor = jax.tree_util.tree_map(lambda _: None, cycle), cycle.anchor
+    anchor = nothing.anchor._replace(t=anchor.t, q=anchor.q)
+    moving = dict(system=cycle.system, period=cycle.period, anchor=anchor)
+    return dataclasses.replace(nothing, **moving), *definitions
+
+
+_of_family = by_columns(_matrices, _matrices_along, _relevant)
 
 
 @host_first

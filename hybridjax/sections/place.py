@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.compilation import at_ease, host_first, quick_jit
+from .._core.compilation import NotOnHostError, at_ease, host_first, quick_jit, require_program
 from .._core.executor import Array, is_traced, namespace, on_host, put, scan, stop_gradient, to_host
 from .._core.lanes import by_lane
 from .._core.precision import require_x64
@@ -19,13 +20,14 @@ from ..engine import kernels
 from ..engine.cubic import interpolate
 from ..engine.lanes import IDLE, Lanes, for_each_chart, only
 from ..engine.move import Options, move
+from ..engine.replay import Variation
 from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
 from ..orbits.coincidence import SAME, TOGETHER
-from ..orbits.crossing import Crossing, to_section
+from ..orbits.crossing import Crossing, ListLevels, to_section
 from ..orbits.cycle import LimitCycle
-from ..orbits.return_map import PATIENCE, ReturnMap
+from ..orbits.return_map import PATIENCE, ReturnMap, with_derivatives
 from ..systems.structure import Structure
 from . import families
 from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
@@ -62,16 +64,21 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     for placed in () if is_traced((cycle, family)) else list(_recent):
         if placed.cycle is cycle and eqx.tree_equal(*jax.device_get((placed.family, family))):
             return placed
-    map = cycle.return_map
-    family.check(map.structure)
-    steps = max(map.settings.max_steps, PATIENCE)
-    map = dataclasses.replace(map, settings=dataclasses.replace(map.settings, max_steps=steps))
-    first, fields = _place(map, family)
+    family.check(cycle.structure)
+    if is_traced((cycle, family)):
+        require_program()
+    first, fields = _place(_patient(cycle), family)
     placed = PlacedSections(cycle, family, *fields)
     if not is_traced((cycle, family)):
         _check(placed, int(first))
         _recent.append(placed)
     return placed
+
+
+def _patient(cycle: LimitCycle) -> ReturnMap:
+    map = cycle.return_map
+    steps = max(map.settings.max_steps, PATIENCE)
+    return dataclasses.replace(map, settings=dataclasses.replace(map.settings, max_steps=steps))
 
 
 def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
@@ -101,6 +108,11 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
 def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tuple]:
     """The `Result` of the flow to section 0, which lies at the anchor if that is a crossing, and
     the fields of `PlacedSections` from `bound` on."""
+    return _locate(map, family, [])
+
+
+def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any, Any]:
+    """As `_place`; on the host `flows` gets the start, the target and the tape of every flow."""
     s, N = Structure(map.system), family.n_sections
     period, begin, xp = map.expected, map.anchor, namespace(map.expected)
     u = xp.zeros((s.nu, 1))
@@ -109,6 +121,7 @@ def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tu
         lanes, h, result = carry
         options = Options(tape=True, tangents=True)
         moved, tape = move(s, lanes, u, target, map.settings, h, result, options)
+        flows.append((lanes, target, tape))
         return (moved.lanes, moved.h, moved.result), tape
 
     def to_next(carry, k, bound):
@@ -158,6 +171,85 @@ def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tu
     with_time = xp.isinf(bound.time) & (map.base is None)
     dims = xp.asarray(s.dims)[lanes.chart] + with_time - ~flat
     return first, (bound, lanes, tape, end - lanes.t, result, drop, dims, normal)
+
+
+def place_along(
+    cycle: LimitCycle, family: AbstractSections, by_cycle: LimitCycle, by_family: AbstractSections
+) -> tuple[PlacedSections, PlacedSections, kernels.Tangents, np.ndarray]:
+    """Sections placed on the host; and in P directions, as complex numbers of N P sections (see
+    `kernels.Tangents`): the same, the structure, and the Jacobians (N, P, n, m) of the flow."""
+    flows: list[Any] = []
+    map, N, M = _patient(cycle), family.n_sections, family.points
+    placed = PlacedSections(cycle, family, *_locate(map, family, flows)[1])
+    if np.any(placed.result):
+        raise NotOnHostError
+    P = len(jax.tree_util.tree_leaves((by_cycle, by_family))[0])
+    s, bound = map.structure, placed.bound
+    x, longer = np.zeros((1 + s.d, P)), np.zeros(P) if by_cycle.period is None else by_cycle.period
+    x[0] = 0.0 if by_cycle.anchor.t is None else by_cycle.anchor.t[:, 0]
+    x[1:] = 0.0 if by_cycle.anchor.q is None else by_cycle.anchor.q[..., 0].T
+
+    def follow(flows, by_levels, times):
+        levels = flows[0][1].levels
+        flows = [(lanes, dataclasses.replace(to, levels=None), tape) for lanes, to, tape in flows]
+        stacked = jax.tree_util.tree_map(lambda *x: np.stack(x), *flows)
+        lanes, target, tape = _side_by_side(stacked)
+        target = dataclasses.replace(target, levels=levels)
+        by_levels = None if levels is None else by_levels
+        along = kernels.Tangents(s, by_cycle.structure, levels, by_levels, P)
+        flow = Variation(along, lanes, target, tape, times)
+        return flow, flow.tangents(x), along
+
+    if isinstance(family.anchor, Crossing):
+        x = follow(flows[:1], ListLevels((cast(Crossing, by_family.anchor),)), np.zeros((P, 1)))[1][
+            -1
+        ]
+        flows = flows[1:]
+    start, points = flows[0][0], x[None]
+    orbit = Orbit(cycle.period, start.t, start.chart, start.q.T)
+    if M > 1:
+        times = x[0][:, None] + longer[:, None] * np.arange(1, M + 1) / M
+        flow, points, _ = follow(flows[:M], None, times)
+        points, flows = points[flow.first], flows[M:]
+        orbit = Orbit(cycle.period, flow.starts.t, flow.starts.chart, flow.starts.q.T)
+    moving = longer, np.moveaxis(points[:, 0], 1, 0), np.moveaxis(points[:, 1:], 2, 0)
+    directions = by_cycle.structure, by_family, moving
+    raw, by_bound = to_host(_bind_along(s, family, orbit, directions))
+    clock = np.isfinite(bound.time)
+    late = np.rint((bound.time[0] - raw.time[0]) / cycle.period) if clock[0] else 0.0
+    k = np.arange(N + 1)[-len(flows) :]
+    by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
+    times = clock[k % N] * (by_time[:, k % N] + (late + k // N) * longer[:, None])
+    flow, tangents, along = follow(flows, by_bound.levels, times)
+    t, chart, q, u = (y[..., -N * P :] for y in flow.points(tangents))
+    many = lambda y: np.repeat(y, P)  # noqa: E731
+    index, levels = many(np.arange(N, dtype=np.int32)), bound.levels
+
+    def gradient(a, t, q, u):
+        n = 2 + s.dims[a] + s.nu
+        if levels is None or not levels.present(s, a):
+            return np.zeros((1, n, N * P))
+        return kernels.watched(along, a, levels, t, q, u, index)[-1:]
+
+    normal = with_derivatives(along, gradient, chart, t, q, 1, u)[0, 1 : 2 + s.d].T
+    normal = np.where(many(np.isinf(bound.time) & (bound.event < 0))[:, None], normal, 0.0)
+    moved = dataclasses.replace(
+        placed, bound=dataclasses.replace(bound, time=many(bound.time)),
+        lanes=placed.lanes._replace(t=t, chart=chart, q=q), drop=many(placed.drop),
+        dims=many(placed.dims), normal=normal,
+    )  # fmt: skip
+    return placed, moved, along, flow.jacobians(tangents)[-N:]
+
+
+@quick_jit
+def _bind_along(s: Structure, family: AbstractSections, orbit: Orbit, directions: tuple):
+    def bind(s, family, moving):
+        period, t, q = moving
+        return family.bind(s, Orbit(period, t, orbit.chart, q))
+
+    begin = s, family, (orbit.period, orbit.t, orbit.q)
+    push = lambda tangents: eqx.filter_jvp(bind, begin, tangents)  # noqa: E731
+    return eqx.filter_vmap(push, out_axes=(None, 0))(directions)
 
 
 class _FromAnchor(AbstractLevels):

@@ -44,7 +44,7 @@ def compiled():
 @pytest.mark.slow
 def test_no_operation_outside_of_programs_compiles_one(monkeypatch):
     # (However much the host has done in tests before.)
-    monkeypatch.setattr(compilation, "_WORTH_COMPILING", np.inf)
+    monkeypatch.setattr(compilation, "WORTH_COMPILING", np.inf)
     u = np.full((EXPERIMENTS, PERIODS * SECTIONS, 1), 1e-3)
     with compiled() as names:
         cycle = hj.find_limit_cycle(hj.models.VerticalHopper(k=10.5))

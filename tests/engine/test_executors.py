@@ -87,12 +87,12 @@ def test_both_agree_on_random_systems(name):
 @pytest.fixture(scope="module")
 def compiled(hopper_cycle):
     """The hopper's cycle by compiled programs only."""
-    patience = compilation._WORTH_COMPILING
-    compilation._WORTH_COMPILING = -1.0
+    patience = compilation.WORTH_COMPILING
+    compilation.WORTH_COMPILING = -1.0
     try:
         return hj.find_limit_cycle(hopper_cycle.system)
     finally:
-        compilation._WORTH_COMPILING = patience
+        compilation.WORTH_COMPILING = patience
 
 
 @pytest.mark.slow

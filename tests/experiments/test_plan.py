@@ -29,7 +29,7 @@ def test_host_and_program_try_the_same_ways(name, monkeypatch):
     sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
     scale = np.concatenate([np.full((7, 1), float(cycle.period)), sizes], axis=1)
     host = plan._try_ways(placed, settings, np.zeros((1, len(cycle.system.inputs))))
-    monkeypatch.setattr(compilation, "_WORTH_COMPILING", -1.0)
+    monkeypatch.setattr(compilation, "WORTH_COMPILING", -1.0)
     xla = plan._try_ways(placed, settings, np.zeros((1, len(cycle.system.inputs))))
     after = np.roll(scale, -1, axis=0).T[:, None, None]
     np.testing.assert_allclose(host.ends / after, xla.ends / after, atol=1e-13)

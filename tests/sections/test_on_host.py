@@ -1,0 +1,100 @@
+"""Derivatives outside of programs come from the host: against finite differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import hybridjax as hj
+from hybridjax._core.compilation import NotOnHostError, only_on_host
+
+from ..conftest import APEX
+
+
+@pytest.fixture
+def compiles_none():
+    with only_on_host():
+        yield
+
+
+def measured(guess, family):
+    """What users differentiate, as a function of a system."""
+
+    def measure(system):
+        cycle = hj.find_limit_cycle(system, guess)
+        model = hj.linearize(cycle, family)
+        # (Under transformations, matrices are padded with zeros.)
+        matrices = model.A[:, :1, :1], model.B[:, :1], model.C[..., :1], cycle.factors
+        polynomial = model.characteristic_polynomial()[:2]
+        parts = *matrices, polynomial, cycle.period, cycle.anchor.q, cycle.legs.q
+        return jnp.concatenate([jnp.ravel(x) for x in parts])
+
+    return measure
+
+
+def agrees(system, measure, rtol):
+    """Derivatives of all outputs in a direction of all parameters, and reverse mode."""
+    numbers, others = eqx.partition(system, eqx.is_inexact_array)
+    flat, unravel = ravel_pytree(numbers)
+    along = flat * np.random.default_rng(0).uniform(-1, 1, flat.shape)
+    at = lambda h: measure(eqx.combine(unravel(flat + h * along), others))  # noqa: E731
+    by_host = np.asarray(jax.jacfwd(at)(0.0))
+    e = 2e-4
+    minus2, minus, plus, plus2 = (np.asarray(at(k * e)) for k in (-2, -1, 1, 2))
+    differences = (8 * (plus - minus) - (plus2 - minus2)) / (12 * e)
+    np.testing.assert_allclose(by_host, differences, rtol=rtol, atol=rtol * np.max(np.abs(by_host)))
+    weights = np.cos(np.arange(len(by_host)))
+    reverse = jax.grad(lambda h: weights @ at(h))(0.0)
+    np.testing.assert_allclose(reverse, weights @ by_host, rtol=1e-11)
+
+
+FAMILIES = {
+    "clock": hj.ClockPhase(4, anchor=0.3),
+    "angle": hj.KinematicPhase(
+        4, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
+    ),
+    "arc": hj.ArcLength(4, ("yM", "vM"), APEX),
+    "event": [hj.AtEvent("touchdown"), APEX],
+}
+
+
+SLOW = [pytest.param(x, marks=pytest.mark.slow) for x in ("clock", "arc", "event")]
+
+
+@pytest.mark.usefixtures("compiles_none")
+@pytest.mark.parametrize("family", ["angle", *SLOW])
+def test_a_hopper(hopper_cycle, family):
+    """Two charts, clock; the sections move with the cycle."""
+    agrees(hopper_cycle.system, measured(hopper_cycle, FAMILIES[family]), 1e-8)
+
+
+@pytest.mark.usefixtures("compiles_none")
+def test_an_autonomous_wheel():
+    """The period depends on the parameters, and the flow is projected out of the factors."""
+    wheel = hj.models.RimlessWheel()
+    cycle = hj.find_limit_cycle(wheel, section=hj.AtEvent("impact"))
+    sections = [hj.AtEvent("impact"), hj.Crossing("th", "rising", 0.1)]
+    agrees(wheel, measured(cycle, sections), 1e-8)
+
+
+@pytest.mark.usefixtures("compiles_none")
+def test_numbers_of_sections(hopper_cycle):
+    """A section is a definition, whose numbers have derivatives as those of systems."""
+
+    def determinant(value):
+        sections = [hj.Crossing("vM", "falling", value)]
+        return hj.linearize(hopper_cycle, sections, "yM").C[0, 0, 0]
+
+    e = 1e-4
+    differences = (determinant(e) - determinant(-e)) / (2 * e)
+    np.testing.assert_allclose(jax.grad(determinant)(0.0), differences, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.usefixtures("compiles_none")
+def test_schedules_are_left_to_programs():
+    buck = hj.models.BuckConverter()
+    cycle = hj.find_limit_cycle(buck)
+    with pytest.raises(NotOnHostError):
+        eqx.filter_grad(lambda x: hj.find_limit_cycle(x, cycle).anchor.q[0, 0])(buck)
