@@ -51,6 +51,9 @@ _WORTH_COMPILING = 3.0
 # time. Less: it waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
 _WORTH_OPTIMIZING = 8.0
+# Calls of a loop of steps, in scripts and in interactive sessions, after which a thread compiles it.
+# Fewer: it takes longer than it saves. More: calls stay slow for longer.
+_WORTH_A_LOOP, _WORTH_A_LOOP_AT_ONCE = 300, 60
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
 # is 1024.
 _LOOP_KERNELS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
@@ -360,11 +363,7 @@ def kernel(
     (XLA runs the smallest programs, of a thousand operations, in the thread that calls them, and
     hands larger ones to another thread, which takes longer than they do.)
     """
-    leaves, structure = jax.tree_util.tree_flatten(trees)
-    arrays = jax.device_put([x for x in leaves if _is_array(x)])
-    # (1, 1.0 and True are equal, and not the same.)
-    static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
-    program = _kernel_program(function, form, static, structure, static_leaves, lanes)
+    program, arrays = _bound(function, form, static, trees, lanes)
 
     def call(*arguments, some=None):
         if some is not None:
@@ -382,6 +381,41 @@ def kernel(
         return np.concatenate(parts, axis=-1)[..., :L]
 
     return call
+
+
+def deferred(
+    function: Callable, form: Callable, static: tuple[Hashable, ...], trees: Any
+) -> Callable:
+    """A `kernel` of any arguments and results, for which there is another way: it returns None,
+    until it has been called so often that a thread compiles it, and has done so."""
+    program, arrays = _bound(function, form, static, trees, 1)
+    worth = _WORTH_A_LOOP_AT_ONCE if hasattr(sys, "ps1") else _WORTH_A_LOOP
+
+    def call(*arguments):
+        calls = _calls[program] = _calls.get(program, 0) + 1
+        if calls < 0:
+            return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
+        if calls == worth:
+            threading.Thread(target=compile_, args=arguments).start()
+        return None
+
+    def compile_(*arguments):
+        program(arrays, *arguments)
+        _calls[program] = -sys.maxsize
+
+    return call
+
+
+_calls: dict[Callable, int] = {}
+
+
+def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:
+    """The program of a kernel, and the arrays of its trees."""
+    leaves, structure = jax.tree_util.tree_flatten(trees)
+    arrays = jax.device_put([x for x in leaves if _is_array(x)])
+    # (1, 1.0 and True are equal, and not the same.)
+    static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
+    return _kernel_program(function, form, static, structure, static_leaves, lanes), arrays
 
 
 @ft.lru_cache(_KEPT)

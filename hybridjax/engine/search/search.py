@@ -4,15 +4,23 @@ The search decides on step sizes, on the order of events, and on failures. It is
 its decisions are recorded in a `Tape`, which `replay` follows.
 """
 
-import numpy as np
+import functools as ft
+from collections.abc import Callable
+from typing import Any
 
-from ..._core.executor import cond, namespace, put, while_loop
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ..._core.compilation import deferred
+from ..._core.executor import cond, namespace, on_host, put, while_loop
 from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..arrays import Index, Inputs, Mask, Times
 from ..events import SAME_TIME, arm, next_schedule
-from ..lanes import Lanes, blank_tape, for_each_chart, only, write_row
+from ..lanes import Lanes, Tape, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
 from ..target import Target
 from ..watch import chart_field, watch
@@ -33,6 +41,8 @@ _FIRST_STEP = 0.1
 # once: the first step is no shorter than this part of the time allowed. Higher: stiff systems
 # reject it. Lower: more steps until they have grown.
 _SHORTEST = 1e-6
+# Steps without events in one call of a compiled loop. Fewer: more calls. More: larger arrays.
+_ROWS = 32
 
 
 def search(
@@ -60,6 +70,10 @@ def search(
 
         def iterate(carry):
             state, tape = carry
+            if on_host(state.h) and len(state.h) == 1 and not state.approach.on[0]:
+                state = _without_events(state, tape, task)
+                if not going((state, tape)):
+                    return state, tape
             aim = take_aim(state, task)
             step = state, aim, attempt(state, aim, task), task
             calm = uneventful(*step).all()
@@ -80,6 +94,77 @@ def search(
         return Recorded(Moved(end.lanes, end.h, end.error, end.result), written)
 
     return cond(arrives.all(), in_one_step, all_the_way)
+
+
+def _without_events(state: State, tape: Tape | None, task: Task) -> State:
+    """The state of a single lane of the host before its next event, if the loop up to there is
+    compiled (see `deferred`)."""
+    s, target, a = task.s, task.target, int(state.lanes.chart[0])
+    trees, static = (target.levels, task.settings), (a, bool(task.tangents), target.missed)
+    every = s, *trees
+    loop = s.once(("calm", static), trees, lambda: deferred(_calm_steps, _whole, static, every))
+    ends = target.time, target.index, target.limit
+    moved = loop(state, task.u, ends, task.span, task.stride)
+    if moved is None:
+        return state
+    moving, count, rows = moved
+    if tape is not None and count > 0:
+        h, code, t, *q = rows[:count].T
+        q = np.stack(q, axis=1)[..., None]
+        row = Tape(h[:, None], code[:, None], t[:, None], q, q, state.lanes.chart)
+        write_row(tape, slice(state.i, state.i + count), row)
+    return _with(state, moving)
+
+
+def _whole(function: Callable, *trees: Any) -> Callable:
+    return ft.partial(function, *trees)
+
+
+def _moving(state: State) -> tuple:
+    """What steps without events change."""
+    (t, _, q, _, _, pace), *_ = state
+    steps = state.h, state.along, state.error, state.result, state.arrived, state.i
+    return t, q, pace, state.watched, *steps
+
+
+def _with(state: State, moving: tuple) -> State:
+    t, q, pace, watched, *steps = moving
+    lanes = state.lanes._replace(t=t, q=q, pace=pace)
+    return State(lanes, watched, state.aimed, state.approach, *steps)
+
+
+def _calm_steps(a: int, tangents: bool, missed: Result, s, levels, settings, state, u, ends, *way):
+    """Steps of a lane in chart a up to the first that is not without events, their number, and
+    their rows of the tape."""
+    time, index, limit = ends
+    none, no = np.zeros(1, np.int32), np.zeros(1, bool)
+    target = Target(time, index, none - 1, limit, None, levels, missed)
+    task = Task(s, u, target, *way, settings, tangents)
+    # (As constants, these take their branches when they are traced.)
+    state = state._replace(lanes=state.lanes._replace(chart=none + a))
+    state = state._replace(
+        approach=Approach(no, none - 1, 0.0 * none, 0.0 * none, 0.0 * none, none)
+    )
+    begin, unravel = ravel_pytree(_moving(state))
+
+    def going(carry):
+        _, count, _, on = carry
+        return on & (count < _ROWS)
+
+    def body(carry):
+        x, count, rows, _ = carry
+        begin = _with(state, unravel(x))._replace(result=none, arrived=no)
+        aim = take_aim(begin, task)
+        step = begin, aim, attempt(begin, aim, task, in_step=True), task
+        calm = (uneventful(*step) & (aim.which < 0))[0]
+        end, row = without_events(*step)
+        rows = rows.at[count].set(jnp.concatenate([row.h, row.code, row.t, row.before[:, 0]]))
+        on = calm & end.active[0] & (end.i < settings.max_steps)
+        return jnp.where(calm, ravel_pytree(_moving(end))[0], x), count + calm, rows, on
+
+    carry = begin, 0, jnp.zeros((_ROWS, 3 + s.d)), True
+    x, count, rows, _ = jax.lax.while_loop(going, body, carry)
+    return unravel(x), count, rows
 
 
 def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
