@@ -236,5 +236,7 @@ def _stacked(systems) -> HybridSystem:
     if len(kinds) != 1:
         raise DefinitionError("`systems` must be at least one system, all of the same class.")
     arrays = [eqx.filter(x, eqx.is_array) for x in systems]
-    stacked = jax.tree_util.tree_map(lambda *x: jnp.stack(x), *arrays)
+    # (By NumPy: a program of JAX with thousands of arguments compiles for minutes.)
+    stack = lambda *x: jax.device_put(np.stack([np.asarray(y) for y in x]))  # noqa: E731
+    stacked = jax.tree_util.tree_map(stack, *arrays)
     return eqx.combine(stacked, eqx.filter(systems[0], eqx.is_array, inverse=True))

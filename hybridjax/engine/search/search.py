@@ -19,12 +19,12 @@ from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..arrays import Index, Inputs, Mask, Times
-from ..events import SAME_TIME, arm, next_schedule
-from ..lanes import Lanes, Tape, blank_tape, for_each_chart, only, write_row
+from ..events import INSTANT, SAME_TIME, arm, next_schedule
+from ..lanes import IDLE, Lanes, Tape, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
 from ..target import Target
 from ..watch import chart_field, watch
-from .accept import uneventful
+from .accept import accurate, uneventful
 from .attempt import attempt, deviation
 from .outcome import level_counts, with_events, without_events
 from .state import Aim, Approach, Attempt, Moved, Options, Recorded, State, Stride, Task
@@ -141,10 +141,8 @@ def _calm_steps(a: int, tangents: bool, missed: Result, s, levels, settings, sta
     target = Target(time, index, none - 1, limit, None, levels, missed)
     task = Task(s, u, target, *way, settings, tangents)
     # (As constants, these take their branches when they are traced.)
-    state = state._replace(lanes=state.lanes._replace(chart=none + a))
-    state = state._replace(
-        approach=Approach(no, none - 1, 0.0 * none, 0.0 * none, 0.0 * none, none)
-    )
+    still = Approach(no, none - 1, 0.0 * none, 0.0 * none, 0.0 * none, none)
+    state = state._replace(lanes=state.lanes._replace(chart=none + a), approach=still)
     begin, unravel = ravel_pytree(_moving(state))
 
     def going(carry):
@@ -155,12 +153,18 @@ def _calm_steps(a: int, tangents: bool, missed: Result, s, levels, settings, sta
         x, count, rows, _ = carry
         begin = _with(state, unravel(x))._replace(result=none, arrived=no)
         aim = take_aim(begin, task)
-        step = begin, aim, attempt(begin, aim, task, in_step=True), task
-        calm = (uneventful(*step) & (aim.which < 0))[0]
+        new = attempt(begin, aim, task, in_step=True)
+        step, free = (begin, aim, new, task), aim.which[0] < 0
+        calm = free & uneventful(*step)[0]
         end, row = without_events(*step)
-        rows = rows.at[count].set(jnp.concatenate([row.h, row.code, row.t, row.before[:, 0]]))
-        on = calm & end.active[0] & (end.i < settings.max_steps)
-        return jnp.where(calm, ravel_pytree(_moving(end))[0], x), count + calm, rows, on
+        shorter = free & ~accurate(new, task)[0] & (end.h >= INSTANT * task.span)[0]
+        code = jnp.where(calm, row.code, IDLE)
+        rows = rows.at[count].set(jnp.concatenate([row.h, code, row.t, row.before[:, 0]]))
+        again = begin._replace(h=end.h, i=end.i)
+        after, again = (ravel_pytree(_moving(state))[0] for state in (end, again))
+        on = ((calm & end.active[0]) | shorter) & (end.i < settings.max_steps)
+        x = jnp.where(calm, after, jnp.where(shorter, again, x))
+        return x, count + (calm | shorter), rows, on
 
     carry = begin, 0, jnp.zeros((_ROWS, 3 + s.d)), True
     x, count, rows, _ = jax.lax.while_loop(going, body, carry)
