@@ -51,8 +51,8 @@ _WORTH_COMPILING = 3.0
 # time. Less: it waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
 _WORTH_OPTIMIZING = 8.0
-# Calls of a loop of steps, in scripts and in interactive sessions, after which a thread compiles it.
-# Fewer: it takes longer than it saves. More: calls stay slow for longer.
+# Calls of a loop of steps, in a script and in an interactive session, after which a thread compiles
+# it. Fewer: it takes longer than it saves. More: calls stay slow for longer.
 _WORTH_A_LOOP, _WORTH_A_LOOP_AT_ONCE = 300, 60
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
 # is 1024.
