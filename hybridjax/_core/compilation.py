@@ -166,28 +166,37 @@ def quick_jit(function: Callable) -> Callable:
 def host_first(function: Callable) -> Callable:
     """A function of few lanes, run on the host (see `executor.py`) while that is faster in total;
     compiled by `quick_jit` once the host has spent as much on arguments of the same kind as
-    compiling takes. Both give the same result up to rounding.
+    compiling takes: in a thread, or at once if a single call has taken so long. Both give the same
+    result up to rounding.
 
     Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`.
     """
     compiled = quick_jit(function)
     spent: dict[tuple, float] = collections.defaultdict(float)
+    programs: dict[tuple, Callable] = {}
+
+    def compile_(key, arguments):
+        # (It is not run: programs with factorizations may run in one thread only, see `in_turn`.)
+        programs[key] = getattr(compiled, "lower")(*arguments).compile()  # noqa: B009
 
     @ft.wraps(function)
     def call(*arguments):
         if not on_cpu() or is_traced(arguments) or is_inside_program():
             return compiled(*arguments)
         key, begin = kind(arguments), time.thread_time()
-        left = _WORTH_COMPILING - spent[key]
-        if left <= 0:
-            return compiled(*arguments)
+        before = spent[key]
+        if key in programs:
+            return programs[key](*arguments)
         try:
-            with uncollected(), at_ease(), at_most(left):
+            with uncollected(), at_ease(), at_most(_WORTH_COMPILING):
                 return from_host(function(*to_host(arguments)))
         except OutOfTimeError:
+            programs[key] = compiled
             return compiled(*arguments)
         finally:
             spent[key] += time.thread_time() - begin
+            if before <= _WORTH_COMPILING < spent[key] and key not in programs:
+                threading.Thread(target=compile_, args=(key, arguments)).start()
 
     return call
 
