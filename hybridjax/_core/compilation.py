@@ -4,7 +4,8 @@
 - `host_first` runs a function on the host until compiling it is worth its time.
 - `TwoTiers` compiles the experiments twice: a quick executable for the first answer, and the fully
   optimized one in a thread beside it.
-- `kernel` compiles single functions of users for code that runs on the host.
+- `kernel` compiles single functions of users for code that runs on the host, and `deferred` loops
+  of them.
 """
 
 import collections
@@ -51,9 +52,6 @@ _WORTH_COMPILING = 3.0
 # time. Less: it waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
 _WORTH_OPTIMIZING = 8.0
-# Calls of a loop of steps, in a script and in an interactive session, after which a thread compiles
-# it. Fewer: it takes longer than it saves. More: calls stay slow for longer.
-_WORTH_A_LOOP, _WORTH_A_LOOP_AT_ONCE = 300, 60
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
 # is 1024.
 _LOOP_KERNELS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
@@ -395,26 +393,31 @@ def kernel(
 def deferred(
     function: Callable, form: Callable, static: tuple[Hashable, ...], trees: Any
 ) -> Callable:
-    """A `kernel` of any arguments and results, for which there is another way: it returns None,
-    until it has been called so often that a thread compiles it, and has done so."""
+    """A `kernel` of any arguments and results, for which there is another way: it returns None
+    until it has been called so often that a thread compiles it, and has done so.
+
+    That takes a tenth of the time of a whole program, and a call spares some ms of the other way.
+    In interactive sessions there is time between calls: the thread starts earlier.
+    """
     program, arrays = _bound(function, form, static, trees, 1)
-    worth = _WORTH_A_LOOP_AT_ONCE if hasattr(sys, "ps1") else _WORTH_A_LOOP
+    worth = _WORTH_COMPILING * (16 if hasattr(sys, "ps1") else 128)
 
     def call(*arguments):
         calls = _calls[program] = _calls.get(program, 0) + 1
         if calls < 0:
             return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
-        if calls == worth:
+        if calls - 1 < worth <= calls:
             threading.Thread(target=compile_, args=arguments).start()
         return None
 
     def compile_(*arguments):
         program(arrays, *arguments)
-        _calls[program] = -sys.maxsize
+        _calls[program] = -sys.maxsize  # (less than zero from now on)
 
     return call
 
 
+# Calls of each such program.
 _calls: dict[Callable, int] = {}
 
 

@@ -5,8 +5,6 @@ its decisions are recorded in a `Tape`, which `replay` follows.
 """
 
 import functools as ft
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,8 +39,6 @@ _FIRST_STEP = 0.1
 # once: the first step is no shorter than this part of the time allowed. Higher: stiff systems
 # reject it. Lower: more steps until they have grown.
 _SHORTEST = 1e-6
-# Steps without events in one call of a compiled loop. Fewer: more calls. More: larger arrays.
-_ROWS = 32
 
 
 def search(
@@ -71,7 +67,7 @@ def search(
         def iterate(carry):
             state, tape = carry
             if on_host(state.h) and len(state.h) == 1 and not state.approach.on[0]:
-                state = _without_events(state, tape, task)
+                state = _calm_steps(state, tape, task)
                 if not going((state, tape)):
                     return state, tape
             aim = take_aim(state, task)
@@ -96,58 +92,55 @@ def search(
     return cond(arrives.all(), in_one_step, all_the_way)
 
 
-def _without_events(state: State, tape: Tape | None, task: Task) -> State:
-    """The state of a single lane of the host before its next event, if the loop up to there is
-    compiled (see `deferred`)."""
+def _calm_steps(state: State, tape: Tape | None, task: Task) -> State:
+    """The state of a single lane of the host before its next event, if the loop of steps up to
+    there is compiled; else the state itself."""
     s, target, a = task.s, task.target, int(state.lanes.chart[0])
-    trees, static = (target.levels, task.settings), (a, bool(task.tangents), target.missed)
-    every = s, *trees
-    loop = s.once(("calm", static), trees, lambda: deferred(_calm_steps, _whole, static, every))
+    trees, static = (target.levels, task.settings), ((a, bool(task.tangents), target.missed),)
+    make = lambda: deferred(_calm_loop, ft.partial, static, (s, *trees))  # noqa: E731
+    loop = s.once(("calm steps", static), trees, make)
     ends = target.time, target.index, target.limit
-    moved = loop(state, task.u, ends, task.span, task.stride)
-    if moved is None:
+    taken = loop(state, task.u, ends, task.span, task.stride)
+    if taken is None:
         return state
-    moving, count, rows = moved
+    moving, count, rows = taken
     if tape is not None and count > 0:
-        h, code, t, *q = rows[:count].T
-        q = np.stack(q, axis=1)[..., None]
-        row = Tape(h[:, None], code[:, None], t[:, None], q, q, state.lanes.chart)
+        h, code, t, *q = rows[:count].T[..., None]
+        q = np.stack(q, axis=1)
+        row = Tape(h, code, t, q, q, state.lanes.chart)
         write_row(tape, slice(state.i, state.i + count), row)
     return _with(state, moving)
 
 
-def _whole(function: Callable, *trees: Any) -> Callable:
-    return ft.partial(function, *trees)
-
-
 def _moving(state: State) -> tuple:
-    """What steps without events change."""
+    """Parts of a state that steps without events change."""
     (t, _, q, _, _, pace), *_ = state
     steps = state.h, state.along, state.error, state.result, state.arrived, state.i
     return t, q, pace, state.watched, *steps
 
 
 def _with(state: State, moving: tuple) -> State:
+    """A state with other such parts."""
     t, q, pace, watched, *steps = moving
     lanes = state.lanes._replace(t=t, q=q, pace=pace)
     return State(lanes, watched, state.aimed, state.approach, *steps)
 
 
-def _calm_steps(a: int, tangents: bool, missed: Result, s, levels, settings, state, u, ends, *way):
-    """Steps of a lane in chart a up to the first that is not without events, their number, and
-    their rows of the tape."""
-    time, index, limit = ends
+def _calm_loop(static: tuple, s, levels, settings: Settings, state: State, u, ends, *way):
+    """Steps of a lane, accepted and rejected, up to the first that may have an event or fail: the
+    moving parts of its state, the number of steps, and rows of the tape."""
+    (a, tangents, missed), (time, index, limit) = static, ends
     none, no = np.zeros(1, np.int32), np.zeros(1, bool)
     target = Target(time, index, none - 1, limit, None, levels, missed)
     task = Task(s, u, target, *way, settings, tangents)
-    # (As constants, these take their branches when they are traced.)
+    # (Branches on constants are taken when the loop is traced.)
     still = Approach(no, none - 1, 0.0 * none, 0.0 * none, 0.0 * none, none)
     state = state._replace(lanes=state.lanes._replace(chart=none + a), approach=still)
     begin, unravel = ravel_pytree(_moving(state))
 
     def going(carry):
-        _, count, _, on = carry
-        return on & (count < _ROWS)
+        _, count, rows, on = carry
+        return on & (count < len(rows))
 
     def body(carry):
         x, count, rows, _ = carry
@@ -166,7 +159,8 @@ def _calm_steps(a: int, tangents: bool, missed: Result, s, levels, settings, sta
         x = jnp.where(calm, after, jnp.where(shorter, again, x))
         return x, count + (calm | shorter), rows, on
 
-    carry = begin, 0, jnp.zeros((_ROWS, 3 + s.d)), True
+    rows = jnp.zeros((min(settings.max_steps, Settings().max_steps), 3 + s.d))
+    carry = begin, 0, rows, True
     x, count, rows, _ = jax.lax.while_loop(going, body, carry)
     return unravel(x), count, rows
 
