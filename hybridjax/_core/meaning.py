@@ -78,9 +78,38 @@ def code_digest(x: Definition) -> str:
 
     **Raises:** `DefinitionError`, as `meaning`.
     """
+    if (digests := _of_call.get()) is None:
+        return _code_digest(x)
+    leaves, structure = jax.tree_util.tree_flatten(x)
+    key = structure, *(None if eqx.is_array(y) else (type(y), y) for y in leaves)
+    try:
+        if key not in digests:
+            digests[key] = _code_digest(x)
+    except TypeError:  # (something in it has no hash)
+        return _code_digest(x)
+    return digests[key]
+
+
+def _code_digest(x: Definition) -> str:
     walk = _Walk(jax.tree_util.tree_map(lambda x: None if eqx.is_array(x) else x, x))
     _clear_old_traces(walk.alive, walk.result)
     return walk.result
+
+
+_of_call: contextvars.ContextVar[dict[tuple, str] | None] = contextvars.ContextVar(
+    "of_call", default=None
+)
+
+
+@contextlib.contextmanager
+def unchanged_code() -> Iterator[None]:
+    """A context of a single call, in which definitions that differ in arrays only have one digest.
+    (Thousands of systems of a sweep are given at once.)"""
+    token = _of_call.set({})
+    try:
+        yield
+    finally:
+        _of_call.reset(token)
 
 
 _JITTED: Any = type(jax.jit(len))
