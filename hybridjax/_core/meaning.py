@@ -78,27 +78,21 @@ def code_digest(x: Definition) -> str:
 
     **Raises:** `DefinitionError`, as `meaning`.
     """
-    if (digests := _of_call.get()) is None:
-        return _code_digest(x)
+    digests: dict[tuple, str] | None = _of_call.get(None)
     leaves, structure = jax.tree_util.tree_flatten(x)
     key = structure, *(None if eqx.is_array(y) else (type(y), y) for y in leaves)
-    try:
-        if key not in digests:
-            digests[key] = _code_digest(x)
-    except TypeError:  # (something in it has no hash)
-        return _code_digest(x)
-    return digests[key]
-
-
-def _code_digest(x: Definition) -> str:
+    with contextlib.suppress(TypeError):  # (something in it has no hash)
+        if digests is not None and key in digests:
+            return digests[key]
     walk = _Walk(jax.tree_util.tree_map(lambda x: None if eqx.is_array(x) else x, x))
     _clear_old_traces(walk.alive, walk.result)
+    with contextlib.suppress(TypeError):
+        if digests is not None:
+            digests[key] = walk.result
     return walk.result
 
 
-_of_call: contextvars.ContextVar[dict[tuple, str] | None] = contextvars.ContextVar(
-    "of_call", default=None
-)
+_of_call: contextvars.ContextVar[dict[tuple, str]] = contextvars.ContextVar("of_call")
 
 
 @contextlib.contextmanager

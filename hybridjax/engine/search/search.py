@@ -100,7 +100,7 @@ def _calm_steps(state: State, tape: Tape | None, task: Task) -> State:
     make = lambda: deferred(_calm_loop, ft.partial, static, (s, *trees))  # noqa: E731
     loop = s.once(("calm steps", static), trees, make)
     ends = target.time, target.index, target.limit
-    taken = loop(state, task.u, ends, task.span, task.stride)
+    taken = loop(state, task.u, ends, (task.span, task.stride))
     if taken is None:
         return state
     moving, count, rows = taken
@@ -126,13 +126,13 @@ def _with(state: State, moving: tuple) -> State:
     return State(lanes, watched, state.aimed, state.approach, *steps)
 
 
-def _calm_loop(static: tuple, s, levels, settings: Settings, state: State, u, ends, *way):
+def _calm_loop(static: tuple, s, levels, settings: Settings, state: State, u, ends, way):
     """Steps of a lane, accepted and rejected, up to the first that may have an event or fail: the
     moving parts of its state, the number of steps, and rows of the tape."""
-    (a, tangents, missed), (time, index, limit) = static, ends
+    (a, tangents, missed), (time, index, limit), (span, stride) = static, ends, way
     none, no = np.zeros(1, np.int32), np.zeros(1, bool)
     target = Target(time, index, none - 1, limit, None, levels, missed)
-    task = Task(s, u, target, *way, settings, tangents)
+    task = Task(s, u, target, span, stride, settings, tangents)
     # (Branches on constants are taken when the loop is traced.)
     still = Approach(no, none - 1, 0.0 * none, 0.0 * none, 0.0 * none, none)
     state = state._replace(lanes=state.lanes._replace(chart=none + a), approach=still)
