@@ -2,9 +2,9 @@
 
 Seconds of the wall's clock after the import, for each call in turn: `find_limit_cycle`,
 `linearize`, `run_experiments` (80 experiments, 84 cycles), `find_limit_cycle` again. `cold` begins
-with an empty cache, `cached` with the one that the cold process left, `later` after a process that has made programs be
-compiled thoroughly. A third process changes a parameter and counts
-what is traced or compiled again, and looks for host callbacks in all programs.
+with an empty cache, `cached` with the one that the cold process left, `later` after a process
+that has made programs be compiled thoroughly. A third process changes a parameter and counts what
+is traced or compiled again, and looks for host callbacks in all programs.
 
 `own` is the hopper again, of classes that are defined in `__main__`, as in a notebook, on kinematic
 sections; `bar` is the bar, with its four charts, on both families (`times_hopper`: as multiples of
