@@ -27,7 +27,7 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
 # 890 the responses of cycles; of the tests, 630 are those of both.
 LIMITS = {
-    "code": 25_370,
+    "code": 25_485,
     "files": 222,
     "longest": 500,
     "public_names": 170,
@@ -36,7 +36,7 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_685,
+    "test_lines": 16_760,
     "doc_words": 36_000,
 }
 

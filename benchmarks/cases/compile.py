@@ -1,10 +1,10 @@
 """First calls in fresh processes on two cores, without and with a cache of compiled programs.
 
 Seconds of the wall's clock after the import, for each call in turn: `find_limit_cycle`,
-`linearize`, `run_experiments` (80 experiments, 84 cycles). `cold` begins with an empty cache,
-`cached` with the one that the cold process left, `later` after a process that has made programs be
-compiled thoroughly. A third process changes a parameter and counts
-what is traced or compiled again, and looks for host callbacks in all programs.
+`linearize`, `run_experiments` (80 experiments, 84 cycles), `find_limit_cycle` again. `cold` begins
+with an empty cache, `cached` with the one that the cold process left, `later` after a process
+that has made programs be compiled thoroughly. A third process changes a parameter and counts what
+is traced or compiled again, and looks for host callbacks in all programs.
 
 `own` is the hopper again, of classes that are defined in `__main__`, as in a notebook, on kinematic
 sections; `bar` is the bar, with its four charts, on both families (`times_hopper`: as multiples of
@@ -98,6 +98,7 @@ def first_calls(model: str, family: str, repetition: int = 0):
     timed("linearize", lambda: hj.linearize(cycle, own, outputs))
     data = timed("run_experiments", lambda: hj.run_experiments(cycle, own, design, outputs))
     assert data.ok.all()
+    timed("find_limit_cycle_again", lambda: hj.find_limit_cycle(system))
     return seconds
 
 

@@ -4,7 +4,8 @@
 - `host_first` runs a function on the host until compiling it is worth its time.
 - `TwoTiers` compiles the experiments twice: a quick executable for the first answer, and the fully
   optimized one in a thread beside it.
-- `kernel` compiles single functions of users for code that runs on the host.
+- `kernel` compiles single functions of users for code that runs on the host, and `deferred` loops
+  of them.
 """
 
 import collections
@@ -167,7 +168,8 @@ def quick_jit(function: Callable) -> Callable:
 def host_first(function: Callable, along: Callable | None = None) -> Callable:
     """A function of few lanes, run on the host (see `executor.py`) while that is faster in total;
     compiled by `quick_jit` once the host has spent as much on arguments of the same kind as
-    compiling takes. Both give the same result up to rounding.
+    compiling takes: in a thread, or at once if a single call has taken so long. Both give the same
+    result up to rounding.
 
     Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`; but
     derivatives outside of programs are those of `along`, if it is given (see `by_columns`).
@@ -175,22 +177,30 @@ def host_first(function: Callable, along: Callable | None = None) -> Callable:
     compiled = quick_jit(function)
     spent: dict[tuple, float] = collections.defaultdict(float)
     derived = compiled if along is None else by_columns(compiled, along)
+    programs: dict[tuple, Callable] = {}
+
+    def compile_(key, arguments):
+        # (It is not run: programs with factorizations may run in one thread only, see `in_turn`.)
+        programs[key] = getattr(compiled, "lower")(*arguments).compile()  # noqa: B009
 
     @ft.wraps(function)
     def call(*arguments):
         if not on_cpu() or is_traced(arguments) or is_inside_program():
             return derived(*arguments)
         key, begin = kind(arguments), time.thread_time()
-        left = WORTH_COMPILING - spent[key]
-        if left <= 0:
-            return compiled(*arguments)
+        before = spent[key]
+        if key in programs:
+            return programs[key](*arguments)
         try:
-            with eval_context(), uncollected(), at_ease(), at_most(left):
+            with eval_context(), uncollected(), at_ease(), at_most(WORTH_COMPILING):
                 return from_host(function(*to_host(arguments)))
         except OutOfTimeError:
+            programs[key] = compiled
             return compiled(*arguments)
         finally:
             spent[key] += time.thread_time() - begin
+            if before <= WORTH_COMPILING < spent[key] and key not in programs:
+                threading.Thread(target=compile_, args=(key, arguments)).start()
 
     return call
 
@@ -439,11 +449,7 @@ def kernel(
     (XLA runs the smallest programs, of a thousand operations, in the thread that calls them, and
     hands larger ones to another thread, which takes longer than they do.)
     """
-    leaves, structure = jax.tree_util.tree_flatten(trees)
-    arrays = jax.device_put([x for x in leaves if _is_array(x)])
-    # (1, 1.0 and True are equal, and not the same.)
-    static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
-    program = _kernel_program(function, form, static, structure, static_leaves, lanes)
+    program, arrays = _bound(function, form, static, trees, lanes)
 
     def call(*arguments, some=None):
         if some is not None:
@@ -461,6 +467,46 @@ def kernel(
         return np.concatenate(parts, axis=-1)[..., :L]
 
     return call
+
+
+def deferred(
+    function: Callable, form: Callable, static: tuple[Hashable, ...], trees: Any
+) -> Callable:
+    """A `kernel` of any arguments and results, for which there is another way: it returns None
+    until it has been called so often that a thread compiles it, and has done so.
+
+    That takes a tenth of the time of a whole program, and a call spares some ms of the other way.
+    In interactive sessions there is time between calls: the thread starts earlier.
+    """
+    program, arrays = _bound(function, form, static, trees, 1)
+    worth = WORTH_COMPILING * (16 if hasattr(sys, "ps1") else 128)
+
+    def call(*arguments):
+        calls = _calls[program] = _calls.get(program, 0) + 1
+        if calls < 0:
+            return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
+        if calls - 1 < worth <= calls:
+            threading.Thread(target=compile_, args=arguments).start()
+        return None
+
+    def compile_(*arguments):
+        program(arrays, *arguments)
+        _calls[program] = -sys.maxsize  # (less than zero from now on)
+
+    return call
+
+
+# Calls of each such program.
+_calls: dict[Callable, int] = {}
+
+
+def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:
+    """The program of a kernel, and the arrays of its trees."""
+    leaves, structure = jax.tree_util.tree_flatten(trees)
+    arrays = jax.device_put([x for x in leaves if _is_array(x)])
+    # (1, 1.0 and True are equal, and not the same.)
+    static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
+    return _kernel_program(function, form, static, structure, static_leaves, lanes), arrays
 
 
 @ft.lru_cache(_KEPT)

@@ -78,9 +78,32 @@ def code_digest(x: Definition) -> str:
 
     **Raises:** `DefinitionError`, as `meaning`.
     """
+    digests: dict[tuple, str] | None = _of_call.get(None)
+    leaves, structure = jax.tree_util.tree_flatten(x)
+    key = structure, *(None if eqx.is_array(y) else (type(y), y) for y in leaves)
+    with contextlib.suppress(TypeError):  # (something in it has no hash)
+        if digests is not None and key in digests:
+            return digests[key]
     walk = _Walk(jax.tree_util.tree_map(lambda x: None if eqx.is_array(x) else x, x))
     _clear_old_traces(walk.alive, walk.result)
+    with contextlib.suppress(TypeError):
+        if digests is not None:
+            digests[key] = walk.result
     return walk.result
+
+
+_of_call: contextvars.ContextVar[dict[tuple, str]] = contextvars.ContextVar("of_call")
+
+
+@contextlib.contextmanager
+def unchanged_code() -> Iterator[None]:
+    """A context of a single call, in which definitions that differ in arrays only have one digest.
+    (Thousands of systems of a sweep are given at once.)"""
+    token = _of_call.set({})
+    try:
+        yield
+    finally:
+        _of_call.reset(token)
 
 
 _JITTED: Any = type(jax.jit(len))

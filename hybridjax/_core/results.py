@@ -73,5 +73,5 @@ def update_result(
     result: Int[Array, "*lanes"], failed: Bool[Array, "*lanes"], code: Result
 ) -> Int[Array, "*lanes"]:
     """Record `code` where `failed`, unless an earlier failure is there already."""
-    xp = namespace(result)
+    xp = namespace(failed)
     return xp.where((result == Result.OK) & failed, xp.int32(code), result)

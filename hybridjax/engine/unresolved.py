@@ -11,7 +11,7 @@ import numpy as np
 from jax.extend import core as jex
 from jaxtyping import Float
 
-from .._core.compilation import quick_jit
+from .._core.compilation import kind, quick_jit
 from .._core.meaning import is_of_package
 from ..systems.solver import Method
 from ..systems.structure import Member, Structure, stacked
@@ -74,6 +74,18 @@ def sudden(program: jex.Jaxpr) -> Iterator[tuple[str, Any]]:
             yield from ((name, equation) for call in calls for name, _ in sudden(call))
             if not _is_smooth(equation, moves):
                 yield equation.primitive.name, equation
+
+
+def may_be_sudden(s: Structure, a: int, function: Callable) -> frozenset[str]:
+    """Names of the `sudden` operations of a function (structure, chart, *point) of a module."""
+    key = function, a, kind(s)
+    if key not in _sudden:
+        names = (name for name, _ in sudden(program_of(s, a, ft.partial(function, s, a))))
+        _sudden[key] = frozenset(names)
+    return _sudden[key]
+
+
+_sudden: dict[tuple, frozenset[str]] = {}
 
 
 def _is_smooth(equation: Any, moves: list[bool]) -> bool:
@@ -185,9 +197,11 @@ def values_at(s: Structure, a: int, points: Points, u: Float[np.ndarray, " nu"])
 
 def may_have_pulses(s: Structure, a: int) -> bool:
     """Test whether the field or a guard of chart a may jump or have pulses."""
-    kinds = s.guard_kinds(a)
-    both = lambda *x: stacked([s.field(a, *x), *s.guard_values(kinds, *x)])  # noqa: E731
-    return any(sudden(program_of(s, a, both)))
+    return bool(may_be_sudden(s, a, _field_and_guards))
+
+
+def _field_and_guards(s: Structure, a: int, *point: Any) -> Any:
+    return stacked([s.field(a, *point), *s.guard_values(s.guard_kinds(a), *point)])
 
 
 @quick_jit
@@ -238,8 +252,7 @@ def jumps(s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarr
 
 def has_kinks(s: Structure) -> bool:
     """Test whether a field has operations with kinks or jumps, where many steps are rejected."""
-    programs = (program_of(s, a) for a in range(len(s.charts)))
-    return any(name in _KINKS for program in programs for name, _ in sudden(program))
+    return any(may_be_sudden(s, a, Structure.field) & _KINKS for a in range(len(s.charts)))
 
 
 def lines_of_jumps(s: Structure, a: int) -> list[str]:

@@ -1,7 +1,6 @@
 """Checks of a system's clock and of conserved quantities; the reasons of a search that failed."""
 
 import dataclasses
-import functools as ft
 import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, cast
@@ -19,10 +18,9 @@ from ..engine.unresolved import (
     column_name,
     jumps,
     lines_of_jumps,
+    may_be_sudden,
     may_have_pulses,
     passed_over,
-    program_of,
-    sudden,
 )
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
@@ -109,8 +107,7 @@ def check_times(
     for a in np.unique(chart).tolist():
         n, rows = s.dims[a], np.flatnonzero(chart == a)
         sizes = np.concatenate([[time], np.asarray(scale)[a, :n]])
-        is_sudden = any(sudden(program_of(s, a, ft.partial(_all, s, a))))
-        every = -(-_TIMES // len(rows)) if is_sudden else 1
+        every = -(-_TIMES // len(rows)) if may_be_sudden(s, a, _all) else 1
         times = t[rows, None] + time * (_BASE + np.arange(every) / every)
         for name, function in _functions(s, a):
             _compare(s, name, function, times.ravel(), q[:n, rows].repeat(every, axis=1), sizes)

@@ -247,6 +247,9 @@ class Structure:
 
         **Raises:** `DefinitionError` for a solver that is none with an error estimate.
         """
+        return self.once(("method", a), (), lambda: self._method(a))
+
+    def _method(self, a: int) -> Method:
         system = self.system.system if isinstance(self.system, Driven) else self.system
         solver = type(system).solver if system.solver is None else system.solver
         solver = solver.get(self.names[a]) if isinstance(solver, ByChart) else solver
@@ -303,7 +306,8 @@ class Structure:
 
     def guard_kinds(self, a: int) -> tuple[Kind, ...]:
         """Kinds of the state-dependent transitions out of chart a."""
-        return tuple(kind for kind in self.kinds if self._leaves(kind[0], a, by_clock=False))
+        leaves = lambda kind: self._leaves(kind[0], a, by_clock=False)  # noqa: E731
+        return self.once(("guards", a), (), lambda: tuple(filter(leaves, self.kinds)))
 
     def guards(self, a: int) -> list[int]:
         """Indices of the state-dependent transitions out of chart a, by kind."""

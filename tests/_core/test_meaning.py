@@ -5,7 +5,9 @@ import types
 
 import pytest
 
-from hybridjax._core.meaning import is_of_package, meaning
+import hybridjax as hj
+from hybridjax._core.boundary.containers import Instance, Items
+from hybridjax._core.meaning import current, is_of_package, meaning
 from hybridjax.errors import DefinitionError
 
 
@@ -202,3 +204,12 @@ def test_values_that_are_not_named_are_refused(code):
     exec(f"P = functools.partial(lambda: eval('K'))\ndef f(x): return {code} * x", space)
     with pytest.raises(DefinitionError, match="` uses `"):
         meaning(space["f"])
+
+
+def test_systems_given_together_share_a_digest_if_they_differ_in_arrays_only():
+    hopper = hj.models.VerticalHopper
+    given = [hopper(k=9.0), hopper(k=10.0), hopper(solver=hj.Radau())]
+    taken = Items(Instance(hj.HybridSystem)).take(given)
+    digests = [x.code_digest for x in taken]
+    assert digests == [current(x).code_digest for x in given]
+    assert digests[0] == digests[1] != digests[2]

@@ -1,5 +1,8 @@
 """One source, two executors: the host and XLA agree, and the host compiles users' functions."""
 
+import contextlib
+import threading
+
 import jax
 import numpy as np
 import pytest
@@ -38,6 +41,30 @@ def flow(system, t, chart, q, u, end, settings):
 compiled_flow = quick_jit(flow)
 
 
+class AtOnce(threading.Thread):
+    """A thread that is done when it starts."""
+
+    def start(self):
+        self.run()
+
+
+class Often(dict):
+    """Calls of programs that are worth compiling at the next call."""
+
+    def get(self, program, _):
+        return super().get(program, 128 * compilation._WORTH_COMPILING - 1)
+
+
+@contextlib.contextmanager
+def loops_of_steps():
+    """A context in which the host takes all steps without events in compiled loops."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compilation, "_calls", Often())
+        patch.setattr(threading, "Thread", AtOnce)
+        yield
+        assert min(compilation._calls.values()) < 0
+
+
 def agree(system, chart, state, u, begin, duration):
     """Both executors decide the same, and their tapes are the same to rounding."""
     s = Structure(system)
@@ -49,15 +76,21 @@ def agree(system, chart, state, u, begin, duration):
     with unchecked_host():
         host = flow(system, *to_host(arguments))
     assert all(on_host(x) for x in jax.tree_util.tree_leaves(host))
+    with unchecked_host(), loops_of_steps():
+        loops = flow(system, *to_host(arguments))
     xla = compiled_flow(system, *from_host(arguments))
-    np.testing.assert_array_equal(host.moved.result, xla.moved.result)
     assert np.sum(host.tape.code != IDLE) > 2
-    for name in ("code", "chart"):
-        np.testing.assert_array_equal(getattr(host.tape, name), getattr(xla.tape, name))
     # Steps amplify the rounding errors of their error estimates.
-    np.testing.assert_allclose(host.moved.lanes.t, xla.moved.lanes.t, rtol=1e-12)
     size = 1 + np.abs(xla.moved.lanes.q)
-    np.testing.assert_allclose(host.moved.lanes.q / size, xla.moved.lanes.q / size, atol=1e-9)
+    for other in (loops, xla):
+        np.testing.assert_array_equal(host.moved.result, other.moved.result)
+        for name in ("code", "chart"):
+            np.testing.assert_array_equal(getattr(host.tape, name), getattr(other.tape, name))
+        np.testing.assert_allclose(host.moved.lanes.t, other.moved.lanes.t, rtol=1e-12)
+        np.testing.assert_allclose(host.moved.lanes.q / size, other.moved.lanes.q / size, atol=1e-9)
+    moved = host.tape.code[:, 0] != IDLE
+    np.testing.assert_allclose(loops.tape.t[moved], host.tape.t[moved], rtol=1e-9)
+    np.testing.assert_allclose(loops.tape.before[moved], host.tape.before[moved], atol=1e-7)
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, FEW))
@@ -82,6 +115,30 @@ def test_both_agree_on_random_systems(name):
         start = sample.start
         system = from_host(Random(plan, sample.charts, sample.arrows))
         agree(system, 0, start.q, start.u, start.t, 2.0)
+
+
+def test_a_derivative_of_a_flow_by_loops_of_steps(hopper_cycle):
+    """Newton's method finds the same cycle with loops: steps are also short enough for derivatives,
+    and land on the anchor's time."""
+    with loops_of_steps():
+        cycle = hj.find_limit_cycle(hopper_cycle.system)
+    np.testing.assert_allclose(cycle.anchor.q, hopper_cycle.anchor.q, atol=1e-12)
+    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, atol=1e-11)
+
+
+def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
+    monkeypatch.setattr(threading, "Thread", AtOnce)
+    seen = []
+
+    def function(x):
+        seen.append(on_host(x))
+        return 2 * x
+
+    call = compilation.host_first(function)
+    monkeypatch.setattr(compilation, "_WORTH_COMPILING", 1e-9)
+    results = [call(from_host(np.arange(3.0))) for _ in range(3)]
+    assert seen == [True, False]  # on the host, then traced, then no more
+    np.testing.assert_array_equal(results, [[0.0, 2.0, 4.0]] * 3)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from ..executor import is_tracer
-from ..meaning import current
+from ..meaning import current, unchanged_code
 from ..signal import Signal
 from .values import TEXT, Kind, Misfit, listed, refuse_traced, show, with_article
 
@@ -82,7 +82,8 @@ class Items(Kind):
             value = tuple(value)
         if self.item is not None:
             form = list if isinstance(value, list) else tuple
-            value = form(_taken(self.item, i, x) for i, x in enumerate(value))
+            with unchanged_code():
+                value = form(_taken(self.item, i, x) for i, x in enumerate(value))
         return value if self.form is None or isinstance(value, self.form) else self.form(value)
 
 

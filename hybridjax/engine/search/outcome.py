@@ -182,7 +182,7 @@ def level_counts(watched: Watch, span: Times) -> Mask:
 
 
 def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:
-    xp = namespace(mask)
+    xp = namespace(new.value)
     return Watch(xp.where(mask, new.value, old.value), xp.where(mask, new.rate, old.rate))
 
 
