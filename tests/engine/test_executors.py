@@ -52,7 +52,7 @@ class Often(dict):
     """Calls of programs that are worth compiling at the next call."""
 
     def get(self, program, _):
-        return super().get(program, 128 * compilation._WORTH_COMPILING - 1)
+        return super().get(program, 128 * compilation.WORTH_COMPILING - 1)
 
 
 @contextlib.contextmanager
@@ -135,7 +135,7 @@ def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
         return 2 * x
 
     call = compilation.host_first(function)
-    monkeypatch.setattr(compilation, "_WORTH_COMPILING", 1e-9)
+    monkeypatch.setattr(compilation, "WORTH_COMPILING", 1e-9)
     results = [call(from_host(np.arange(3.0))) for _ in range(3)]
     assert seen == [True, False]  # on the host, then traced, then no more
     np.testing.assert_array_equal(results, [[0.0, 2.0, 4.0]] * 3)
