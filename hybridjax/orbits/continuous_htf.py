@@ -27,7 +27,7 @@ from .return_map import ReturnMap, with_derivatives
 
 # Largest angle by which an input, or a harmonic of the output, turns within a piece. Larger:
 # polynomials on a piece lose digits. Smaller: more pieces than needed.
-_INPUT_TURNS, _OUTPUT_TURNS = 1.5, 4.0
+_INPUT_TURNS, _OUTPUT_TURNS = 3.0, 4.0
 # Distance in cycles per period from a pole on the unit circle at which a frequency lies on it.
 # Smaller: responses are rounding errors. Larger: frequencies beside it are rejected.
 _POLE = 1e-9
@@ -104,22 +104,24 @@ def _transfer(
     s, xp, w = map.structure, namespace(flow.q), rule().weights
     clocked, jumps, h = map.base is None, flow.jumps, flow.length
     y, T = observed(s, flow, z), period
+    (P, K, d), F, nu = flow.q.shape, len(f), flow.by_input.shape[-1]
     free, forced = flow.forward()
-    # Time 0 is that of the clock, or the anchor of an autonomous cycle.
+    # Time 0 is that of the clock, or the anchor of an autonomous cycle. Frequencies come last, so
+    # that all products are those of matrices.
     t = flow.t if clocked else flow.t - flow.t[0, 0]
     rate = 2j * np.pi * f / T
-    begin = xp.exp(t[:, :1] * rate)  # (P, F)
-    inside = xp.exp(rate[:, None] * (h[:, None] * rule().nodes)[:, None])  # (P, F, K)
+    begin = xp.exp(t[:, :1] * rate)[:, None, None]  # (P, 1, 1, F)
+    inside = xp.exp((h[:, None] * rule().nodes)[..., None] * rate)  # (P, K, F)
+    at_end = begin * inside[:, -1:, None]
     push = forced * h[:, None, None, None, None]
-    push = xp.einsum("piakb,pkbu->piaku", push, flow.by_input)  # nodes by inputs at nodes
+    push = xp.einsum("piakb,pkbu->piauk", push, flow.by_input)  # nodes by inputs at nodes
     # From piece to piece.
-    kick = xp.einsum("pfk,paku->pfau", inside, push[:, -1]) * begin[..., None, None]
-    at_end = (begin * inside[:, :, -1])[..., None, None]
-    driven = xp.einsum("pab,pfbu->pfau", jumps.by_state, kick) + jumps.by_input[:, None] * at_end
+    arrived = (push[:, -1].reshape(P, d * nu, K) @ inside).reshape(P, d, nu, F)
+    driven = jumps.by_state @ (arrived * begin).reshape(P, d, nu * F)
+    driven = driven + (jumps.by_input[..., None] * at_end).reshape(P, d, nu * F)
     through = jumps.by_state @ free[:, -1]
     advance = lambda x, piece: (piece[0] @ x + piece[1], x)  # noqa: E731
-    zero = xp.zeros(driven.shape[1:], driven.dtype)
-    total, _ = scan(advance, zero, (through + 0j, driven))
+    total, _ = scan(advance, xp.zeros(driven.shape[1:], driven.dtype), (through + 0j, driven))
     # Deviations at the beginning: X(T) = exp(i w T) X(0).
     size = map.sizes
     whole = flow.monodromy(free, map.valid) * size / size[:, None]
@@ -131,27 +133,27 @@ def _transfer(
                 f"`f` = {f[apart.argmin()]:.10g} cycles per period is a pole of the cycle, which "
                 f"lie at {where}: leave it out."
             )
-    turned = xp.exp(rate * T)[:, None, None] * xp.eye(len(size))
-    start = xp.linalg.solve(turned - whole, total / size[:, None]) * size[:, None]
-    _, x = scan(advance, start, (through + 0j, driven))
+    turned = xp.exp(rate * T)[:, None, None] * xp.eye(d)
+    total = xp.moveaxis(total.reshape(d, nu, F), -1, 0) / size[:, None]
+    start = xp.moveaxis(xp.linalg.solve(turned - whole, total) * size[:, None], 0, -1)
+    _, x = scan(advance, start.reshape(d, nu * F), (through + 0j, driven))
     # Fourier integrals, with exp(-i w t) of the piece and of the node apart.
-    weight = h[:, None] * w
-    C = y.by_state * weight[..., None, None]
-    D = xp.einsum("pkyu,pk->pyku", y.by_input, weight)
-    of_start = xp.einsum("pkya,pkab->pkyb", C, free)
-    of_push = xp.einsum("piya,piaku->pkiyu", C, push)
-    shape = *inside.shape, *D.shape[1::2]
-    within = (inside @ of_push.reshape(*of_push.shape[:2], -1)).reshape(shape)
-    back, before = xp.conj(inside), x / begin[..., None, None]
-    response = xp.einsum("pkyb,pfbu->pfkyu", of_start, before) + within
-    response = response * back[..., None, None] + xp.moveaxis(D, 2, 1)[:, None]
+    weight = (h[:, None] * w)[..., None, None]
+    C = y.by_state * weight
+    before = (x.reshape(P, d, nu, F) / begin).reshape(P, d, nu * F)
+    of_push = C @ push.reshape(P, K, d, nu * K)
+    shape = P, K, len(z.names), nu, F
+    response = ((C @ free).reshape(P, -1, d) @ before).reshape(shape)
+    response += (of_push.reshape(P, -1, K) @ inside).reshape(shape)
+    back = xp.conj(inside)[:, :, None, None]
+    response *= back
     # Events whose time moves: the jump of the output at the moment of the event.
-    last = xp.einsum("pab,pfbu->pfau", free[:, -1], before)
-    last = last + xp.einsum("pfk,paku->pfau", inside, push[:, -1])
-    delay = xp.einsum("pa,pfau->pfu", jumps.delay_by_state, last)
-    delay = delay * back[:, :, -1, None] + jumps.delay_by_input[:, None]
+    last = (free[:, -1] @ before).reshape(arrived.shape) + arrived
+    delay = xp.einsum("pa,pauf->puf", jumps.delay_by_state, last) * back[:, -1, 0]
     step = y.values[:, -1] - xp.roll(y.values[:, 0], -1, axis=0)
-    impulse = step[:, None, :, None] * delay[:, :, None]
+    impulse = step[..., None, None] * (delay + jumps.delay_by_input[..., None])[:, None]
     waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / T))
-    H = xp.tensordot(waves, response, ((1, 2), (0, 2)))
-    return (H + xp.einsum("mp,pfyu->mfyu", waves[:, :, -1], impulse)) / T
+    H = waves.reshape(len(waves), -1) @ response.reshape(P * K, -1)
+    H = (H + waves[:, :, -1] @ impulse.reshape(P, -1)).reshape(-1, *shape[2:])
+    H = H + xp.einsum("mpk,pkyu->myu", waves, y.by_input * weight)[..., None]
+    return xp.moveaxis(H, -1, 1) / T

@@ -27,6 +27,7 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled
 from .return_map import ReturnMap, with_derivatives
+from .scale import has_implicit
 
 
 # Nodes of a piece, both ends among them. Fewer: polynomials through them lose digits of responses.
@@ -218,15 +219,19 @@ def _linear_flow(course: Course, longest: float) -> LinearFlow:
         assert tape is not None
         pieces = _pieces(map, legs, target, tape, ends[-1:])
         if on_host(pieces.t):
-            divide = np.maximum(np.ceil(pieces.h / (longest * period) - 1e-9), 1).astype(int)
+            first, joined = _joined(s, pieces, longest * period)
+            divide = np.maximum(np.ceil(joined.h / (longest * period) - 1e-9), 1).astype(int)
         else:
-            divide = np.full(len(pieces.t), max(int(np.ceil(_LONGEST / longest)), 1))
-        return _linearized(s, course.linearized, pieces, divide, events)
+            first, joined = np.arange(len(pieces.t)), pieces
+            divide = np.full(len(first), max(int(np.ceil(_LONGEST / longest)), 1))
+        return _linearized(course, pieces, first, joined, divide)
 
 
 # Bound on the steps of a turn that is traced, whose number is not known. Fewer: results for long
 # turns are NaN. More: programs take longer.
 _MOST = 256
+# Explicit steps of a piece. More: its polynomials lose digits. Fewer: more pieces than needed.
+_STEPS = 4
 # The longest step that a turn can have, in parts of the period (see `ReturnMap.travel`).
 _LONGEST = 0.5
 
@@ -273,19 +278,39 @@ def _pieces(map: ReturnMap, legs: Lanes, target: Target, tape: Tape, end: Array)
     return pieces._replace(h=xp.where(lost, xp.nan, pieces.h))
 
 
+def _joined(s: Structure, steps: _Pieces, longest: Array) -> tuple[np.ndarray, _Pieces]:
+    """Pieces of several steps between events, because a step of an explicit method is short for
+    the polynomials of a piece, and the indices of their first steps."""
+    first, length, most = [0], 0.0, 1 if has_implicit(s) else _STEPS
+    for k, h in enumerate(steps.h[1:], 1):
+        length += steps.h[k - 1]
+        if steps.code[k - 1] >= 0 or k - first[-1] == most or length + h > longest:
+            first.append(k)
+            length = 0.0
+    last = np.append(first[1:], len(steps.h)) - 1
+    begin = (x[..., first] for x in steps[:3])
+    return np.array(first), _Pieces(*begin, np.add.reduceat(steps.h, first), steps.code[last])
+
+
 def _linearized(
-    s: Structure, of: Structure, pieces: _Pieces, divide: Int[np.ndarray, " P"], events
+    course: Course, steps: _Pieces, first: np.ndarray, pieces: _Pieces, divide: np.ndarray
 ) -> LinearFlow:
-    xp, K, nodes = namespace(pieces.t), NODES, rule().nodes
+    """The flow linearized at nodes of pieces, each divided into some parts, whose states follow
+    from the recorded steps."""
+    s, of, events = course.map.structure, course.linearized, course.events
+    xp, K, nodes = namespace(steps.t), NODES, rule().nodes
     whole = np.repeat(np.arange(len(divide)), divide)
     part = np.arange(len(whole)) - np.repeat(np.cumsum(divide) - divide, divide)
-    of_step = (part[:, None] + nodes) / divide[whole, None]  # of the step in which a node lies
-    t, chart, q, h, code = (x[..., whole] for x in pieces)
+    of_piece = (part[:, None] + nodes) / divide[whole, None]
+    t, chart, _, h, code = (x[..., whole] for x in pieces)
     P = len(whole)
-    many = lambda x: xp.repeat(x, K, axis=-1)  # noqa: E731
-    ahead = (h[:, None] * of_step).ravel()
-    time, charts = many(t) + ahead, many(chart)
-    states = _ahead(s, many(t), charts, many(q), ahead)
+    time, charts = (t[:, None] + h[:, None] * of_piece).ravel(), xp.repeat(chart, K)
+    step = np.repeat(first[whole], K)
+    if len(first) < len(steps.t):
+        last = np.append(first[1:], len(steps.t))[whole] - 1
+        step = np.clip(np.searchsorted(steps.t, time, "right") - 1, step, np.repeat(last, K))
+    begin, q = steps.t[step], steps.q[:, step]
+    states = _ahead(s, begin, charts, q, time - begin)
     code = xp.where(part == divide[whole] - 1, xp.maximum(code, -1), -1)
     by = with_derivatives(of, ft.partial(kernels.field, of), charts, time, states, s.d)
     d = s.d
