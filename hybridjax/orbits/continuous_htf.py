@@ -27,7 +27,7 @@ from .return_map import ReturnMap, with_derivatives
 
 # Largest angle by which an input, or a harmonic of the output, turns within a piece. Larger:
 # polynomials on a piece lose digits. Smaller: more pieces than needed.
-_INPUT_TURNS, _OUTPUT_TURNS = 3.0, 4.0
+_TURNS = 4.0
 # Distance in cycles per period from a pole on the unit circle at which a frequency lies on it.
 # Smaller: responses are rounding errors. Larger: frequencies beside it are rejected.
 _POLE = 1e-9
@@ -57,9 +57,8 @@ def observed(s: Structure, flow: LinearFlow, z: Outputs) -> Parts:
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
     """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of 2, so
     that calls with similar frequencies share a linearization."""
-    inputs = _INPUT_TURNS / (2 * np.pi * max(np.max(np.abs(f), initial=0.0), 0.1))
-    outputs = _OUTPUT_TURNS / (2 * np.pi * max(np.max(np.abs(harmonics)), 0.1))
-    longest = float(2.0 ** np.floor(np.log2(min(inputs, outputs, 1.0))))
+    fastest = max(1.25 * np.max(np.abs(f), initial=0.0), np.max(np.abs(harmonics)), 0.1)
+    longest = float(2.0 ** np.floor(np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))))
     if max(len(f), 64) / longest > _LARGEST:
         raise DefinitionError(
             f"{len(f)} frequencies up to {np.abs(f).max():.3g} per period and harmonics up to "

@@ -80,6 +80,8 @@ class Jumps(NamedTuple):
     delay_by_input: Float[Array, "P nu"]
     slip: Float[Array, "P d"]
     """Change of the state after the event, at a fixed time, by the time of the event."""
+    delay_by_level: Float[Array, " P"]
+    """Change of the time of the event by the level of its guard, or by its schedule."""
 
 
 class LinearFlow(eqx.Module):
@@ -288,8 +290,9 @@ def _joined(s: Structure, steps: _Pieces, longest: Array) -> tuple[np.ndarray, _
             first.append(k)
             length = 0.0
     last = np.append(first[1:], len(steps.h)) - 1
-    begin = (x[..., first] for x in steps[:3])
-    return np.array(first), _Pieces(*begin, np.add.reduceat(steps.h, first), steps.code[last])
+    h, code = np.add.reduceat(steps.h, first), steps.code[last]
+    begin = _Pieces(*(x[..., first] for x in steps))
+    return np.array(first), begin._replace(h=h, code=code)
 
 
 def _linearized(
@@ -351,7 +354,7 @@ def _jumps(s: Structure, end, after, code, events) -> Jumps:
     xp, (P, d) = namespace(t), f.shape
     out = Jumps(
         xp.broadcast_to(xp.eye(d), (P, d, d)), xp.zeros((P, d, s.nu)),
-        xp.zeros((P, d)), xp.zeros((P, s.nu)), xp.zeros((P, d)),
+        xp.zeros((P, d)), xp.zeros((P, s.nu)), xp.zeros((P, d)), xp.zeros(P),
     )  # fmt: skip
     for g in sorted(set(events)):
         fired = code == g
@@ -364,14 +367,14 @@ def _jumps(s: Structure, end, after, code, events) -> Jumps:
         by = xp.moveaxis(kernels.linear_reset(s, s.member(g), *point), -1, 0)
         m, n_u = by.shape[1], 2 + n
         by_t, by_q, by_u = by[:, :, 1], by[:, :, 2:n_u], by[:, :, n_u:]
-        moves, pushed = xp.zeros((P, n)), xp.zeros((P, s.nu))
+        moves, pushed, delay = xp.zeros((P, n)), xp.zeros((P, s.nu)), xp.ones(P)
         if not isinstance(tr.guard, Scheduled):
             index = np.zeros(1, np.int32)
             guard = kernels.watched(s, a, None, *point, xp.asarray(index))[s.guards(a).index(g)]
             guard = xp.moveaxis(guard, -1, 0)
             rate = guard[:, 1] + xp.sum(guard[:, 2:n_u] * f[:, :n], axis=1)
-            rate = xp.where(fired, rate, 1.0)[:, None]
-            moves, pushed = -guard[:, 2:n_u] / rate, -guard[:, n_u:] / rate
+            delay = -1 / xp.where(fired, rate, 1.0)
+            moves, pushed = guard[:, 2:n_u] * delay[:, None], guard[:, n_u:] * delay[:, None]
         slip = by_t + xp.einsum("pij,pj->pi", by_q, f[:, :n]) - after[:, :m]
         salted = by_q + slip[:, :, None] * moves[:, None, :]
         driven = by_u + slip[:, :, None] * pushed[:, None, :]
@@ -381,6 +384,7 @@ def _jumps(s: Structure, end, after, code, events) -> Jumps:
             xp.pad(moves, [(0, 0), (0, d - n)]),
             pushed,
             xp.pad(slip, [(0, 0), (0, d - m)]),
+            delay,
         )
         choose = lambda x, y, fired=fired: xp.where(fired.reshape(-1, *[1] * (x.ndim - 1)), x, y)  # noqa: E731
         out = Jumps(*(choose(x, y) for x, y in zip(new, out, strict=True)))

@@ -230,10 +230,10 @@ def responses(course: Course, modes: int | None) -> Responses:
     if host and not np.any(np.iscomplex(exponents)):
         amplitudes, right = np.real(amplitudes), np.real(right)
     total = int(np.sum(map.valid)) - (not clocked) if host else len(values)
-    surface = _surface(map.structure, flow)
+    off = surface(map.structure, flow)
     return Responses(
         map.structure, flow, period, values, exponents, right, total - len(values),
-        events, phase, amplitudes, surface,
+        events, phase, amplitudes, off,
     )  # fmt: skip
 
 
@@ -310,7 +310,7 @@ def _eigenpairs(M: Float[Array, "d d"], value, right):
     return root, right, left
 
 
-def _surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
+def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
     """The effect of pushes in charts of sliding; identity in others."""
     sliding = [a for a, chart in enumerate(s.charts) if isinstance(chart, SlidingChart)]
     if not sliding:
