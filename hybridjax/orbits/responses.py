@@ -26,6 +26,7 @@ from .._core.executor import (
     stop_gradient,
     to_host,
 )
+from .._core.signal import unit_of
 from .._core.text import number
 from ..engine import kernels
 from ..engine.lanes import for_each_chart, only
@@ -45,7 +46,7 @@ Phases = Annotated[Numbers, Reals("p")]
 
 
 class PhaseCurve(eqx.Module):
-    """The phase response to one input over one cycle.
+    """The phase response to one input over one cycle, of a model or measured.
 
     **Fields:** `phase` (P,), in cycles; `values` (P,), in cycles per unit of time and of the input,
     with NaN between both sides of an event; `input`; `time_unit`.
@@ -55,6 +56,12 @@ class PhaseCurve(eqx.Module):
     values: Float[np.ndarray, " P"]
     input: str = eqx.field(static=True)
     time_unit: str = eqx.field(static=True, default="s", kw_only=True)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the values."""
+        unit, time = unit_of(self.input), self.time_unit or "time"
+        return f"cycles / ({unit} {time})" if unit else f"cycles / {time} / input"
 
 
 class Impulse(NamedTuple):

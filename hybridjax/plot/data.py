@@ -11,9 +11,11 @@ from .._core.boundary.kinds import PeriodCount
 from .._core.results import Result
 from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from .._core.text import p_value
+from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..identify.validate import Validation
-from ..recordings.beats.response import PhaseResponse, curve_unit
+from ..orbits.responses import PhaseCurve
+from ..recordings.beats.response import PhaseResponse
 from ..recordings.data import SectionData, input_spectrum
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase import Phase
@@ -133,20 +135,43 @@ def impulse_responses(
 
 
 @checked
-def phase_response(found: PhaseResponse, *, ax: AxesLike | None = None) -> Plot:
-    """The curve with its 95 % band."""
+def phase_response(
+    found: PhaseCurve, *, model: PhaseCurve | None = None, ax: AxesLike | None = None
+) -> Plot:
+    """The curve; an estimate with its 95 % band. Dotted lines are events of a model.
+
+    **Arguments:** `model`: the curve of a model (`Responses.curve`), drawn over that of a
+    recording; a time in ms is converted. Phase 0 of both must be the same event.
+
+    **Raises:** `DefinitionError` if curves differ in their units of time.
+    """
+    curves = [found] if model is None else [found, model]
     with panels(ax, height=2.8) as axes:
-        curve = axes[0, 0]
-        low, high = found.interval(found.phase)
-        curve.fill_between(found.phase, low, high, color=CYCLE[0], alpha=0.25, lw=0)
-        curve.plot(found.phase, found.values, color=CYCLE[0], label="estimated, 95 %")
-        curve.axhline(0, color="black", lw=0.4)
+        panel = axes[0, 0]
+        for k, curve in enumerate(curves):
+            scale, color = _per(curve.time_unit, found.time_unit), CYCLE[k]
+            label = "model"
+            if isinstance(curve, PhaseResponse):
+                low, high = curve.interval(curve.phase)
+                panel.fill_between(curve.phase, low, high, color=color, alpha=0.25, lw=0)
+                label = "estimated, 95 %"
+            panel.plot(curve.phase, scale * curve.values, color=color, label=label)
+            for phase in curve.phase[np.isnan(curve.values)]:
+                panel.axvline(phase, color=color, lw=0.8, ls=":")
+        panel.axhline(0, color="black", lw=0.4)
         name = f"response to {found.input}"
-        curve.set(
-            xlabel="phase (cycles)", ylabel=f"{name}\n({curve_unit(found.input)})", xlim=(0, 1)
-        )
-        curve.legend()
+        panel.set(xlabel="phase (cycles)", ylabel=f"{name}\n({found.unit})", xlim=(0, 1))
+        panel.legend()
     return Plot(axes)
+
+
+def _per(unit: str, wanted: str) -> float:
+    """The factor from one per unit of time to one per wanted unit."""
+    if unit == wanted or not unit or not wanted:
+        return 1.0
+    if {unit, wanted} != {"s", "ms"}:
+        raise DefinitionError(f"curves per {unit} and per {wanted} do not fit: convert one.")
+    return 1e3 if unit == "ms" else 1e-3
 
 
 @checked
