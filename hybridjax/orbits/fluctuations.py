@@ -135,7 +135,7 @@ def fluctuations(
 
     pieces = forward, _pad(collected, n), jump, added
     (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
-    last = np.diag(np.append(map.valid, np.ones(n - d)))
+    last = xp.diag(xp.append(map.valid, xp.ones(n - d)))
     diffusion, to_end = xp.zeros(()), adjoint @ flow.backward(adjoint, xp.eye(d))[:, None]
     across = np.eye(d)
     if not clocked:
