@@ -6,8 +6,6 @@ turn; the Fourier integral is a sum over the same nodes, interrupted at events (
 N. M. Wereley, Analysis and control of linear periodically time varying systems, MIT 1991).
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -36,22 +34,14 @@ _POLE = 1e-9
 _LARGEST = 2**21
 
 
-class Parts(NamedTuple):
-    """Outputs along a linear flow: values, and derivatives by states and inputs."""
-
-    values: Float[Array, "P K ny"]
-    by_state: Float[Array, "P K ny d"]
-    by_input: Float[Array, "P K ny nu"]
-
-
-def observed(s: Structure, flow: LinearFlow, z: Outputs) -> Parts:
-    """Outputs at the nodes."""
+def observed(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, Array, Array]:
+    """Outputs at the nodes (P, K, ny), and their derivatives by states and inputs."""
     xp, (P, K, d), ny = namespace(flow.q), flow.q.shape, len(z.names)
     chart, t, q = xp.repeat(flow.chart, K), flow.t.ravel(), flow.q.reshape(P * K, d).T
     outputs = lambda a, *point: kernels.outputs(s, a, tuple(z.items), *point)  # noqa: E731
     by = with_derivatives(s, outputs, chart, t, q, ny)
     by = xp.moveaxis(by, -1, 0).reshape(P, K, ny, -1)
-    return Parts(by[..., 0], by[..., 2 : 2 + d], by[..., 2 + d :])
+    return by[..., 0], by[..., 2 : 2 + d], by[..., 2 + d :]
 
 
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
@@ -102,7 +92,7 @@ def _transfer(
 ) -> Complex[Array, "M F ny nu"]:
     s, xp, w = map.structure, namespace(flow.q), rule().weights
     clocked, jumps, h = map.base is None, flow.jumps, flow.length
-    y, T = observed(s, flow, z), period
+    (values, by_state, by_input), T = observed(s, flow, z), period
     (P, K, d), F, nu = flow.q.shape, len(f), flow.by_input.shape[-1]
     free, forced = flow.forward()
     # Time 0 is that of the clock, or the anchor of an autonomous cycle. Frequencies come last, so
@@ -138,7 +128,7 @@ def _transfer(
     _, x = scan(advance, start.reshape(d, nu * F), (through + 0j, driven))
     # Fourier integrals, with exp(-i w t) of the piece and of the node apart.
     weight = (h[:, None] * w)[..., None, None]
-    C = y.by_state * weight
+    C = by_state * weight
     before = (x.reshape(P, d, nu, F) / begin).reshape(P, d, nu * F)
     of_push = C @ push.reshape(P, K, d, nu * K)
     shape = P, K, len(z.names), nu, F
@@ -149,10 +139,10 @@ def _transfer(
     # Events whose time moves: the jump of the output at the moment of the event.
     last = (free[:, -1] @ before).reshape(arrived.shape) + arrived
     delay = xp.einsum("pa,pauf->puf", jumps.delay_by_state, last) * back[:, -1, 0]
-    step = y.values[:, -1] - xp.roll(y.values[:, 0], -1, axis=0)
+    step = values[:, -1] - xp.roll(values[:, 0], -1, axis=0)
     impulse = step[..., None, None] * (delay + jumps.delay_by_input[..., None])[:, None]
     waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / T))
     H = waves.reshape(len(waves), -1) @ response.reshape(P * K, -1)
     H = (H + waves[:, :, -1] @ impulse.reshape(P, -1)).reshape(-1, *shape[2:])
-    H = H + xp.einsum("mpk,pkyu->myu", waves, y.by_input * weight)[..., None]
+    H = H + xp.einsum("mpk,pkyu->myu", waves, by_input * weight)[..., None]
     return xp.moveaxis(H, -1, 1) / T

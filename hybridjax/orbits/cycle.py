@@ -32,7 +32,7 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
-from .fluctuations import Fluctuations, Strengths, fluctuations
+from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
 from .linear_flow import Course
 from .responses import Responses, responses
 from .return_map import ReturnMap
@@ -268,10 +268,7 @@ class LimitCycle(eqx.Module):
         return sensitivity(self._course(), parameter)
 
     def fluctuations(
-        self,
-        white: Strengths | None = None,
-        guards: Strengths | None = None,
-        resets: Mapping[str, Strengths] | None = None,
+        self, white: Given = None, guards: Given = None, resets: GivenResets = None
     ) -> Fluctuations:
         """Stationary deviations from the cycle under independent noise, to first order in it:
         covariances at every phase and from period to period, of durations, and phase diffusion.

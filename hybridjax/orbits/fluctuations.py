@@ -26,6 +26,9 @@ from .sensitivity import to_section
 
 
 Strengths = Mapping[str, NonNegative]
+Resets = Mapping[str, Strengths]
+Given = Strengths | None
+GivenResets = Resets | None
 
 
 @checked_methods
@@ -67,8 +70,7 @@ class Fluctuations(eqx.Module):
         """
         if on_host(self.period) and self.unresolved > SINGULAR:
             raise ComputationError(
-                "an implicit method steps over decays too fast for covariances at all phases: use "
-                "`durations`, `diffusion`, or an explicit method."
+                "steps pass over decays: use an explicit method, or `durations`."
             )
         C, d = self.at_nodes, self.at_nodes.shape[-1]
         if lag:
@@ -88,30 +90,26 @@ class Fluctuations(eqx.Module):
         name, unit = type(self.structure.system).__name__, self.structure.system.time_unit
         if is_traced(self):
             return f"Fluctuations({name}, traced)"
-        rows = [f"{number(self.diffusion)} {unit}: diffusion of the phase"]
+        rows = [f"{number(self.diffusion, unit=unit)}: diffusion of the phase"]
         rows = rows if self.diffusion else []
-        for a, b, x in zip(
-            [*self.events[-1:], *self.events], self.events, np.diag(self.durations()), strict=False
-        ):
-            rows.append(f"{number(np.sqrt(x), 6, unit)}: standard deviation from {a} to {b}")
+        before, spread = [*self.events[-1:], *self.events], np.sqrt(np.diag(self.durations()))
+        for a, b, x in zip(before, self.events, spread, strict=False):
+            rows.append(f"{number(x, 6, unit)}: standard deviation from {a} to {b}")
         return f"Fluctuations({name})" + "".join(f"\n  {x}" for x in rows)
 
 
 def fluctuations(
-    course: Course, white: Strengths, guards: Strengths, resets: Mapping[str, Strengths]
+    course: Course, white: Strengths, guards: Strengths, resets: Resets
 ) -> Fluctuations:
     """Deviations from a cycle under noise (see `LimitCycle.fluctuations`)."""
     s, flow = course.map.structure, course.linear_flow()
     levels, scatter = _at_events(s, guards, resets)
-    if on_host(flow.q):
-        course = to_host(course)
+    course = to_host(course) if on_host(flow.q) else course
     _, map, _, period, events, _ = course
     xp, jumps = namespace(flow.q), flow.jumps
     (P, _, d), clocked, f = flow.q.shape, map.base is None, flow.field[0, 0]
-    names = [s.transitions[g].name for g in events]
-    names = names if names or clocked else [str(map.base)]
-    E = len(names)
-    n = d + 1 + E
+    names = [s.transitions[g].name for g in events] or ([] if clocked else [str(map.base)])
+    n, E = d + 1 + len(names), len(names)
     # Noise in the states, collected over each piece.
     B, (free, _), adjoint = _columns(s, flow, white), flow.forward(), flow.adjoint()
     turned = xp.swapaxes(adjoint, -1, -2) @ B
@@ -135,7 +133,7 @@ def fluctuations(
 
     pieces = forward, _pad(collected, n), jump, added
     (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
-    last = xp.diag(xp.append(map.valid, xp.ones(n - d)))
+    M, last = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0), xp.eye(n)
     diffusion, to_end = xp.zeros(()), adjoint @ flow.backward(adjoint, xp.eye(d))[:, None]
     across = np.eye(d)
     if not clocked:
@@ -155,9 +153,9 @@ def fluctuations(
         joint = step @ joint @ step.T + Q
     _, (_, C, after) = scan(turn, (xp.eye(n), joint), pieces)
     inward = xp.linalg.inv(free) @ B
-    rate = (inward @ xp.swapaxes(inward, -1, -2))[:, 1:]
-    whole = xp.einsum("ij,pjab->piab", np.linalg.inv(rule().derivative[1:, 1:]), rate)
-    whole = xp.pad(whole * flow.length[:, None, None, None], [(0, 0), (1, 0), (0, 0), (0, 0)])
+    rate = flow.length[:, None, None, None] * inward @ xp.swapaxes(inward, -1, -2)
+    integral = np.pad(np.linalg.inv(rule().derivative[1:, 1:]), [(1, 0), (1, 0)])
+    whole = xp.einsum("ij,pjab->piab", integral, rate)
     C = free @ (C[:, None, :d, :d] + whole) @ xp.swapaxes(free, -1, -2)
     off = xp.max(xp.abs(C[:, -1] - after[:, :d, :d]), axis=0)
     unresolved = xp.max(off / xp.maximum(xp.max(xp.abs(C), axis=(0, 1)), 1e-300))
@@ -178,21 +176,17 @@ def _timing(by_state: Array, delay: Array, hit: Array, slot: Array) -> Float[Arr
     """From states, the delay of the last event and durations before an event to those after it."""
     xp, ((P, d), E) = namespace(delay), (delay.shape, slot.shape[1])
     each = slot[..., None]
-    rows = [
+    return xp.block([
         [by_state, xp.zeros((P, d, 1 + E))],
         [delay[:, None], 1.0 - hit[:, None, None], xp.zeros((P, 1, E))],
         [each * delay[:, None], -1.0 * each, (1.0 - each) * np.eye(E)],
-    ]
-    return xp.concatenate([xp.concatenate(x, axis=2) for x in rows], axis=1)
+    ])  # fmt: skip
 
 
 def _stationary(step: Float[Array, "d d"], noise: Float[Array, "d d"]) -> Float[Array, "d d"]:
     xp, d = namespace(step), len(step)
     if on_host(step) and not np.abs(np.linalg.eigvals(step)).max(initial=0.0) < 1 - SINGULAR:
-        raise ComputationError(
-            "deviations have no stationary covariance, because the cycle is not stable: noise "
-            "drives them away."
-        )
+        raise ComputationError("noise drives deviations away, because the cycle is not stable.")
     return xp.linalg.solve(np.eye(d * d) - xp.kron(step, step), noise.ravel()).reshape(d, d)
 
 
@@ -200,21 +194,20 @@ def _columns(s: Structure, flow: LinearFlow, white: Strengths) -> Float[Array, "
     """Effects of white noise of strength 1 on the states."""
     xp = namespace(flow.q)
     require_among("state or input", white, [*s.state_names(), *s.inputs], "`white`: ")
-    of_states = np.zeros((len(s.charts), s.d))
-    for a, chart in enumerate(s.charts):
-        of_states[a, : s.dims[a]] = [white.get(x, 0.0) for x in chart.states]
-    direct = xp.asarray(of_states)[flow.chart][:, None, :, None] * np.eye(s.d)
+    names = [(*chart.states, *[""] * s.d)[: s.d] for chart in s.charts]
+    of_states = xp.asarray([[white.get(x, 0.0) for x in states] for states in names])
+    direct = of_states[flow.chart][:, None, :, None] * np.eye(s.d)
     pushed = surface(s, flow)
     direct = xp.broadcast_to(direct, flow.by_state.shape) if pushed is None else pushed @ direct
     driven = flow.by_input * np.array([white.get(x, 0.0) for x in s.inputs])
     return xp.concatenate([direct, driven], axis=-1)
 
 
-def _at_events(s: Structure, guards: Strengths, resets: Mapping[str, Strengths]):
+def _at_events(s: Structure, guards: Strengths, resets: Resets):
     """Standard deviations of levels and of states after events, by index of the transition."""
     names = [x.name for x in s.transitions]
-    require_among("transition", guards, names, "`guards`: ")
-    require_among("transition", resets, names, "`resets`: ")
+    for argument, given in (("guards", guards), ("resets", resets)):
+        require_among("transition", given, names, f"`{argument}`: ")
     levels, scatter = np.zeros(len(names) + 1), np.zeros((len(names) + 1, s.d))
     for g, transition in enumerate(s.transitions):
         levels[g] = guards.get(transition.name, 0.0)

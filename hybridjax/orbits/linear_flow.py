@@ -312,8 +312,7 @@ def _linearized(
     if len(first) < len(steps.t):
         last = np.append(first[1:], len(steps.t))[whole] - 1
         step = np.clip(np.searchsorted(steps.t, time, "right") - 1, step, np.repeat(last, K))
-    begin, q = steps.t[step], steps.q[:, step]
-    states = _ahead(s, begin, charts, q, time - begin)
+    states = _ahead(s, steps.t[step], charts, steps.q[:, step], time - steps.t[step])
     code = xp.where(part == divide[whole] - 1, xp.maximum(code, -1), -1)
     by = with_derivatives(of, ft.partial(kernels.field, of), charts, time, states, s.d)
     d = s.d
@@ -381,11 +380,8 @@ def _jumps(s: Structure, end, after, code, events) -> Jumps:
         new = Jumps(
             xp.pad(salted, [(0, 0), (0, d - m), (0, d - n)]),
             xp.pad(driven, [(0, 0), (0, d - m), (0, 0)]),
-            xp.pad(moves, [(0, 0), (0, d - n)]),
-            pushed,
-            xp.pad(slip, [(0, 0), (0, d - m)]),
-            delay,
-        )
+            xp.pad(moves, [(0, 0), (0, d - n)]), pushed, xp.pad(slip, [(0, 0), (0, d - m)]), delay,
+        )  # fmt: skip
         choose = lambda x, y, fired=fired: xp.where(fired.reshape(-1, *[1] * (x.ndim - 1)), x, y)  # noqa: E731
         out = Jumps(*(choose(x, y) for x, y in zip(new, out, strict=True)))
     return out

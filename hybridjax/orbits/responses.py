@@ -104,7 +104,8 @@ class Coupling(eqx.Module):
         """The least and the largest frequency of a push that the cycle follows, less that of the
         cycle, per strength of the push: the Arnold tongue, to first order."""
         c = to_host(self.coefficients)
-        values = _series(c, [x for x, _ in _zeros(_derivative(c))] or [0.0])
+        slopes = 2j * np.pi * np.arange(len(c)) * c
+        values = _series(c, [x.lead for x in _zeros(slopes)] or [0.0])
         return float(values.min()), float(values.max())
 
     def locked(self, detuning: float = 0.0, mutual: bool = False) -> tuple[Locked, ...]:
@@ -118,7 +119,7 @@ class Coupling(eqx.Module):
         """
         c = to_host(self.coefficients)
         c = np.conj(c) - c if mutual else -c
-        return tuple(Locked(*x) for x in _zeros(c + detuning * (np.arange(len(c)) == 0)))
+        return _zeros(c + detuning * (np.arange(len(c)) == 0))
 
 
 def _series(c: Complex[Array, " n"], lead: Phases) -> Float[Array, " p"]:
@@ -127,18 +128,15 @@ def _series(c: Complex[Array, " n"], lead: Phases) -> Float[Array, " p"]:
     return xp.real(waves @ (c * np.where(n == 0, 1, 2)))
 
 
-def _derivative(c: Complex[np.ndarray, " n"]) -> Complex[np.ndarray, " n"]:
-    return 2j * np.pi * np.arange(len(c)) * c
-
-
-def _zeros(c: Complex[np.ndarray, " n"]) -> list[tuple[float, float]]:
+def _zeros(c: Complex[np.ndarray, " n"]) -> tuple[Locked, ...]:
     """Zeros of a series in one cycle, and its slopes there."""
     grid = (np.arange(16 * len(c) + 1) - 0.5) / (16 * len(c))
     sign = np.sign(_series(c, grid))
     crossed = zip(grid[:-1], grid[1:], sign[:-1] * sign[1:] < 0, strict=True)
     value = lambda x: float(_series(c, x))  # noqa: E731
     zeros = [optimize.root_scalar(value, bracket=(a, b)).root for a, b, turns in crossed if turns]
-    return [(x % 1.0, float(_series(_derivative(c), x))) for x in zeros]
+    slopes = _series(2j * np.pi * np.arange(len(c)) * c, zeros)
+    return tuple(Locked(x % 1.0, float(rate)) for x, rate in zip(zeros, slopes, strict=True))
 
 
 @checked_methods
@@ -217,9 +215,7 @@ class Responses(eqx.Module):
         cycle that is driven by a clock, and inside of transformations of JAX.
         """
         of_phase = self._covector(None)
-        (signal, *_), (column, *_) = self.structure.inputs_among(
-            input if input is None else [input]
-        )
+        signal, column = self._input(input)
         if any(x.weight[signal] != 0 for x in self.impulses()):
             raise DefinitionError(f"'{signal}' acts at events alone: see `impulses()`.")
         flow = to_host(self.flow)
@@ -247,9 +243,7 @@ class Responses(eqx.Module):
         that is driven by a clock.
         """
         flow, xp = self.flow, namespace(self.flow.q)
-        (signal, *_), (column, *_) = self.structure.inputs_among(
-            input if input is None else [input]
-        )
+        signal, column = self._input(input)
         # Nodes within parts of pieces that resolve the fastest wave.
         parts = 1 + harmonics // 2
         x = ((np.arange(parts)[:, None] + rule().nodes) / parts).ravel()
@@ -272,10 +266,7 @@ class Responses(eqx.Module):
             response += xp.exp(-2j * np.pi * n[:, 0, 0] * x.phase) * x.weight[signal] / period
         c = xp.conj(response) * wave / period
         if on_host(c) and np.abs(c[len(c) * 3 // 4 :]).max() > 1e-3 * np.abs(c).max():
-            raise DefinitionError(
-                f"{harmonics} harmonics do not resolve the coupling: raise `harmonics`, or smooth "
-                "a push that jumps where the input acts at an event."
-            )
+            raise DefinitionError(f"`harmonics` = {harmonics} does not resolve jumps of the push.")
         return Coupling(c)
 
     def __repr__(self):
@@ -293,6 +284,10 @@ class Responses(eqx.Module):
             kinds.append(f"inputs act at {', '.join(dict.fromkeys(acting))}: see `impulses()`")
         period = number(self.period, 9, self.structure.system.time_unit)
         return f"Responses({name}: period {period})" + "".join(f"\n  {x}" for x in kinds)
+
+    def _input(self, name: str | None) -> tuple[str, int]:
+        names, columns = self.structure.inputs_among(name if name is None else [name])
+        return names[0], columns[0]
 
     def _covector(self, mode: int | None) -> Inexact[Array, "P K d"]:
         if mode is None:

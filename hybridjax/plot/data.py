@@ -11,7 +11,6 @@ from .._core.boundary.kinds import PeriodCount
 from .._core.results import Result
 from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from .._core.text import p_value
-from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..identify.validate import Validation
 from ..orbits.responses import PhaseCurve
@@ -30,6 +29,10 @@ from .look import (
     letters,
     panels,
 )  # fmt: skip
+
+
+# Factors of what is per one unit of time, per another.
+_PER = {("ms", "s"): 1e3, ("s", "ms"): 1e-3}
 
 
 @checked
@@ -142,14 +145,12 @@ def phase_response(
 
     **Arguments:** `model`: the curve of a model (`Responses.curve`), drawn over that of a
     recording; a time in ms is converted. Phase 0 of both must be the same event.
-
-    **Raises:** `DefinitionError` if curves differ in their units of time.
     """
     curves = [found] if model is None else [found, model]
     with panels(ax, height=2.8) as axes:
         panel = axes[0, 0]
         for k, curve in enumerate(curves):
-            scale, color = _per(curve.time_unit, found.time_unit), CYCLE[k]
+            scale, color = _PER.get((curve.time_unit, found.time_unit), 1.0), CYCLE[k]
             label = "model"
             if isinstance(curve, PhaseResponse):
                 low, high = curve.interval(curve.phase)
@@ -163,15 +164,6 @@ def phase_response(
         panel.set(xlabel="phase (cycles)", ylabel=f"{name}\n({found.unit})", xlim=(0, 1))
         panel.legend()
     return Plot(axes)
-
-
-def _per(unit: str, wanted: str) -> float:
-    """The factor from one per unit of time to one per wanted unit."""
-    if unit == wanted or not unit or not wanted:
-        return 1.0
-    if {unit, wanted} != {"s", "ms"}:
-        raise DefinitionError(f"curves per {unit} and per {wanted} do not fit: convert one.")
-    return 1e3 if unit == "ms" else 1e-3
 
 
 @checked

@@ -163,6 +163,23 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     assert "exponent -0.2" in str(responses)
 
 
+def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
+    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
+    responses = hj.find_limit_cycle(StuartLandau(), guess, section=section).responses()
+    pushed = responses.coupling(lambda phase: np.cos(2 * np.pi * phase))
+    size, angle = 1 / (4 * np.pi * np.sqrt(0.1)), 2 * np.pi * PHASES
+    np.testing.assert_allclose(
+        pushed(PHASES), size * (np.sin(angle) + 0.4 * np.cos(angle)), rtol=1e-11
+    )
+    np.testing.assert_allclose(pushed.locking, np.array([-1, 1]) * size * np.sqrt(1.16), rtol=1e-12)
+    rates = [x.rate for x in pushed.locked(0.1 * size)]
+    np.testing.assert_allclose(np.abs(rates), 2 * np.pi * size * np.sqrt(1.15), rtol=1e-11)
+    together, apart = responses.coupling("x").locked(mutual=True)
+    np.testing.assert_allclose([*together, *apart], [0, -1, 0.5, 1], rtol=0, atol=1e-12)
+    with pytest.raises(hj.DefinitionError, match="`harmonics` = 64 does not resolve jumps"):
+        hj.find_limit_cycle(Neuron(grip=0.3)).responses().coupling("v")
+
+
 @pytest.mark.core
 def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     leaky = hj.find_limit_cycle(Neuron(grip=0.3)).responses()
