@@ -77,8 +77,8 @@ htf = buck.htf(f, (-1, 0, 1), "v")
 figure, panel = plt.subplots(figsize=(5, 3), layout="constrained")
 for m in htf.harmonics:
     panel.semilogy(f, abs(htf[m][:, 0, 0]), label=f"m = {m}")
-panel.set(xlabel="frequency of the reference (periods of the switch)", ylabel="|H| (V/V)")
-legend = panel.legend()
+panel.set(xlabel="frequency of the reference (cycles/period)", ylabel="|H| (V/V)")
+legend = panel.legend(loc="upper right")
 
 # %% [markdown]
 # Jitter of 1 µs of the clock, and 1 mV of noise at the comparator, make the voltage uncertain by
