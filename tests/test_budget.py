@@ -37,7 +37,7 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_830,
+    "test_lines": 16_835,
     "doc_words": 36_600,
 }
 
