@@ -25,10 +25,11 @@ PRONOUNS = set(
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
 # a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
-# 890 the responses of cycles; of the tests, 630 are those of both.
+# 1220 the responses of cycles with noise, coupling and symmetry in time; of the tests, 770 are
+# those of both.
 LIMITS = {
-    "code": 25_485,
-    "files": 222,
+    "code": 25_700,
+    "files": 223,
     "longest": 500,
     "public_names": 170,
     "many_parameters": 8,
@@ -36,8 +37,8 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_760,
-    "doc_words": 36_000,
+    "test_lines": 16_835,
+    "doc_words": 36_600,
 }
 
 

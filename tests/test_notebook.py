@@ -76,6 +76,11 @@ def neurons(found):
     assert np.mean((found.low <= found.true) & (found.true <= found.high)) > 0.7
 
 
+def responses(found):
+    # The regulator follows slow changes of its reference.
+    assert abs(abs(found.htf[0][0, 0, 0]) - 1) < 0.05
+
+
 def robot(found):
     low, high = found.natural.interval()[0]
     assert high - low > 0.3 and "feedback" in {f.cause for f in found.looked.findings}
@@ -86,7 +91,8 @@ def walking(found):
 
 
 CHECKS = (
-    fit, how_to_push, neurons, own_system, paper, recording, robot, strides, sweep, walking,
+    fit, how_to_push, neurons, own_system, paper, recording, responses, robot, strides,
+    sweep, walking,
 )  # fmt: skip
 
 

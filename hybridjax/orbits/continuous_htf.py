@@ -6,8 +6,6 @@ turn; the Fourier integral is a sum over the same nodes, interrupted at events (
 N. M. Wereley, Analysis and control of linear periodically time varying systems, MIT 1991).
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -27,7 +25,7 @@ from .return_map import ReturnMap, with_derivatives
 
 # Largest angle by which an input, or a harmonic of the output, turns within a piece. Larger:
 # polynomials on a piece lose digits. Smaller: more pieces than needed.
-_INPUT_TURNS, _OUTPUT_TURNS = 1.5, 4.0
+_TURNS = 4.0
 # Distance in cycles per period from a pole on the unit circle at which a frequency lies on it.
 # Smaller: responses are rounding errors. Larger: frequencies beside it are rejected.
 _POLE = 1e-9
@@ -36,30 +34,21 @@ _POLE = 1e-9
 _LARGEST = 2**21
 
 
-class Parts(NamedTuple):
-    """Outputs along a linear flow: values, and derivatives by states and inputs."""
-
-    values: Float[Array, "P K ny"]
-    by_state: Float[Array, "P K ny d"]
-    by_input: Float[Array, "P K ny nu"]
-
-
-def observed(s: Structure, flow: LinearFlow, z: Outputs) -> Parts:
-    """Outputs at the nodes."""
+def observed(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, Array, Array]:
+    """Outputs at the nodes (P, K, ny), and their derivatives by states and inputs."""
     xp, (P, K, d), ny = namespace(flow.q), flow.q.shape, len(z.names)
     chart, t, q = xp.repeat(flow.chart, K), flow.t.ravel(), flow.q.reshape(P * K, d).T
     outputs = lambda a, *point: kernels.outputs(s, a, tuple(z.items), *point)  # noqa: E731
     by = with_derivatives(s, outputs, chart, t, q, ny)
     by = xp.moveaxis(by, -1, 0).reshape(P, K, ny, -1)
-    return Parts(by[..., 0], by[..., 2 : 2 + d], by[..., 2 + d :])
+    return by[..., 0], by[..., 2 : 2 + d], by[..., 2 + d :]
 
 
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
     """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of 2, so
     that calls with similar frequencies share a linearization."""
-    inputs = _INPUT_TURNS / (2 * np.pi * max(np.max(np.abs(f), initial=0.0), 0.1))
-    outputs = _OUTPUT_TURNS / (2 * np.pi * max(np.max(np.abs(harmonics)), 0.1))
-    longest = float(2.0 ** np.floor(np.log2(min(inputs, outputs, 1.0))))
+    fastest = max(1.25 * np.max(np.abs(f), initial=0.0), np.max(np.abs(harmonics)), 0.1)
+    longest = float(2.0 ** np.floor(np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))))
     if max(len(f), 64) / longest > _LARGEST:
         raise DefinitionError(
             f"{len(f)} frequencies up to {np.abs(f).max():.3g} per period and harmonics up to "
@@ -103,23 +92,25 @@ def _transfer(
 ) -> Complex[Array, "M F ny nu"]:
     s, xp, w = map.structure, namespace(flow.q), rule().weights
     clocked, jumps, h = map.base is None, flow.jumps, flow.length
-    y, T = observed(s, flow, z), period
+    (values, by_state, by_input), T = observed(s, flow, z), period
+    (P, K, d), F, nu = flow.q.shape, len(f), flow.by_input.shape[-1]
     free, forced = flow.forward()
-    # Time 0 is that of the clock, or the anchor of an autonomous cycle.
+    # Time 0 is that of the clock, or the anchor of an autonomous cycle. Frequencies come last, so
+    # that all products are those of matrices.
     t = flow.t if clocked else flow.t - flow.t[0, 0]
     rate = 2j * np.pi * f / T
-    begin = xp.exp(t[:, :1] * rate)  # (P, F)
-    inside = xp.exp(rate[:, None] * (h[:, None] * rule().nodes)[:, None])  # (P, F, K)
+    begin = xp.exp(t[:, :1] * rate)[:, None, None]  # (P, 1, 1, F)
+    inside = xp.exp((h[:, None] * rule().nodes)[..., None] * rate)  # (P, K, F)
+    at_end = begin * inside[:, -1:, None]
     push = forced * h[:, None, None, None, None]
-    push = xp.einsum("piakb,pkbu->piaku", push, flow.by_input)  # nodes by inputs at nodes
+    push = xp.einsum("piakb,pkbu->piauk", push, flow.by_input)  # nodes by inputs at nodes
     # From piece to piece.
-    kick = xp.einsum("pfk,paku->pfau", inside, push[:, -1]) * begin[..., None, None]
-    at_end = (begin * inside[:, :, -1])[..., None, None]
-    driven = xp.einsum("pab,pfbu->pfau", jumps.by_state, kick) + jumps.by_input[:, None] * at_end
+    arrived = (push[:, -1].reshape(P, d * nu, K) @ inside).reshape(P, d, nu, F)
+    driven = jumps.by_state @ (arrived * begin).reshape(P, d, nu * F)
+    driven = driven + (jumps.by_input[..., None] * at_end).reshape(P, d, nu * F)
     through = jumps.by_state @ free[:, -1]
     advance = lambda x, piece: (piece[0] @ x + piece[1], x)  # noqa: E731
-    zero = xp.zeros(driven.shape[1:], driven.dtype)
-    total, _ = scan(advance, zero, (through + 0j, driven))
+    total, _ = scan(advance, xp.zeros(driven.shape[1:], driven.dtype), (through + 0j, driven))
     # Deviations at the beginning: X(T) = exp(i w T) X(0).
     size = map.sizes
     whole = flow.monodromy(free, map.valid) * size / size[:, None]
@@ -131,27 +122,27 @@ def _transfer(
                 f"`f` = {f[apart.argmin()]:.10g} cycles per period is a pole of the cycle, which "
                 f"lie at {where}: leave it out."
             )
-    turned = xp.exp(rate * T)[:, None, None] * xp.eye(len(size))
-    start = xp.linalg.solve(turned - whole, total / size[:, None]) * size[:, None]
-    _, x = scan(advance, start, (through + 0j, driven))
+    turned = xp.exp(rate * T)[:, None, None] * xp.eye(d)
+    total = xp.moveaxis(total.reshape(d, nu, F), -1, 0) / size[:, None]
+    start = xp.moveaxis(xp.linalg.solve(turned - whole, total) * size[:, None], 0, -1)
+    _, x = scan(advance, start.reshape(d, nu * F), (through + 0j, driven))
     # Fourier integrals, with exp(-i w t) of the piece and of the node apart.
-    weight = h[:, None] * w
-    C = y.by_state * weight[..., None, None]
-    D = xp.einsum("pkyu,pk->pyku", y.by_input, weight)
-    of_start = xp.einsum("pkya,pkab->pkyb", C, free)
-    of_push = xp.einsum("piya,piaku->pkiyu", C, push)
-    shape = *inside.shape, *D.shape[1::2]
-    within = (inside @ of_push.reshape(*of_push.shape[:2], -1)).reshape(shape)
-    back, before = xp.conj(inside), x / begin[..., None, None]
-    response = xp.einsum("pkyb,pfbu->pfkyu", of_start, before) + within
-    response = response * back[..., None, None] + xp.moveaxis(D, 2, 1)[:, None]
+    weight = (h[:, None] * w)[..., None, None]
+    C = by_state * weight
+    before = (x.reshape(P, d, nu, F) / begin).reshape(P, d, nu * F)
+    of_push = C @ push.reshape(P, K, d, nu * K)
+    shape = P, K, len(z.names), nu, F
+    response = ((C @ free).reshape(P, -1, d) @ before).reshape(shape)
+    response += (of_push.reshape(P, -1, K) @ inside).reshape(shape)
+    back = xp.conj(inside)[:, :, None, None]
+    response *= back
     # Events whose time moves: the jump of the output at the moment of the event.
-    last = xp.einsum("pab,pfbu->pfau", free[:, -1], before)
-    last = last + xp.einsum("pfk,paku->pfau", inside, push[:, -1])
-    delay = xp.einsum("pa,pfau->pfu", jumps.delay_by_state, last)
-    delay = delay * back[:, :, -1, None] + jumps.delay_by_input[:, None]
-    step = y.values[:, -1] - xp.roll(y.values[:, 0], -1, axis=0)
-    impulse = step[:, None, :, None] * delay[:, :, None]
+    last = (free[:, -1] @ before).reshape(arrived.shape) + arrived
+    delay = xp.einsum("pa,pauf->puf", jumps.delay_by_state, last) * back[:, -1, 0]
+    step = values[:, -1] - xp.roll(values[:, 0], -1, axis=0)
+    impulse = step[..., None, None] * (delay + jumps.delay_by_input[..., None])[:, None]
     waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / T))
-    H = xp.tensordot(waves, response, ((1, 2), (0, 2)))
-    return (H + xp.einsum("mp,pfyu->mfyu", waves[:, :, -1], impulse)) / T
+    H = waves.reshape(len(waves), -1) @ response.reshape(P * K, -1)
+    H = (H + waves[:, :, -1] @ impulse.reshape(P, -1)).reshape(-1, *shape[2:])
+    H = H + xp.einsum("mpk,pkyu->myu", waves, by_input * weight)[..., None]
+    return xp.moveaxis(H, -1, 1) / T

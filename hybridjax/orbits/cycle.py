@@ -32,6 +32,7 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
+from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
 from .linear_flow import Course
 from .responses import Responses, responses
 from .return_map import ReturnMap
@@ -265,6 +266,26 @@ class LimitCycle(eqx.Module):
         cycles that are not isolated.
         """
         return sensitivity(self._course(), parameter)
+
+    def fluctuations(
+        self, white: Given = None, guards: Given = None, resets: GivenResets = None
+    ) -> Fluctuations:
+        """Stationary deviations from the cycle under independent noise, to first order in it:
+        covariances at every phase and from period to period, of durations, and phase diffusion.
+
+        **Arguments:**
+
+        - `white`: strengths of white noise by name of a state or an input, in units of a rate of
+            the state, or of the input, times the square root of time. Default: none.
+        - `guards`: standard deviations of the level of a transition's guard, or of the time of a
+            scheduled event, by name. Default: none.
+        - `resets`: standard deviations of states after a transition, by its name and theirs.
+            Default: none.
+
+        **Raises:** `DefinitionError` for names that do not exist; `ComputationError` for cycles
+        that are not stable.
+        """
+        return fluctuations(self._course(), white or {}, guards or {}, resets or {})
 
     def _course(self) -> Course:
         require_x64()

@@ -27,6 +27,7 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled
 from .return_map import ReturnMap, with_derivatives
+from .scale import has_implicit
 
 
 # Nodes of a piece, both ends among them. Fewer: polynomials through them lose digits of responses.
@@ -79,6 +80,8 @@ class Jumps(NamedTuple):
     delay_by_input: Float[Array, "P nu"]
     slip: Float[Array, "P d"]
     """Change of the state after the event, at a fixed time, by the time of the event."""
+    delay_by_level: Float[Array, " P"]
+    """Change of the time of the event by the level of its guard, or by its schedule."""
 
 
 class LinearFlow(eqx.Module):
@@ -218,15 +221,19 @@ def _linear_flow(course: Course, longest: float) -> LinearFlow:
         assert tape is not None
         pieces = _pieces(map, legs, target, tape, ends[-1:])
         if on_host(pieces.t):
-            divide = np.maximum(np.ceil(pieces.h / (longest * period) - 1e-9), 1).astype(int)
+            first, joined = _joined(s, pieces, longest * period)
+            divide = np.maximum(np.ceil(joined.h / (longest * period) - 1e-9), 1).astype(int)
         else:
-            divide = np.full(len(pieces.t), max(int(np.ceil(_LONGEST / longest)), 1))
-        return _linearized(s, course.linearized, pieces, divide, events)
+            first, joined = np.arange(len(pieces.t)), pieces
+            divide = np.full(len(first), max(int(np.ceil(_LONGEST / longest)), 1))
+        return _linearized(course, pieces, first, joined, divide)
 
 
 # Bound on the steps of a turn that is traced, whose number is not known. Fewer: results for long
 # turns are NaN. More: programs take longer.
 _MOST = 256
+# Explicit steps of a piece. More: its polynomials lose digits. Fewer: more pieces than needed.
+_STEPS = 4
 # The longest step that a turn can have, in parts of the period (see `ReturnMap.travel`).
 _LONGEST = 0.5
 
@@ -273,19 +280,39 @@ def _pieces(map: ReturnMap, legs: Lanes, target: Target, tape: Tape, end: Array)
     return pieces._replace(h=xp.where(lost, xp.nan, pieces.h))
 
 
+def _joined(s: Structure, steps: _Pieces, longest: Array) -> tuple[np.ndarray, _Pieces]:
+    """Pieces of several steps between events, because a step of an explicit method is short for
+    the polynomials of a piece, and the indices of their first steps."""
+    first, length, most = [0], 0.0, 1 if has_implicit(s) else _STEPS
+    for k, h in enumerate(steps.h[1:], 1):
+        length += steps.h[k - 1]
+        if steps.code[k - 1] >= 0 or k - first[-1] == most or length + h > longest:
+            first.append(k)
+            length = 0.0
+    last = np.append(first[1:], len(steps.h)) - 1
+    h, code = np.add.reduceat(steps.h, first), steps.code[last]
+    begin = _Pieces(*(x[..., first] for x in steps))
+    return np.array(first), begin._replace(h=h, code=code)
+
+
 def _linearized(
-    s: Structure, of: Structure, pieces: _Pieces, divide: Int[np.ndarray, " P"], events
+    course: Course, steps: _Pieces, first: np.ndarray, pieces: _Pieces, divide: np.ndarray
 ) -> LinearFlow:
-    xp, K, nodes = namespace(pieces.t), NODES, rule().nodes
+    """The flow linearized at nodes of pieces, each divided into some parts, whose states follow
+    from the recorded steps."""
+    s, of, events = course.map.structure, course.linearized, course.events
+    xp, K, nodes = namespace(steps.t), NODES, rule().nodes
     whole = np.repeat(np.arange(len(divide)), divide)
     part = np.arange(len(whole)) - np.repeat(np.cumsum(divide) - divide, divide)
-    of_step = (part[:, None] + nodes) / divide[whole, None]  # of the step in which a node lies
-    t, chart, q, h, code = (x[..., whole] for x in pieces)
+    of_piece = (part[:, None] + nodes) / divide[whole, None]
+    t, chart, _, h, code = (x[..., whole] for x in pieces)
     P = len(whole)
-    many = lambda x: xp.repeat(x, K, axis=-1)  # noqa: E731
-    ahead = (h[:, None] * of_step).ravel()
-    time, charts = many(t) + ahead, many(chart)
-    states = _ahead(s, many(t), charts, many(q), ahead)
+    time, charts = (t[:, None] + h[:, None] * of_piece).ravel(), xp.repeat(chart, K)
+    step = np.repeat(first[whole], K)
+    if len(first) < len(steps.t):
+        last = np.append(first[1:], len(steps.t))[whole] - 1
+        step = np.clip(np.searchsorted(steps.t, time, "right") - 1, step, np.repeat(last, K))
+    states = _ahead(s, steps.t[step], charts, steps.q[:, step], time - steps.t[step])
     code = xp.where(part == divide[whole] - 1, xp.maximum(code, -1), -1)
     by = with_derivatives(of, ft.partial(kernels.field, of), charts, time, states, s.d)
     d = s.d
@@ -326,7 +353,7 @@ def _jumps(s: Structure, end, after, code, events) -> Jumps:
     xp, (P, d) = namespace(t), f.shape
     out = Jumps(
         xp.broadcast_to(xp.eye(d), (P, d, d)), xp.zeros((P, d, s.nu)),
-        xp.zeros((P, d)), xp.zeros((P, s.nu)), xp.zeros((P, d)),
+        xp.zeros((P, d)), xp.zeros((P, s.nu)), xp.zeros((P, d)), xp.zeros(P),
     )  # fmt: skip
     for g in sorted(set(events)):
         fired = code == g
@@ -339,24 +366,22 @@ def _jumps(s: Structure, end, after, code, events) -> Jumps:
         by = xp.moveaxis(kernels.linear_reset(s, s.member(g), *point), -1, 0)
         m, n_u = by.shape[1], 2 + n
         by_t, by_q, by_u = by[:, :, 1], by[:, :, 2:n_u], by[:, :, n_u:]
-        moves, pushed = xp.zeros((P, n)), xp.zeros((P, s.nu))
+        moves, pushed, delay = xp.zeros((P, n)), xp.zeros((P, s.nu)), xp.ones(P)
         if not isinstance(tr.guard, Scheduled):
             index = np.zeros(1, np.int32)
             guard = kernels.watched(s, a, None, *point, xp.asarray(index))[s.guards(a).index(g)]
             guard = xp.moveaxis(guard, -1, 0)
             rate = guard[:, 1] + xp.sum(guard[:, 2:n_u] * f[:, :n], axis=1)
-            rate = xp.where(fired, rate, 1.0)[:, None]
-            moves, pushed = -guard[:, 2:n_u] / rate, -guard[:, n_u:] / rate
+            delay = -1 / xp.where(fired, rate, 1.0)
+            moves, pushed = guard[:, 2:n_u] * delay[:, None], guard[:, n_u:] * delay[:, None]
         slip = by_t + xp.einsum("pij,pj->pi", by_q, f[:, :n]) - after[:, :m]
         salted = by_q + slip[:, :, None] * moves[:, None, :]
         driven = by_u + slip[:, :, None] * pushed[:, None, :]
         new = Jumps(
             xp.pad(salted, [(0, 0), (0, d - m), (0, d - n)]),
             xp.pad(driven, [(0, 0), (0, d - m), (0, 0)]),
-            xp.pad(moves, [(0, 0), (0, d - n)]),
-            pushed,
-            xp.pad(slip, [(0, 0), (0, d - m)]),
-        )
+            xp.pad(moves, [(0, 0), (0, d - n)]), pushed, xp.pad(slip, [(0, 0), (0, d - m)]), delay,
+        )  # fmt: skip
         choose = lambda x, y, fired=fired: xp.where(fired.reshape(-1, *[1] * (x.ndim - 1)), x, y)  # noqa: E731
         out = Jumps(*(choose(x, y) for x, y in zip(new, out, strict=True)))
     return out

@@ -7,15 +7,17 @@ the mode v (G. B. Ermentrout, D. H. Terman, Mathematical foundations of neurosci
 Ch. 8; D. Wilson, J. Moehlis, Phys. Rev. E 94, 2016).
 """
 
+from collections.abc import Callable
 from typing import Annotated, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
+from scipy import optimize
 
-from .._core.arguments import require_index
+from .._core.arguments import require_among, require_index
 from .._core.boundary.checked import checked_methods
-from .._core.boundary.kinds import Index, Numbers
+from .._core.boundary.kinds import Count, Index, Numbers
 from .._core.boundary.values import Reals
 from .._core.executor import (
     Array,
@@ -26,13 +28,14 @@ from .._core.executor import (
     stop_gradient,
     to_host,
 )
+from .._core.signal import unit_of
 from .._core.text import number
 from ..engine import kernels
 from ..engine.lanes import for_each_chart, only
 from ..errors import ComputationError, DefinitionError
 from ..systems.sliding import SlidingChart
 from ..systems.structure import Structure
-from .linear_flow import Course, LinearFlow, by_name
+from .linear_flow import Course, LinearFlow, by_name, polynomials, rule
 from .return_map import SINGULAR, ReturnMap
 
 
@@ -45,7 +48,7 @@ Phases = Annotated[Numbers, Reals("p")]
 
 
 class PhaseCurve(eqx.Module):
-    """The phase response to one input over one cycle.
+    """The phase response to one input over one cycle, of a model or measured.
 
     **Fields:** `phase` (P,), in cycles; `values` (P,), in cycles per unit of time and of the input,
     with NaN between both sides of an event; `input`; `time_unit`.
@@ -56,6 +59,12 @@ class PhaseCurve(eqx.Module):
     input: str = eqx.field(static=True)
     time_unit: str = eqx.field(static=True, default="s", kw_only=True)
 
+    @property
+    def unit(self) -> str:
+        """The unit of the values."""
+        unit, time = unit_of(self.input), self.time_unit or "time"
+        return f"cycles / ({unit} {time})" if unit else f"cycles / {time} / input"
+
 
 class Impulse(NamedTuple):
     """The response to an input that acts at an event, through its guard or reset: there, the input
@@ -65,6 +74,69 @@ class Impulse(NamedTuple):
     phase: Float[Array, ""]
     weight: dict[str, Inexact[Array, ""]]
     """By name of the input."""
+
+
+class Locked(NamedTuple):
+    """A state in which phases move together: `lead` of the push, in cycles, and the `rate` at which
+    deviations grow, per time and strength of the push; negative where it is stable."""
+
+    lead: float
+    rate: float
+
+
+@checked_methods
+class Coupling(eqx.Module):
+    r"""Mean effect of a weak push, by its lead $\psi$ in cycles (see `Responses.coupling`).
+
+    The rate of the phase is $f_0 + \varepsilon \Gamma(\psi)$ in cycles per time under a push of the
+    strength $\varepsilon$. Calls return $\Gamma$ at some leads.
+
+    **Fields:** `coefficients` (n,): those of $e^{2 \pi i n \psi}$ in $\Gamma$, n = 0, 1, ...
+    """
+
+    coefficients: Complex[Array, " n"]
+
+    def __call__(self, lead: Phases) -> Float[Array, " p"]:
+        return _series(self.coefficients, lead)
+
+    @property
+    def locking(self) -> tuple[float, float]:
+        """The least and the largest frequency of a push that the cycle follows, less that of the
+        cycle, per strength of the push: the Arnold tongue, to first order."""
+        c = to_host(self.coefficients)
+        slopes = 2j * np.pi * np.arange(len(c)) * c
+        values = _series(c, [x.lead for x in _zeros(slopes)] or [0.0])
+        return float(values.min()), float(values.max())
+
+    def locked(self, detuning: float = 0.0, mutual: bool = False) -> tuple[Locked, ...]:
+        """The leads at which the phases stay together.
+
+        **Arguments:**
+
+        - `detuning`: frequency of the push less that of the cycle, per strength. Default: 0.
+        - `mutual`: whether the push comes from an equal cycle that is pushed in return. Default:
+            False.
+        """
+        c = to_host(self.coefficients)
+        c = np.conj(c) - c if mutual else -c
+        return _zeros(c + detuning * (np.arange(len(c)) == 0))
+
+
+def _series(c: Complex[Array, " n"], lead: Phases) -> Float[Array, " p"]:
+    xp, n = namespace(c), np.arange(len(c))
+    waves = xp.exp(2j * np.pi * xp.asarray(lead)[..., None] * n)
+    return xp.real(waves @ (c * np.where(n == 0, 1, 2)))
+
+
+def _zeros(c: Complex[np.ndarray, " n"]) -> tuple[Locked, ...]:
+    """Zeros of a series in one cycle, and its slopes there."""
+    grid = (np.arange(16 * len(c) + 1) - 0.5) / (16 * len(c))
+    sign = np.sign(_series(c, grid))
+    crossed = zip(grid[:-1], grid[1:], sign[:-1] * sign[1:] < 0, strict=True)
+    value = lambda x: float(_series(c, x))  # noqa: E731
+    zeros = [optimize.root_scalar(value, bracket=(a, b)).root for a, b, turns in crossed if turns]
+    slopes = _series(2j * np.pi * np.arange(len(c)) * c, zeros)
+    return tuple(Locked(x % 1.0, float(rate)) for x, rate in zip(zeros, slopes, strict=True))
 
 
 @checked_methods
@@ -143,9 +215,7 @@ class Responses(eqx.Module):
         cycle that is driven by a clock, and inside of transformations of JAX.
         """
         of_phase = self._covector(None)
-        (signal, *_), (column, *_) = self.structure.inputs_among(
-            input if input is None else [input]
-        )
+        signal, column = self._input(input)
         if any(x.weight[signal] != 0 for x in self.impulses()):
             raise DefinitionError(f"'{signal}' acts at events alone: see `impulses()`.")
         flow = to_host(self.flow)
@@ -157,6 +227,47 @@ class Responses(eqx.Module):
         values = np.concatenate([values, tail], axis=1).ravel()
         phase = np.concatenate([phase, phase[:, -1:]], axis=1).ravel()
         return PhaseCurve(phase, values, signal, time_unit=self.structure.system.time_unit)
+
+    def coupling(
+        self, push: Callable | str, input: str | None = None, harmonics: Count = 64
+    ) -> Coupling:
+        """Mean effect of a weak periodic push on the phase, by the lead of the push.
+
+        **Arguments:**
+
+        - `push`: a function of phases (P,) in cycles, or the name of a state of an equal cycle.
+        - `input`: the input through which it acts. Default: the first.
+        - `harmonics`: number of harmonics of the push and of the response. Default: 64.
+
+        **Raises:** `DefinitionError` for names that do not exist, too few harmonics, and a cycle
+        that is driven by a clock.
+        """
+        flow, xp = self.flow, namespace(self.flow.q)
+        signal, column = self._input(input)
+        # Nodes within parts of pieces that resolve the fastest wave.
+        parts = 1 + harmonics // 2
+        x = ((np.arange(parts)[:, None] + rule().nodes) / parts).ravel()
+        mix = polynomials(x) @ rule().coefficients
+        turn, period = flow.length[:, None] / self.period, self.period
+        phase = flow.turn[:, None] / period + turn * x
+        Z = xp.einsum("pki,pki->pk", self._covector(None), flow.by_input[..., column]) @ mix.T
+        if isinstance(push, str):
+            require_among("state", [push], self.structure.state_names(), "`push`: ")
+            chart, states = xp.repeat(flow.chart, len(x)), mix @ flow.q
+            wave = by_name(self.structure, chart, states.reshape(len(chart), -1))[push]
+        else:
+            wave = xp.asarray(push(phase.ravel()), float)
+        n = np.arange(harmonics + 1)[:, None, None]
+        weight = turn * np.tile(rule().weights / parts, parts)
+        weight = xp.exp(-2j * np.pi * n * phase) * weight
+        wave = xp.sum(weight * wave.reshape(phase.shape), axis=(1, 2))
+        response = xp.sum(weight * Z, axis=(1, 2))
+        for x in self.impulses():
+            response += xp.exp(-2j * np.pi * n[:, 0, 0] * x.phase) * x.weight[signal] / period
+        c = xp.conj(response) * wave / period
+        if on_host(c) and np.abs(c[len(c) * 3 // 4 :]).max() > 1e-3 * np.abs(c).max():
+            raise DefinitionError(f"`harmonics` = {harmonics} does not resolve jumps of the push.")
+        return Coupling(c)
 
     def __repr__(self):
         name = type(self.structure.system).__name__
@@ -173,6 +284,10 @@ class Responses(eqx.Module):
             kinds.append(f"inputs act at {', '.join(dict.fromkeys(acting))}: see `impulses()`")
         period = number(self.period, 9, self.structure.system.time_unit)
         return f"Responses({name}: period {period})" + "".join(f"\n  {x}" for x in kinds)
+
+    def _input(self, name: str | None) -> tuple[str, int]:
+        names, columns = self.structure.inputs_among(name if name is None else [name])
+        return names[0], columns[0]
 
     def _covector(self, mode: int | None) -> Inexact[Array, "P K d"]:
         if mode is None:
@@ -230,10 +345,10 @@ def responses(course: Course, modes: int | None) -> Responses:
     if host and not np.any(np.iscomplex(exponents)):
         amplitudes, right = np.real(amplitudes), np.real(right)
     total = int(np.sum(map.valid)) - (not clocked) if host else len(values)
-    surface = _surface(map.structure, flow)
+    off = surface(map.structure, flow)
     return Responses(
         map.structure, flow, period, values, exponents, right, total - len(values),
-        events, phase, amplitudes, surface,
+        events, phase, amplitudes, off,
     )  # fmt: skip
 
 
@@ -310,7 +425,7 @@ def _eigenpairs(M: Float[Array, "d d"], value, right):
     return root, right, left
 
 
-def _surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
+def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
     """The effect of pushes in charts of sliding; identity in others."""
     sliding = [a for a, chart in enumerate(s.charts) if isinstance(chart, SlidingChart)]
     if not sliding:

@@ -109,7 +109,11 @@ def _sensitivity(course: Course, flow: LinearFlow, s: Structure, varied: Varied)
     time = flow.t
     if not clocked:  # phase 0 stays on the section
         time = flow.t - flow.t[0, 0]
-        ahead = late[-1] - longer if isinstance(map.base, AtEvent) else _off(course, begin, f0)
+        if isinstance(map.base, AtEvent):
+            ahead = late[-1] - longer
+        else:
+            by_state, by_parameter = to_section(course, f0)
+            ahead = by_state @ begin + by_parameter
         change, late = change + ahead * flow.field, late - ahead
     change = change + flow.field * (time / period * longer)[..., None]
     place = xp.argsort(flow.event < 0, stable=True)[: len(course.events)]
@@ -139,22 +143,23 @@ def _due(flow: LinearFlow, events: tuple[int, ...], varied: Varied) -> Float[Arr
     return out
 
 
-def _off(course: Course, begin: Float[Array, " d"], f: Float[Array, " d"]) -> Float[Array, ""]:
-    """The time by which the changed state at phase 0 comes later to the section."""
-    map, xp = course.map, namespace(begin)
+def to_section(course: Course, f: Float[Array, " d"]) -> tuple[Float[Array, " d"], Array]:
+    """The time by which a changed state at phase 0 comes later to the section, per change of the
+    state and of the first input."""
+    map, xp = course.map, namespace(f)
     assert map.base is not None
     levels, (t, chart, q, *_) = ListLevels((map.base,)), map.anchor
 
     def work(a, here, out):
-        n, u = map.structure.dims[a], xp.zeros((1, 1))
+        n, u = map.structure.dims[a], xp.zeros((course.linearized.nu, 1))
         by = kernels.linear(course.linearized, _level, a, t, q[:n], u, levels)[0, :, 0]
-        moved = by[-1] + by[2 : 2 + n] @ begin[:n]
-        return out - moved / (by[2 : 2 + n] @ f[:n])
+        rate = by[2 : 2 + n] @ f[:n]
+        return out + xp.append(xp.pad(by[2 : 2 + n], (0, len(f) - n)), by[2 + n]) / -rate
 
-    return for_each_chart(map.structure, chart, xp.ones(1, bool), work, xp.zeros(()))
+    out = for_each_chart(map.structure, chart, xp.ones(1, bool), work, xp.zeros(len(f) + 1))
+    return out[:-1], out[-1]
 
 
 def _level(a: int, s: Structure, levels: ListLevels, t, q, u):
-    assert isinstance(s.system, Varied)
-    of = Structure(s.system.at(u[0]))
+    of = Structure(s.system.at(u[0])) if isinstance(s.system, Varied) else s
     return levels.level(of, a, jnp.zeros((), int), t, q)[None]

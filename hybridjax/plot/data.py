@@ -13,7 +13,8 @@ from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from .._core.text import p_value
 from ..experiments.data import ExperimentData
 from ..identify.validate import Validation
-from ..recordings.beats.response import PhaseResponse, curve_unit
+from ..orbits.responses import PhaseCurve
+from ..recordings.beats.response import PhaseResponse
 from ..recordings.data import SectionData, input_spectrum
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase import Phase
@@ -28,6 +29,10 @@ from .look import (
     letters,
     panels,
 )  # fmt: skip
+
+
+# Factors of what is per one unit of time, per another.
+_PER = {("ms", "s"): 1e3, ("s", "ms"): 1e-3}
 
 
 @checked
@@ -133,19 +138,31 @@ def impulse_responses(
 
 
 @checked
-def phase_response(found: PhaseResponse, *, ax: AxesLike | None = None) -> Plot:
-    """The curve with its 95 % band."""
+def phase_response(
+    found: PhaseCurve, *, model: PhaseCurve | None = None, ax: AxesLike | None = None
+) -> Plot:
+    """The curve; an estimate with its 95 % band. Dotted lines are events of a model.
+
+    **Arguments:** `model`: the curve of a model (`Responses.curve`), drawn over that of a
+    recording; a time in ms is converted. Phase 0 of both must be the same event.
+    """
+    curves = [found] if model is None else [found, model]
     with panels(ax, height=2.8) as axes:
-        curve = axes[0, 0]
-        low, high = found.interval(found.phase)
-        curve.fill_between(found.phase, low, high, color=CYCLE[0], alpha=0.25, lw=0)
-        curve.plot(found.phase, found.values, color=CYCLE[0], label="estimated, 95 %")
-        curve.axhline(0, color="black", lw=0.4)
+        panel = axes[0, 0]
+        for k, curve in enumerate(curves):
+            scale, color = _PER.get((curve.time_unit, found.time_unit), 1.0), CYCLE[k]
+            label = "model"
+            if isinstance(curve, PhaseResponse):
+                low, high = curve.interval(curve.phase)
+                panel.fill_between(curve.phase, low, high, color=color, alpha=0.25, lw=0)
+                label = "estimated, 95 %"
+            panel.plot(curve.phase, scale * curve.values, color=color, label=label)
+            for phase in curve.phase[np.isnan(curve.values)]:
+                panel.axvline(phase, color=color, lw=0.8, ls=":")
+        panel.axhline(0, color="black", lw=0.4)
         name = f"response to {found.input}"
-        curve.set(
-            xlabel="phase (cycles)", ylabel=f"{name}\n({curve_unit(found.input)})", xlim=(0, 1)
-        )
-        curve.legend()
+        panel.set(xlabel="phase (cycles)", ylabel=f"{name}\n({found.unit})", xlim=(0, 1))
+        panel.legend()
     return Plot(axes)
 
 

@@ -1,5 +1,6 @@
 """Systems modulo a symmetry: legs that are relabeled, a position that has no effect."""
 
+import dataclasses
 import functools as ft
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -46,8 +47,17 @@ class Quotient(Derived):
     - `flipped`: states that change their sign in the mirror.
     - `translation`: states that have no effect on others, such as the position along the floor.
         They are left out.
+    - `half_period`: for cycles with x(t + T/2) = S x(t), with S from the arguments above. True if a
+        clock drives the system; otherwise the name of a state, or a function of (t, q), that S
+        multiplies by -1 and that rises through zero once in half a period. There, or after half a
+        period of the clock, the transition "half period" puts the mirror image of the state. The
+        multipliers are those of this half map, whose squares are those of the cycle. All charts are
+        kept; if one is its own mirror image, its last transition is the image of its first. The
+        state `clock`, the time since that transition, makes a system with a clock autonomous.
+        Default: False.
 
-    Inputs are those of the charts that are kept.
+    Inputs are those of the charts that are kept; with `half_period`, they act on the mirror image
+    in every second half of a cycle.
 
     **Raises:** `DefinitionError` if charts or states do not fit together and, when a cycle is
     looked for, if a function does not have the symmetry; it names the function.
@@ -65,7 +75,13 @@ class Quotient(Derived):
         relabel: Mapping[str, str] | None = None,
         flipped: SignalNames = (),
         translation: SignalNames = (),
+        half_period: str | Callable | bool = False,
     ):
+        if half_period:
+            images = {**(swap or {}), **{b: a for a, b in (swap or {}).items()}}
+            images = {name: images.get(name, name) for name in system.charts()}
+            system = _Halves(system, half_period, tuple(images.items()))
+            swap = {name: image + SECOND for name, image in images.items()}
         self.system, self.solver = system, system.solver
         self.pairs, self.names = (tuple((x or {}).items()) for x in (swap, relabel))
         self.flipped, self.translation = (
@@ -147,9 +163,9 @@ class Quotient(Derived):
         values = both(rng.normal(size=(3, d)), rng.normal(size=3))
         for (sentence, *_), pair in zip(claims, values, strict=True):
             if not _equal(*pair):
+                full = self.system.system if isinstance(self.system, _Halves) else self.system
                 raise DefinitionError(
-                    f"{type(self.system).__name__} does not have the symmetry of its Quotient: "
-                    f"{sentence}."
+                    f"{type(full).__name__} does not have the symmetry of its Quotient: {sentence}."
                 )
 
     def _claims(self):
@@ -221,6 +237,108 @@ class Quotient(Derived):
         order = [source.index(self._partner(name)) for name in target]
         names = target if back else map(self._partner, target)
         return q[np.array(order)] * np.array([-1.0 if x in self.flipped else 1.0 for x in names])
+
+
+SECOND = " (second half)"
+
+
+class _Halves(Derived):
+    """A system whose charts have copies for the second half of a cycle."""
+
+    half_period: str | Callable | bool = eqx.field(static=True)
+    images: tuple[tuple[str, str], ...] = eqx.field(static=True)
+
+    def __check_init__(self):
+        if (self.system.period() is not None) != (self.half_period is True):
+            sentence = (
+                "True if a clock drives the system, otherwise a state or a function of (t, q)"
+            )
+            raise DefinitionError(f"Quotient: `half_period` must be {sentence}.")
+        if any(isinstance(x.guard, Scheduled) for x in self.system.transitions()):
+            raise DefinitionError("Quotient: `half_period` does not cover scheduled transitions.")
+        for name, chart in self.system.charts().items():
+            named = [self.half_period] if isinstance(self.half_period, str) else []
+            require_among("state", named, chart.states, f"Quotient: in '{name}' ")
+
+    def period(self):
+        return None
+
+    def charts(self):
+        period, charts = self.system.period(), self.system.charts().items()
+        first, later = (None, None) if period is None else (0.0, period / 2)
+        pairs = [(x, "", first) for x in charts] + [(x, SECOND, later) for x in charts]
+        return {name + when: _Half(chart, later) for (name, chart), when, later in pairs}
+
+    def transitions(self):
+        charts, events, made = self.charts(), list(self.system.transitions()), []
+        for when, other, sign in (("", SECOND, 1), (SECOND, "", -1)):
+            for name, image in self.images:
+                chart = charts[name + when]
+                copies = [chart.copied(x, when) for x in events if x.source == name]
+                guard, places = ft.partial(self._switch, chart, sign), (name + when, name + other)
+                made += copies[::-1] if when and name == image else copies
+                made += [Transition("half period", *places, guard, "rising", chart.anew)]
+        return made
+
+    def _switch(self, chart: "_Half", sign: int, t, q, u):
+        if (period := self.system.period()) is not None:
+            return q[-1] - period / 2
+        if callable(self.half_period):
+            return sign * self.half_period(t, q)
+        return sign * q[chart.chart.states.index(self.half_period)]
+
+    def guess(self):
+        guess, period = self.system.guess(), self.system.period()
+        if guess is None or period is None:
+            return guess
+        clock = jnp.asarray(guess.time) % (period / 2)
+        return Guess(guess.chart, jnp.append(guess.state, clock), after=guess.after)
+
+    def outputs(self):
+        charts, outputs = self.charts(), []
+        for x in self.system.outputs():
+            given = dict.fromkeys(charts, x.function) if callable(x.function) else x.function
+            lifted = {name: charts[name].lifted(f) for name, f in given.items()}
+            outputs.append(Output(x.name, lifted, x.unit))
+        return outputs
+
+
+class _Half(DerivedChart):
+    """A chart in one half of a cycle: with the time since its begin, if a clock drives the system,
+    and then for times that are `later` by so much."""
+
+    later: Any
+
+    @property
+    def states(self) -> tuple[str, ...]:  # type: ignore[override]
+        return (*self.chart.states, *(() if self.later is None else ("clock",)))
+
+    @property
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
+        extra = () if self.later is None or not self.chart.units else ("",)
+        return (*self.chart.units, *extra)
+
+    def lifted(self, function: Callable) -> Callable:
+        if self.later is None:
+            return function
+        return lambda t, q, u: function(q[-1] + self.later, q[:-1], u)
+
+    def field(self, t, q, u):
+        rates = as_vector(self.lifted(self.chart.field)(t, q, u))
+        return rates if self.later is None else jnp.append(rates, 1.0)
+
+    def anew(self, t, q, u):
+        """The state when the other half begins."""
+        return q if self.later is None else jnp.append(q[:-1], 0.0)
+
+    def copied(self, x: Transition, when: str) -> Transition:
+        """A transition of this half; the clock goes on."""
+        assert not isinstance(x.guard, Scheduled)
+        at, kept = self.lifted, slice(len(self.chart.states), None)
+        reset = lambda t, q, u: jnp.append(as_vector(at(x.reset)(t, q, u)), q[kept])  # noqa: E731
+        copy = dataclasses.replace(x, guard=at(x.guard), reset=reset)
+        copy = dataclasses.replace(copy, enabled=x.enabled and at(x.enabled))
+        return dataclasses.replace(copy, source=x.source + when, target=x.target + when)
 
 
 class _Reduced(DerivedChart):

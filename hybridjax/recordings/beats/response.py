@@ -13,9 +13,10 @@ from ..._core.boundary.kinds import Probability
 from ..._core.boundary.values import Reals
 from ..._core.progress import say, working
 from ..._core.results import Result
-from ..._core.signal import Signal, unit_of, with_unit
+from ..._core.signal import Signal, with_unit
 from ...errors import DefinitionError
 from ...orbits.crossing import AtEvent, Crossing
+from ...orbits.responses import PhaseCurve
 from ..findings import Finding, print_findings
 from ..fit_warnings import about_phase_response
 from ..phase import Phase
@@ -30,7 +31,7 @@ Phases = Annotated[Numbers, Reals("n")]
 
 
 @checked_methods
-class PhaseResponse(eqx.Module):
+class PhaseResponse(PhaseCurve):
     r"""The curve Z of the phase model $\dot\varphi = w + Z(\varphi)\,I(t)$, with its accuracy.
 
     Z is in cycles per second and unit of the input; $\varphi$ is 0 at an event, and the next event
@@ -60,8 +61,6 @@ class PhaseResponse(eqx.Module):
     covariance: Float[np.ndarray, "p p"]
     freedom: float = eqx.field(static=True)
     detail: float = eqx.field(static=True)
-    phase: Float[np.ndarray, " P"]
-    values: Float[np.ndarray, " P"]
     errors: Float[np.ndarray, " P"]
     rates: Float[np.ndarray, " trials"]
     jitter: float = eqx.field(static=True)
@@ -72,7 +71,6 @@ class PhaseResponse(eqx.Module):
     intervals: int = eqx.field(static=True)
     miscounted: int = eqx.field(static=True)
     memory: float = eqx.field(static=True)
-    input: str = eqx.field(static=True)
     result: Result = eqx.field(static=True)
 
     @property
@@ -101,18 +99,13 @@ class PhaseResponse(eqx.Module):
         return (
             f"PhaseResponse(detail of {self.detail:.1f} numbers, {self.intervals} intervals of "
             f"{len(self.rates)} trials, {self.miscounted} of them miscounted)\n"
-            f"  mean {with_unit('Z', curve_unit(self.input))}  {mean:.4g} +- {error:.2g}; from "
+            f"  mean {with_unit('Z', self.unit)}  {mean:.4g} +- {error:.2g}; from "
             f"{self.values.min():.4g} to {self.values.max():.4g}\n"
             f"  rates        {self.rates.min():.4g} to {self.rates.max():.4g} cycles/s, jitter "
             f"{100 * self.jitter:.2g} % of a cycle\n"
             f"  R2 left out  {self.left_out:.3f}; of a flat curve {self.left_out_flat:.3f}\n"
             + print_findings(self.warnings, "  ")
         )
-
-
-def curve_unit(name: str) -> str:
-    """Return the unit of a phase response to this input."""
-    return f"cycles / ({unit_of(name)} s)" if unit_of(name) else "cycles / s / input"
 
 
 @checked

@@ -1,0 +1,218 @@
+r"""Random deviations from a cycle under weak noise, to first order.
+
+Over a piece of the cycle the covariance C of deviations satisfies dC/dt = Df C + C Df^T + B B^T,
+and events multiply it by saltation matrices; it is stationary where it closes over a turn (periodic
+Lyapunov equation; S. Bittanti, P. Colaneri, Periodic systems, Springer 2009). Without a clock the
+phase Z . x diffuses and is taken out: the deviations are those across the cycle at equal phases.
+"""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from .._core.arguments import require_among
+from .._core.boundary.checked import checked_methods
+from .._core.boundary.kinds import Index, NonNegative
+from .._core.executor import Array, is_traced, namespace, on_host, scan, to_host
+from .._core.text import number
+from ..errors import ComputationError
+from ..systems.structure import Structure
+from .linear_flow import Course, LinearFlow, rule
+from .responses import Phases, loop, surface
+from .return_map import SINGULAR
+from .sensitivity import to_section
+
+
+Strengths = Mapping[str, NonNegative]
+Resets = Mapping[str, Strengths]
+Given = Strengths | None
+GivenResets = Resets | None
+
+
+@checked_methods
+class Fluctuations(eqx.Module):
+    """Stationary deviations from a cycle under noise (see `LimitCycle.fluctuations`).
+
+    **Fields:**
+
+    - `diffusion`: growth of the variance of the phase, in time, per time; 0 if a clock drives the
+        system.
+    - `events`: names of the events of one period; for an autonomous cycle without events, its
+        section.
+    """
+
+    diffusion: Float[Array, ""]
+    events: tuple[str, ...] = eqx.field(static=True)
+    structure: Structure
+    flow: LinearFlow
+    period: Float[Array, ""]
+    step: Float[Array, "n n"]
+    """From states, the delay of the last event and durations to those one turn later."""
+    joint: Float[Array, "n n"]
+    """Their stationary covariance."""
+    at_nodes: Float[Array, "P K d d"]
+    unresolved: Float[Array, ""]
+    """The largest difference of covariances at ends of pieces, computed in two ways."""
+    to_nodes: Float[Array, "P K d d"]
+    """From deviations at phase 0 to those at the nodes, across the cycle; `to_end` one turn on."""
+    to_end: Float[Array, "P K d d"]
+
+    def covariance(self, phase: Phases, lag: Index = 0) -> Float[Array, "p d d"]:
+        """Covariance of the states at some phases, right after events, with those `lag` periods
+        before. Rows and columns have the order of the chart's states, and zeros beyond.
+
+        Without a clock phases are asymptotic phases, and deviations along the cycle are left out
+        (see `diffusion`).
+
+        **Raises:** `ComputationError` if an implicit method steps over fast decays.
+        """
+        if on_host(self.period) and self.unresolved > SINGULAR:
+            raise ComputationError(
+                "steps pass over decays: use an explicit method, or `durations`."
+            )
+        C, d = self.at_nodes, self.at_nodes.shape[-1]
+        if lag:
+            turns = namespace(C).linalg.matrix_power(self.step[:d, :d], lag - 1)
+            C = self.to_nodes @ turns @ self.to_end @ C
+        return self.flow.at(phase, self.period, C)[1]
+
+    def durations(self, lag: Index = 0) -> Float[Array, "E E"]:
+        """Covariance of the durations that end at the `events` of a turn, each since the event
+        before, with those `lag` turns before. The sum of all entries is the covariance of periods
+        from the last event to the next such event."""
+        n = len(self.joint) - len(self.events)
+        power = namespace(self.joint).linalg.matrix_power(self.step, lag)
+        return (power @ self.joint)[n:, n:]
+
+    def __repr__(self):
+        name, unit = type(self.structure.system).__name__, self.structure.system.time_unit
+        if is_traced(self):
+            return f"Fluctuations({name}, traced)"
+        rows = [f"{number(self.diffusion, unit=unit)}: diffusion of the phase"]
+        rows = rows if self.diffusion else []
+        before, spread = [*self.events[-1:], *self.events], np.sqrt(np.diag(self.durations()))
+        for a, b, x in zip(before, self.events, spread, strict=False):
+            rows.append(f"{number(x, 6, unit)}: standard deviation from {a} to {b}")
+        return f"Fluctuations({name})" + "".join(f"\n  {x}" for x in rows)
+
+
+def fluctuations(
+    course: Course, white: Strengths, guards: Strengths, resets: Resets
+) -> Fluctuations:
+    """Deviations from a cycle under noise (see `LimitCycle.fluctuations`)."""
+    s, flow = course.map.structure, course.linear_flow()
+    levels, scatter = _at_events(s, guards, resets)
+    course = to_host(course) if on_host(flow.q) else course
+    _, map, _, period, events, _ = course
+    xp, jumps = namespace(flow.q), flow.jumps
+    (P, _, d), clocked, f = flow.q.shape, map.base is None, flow.field[0, 0]
+    names = [s.transitions[g].name for g in events] or ([] if clocked else [str(map.base)])
+    n, E = d + 1 + len(names), len(names)
+    # Noise in the states, collected over each piece.
+    B, (free, _), adjoint = _columns(s, flow, white), flow.forward(), flow.adjoint()
+    turned = xp.swapaxes(adjoint, -1, -2) @ B
+    weight = (flow.length[:, None] * rule().weights)[..., None, None]
+    collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
+    # Noise of events, and what each makes of the states before, of the delay of the last event,
+    # and of durations.
+    hit = flow.event >= 0
+    slot = (xp.cumsum(hit)[:, None] - 1 == np.arange(E)) & hit[:, None]
+    jump = _timing(jumps.by_state, jumps.delay_by_state, hit, slot)
+    late = xp.asarray(levels)[flow.event] * jumps.delay_by_level
+    late = late[:, None] * xp.concatenate([jumps.slip, xp.ones((P, 1)), slot], axis=1)
+    added = late[:, :, None] * late[:, None]
+    added += _pad(xp.asarray(scatter)[flow.event][:, :, None] ** 2 * np.eye(d), n)
+    forward = _pad(free[:, -1], n) + np.diag(np.arange(n) >= d)
+
+    def turn(carry, piece):
+        forward, collected, jump, added = piece
+        (M, C), after = carry, forward @ carry[1] @ forward.T + collected
+        return (jump @ forward @ M, jump @ after @ jump.T + added), (M, C, after)
+
+    pieces = forward, _pad(collected, n), jump, added
+    (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
+    M, last = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0), xp.eye(n)
+    diffusion, to_end = xp.zeros(()), adjoint @ flow.backward(adjoint, xp.eye(d))[:, None]
+    across = np.eye(d)
+    if not clocked:
+        closed, along = loop(map, M[:d, :d], f)
+        Z = xp.linalg.solve(closed.T, along)
+        if not events:
+            delay = to_section(course, f)[0][None]
+            last = _timing(np.eye(d)[None], delay, np.ones(1, bool), np.ones((1, 1), bool))[0]
+        diffusion = Z @ Q[:d, :d] @ Z / period
+        # (A state ahead of the cycle meets the next events earlier.)
+        ahead = xp.concatenate([-f, xp.ones(1), xp.zeros(E)])
+        last = last + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
+        across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
+    step, Q = last @ M, last @ Q @ last.T
+    joint = _pad(_stationary(step[:d, :d], Q[:d, :d]), n)
+    for _ in range(2):  # durations follow from the states of this turn and from the last
+        joint = step @ joint @ step.T + Q
+    _, (_, C, after) = scan(turn, (xp.eye(n), joint), pieces)
+    inward = xp.linalg.inv(free) @ B
+    rate = flow.length[:, None, None, None] * inward @ xp.swapaxes(inward, -1, -2)
+    integral = np.pad(np.linalg.inv(rule().derivative[1:, 1:]), [(1, 0), (1, 0)])
+    whole = xp.einsum("ij,pjab->piab", integral, rate)
+    C = free @ (C[:, None, :d, :d] + whole) @ xp.swapaxes(free, -1, -2)
+    off = xp.max(xp.abs(C[:, -1] - after[:, :d, :d]), axis=0)
+    unresolved = xp.max(off / xp.maximum(xp.max(xp.abs(C), axis=(0, 1)), 1e-300))
+    C = across @ C @ xp.swapaxes(across, -1, -2)
+    to_end = last[:d, :d] @ xp.swapaxes(to_end, -1, -2)
+    return Fluctuations(
+        diffusion, tuple(names), s, flow, period, step, joint, C, unresolved,
+        across @ free @ begin[:, None, :d, :d], to_end,
+    )  # fmt: skip
+
+
+def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:
+    more = n - x.shape[-1]
+    return namespace(x).pad(x, [(0, 0)] * (x.ndim - 2) + [(0, more), (0, more)])
+
+
+def _timing(by_state: Array, delay: Array, hit: Array, slot: Array) -> Float[Array, "P n n"]:
+    """From states, the delay of the last event and durations before an event to those after it."""
+    xp, ((P, d), E) = namespace(delay), (delay.shape, slot.shape[1])
+    each = slot[..., None]
+    return xp.block([
+        [by_state, xp.zeros((P, d, 1 + E))],
+        [delay[:, None], 1.0 - hit[:, None, None], xp.zeros((P, 1, E))],
+        [each * delay[:, None], -1.0 * each, (1.0 - each) * np.eye(E)],
+    ])  # fmt: skip
+
+
+def _stationary(step: Float[Array, "d d"], noise: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    xp, d = namespace(step), len(step)
+    if on_host(step) and not np.abs(np.linalg.eigvals(step)).max(initial=0.0) < 1 - SINGULAR:
+        raise ComputationError("noise drives deviations away, because the cycle is not stable.")
+    return xp.linalg.solve(np.eye(d * d) - xp.kron(step, step), noise.ravel()).reshape(d, d)
+
+
+def _columns(s: Structure, flow: LinearFlow, white: Strengths) -> Float[Array, "P K d r"]:
+    """Effects of white noise of strength 1 on the states."""
+    xp = namespace(flow.q)
+    require_among("state or input", white, [*s.state_names(), *s.inputs], "`white`: ")
+    names = [(*chart.states, *[""] * s.d)[: s.d] for chart in s.charts]
+    of_states = xp.asarray([[white.get(x, 0.0) for x in states] for states in names])
+    direct = of_states[flow.chart][:, None, :, None] * np.eye(s.d)
+    pushed = surface(s, flow)
+    direct = xp.broadcast_to(direct, flow.by_state.shape) if pushed is None else pushed @ direct
+    driven = flow.by_input * np.array([white.get(x, 0.0) for x in s.inputs])
+    return xp.concatenate([direct, driven], axis=-1)
+
+
+def _at_events(s: Structure, guards: Strengths, resets: Resets):
+    """Standard deviations of levels and of states after events, by index of the transition."""
+    names = [x.name for x in s.transitions]
+    for argument, given in (("guards", guards), ("resets", resets)):
+        require_among("transition", given, names, f"`{argument}`: ")
+    levels, scatter = np.zeros(len(names) + 1), np.zeros((len(names) + 1, s.d))
+    for g, transition in enumerate(s.transitions):
+        levels[g] = guards.get(transition.name, 0.0)
+        states = s.charts[s.chart_index(transition.target)].states
+        chosen = resets.get(transition.name, {})
+        require_among("state", chosen, states, f"`resets`: after '{transition.name}' ")
+        scatter[g, : len(states)] = [chosen.get(x, 0.0) for x in states]
+    return levels, scatter
