@@ -127,14 +127,79 @@ def discs(model, size, sensor, design, truths, rng) -> dict[str, float]:
     }
 
 
+def unlike(k: int) -> hj.LDTP:
+    """Return the k-th of random plants: 2 to 5 states, 1 or 2 inputs, 8 to 24 sections.
+
+    Every tenth is unstable. All moduli are above 0.3, and the outputs tell all states.
+    """
+    rng = np.random.default_rng((5, k))
+    d, nu, n = int(rng.integers(2, 6)), int(rng.integers(1, 3)), int(rng.integers(8, 25))
+    size = np.sort(rng.uniform(0.3, 0.9, d))[::-1]
+    size[0] = 1.5 if k % 10 == 9 else size[0]
+    T = rng.normal(size=(n, d, d)) / 2 + 1.5 * np.eye(d)
+    turn = np.linalg.qr(rng.normal(size=(d, d)))[0]
+    root = turn @ np.diag(size ** (1 / n)) @ turn.T
+    A = [T[(i + 1) % n] @ root @ np.linalg.inv(T[i]) for i in range(n)]
+    B, C = rng.normal(size=(n, d, nu)), rng.normal(size=(n, d, d)) / 2 + np.eye(d)
+    return hj.LDTP(A, B, C)
+
+
+def regulator(model: hj.LDTP, weight: float) -> np.ndarray:
+    """Return gains of u = -K y that minimize the mean of |x|^2 + weight |u|^2 (Riccati)."""
+    A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
+    P, K = np.eye(A.shape[1]), np.zeros((len(A), B.shape[2], A.shape[1]))
+    for n in 40 * list(range(len(A)))[::-1]:
+        K[n] = np.linalg.solve(weight * np.eye(B.shape[2]) + B[n].T @ P @ B[n], B[n].T @ P @ A[n])
+        P = np.eye(len(P)) + A[n].T @ P @ (A[n] - B[n] @ K[n])
+    return np.stack([k @ np.linalg.inv(c) for k, c in zip(K, C, strict=True)])
+
+
+def in_a_loop(model: hj.LDTP, gain: np.ndarray, rng, noise: float, strides: int) -> hj.Record:
+    """Return a record with a white reference and white noise of process and sensors."""
+    A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
+    n = len(A) * strides
+    r, w = rng.normal(size=(2, n, B.shape[2]))
+    x, u, y = np.zeros(A.shape[1]), np.zeros(r.shape), np.zeros((n, C.shape[1]))
+    for i in range(n):
+        k = i % len(A)
+        y[i] = C[k] @ x + noise / 5 * rng.normal(size=y.shape[1])
+        u[i] = r[i] - gain[k] @ y[i]
+        x = A[k] @ x + B[k] @ (u[i] + noise * w[i])
+    names = tuple(f"u{j}" for j in range(r.shape[1])) + tuple(f"r{j}" for j in range(r.shape[1]))
+    return hj.Record(np.concatenate([u, r], axis=1), y, n_sections=len(A), inputs=names)
+
+
+def random_loops(count: int) -> dict[str, int]:
+    """Count random loops that are identified, refused or reported, and silently wrong."""
+    counts = dict.fromkeys(("right", "reported", "wrong"), 0)
+    for k in range(count):
+        model, rng = unlike(k), np.random.default_rng((6, k))
+        gain = regulator(model, 10 ** rng.uniform(-1, 2))
+        data = in_a_loop(model, gain, rng, 0.5, 400)
+        try:
+            fit = hj.fit_ldtp(data, len(model.multipliers), reference=data.inputs[gain.shape[1] :])
+        except hj.DefinitionError:
+            counts["reported"] += 1
+            continue
+        right = fit.contains(model.multipliers, 0.9999).all()
+        name = "right" if right else "wrong" if fit.result == hj.Result.OK else "reported"
+        counts[name] += 1
+        print(f"in_loop.random.{k} {name}: {fit.compare(model.multipliers).max_error:.2g}", flush=True)
+    return counts
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=400)
     parser.add_argument("--size", type=float, default=1.0, help="of process noise, relative to r")
+    parser.add_argument("--random", type=int, default=0, help="only so many random loops")
     options = parser.parse_args()
     hj.enable_x64()
     model, rng, draws = hopper(), np.random.default_rng(0), options.draws
     sensor = SENSOR * sizes(model)
+    if options.random:
+        print(random_loops(options.random))
+        return
     show = lambda what, value: print(f"in_loop.{what} {value:.4g}", flush=True)  # noqa: E731
 
     records = [draw(model, options.size, sensor, rng) for _ in range(10)]
