@@ -27,8 +27,8 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
 # 890 the responses of cycles; of the tests, 630 are those of both.
 LIMITS = {
-    "code": 25_370,
-    "files": 222,
+    "code": 25_412,
+    "files": 223,
     "longest": 500,
     "public_names": 170,
     "many_parameters": 8,
@@ -36,8 +36,8 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_685,
-    "doc_words": 36_000,
+    "test_lines": 16_712,
+    "doc_words": 36_210,
 }
 
 
