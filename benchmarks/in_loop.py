@@ -13,8 +13,8 @@ of a tenth of the outputs' rms, which goes round the loop. Printed, as `name val
   `hj.identify.loop` with two references, and noise of a fifth of r in what the controller does;
   the p-value is that of their mean over draws (t test).
 - `seconds.*`: CPU seconds of fits.
-- with `--random 20`: `short_gait.*`, errors of the multiplier 4.00386 of the simplest walker's short
-  gait, from nonlinear experiments in a loop that stabilizes it; and of random plants (2 to 5
+- with `--random 20`: `short_gait.*`, errors of the multiplier 4.00386 of the simplest walker's
+  short gait, from nonlinear experiments in a loop that stabilizes it; and of random plants (2 to 5
   states, 1 to 2 inputs, 8 to 24 sections, every tenth unstable) in random loops, how many are
   identified (`right`: the region of 99.99 % holds), refused or not converged (`reported`), `wrong`.
 
