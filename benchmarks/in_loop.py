@@ -211,6 +211,7 @@ def short_gait() -> tuple[float, float]:
         cycle, phase, design, outputs, feedback=regulator(model, 1.0), discard=30
     )
     htf = hj.estimate_htf(data, reference="r")
+    # (without noise, its descent does not converge)
     noisy = hj.experiments.add_noise(data, std=0.01 * data.y.std(axis=(0, 1)), seed=1)
     fits = hj.fit_multipliers(htf, 2, check=False), hj.fit_ldtp(noisy, model.dims, reference="r")
     return tuple(float(fit.compare(cycle.multipliers).max_error) for fit in fits)

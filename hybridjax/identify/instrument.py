@@ -11,8 +11,8 @@ which is $T_{yr} T_{ur}^{-1}$ for as many references as inputs. With $E = Y - P 
 part of R, the error of P is $E \hat U^* (U \hat U^*)^{-1}$: the variance of its entry (a, b) is
 that of row a of E times the entry (b, b) of $(\hat U \hat U^*)^{-1}$ (Pintelon and Schoukens 2012,
 sections 2.6 and 7.2.7, for matrices; Söderström and Stoica 1983). With the estimated P, the
-expectation of $E E^*$ is this variance times $M - 2 n + \mathrm{tr}\, (\hat U \hat U^*)^{-1} U U^*$,
-n the number of rows of U.
+expectation of $E E^*$ is this variance times
+$M - 2 n + \mathrm{tr}\, (\hat U \hat U^*)^{-1} U U^*$, n the number of rows of U.
 """
 
 import dataclasses
