@@ -10,7 +10,9 @@ $$P = (Y \hat U^*) (U \hat U^*)^{-1}, \qquad \hat U = (U R^*) (R R^*)^{-1} R,$$
 which is $T_{yr} T_{ur}^{-1}$ for as many references as inputs. With $E = Y - P U$, which holds no
 part of R, the error of P is $E \hat U^* (U \hat U^*)^{-1}$: the variance of its entry (a, b) is
 that of row a of E times the entry (b, b) of $(\hat U \hat U^*)^{-1}$ (Pintelon and Schoukens 2012,
-sections 2.6 and 7.2.7, for matrices; Söderström and Stoica 1983).
+sections 2.6 and 7.2.7, for matrices; Söderström and Stoica 1983). With the estimated P, the
+expectation of $E E^*$ is this variance times
+$M - 2 n + \mathrm{tr}\, (\hat U \hat U^*)^{-1} U U^*$, n the number of rows of U.
 """
 
 import dataclasses
@@ -208,17 +210,19 @@ def solve(
     H = np.linalg.solve(power, to_r.conj().swapaxes(1, 2) @ block(r, y)).conj().swapaxes(1, 2)
     spread = np.linalg.inv(power)
 
-    def variance(G, freedom):
+    def variance(G, rows):
         cross = block(y, u, G) @ H.conj().swapaxes(1, 2)
         square = block(y, y, G) - cross - cross.conj().swapaxes(1, 2)
         square = square + H @ block(u, u, G) @ H.conj().swapaxes(1, 2)
-        rows = np.maximum(np.einsum("kii->ki", square).real, 0) / freedom
-        return rows[:, :, None] * np.einsum("kii->ki", spread).real[:, None]
+        mean = np.maximum(np.einsum("kii->ki", square).real, 0) / rows
+        return mean[:, :, None] * np.einsum("kii->ki", spread).real[:, None]
 
     freedom = sums.experiments - len(u)
     total = noise = None
     if kind != "noise" and freedom > 0:
-        total = variance(G, freedom)
+        # The error of P multiplies all of U in E, of which the references explain only a part.
+        whole = np.einsum("kij,kji->k", spread, block(u, u)).real
+        total = variance(G, (freedom - len(u) + whole)[:, None])
     if repeats > 1:
         noise = variance(sums.between[classes], sums.experiments)
     if kind == "total" and total is None:

@@ -437,6 +437,6 @@ def refuse_invented(values: Float[np.ndarray, " d1"], spread: float) -> None:
         raise DefinitionError(
             f"the data support {carried} multipliers, not {order}: the weakest is "
             f"{np.sqrt(max(values[1], 0.0)):.3g} times the noise, which may be noise alone. Lower "
-            "`order` (`select_order` compares orders), measure longer, name the `reference` of an "
-            "input that answers the outputs, or pass check=False."
+            "`order` (`select_order` compares orders), measure longer, pass check=False, or, for "
+            "inputs that answer the outputs, name their `reference` (`fit_ldtp`, `estimate_htf`)."
         )

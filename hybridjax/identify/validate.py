@@ -1,26 +1,28 @@
 """Is an identified model good enough? Simulation of data that it was not fitted to."""
 
+import itertools
 from typing import Literal
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import special, stats
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Probability
+from .._core.boundary.kinds import Probability, SignalNames
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import p_value
 from ..errors import DefinitionError
 from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
+from .instrument import in_loop
 from .joint.fit import LDTPFit
 from .joint.model import PeriodicModel
 from .joint.prediction import Predictor
+from .residuals import FEWEST_SAMPLES, independence_test, whiteness_test
 from .series.fit import SeriesFit
-from .series.output_error import RANK, SectionRegression
+from .series.output_error import SectionRegression
 from .series.records import CycleGrid, divide_by_chi, drift_waves, lagged_inputs, start_responses
 
 
@@ -87,83 +89,6 @@ def _free_cycles(fit: SeriesFit) -> int:
     return d + -(-(R - 1 - fit.lead - d * N) // N)
 
 
-# Samples of a section, below which its correlations are not tested. Fewer: their distribution is
-# not normal; more: short records cannot be validated.
-FEWEST_SAMPLES = 8
-# Probability with which a misfit that counts as visible is detected. Larger: models are called
-# better tested than they are; smaller: misfits that are detected as a rule count as invisible.
-_POWER = 0.8
-
-
-def whiteness_test(
-    error: Float[np.ndarray, "S T N ny"], size: Float[np.ndarray, "N ny"], lags: int
-) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
-    """Return correlations of residuals with earlier ones, section by section, and p-values.
-
-    **Arguments:** `size`: rms of the residuals at each section.
-    """
-    S, T, N, ny = error.shape
-    scaled = (error / np.where(size > 0, size, 1.0)).reshape(S, T * N, ny)
-    z, tested = np.zeros((N, lags, ny)), np.zeros((N, lags, ny), bool)
-    for k in range(lags):
-        product = np.full(scaled.shape, np.nan)
-        product[:, k + 1 :] = scaled[:, k + 1 :] * scaled[:, : -k - 1]
-        product = product.reshape(error.shape)
-        count = np.isfinite(product).sum(axis=(0, 1))
-        z[:, k] = np.nansum(product, axis=(0, 1)) / np.sqrt(np.maximum(count, 1))
-        tested[:, k] = count >= FEWEST_SAMPLES
-    # The mean over the sections of each lag, and the deviations from it: independent.
-    z = z * tested
-    count = tested.sum(axis=0)
-    pooled = z.sum(axis=0) ** 2 / np.maximum(count, 1)
-    deviations = (z**2).sum(axis=(0, 1)) - pooled.sum(axis=0)
-    degrees = (count > 0).sum(axis=0)
-    p = stats.chi2.sf(pooled.sum(axis=0), degrees)
-    if N > 1:
-        p = np.minimum(p, stats.chi2.sf(deviations, count.sum(axis=0) - degrees))
-        p = -np.expm1(2 * np.log1p(-p))
-    return z, p
-
-
-def independence_test(
-    u: Float[np.ndarray, "S T N nu"], error: Float[np.ndarray, "S T N ny"], lags: int, level: float
-) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
-    """Test the part of residuals that present and past inputs explain, section by section.
-
-    **Arguments:** `error`: NaN where the inputs of so many lags are not known.
-
-    **Returns:** the correlations with the inputs, the p-values, and the smallest visible misfits,
-    in standard deviations of the noise, for tests of this level. A misfit of rms r times the noise
-    makes F ratios of n samples noncentral, by $n r^2$. The power is that of one F ratio with the
-    degrees of freedom of all sections, which is 1 to 4 % too optimistic.
-    """
-    _, _, N, ny = error.shape
-    nu = u.shape[3]
-    z, deviates, tested = np.zeros((N, lags, ny, nu)), np.zeros(ny), np.zeros(ny)
-    degrees = np.zeros((2, ny))
-    for n in range(N):
-        past = lagged_inputs(u, n, lags, 0)
-        for i in range(ny):
-            present = np.isfinite(error[:, :, n, i])
-            U, r, count = past[present], error[:, :, n, i][present], int(present.sum())
-            if count < FEWEST_SAMPLES or not r.any():
-                continue
-            size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
-            z[n, :, i] = (U.T @ r / np.where(size > 0, size, 1.0)).reshape(lags, nu)
-            left, s, _ = np.linalg.svd(U, full_matrices=False)
-            left = left[:, s > RANK * s[0]][:, : count // 2]
-            # Explained against unexplained part: an F ratio, as its Gaussian deviate.
-            a, b = left.shape[1], count - left.shape[1]
-            inside = ((left.T @ r) ** 2).sum()
-            p = stats.f.sf((inside / a) / ((r @ r - inside) / b), a, b)
-            deviates[i] += stats.norm.isf(np.clip(p, 1e-300, 1 - 1e-16))
-            degrees[:, i] += a, b
-            tested[i] += 1
-    p = stats.norm.sf(deviates / np.sqrt(np.maximum(tested, 1)))
-    shift = special.ncfdtrinc(*degrees, 1 - _POWER, special.fdtri(*degrees, 1 - level))
-    return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
-
-
 # Cycles that a notebook draws. More: they are harder to see.
 _DRAWN = 4
 # Samples for each lag that is tested by default. Fewer: correlations of too few samples; more: late
@@ -184,13 +109,13 @@ class Validation(eqx.Module):
     - `whiteness` (ny,): p-value of the hypothesis that the residuals are white: they are not where
       it is small (process noise, or dynamics that the model lacks).
     - `independence` (ny,): p-value of the hypothesis that the residuals do not depend on the
-      input: the model is wrong where it is small.
+      input, or of the reference of a loop: the model is wrong where it is small.
     - `level`: significance level of both tests, for all outputs together.
     - `visible` (ny,): the smallest misfit that the test of independence would detect in four of
       five such data: rms of the response to lagged inputs that the model lacks, relative to
       the rms of the simulated output. Smaller errors of a model pass.
     - `autocorrelation` (N, lags, ny): of the residual at each section with those 1, 2, ... samples
-      earlier. `cross_correlation` (N, lags, ny, nu): of the residual with the inputs 0, 1, ...
+      earlier. `cross_correlation` (N, lags, ny, nu): of the residual with these inputs 0, 1, ...
       samples earlier. Both in units of their standard deviation where there is no correlation.
     - `measured`, `simulated` (n, ny): the longest record, whose first sample lies on
       `first_section`.
@@ -264,6 +189,7 @@ def validate(
     *,
     start: Literal["free", "cycle"] = "free",
     level: Probability = 0.01,
+    reference: SignalNames | None = None,
 ) -> Validation:
     r"""Simulate a model on data and test the residuals.
 
@@ -291,15 +217,27 @@ def validate(
     - `start`: "free", the default, estimates the initial state of each record from the record;
       "cycle" takes it as zero. Declared drift of the records is estimated in either case.
     - `level`: significance level of the tests. Default: 0.01.
+    - `reference`: names of those inputs of the data that act from outside on a loop. The model is
+      that of the plant, from the other inputs, and residuals are tested for independence of the
+      reference, since these inputs answer the noise. Default: None.
 
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few
-    cycles, or all records are too short to be compared or for so many lags.
+    cycles, all records are too short to be compared or for so many lags, or a plant that is
+    unstable outside of its loop, unless it is a fit of `fit_ldtp`.
     """
     free_start = start == "free"
     tested = (model.predictor or model.model) if isinstance(model, LDTPFit) else model
-    records = uninterrupted_records(data)
+    records, drive = uninterrupted_records(data), None
+    if reference is not None:
+        records, drive = in_loop(data, reference)
+        if not isinstance(tested, Predictor) and np.abs(model.multipliers[:1]).max(initial=0) >= 1:
+            raise DefinitionError(
+                "the simulation of an unstable plant grows without bound: validate a fit of "
+                "`fit_ldtp` with `reference`, which predicts one step ahead."
+            )
     require_same("model and data", model, records[0])
-    compared = [r for r in records if can_be_compared(tested, r, free_start)]
+    kept = [can_be_compared(tested, r, free_start) for r in records]
+    compared = list(itertools.compress(records, kept))
     N, outputs, ny = records[0].n_sections, records[0].outputs, len(records[0].outputs)
     if not compared:
         raise DefinitionError(
@@ -339,7 +277,8 @@ def validate(
     size = np.sqrt(np.mean(simulated[grid.inside] ** 2, axis=0))
     auto, whiteness = whiteness_test(error, np.sqrt(square / sampled), lags)
     late = np.where((before >= lags - 1)[..., None], error, np.nan)
-    cross, independence, visible = independence_test(grid.u, late, lags, level / ny)
+    outside = CycleGrid.from_records(list(itertools.compress(drive or records, kept))).u
+    cross, independence, visible = independence_test(outside, late, lags, level / ny)
     k = int(np.argmax([len(r.u) for r in compared]))
     longest = compared[k]
     shown = slice(first[k], first[k] + len(longest.u) - longest.lead)  # later inputs are unknown

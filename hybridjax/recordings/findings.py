@@ -19,6 +19,11 @@ from .recording import Recording, Trial
 # chance is reported.
 CLEAR = 4.0
 
+NAME_REFERENCE = (
+    "Record a signal that acts on the loop from outside, too, and name it as the `reference` of "
+    "`hj.fit_ldtp` or `hj.estimate_htf`."
+)
+
 
 class Finding(eqx.Module):
     """A property of data, or of a fit to them, that makes a result worth less than it seems.

@@ -16,12 +16,13 @@ from .._core.results import Result
 from .._core.text import p_value
 from ..errors import DefinitionError
 from ..identify.multiplier_estimate import compare_multipliers
+from ..identify.residuals import ANSWER, feedback_test
 from ..identify.series.fit import SeriesFit, delayed_outputs, ordinary_least_squares, refuse_order
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
-from ..identify.validate import Validation
+from ..identify.validate import Validation, simulate
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
-from .findings import Finding, print_findings
+from .findings import NAME_REFERENCE, Finding, print_findings
 
 
 # Fraction of samples: if fewer remain beyond the number of unknowns, strides are few; if more are
@@ -76,8 +77,8 @@ def advise(
 
     They are: too few strides for the unknowns, more multipliers than the data support, inputs
     without power at the frequencies of the multipliers, redundant outputs, noise that would bias
-    plain regression, confidence intervals that reach the unit circle, an iteration that did not
-    converge, gaps and spikes.
+    plain regression, inputs that answer the outputs, confidence intervals that reach the unit
+    circle, an iteration that did not converge, gaps and spikes.
 
     **Arguments:** `data`: the data at the sections. `fit`: the result of `fit_series`.
     `validation`: a validation on held-out strides, whose tests are reported. `findings`: findings
@@ -102,6 +103,8 @@ def advise(
         text = f"the data do not carry {d} multipliers: the weakest, and its region, may be noise."
         warnings.append(Finding("order", text))
     band = input_band(data)
+    error = np.where(grid.sampled, grid.y - simulate(fit, grid, True), 0.0)
+    warnings += _about_feedback(data, feedback_test(grid, error, _LEVEL))
     warnings += [*_about_excitation(data, fit, band), *_about_outputs(grid, fit)]
     if bias > 2 * fit.standard_errors.max():
         values = ", ".join(f"{z:.4f}" for z in plain)
@@ -126,6 +129,13 @@ def advise(
     with np.errstate(divide="ignore"):
         expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
     return Advice(tuple(warnings), plain, tuple(band), strides, expected)
+
+
+def _about_feedback(data: SectionData, p: Float[np.ndarray, " nu"]) -> Iterator[Finding]:
+    for name, value in zip(data.inputs, p, strict=True):
+        if value < ANSWER:
+            text = f"{name} answers earlier residuals of the outputs ({p_value(value)}), as by a "
+            yield Finding("feedback", f"{text}controller: fits are biased. {NAME_REFERENCE}")
 
 
 def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:

@@ -1,9 +1,14 @@
 """A plant in a loop: from a reference, against the exact plant and by draws."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.identify.residuals import feedback_test
+from hybridjax.identify.series.records import CycleGrid
+from hybridjax.identify.validate import simulate
 
 
 N, SEEN = 4, ("u", "r", "d")
@@ -133,6 +138,28 @@ def test_a_plant_that_is_stable_in_its_loop_only():
     fit = hj.fit_ldtp(data, 1, reference="r")
     assert fit.contains(plant.multipliers, 0.999).all()
     assert abs(fit.multipliers[0] - 1.2**N) < 0.1
+
+
+def test_residuals_tell_of_the_loop(plant):
+    early, late = (series(plant, seed, noise=0.5) for seed in (5, 6))
+    fit = hj.fit_ldtp(early, 2, reference="r")
+    true = hj.validate(fit, late, reference="r")
+    assert true.independent and true.white  # (of other strides)
+    # (the ratio of y to u is no model of the plant, and the reference shows it)
+    alone = hj.Record(early.u[:, :1], early.y, n_sections=N, inputs="u")
+    biased = hj.fit_series(alone, 2, check=False)
+    assert not hj.validate(biased, late, reference="r").independent
+    for record, answers in (
+        (alone, True),
+        (dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",)), False),
+    ):
+        fit, grid = hj.fit_series(record, 2, check=False), CycleGrid.from_records([record])
+        p = feedback_test(grid, grid.y - simulate(fit, grid, True), 0.01)
+        assert (p[0] < 1e-3) == answers
+    unstable = hj.LDTP(1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1)))
+    unstable = dataclasses.replace(unstable, inputs=("u",), outputs=early.outputs)
+    with pytest.raises(hj.DefinitionError, match="predicts one step ahead"):
+        hj.validate(unstable, late, reference="r")
 
 
 def test_what_does_not_fit_is_refused(plant):

@@ -18,6 +18,7 @@ from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..denominator import SLOWEST
 from ..descent import ROUNDING
+from ..residuals import ANSWER
 from ..series.fit import SeriesFit
 from ..series.records import PreparedRecords
 from ..weights import SMALLEST_ERROR
@@ -253,11 +254,6 @@ def subspace_model(
     return _from_states(sections, to_state, past, innovations, direct)
 
 
-# Probability that noise alone counts as an answer to a reference at the same section. Smaller: a
-# weak feed-through is set to zero. Larger: more unknowns than there are.
-_AT_ONCE = 1e-3
-
-
 def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
     """Test whether the outputs answer the inputs of a loop at their own section.
 
@@ -287,7 +283,7 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
         freedom += ny * nr
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
-    if special.gammaincc(freedom / 2, statistic / 2) > _AT_ONCE:
+    if special.gammaincc(freedom / 2, statistic / 2) > ANSWER:
         return False
     if left > _SHRINKAGE * whole:
         raise DefinitionError(

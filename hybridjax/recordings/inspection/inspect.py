@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import OptionalNames, SignalNames
 from ..data import SectionData
-from ..findings import CLEAR, Finding, Inspection, listed, place, places
+from ..findings import CLEAR, NAME_REFERENCE, Finding, Inspection, listed, place, places
 from ..phase import Phase
 from ..recording import Recording
 from ..smoothing import FEWEST
@@ -313,7 +313,7 @@ def feedback(data: SectionData) -> Iterator[Finding]:
         share = repeated / max(repeated + float(deviations[i]) ** 2, np.finfo(float).tiny)
         if share > 0.5:
             text = f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: fits "
-            text += "are biased. Add a perturbation, and name it as the input."
+            text += "are biased. " + NAME_REFERENCE
             yield Finding("feedback", text)
         elif share > CLEAR**2 / data.cycles and data.n_sections > 2 * shapes.shape[1]:
             mean = np.nan_to_num(data.cycle_inputs[:, i] - np.nanmean(data.cycle_inputs[:, i]))

@@ -1,0 +1,112 @@
+"""Tests of residuals, section by section: their correlations in time and with inputs."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy import special, stats
+
+from .series.output_error import RANK
+from .series.records import CycleGrid, lagged_inputs
+
+
+# Samples of a section, below which its correlations are not tested. Fewer: their distribution is
+# not normal; more: short records cannot be validated.
+FEWEST_SAMPLES = 8
+# Probability with which a misfit that counts as visible is detected. Larger: models are called
+# better tested than they are; smaller: misfits that are detected as a rule count as invisible.
+_POWER = 0.8
+# Probability that noise alone counts as an answer, of inputs to earlier outputs, or of outputs to a
+# reference at the same section. Smaller: controllers and weak feed-through pass. Larger: open loops
+# are refused.
+ANSWER = 1e-3
+
+
+def whiteness_test(
+    error: Float[np.ndarray, "S T N ny"], size: Float[np.ndarray, "N ny"], lags: int
+) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
+    """Return correlations of residuals with earlier ones, section by section, and p-values.
+
+    **Arguments:** `size`: rms of the residuals at each section.
+    """
+    S, T, N, ny = error.shape
+    scaled = (error / np.where(size > 0, size, 1.0)).reshape(S, T * N, ny)
+    z, tested = np.zeros((N, lags, ny)), np.zeros((N, lags, ny), bool)
+    for k in range(lags):
+        product = np.full(scaled.shape, np.nan)
+        product[:, k + 1 :] = scaled[:, k + 1 :] * scaled[:, : -k - 1]
+        product = product.reshape(error.shape)
+        count = np.isfinite(product).sum(axis=(0, 1))
+        z[:, k] = np.nansum(product, axis=(0, 1)) / np.sqrt(np.maximum(count, 1))
+        tested[:, k] = count >= FEWEST_SAMPLES
+    # The mean over the sections of each lag, and the deviations from it: independent.
+    z = z * tested
+    count = tested.sum(axis=0)
+    pooled = z.sum(axis=0) ** 2 / np.maximum(count, 1)
+    deviations = (z**2).sum(axis=(0, 1)) - pooled.sum(axis=0)
+    degrees = (count > 0).sum(axis=0)
+    p = stats.chi2.sf(pooled.sum(axis=0), degrees)
+    if N > 1:
+        p = np.minimum(p, stats.chi2.sf(deviations, count.sum(axis=0) - degrees))
+        p = -np.expm1(2 * np.log1p(-p))
+    return z, p
+
+
+def independence_test(
+    u: Float[np.ndarray, "S T N nu"], error: Float[np.ndarray, "S T N ny"], lags: int, level: float
+) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
+    """Test the part of residuals that present and past inputs explain, section by section.
+
+    **Arguments:** `error`: NaN where the inputs of so many lags are not known.
+
+    **Returns:** the correlations with the inputs, the p-values, and the smallest visible misfits,
+    in standard deviations of the noise, for tests of this level. A misfit of rms r times the noise
+    makes F ratios of n samples noncentral, by $n r^2$. The power is that of one F ratio with the
+    degrees of freedom of all sections, which is 1 to 4 % too optimistic.
+    """
+    _, _, N, ny = error.shape
+    nu = u.shape[3]
+    z, deviates, tested = np.zeros((N, lags, ny, nu)), np.zeros(ny), np.zeros(ny)
+    degrees = np.zeros((2, ny))
+    for n in range(N):
+        past = lagged_inputs(u, n, lags, 0)
+        for i in range(ny):
+            present = np.isfinite(error[:, :, n, i])
+            U, r, count = past[present], error[:, :, n, i][present], int(present.sum())
+            if count < FEWEST_SAMPLES or not r.any():
+                continue
+            size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
+            z[n, :, i] = (U.T @ r / np.where(size > 0, size, 1.0)).reshape(lags, nu)
+            left, s, _ = np.linalg.svd(U, full_matrices=False)
+            left = left[:, s > RANK * s[0]][:, : count // 2]
+            # Explained against unexplained part: an F ratio, as its Gaussian deviate.
+            a, b = left.shape[1], count - left.shape[1]
+            inside = ((left.T @ r) ** 2).sum()
+            p = stats.f.sf((inside / a) / ((r @ r - inside) / b), a, b)
+            deviates[i] += stats.norm.isf(np.clip(p, 1e-300, 1 - 1e-16))
+            degrees[:, i] += a, b
+            tested[i] += 1
+    p = stats.norm.sf(deviates / np.sqrt(np.maximum(tested, 1)))
+    shift = special.ncfdtrinc(*degrees, 1 - _POWER, special.fdtri(*degrees, 1 - level))
+    return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
+
+
+def feedback_test(
+    grid: CycleGrid, error: Float[np.ndarray, "S T N ny"], level: float
+) -> Float[np.ndarray, " nu"]:
+    """Test whether inputs answer residuals of a model of the outputs at earlier sections.
+
+    The part of each input that its own past does not explain is regressed on these residuals: it
+    is white for any spectrum of the input, so that residuals may be colored.
+
+    **Returns:** p-values; small ones show a controller at work.
+    """
+    S, T, N, nu = grid.u.shape
+    lags = 2
+    late = np.zeros((S, T * N, error.shape[3]))
+    late[:, 1:] = np.nan_to_num(error).reshape(S, T * N, -1)[:, :-1]
+    new = np.full(grid.u.shape, np.nan)
+    start = np.cumsum(grid.inside.reshape(S, -1), axis=1).reshape(S, T, N) > lags + 1
+    for n in range(N):
+        rows = grid.inside[:, :, n] & start[:, :, n]
+        past, u = lagged_inputs(grid.u, n, lags + 1, 0)[rows][:, nu:], grid.u[:, :, n][rows]
+        new[:, :, n][rows] = u - past @ np.linalg.lstsq(past, u)[0]
+    return independence_test(late.reshape(error.shape), new, lags, level)[1]
