@@ -5,6 +5,7 @@ import pytest
 
 import hybridjax as hj
 
+from .linear.conftest import blocks_at_random
 from .recordings.conftest import wave as wave
 
 
@@ -19,15 +20,9 @@ def model():
 
 
 def _model(dims, nu=2):
-    rng = np.random.default_rng(0)
-    after = dims[1:] + dims[:1]
+    blocks = blocks_at_random(0, dims, 1, nu)
     return hj.LDTP.from_blocks(
-        [0.6 * rng.normal(size=s) for s in zip(after, dims, strict=True)],
-        [rng.normal(size=(d, nu)) for d in after],
-        [rng.normal(size=(1, d)) for d in dims],
-        list(rng.normal(size=(N, 1, nu))),
-        inputs={"u": "N", "w": ""} if nu == 2 else "u",
-        outputs={"y": "m"},
+        *blocks, inputs={"u": "N", "w": ""} if nu == 2 else "u", outputs={"y": "m"}
     )
 
 

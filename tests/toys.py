@@ -29,13 +29,13 @@ def toy(charts, transitions=(), period=None, outputs=(), **names):
     return type("Toy", (hj.HybridSystem,), methods | names)()
 
 
-# A driven oscillator, and beside it a state w that only rounding errors move from zero, by time.
-RESTING = toy({"all": Field(("x", "v", "w"), lambda t, q, u: resting(*q, jnp.cos(3 * t), u[0]))},
-              period=2 * np.pi / 3)  # fmt: skip
+def resting(t, q, u):
+    """A driven oscillator, and beside it a state that only rounding errors move from zero."""
+    (x, v, w), c = q, jnp.cos(3 * t)
+    return v, c - 4 * x - v + u[0], (1 + 0.1 * c) * 3 - 3 - 0.3 * c - w
 
 
-def resting(x, v, w, c, force):
-    return v, c - 4 * x - v + force, (1 + 0.1 * c) * 3 - 3 - 0.3 * c - w
+RESTING = toy({"all": Field(("x", "v", "w"), resting)}, period=2 * np.pi / 3)
 
 
 def hopper_in(length, time):
