@@ -1,7 +1,9 @@
-"""Sessions in documents: fences of python that run one after the other, and what they print."""
+"""Processes, and sessions in documents: fences of python that run one after the other, and what
+they print."""
 
 import pathlib
 import re
+import subprocess
 import sys
 import types
 
@@ -10,6 +12,14 @@ import numpy as np
 
 ROOT = pathlib.Path(__file__).parents[1]
 NUMBER = re.compile(r"[+-]?\s?\d+(?:\.\d*)?(?:e[+-]?\d+)?")
+
+
+def run_python(*arguments, **options) -> str:
+    """What a process of its own prints."""
+    command = [sys.executable, *map(str, arguments)]
+    run = subprocess.run(command, capture_output=True, text=True, **options)
+    assert run.returncode == 0, run.stdout + run.stderr
+    return run.stdout
 
 
 def blocks(page: str) -> list[tuple[str, str]]:

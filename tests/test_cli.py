@@ -1,8 +1,6 @@
 """The command line: fast help, the short form of the main job, bad input."""
 
 import json
-import subprocess
-import sys
 from concurrent.futures import Executor, Future
 
 import numpy as np
@@ -12,9 +10,7 @@ import hybridjax as hj
 from hybridjax.apps.cli import main
 from hybridjax.apps.reproduce import Protocol, reproduce
 
-
-def _python(*arguments):
-    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
+from .sessions import run_python
 
 
 @pytest.mark.parametrize(
@@ -33,16 +29,14 @@ def test_help_does_not_import_jax(arguments, text):
         "try: main(sys.argv[1:])\n"
         "finally: assert not {'jax', 'numpy', 'matplotlib'} & set(sys.modules)"
     )
-    run = _python("-c", code, *arguments.split())
-    assert run.returncode == 0 and text in run.stdout, run.stderr
+    assert text in run_python("-c", code, *arguments.split())
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduce")
     options = ["--quick", "--out", str(out), "--formats", "png,svg"]
-    run = _python("-m", "hybridjax", "reproduce", *options)
-    assert run.returncode == 0, run.stderr
+    run_python("-m", "hybridjax", "reproduce", *options)
     return out
 
 
@@ -154,14 +148,11 @@ def protocols(monkeypatch):
     return asked
 
 
-def test_the_short_form_has_other_sizes(protocols):
+def test_the_short_form_has_other_sizes_and_failures_are_said(protocols, capsys):
     for options, sizes in {"": (80, 84, 64), "--quick": (20, 36, 16)}.items():
         assert main(["reproduce", "--out", "x", *options.split()]) == 0
         protocol = protocols.pop()
         assert (protocol.experiments, protocol.cycles, protocol.keep) == sizes
-
-
-def test_what_has_not_converged_is_said(protocols, capsys):
     assert main(["reproduce", "--out", "x", "--seed", "1"]) == 1
     assert "a fit did not converge" in capsys.readouterr().err
 
@@ -182,5 +173,4 @@ def test_the_main_job_imports_what_it_needs():
     """And nothing else that takes long."""
     heavy = "diffrax", "optimistix", "lineax", "scipy.linalg", "scipy.special", "matplotlib"
     code = f"import sys, hybridjax.apps.reproduce\nprint([m for m in {heavy} if m in sys.modules])"
-    run = _python("-c", code)
-    assert (run.returncode, run.stdout) == (0, "[]\n"), run.stderr
+    assert run_python("-c", code) == "[]\n"

@@ -1,13 +1,12 @@
 """Other libraries get the same numbers, and give them back."""
 
-import jax
 import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.experiments.data import Simulated
 
-from .linear.test_variances import htf as htf
+from .linear.conftest import blocks_at_random
+from .recordings.conftest import wave as wave
 
 
 convert = hj.convert
@@ -21,29 +20,10 @@ def model():
 
 
 def _model(dims, nu=2):
-    rng = np.random.default_rng(0)
-    after = dims[1:] + dims[:1]
+    blocks = blocks_at_random(0, dims, 1, nu)
     return hj.LDTP.from_blocks(
-        [0.6 * rng.normal(size=s) for s in zip(after, dims, strict=True)],
-        [rng.normal(size=(d, nu)) for d in after],
-        [rng.normal(size=(1, d)) for d in dims],
-        list(rng.normal(size=(N, 1, nu))),
-        inputs={"u": "N", "w": ""} if nu == 2 else "u",
-        outputs={"y": "m"},
+        *blocks, inputs={"u": "N", "w": ""} if nu == 2 else "u", outputs={"y": "m"}
     )
-
-
-def same(a, b):
-    """Equal fields, bit by bit, also the static ones and units."""
-    assert type(a) is type(b)
-    leaves, structure = jax.tree_util.tree_flatten(a)
-    others, other = jax.tree_util.tree_flatten(b)
-    assert structure == other
-    for x, y in zip(leaves, others, strict=True):
-        assert np.asarray(x).dtype == np.asarray(y).dtype
-        np.testing.assert_array_equal(x, y)
-    for names in ("inputs", "outputs", "input_names"):
-        assert repr(getattr(a, names, None)) == repr(getattr(b, names, None))
 
 
 def whole_operator(htf, f):
@@ -106,21 +86,6 @@ def test_scipy(model):
         np.testing.assert_array_equal(getattr(system, name), getattr(lti, name)[0])
 
 
-def experiments(model):
-    rng = np.random.default_rng(2)
-    u = rng.normal(size=(2, 2 * N, 2))
-    return hj.ExperimentData(
-        u,
-        np.stack([model.simulate(x) for x in u]),
-        n_sections=N,
-        periods=1,
-        inputs=model.inputs,
-        outputs=model.outputs,
-        simulated=Simulated(np.array([-1, -1]), np.array([1e-9, 2e-9]), "clock"),
-        cycle_outputs=rng.normal(size=(N, 1)),
-    )
-
-
 def recording():
     t = np.arange(5) / 10
     one = {"a": t, "b": np.where(t == 0.2, np.nan, t**2)}
@@ -129,31 +94,6 @@ def recording():
         for name in ("first", "second")
     ]
     return hj.Recording.join(parts)
-
-
-MADE = {
-    "LDTP": lambda m: m,
-    "HTF": lambda m: m.htf(np.linspace(0.01, 0.4, 5)),
-    "ExperimentData": experiments,
-    "Design": lambda m: hj.paper_design(seed=0),
-    "Record": lambda m: experiments(m).records[0],
-    "SeriesFit": lambda m: hj.fit_series(hj.Record(*series(m), n_sections=N), order=1),
-}
-
-
-def series(model):
-    u = np.random.default_rng(3).normal(size=(60 * N, 2))
-    return u, np.asarray(model.simulate(u))
-
-
-@pytest.mark.parametrize("kind", MADE)
-def test_there_and_back_with_xarray(model, kind):
-    xarray = pytest.importorskip("xarray")
-    thing = MADE[kind](model)
-    dataset = convert.to_xarray(thing)
-    assert isinstance(dataset, xarray.Dataset)
-    same(convert.from_xarray(dataset), thing)
-    same(convert.from_xarray(xarray.Dataset.from_dict(dataset.to_dict())), thing)
 
 
 def test_datasets_know_names_and_units(model):
@@ -175,10 +115,11 @@ def test_datasets_know_names_and_units(model):
     assert dims["B"] == ("section", "next_state", "input")
 
 
-def test_section_data(rhythm_data):
+def test_section_data(wave):
     pytest.importorskip("xarray")
     pytest.importorskip("pandas")
-    data = rhythm_data
+    crossing, about = hj.Crossing("v", "falling"), {"inputs": "f", "outputs": "x"}
+    data = hj.recordings.section_data(wave, crossing, **about, n_sections=8)
     dataset, frame = convert.to_xarray(data), convert.to_pandas(data)
     np.testing.assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
     np.testing.assert_array_equal(frame["time"], data.times[0])
@@ -187,15 +128,6 @@ def test_section_data(rhythm_data):
         convert.from_xarray(dataset)
     average = dataset.average_cycle.sel(signal="x").values
     np.testing.assert_array_equal(average, data.cycle_outputs[:, 0])
-
-
-@pytest.fixture(scope="module")
-def rhythm_data():
-    t = np.linspace(0.0, 20.0, 2001)
-    signals = {"f": np.cos(3 * t), "x": np.cos(2 * np.pi * t), "v": -np.sin(2 * np.pi * t)}
-    crossing = hj.Crossing("v", "falling")
-    made = hj.Recording(t, signals, units={"x": "m"})
-    return hj.recordings.section_data(made, crossing, inputs="f", outputs="x", n_sections=8)
 
 
 def test_pandas(model):
@@ -207,7 +139,8 @@ def test_pandas(model):
     np.testing.assert_array_equal(again.trials[0].values, recording().trials[0].values)
     H = model.htf(np.linspace(0.01, 0.4, 5))
     assert convert.to_pandas(H)["H"][-1, H.f[1].item(), "y", "w"] == complex(H[-1][1, 0, 1])
-    fit = MADE["SeriesFit"](model)
+    u = np.random.default_rng(3).normal(size=(60 * N, 2))
+    fit = hj.fit_series(hj.Record(u, model.simulate(u), n_sections=N), order=1)
     table = convert.to_pandas(fit)
     np.testing.assert_array_equal(table["multiplier"], fit.multipliers)
     np.testing.assert_array_equal(table["standard_error"], fit.standard_errors)
@@ -227,15 +160,3 @@ def test_what_is_refused(model, monkeypatch):
         monkeypatch.setitem(__import__("sys").modules, name, None)
         with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{name}\]'"):
             call(model)
-
-
-def test_scatter_is_kept(htf, tmp_path):
-    """In files, datasets, and by transformations of JAX."""
-    hj.save(tmp_path / "htf.npz", htf)
-    radius = htf.confidence_radius()
-    dataset = hj.convert.to_xarray(htf)
-    assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
-    for other in (hj.load(tmp_path / "htf.npz"), hj.convert.from_xarray(dataset)):
-        assert jax.tree.structure(other) == jax.tree.structure(htf)
-        np.testing.assert_array_equal(other.confidence_radius(), radius)
-    np.testing.assert_allclose(jax.jit(lambda x: x.confidence_radius())(htf), radius)

@@ -6,12 +6,12 @@ import graphlib
 import importlib
 import pathlib
 import re
-import subprocess
-import sys
 
 import pytest
 
 import hybridjax
+
+from .sessions import run_python
 
 
 ROOT = pathlib.Path(hybridjax.__file__).parent
@@ -56,8 +56,9 @@ def test_imports_flow_one_way():
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda f: str(f.relative_to(ROOT)))
-def test_imports_flow_one_way_inside_of_folders(folder):
-    """Between its files and folders, each with all that is in it."""
+def test_folders(folder):
+    """Imports flow one way between its files and folders, each with all that is in it. No public
+    name is also a module, which would make it either of them, by chance."""
     where = folder.relative_to(ROOT).parts
     depth, needs = len(where), {}
     for file in folder.rglob("*.py"):
@@ -65,11 +66,6 @@ def test_imports_flow_one_way_inside_of_folders(folder):
         others = {path[depth] for path in imported(file) if path[:depth] == where and path[depth:]}
         needs.setdefault(own, set()).update(others - {own})
     tuple(graphlib.TopologicalSorter(needs).static_order())
-
-
-@pytest.mark.parametrize("folder", FOLDERS, ids=lambda f: str(f.relative_to(ROOT)))
-def test_folders_hide_no_name(folder):
-    """A public name that is also a module of its folder would be either of them, by chance."""
     modules = {f.stem for f in folder.iterdir() if f.suffix == ".py" or f.is_dir()}
     stub = folder / "__init__.pyi"
     if stub.exists():
@@ -84,7 +80,7 @@ def test_importing_hybridjax_does_not_import_jax():
         "assert {'simulate', 'find_limit_cycle', 'linearize', 'models'} <= set(names), names; "
         "assert not {'jax', 'numpy', 'matplotlib'} & set(sys.modules), 'heavy imports'"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    run_python("-c", code)
 
 
 def test_public_names_resolve_and_have_docstrings():

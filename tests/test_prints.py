@@ -1,4 +1,8 @@
-"""What objects print: values with units, briefly, also where JAX hides values or adds axes."""
+"""What objects print and show in notebooks: values with units, briefly, also where JAX hides them
+or adds axes; and well-formed pages with escaped names."""
+
+import types
+import xml.etree.ElementTree as ElementTree
 
 import equinox as eqx
 import jax
@@ -7,11 +11,26 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.html import Curve, picture
 from hybridjax._core.text import p_value
 from hybridjax.experiments.data import Simulated
+from hybridjax.orbits.continuation import Branch, BranchEnd, BranchPoint
 from hybridjax.systems.system import own_fields
 
-from .conftest import KINEMATIC, OUTPUTS
+from .conftest import APEX, KINEMATIC, OUTPUTS
+from .toys import many
+
+
+BYTES = 50_000  # the most that a page of a result may take
+
+
+def shown(thing):
+    """The texts of a page, and the number of its pictures: every tag that opens is closed."""
+    page = thing._repr_html_()
+    assert len(page) < BYTES and "nan" not in page.replace("nanm", "")
+    root = ElementTree.fromstring(f"<page>{page}</page>")
+    tags = [x.tag.rpartition("}")[2] for x in root.iter()]
+    return types.SimpleNamespace(texts=list(root.itertext()), pictures=tags.count("svg"))
 
 
 @pytest.fixture(scope="module")
@@ -36,19 +55,22 @@ def test_many_systems_print_their_number_and_range():
     assert "k 100 numbers, 8 to 13 N/m" in text and "M 100 numbers, all 2 kg" in text
 
 
-def test_prints_under_transformations():
-    seen = []
+def test_under_transformations(hopper_cycle, placed_kinematic, kinematic_ldtp):
+    printed, pages = [], []
 
     @jax.jit
     def look(k):
-        seen.append(repr(hj.models.VerticalHopper(k=k)))
-        seen.append(repr(hj.Settings(rtol=k)))
-        seen.append(repr(hj.Guess("stance", (k, 0.0), k)))
-        seen.append(repr(hj.ClockPhase(8, anchor=k)))
+        written = hj.models.VerticalHopper(k=k), hj.Settings(rtol=k), hj.ClockPhase(8, anchor=k)
+        printed.extend(map(repr, (*written, hj.Guess("stance", (k, 0.0), k))))
+        for thing in (hopper_cycle, placed_kinematic, kinematic_ldtp, kinematic_ldtp.htf([0.1])):
+            traced = jax.tree_util.tree_map(
+                lambda x: x * k.astype(x.dtype) if eqx.is_array(x) else x, thing
+            )
+            pages.append(traced._repr_html_())
         return k
 
-    look(1.0)
-    assert all("traced float64[" in text for text in seen)
+    look(jnp.ones(()))
+    assert all("traced float64[" in text for text in printed) and pages == [None] * 4
 
 
 def test_definitions_print_as_they_are_written():
@@ -85,7 +107,73 @@ def test_results_print_briefly(hopper_cycle, placed_kinematic, kinematic_ldtp, h
         assert "f64[" not in text and "array(" not in text
     assert "period       1 s" in repr(hopper_cycle) and "yM = 1.96504037 m, " in repr(hopper_cycle)
     assert "u (N) -> yM (m), vM (m/s)" in repr(hopper_data)
-    assert "27 in flight, 5 in stance; dimension 2 to 4" in repr(placed_kinematic)
+
+
+def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
+    m, end = kinematic_ldtp, BranchEnd(1.0, hj.Result.OK, "the <values> end")
+    model = hj.LDTP(m.A, m.B, m.C, m.D, m.dims, inputs="<u>", outputs=("yM & co", "vM"))
+    point = BranchPoint("flip", 1, 2.0, np.array([-1.0 + 0j, 0.5]))
+    branch = Branch("k", np.array([1.0, 2.0]), many(hopper_cycle, 2), (point,), (end, end))
+    t = np.linspace(0.0, 20.0, 2001)
+    tt, *values = hopper_cycle.trajectory()("yM", "vM")
+    y, v = (np.interp(t, tt, x, period=1.0) for x in values)
+    signals, events = {"<u>": np.cos(3 * t), "yM & co": y, "vM": v}, {"<hit>": [1.0]}
+    recording = hj.Recording(t, signals, units={"vM": "m/s"}, events=events, name="<i>")
+    data = hj.recordings.section_data(
+        recording, APEX, inputs="<u>", outputs=("yM & co", "vM"), n_sections=8
+    )
+    f = np.linspace(0.05, 5, 300)
+    for thing, texts, pictures in (
+        (hopper_cycle, ["-0.248983 + 0.699333i", "1 s", "liftoff, touchdown", "yM (m)"], 2),
+        (placed_kinematic, ["27 in flight, 5 in stance", "2 to 4"], 1),
+        (branch, ["flip", "2", "-1", "the <values> end"], 1),
+        (model, ["<u>", "yM & co, vM"], 1),
+        (model.htf(f, (-2, -1, 0, 1, 2)), ["H_-2", "|H|, <u> to vM"], 2),
+        (model.htf([0.05], (0, 1)), [], 2),  # of one frequency there is no curve
+        (data, [], 3),
+    ):
+        page = shown(thing)
+        assert page.pictures == pictures
+        assert set(texts) <= {*page.texts, *(x.split(" (")[0] for x in page.texts)}
+    assert any("rms deviations: <u> " in x for x in page.texts)
+
+
+def test_fits_show_intervals():
+    A, B, C = [[[0.6, 0.5], [-0.5, 0.6]]] * 4, [[[1.0], [0.3]]] * 4, [[[1.0, 0.0], [0.2, 1.0]]] * 4
+    model = hj.LDTP(A, B, C, inputs="<u>", outputs=("yM & co", "vM"))
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(600, 1))
+    y = np.asarray(model.simulate(u)) + 1e-2 * rng.normal(size=(600, 2))
+    record = hj.Record(u, y, n_sections=4, inputs=model.inputs, outputs=model.outputs)
+    fit = hj.fit_series(record, order=2)
+    page = shown(fit)
+    said = [tuple(map(float, x.split(" ± "))) for x in page.texts if " ± " in x]
+    parts = np.stack([fit.multipliers.real, fit.multipliers.imag], axis=1)
+    values, widths = np.reshape(said, (2, 2, 2)).transpose(2, 0, 1)
+    np.testing.assert_allclose(widths, fit.half_widths(), rtol=0.1)
+    assert (np.abs(values - parts) < 0.1 * widths).all()
+    assert any(x.startswith("noise yM & co ") for x in page.texts)
+    assert shown(hj.validate(fit, record)).pictures == 1
+    htf = model.htf(np.linspace(0.05, 1.9, 30), harmonics=(0,))
+    assert "yM & co: multipliers" in "".join(shown(hj.fit_rational(htf)).texts)
+
+
+def test_pictures_are_xml_whatever_is_drawn():
+    x = np.arange(10.0)
+    pictures = [
+        picture([Curve(x, x)], "<x>", "y & z"),
+        picture([Curve(x, np.where(x == 3, np.nan, 1e9 + 1e-3 * x), "<name>")]),
+        picture([Curve(x, np.zeros(10))], log=True),
+        picture([Curve(x, 10.0**-x)], log=True),
+        picture([Curve(np.full(3, np.nan), x[:3])]),
+        picture([Curve(x, np.zeros(10)), Curve(x, x, points=True)], square=True),
+        picture([]),
+    ]
+    assert [p == "" for p in pictures] == [False, False, True, False, True, False, True]
+    for one in filter(None, pictures):
+        ElementTree.fromstring(one)
+    labels = [t.text for t in ElementTree.fromstring(pictures[1]).findall(".//{*}text")]
+    assert len(set(labels)) == len(labels) > 4  # numbers on an axis can be told apart
 
 
 def test_p_values_have_few_digits():

@@ -2,8 +2,6 @@
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ import hybridjax as hj
 from hybridjax.apps.cli import main
 
 from .conftest import OUTPUTS
-from .sessions import ROOT, Session, blocks, fences, same_output
+from .sessions import ROOT, Session, blocks, fences, run_python, same_output
 
 
 CLAIMS = ROOT / "CLAIMS.md"
@@ -78,20 +76,17 @@ def read_section(tmp_path_factory, hopper_cycle):
 
 
 # (What they begin with takes as long as each, so one worker gets them.)
-in_one_worker = pytest.mark.xdist_group("readme")
+def section(test):
+    return pytest.mark.slow(pytest.mark.long(pytest.mark.xdist_group("readme")(test)))
 
 
-@pytest.mark.slow
-@pytest.mark.long
-@in_one_worker
+@section
 @pytest.mark.parametrize("heading", ["Many of them, and derivatives", "Fewer strides"])
 def test_the_section_runs(heading, read_section):
     read_section(heading)
 
 
-@pytest.mark.slow
-@pytest.mark.long
-@in_one_worker
+@section
 def test_the_section_on_fits_finds_the_parameters(read_section):
     made = read_section("Along a parameter, and from data to parameters")
     for name in ("M", "k", "b"):  # up to the distortion that the experiments hold
@@ -99,9 +94,7 @@ def test_the_section_on_fits_finds_the_parameters(read_section):
         assert abs(value / true - 1) < 1e-4, name
 
 
-@pytest.mark.slow
-@pytest.mark.long
-@in_one_worker
+@section
 def test_the_section_on_recordings_finds_the_multipliers(read_section):
     made = read_section("From a recording")
     found = made.result.fit.compare(made.cycle.multipliers)
@@ -160,13 +153,8 @@ def test_the_page_runs_and_prints_what_it_shows(page, capsys, tmp_path, monkeypa
 def test_the_example_runs_in_processes_of_its_own(tmp_path):
     *_, script = (text for kind, text in blocks("docs/how-to/scale.md") if kind == "python")
     (tmp_path / "script.py").write_text(script)
-    run = subprocess.run(
-        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300
-    )
-    assert run.returncode == 0, run.stderr
-    scatter, mean = (
-        [complex(z) for z in part.strip(" []\n").split()] for part in run.stdout.split("around")
-    )
+    parts = run_python("script.py", cwd=tmp_path, timeout=300).split("around")
+    scatter, mean = ([complex(z) for z in part.strip(" []\n").split()] for part in parts)
     true = (0.6 + 0.5j) ** 4
     np.testing.assert_allclose(mean, [true, true.conjugate()], atol=1e-3)
     assert 0 < abs(scatter[0]) < 2e-3

@@ -3,13 +3,11 @@
 import os
 import re
 import shutil
-import subprocess
-import sys
 import tomllib
 
 import pytest
 
-from .sessions import ROOT
+from .sessions import ROOT, run_python
 
 
 RECIPE = ROOT / "conda/recipe.yaml"
@@ -43,7 +41,7 @@ def test_the_tables_are_those_of_the_baseline(tmp_path):
         "import json, pathlib, sys; from tables import fill; "
         "fill(pathlib.Path(sys.argv[1]), json.loads(pathlib.Path('baseline.json').read_text()))"
     )
-    subprocess.run([sys.executable, "-c", code, str(copy)], cwd=ROOT / "benchmarks", check=True)
+    run_python("-c", code, copy, cwd=ROOT / "benchmarks")
     assert copy.read_text() == page.read_text()
 
 
@@ -62,8 +60,4 @@ np.testing.assert_array_equal(jax.jit(lengths)(rows), np.arange(n) ** 2.0)
 def test_batched_products_followed_by_a_reduction():
     """jax issue 39103: on CPU, jax 0.10.2 silently returns 267911424 for the last of these."""
     kept = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    environment = kept | {"JAX_ENABLE_X64": "1"}
-    run = subprocess.run(
-        [sys.executable, "-c", PRODUCTS], env=environment, capture_output=True, text=True
-    )
-    assert run.returncode == 0, run.stderr
+    run_python("-c", PRODUCTS, env=kept | {"JAX_ENABLE_X64": "1"})

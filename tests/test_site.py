@@ -3,8 +3,6 @@
 import ast
 import html
 import re
-import subprocess
-import sys
 from collections import Counter
 from urllib.parse import unquote
 
@@ -12,7 +10,7 @@ import pytest
 
 import hybridjax as hj
 
-from .sessions import ROOT
+from .sessions import ROOT, run_python
 from .test_typing import UNCHECKED
 
 
@@ -54,9 +52,7 @@ def test_every_public_name_that_a_user_writes_is_in_an_example():
 def site(tmp_path_factory):
     pytest.importorskip("mkdocs", reason="pip install '.[docs]' installs what builds the site")
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder]
-    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr
+    run_python("-m", "mkdocs", "build", "--strict", "--site-dir", folder, cwd=ROOT)
     return folder
 
 

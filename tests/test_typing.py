@@ -5,16 +5,15 @@ import importlib
 import inspect
 import json
 import os
-import pathlib
 import re
-import subprocess
 import sys
 import typing
 
 import pytest
 
+from .sessions import ROOT, run_python
 
-ROOT = pathlib.Path(__file__).parents[1]
+
 BLOCK = re.compile(r"^```(?:python|py)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 # What the README leaves out, and users write.
@@ -58,12 +57,8 @@ def script():
 @pytest.mark.slow
 def test_a_users_script_has_no_errors_in_mypy(tmp_path, script):
     (tmp_path / "session.py").write_text(script)
-    command = [sys.executable, "-m", "mypy", "--follow-imports=silent", "--cache-dir=cache"]
-    paths = {**os.environ, "MYPYPATH": str(ROOT)}
-    found = subprocess.run(
-        [*command, "session.py"], cwd=tmp_path, env=paths, capture_output=True, text=True
-    )
-    assert found.returncode == 0, found.stdout + found.stderr
+    options, paths = ["--follow-imports=silent", "--cache-dir=cache"], {"MYPYPATH": str(ROOT)}
+    run_python("-m", "mypy", *options, "session.py", cwd=tmp_path, env={**os.environ, **paths})
 
 
 def test_a_users_script_has_no_errors_in_pyright(tmp_path, script):
@@ -71,10 +66,7 @@ def test_a_users_script_has_no_errors_in_pyright(tmp_path, script):
     (tmp_path / "session.py").write_text(script)
     about = {"typeCheckingMode": "basic", "include": ["session.py"], "extraPaths": [str(ROOT)]}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(about))
-    command = [sys.executable, "-m", "basedpyright", "-p", str(tmp_path)]
-    command += ["--pythonpath", sys.executable]
-    found = subprocess.run(command, capture_output=True, text=True)
-    assert found.returncode == 0, found.stdout + found.stderr
+    run_python("-m", "basedpyright", "-p", tmp_path, "--pythonpath", sys.executable)
 
 
 @pytest.mark.slow
@@ -83,9 +75,7 @@ def test_a_users_script_has_no_errors_in_pyright(tmp_path, script):
 )
 def test_the_package_has_no_type_errors(checker):
     """With the settings in pyproject.toml."""
-    command = [sys.executable, "-m", *checker]
-    report = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert report.returncode == 0, report.stdout + report.stderr
+    run_python("-m", *checker, cwd=ROOT)
 
 
 # Arguments that may be anything: what a subclass declares, what users' functions return, objects of

@@ -22,29 +22,42 @@ class Field(hj.Chart):
         return self.function(t, q, u)
 
 
-class Ceiling(hj.HybridSystem):
-    """A ball thrown up under gravity 1 against a ceiling at `height`."""
+def toy(charts, transitions=(), period=None, outputs=(), **names):
+    """Return a system without parameters, whose methods return these."""
+    parts = {"charts": charts, "transitions": transitions, "period": period, "outputs": outputs}
+    methods = {name: lambda self, x=x: x for name, x in parts.items()}
+    return type("Toy", (hj.HybridSystem,), methods | names)()
 
-    height: Float[Array, ""] = hj.parameter(1.0)
+
+def resting(t, q, u):
+    """A driven oscillator, and beside it a state that only rounding errors move from zero."""
+    (x, v, w), c = q, jnp.cos(3 * t)
+    return v, c - 4 * x - v + u[0], (1 + 0.1 * c) * 3 - 3 - 0.3 * c - w
+
+
+RESTING = toy({"all": Field(("x", "v", "w"), resting)}, period=2 * np.pi / 3)
+
+
+def hopper_in(length, time):
+    """Return the hopper with lengths and times multiplied."""
+    h, force = hj.models.VerticalHopper(), length / time**2
+    return hj.models.VerticalHopper(
+        l0=h.l0 * length, a=h.a * force, g=h.g * force,
+        k=h.k / time**2, b=h.b / time, omega=h.omega / time,
+    )  # fmt: skip
+
+
+class Toys(hj.HybridSystem):
+    """Systems of which `make` returns the charts and transitions, with numbers."""
+
+    make: Callable = eqx.field(static=True)
+    numbers: Float[Array, " n"] = eqx.field(converter=lambda x: jnp.array(x, float))
 
     def charts(self):
-        return {"air": Field(("y", "v"), lambda t, q, u: (q[1], -1.0))}
+        return self.make(*self.numbers)[0]
 
     def transitions(self):
-        def guard(t, q, u):
-            return q[0] - self.height
-
-        def reset(t, q, u):
-            return q[0], -q[1]
-
-        return (hj.Transition("hit", "air", "air", guard, "rising", reset),)
-
-
-class Blowup(hj.HybridSystem):
-    """x' = x^2, which reaches infinity at t = 1 / x(0)."""
-
-    def charts(self):
-        return {"x": Field(("x",), lambda t, q, u: q**2)}
+        return self.make(*self.numbers)[1]
 
 
 class Switched(hj.HybridSystem):
@@ -74,81 +87,6 @@ class Switched(hj.HybridSystem):
         """x at the time of switching on, on the cycle."""
         rest = jnp.exp(-(1 - self.duty))
         return (rest - jnp.exp(-1.0)) / (1 - jnp.exp(-1.0))
-
-
-class Turning(hj.HybridSystem):
-    """A point on the unit circle that turns at rate 1, and marks where it passes.
-
-    `low` and `high` are marked where x falls through them; `low` only in the upper half plane
-    (y > 0), and `gate` only when it is enabled. The mark counts events in the state `n`.
-    """
-
-    low: Float[Array, ""] = hj.parameter(-0.5)
-    high: Float[Array, ""] = hj.parameter(0.5)
-    gate: Float[Array, ""] = hj.parameter(1.0)
-
-    def charts(self):
-        return {"turn": Field(("x", "y", "n"), lambda t, q, u: (-q[1], q[0], 0.0))}
-
-    def transitions(self):
-        def count(t, q, u):
-            return q[0], q[1], q[2] + 1
-
-        return (
-            hj.Transition("low", "turn", "turn", lambda t, q, u: q[0] - self.low, reset=count),
-            hj.Transition("high", "turn", "turn", lambda t, q, u: q[0] - self.high, reset=count),
-            hj.Transition(
-                "gated",
-                "turn",
-                "turn",
-                lambda t, q, u: q[1],
-                reset=count,
-                enabled=lambda t, q, u: q[2] < self.gate,
-            ),
-        )
-
-
-class Close(hj.HybridSystem):
-    """A point on the unit circle and two guards on x that fall a `gap` apart.
-
-    The second one is so far from a cubic that its crossing is first estimated wrongly.
-    """
-
-    gap: Float[Array, ""] = hj.parameter(0.0)
-    k: Float[Array, ""] = hj.parameter(20.0)
-
-    def charts(self):
-        return {"turn": Field(("x", "y"), lambda t, q, u: (-q[1], q[0]))}
-
-    def transitions(self):
-        def plain(t, q, u):
-            return q[0] - 0.5
-
-        def curved(t, q, u):
-            return jnp.exp(self.k * (q[0] - 0.5 - self.gap)) - 1
-
-        return (
-            hj.Transition("plain", "turn", "turn", plain),
-            hj.Transition("curved", "turn", "turn", curved),
-        )
-
-
-class Dip(hj.HybridSystem):
-    """y = (t - 1)^2 - depth as a state: below zero for 2 sqrt(depth), then back."""
-
-    depth: Float[Array, ""] = hj.parameter(1e-6)
-
-    def charts(self):
-        return {"dip": Field(("y", "n"), lambda t, q, u: (2 * (t - 1.0), 0.0))}
-
-    def transitions(self):
-        def mark(t, q, u):
-            return q[0], q[1] + 1.0
-
-        return (hj.Transition("dip", "dip", "dip", lambda t, q, u: q[0] - 0.0, reset=mark),)
-
-    def start(self):
-        return 1.0 - float(self.depth), 0.0
 
 
 def many(cycle, n):

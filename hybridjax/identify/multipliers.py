@@ -77,7 +77,7 @@ class StructuredFit(MultiplierEstimate):
 
     residual: Float[np.ndarray, " ny"]
     correlation: float = eqx.field(static=True)
-    numerators: Complex[np.ndarray, "M coefficients ny nu"]
+    numerators: Complex[np.ndarray, "M powers ny nu"]
     cost: float = eqx.field(static=True)
     freedom: int = eqx.field(static=True)
     result: int = eqx.field(static=True)

@@ -5,8 +5,6 @@ import os
 import pathlib
 import pickle
 import shutil
-import subprocess
-import sys
 import threading
 from typing import NamedTuple
 
@@ -20,6 +18,8 @@ import hybridjax as hj
 from hybridjax._core import compilation
 from hybridjax._core.compilation import TwoTiers, in_turn, is_left_to_lapack, kernel, quick_jit
 from hybridjax._core.lanes import by_lane
+
+from ..sessions import run_python
 
 
 @quick_jit
@@ -271,10 +271,7 @@ print(hj.run_experiments(cycle, hj.ClockPhase(4), u, ("x",), discard=0, executio
 def run(code: str, **environment: str) -> str:
     before = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     environment = before | {"JAX_PLATFORMS": "cpu"} | environment
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return run_python("-c", code, env=environment, timeout=900)
 
 
 def test_loop_kernels_that_come_too_late_are_refused():

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -40,10 +42,7 @@ def expected_htf(model, design, noise, harmonics=None):
     """Return the exact HTFs at the lines of a design, with the variance of their estimates."""
     htf = model.htf(design.frequencies, harmonics)
     variance = design.expected_variance()[:, None, :] * np.square(list(noise.values()))[:, None]
-    return hj.HTF(
-        htf.f, htf.H, htf.harmonics, htf.n_sections, model.inputs, model.outputs,
-        variance=np.broadcast_to(variance, htf.H.shape),
-    )  # fmt: skip
+    return dataclasses.replace(htf, variance=np.broadcast_to(variance, htf.H.shape))
 
 
 def total_variance(bound):

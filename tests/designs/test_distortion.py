@@ -11,7 +11,7 @@ from hybridjax.designs.limits import products
 from hybridjax.sections.second_order import second_order
 
 from ..conftest import APEX, OUTPUTS
-from ..toys import Field
+from ..toys import Field, toy
 
 
 Limits, Distortion = hj.designs.Limits, hj.designs.Distortion
@@ -46,37 +46,27 @@ class Quadratic(hj.HybridSystem):
         return 1.0
 
 
-class Two(hj.HybridSystem):
+def two_charts():
     """Charts with one and with two states, two inputs, and an output that depends on both."""
 
-    inputs = ("push", "pull")
+    def up(t, q, u):
+        return 0.6 * q[0] + u[0] + 0.3 * q[0] * u[1], 0.5 * q[0] ** 2 + u[1]
 
-    def charts(self):
-        return {
-            "one": Field(("x",), lambda t, q, u: (0.0 * q[0],)),
-            "two": Field(("x", "v"), lambda t, q, u: (0.0 * q[0], 0.0 * q[1])),
-        }
+    def down(t, q, u):
+        return (0.5 * q[0] - q[1] + 0.2 * u[0] * u[1] + 0.4 * q[1] ** 2,)
 
-    def transitions(self):
-        def up(t, q, u):
-            return 0.6 * q[0] + u[0] + 0.3 * q[0] * u[1], 0.5 * q[0] ** 2 + u[1]
+    def shown(t, q, u):
+        return q[0] + u[1] + q[0] * u[0] + 2 * u[1] ** 2 + 0.5 * u[0] * u[1]
 
-        def down(t, q, u):
-            return (0.5 * q[0] - q[1] + 0.2 * u[0] * u[1] + 0.4 * q[1] ** 2,)
-
-        return (
-            hj.Transition("up", "one", "two", hj.Scheduled(1.0), reset=up),
-            hj.Transition("down", "two", "one", hj.Scheduled(1.0, 0.5), reset=down),
-        )
-
-    def outputs(self):
-        def shown(t, q, u):
-            return q[0] + u[1] + q[0] * u[0] + 2 * u[1] ** 2 + 0.5 * u[0] * u[1]
-
-        return (hj.Output("z", shown),)
-
-    def period(self):
-        return 1.0
+    charts = {
+        "one": Field(("x",), lambda t, q, u: (0.0 * q[0],)),
+        "two": Field(("x", "v"), lambda t, q, u: (0.0 * q[0], 0.0 * q[1])),
+    }
+    transitions = (
+        hj.Transition("up", "one", "two", hj.Scheduled(1.0), reset=up),
+        hj.Transition("down", "two", "one", hj.Scheduled(1.0, 0.5), reset=down),
+    )
+    return toy(charts, transitions, 1.0, (hj.Output("z", shown),), inputs=("push", "pull"))
 
 
 SHORT = hj.multisine(4, periods=8, inputs=("push", "pull")).scaled(1e-3)
@@ -90,13 +80,13 @@ def about(system):
 
 
 @pytest.fixture(scope="module")
-def toy():
+def quadratic():
     return about(Quadratic())
 
 
 @pytest.fixture(scope="module")
 def two():
-    cycle = hj.find_limit_cycle(Two(), hj.Guess("one", (0.0,), time=0.75))
+    cycle = hj.find_limit_cycle(two_charts(), hj.Guess("one", (0.0,), time=0.75))
     return cycle, hj.ClockPhase(4), hj.linearize(cycle, hj.ClockPhase(4), ("x", "z"))
 
 
@@ -166,7 +156,7 @@ def test_the_expected_size_with_two_inputs(two, gaussian):
 
 
 @pytest.mark.parametrize("f", [0.125, 0.375])
-def test_one_cosine_in_closed_form(toy, f):
+def test_one_cosine_in_closed_form(quadratic, f):
     """x2[p+1] = 0.6 x2[p] + 0.7 x1[p]^2, of which the mean and twice the frequency are seen; z has
     the square of the input, too."""
     a, z = 0.01, np.exp(2j * np.pi * f)
@@ -175,7 +165,7 @@ def test_one_cosine_in_closed_form(toy, f):
         periods=8, experiments=1, input_names=("u",),
     )  # fmt: skip
     cosines = Candidates.of(design)
-    limit = Distortion(toy[0], toy[1], {"x": 1.0, "z": 1.0})
+    limit = Distortion(quadratic[0], quadratic[1], {"x": 1.0, "z": 1.0})
     found = products(limit, cosines, ("u",), cosines.power_of(design))
     x1 = a / np.abs(z - 0.6)
     mean, twice = 0.7 * x1**2 / 2 / 0.4, 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
@@ -211,9 +201,9 @@ def test_designs_within_a_distortion(hopper_cycle):
     np.testing.assert_allclose(seen, said, rtol=0.1)
 
 
-def test_beside_other_limits(toy):
+def test_beside_other_limits(quadratic):
     """Peaks, with the distortion of the phases that these get; several models."""
-    cycle, sections, model = toy
+    cycle, sections, model = quadratic
     usual = hj.multisine(4, periods=16).scaled(0.01)
     distortion = Distortion(cycle, sections, {"x": 1e-3})
     options = dict(noise={"x": 1e-4}, goal=GOAL)
@@ -231,7 +221,7 @@ def test_beside_other_limits(toy):
     assert both.rms["u"] <= 0.01 * (1 + 1e-9) and both.certificate >= 1
 
 
-def test_without_distortion(toy):
+def test_without_distortion(quadratic):
     """Nothing limits a linear system's."""
     cycle, sections, model = about(Quadratic(b=0.0))
     usual = hj.multisine(4, periods=16).scaled(0.01)
@@ -246,8 +236,8 @@ def test_without_distortion(toy):
     assert plan.criterion == pytest.approx(alone.criterion, rel=1e-3)
 
 
-def test_bad_distortions(toy):
-    cycle, sections, model = toy
+def test_bad_distortions(quadratic):
+    cycle, sections, model = quadratic
     twice = hj.LDTP(model.A, 2 * model.B, model.C, outputs="x")
     for family, message in (
         (hj.ClockPhase(8), "different n_sections: 8 and 4"),

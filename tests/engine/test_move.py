@@ -13,7 +13,7 @@ from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 
 from ..conftest import no_compilation
-from ..toys import Field
+from ..toys import Field, Toys
 
 
 def tight(s):
@@ -155,18 +155,12 @@ def test_new_numbers_compile_nothing():
         run(8.0, 1.1, 0.1, until=1.3, time=0.2)
 
 
-class Roots(hj.HybridSystem):
+def roots(a):
     """Chart "rise" is not defined for negative states, which chart "fall" has."""
-
-    a: hj.Parameter = hj.parameter(1.0)
-
-    def charts(self):
-        fall = Field(("x",), lambda t, q, u: (-self.a,))
-        return {"fall": fall, "rise": Field(("z",), lambda t, q, u: (jnp.sqrt(q[0]),))}
-
-    def transitions(self):
-        turn = lambda t, q, u: q[0] + 1.0  # noqa: E731
-        return (hj.Transition("turn", "fall", "rise", turn, reset=lambda t, q, u: -q),)
+    rise = Field(("z",), lambda t, q, u: (jnp.sqrt(q[0]),))
+    charts = {"fall": Field(("x",), lambda t, q, u: (-a,)), "rise": rise}
+    turn = lambda t, q, u: q[0] + 1.0  # noqa: E731
+    return charts, (hj.Transition("turn", "fall", "rise", turn, reset=lambda t, q, u: -q),)
 
 
 def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywhere():
@@ -174,7 +168,8 @@ def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywher
     z = (1 + (2 - t1) / 2)^2 with the event at t1 = (x + 1) / a."""
 
     def end(x, a):
-        return flow(Roots(a), "fall", x[None], jnp.zeros(1), jnp.zeros(()), jnp.asarray(2.0))[0][0]
+        system, zero = Toys(roots, [a]), jnp.zeros(())
+        return flow(system, "fall", x[None], zero[None], zero, jnp.asarray(2.0))[0][0]
 
     exact = lambda x, a: (1 + (2 - (x + 1) / a) / 2) ** 2  # noqa: E731
     x, a = jnp.array([-0.5, 0.2]), 1.3

@@ -7,7 +7,7 @@ from hypothesis import example, given, settings, strategies as st
 
 import hybridjax as hj
 
-from ..toys import Blowup, Ceiling, Close, Dip, Field, Turning
+from ..toys import Field, Toys, toy
 
 
 G = 9.81
@@ -21,6 +21,51 @@ def ball(restitution, duration=60.0, **options):
 
 def times(trajectory, name=None):
     return np.array([e.time for e in trajectory.events if name in (None, e.name)])
+
+
+def ceiling(height):
+    """A ball thrown up under gravity 1 against a ceiling."""
+    hit = lambda t, q, u: q[0] - height  # noqa: E731
+    back = lambda t, q, u: (q[0], -q[1])  # noqa: E731
+    charts = {"air": Field(("y", "v"), lambda t, q, u: (q[1], -1.0))}
+    return charts, (hj.Transition("hit", "air", "air", hit, "rising", back),)
+
+
+def turning(low, high):
+    """A point on the unit circle that turns at rate 1, and counts in the state `n` where it passes:
+    where x falls through `low` and `high`, and once where y falls through zero."""
+    count = lambda t, q, u: (q[0], q[1], q[2] + 1)  # noqa: E731
+    guards = {
+        "low": (lambda t, q, u: q[0] - low, None),
+        "high": (lambda t, q, u: q[0] - high, None),
+        "gated": (lambda t, q, u: q[1], lambda t, q, u: q[2] < 1.0),
+    }
+    return {"turn": Field(("x", "y", "n"), lambda t, q, u: (-q[1], q[0], 0.0))}, [
+        hj.Transition(name, "turn", "turn", guard, reset=count, enabled=enabled)
+        for name, (guard, enabled) in guards.items()
+    ]
+
+
+def close(gap, k):
+    """A point on the unit circle and two guards on x that fall a `gap` apart. The second one is so
+    far from a cubic that its crossing is first estimated wrongly."""
+    plain = lambda t, q, u: q[0] - 0.5  # noqa: E731
+    curved = lambda t, q, u: jnp.exp(k * (q[0] - 0.5 - gap)) - 1  # noqa: E731
+    transitions = (
+        hj.Transition("plain", "turn", "turn", plain),
+        hj.Transition("curved", "turn", "turn", curved),
+    )
+    return {"turn": Field(("x", "y"), lambda t, q, u: (-q[1], q[0]))}, transitions
+
+
+def dip(depth):
+    """y = (t - 1)^2 - depth as a state: below zero for 2 sqrt(depth), then back."""
+    mark = lambda t, q, u: (q[0], q[1] + 1.0)  # noqa: E731
+    charts = {"dip": Field(("y", "n"), lambda t, q, u: (2 * (t - 1.0), 0.0))}
+    return charts, [hj.Transition("dip", "dip", "dip", lambda t, q, u: q[0] - 0.0, reset=mark)]
+
+
+BLOWUP = toy({"x": Field(("x",), lambda t, q, u: q**2)})  # infinite at t = 1 / x(0)
 
 
 def test_a_hundred_bounces():
@@ -49,7 +94,7 @@ def test_zeno_is_seen_before_its_limit(e):
 @pytest.mark.parametrize("gap", [1e-12, -1e-12, 1e-9, -1e-9])
 def test_grazing(gap):
     """A ball that would rise to 1 + 1e-16, under a ceiling at 1 + gap."""
-    found = hj.simulate(Ceiling(height=1 + gap), "air", (0.0, np.sqrt(2.0)), 2.0, throw=False)
+    found = hj.simulate(Toys(ceiling, [1 + gap]), "air", (0.0, np.sqrt(2.0)), 2.0, throw=False)
     hit = np.sqrt(2.0) - np.sqrt(max(-2 * gap, 0.0))
     if abs(gap) < 1e-10:
         assert found.result == hj.Result.GRAZING
@@ -63,19 +108,19 @@ def test_grazing(gap):
 @given(exponent=st.floats(-9.0, -1.0))
 def test_a_guard_that_dips_within_a_step_fires(exponent):
     depth = 10**exponent
-    found = hj.simulate(Dip(depth=depth), "dip", (1.0 - depth, 0.0), 3.0)
+    found = hj.simulate(Toys(dip, [depth]), "dip", (1.0 - depth, 0.0), 3.0)
     np.testing.assert_allclose(times(found), [1 - np.sqrt(depth)], atol=1e-11)
-    above = hj.simulate(Dip(depth=-depth), "dip", (1.0 + depth, 0.0), 3.0)
+    above = hj.simulate(Toys(dip, [-depth]), "dip", (1.0 + depth, 0.0), 3.0)
     assert not above.events and above.result == hj.Result.OK
 
 
 def test_blow_up():
-    found = hj.simulate(Blowup(), "x", (1.0,), 2.0, throw=False)
+    found = hj.simulate(BLOWUP, "x", (1.0,), 2.0, throw=False)
     assert found.result == hj.Result.BLOW_UP
     assert abs(found.t[-1] - 1.0) < 1e-6
     with pytest.raises(hj.ComputationError, match="the state left all bounds"):
-        hj.simulate(Blowup(), "x", (1.0,), 2.0)
-    decay = hj.simulate(Blowup(), "x", (-1.0,), 2.0)
+        hj.simulate(BLOWUP, "x", (1.0,), 2.0)
+    decay = hj.simulate(BLOWUP, "x", (-1.0,), 2.0)
     np.testing.assert_allclose(decay.after[-1], [-1 / 3], rtol=1e-10)
 
 
@@ -88,7 +133,7 @@ def test_blow_up():
     ],
 )
 def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, order):
-    found = hj.simulate(Turning(low=low, high=high), "turn", (0.0, -1.0, 0.0), 2 * np.pi)
+    found = hj.simulate(Toys(turning, [low, high]), "turn", (0.0, -1.0, 0.0), 2 * np.pi)
     assert [e.name for e in found.events if e.name != "gated"] == order
     for name, level in (("low", low), ("high", high)):
         expected = np.pi / 2 + np.arccos(level)
@@ -104,7 +149,7 @@ def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, or
     k=st.sampled_from([1.0, 5.0, 20.0]),
 )
 def test_close_crossings_of_different_shape(gap, sign, k):
-    found = hj.simulate(Close(gap=sign * gap, k=k), "turn", (0.0, -1.0), 2 * np.pi)
+    found = hj.simulate(Toys(close, [sign * gap, k]), "turn", (0.0, -1.0), 2 * np.pi)
     expected = [(np.arccos(0.5), "plain"), (np.arccos(0.5 + sign * gap), "curved")]
     if gap > 1e-11:  # otherwise they are at the same instant, up to rounding
         assert [e.name for e in found.events] == [name for _, name in sorted(expected)]
@@ -112,27 +157,19 @@ def test_close_crossings_of_different_shape(gap, sign, k):
         np.testing.assert_allclose(times(found, name), [np.pi / 2 + angle], atol=1e-11)
 
 
+COUNT = hj.Transition("tick", "a", "a", hj.Scheduled(0.1), reset=lambda t, q, u: q + 1)
+TICK = toy({"a": Field(("n",), lambda t, q, u: (0.0,))}, [COUNT])
+
+
 @settings(max_examples=5)
 @given(k=st.integers(1, 40), pieces=st.integers(2, 7))
 def test_a_tick_at_the_end_of_a_piece_happens_once(k, pieces):
     """Times such as 0.3 and 3 * 0.1 differ by rounding; the tick between is counted once."""
-    system = Tick()
     chart, state, time = "a", (0.0,), 0.0
     for end in np.linspace(0.0, k * 0.1, pieces + 1)[1:]:
-        run = hj.simulate(system, chart, state, end - time, time=time)
+        run = hj.simulate(TICK, chart, state, end - time, time=time)
         state, time = run.after[-1], float(run.t[-1])
     assert state[0] == k
-
-
-class Tick(hj.HybridSystem):
-    """Counts the ticks of a clock with period 0.1."""
-
-    def charts(self):
-        return {"a": Field(("n",), lambda t, q, u: (0.0,))}
-
-    def transitions(self):
-        reset = lambda t, q, u: q + 1  # noqa: E731
-        return (hj.Transition("tick", "a", "a", hj.Scheduled(0.1), reset=reset),)
 
 
 def test_an_input_that_varies_in_time():
@@ -177,41 +214,24 @@ def test_samples_between_steps(reference, hopper_cycle):
     np.testing.assert_array_equal(ym[chart == 1], 0.0)
 
 
-class Sine(hj.HybridSystem):
-    """A guard that turns many times while the state hardly changes."""
-
-    rate: hj.Parameter = hj.parameter(61.0)
-
-    def charts(self):
-        return {"line": Field(("x",), lambda t, q, u: (1.0,))}
-
-    def transitions(self):
-        return [hj.Transition("fall", "line", "line", lambda t, q, u: jnp.sin(self.rate * q[0]))]
+LINE = {"line": Field(("x",), lambda t, q, u: (1.0,))}
 
 
 def test_every_turn_of_a_fast_guard_is_seen():
-    run = hj.simulate(Sine(), "line", (0.1,), 3.0)
+    """Many, while the state hardly changes."""
+    guard = lambda t, q, u: jnp.sin(61.0 * q[0])  # noqa: E731
+    fast = toy(LINE, [hj.Transition("fall", "line", "line", guard)])
+    run = hj.simulate(fast, "line", (0.1,), 3.0)
     falls = (2 * np.arange(1000) + 1) * np.pi / 61.0 - 0.1
     np.testing.assert_allclose(times(run), falls[(falls > 0) & (falls < 3.0)], atol=1e-12)
 
 
-class Coinciding(hj.HybridSystem):
-    """x falls to zero at each tick of a clock, and starts again from 1; n and m count both."""
-
-    def charts(self):
-        return {"a": Field(("x", "n", "m"), lambda t, q, u: (-1.0, 0.0, 0.0))}
-
-    def transitions(self):
-        again, count = jnp.array([1.0, 0.0, 1.0]), jnp.array([0.0, 1.0, 0.0])
-        fall = lambda t, q, u: q[0]  # noqa: E731
-        return (
-            hj.Transition("fall", "a", "a", fall, reset=lambda t, q, u: q + again),
-            hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=lambda t, q, u: q + count),
-        )
-
-
 def test_an_event_at_a_tick():
-    """Both happen, once, and the state is right."""
-    run = hj.simulate(Coinciding(), "a", (1.0, 0.0, 0.0), 3.5)
+    """Where x falls to zero, and starts again from 1: both happen once; n and m count them."""
+    again, count = jnp.array([1.0, 0.0, 1.0]), jnp.array([0.0, 1.0, 0.0])
+    fall = hj.Transition("fall", "a", "a", lambda t, q, u: q[0], reset=lambda t, q, u: q + again)
+    tick = hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=lambda t, q, u: q + count)
+    charts = {"a": Field(("x", "n", "m"), lambda t, q, u: (-1.0, 0.0, 0.0))}
+    run = hj.simulate(toy(charts, (fall, tick)), "a", (1.0, 0.0, 0.0), 3.5)
     np.testing.assert_allclose(run.after[-1], [0.5, 3.0, 3.0], atol=1e-12)
     np.testing.assert_allclose(times(run), [1.0, 1.0, 2.0, 2.0, 3.0, 3.0], atol=1e-12)

@@ -22,29 +22,21 @@ from hybridjax.systems.solver import as_method
 from hybridjax.systems.structure import Structure
 from hybridjax.systems.system import integrated
 
-from ..toys import Field
+from ..toys import Field, toy
 
 
 STIFF = np.array([[0.0, 1.0], [-1e3, -3e3]])
 FAST, SLOW = sorted(np.linalg.eigvals(STIFF))
 
 
-class Damped(hj.HybridSystem):
-    """y'' = -1e3 y - 3e3 y' + a sin 2 pi t: one mode decays in 3 s, one in 0.3 ms."""
+# One mode decays in 3 s, one in 0.3 ms.
+DAMPED = toy(
+    {"a": Field(("y", "v"), lambda t, q, u: (q[1], STIFF[1] @ q + force(t) + u[0]))}, period=1.0
+)
 
-    a: hj.Parameter = hj.parameter(20.0)
 
-    def charts(self):
-        def field(t, q, u):
-            return q[1], -1e3 * q[0] - 3e3 * q[1] + self.a * jnp.sin(2 * jnp.pi * t) + u[0]
-
-        return {"a": Field(("y", "v"), field)}
-
-    def period(self):
-        return 1.0
-
-    def guess(self):
-        return hj.Guess("a", (0.01, 0.02))
+def force(t):
+    return 20.0 * jnp.sin(2 * jnp.pi * t)
 
 
 def exact(a=20.0):
@@ -76,16 +68,12 @@ def test_no_error_of_a_stiff_step_is_hidden(rate):
     assert np.all(error < 5 * np.asarray(step.error) + 1e-15)
 
 
-class Ramp(hj.HybridSystem):
-    """x rises, and v dies out fast."""
-
-    def charts(self):
-        return {"a": Field(("x", "v"), lambda t, q, u: (1.0 + 0 * q[0], -2e3 * q[1]))}
+RAMP = toy({"a": Field(("x", "v"), lambda t, q, u: (1.0 + 0 * q[0], -2e3 * q[1]))})
 
 
 def test_a_landing_is_as_stiff_as_its_chart():
     """The last part of the way, five decay times long, is no explicit step."""
-    s = Structure(integrated(Ramp(), hj.Radau()))
+    s = Structure(integrated(RAMP, hj.Radau()))
     levels = ListLevels((hj.Crossing("x", "rising", 1.0),))
     one, none = np.ones(1), np.zeros(1, np.int32)
     lanes = to_host(start_lanes(s, np.zeros(1), none, np.array([[0.0], [1e-3]])))
@@ -144,7 +132,7 @@ def test_derivatives_of_implicit_steps(solver):
 
 @pytest.fixture(scope="module")
 def damped():
-    return hj.find_limit_cycle(Damped(solver=hj.Radau()))
+    return hj.find_limit_cycle(integrated(DAMPED, hj.Radau()), hj.Guess("a", (0.01, 0.02)))
 
 
 def test_a_stiff_cycle_with_default_settings(damped):

@@ -1,9 +1,7 @@
 """The flow does not depend on the units in which a system is written."""
 
 import functools as ft
-from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,24 +14,12 @@ from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 
-from ..toys import Field
+from ..toys import Field, hopper_in, toy
 
 
 # Lengths and times in these units. Powers of two change no rounding: all decisions are the same.
 UNITS = [(2.0**20, 1.0), (2.0**-30, 1.0), (1.0, 2.0**10), (2.0**-20, 2.0**-8)]
 SIZES = np.array([[2.0, 2.0, 0.3, 4.0], [2.0, 2.0, 1.0, 1.0]])
-
-
-def hopper(length=1.0, time=1.0):
-    """The hopper with lengths and times multiplied."""
-    return hj.models.VerticalHopper(
-        l0=2.0 * length,
-        a=20.0 * length / time**2,
-        g=2.0 * length / time**2,
-        k=10.0 / time**2,
-        b=5.0 / time,
-        omega=2 * np.pi / time,
-    )
 
 
 def sizes(length, time):
@@ -50,7 +36,7 @@ def begin(system, length, time):
 @ft.partial(jax.jit, static_argnums=3)
 def flow(length, time, scale, tangents):
     """Steps, codes and states (in the units of 1, 1) of a second and a half."""
-    system = hopper(length, time)
+    system = hopper_in(length, time)
     lanes, u = begin(system, length, time), jnp.zeros((1, 2))
     settings = Settings(1e-10, 1e-10, 256, scale)
     end = until(jnp.full(2, 1.5 * time))
@@ -74,16 +60,6 @@ def test_the_same_steps_in_all_units(tangents):
 # --- Single trajectories, whose usual sizes are not known -----------------------------------------
 
 
-class Any(hj.HybridSystem):
-    """One chart with any field."""
-
-    function: Callable = eqx.field(static=True)
-    n: int = eqx.field(static=True)
-
-    def charts(self):
-        return {"x": Field(tuple(f"x{k}" for k in range(self.n)), self.function)}
-
-
 SPRING = lambda t, q, u: (q[1], 9.81 - 100.3 * (q[0] - 0.1))  # noqa: E731
 CHAIN = lambda t, q, u: (*q[1:], jnp.cos(t))  # noqa: E731
 
@@ -102,7 +78,8 @@ CHAIN = lambda t, q, u: (*q[1:], jnp.cos(t))  # noqa: E731
     ],
 )
 def test_states_at_rest_stop_nothing(function, start, end):
-    found = hj.simulate(Any(function, len(start)), "x", start, 10.0)
+    states = tuple(f"x{k}" for k in range(len(start)))
+    found = hj.simulate(toy({"x": Field(states, function)}), "x", start, 10.0)
     assert len(found.t) < 150
     if end is None:
         t = 10.0

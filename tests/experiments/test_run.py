@@ -16,7 +16,7 @@ import hybridjax as hj
 
 from ..conftest import OUTPUTS, no_compilation
 from ..orbits import hopper_scipy
-from ..toys import Field
+from ..toys import RESTING
 
 
 FAMILIES = ("isochron", "kinematic")
@@ -180,25 +180,8 @@ def test_clock_sections_of_an_autonomous_system(vanderpol_cycle):
     model.htf([0.5])
 
 
-class Resting(hj.HybridSystem):
-    """A driven oscillator, and beside it a state w that only rounding errors move from zero."""
-
-    inputs = ("force",)
-
-    def charts(self):
-        def field(t, q, u):
-            (x, v, w), c = q, jnp.cos(3 * t)
-            nothing = (1 + 0.1 * c) * 3 - 3 - 0.3 * c
-            return v, c - 4 * x - v + u[0], nothing - w
-
-        return {"all": Field(("x", "v", "w"), field)}
-
-    def period(self):
-        return 2 * np.pi / 3
-
-
 def test_experiments_judge_errors_by_the_sizes_of_the_cycle():
-    resting = hj.find_limit_cycle(Resting(), hj.Guess("all", (0.0, 0.0, 0.0)), scale={"w": 1.0})
+    resting = hj.find_limit_cycle(RESTING, hj.Guess("all", (0.0, 0.0, 0.0)), scale={"w": 1.0})
     family = hj.ClockPhase(4)
     design = hj.Design.from_lines([[0.25], [0.75]], n_sections=4, periods=4)
     data = hj.run_experiments(resting, family, design, ("x", "w"))

@@ -109,9 +109,16 @@ def beside(rng, x, sign: float) -> dict[str, Any]:
     }
 
 
-# Structures: a plan and a function that draws a system.
+STRUCTURES: dict[str, tuple[Plan, Callable[[np.random.Generator], Sample]]] = {}
 
 
+def structure(*arrows, dims):
+    """List a function that draws systems of this plan."""
+    plan = Plan(dims, tuple(Arrow(*a) for a in arrows))
+    return lambda function: STRUCTURES.setdefault(function.__name__, (plan, function))[1]
+
+
+@structure((0, 0, "falling"), (0, 0, "rising"), (0, 0, "falling", True), dims=(3,))
 def kicks(rng) -> Sample:
     """An oscillator that three guards kick, one of them only where it is enabled.
 
@@ -124,6 +131,7 @@ def kicks(rng) -> Sample:
     return Sample([swinging(rng, 3)], arrows, start(rng, 3))
 
 
+@structure((0, 0, "falling"), (0, 0, "falling", True), dims=(2,))
 def dips(rng) -> Sample:
     """Guards that are negative in a thin layer only: they dip and return within a step."""
 
@@ -140,6 +148,7 @@ def dips(rng) -> Sample:
     return Sample([swinging(rng, 2)], arrows, start(rng, 2))
 
 
+@structure((0, 1, "falling"), (1, 0, "rising"), dims=(4, 2))
 def hop(rng) -> Sample:
     """Two oscillators, of which one stops at touchdown and starts again at liftoff, in half of
     the systems where touchdown's guard is zero."""
@@ -152,6 +161,7 @@ def hop(rng) -> Sample:
     return Sample([air, ground], [land, lift], start(rng, 4))
 
 
+@structure((0, 1, "rising"), (1, 2, "falling"), (2, 0, "rising"), dims=(1, 3, 5))
 def ladder(rng) -> Sample:
     """Three charts in turn, of dimensions 1, 3 and 5."""
     charts = [drifting(rng, 1, 1.0), drifting(rng, 3, -1.0), drifting(rng, 5, 1.0)]
@@ -165,6 +175,9 @@ def ladder(rng) -> Sample:
     return Sample(charts, arrows, start(rng, 1, size=0.3))
 
 
+@structure(
+    (0, 1, "falling"), (0, 2, "rising"), (1, 0, "falling"), (2, 0, "rising"), dims=(2, 3, 2)
+)  # fmt: skip
 def fork(rng) -> Sample:
     """Whichever of two guards comes first, one close to the other, decides on the next chart."""
     charts = [swinging(rng, 2), swinging(rng, 3), swinging(rng, 2)]
@@ -173,6 +186,7 @@ def fork(rng) -> Sample:
     return Sample(charts, arrows, start(rng, 2))
 
 
+@structure((0, 1, "scheduled"), (1, 0, "scheduled"), (0, 0, "falling"), dims=(2, 2))
 def switch(rng) -> Sample:
     """Switched by a clock, with a guard in between."""
     period = rng.uniform(1.0, 3.0)
@@ -186,6 +200,9 @@ def switch(rng) -> Sample:
     return Sample([swinging(rng, 2), swinging(rng, 2)], arrows, start(rng, 2))
 
 
+@structure(
+    (0, 0, "falling"), (0, 0, "rising"), (0, 0, "falling", True), (0, 0, "rising", True), dims=(5,)
+)  # fmt: skip
 def crowd(rng) -> Sample:
     """Five dimensions and four guards of all kinds, in slow motion: many crossings in one step."""
     chart = swinging(rng, 5, rate=(0.1, 0.5))
@@ -201,6 +218,10 @@ def crowd(rng) -> Sample:
     return Sample([chart], arrows, start(rng, 5, limit=60.0))
 
 
+@structure(
+    (0, 1, "falling"), (0, 2, "rising"), (1, 2, "falling"), (2, 0, "rising", True),
+    (2, 2, "scheduled"), dims=(5, 1, 4),
+)  # fmt: skip
 def tour(rng) -> Sample:
     """Three charts of dimensions 5, 1 and 4, a clock, and a guard of every kind."""
     charts = [swinging(rng, 5), drifting(rng, 1, -1.0), swinging(rng, 4)]
@@ -215,53 +236,8 @@ def tour(rng) -> Sample:
     return Sample(charts, arrows, start(rng, 5))
 
 
-def _one(*arrows, dims) -> Plan:
-    return Plan(dims, tuple(Arrow(*a) for a in arrows))
-
-
-STRUCTURES: dict[str, tuple[Plan, Callable[[np.random.Generator], Sample]]] = {
-    "kicks": (
-        _one((0, 0, "falling"), (0, 0, "rising"), (0, 0, "falling", True), dims=(3,)),
-        kicks,
-    ),
-    "dips": (_one((0, 0, "falling"), (0, 0, "falling", True), dims=(2,)), dips),
-    "hop": (_one((0, 1, "falling"), (1, 0, "rising"), dims=(4, 2)), hop),
-    "ladder": (
-        _one((0, 1, "rising"), (1, 2, "falling"), (2, 0, "rising"), dims=(1, 3, 5)),
-        ladder,
-    ),
-    "fork": (
-        _one(
-            (0, 1, "falling"), (0, 2, "rising"), (1, 0, "falling"), (2, 0, "rising"),
-            dims=(2, 3, 2),
-        ),
-        fork,
-    ),
-    "switch": (
-        _one((0, 1, "scheduled"), (1, 0, "scheduled"), (0, 0, "falling"), dims=(2, 2)),
-        switch,
-    ),
-    "crowd": (
-        _one(
-            (0, 0, "falling"), (0, 0, "rising"), (0, 0, "falling", True), (0, 0, "rising", True),
-            dims=(5,),
-        ),
-        crowd,
-    ),
-    "tour": (
-        _one(
-            (0, 1, "falling"), (0, 2, "rising"), (1, 2, "falling"), (2, 0, "rising", True),
-            (2, 2, "scheduled"),
-            dims=(5, 1, 4),
-        ),
-        tour,
-    ),
-}  # fmt: skip
-
-
 def draw(name: str, number: int, seed: int = 0) -> Sample:
     """System `number` of a structure."""
-    place = 2 + list(STRUCTURES).index(
-        name
-    )  # (so that "dips:28" stays the system that failed once)
+    # (So that "dips:28" stays the system that failed once.)
+    place = 2 + list(STRUCTURES).index(name)
     return STRUCTURES[name][1](np.random.default_rng([seed, place, number]))

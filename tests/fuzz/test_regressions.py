@@ -14,46 +14,35 @@ from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 
-from ..toys import Field
+from ..toys import Field, Toys, toy
 
 
 SETTINGS = Settings(1e-10, 1e-10)
 
 
-class Threshold(hj.HybridSystem):
-    """x' = -1, with an event where x + u falls through zero: the input moves the guard."""
-
-    def charts(self):
-        return {"line": Field(("x",), lambda t, q, u: (-1.0,))}
-
-    def transitions(self):
-        return (hj.Transition("fall", "line", "line", lambda t, q, u: q[0] + u[0]),)
+# x' = -1, with an event where x + u falls through zero: the input moves the guard.
+THRESHOLD = toy(
+    {"line": Field(("x",), lambda t, q, u: (-1.0,))},
+    [hj.Transition("fall", "line", "line", lambda t, q, u: q[0] + u[0])],
+)
 
 
-class Rounded(hj.HybridSystem):
+def rounded(level):
     """An event that changes nothing: its guard is zero afterwards, but for rounding errors, which
     grow with the state and with time."""
-
-    level: hj.Parameter = hj.parameter(0.0)
-
-    def charts(self):
-        return {"line": Field(("x", "y"), lambda t, q, u: (-1.0, -1.0))}
-
-    def transitions(self):
-        def guard(t, q, u):
-            return q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - self.level
-
-        return (hj.Transition("fall", "line", "line", guard),)
+    guard = lambda t, q, u: q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - level  # noqa: E731
+    charts = {"line": Field(("x", "y"), lambda t, q, u: (-1.0, -1.0))}
+    return charts, (hj.Transition("fall", "line", "line", guard),)
 
 
 def test_a_guard_that_the_input_makes_negative_is_not_armed():
-    run = hj.simulate(Threshold(), "line", (0.5,), 1.0, input=-1.0, throw=False)
+    run = hj.simulate(THRESHOLD, "line", (0.5,), 1.0, input=-1.0, throw=False)
     assert run.result == hj.Result.OK and not run.events
 
 
 def two_pieces(x, first, second):
     """One second at one input, and one at another."""
-    s = Structure(Threshold())
+    s = Structure(THRESHOLD)
     lanes = start_lanes(s, jnp.zeros(1), jnp.zeros(1, jnp.int32), jnp.full((1, 1), x))
     h = None
     for end, u in ((1.0, first), (2.0, second)):
@@ -82,7 +71,8 @@ def across(x, time, duration):
     t = jnp.full(1, time)
     q = jnp.stack([x, -x])[:, None]
     hit = duration / 3
-    s = Structure(Rounded(-0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit))))
+    level = -0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit))
+    s = Structure(Toys(rounded, [level]))
     lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
     u = jnp.zeros((1, 1))
     moved = move(s, lanes, u, until(t + duration), SETTINGS).moved

@@ -48,12 +48,9 @@ def systems(t):
     yield hj.enable_vector_math, dict(enabled=True)
     yield hj.enable_progress, dict(enabled=False)
     yield hj.enable_compilation_cache, dict(folder=None)
-    yield hj.Execution, {}
     yield hj.Settings, dict(rtol=1e-09, atol=1e-09)
     begin = dict(chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0)
     yield hj.simulate, dict(system=t.system) | begin
-    yield t.trajectory, {}
-    yield t.trajectory.dense, {}
 
 
 def sections(t):
@@ -72,10 +69,8 @@ def sections(t):
 
 def cycles(t):
     yield hj.find_limit_cycle, dict(system=t.system, guess=t.cycle)
-    yield t.cycle.trajectory, {}
     yield hj.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle)
     yield t.cycles.__getitem__, dict(i=0)
-    yield t.cycles.summary, {}
     yield hj.continuation, dict(cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05)
     yield t.cycle.responses, dict(modes=0)
     yield t.cycle.htf, dict(f=np.array([0.3]), harmonics=0, outputs=STATES)
@@ -100,8 +95,6 @@ def linear(t):
     yield t.model.impulse_response, dict(n_lags=3)
     yield t.model.htf, dict(f=np.array([0.1, 0.2]))
     yield t.model.feedback, dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs))))
-    yield t.model.monodromy, {}
-    yield t.model.rank, {}
     f, H = (np.asarray(t.estimate.f), np.asarray(t.estimate.H))
     size = np.ones(H.shape)
     scatter = hj.Scatter(f, size)
@@ -119,7 +112,6 @@ def linear(t):
     htf = t.estimate
     yield htf.__getitem__, dict(m=0)
     yield htf.select, dict(harmonics=0)
-    yield htf.confidence_radius, {}
     yield htf.predict, dict(u=u)
     for name in ("error", "harmonic_errors"):
         yield getattr(htf, name), dict(other=t.exact)
@@ -133,18 +125,14 @@ def designs(t):
     yield hj.Design.from_lines, cosines | dict(n_sections=6, periods=16)
     good = {name: getattr(t.one_input, name) for name in t.one_input.__dataclass_fields__}
     yield hj.Design, good
-    yield t.design.inputs, {}
     yield t.design.scaled, dict(rms=1.0)
     yield t.design.realizations, dict(count=2)
-    yield t.design.expected_variance, {}
-    yield t.design.cycles, {}
     yield hj.experiments.optimize_phases, dict(design=t.design)
 
 
 def experiments(t):
     to_run = dict(cycle=t.cycle, sections=t.placed, design=t.one_input, outputs=STATES)
     yield hj.run_experiments, to_run
-    yield hj.experiments.Options, {}
     yield hj.experiments.stream_experiments, to_run
     yield hj.experiments.StoredExperiments, dict(store="nope")
     yield hj.response_function, {name: to_run[name] for name in ("cycle", "sections", "outputs")}
@@ -155,8 +143,6 @@ def experiments(t):
     yield hj.experiments.add_noise, dict(data=t.data, std=0.1)
     y = np.ones(t.data.y.shape)
     yield hj.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16)
-    yield t.data.windows, {}
-    yield t.data.summary, {}
     one = t.record
     yield hj.Record, dict(u=one.u, y=one.y, n_sections=6)
     yield one.part, dict(first=0, stop=12)
@@ -175,7 +161,6 @@ def estimates(t):
     yield t.structured.distance, dict(true=true)
     yield t.structured.compare, dict(true=true)
     yield t.structured.contains, dict(true=true)
-    yield t.structured.ellipse, {}
     yield hj.select_order, dict(htf=t.estimate, overhang=6)
     yield hj.identify.multiplier_bound, dict(model=t.model, htf=t.uncertain)
     yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)
@@ -211,7 +196,6 @@ def fitting(t):
 def designs_data(t):
     ask = hj.designs.Multipliers(harmonics=0, overhang=6)
     yield hj.optimal_design, dict(model=t.model, design=t.design, goal=ask)
-    yield hj.designs.Multipliers, {}
     yield hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
     yield hj.designs.FrequencyResponse, dict(band=(0.1, 1.0))
     yield hj.designs.Limits, dict(rms={"u0": 1.0})
@@ -311,13 +295,22 @@ def rhythms(t):
     yield t.beats, at
     yield t.beats.interval, at
     yield hj.recordings.natural_multipliers, dict(data=t.variability)
-    natural = hj.recordings.natural_multipliers(t.variability)
-    yield natural.interval, {}
-    yield t.structured.half_widths, {}
     yield hj.testing.simulate_beats, dict(curve=[1.0], force=jnp.ones((1, 99)))
 
 
+def without_arguments(t):
+    natural = hj.recordings.natural_multipliers(t.variability)
+    data, design = t.data, t.design
+    for call in (
+        hj.Execution, hj.designs.Multipliers, hj.experiments.Options, natural.interval,
+        t.trajectory, t.trajectory.dense, t.cycle.trajectory, t.cycles.summary, t.model.monodromy,
+        t.model.rank, t.estimate.confidence_radius, design.inputs, design.expected_variance,
+        design.cycles, data.windows, data.summary, t.structured.ellipse, t.structured.half_widths,
+    ):  # fmt: skip
+        yield call, {}
+
+
 PARTS = (
-    scale, systems, sections, cycles, linear, designs, experiments, estimates, series, fitting,
-    designs_data, recordings, testing, files, conversions, plots, rhythms,
+    without_arguments, scale, systems, sections, cycles, linear, designs, experiments, estimates,
+    series, fitting, designs_data, recordings, testing, files, conversions, plots, rhythms,
 )  # fmt: skip

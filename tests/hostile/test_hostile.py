@@ -2,12 +2,10 @@
 
 import inspect
 import json
-import pathlib
-import subprocess
-import sys
 
 import pytest
 
+from ..sessions import ROOT, run_python
 from ..test_typing import public
 
 
@@ -25,12 +23,7 @@ SLOW_TO_MAKE = {"ModelFit", "StoredExperiments"}
 
 def printed(*command):
     """By a process without this one's check of types."""
-    run = subprocess.run(
-        [sys.executable, "-m", *command],
-        capture_output=True, text=True, timeout=1800, cwd=pathlib.Path(__file__).parents[2],
-    )  # fmt: skip
-    assert run.returncode == 0, run.stderr
-    return json.loads(run.stdout)
+    return json.loads(run_python("-m", *command, timeout=1800, cwd=ROOT))
 
 
 @pytest.fixture(scope="module")

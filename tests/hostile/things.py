@@ -1,5 +1,7 @@
 """Objects of every public kind, each made once, on first use: good arguments for the table."""
 
+import dataclasses
+
 import matplotlib
 import numpy as np
 
@@ -75,9 +77,8 @@ MAKE = {
     "data": lambda t: hj.experiments.simulate_experiments(t.model, t.design, start="periodic"),
     "repeated": repeated,
     "estimate": lambda t: hj.estimate_htf(t.data, (-1, 0, 1)),
-    "uncertain": lambda t: hj.HTF(
-        t.estimate.f, t.estimate.H, t.estimate.harmonics, 6,
-        variance=np.full(t.estimate.H.shape, 1e-6),
+    "uncertain": lambda t: dataclasses.replace(
+        t.estimate, variance=np.full(t.estimate.H.shape, 1e-6)
     ),
     "exact": lambda t: t.model.htf(t.estimate.f, (-1, 0, 1)),
     "rational": lambda t: hj.fit_rational(t.estimate, output=0, poles=1, zeros=1),

@@ -6,6 +6,10 @@ import hybridjax as hj
 from ..linear.conftest import blocks_at_random, hopper as hopper
 
 
+# Dimensions, outputs and inputs.
+SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
+
+
 def scaled(seed, dims, ny, nu, modulus=0.7):
     """A random system whose largest multiplier has this modulus."""
     A, B, C, D = blocks_at_random(seed, dims, ny, nu)

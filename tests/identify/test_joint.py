@@ -1,5 +1,7 @@
 """The fit of a linear periodic model itself, and its bound."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -34,9 +36,7 @@ def exact(model):
 def with_values(htf, H, variance=None):
     if variance is not None:
         variance = np.full(H.shape, variance)
-    return hj.HTF(
-        htf.f, H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs, variance=variance
-    )
+    return dataclasses.replace(htf, H=H, variance=variance)
 
 
 def noisy(htf, rng):

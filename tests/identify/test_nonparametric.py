@@ -83,8 +83,7 @@ def failed(data, experiments):
     """The same data, as if these experiments had failed at sample 50."""
     y, result = data.y.copy(), data.result.copy()
     y[experiments, 50:], result[experiments] = np.nan, hj.Result.BLOW_UP
-    kept = {f.name: getattr(data, f.name) for f in dataclasses.fields(data)}
-    return hj.ExperimentData(**(kept | dict(y=y, result=result)))
+    return dataclasses.replace(data, y=y, result=result)
 
 
 def test_failed_experiments_are_left_out(paper_data, paper_estimate):

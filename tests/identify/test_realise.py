@@ -1,11 +1,13 @@
 """State-space models from responses: exact and minimal on exact data, sensible on noisy data."""
 
+import dataclasses
+
 import numpy as np
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 
-from .conftest import scaled
+from .conftest import SHAPES, scaled
 from .test_series import record
 
 
@@ -30,9 +32,6 @@ def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
     np.testing.assert_allclose(model.multipliers, multipliers, atol=1e-11)
     assert model.htf(F).error(hopper.htf(F)).max() < 1e-10
     assert model.inputs == ("u",) and model.outputs == ("yM", "vM")
-
-
-SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 
 
 @settings(max_examples=5)
@@ -67,10 +66,8 @@ def test_from_noisy_htfs(exact, hopper, multipliers):
     rng = np.random.default_rng(0)
     variance = np.full(exact.H.shape, (1e-4 * np.abs(exact.H).max()) ** 2)
     error = rng.normal(size=exact.H.shape) + 1j * rng.normal(size=exact.H.shape)
-    noisy = hj.HTF(
-        exact.f, exact.H + np.sqrt(variance / 2) * error, exact.harmonics, 32,
-        exact.inputs, exact.outputs, variance=variance,
-    )  # fmt: skip
+    H = exact.H + np.sqrt(variance / 2) * error
+    noisy = dataclasses.replace(exact, H=H, variance=variance)
     model = hj.identify.realize(noisy, order=2)
     assert np.all(np.asarray(model.dims) <= MINIMAL)
     assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3

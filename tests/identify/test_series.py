@@ -1,5 +1,7 @@
 """Fits to time series: accurate without noise, calibrated with noise, gaps, unknown starts."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -10,7 +12,7 @@ from hybridjax.identify.series.linearization import each_fit, linearize
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.records import PreparedRecords
 
-from .conftest import scaled
+from .conftest import SHAPES, scaled
 from .test_uncertainty import covered
 
 
@@ -39,9 +41,6 @@ def test_the_hopper_is_identified_to_rounding(hopper, multipliers):
     assert fit.htf(f).error(hopper.htf(f)).max() < 1e-12
     np.testing.assert_allclose(fit.impulse_response(200), hopper.impulse_response(200), atol=1e-12)
     assert fit.result == hj.Result.OK and np.all(fit.noise < 1e-14)
-
-
-SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 
 
 @settings(max_examples=6)
@@ -128,12 +127,9 @@ def test_experiments_are_used_from_their_start(small):
     """The transient is information; failed experiments are left out; all data are records."""
     design = hj.multisine(n_sections=4, periods=24, band=(0, 2.0))
     data = hj.experiments.simulate_experiments(small, design, discard=0)
-    y = np.array(data.y)
-    y[-1] = 1e3
-    data = hj.ExperimentData(
-        data.u, y, n_sections=4, periods=24, inputs=small.inputs, outputs=small.outputs,
-        result=[0] * (len(y) - 1) + [hj.Result.BLOW_UP],
-    )  # fmt: skip
+    y, result = np.array(data.y), np.zeros(len(data.y), int)
+    y[-1], result[-1] = 1e3, hj.Result.BLOW_UP
+    data = dataclasses.replace(data, y=y, result=result)
     fit = hj.fit_series(data, 2)
     assert fit.compare(small.multipliers).max_error < 1e-8
     assert f"SeriesFit(multipliers {small.multipliers[0].real:.4f}" in repr(fit)

@@ -7,6 +7,7 @@ from hypothesis import given, settings, strategies as st
 import hybridjax as hj
 
 from ..linear.conftest import blocks_at_random
+from .conftest import SHAPES
 
 
 @pytest.mark.parametrize("harmonics", [0, (-1, 0, 1), 1, (1, 2), (-16, -2, 2)])
@@ -19,9 +20,6 @@ def test_the_hopper_is_found_exactly(harmonics, exact, multipliers):
 def test_the_paper_protocol(paper_estimate, multipliers):
     narrow = hj.fit_multipliers(paper_estimate.select((-2, -1, 0, 1, 2)), 2)
     assert narrow.compare(multipliers).max_error < 2e-5
-
-
-SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 
 
 @settings(max_examples=12)

@@ -1,5 +1,7 @@
 """Multipliers with errors: efficient, and with regions that hold what they promise."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -21,10 +23,8 @@ def noisy(htf, variance, rng, correlation=0.0):
 
 
 def with_variance(htf, H, variance, freedom=None):
-    return hj.HTF(
-        htf.f, H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
-        variance=variance, scatter=None if freedom is None else hj.Scatter(freedom),
-    )  # fmt: skip
+    scatter = None if freedom is None else hj.Scatter(freedom)
+    return dataclasses.replace(htf, H=H, variance=variance, scatter=scatter)
 
 
 @pytest.fixture(scope="module")

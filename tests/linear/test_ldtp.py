@@ -34,16 +34,6 @@ def test_simulation_follows_the_definition(seed, shape, start):
     np.testing.assert_allclose(ldtp.simulate(u, x0, start), ys, rtol=0, atol=1e-12)
 
 
-@settings(max_examples=5)
-@given(seeds, st.sampled_from(SHAPES))
-def test_periodic_state_returns_to_itself(seed, shape):
-    dims, ny, nu = shape
-    ldtp = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
-    u = np.random.default_rng(seed).normal(size=(4 * len(dims), nu))
-    x = np.asarray(ldtp.states(u, ldtp.periodic_state(u, 4)))
-    np.testing.assert_allclose(x[-1], x[0], rtol=0, atol=1e-12)
-
-
 def test_periodic_state_of_an_unstable_system():
     # Phi^20 has the entries 1e20 and 1e-20; the stable part must not drown.
     A = [np.array([[10.0, 0.0], [3.0, 0.1]])]

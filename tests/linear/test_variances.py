@@ -1,5 +1,6 @@
 """Variances of HTFs: carried along, and what they say about an interval."""
 
+import jax
 import numpy as np
 import pytest
 from scipy import stats
@@ -16,7 +17,7 @@ def an_htf(**more):
     return hj.HTF(F, H, (-1, 0, 1), 4, **more)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def htf():
     size = np.random.default_rng(1).uniform(1, 2, (3, len(F), 2, 1))
     scatter = hj.Scatter(np.full(len(F), 4.0), size)
@@ -29,7 +30,8 @@ def test_the_radius_is_that_of_the_f_distribution(htf):
     np.testing.assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
     level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.scatter.roundness) - 1))
     expected = np.sqrt(stats.f.ppf(level, 2, 8) * np.asarray(htf.variance))
-    np.testing.assert_allclose(htf.confidence_radius(), expected, rtol=1e-9)
+    for radius in (hj.HTF.confidence_radius, jax.jit(hj.HTF.confidence_radius)):
+        np.testing.assert_allclose(radius(htf), expected, rtol=1e-9)
     known = an_htf(variance=htf.variance).confidence_radius(0.9)
     np.testing.assert_allclose(
         known, np.sqrt(stats.chi2.ppf(0.9, 2) / 2 * np.asarray(htf.variance)), rtol=1e-12

@@ -7,6 +7,8 @@ import pytest
 
 import hybridjax as hj
 
+from ..toys import Field, toy
+
 
 hj.enable_x64()
 m, M, L, G = 1.3, 2.0, 0.7, 9.81
@@ -77,25 +79,15 @@ def test_impacts(e):
     assert abs(lost) < 1e-12 if e == 1 else lost > 0
 
 
-class Losing(hj.Chart):
+def worn(t, q, u):
     """The second body wears away as the first moves, until x = 1."""
-
-    states = ("x", "y", "vx", "vy")
-
-    def field(self, t, q, u):
-        body = hj.Mechanism(
-            lambda q, v: 0.5 * v[0] ** 2 + 0.5 * jnp.maximum(1 - q[0], 0.0) * v[1] ** 2
-        )
-        return jnp.concatenate([q[2:], body.acceleration(q[:2], q[2:])])
-
-
-class Worn(hj.HybridSystem):
-    def charts(self):
-        return {"move": Losing()}
+    lost = lambda q, v: 0.5 * v[0] ** 2 + 0.5 * jnp.maximum(1 - q[0], 0.0) * v[1] ** 2  # noqa: E731
+    return jnp.concatenate([q[2:], hj.Mechanism(lost).acceleration(q[:2], q[2:])])
 
 
 def test_a_singular_mass_matrix_ends_the_trajectory_with_its_cause():
-    found = hj.simulate(Worn(), "move", (0.0, 0.0, 1.5, 0.0), 5.0, throw=False)
+    system = toy({"move": Field(("x", "y", "vx", "vy"), worn)})
+    found = hj.simulate(system, "move", (0.0, 0.0, 1.5, 0.0), 5.0, throw=False)
     assert found.result == hj.Result.FIELD_NOT_FINITE
     np.testing.assert_allclose(found.t[-1], 2 / 3, rtol=1e-6)
     with pytest.raises(hj.DefinitionError, match="kinetic energy must be positive"):

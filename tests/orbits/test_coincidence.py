@@ -7,82 +7,61 @@ import pytest
 
 import hybridjax as hj
 
-from ..toys import Field
+from ..toys import Field, toy
 from .test_explain import BALLS, Balls
 
 
-class Pair(hj.HybridSystem):
-    """x and y relax to 1, and are set back to 0 together at the level 1/2."""
-
-    def charts(self):
-        return {"a": Field(("x", "y"), lambda t, q, u: (1.0 - q[0], 1.0 - q[1]))}
-
-    def transitions(self):
-        first = hj.Transition(
+# x and y relax to 1, and are set back to 0 together at the level 1/2.
+PAIR = toy(
+    {"a": Field(("x", "y"), lambda t, q, u: (1.0 - q[0], 1.0 - q[1]))},
+    [
+        hj.Transition(
             "x", "a", "a", lambda t, q, u: q[0] - 0.5, "rising",
             lambda t, q, u: (0.5 * (q[1] - 0.5), q[1]),
-        )  # fmt: skip
-        second = hj.Transition(
+        ),
+        hj.Transition(
             "y", "a", "a", lambda t, q, u: q[1] - 0.5, "rising", lambda t, q, u: (q[0], 0.0)
-        )
-        return first, second
+        ),
+    ],
+)  # fmt: skip
 
 
-class Ticked(hj.HybridSystem):
+def ticked(height=1.0, other=0.0):
     """A saw-tooth that is set back when it comes to `height`, and by a clock at whole times."""
-
-    height: hj.Parameter = hj.parameter(1.0)
-    other: float = 0.0
-
-    def charts(self):
-        return {"a": Field(("x",), lambda t, q, u: (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),))}
-
-    def transitions(self):
-        back = lambda t, q, u: (0.2,)  # noqa: E731
-        found = [
-            hj.Transition("full", "a", "a", lambda t, q, u: q[0] - self.height, "rising", back),
-            hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=back),
-        ]
-        if self.other:
-            found.append(hj.Transition("tock", "a", "a", hj.Scheduled(0.5, self.other), reset=back))
-        return found
-
-    def period(self):
-        return 1.0
+    back = lambda t, q, u: (0.2,)  # noqa: E731
+    transitions = [
+        hj.Transition("full", "a", "a", lambda t, q, u: q[0] - height, "rising", back),
+        hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=back),
+    ]
+    if other:
+        transitions.append(hj.Transition("tock", "a", "a", hj.Scheduled(0.5, other), reset=back))
+    charts = {"a": Field(("x",), lambda t, q, u: (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),))}
+    return toy(charts, transitions, period=1.0)
 
 
-class Race(hj.HybridSystem):
+def race():
     """x and y rise to 1 together; the other goes on at its own speed when one is there. Both fall
     then, until the clock starts them again."""
-
-    def charts(self):
-        speeds = {"a": (1.0, 1.0), "x first": (1.0, 2.0), "y first": (3.0, 1.0), "c": (-4.0, -5.0)}
-        return {
-            name: Field(("x", "y"), lambda t, q, u, speed=speed: speed)
-            for name, speed in speeds.items()
-        }
-
-    def transitions(self):
-        x, y = (lambda t, q, u, k=k: q[k] - 1.0 for k in range(2))
-        again = lambda t, q, u: (0.5 + 0.1 * (q[0] + 1.0), 0.5 + 0.1 * (q[1] + 1.5))  # noqa: E731
-        return (
-            hj.Transition("x", "a", "x first", x, "rising"),
-            hj.Transition("y", "a", "y first", y, "rising"),
-            hj.Transition("y second", "x first", "c", y, "rising"),
-            hj.Transition("x second", "y first", "c", x, "rising"),
-            hj.Transition("start", "c", "a", hj.Scheduled(1.0), reset=again),
-        )
-
-    def period(self):
-        return 1.0
-
-
-GUESS = hj.Guess("a", (0.1, 0.1))
+    speeds = {"a": (1.0, 1.0), "x first": (1.0, 2.0), "y first": (3.0, 1.0), "c": (-4.0, -5.0)}
+    charts = {
+        name: Field(("x", "y"), lambda t, q, u, speed=speed: speed)
+        for name, speed in speeds.items()
+    }
+    x, y = (lambda t, q, u, k=k: q[k] - 1.0 for k in range(2))
+    again = lambda t, q, u: (0.5 + 0.1 * (q[0] + 1.0), 0.5 + 0.1 * (q[1] + 1.5))  # noqa: E731
+    transitions = (
+        hj.Transition("x", "a", "x first", x, "rising"),
+        hj.Transition("y", "a", "y first", y, "rising"),
+        hj.Transition("y second", "x first", "c", y, "rising"),
+        hj.Transition("x second", "y first", "c", x, "rising"),
+        hj.Transition("start", "c", "a", hj.Scheduled(1.0), reset=again),
+    )
+    return toy(charts, transitions, period=1.0)
 
 
 def test_derivatives_of_both_orders():
     """By hand: x is at 1 at the time -dx, or -(dx + 2 dy) / 3 if y was there first; and so on."""
-    cycle = hj.find_limit_cycle(Race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
+    cycle = hj.find_limit_cycle(race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
     assert cycle.result == hj.Result.COINCIDENCE
     (found,) = hj.coincidences(cycle)
     assert found.time % 1.0 == pytest.approx(0.5) and not found.commute
@@ -97,7 +76,7 @@ def test_derivatives_of_both_orders():
 
 def test_an_event_that_coincides_with_the_one_at_the_anchor():
     with pytest.raises(hj.ComputationError, match="'y' coincides with 'x', its beginning"):
-        hj.find_limit_cycle(Pair(), GUESS, section=hj.AtEvent("x"))
+        hj.find_limit_cycle(PAIR, hj.Guess("a", (0.1, 0.1)), section=hj.AtEvent("x"))
 
 
 @pytest.mark.slow
@@ -117,9 +96,9 @@ def test_an_event_that_coincides_with_a_schedule():
     """Without the clock, it would be full at the time 1: which of the two sets it back?"""
     height = 10 - 9.8 * np.exp(-0.1)
     with pytest.raises(hj.ComputationError, match="'full' and 'tick' coincide|'tick' and 'full'"):
-        hj.find_limit_cycle(Ticked(height), hj.Guess("a", (0.5,), 0.3))
+        hj.find_limit_cycle(ticked(height), hj.Guess("a", (0.5,), 0.3))
 
 
 def test_two_schedules_for_one_time():
     with pytest.raises(hj.DefinitionError, match="'tick' and 'tock' are scheduled for the same"):
-        hj.find_limit_cycle(Ticked(other=0.5), hj.Guess("a", (0.5,), 0.3))
+        hj.find_limit_cycle(ticked(other=0.5), hj.Guess("a", (0.5,), 0.3))

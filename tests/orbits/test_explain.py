@@ -6,7 +6,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..toys import Field
+from ..toys import Field, toy
 
 
 class Balls(hj.HybridSystem):
@@ -40,31 +40,16 @@ class Balls(hj.HybridSystem):
         return 1.0
 
 
-class WrongWay(hj.HybridSystem):
-    """A ball that falls through its floor, whose guard should rise."""
-
-    def charts(self):
-        return {"air": Field(("y", "v"), lambda t, q, u: (q[1], -1.0))}
-
-    def transitions(self):
-        guard = lambda t, q, u: q[0] - 0.1 * jnp.sin(2 * jnp.pi * t)  # noqa: E731
-        return [hj.Transition("impact", "air", "air", guard, "rising", lambda t, q, u: q)]
-
-    def period(self):
-        return 1.0
-
-
-class Damped(hj.HybridSystem):
-    """A pushed mass on a spring with a dashpot that is much too strong."""
-
-    def charts(self):
-        force = lambda t, q: -1e5 * q[0] - 3e3 * q[1] + 20 * jnp.sin(2 * jnp.pi * t)  # noqa: E731
-        return {"a": Field(("y", "v"), lambda t, q, u: (q[1], force(t, q)))}
-
-    def period(self):
-        return 1.0
-
-
+# A ball that falls through its floor, whose guard should rise.
+FLOOR = lambda t, q, u: q[0] - 0.1 * jnp.sin(2 * jnp.pi * t)  # noqa: E731
+WRONG_WAY = toy(
+    {"air": Field(("y", "v"), lambda t, q, u: (q[1], -1.0))},
+    [hj.Transition("impact", "air", "air", FLOOR, "rising", lambda t, q, u: q)],
+    period=1.0,
+)
+# A pushed mass on a spring with a dashpot that is much too strong.
+FORCE = lambda t, q: -1e5 * q[0] - 3e3 * q[1] + 20 * jnp.sin(2 * jnp.pi * t)  # noqa: E731
+DAMPED = toy({"a": Field(("y", "v"), lambda t, q, u: (q[1], FORCE(t, q)))}, period=1.0)
 BALLS = hj.Guess("air", (0.1, 4.7, 0.1, 4.7), 0.1)
 
 
@@ -106,12 +91,12 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     "system, guess, message",
     [
         pytest.param(
-            WrongWay(),
+            WRONG_WAY,
             (0.2, 0.5),
             "No event happened: the guard of 'impact', which should be risin",
             marks=pytest.mark.slow,
         ),
-        (Damped(), (0.0, 0.0), r'is stiff: a mode decays .*solver="auto".*max_steps'),
+        (DAMPED, (0.0, 0.0), r'is stiff: a mode decays .*solver="auto".*max_steps'),
     ],
 )
 def test_causes(system, guess, message):

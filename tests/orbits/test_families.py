@@ -12,7 +12,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..toys import Field
+from ..toys import Field, toy
 
 
 APEX = hj.Crossing("vy", "falling")
@@ -53,21 +53,15 @@ def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):
         np.testing.assert_allclose(exact, (ends[1] - ends[0]) / 2 / max(step), rtol=1e-5)
 
 
-class Oscillator(hj.HybridSystem):
-    """x'' = -x, whose cycles are circles."""
-
-    def charts(self):
-        return {"a": Field(("x", "v"), lambda t, q, u: (q[1], -q[0]))}
-
-    def outputs(self):
-        energy = lambda t, q, u: (q[0] ** 2 + q[1] ** 2) / 2  # noqa: E731
-        return (hj.Output("energy", energy),)
+ENERGY = hj.Output("energy", lambda t, q, u: (q[0] ** 2 + q[1] ** 2) / 2)
+# x'' = -x, whose cycles are circles.
+CIRCLES = toy({"a": Field(("x", "v"), lambda t, q, u: (q[1], -q[0]))}, outputs=(ENERGY,))
 
 
 def find(**conserved):
     section = hj.Crossing("x", "rising")
     guess = hj.Guess("a", (0.0, 1.1))
-    return hj.find_limit_cycle(Oscillator(), guess, section=section, conserved=conserved)
+    return hj.find_limit_cycle(CIRCLES, guess, section=section, conserved=conserved)
 
 
 def test_the_circle_of_an_energy():

@@ -6,39 +6,19 @@ import pytest
 
 import hybridjax as hj
 
-from ..toys import Field
+from ..toys import Field, toy
 
 
-class Kicked(hj.HybridSystem):
+def kicked(beat=1.0, schedule=0.0):
     """x' = -x, and x grows by 1 each time the cosine falls, or at scheduled times."""
-
-    beat: float = 1.0
-    schedule: float = 0.0
-
-    def charts(self):
-        return {"a": Field(("x",), lambda t, q, u: (-q[0] + 0.0 * jnp.sin(t) + u[0],))}
-
-    def transitions(self):
-        guard = lambda t, q, u: jnp.cos(2 * jnp.pi * t)  # noqa: E731
-        if self.schedule:
-            guard = hj.Scheduled(self.schedule, 0.1)
-        return [hj.Transition("kick", "a", "a", guard, reset=lambda t, q, u: (q[0] + 1.0,))]
-
-    def period(self):
-        return self.beat
+    guard = lambda t, q, u: jnp.cos(2 * jnp.pi * t)  # noqa: E731
+    guard = hj.Scheduled(schedule, 0.1) if schedule else guard
+    kick = hj.Transition("kick", "a", "a", guard, reset=lambda t, q, u: (q[0] + 1.0,))
+    charts = {"a": Field(("x",), lambda t, q, u: (-q[0] + 0.0 * jnp.sin(t) + u[0],))}
+    return toy(charts, [kick], beat)
 
 
-def test_a_search_that_begins_at_an_event():
-    with pytest.raises(hj.ComputationError, match="event 'kick' coincides with the beginning"):
-        hj.find_limit_cycle(Kicked(), hj.Guess("a", (1 / np.expm1(1),), 0.25))
-
-
-def test_a_schedule_that_does_not_fit_the_clock():
-    with pytest.raises(hj.DefinitionError, match="schedule of 'kick' must divide"):
-        hj.find_limit_cycle(Kicked(beat=2.0, schedule=3.0), hj.Guess("a", (0.3,)))
-
-
-BEAT = Kicked(schedule=1.0)
+BEAT = kicked(schedule=1.0)
 
 
 @pytest.mark.parametrize("size", [1e300, 1e100])
@@ -47,9 +27,18 @@ def test_a_guess_that_is_far_too_large_leads_to_the_same_cycle(size):
     np.testing.assert_allclose(cycle.state["x"], np.exp(-0.9) / (1 - np.exp(-1)), rtol=1e-12)
 
 
-def test_a_cycle_of_one_period_is_none_of_two():
-    with pytest.raises(hj.ComputationError, match="closes sooner than after the 2 periods"):
-        hj.find_limit_cycle(BEAT, hj.Guess("a", (0.6,)), multiplicity=2)
+@pytest.mark.parametrize(
+    "system, guess, options, message",
+    [
+        (kicked(), (1 / np.expm1(1), 0.25), {}, "event 'kick' coincides with the beginning"),
+        (kicked(beat=2.0, schedule=3.0), (0.3,), {}, "schedule of 'kick' must divide"),
+        (BEAT, (0.6,), {"multiplicity": 2}, "closes sooner than after the 2 periods"),
+    ],
+)
+def test_what_is_no_cycle(system, guess, options, message):
+    x, *time = guess
+    with pytest.raises(hj.HybridJaxError, match=message):
+        hj.find_limit_cycle(system, hj.Guess("a", (x,), *time), **options)
 
 
 def test_outputs_of_a_call_have_the_period_of_the_clock():

@@ -1,14 +1,14 @@
 """Results do not depend on the units of length and time in which a system is written."""
 
-import jax
-import jax.numpy as jnp
+import dataclasses
+
 import numpy as np
 import pytest
 
 import hybridjax as hj
 
 from ..conftest import APEX
-from ..toys import Field
+from ..toys import RESTING, Field, hopper_in, toy
 
 
 # Units of length and time, in those of the models.
@@ -26,50 +26,23 @@ def dimensions(length, time):
     return {"y": length, "x": length, "v": speed, "t": time, "force": speed / time}
 
 
-def scaled_hopper(length, time, **changes):
-    hopper = hj.models.VerticalHopper(**changes)
-    force = length / time**2
-    p = {
-        "k": hopper.k / time**2, "b": hopper.b / time, "l0": hopper.l0 * length,
-        "a": hopper.a * force, "g": hopper.g * force, "omega": hopper.omega / time,
-    }  # fmt: skip
-    return hj.models.VerticalHopper(m=hopper.m, M=hopper.M, retention=hopper.retention, **p)
-
-
 def hopper_cycle_in(length, time):
     guess = hj.Guess("stance", (2.0 * length, 1.9 * length / time), 0.5 * time)
-    return hj.find_limit_cycle(scaled_hopper(length, time), guess)
-
-
-class Relaxation(hj.HybridSystem):
-    """Van der Pol's oscillator with a length and a time, and two states that rest: one that is
-    zero, and one that rounding errors move."""
-
-    length: jax.Array = hj.parameter(1.0)
-    time: jax.Array = hj.parameter(1.0)
-    mu: jax.Array = hj.parameter(1.0)
-
-    def charts(self):
-        return {"all": Motion(self)}
-
-    def guess(self):
-        return hj.Guess("all", (2.0 * self.length, 0.0, 0.0, 0.0))
-
-
-class Motion(hj.Chart):
-    states = ("x", "v", "nothing", "rounding")
-    system: Relaxation
-
-    def field(self, t, q, u):
-        x, v, nothing, rounding = q
-        length, time, mu = self.system.length, self.system.time, self.system.mu
-        force = mu * (1 - (x / length) ** 2) * v / time - x / time**2
-        rest = (((x + length) - x) - length - rounding) / time
-        return v, force + u[0], -nothing / time, rest
+    return hj.find_limit_cycle(hopper_in(length, time), guess)
 
 
 def relaxation_in(length, time):
-    return hj.find_limit_cycle(Relaxation(length=length, time=time))
+    """Van der Pol's oscillator with a length and a time, and two states that rest: one that is
+    zero, and one that rounding errors move."""
+
+    def field(t, q, u):
+        x, v, nothing, rounding = q
+        force = (1 - (x / length) ** 2) * v / time - x / time**2
+        still = (((x + length) - x) - length - rounding) / time
+        return v, force + u[0], -nothing / time, still
+
+    system = toy({"all": Field(("x", "v", "nothing", "rounding"), field)})
+    return hj.find_limit_cycle(system, hj.Guess("all", (2.0 * length, 0.0, 0.0, 0.0)))
 
 
 @pytest.fixture(scope="module")
@@ -117,35 +90,27 @@ def test_states_that_rest_stop_nothing(relaxation):
     assert relaxation.scale["nothing"] == 1.0 and relaxation.scale["rounding"] > 1e-7
 
 
-class Shaken(hj.HybridSystem):
-    """A damped oscillator under a clock, beside a state that only rounding moves, by time."""
-
-    def charts(self):
-        def field(t, q, u):
-            beat = jnp.cos(3 * t)
-            rounding = (1 + 0.1 * beat) * 3 - 3 - 0.3 * beat
-            return q[1], -q[0] - 0.2 * q[1] + beat, rounding - q[2]
-
-        return {"all": Field(("x", "v", "w"), field)}
-
-    def period(self):
-        return 2 * np.pi / 3
-
-
 def test_a_state_that_rounding_moves_by_time_stops_nothing():
-    amplitude = 1 / (1 - 9 + 0.6j)
+    amplitude = 1 / (4 - 9 + 3j)
+    """Beside a damped oscillator under a clock."""
     for time in (0.0, 0.3):
-        cycle = hj.find_limit_cycle(Shaken(), hj.Guess("all", (0.0, 0.0, 0.0), time))
+        cycle = hj.find_limit_cycle(RESTING, hj.Guess("all", (0.0, 0.0, 0.0), time))
         assert cycle.scale["w"] > 1e-7
         x = (amplitude * np.exp(3j * time)).real
         np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-9)
         decay = np.sort(np.abs(cycle.multipliers))
-        truth = np.exp(-np.array([1.0, 0.1, 0.1]) * 2 * np.pi / 3)
+        truth = np.exp(-np.array([1.0, 0.5, 0.5]) * 2 * np.pi / 3)
         np.testing.assert_allclose(decay, truth, rtol=1e-9)
 
 
-def test_sizes_that_are_given(hopper_cycle):
-    cycle = hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, scale={"ym": 5.0})
-    assert cycle.scale["ym"] == 5.0
-    np.testing.assert_allclose(cycle.scale["yM"], hopper_cycle.scale["yM"], rtol=1e-9)
+@pytest.mark.parametrize("factor", [100.0, 0.5])
+def test_sizes_that_are_given(hopper_cycle, factor):
+    """Others follow from the cycle, not from those with which the search begins."""
+    settings = hopper_cycle.settings
+    settings = dataclasses.replace(settings, scale=factor * settings.scale)
+    guess = dataclasses.replace(hopper_cycle, settings=settings)
+    cycle = hj.find_limit_cycle(hopper_cycle.system, guess, scale={"ym": 5.0})
+    assert cycle.residual < 1e-12
+    expected = hopper_cycle.scale | {"ym": 5.0}
+    assert dict(cycle.scale) == pytest.approx(expected, rel=1e-9)
     np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)

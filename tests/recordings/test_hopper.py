@@ -8,14 +8,15 @@ import pytest
 import hybridjax as hj
 
 
+ABOUT = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
+
+
 def spoil(recording, signals=("yM", "vM"), **dirt):
     return hj.testing.spoil(recording, signals, **dirt)
 
 
 def test_five_lines(hopper_recording, hopper_cycle, angle):
-    data = hj.recordings.section_data(
-        hopper_recording, angle, inputs="u", outputs=("yM", "vM"), n_sections=16
-    )
+    data = hj.recordings.section_data(hopper_recording, angle, **ABOUT)
     fit = hj.fit_series(data.records, order=2)
     assert fit.compare(hopper_cycle.multipliers).max_error < 2e-3
     assert fit.contains(hopper_cycle.multipliers, 0.999).all()
@@ -27,9 +28,8 @@ def test_five_lines(hopper_recording, hopper_cycle, angle):
 def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angle):
     """At the sections of an angle of the two outputs, these are one number."""
     noisy = spoil(hopper_recording, noise=1e-4)
-    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
     apex = hj.Crossing("vM", "falling")
-    data = [hj.recordings.section_data(noisy, phase, **options) for phase in (angle, apex)]
+    data = [hj.recordings.section_data(noisy, phase, **ABOUT) for phase in (angle, apex)]
     fits = [hj.fit_series(x.records, order=2) for x in data]
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
@@ -42,8 +42,7 @@ def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycl
     fits, data, apex = [], [], hj.Crossing("vM", "falling")
     dirty = spoil(clean, ("u", "yM", "vM"), spikes=1e-2, seed=1)
     for recording in (clean, dirty):
-        options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
-        data.append(hj.recordings.section_data(recording, apex, **options))
+        data.append(hj.recordings.section_data(recording, apex, **ABOUT))
         fits.append(hj.fit_series(data[-1], order=2))
     changed = (clean.trials[0].values != dirty.trials[0].values).sum(axis=0)
     assert np.abs(data[1].spikes - changed).max() <= 0.05 * max(changed) + 1
@@ -55,8 +54,7 @@ def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycl
 @pytest.mark.slow
 def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
     """Against the exact linearization, averaged over the push."""
-    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
-    data = hj.recordings.section_data(hopper_recording, angle, **options)
+    data = hj.recordings.section_data(hopper_recording, angle, **ABOUT)
     fit = hj.fit_series(data.records, order=2)
     found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
     sections = dataclasses.replace(angle, anchor=hj.Crossing("vM", "falling"))

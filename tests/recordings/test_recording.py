@@ -165,11 +165,13 @@ def test_vicon(tmp_path, separator):
         ("time;a\n0,5;1\n1.5;2\n", "line 3: there are points beside"),
         ("Subject 3\ntime,a\n0,1\n1,2\n", "fields, but the header names 1|is not a number"),
         ("time (ms),time (s)\n0,1\n1,2\n", "two columns 'time'"),
+        (b"time,a\x00\x01", "not a text file"),
+        (b"\xff\xfe\x00\xd8\x00", "not a text file"),
     ],
 )
 def test_bad_csv(tmp_path, text, message):
     path = tmp_path / "x.csv"
-    path.write_text(text)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(hj.HybridJaxError, match=message) as error:
         hj.read_recording(path)
     assert "\n" not in str(error.value)
@@ -196,14 +198,8 @@ def test_the_unit_of_time(tmp_path):
 
 
 def test_other_bad_files(tmp_path):
-    for name, content, message in [
-        ("x.xls", b"?", "ends in '.xls'"),
-        ("x.npz", b"not", "not an npz file"),
-        ("x.csv", b"time,a\x00\x01", "not a text file"),
-        ("x.csv", b"\xff\xfe\x00\xd8\x00", "not a text file"),
-    ]:
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(hj.HybridJaxError, match=message):
-            hj.read_recording(tmp_path / name)
+    (tmp_path / "x.xls").write_bytes(b"?")
+    with pytest.raises(hj.HybridJaxError, match="ends in '.xls'"):
+        hj.read_recording(tmp_path / "x.xls")
     with pytest.raises(hj.DefinitionError, match="cannot read .*No such file"):
         hj.read_recording(tmp_path / "none.csv")

@@ -120,6 +120,12 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
     np.testing.assert_allclose(found.period, whole.period.values[::2, ::2].T.ravel(), rtol=1e-9)
     np.testing.assert_allclose(found.twice[0], float(found.period[0]) * np.array([1, 2]))
     assert np.isnan(found.twice[1]).all()
+    for wrong, message in (
+        (lambda x: x, "a function of parameters that returns one"),
+        (lambda x, y: x, "needs `y`: give it an axis"),
+    ):
+        with pytest.raises(hj.DefinitionError, match=message):
+            hj.sweep(wrong, {"x": [1.0]}, guess=wheel)
 
 
 def test_points_of_sobol_fill_the_box_and_are_always_the_same():
@@ -130,19 +136,6 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
         assert len(points) == 48 and low <= values.min() and values.max() <= high
         assert np.histogram(values, 4, (low, high))[0].tolist() == pytest.approx([12] * 4, abs=2)
         np.testing.assert_array_equal(values, Points.sobol(ranges, 48, seed=3).values[name])
-
-
-WRONG = {
-    "no model": ({"x": [1.0]}, {"model": lambda x: x}, "a function of parameters that returns one"),
-    "no axis": ({"x": [1.0]}, {"model": lambda x, y: x}, "needs `y`: give it an axis"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("over", "change", "message"), WRONG.values(), ids=WRONG)
-def test_what_is_refused(options, over, change, message):
-    arguments = {"model": hj.models.RimlessWheel(), "over": over} | options | change
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.sweep(**arguments)
 
 
 def test_sweep_draws_a_map(tmp_path, capsys):

@@ -8,32 +8,21 @@ from scipy.integrate import solve_ivp
 
 import hybridjax as hj
 
-from ..toys import Field
-
-
-class Learned(hj.HybridSystem):
-    """x' = -x + network(x, cos t) + a polynomial in x, computed by a scan."""
-
-    network: eqx.nn.MLP
-    coefficients: hj.Parameter
-
-    def charts(self):
-        def field(t, q, u):
-            forced = self.network(jnp.stack([q[0], jnp.cos(t)]))
-            horner = lambda value, c: (value * q[0] + c, None)  # noqa: E731
-            value, _ = jax.lax.scan(horner, 0.0 * q[0], self.coefficients)
-            return (-q[0] + forced[0] + value + u[0],)
-
-        return {"a": Field(("x",), field)}
-
-    def period(self):
-        return 2 * np.pi
+from ..toys import Field, toy
 
 
 def test_a_network_and_a_scan():
-    """Against the same in NumPy, integrated by scipy; the multiplier by the divergence."""
+    """x' = -x + network(x, cos t) + a polynomial in x, computed by a scan; against the same in
+    NumPy, integrated by scipy; the multiplier by the divergence."""
     network = eqx.nn.MLP(2, 1, 4, 1, activation=jnp.tanh, key=jax.random.key(1))
-    system = Learned(network, jnp.array([-0.1, 0.2, 0.3]))
+    coefficients = jnp.array([-0.1, 0.2, 0.3])
+
+    def learned(t, q, u):
+        horner = lambda value, c: (value * q[0] + c, None)  # noqa: E731
+        value, _ = jax.lax.scan(horner, 0.0 * q[0], coefficients)
+        return (-q[0] + network(jnp.stack([q[0], jnp.cos(t)]))[0] + value + u[0],)
+
+    system = toy({"a": Field(("x",), learned)}, period=2 * np.pi)
     cycle = hj.find_limit_cycle(system, hj.Guess("a", (0.3,)))
     (W, a), (V, b) = ((np.asarray(x.weight), np.asarray(x.bias)) for x in network.layers)
 

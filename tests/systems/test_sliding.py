@@ -6,6 +6,8 @@ from scipy.integrate import solve_ivp
 
 import hybridjax as hj
 
+from ..toys import Field, toy
+
 
 hj.enable_x64()
 
@@ -35,30 +37,12 @@ def test_a_block_on_a_belt_sticks_and_slips():
     ]
 
 
-class Side(hj.Chart):
-    states = ("x", "y")
-    push: hj.Parameter
-    drift: float
-
-    def field(self, t, q, u):
-        return self.drift, self.push
-
-
-class Surface(hj.HybridSystem):
-    push: hj.Parameter = hj.parameter(3.0)
-
-    def parts(self):
-        return hj.sliding({"up": Side(-1.0, 0.5), "down": Side(self.push, 2.0)}, height)
-
-    def charts(self):
-        return self.parts().charts
-
-    def transitions(self):
-        return self.parts().transitions
-
-
 def height(t, q):
     return q[1]
+
+
+def field(drift, push):
+    return Field(("x", "y"), lambda t, q, u: (drift, push))
 
 
 @pytest.mark.parametrize(
@@ -69,11 +53,12 @@ def height(t, q):
     ],
 )
 def test_it_slides_or_crosses(push, end, chart):
-    way = hj.simulate(Surface(push), "up", (0.0, 1.0), 2.0)
+    parts = hj.sliding({"up": field(0.5, -1.0), "down": field(2.0, push)}, height)
+    way = hj.simulate(toy(parts.charts, parts.transitions), "up", (0.0, 1.0), 2.0)
     np.testing.assert_allclose(way.after[-1], end, atol=1e-9)
     assert way.chart[-1] == chart
 
 
 def test_what_cannot_be_put_together():
     with pytest.raises(hj.DefinitionError, match="two charts"):
-        hj.sliding({"up": Side(1.0, 0.0)}, height)
+        hj.sliding({"up": field(0.0, 1.0)}, height)

@@ -4,7 +4,6 @@ import dataclasses
 import math
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,9 +11,8 @@ import pytest
 import hybridjax as hj
 from hybridjax.systems.check import check_system
 from hybridjax.systems.structure import Structure
-from hybridjax.systems.system import own_fields
 
-from ..toys import Field
+from ..toys import Field, toy
 
 
 ROOM = {
@@ -24,34 +22,6 @@ ROOM = {
 TO_B = hj.Transition("go", "a", "b", lambda t, q, u: q[0], reset=lambda t, q, u: (q[0],))
 SUM = hj.Output("sum", lambda t, q, u: q.sum())
 HOPPER = hj.models.VerticalHopper()
-
-
-class Anything(hj.HybridSystem):
-    """A system from its parts."""
-
-    parts: dict = eqx.field(static=True)
-    links: tuple = eqx.field(static=True, default=())
-    named: tuple = eqx.field(static=True, default=())
-
-    def charts(self):
-        return self.parts
-
-    def transitions(self):
-        return self.links
-
-    def outputs(self):
-        return self.named
-
-
-@pytest.mark.parametrize("model", ["VerticalHopper", "TwoLeggedBar", "VanDerPol", "BouncingBall"])
-def test_models_are_well_formed(model):
-    system = getattr(hj.models, model)()
-    check_system(system)
-    assert system.solver is None
-    for field in own_fields(system):
-        value = getattr(system, field.name)
-        assert isinstance(value, jax.Array) and value.dtype == np.float64 and value.shape == ()
-        assert field.metadata["doc"]
 
 
 def test_parameters_are_arrays_that_can_be_mapped_and_differentiated():
@@ -69,11 +39,11 @@ def test_parameters_are_arrays_that_can_be_mapped_and_differentiated():
 
 def replaced(**changes):
     """`TO_B` with some fields changed."""
-    return Anything(ROOM, (dataclasses.replace(TO_B, **changes),))
+    return toy(ROOM, (dataclasses.replace(TO_B, **changes),))
 
 
 def moved(field, states=("x", "v")):
-    return Anything({"a": Field(states, field)})
+    return toy({"a": Field(states, field)})
 
 
 class Early(hj.models.VerticalHopper):
@@ -84,21 +54,21 @@ class Early(hj.models.VerticalHopper):
 @pytest.mark.parametrize(
     "system, message",
     [
-        (Anything({}), "has no charts"),
+        (toy({}), "has no charts"),
         (moved(lambda t, q, u: (q[0], 1.0), ("x",)), r"field of chart 'a' returns"),
         (moved(lambda t, q, u: q, ("x", "x")), "states of the same name: 'x', 'x'"),
         (moved(lambda t, q, u: q, "xv"), "must be a tuple of names, not 'xv'"),
         (moved(lambda t, q, u: (q[1], math.sin(q[0]))), "write .* `jnp.sin` for `math.sin`"),
         (moved(lambda t, q, u: (q[1], u - q[0])), r"q and u are arrays: write `u\[0\]`"),
         (Early(), "uses a value that JAX does not know yet"),
-        (Anything(ROOM, named=(SUM, SUM)), "states and outputs of the same name"),
-        (Anything(ROOM, named=SUM), r"outputs\(\) must return a list"),
+        (toy(ROOM, outputs=(SUM, SUM)), "states and outputs of the same name"),
+        (toy(ROOM, outputs=SUM), r"outputs\(\) must return a list"),
         (replaced(source="c"), "there is no chart 'c'; charts are a, b"),
         (replaced(reset=lambda t, q, u: q), r"reset of transition 'go' \(a -> b\) returns shape"),
         (replaced(guard=lambda t, q, u: q), r"guard of transition 'go' \(a -> b\) returns shape"),
         (replaced(enabled=lambda t, q, u: q > 0), r"`enabled` of transition 'go' .* returns shape"),
         (moved(lambda t, q, u: (q[1], -q[2])), "field of chart 'a' cannot .* index 2 is out of"),
-        (Anything(ROOM, (TO_B, TO_B)), "transitions of the same name: 'go', 'go'"),
+        (toy(ROOM, (TO_B, TO_B)), "transitions of the same name: 'go', 'go'"),
         (eqx.tree_at(lambda s: s.k, HOPPER, jnp.array(np.inf)), "`k` of VerticalHopper is inf"),
     ],
 )
@@ -109,7 +79,7 @@ def test_what_is_wrong_is_said(system, message):
 
 def test_outputs_by_name_by_function_and_by_chart():
     energy = hj.Output("energy", {"a": lambda t, q, u: q[0] ** 2 + q[1] ** 2 + t + u[0]})
-    s = Structure(Anything(ROOM, named=(energy,)))
+    s = Structure(toy(ROOM, outputs=(energy,)))
     z = s.resolve_outputs(("x", "energy", SUM))
     assert z.names == ("x", "energy", "sum")
     values = z(0, 1.0, jnp.array([2.0, 3.0]), jnp.array([10.0]))
