@@ -142,7 +142,8 @@ def _transfer(
     step = values[:, -1] - xp.roll(values[:, 0], -1, axis=0)
     impulse = step[..., None, None] * (delay + jumps.delay_by_input[..., None])[:, None]
     waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / T))
-    H = waves.reshape(len(waves), -1) @ response.reshape(P * K, -1)
-    H = (H + waves[:, :, -1] @ impulse.reshape(P, -1)).reshape(-1, *shape[2:])
+    entries = len(z.names) * nu * F
+    H = waves.reshape(len(waves), P * K) @ response.reshape(P * K, entries)
+    H = (H + waves[:, :, -1] @ impulse.reshape(P, entries)).reshape(len(waves), *shape[2:])
     H = H + xp.einsum("mpk,pkyu->myu", waves, by_input * weight)[..., None]
     return xp.moveaxis(H, -1, 1) / T

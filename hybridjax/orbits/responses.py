@@ -13,7 +13,6 @@ from typing import Annotated, Literal, NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
-from scipy import optimize
 
 from .._core.arguments import require_among, require_index
 from .._core.boundary.checked import checked_methods
@@ -134,6 +133,8 @@ def _zeros(c: Complex[np.ndarray, " n"]) -> tuple[Locked, ...]:
     sign = np.sign(_series(c, grid))
     crossed = zip(grid[:-1], grid[1:], sign[:-1] * sign[1:] < 0, strict=True)
     value = lambda x: float(_series(c, x))  # noqa: E731
+    from scipy import optimize  # (a third of a second)
+
     zeros = [optimize.root_scalar(value, bracket=(a, b)).root for a, b, turns in crossed if turns]
     slopes = _series(2j * np.pi * np.arange(len(c)) * c, zeros)
     return tuple(Locked(x % 1.0, float(rate)) for x, rate in zip(zeros, slopes, strict=True))

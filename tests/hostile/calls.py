@@ -75,6 +75,7 @@ def cycles(t):
     yield t.cycle.responses, dict(modes=0)
     yield t.cycle.htf, dict(f=np.array([0.3]), harmonics=0, outputs=STATES)
     yield t.cycle.sensitivity, dict(parameter="mu")
+    yield t.cycle.fluctuations, dict(white={"v": 0.1}, guards={}, resets={})
     yield t.cycle.sensitivity("mu").shape, dict(phase=np.array([0.3]))
     yield t.branch.__getitem__, dict(k=0)
     yield t.branch.find, dict(kind="fold")

@@ -139,11 +139,13 @@ class ZarrStore:
                 tuple(about["dims"]), blocks, variables, {}, (), about["description"]
             )
             # (Zarr would read a chunk that was deleted as zeros.)
-            whole = {name: self._group[name] for name in about["whole"]}
-            lost = {_key(x) for x in whole.values() if x.size} - self._present()
+            kept = self._group[_START]
+            start = [kept[f"{i}"] for i in range(about["start"])]
+            whole = [*start, *(self._group[name] for name in about["constants"])]
+            lost = {_key(x) for x in whole if x.size} - self._present()
             if lost:
                 raise FileNotFoundError(f"{min(lost)} is missing")
-            self.start = [x[...] for name, x in whole.items() if name.startswith(f"{_START}/")]
+            self.start = [np.asarray(x[...]) for x in start]
         except Exception as error:  # (of many kinds)
             raise DefinitionError(f"cannot open '{address}' as a store: {error}") from error
         chunk = max(math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values())
@@ -299,7 +301,8 @@ def make_store(address: str | None, layout: Layout, start: list[np.ndarray]) -> 
             "description": layout.description,
             "dims": layout.dims,
             "variables": list(layout.variables),
-            "whole": [*layout.constants, *(f"{_START}/{i}" for i in range(len(start)))],
+            "constants": list(layout.constants),
+            "start": len(start),
         }
         group.attrs[_ABOUT] = json.dumps(about)  # last: from now on it is a store
     return ZarrStore(place)
