@@ -410,7 +410,11 @@ def fine_factors(map: ReturnMap) -> list[Matrix]:
     factors: list[Matrix] = []
     for k, link in enumerate(moves):
         out, into = frames[(k + 1) % len(moves)], frames[k]
-        factor = out[0] @ link.jacobian @ into[1]
+        parts = out[0], link.jacobian, into[1]
+        factor = np.linalg.multi_dot(parts)
+        # (A zero that comes out as rounding would be a multiplier.)
+        least = np.finfo(float).eps * np.prod([np.linalg.norm(x) for x in parts])
+        factor = np.where(np.abs(factor) > least, factor, 0.0)
         merged = factor @ factors[-1] if factors else factor
         if factors and weakest(merged) > WEAKEST:
             factors[-1] = merged
