@@ -300,7 +300,7 @@ def _normals(s: Structure, bound: BoundSections, lanes: Lanes, index, u) -> Arra
 
     def work(a, mask, out):
         n = s.dims[a]
-        point = (only(mask, x) for x in (index, lanes.t, lanes.q[:n]))
+        point = only(mask, index), only(mask, lanes.t), only(mask, lanes.q[:n])
         gradients = put(out, slice(1 + n), _level_gradients(s, a, levels, *point, u))
         return xp.where(mask, gradients, out) if levels.present(s, a) else out
 
