@@ -10,9 +10,7 @@ from . import (
     testing as testing,
 )
 from ._core.cache import enable_compilation_cache as enable_compilation_cache
-from ._core.compilation import (
-    enable_loop_kernels as enable_loop_kernels,
-)
+from ._core.compilation import enable_loop_kernels as enable_loop_kernels
 from ._core.execution import Execution as Execution
 from ._core.precision import enable_x64 as enable_x64
 from ._core.progress import enable_progress as enable_progress

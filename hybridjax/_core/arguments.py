@@ -78,16 +78,14 @@ def require_axes(what: str, array: Any, *axes: Mapping[str, int]) -> None:
         raise DefinitionError(f"{what} must be {allowed}, not of shape {np.shape(array)}.")
 
 
-def require_among(
-    kind: str, names: Iterable[str], allowed: Collection[str], where: str = ""
-) -> None:
+def require_among(kind: str, names: Iterable[str], among: Collection[str], where: str = "") -> None:
     """**Raises:** `DefinitionError` for the first name that is not among those of a kind (a noun).
 
     **Arguments:** `where`: how the sentence begins. Default: nothing.
     """
     for name in names:
-        if name not in allowed:
-            known = ", ".join(allowed) or "none"
+        if name not in among:
+            known = ", ".join(among) or "none"
             raise DefinitionError(f"{where}there is no {kind} '{name}'; {kind}s are {known}.")
 
 

@@ -10,7 +10,6 @@
 
 import collections
 import contextlib
-import contextvars
 import functools as ft
 import gc
 import hashlib
@@ -26,20 +25,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import eval_context
-from jax.flatten_util import ravel_pytree
 
 from ..errors import ComputationError
-from .executor import (
-    OutOfTimeError,
-    at_most,
-    default_device,
-    from_host,
-    is_inside_program,
-    is_traced,
-    on_cpu,
-    to_host,
-)
-from .lanes import JACOBIAN_COLUMNS
+from . import executor
+from .executor import from_host, is_inside_program, is_traced, on_cpu, to_host
 from .progress import say_compiling
 from .vector_math import rewrite
 
@@ -80,8 +69,7 @@ def enable_loop_kernels() -> None:
     this one.
     """
     before = os.environ.get("XLA_FLAGS")
-    words = (before or "").split()
-    os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*words, _LOOP_KERNELS]))
+    os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*(before or "").split(), _LOOP_KERNELS]))
     if jax.default_backend() == "cpu" and not _loops_are_kernels():
         os.environ.pop("XLA_FLAGS")
         if before is not None:
@@ -165,18 +153,17 @@ def quick_jit(function: Callable) -> Callable:
     return call
 
 
-def host_first(function: Callable, along: Callable | None = None) -> Callable:
+def host_first(function: Callable, derived: Callable = lambda compiled: compiled) -> Callable:
     """A function of few lanes, run on the host (see `executor.py`) while that is faster in total;
     compiled by `quick_jit` once the host has spent as much on arguments of the same kind as
     compiling takes: in a thread, or at once if a single call has taken so long. Both give the same
     result up to rounding.
 
-    Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`; but
-    derivatives outside of programs are those of `along`, if it is given (see `by_columns`).
+    Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`, or
+    that `derived`, as by `by_columns`.
     """
-    compiled = quick_jit(function)
+    transformed = derived(compiled := quick_jit(function))
     spent: dict[tuple, float] = collections.defaultdict(float)
-    derived = compiled if along is None else by_columns(compiled, along)
     programs: dict[tuple, Callable] = {}
 
     def compile_(key, arguments):
@@ -186,15 +173,15 @@ def host_first(function: Callable, along: Callable | None = None) -> Callable:
     @ft.wraps(function)
     def call(*arguments):
         if not on_cpu() or is_traced(arguments) or is_inside_program():
-            return derived(*arguments)
+            return transformed(*arguments)
         key, begin = kind(arguments), time.thread_time()
         before = spent[key]
         if key in programs:
             return programs[key](*arguments)
         try:
-            with eval_context(), uncollected(), at_ease(), at_most(WORTH_COMPILING):
+            with eval_context(), uncollected(), at_ease(), executor.at_most(WORTH_COMPILING):
                 return from_host(function(*to_host(arguments)))
-        except OutOfTimeError:
+        except executor.OutOfTimeError:
             programs[key] = compiled
             return compiled(*arguments)
         finally:
@@ -203,79 +190,6 @@ def host_first(function: Callable, along: Callable | None = None) -> Callable:
                 threading.Thread(target=compile_, args=(key, arguments)).start()
 
     return call
-
-
-class NotOnHostError(Exception):
-    """The host has no derivatives for these arguments."""
-
-
-_only_on_host = contextvars.ContextVar("only on host", default=False)
-
-
-@contextlib.contextmanager
-def only_on_host() -> Iterator[None]:
-    """A context in which derivatives that the host does not have raise `NotOnHostError`."""
-    before = _only_on_host.set(True)
-    try:
-        yield
-    finally:
-        _only_on_host.reset(before)
-
-
-def require_program() -> None:
-    """**Raises:** `NotOnHostError` where a derivative must come from the host."""
-    if _only_on_host.get() and not is_inside_program():
-        raise NotOnHostError
-
-
-def by_columns(
-    compiled: Callable, along: Callable, relevant: Callable = lambda tangents: tangents
-) -> Callable:
-    """`compiled`, whose derivatives outside of programs come from the host.
-
-    `along(arguments, directions)` returns the result and its derivatives in P directions. A
-    direction moves a single number of the arguments: `directions` is a tree of their form with
-    arrays (P, ...), and `None` for what does not move; so is the second result. Values are
-    concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
-    raises `NotOnHostError`, or many numbers move, derivatives are compiled, as inside of programs.
-    `relevant` replaces tangents that make no difference by `None`.
-    """
-    derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
-
-    @derived.def_jvp
-    def rule(arguments, tangents):
-        moving = jax.tree_util.tree_map(
-            lambda t, x: None if t is None else x,
-            relevant(tangents), arguments, is_leaf=lambda t: t is None,
-        )  # fmt: skip
-        leaves, structure = jax.tree_util.tree_flatten(moving)
-        ends = np.cumsum([x.size for x in leaves])
-        is_small = len(leaves) and ends[-1] <= JACOBIAN_COLUMNS
-        if not on_cpu() or is_traced(arguments) or is_inside_program() or not is_small:
-            return eqx.filter_jvp(compiled, arguments, tangents)
-        parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
-        parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
-        try:
-            with eval_context(), uncollected(), at_ease():
-                result, columns = along(
-                    to_host(arguments), jax.tree_util.tree_unflatten(structure, parts)
-                )
-        except NotOnHostError:
-            require_program()
-            return eqx.filter_jvp(compiled, arguments, tangents)
-        return from_host(result), _combined(
-            from_host(columns), jax.tree_util.tree_leaves(relevant(tangents))
-        )
-
-    return derived
-
-
-@jax.jit
-def _combined(columns, tangents):
-    """Tangents by the columns of derivatives. (One product: one for each array compiles longer.)"""
-    _, parts = ravel_pytree(jax.tree_util.tree_map(lambda x: x[0], columns))
-    matrix = jnp.concatenate([x.reshape(len(x), -1) for x in jax.tree_util.tree_leaves(columns)], 1)
-    return parts(jnp.concatenate([jnp.ravel(x) for x in tangents]) @ matrix)
 
 
 def at_ease() -> contextlib.AbstractContextManager:
@@ -391,7 +305,7 @@ class _Program:
 
 def _is_simple() -> bool:
     """Return whether JAX computes on the first CPU, and runs programs as they are."""
-    device = default_device()
+    device = executor.default_device()
     first = device in (None, "cpu") or device == jax.local_devices(backend="cpu")[0]
     names = "jax_disable_jit", "jax_debug_nans", "jax_debug_infs"
     return on_cpu() and first and not any(getattr(jax.config, name) for name in names)
@@ -469,9 +383,7 @@ def kernel(
     return call
 
 
-def deferred(
-    function: Callable, form: Callable, static: tuple[Hashable, ...], trees: Any
-) -> Callable:
+def deferred(function: Callable, form: Callable, static: tuple[Hashable, ...], trees) -> Callable:
     """A `kernel` of any arguments and results, for which there is another way: it returns None
     until it has been called so often that a thread compiles it, and has done so.
 

@@ -130,12 +130,10 @@ def put(x: Array, index: Any, value: Any) -> Array:
 
 def lane(x: Array, i: Array) -> Array:
     """Lane i of x, as the only one."""
-    if on_host(x):
-        return x[..., i : i + 1]
-    return jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
+    return x[..., i : i + 1] if on_host(x) else jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
 
 
-def singular_values(x: Any) -> Any:
+def svdvals(x: Any) -> Any:
     """`jnp.linalg.svd(x, compute_uv=False)`: NaN where x is not finite."""
     if not on_host(x):
         return jnp.linalg.svd(x, compute_uv=False)
@@ -177,5 +175,4 @@ def default_device() -> Any:
 def on_cpu() -> bool:
     """Return whether JAX computes on the CPU, by default or as `jax.default_device` says."""
     device = default_device()
-    platform = getattr(device, "platform", device)
-    return (platform or jax.default_backend()) == "cpu"
+    return (getattr(device, "platform", device) or jax.default_backend()) == "cpu"

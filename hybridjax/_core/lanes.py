@@ -34,8 +34,7 @@ class PerLane(eqx.Module):
 
     def axes(self) -> Any:
         """Return the axes of lanes in the form that `jax.vmap` takes: -1 or None for each array."""
-        arrays = eqx.filter(self.tree, eqx.is_array)
-        structure = jax.tree_util.tree_structure(arrays)
+        structure = jax.tree_util.tree_structure(eqx.filter(self.tree, eqx.is_array))
         return jax.tree_util.tree_unflatten(structure, [-1 if x else None for x in self.split])
 
 
@@ -175,8 +174,7 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
         return jax.jvp(of, (moving, common), (t_moving, t_common))
 
     total = sum(sizes)
-    first = jax.tree_util.tree_map(lambda x: x[..., 0], moving)
-    _, parts = ravel_pytree((first, common))
+    _, parts = ravel_pytree((jax.tree_util.tree_map(lambda x: x[..., 0], moving), common))
 
     def push(direction):
         of_lane, of_all = parts(direction)

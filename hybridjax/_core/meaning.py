@@ -367,8 +367,7 @@ def _names(code: types.CodeType) -> tuple[tuple[Names, ...], Names, Names]:
 def _version(package: str) -> str:
     """Return the version of an installed package, "" for others and Python's own."""
     try:
-        is_own = package in sys.stdlib_module_names
-        return "" if is_own else importlib.metadata.version(package)
+        return "" if package in sys.stdlib_module_names else importlib.metadata.version(package)
     except (importlib.metadata.PackageNotFoundError, ValueError):  # or no name
         return str(getattr(sys.modules.get(package), "__version__", ""))
 

@@ -37,9 +37,7 @@ class Memory:
             self._values.setdefault(name, {})
             weakref.finalize(owner, self._values.pop, name, None).atexit = False
         values = self._values[name]
-        if key in values:
-            return values[key]
-        return values.setdefault(key, make())
+        return values[key] if key in values else values.setdefault(key, make())
 
 
 class remembered:  # noqa: N801 (a decorator, as `property` is)

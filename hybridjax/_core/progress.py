@@ -103,9 +103,7 @@ def say_compiling(compiling: bool) -> None:
 
 
 def _is_watched() -> bool:
-    if _enabled is not None:
-        return _enabled
-    return _display() is not None or sys.stderr.isatty()
+    return (_display() is not None or sys.stderr.isatty()) if _enabled is None else _enabled
 
 
 def _display() -> Callable[..., Any] | None:
@@ -120,9 +118,8 @@ def _line() -> Iterator[None]:
     """The line, kept by a thread of its own: compiled programs let it run."""
     ended = threading.Event()
     # (In its context a kernel finds the cell to which output belongs.)
-    thread = threading.Thread(
-        target=contextvars.copy_context().run, args=(_keep, ended), daemon=True
-    )
+    run = contextvars.copy_context().run
+    thread = threading.Thread(target=run, args=(_keep, ended), daemon=True)
     thread.start()
     try:
         yield

@@ -91,8 +91,7 @@ class Candidates(NamedTuple):
         inputs = self.channel.max() + 1
         key = self.line * inputs + self.channel
         order = np.argsort(key)
-        wanted = design.line * inputs + design.channel
-        return order[np.searchsorted(key, wanted, sorter=order)]
+        return order[np.searchsorted(key, design.line * inputs + design.channel, sorter=order)]
 
     def powers_in(self, design: Design) -> Float[np.ndarray, "E K"]:
         """Return the mean square of each cosine in each experiment of a design."""
@@ -154,8 +153,7 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
     measured = {name: noise[name] for name in outputs if name in noise}
 
     def spectrum(f: np.ndarray, harmonics: tuple[int, ...]) -> np.ndarray:
-        shifted = f + np.array(harmonics)[:, None]
-        folded = np.abs((shifted + N / 2) % N - N / 2)
+        folded = np.abs((f + np.array(harmonics)[:, None] + N / 2) % N - N / 2)
         return np.stack([_level(*item, folded) for item in measured.items()], axis=2) ** 2
 
     return Noise(np.array([outputs.index(name) for name in measured]), spectrum)
@@ -218,8 +216,7 @@ def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
     """
     rng, models = np.random.default_rng(seed), []
     for _ in range(_TRIES * count):
-        step = fit._root @ rng.normal(size=fit._root.shape[1])
-        moved = fit._coordinates.moved(step)
+        moved = fit._coordinates.moved(fit._root @ rng.normal(size=fit._root.shape[1]))
         if np.abs(np.linalg.eigvals(moved.monodromy())).max() < 1:
             models.append(moved.to_ldtp(fit._scale, fit.inputs, fit.outputs))
         if len(models) == count:

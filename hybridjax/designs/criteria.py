@@ -118,14 +118,12 @@ def wanted_parts(
     return np.array(wanted), tuple(names)
 
 
-def _parameters(
-    goal: Parameters, model: Model, cosines: Candidates, noise: Noise
-) -> LinearCriterion:
+def _parameters(goal: Parameters, model: Model, lines: Candidates, noise: Noise) -> LinearCriterion:
     free = tuple(goal.free)
     wanted = free if goal.wanted is None else tuple(goal.wanted)
     require_among("free parameter", wanted, free, "`wanted` of `goal`: ")
     channels = []
-    for htf, members, _ in measured_htfs(model, cosines, goal.harmonics, noise):
+    for htf, members, _ in measured_htfs(model, lines, goal.harmonics, noise):
         observed = ObservedHTF(htf, goal.sections)
         data = identifiability(goal.cycle.system, observed, free, guess=goal.cycle)
         if not data.complete:

@@ -98,8 +98,7 @@ class LinearCriterion(eqx.Module):
         cosine = [np.repeat(x.cosine, x.slopes.shape[1] // d) for x in self.channels]
         half = _root(rows @ rows.T, self.unknowns)
         spread = self.wanted @ half
-        influence = spread @ half.T @ rows
-        variances = (spread**2).sum(axis=1)
+        influence, variances = spread @ half.T @ rows, (spread**2).sum(axis=1)
         squares = np.bincount(np.concatenate(cosine), (influence**2).sum(axis=0), len(power))
         criterion = float(variances.sum())
         if self.part is not None:
@@ -138,16 +137,14 @@ class Criterion(eqx.Module):
         return Criterion(tuple(x.only(kept) for x in self.each), self.exponent)
 
 
-def _root(
-    information: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]
-) -> Float[np.ndarray, "d d"]:
+def _root(matrix: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]) -> Float[np.ndarray, "d d"]:
     """Return R with R R^T the inverse of the information."""
-    size = np.sqrt(np.diag(information))
+    size = np.sqrt(np.diag(matrix))
     lost = np.flatnonzero(~(size > 0))
     if len(lost):
         text = f"no response depends on {unknowns[lost[0]]}: leave it out, or add an output."
         raise DefinitionError(text)
-    values, vectors = np.linalg.eigh(information / size / size[:, None])
+    values, vectors = np.linalg.eigh(matrix / size / size[:, None])
     if not values[0] > SINGULAR:
         direction = vectors[:, 0] / size
         largest = np.abs(direction).max()

@@ -52,10 +52,8 @@ class Matrices(NamedTuple):
 
         **Raises:** `DefinitionError` if the usual design does not determine them.
         """
-        quantity = np.arange(len(wanted)) if part is None else part
-        shown, hidden = (
-            np.bincount(quantity, ((wanted @ root) ** 2).sum(axis=1)) for root in self.spread
-        )
+        row = np.arange(len(wanted)) if part is None else part
+        shown, hidden = (np.bincount(row, ((wanted @ r) ** 2).sum(axis=1)) for r in self.spread)
         if (hidden > _MISSED * (shown + hidden)).any():
             raise DefinitionError(
                 "the usual design does not determine the `goal`: measure more harmonics or lines."

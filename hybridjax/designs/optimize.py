@@ -260,8 +260,7 @@ def optimal_design(
         raise DefinitionError("`model` must be one model or more, not an empty list.")
     usual = multisine(models[0].n_sections, inputs=models[0].inputs) if design is None else design
     _check_alike(models, usual)
-    given = as_limits(limit)
-    cosines = Candidates.of(usual)
+    given, cosines = as_limits(limit), Candidates.of(usual)
     squares = [mean_squares(each, cosines) for each in models]
     linear = power_limits(given, models, squares, cosines.power_of(usual))
 

@@ -41,8 +41,7 @@ def first_crossing(v0: Values, v1: Values, d0: Values, d1: Values, armed: Flags)
     A guard that is not armed at the start counts only after it has become positive.
     """
     xp, rise = namespace(v1), v1 - v0
-    b = 3 * rise - 2 * d0 - d1
-    c = d0 + d1 - 2 * rise
+    b, c = 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise
 
     def cubic(s):
         return v0 + s * (d0 + s * (b + s * c))
@@ -86,12 +85,10 @@ def first_crossing(v0: Values, v1: Values, d0: Values, d1: Values, armed: Flags)
 def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
     """The zero of the cubic with values v0, v1 and slopes d0, d1 that Newton finds from s = 1."""
     xp, rise = namespace(v1), v1 - v0
-    b = 3 * rise - 2 * d0 - d1
-    c = d0 + d1 - 2 * rise
+    b, c = 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise
     s = xp.ones_like(v1)
     for _ in range(4):
-        value = v0 + s * (d0 + s * (b + s * c))
-        s = s - _divide(value, d0 + s * (2 * b + s * 3 * c))
+        s = s - _divide(v0 + s * (d0 + s * (b + s * c)), d0 + s * (2 * b + s * 3 * c))
     return s
 
 

@@ -58,8 +58,7 @@ def step_along(
 def linear_step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
     states, inputs and length of the step."""
-    form = _ByMethod(_linear_step, s.method(a))
-    return s.kernel(_field, form, a, lanes=_POINTS)(t, q, u, h)
+    return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=_POINTS)(t, q, u, h)
 
 
 def divergence(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Times:
@@ -82,8 +81,7 @@ def watched(
     """The guards of chart a, and the level if it has one, with their derivatives."""
     static = a, s.guard_kinds(a)
     if not on_host(q):
-        of_lanes = s.by_lane(_columns(ft.partial(watched_at, *static)), levels)
-        return of_lanes(t, q, u, index)
+        return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(t, q, u, index)
     # (A program for many points is worth its compilation from sixteen calls on.)
     lanes = 1 if q.shape[-1] < 16 * _POINTS else _POINTS
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
@@ -132,8 +130,7 @@ def levels(
     s: Structure, a: int, levels: AbstractLevels, n_sections: int, t: Times, q: States
 ) -> Float[Array, "N 2 L"]:
     """The levels of all sections in chart a, and their rates along the flow."""
-    of_all = s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=_POINTS)
-    return of_all(t, q)
+    return s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=_POINTS)(t, q)
 
 
 # Functions of a point, by what is static, the structure, and other trees. (They belong to the
@@ -206,9 +203,7 @@ class Tangents(Structure):
     for what does not move.
     """
 
-    def __init__(
-        self, s: Structure, along: Structure, levels: Any, by_levels: Any, directions: int
-    ):
+    def __init__(self, s: Structure, along: Structure, levels, by_levels, directions: int):
         super().__init__(s.source)
         self.directions, self._levels, self._plain = directions, levels, s
         self._along = along, by_levels

@@ -31,8 +31,7 @@ class Lanes(NamedTuple):
 
 def start_lanes(s: Structure, t: Times, chart: Index, q: Padded) -> Lanes:
     """Lanes before their first step. No guard is armed yet: the search does that."""
-    L = t.shape[0]
-    xp = namespace(t)
+    L, xp = t.shape[0], namespace(t)
     pace = xp.asarray(np.repeat([[0.0], [np.inf], [0.0], [0.0]], L, axis=1), dtype=float)
     armed = xp.asarray(np.zeros((len(s.transitions), L), bool))
     return Lanes(t, chart, q, armed, xp.asarray(np.zeros(L, np.int32)), pace)
@@ -66,7 +65,7 @@ def only(mask: Mask, x: Array) -> Array:
     return xp.where(mask, x, lane(x, xp.argmax(mask)))
 
 
-def constant(tree):
+def fixed(tree):
     """The same numbers without derivatives."""
     return jax.tree_util.tree_map(
         lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, tree

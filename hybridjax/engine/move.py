@@ -13,7 +13,7 @@ from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
 from .arrays import Array, Index, Inputs, Times
-from .lanes import Lanes, Tape, constant
+from .lanes import Lanes, Tape, fixed
 from .replay import chain, replay
 from .search.search import initial_step, search
 from .search.state import Moved, Options, Recorded, Stride
@@ -53,7 +53,7 @@ def move(
         result = xp.full(lanes.t.shape, Result.OK, xp.int32)
     if on_host(lanes.t):
         return search(s, lanes, u, target, setout, result, settings, options)
-    return _move(s, lanes, u, target, constant(setout), result, settings, options)
+    return _move(s, lanes, u, target, fixed(setout), result, settings, options)
 
 
 @eqx.filter_jit
@@ -86,7 +86,7 @@ def _move_jvp(primals, tangents):
     s, lanes, u, target, setout, result, settings, options = primals
     closely = options.tangents is not False or not options.glide
     taped = options._replace(tape=True, glide=False, tangents=closely)
-    still = constant((s, lanes, u, target, setout))
+    still = fixed((s, lanes, u, target, setout))
     recorded: Recorded = _search(*still, result, settings, taped)  # pyright: ignore[reportCallIssue]
     primals = s, lanes, u, target, recorded, options.glide
     ends = _follow_jvp(primals, (*tangents[:4], None, None))
@@ -139,7 +139,7 @@ def flow_jacobian(
 
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
-    still, start, goal = constant((s, lanes, target))
+    still, start, goal = fixed((s, lanes, target))
     u, options = jnp.zeros((s.nu, 1)), Options(tape=True, new_input=False, tangents=wanted)
     moved, tape = move(still, start, u, goal, settings, h, result, options)
     assert tape is not None

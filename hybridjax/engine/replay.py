@@ -19,23 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Inexact, Int
 
-from .._core.compilation import NotOnHostError
+from .._core.host_derivatives import NotOnHostError
 from ..systems.structure import Member, Structure
 from ..systems.transition import Scheduled
 from . import kernels
 from .arrays import Index, Inputs, Mask, Padded, Times
 from .events import apply_resets, scheduled_time
-from .lanes import (
-    ARRIVE_LEVEL,
-    ARRIVE_TIME,
-    IDLE,
-    Lanes,
-    Tape,
-    constant,
-    for_each_chart,
-    needed,
-    only,
-)
+from .lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Lanes, Tape, fixed, for_each_chart, needed, only
 from .runge_kutta import Step, take_step
 from .target import Target
 from .watch import ChartFlow, slopes
@@ -64,8 +54,7 @@ def replay(
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
-            moving = code != IDLE
-            t, q = _advance(s, begin, moving, u, target, h1, which, unroll)
+            t, q = _advance(s, begin, code != IDLE, u, target, h1, which, unroll)
             q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
             return t, q, chart
 
@@ -106,7 +95,7 @@ def _advance(
         goal = dataclasses.replace(target, levels=levels, index=only(here, target.index))
         t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
         flow = ChartFlow(system, a, u0, goal)
-        still = ChartFlow(constant(system), a, constant(u0), goal)
+        still = ChartFlow(fixed(system), a, fixed(u0), goal)
         # (The charts, which may hold traced values, are made here, and not within a branch.)
         method = flow.method
         crossing = jnp.where(here, which, -1)
@@ -228,8 +217,7 @@ class Variation:
         by = self._by[:, None] + 1j * kernels.TINY * change.reshape(M, P, n, m)
         lane, order = (np.repeat(x, P) for x in (moves.lane, moves.order))
         moves = moves._replace(lane=lane * P + np.arange(M * P) % P, order=order)
-        columns = _products(moves, by.reshape(-1, n, m), len(self.first) * P)
-        return columns.reshape(-1, P, n, m)
+        return _products(moves, by.reshape(-1, n, m), len(self.first) * P).reshape(-1, P, n, m)
 
     def points(self, tangents: Float[np.ndarray, "moves n P"]) -> tuple:
         """Times, charts, states and inputs where lanes start, in each direction."""
@@ -335,11 +323,9 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
         q[:, lands] = zero.q
         by_field = np.moveaxis(kernels.field(s, a, t[lands], q[:, lands], u[:, lands]), -1, 0)
         f, (f_t, f_q, f_u) = by_field[:, :, :1], _split(by_field, n)
-        rows = kernels.watched(
-            s, a, target.levels, t[lands], q[:, lands], u[:, lands], index[lands]
-        )
+        jac = kernels.watched(s, a, target.levels, t[lands], q[:, lands], u[:, lands], index[lands])
         row = np.argmax(np.array(flow.rows)[:, None] == which[lands], axis=0)
-        by_t, by_q, by_u = _split(rows[row, :, np.arange(len(lands))][:, None], n)
+        by_t, by_q, by_u = _split(jac[row, :, np.arange(len(lands))][:, None], n)
         # (Over the time past: nothing but rounding errors, with derivatives.)
         past, moved = zero.past[:, None, None], dq[lands]
         moved = moved + past * (f_t @ dt[lands] + f_q @ moved)
@@ -376,8 +362,7 @@ def _step(s: Structure, a: int, t, q, u, h):
     """States (n, M) at the end of Runge-Kutta steps, their derivatives (M, n, m) by (t, q, u, h) at
     the start, and the field (n, M) at the end."""
     n, M = q.shape
-    m = 2 + n + s.nu
-    method = s.method(a)
+    m, method = 2 + n + s.nu, s.method(a)
     if method.implicit or isinstance(s, kernels.Tangents):
         expanded = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h), -1, 0))
         return expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T

@@ -204,8 +204,7 @@ def _increments(method, field, t, q, h):
     small = 4.0 * jnp.finfo(q.dtype).eps  # a few rounding errors
 
     def correction(w):
-        stages = q + jnp.tensordot(np.array(method.a), w, 1)
-        residual = h * evaluate(t + c * h, stages) - w
+        residual = h * evaluate(t + c * h, q + jnp.tensordot(np.array(method.a), w, 1)) - w
         residual = jnp.tensordot(right, residual, 1)
         solved = []
         for row, r in zip(R, residual, strict=True):

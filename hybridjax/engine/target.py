@@ -57,9 +57,7 @@ class Target(eqx.Module):
         return dataclasses.replace(self, levels=levels)
 
 
-def toward(
-    time: Float[Array, " L"], event: int, limit: Float[Array, " L"] | Float[Array, ""]
-) -> Target:
+def toward(time: Float[Array, " L"], event: int, limit: Float[Array, "..."]) -> Target:
     """The target of lanes that end at times, or where `time` is infinite, at an event (or at a
     level that is filled in later), giving up at `limit`."""
     xp, L = namespace(time), time.shape[0]

@@ -241,8 +241,7 @@ def jumps(s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarr
         worst, here = uneven.max(axis=2).argmax(axis=0), np.arange(len(low))
         low, high = points[worst, here], points[worst + 1, here]
         first, last = values[worst, here], values[worst + 1, here]
-        steep = (change > _JUMP) & (change > _STEEP * near)
-        for i, j in np.argwhere(steep[worst, here]):
+        for i, j in np.argwhere(((change > _JUMP) & (change > _STEEP * near))[worst, here]):
             yield low[i, 0], j, change[worst[i], i, j] * limit[j]
         keep = uneven.max(axis=(0, 2)) > _JUMP
         low, high, first, last = (x[keep] for x in (low, high, first, last))

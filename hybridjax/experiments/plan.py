@@ -233,10 +233,8 @@ def _cheapest(impact: Float[np.ndarray, "K N"], share: float) -> Int[np.ndarray,
 def _lead(placed: PlacedSections, target):
     """Return the time to the next level as a multiple of Newton's guess; 1 if the guess is bad."""
     s, lanes = placed.structure(), placed.lanes
-    N = placed.n_sections
-    xp = namespace(lanes.t)
-    everywhere = xp.ones(N, bool)
-    watched = watch(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, everywhere)
+    N, xp = placed.n_sections, namespace(lanes.t)
+    watched = watch(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, xp.ones(N, bool))
     value, rate = watched.value[-1], watched.rate[-1]
     falls = (value > 0) & (rate < 0)
     lead = placed.duration * xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
@@ -249,8 +247,7 @@ def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
     N = len(scale)
     section, worst = np.arange(N), np.zeros((_PERIODS, *error.shape[:-1]))
     for m in range(_PERIODS * N):
-        at = (section + 1 + m) % N
-        now = worst[m // N]
+        at, now = (section + 1 + m) % N, worst[m // N]
         np.maximum(now, np.max(np.abs(error) / scale[at], axis=-1), out=now)
         error = np.einsum("kij,...kj->...ki", J[at], error)
     last, before = worst[-1], worst[-2]

@@ -134,8 +134,7 @@ def flow_batch(
         stride = plan.stride(i, S)
         moved = move(s, lanes, u, target, settings, stride, result, Options(glide=True)).moved
         # An event may change places with a section, but none may be left out or come in addition.
-        due = course.lanes.events[j] + turns * one_turn
-        wrong = jnp.abs(moved.lanes.events - due) > 1
+        wrong = jnp.abs(moved.lanes.events - (course.lanes.events[j] + turns * one_turn)) > 1
         result = update_result(moved.result, wrong, Result.EVENT_ORDER)
         # Times and events are counted within one turn, so that every turn is computed alike.
         lanes = eqx.tree_at(
@@ -245,8 +244,7 @@ def response_function(
     range.
     """
     placed = as_placed(cycle, sections)
-    z = check_outputs(cycle, outputs)
-    stepping = plan_flow(placed, accuracy)
+    z, stepping = check_outputs(cycle, outputs), plan_flow(placed, accuracy)
     steps = max(_STEPS, _STEPS**2 // placed.n_sections)
     settings = dataclasses.replace(stepping.settings, max_steps=steps)
     stepping = dataclasses.replace(stepping, settings=settings)

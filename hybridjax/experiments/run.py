@@ -204,8 +204,7 @@ class Campaign:
         inputs: tuple[str, ...] = z.structure.inputs
         if answer is not None:
             u = np.concatenate([u + answer, u], axis=2)
-            references = names("references", None, len(inputs))
-            inputs = inputs + signals(references, map(unit_of, inputs))
+            inputs = inputs + signals(names("references", None, len(inputs)), map(unit_of, inputs))
         return ExperimentData(
             u,
             y,
@@ -270,11 +269,8 @@ class Campaign:
         """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures,
         errors, and what a controller added to the inputs."""
         stepping, N, base = self.stepping, self.placed.n_sections, self.at_sections.on_cycle
-        loop = (
-            None
-            if self.feedback is None
-            else from_host(Feedback(self.feedback, jax.numpy.asarray(base)))
-        )
+        feedback, on_cycle = self.feedback, jax.numpy.asarray(base)
+        loop = None if feedback is None else from_host(Feedback(feedback, on_cycle))
 
         def arguments(rows):
             # (Nobody changes them before the program is done, so they may share memory.)
@@ -463,8 +459,7 @@ def in_batches(
         rows = slice(k, k + size)
         if k + size > S:  # the last batch is filled up with repetitions
             rows = np.arange(k, k + size) % S
-        out = program(*arguments(rows))
-        return jax.tree_util.tree_map(lambda x: np.asarray(x)[: S - k], out)
+        return jax.tree_util.tree_map(lambda x: np.asarray(x)[: S - k], program(*arguments(rows)))
 
     starts = range(0, S, size)
     parts = in_threads(work, starts, execution.workers or 1)

@@ -190,7 +190,7 @@ class ExperimentJob:
 
     def begin(self) -> tuple["ExperimentJob", Layout]:
         """Return the job, and the form of its records."""
-        campaign, description = self.campaign, self.description
+        campaign, text = self.campaign, self.description
         placed, values = campaign.placed, campaign.at_sections
         n, u = campaign.inputs.cycles * placed.n_sections, placed.cycle.system.inputs
         codes = {
@@ -210,9 +210,7 @@ class ExperimentJob:
             "cycle_outputs": (("section", "output"), values.on_cycle, {}),
         }
         coordinates = "input", "output"
-        layout = Layout(
-            ("experiment",), self.blocks, variables, constants, coordinates, description
-        )
+        layout = Layout(("experiment",), self.blocks, variables, constants, coordinates, text)
         return self, layout
 
     def arrays(self) -> list[np.ndarray]:

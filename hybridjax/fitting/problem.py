@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core import compilation
-from .._core.compilation import NotOnHostError, kind, only_on_host, quick_jit
+from .._core.compilation import kind, quick_jit
 from .._core.executor import is_inside_program, on_cpu
+from .._core.host_derivatives import NotOnHostError, only_on_host
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
@@ -164,10 +165,8 @@ class FitProblem(eqx.Module):
 
 def _with_jacobian(problem: FitProblem, x, guess):
     """Return residuals (r,) and Jacobian (r, p): all columns in one pass, in forward mode."""
-    push = jax.vmap(
-        lambda t: jax.jvp(lambda x: problem.residuals(x, guess), (x,), (t,)), out_axes=(None, -1)
-    )
-    return push(jnp.eye(x.shape[0]))
+    push = lambda t: jax.jvp(lambda x: problem.residuals(x, guess), (x,), (t,))  # noqa: E731
+    return jax.vmap(push, out_axes=(None, -1))(jnp.eye(x.shape[0]))
 
 
 _compiled = quick_jit(_with_jacobian)

@@ -55,8 +55,7 @@ def _smooth_radius(power: Float[Array, "d d"], smoothing: Float[Array, ""]) -> F
 
     fixed = jax.lax.stop_gradient(power)
     true = jnp.max(jnp.abs(jnp.linalg.eigvals(fixed)))
-    least = 1e-6 * jnp.linalg.norm(fixed)
-    begin = jnp.log(jnp.maximum(true / jnp.sqrt(1 - smoothing / d), least))
+    begin = jnp.log(jnp.maximum(true / jnp.sqrt(1 - smoothing / d), 1e-6 * jnp.linalg.norm(fixed)))
     # Newton's method goes up from the lower bound and never beyond the root.
     solver: optx.Newton = optx.Newton(rtol=1e-12, atol=1e-12)
     return jnp.exp(optx.root_find(excess, solver, begin, power, max_steps=64, throw=False).value)

@@ -142,8 +142,7 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
     """
     nu, shape = len(sums.setup.inputs), sums.energy.shape[1:]
     H = np.zeros((len(rows), nu, *shape), complex)
-    spread = np.zeros((len(rows), nu))
-    residual = np.zeros((len(rows), *shape))
+    spread, residual = np.zeros((len(rows), nu)), np.zeros((len(rows), *shape))
     for mirrored, unknowns in ((False, nu), (True, 2 * nu)):
         entries = np.flatnonzero(sums.mirrored[rows] == mirrored)
         lines = rows[entries]

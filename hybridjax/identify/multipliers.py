@@ -17,29 +17,18 @@ from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
+from . import variable_projection as varpro
 from .denominator import chi, multipliers_of
 from .descent import ROUNDING
 from .multiplier_estimate import MultiplierEstimate
-from .variable_projection import (
-    HTFGroup,
-    delayed_responses,
-    error_spectrum,
-    group_htf,
-    grouped,
-    maximum_likelihood,
-    misfit_of,
-    numerator_size,
-    numerators_of,
-    summarize,
-    unfold,
-)
+from .variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of, numerator_size
 from .weights import (
     SMALLEST_ERROR,
     are_alike,
     check_values,
-    correlation_of_neighbors,
     error_weights,
     line_variances,
+    neighbor_correlation,
     weights_of,
 )
 
@@ -98,9 +87,7 @@ class StructuredFit(MultiplierEstimate):
         return htf if harmonics is None else htf.select(harmonics)
 
     def _about(self) -> str:
-        misfit = ", ".join(
-            f"{name} {x:.1e}" for name, x in zip(self.outputs, self.residual, strict=True)
-        )
+        misfit = ", ".join(f"{n} {x:.1e}" for n, x in zip(self.outputs, self.residual, strict=True))
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         if are_alike(self.correlation, self.freedom):
             state += "; the misfit is alike at neighboring frequencies: `order` is too low"
@@ -166,12 +153,12 @@ def fit_multipliers(
     c, converged = maximum_likelihood(groups, order)
     if htf.variance is None:
         for _ in range(_REWEIGHTINGS):
-            variance = error_spectrum(groups, c, f, line_variances(htf), len(rms))
+            variance = varpro.error_spectrum(groups, c, f, line_variances(htf), len(rms))
             groups = group_htf(htf, np.broadcast_to(weights_of(variance, rms), H.shape), size)
             c, converged = maximum_likelihood(groups, order, c)
-    covariance, cost, freedom = summarize(groups, c, errors)
-    b = [numerators_of(group, c) for group in groups]
-    B = unfold(htf, groups, b, [x.conj() for x in b])
+    covariance, cost, freedom = varpro.summarize(groups, c, errors)
+    b = [varpro.numerators_of(group, c) for group in groups]
+    B = varpro.unfold(htf, groups, b, [x.conj() for x in b])
     misfit, scale = _evaluate(B, c, f, htf.n_sections) - H, rms[:, None]
     residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
     if check:
@@ -183,7 +170,7 @@ def fit_multipliers(
         covariance=covariance.matrix,
         covariance_freedom=covariance.freedom,
         residual=residual,
-        correlation=correlation_of_neighbors(misfit / scale, H / scale, f),
+        correlation=neighbor_correlation(misfit / scale, H / scale, f),
         numerators=B,
         cost=cost,
         freedom=freedom,
@@ -216,10 +203,9 @@ def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> Mu
     **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
     few frequencies to find the multipliers at all.
     """
-    exact = exact_htf(model, htf)
-    multipliers = model.multipliers
+    exact, multipliers = exact_htf(model, htf), model.multipliers
     d, c = len(multipliers), np.poly(multipliers).real[1:]
-    groups = grouped(exact, d, overhang)
+    groups = varpro.grouped(exact, d, overhang)
     J = np.concatenate([misfit_of(x, c).jacobian.reshape(d, -1) for x in groups], axis=1)
     return MultiplierEstimate(multipliers, c, np.linalg.inv(J @ J.T), np.inf)
 
@@ -367,7 +353,7 @@ def _noise_ratios(
 
     **Arguments:** `noise`: that of each output, relative to its rms.
     """
-    whitened, _ = delayed_responses(groups, np.zeros(order))
+    whitened, _ = varpro.delayed_responses(groups, np.zeros(order))
     values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2
     if noise.max() < ROUNDING:  # rounding errors differ by orders of magnitude
         values = values / _ROUNDING_VARIES
@@ -406,11 +392,7 @@ def _largest_of_noise(size: int) -> float:
 
 
 def require_order(
-    groups: list[HTFGroup],
-    htf: HTF,
-    order: int,
-    misfit: float,
-    residual: Float[np.ndarray, " ny"],
+    groups: list[HTFGroup], htf: HTF, order: int, misfit: float, residual: Float[np.ndarray, " ny"]
 ) -> None:
     """Check that HTFs carry so many multipliers.
 

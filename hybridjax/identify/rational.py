@@ -18,13 +18,7 @@ from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
 from .descent import ROUNDING, least_squares
 from .multiplier_estimate import MultiplierComparison, Multipliers, compare_multipliers
-from .variable_projection import (
-    HTFGroup,
-    delayed_columns,
-    equal_weights,
-    numerators_of,
-    residuals_of,
-)
+from .variable_projection import HTFGroup, equal_weights, late_columns, numerators_of, residuals_of
 
 
 # Iterations of Sanathanan and Koerner from which descents start. Fewer: other minima are found for
@@ -78,9 +72,8 @@ class RationalFit(eqx.Module):
         """Return the fitted functions at frequencies f (F,), cycles per period."""
         f, N = np.atleast_1d(np.asarray(f, float)), self.n_sections
         w = np.exp(-2j * np.pi * f / N)
-        top, bottom = (
-            np.polynomial.polynomial.polyval(w, x.T) for x in (self.numerator, self.denominator)
-        )
+        polyval = np.polynomial.polynomial.polyval
+        top, bottom = (polyval(w, x.T) for x in (self.numerator, self.denominator))
         H = (top / bottom * (w if self.form == "delayed" else 1.0)).T[None, :, :, None]
         harmonic = (self.harmonic + N // 2) % N - N // 2  # (they count modulo N)
         return HTF(f, H, harmonic, N, self.input, self.outputs, "rational fit")
@@ -222,7 +215,7 @@ def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:
     """Iterate as Sanathanan and Koerner: the last denominator weighs the next problem."""
     a = np.zeros(poles)
     for step in range(1 + max(_STARTS)):
-        columns, _ = delayed_columns(group, a)
+        columns, _ = late_columns(group, a)
         a = np.linalg.lstsq(columns[:, 1:], -columns[:, 0])[0]
         if step in _STARTS:
             yield a

@@ -38,8 +38,7 @@ def whiteness_test(
         z[:, k] = np.nansum(product, axis=(0, 1)) / np.sqrt(np.maximum(count, 1))
         tested[:, k] = count >= FEWEST_SAMPLES
     # The mean over the sections of each lag, and the deviations from it: independent.
-    z = z * tested
-    count = tested.sum(axis=0)
+    z, count = z * tested, tested.sum(axis=0)
     pooled = z.sum(axis=0) ** 2 / np.maximum(count, 1)
     deviations = (z**2).sum(axis=(0, 1)) - pooled.sum(axis=0)
     degrees = (count > 0).sum(axis=0)

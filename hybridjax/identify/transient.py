@@ -95,8 +95,7 @@ def remove_transient(
 
     size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
     good = np.flatnonzero(data.ok).tolist()
-    scaled = data.y[data.ok] / np.where(size > 0, size, 1.0)
-    y = scaled.reshape(len(good), -1, N * ny)[:, skip:]
+    y = (data.y[data.ok] / np.where(size > 0, size, 1.0)).reshape(len(good), -1, N * ny)[:, skip:]
     everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
     if everything:
         free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(good)

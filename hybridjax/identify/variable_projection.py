@@ -122,7 +122,7 @@ def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     return Misfit(residual, slopes, by_noise, (q**2).sum(axis=1).reshape(2, E))
 
 
-def delayed_columns(
+def late_columns(
     group: HTFGroup, c: Coefficients
 ) -> tuple[Float[np.ndarray, "n d1"], Float[np.ndarray, " E"]]:
     r"""Return $z^{-jN} H$, j = 0, ..., d, less numerators and weighted by $1/|\chi|$.
@@ -130,10 +130,8 @@ def delayed_columns(
     The coefficients of chi combine the columns to errors alone. Then the part of each equation's
     variance that numerators leave.
     """
-    q, _ = group.numerator_space(c)
-    rows = [
-        group.weighted(c, group.period_delay[:, None] ** j * group.data) for j in range(len(c) + 1)
-    ]
+    (q, _), delay = group.numerator_space(c), group.period_delay[:, None]
+    rows = [group.weighted(c, delay**j * group.data) for j in range(len(c) + 1)]
     columns = np.stack([(x - q @ (q.T @ x)).ravel() for x in rows], axis=1)
     left = 2 - (q**2).sum(axis=1).reshape(2, -1).sum(axis=0)
     return columns, left / np.abs(chi(group.period_delay, c)) ** 2
@@ -149,7 +147,7 @@ def delayed_responses(
     """
     delays, columns, noise_gram = np.arange(len(c) + 1), [], 0.0
     for group in groups:
-        delayed, left = delayed_columns(group, c)
+        delayed, left = late_columns(group, c)
         columns.append(delayed)
         by_delay = (left * (group.period_delay ** delays[:, None]).real).sum(axis=1)
         noise_gram = noise_gram + by_delay[np.abs(delays[:, None] - delays)] * group.size
@@ -223,8 +221,7 @@ def summarize(
         # A residual is smaller than the error, by the share of its equation in the numerators.
         error = misfit.residual / np.sqrt(1 - misfit.leverage)[..., None]
         np.add.at(score, group.line, np.einsum("jaek,aek->ej", misfit.jacobian, error))
-        products = np.einsum("iaek,jaek->eij", misfit.jacobian, misfit.jacobian)
-        np.add.at(shares, group.line, products)
+        np.add.at(shares, group.line, np.einsum("iaek,jaek->eij", misfit.jacobian, misfit.jacobian))
     square = shares.sum(axis=0)
     if errors == "variance":
         return sandwich(square - noise, square), cost, freedom
@@ -335,8 +332,7 @@ def equal_weights(
     _, first, which = np.unique(
         np.round(shape, EQUAL_WEIGHTS), axis=0, return_index=True, return_inverse=True
     )
-    copies = len(matrix) // len(f)
-    groups = []
+    copies, groups = len(matrix) // len(f), []
     for k, representative in enumerate(first):
         same = np.flatnonzero(which.ravel() == k)
         groups.append(
@@ -424,11 +420,9 @@ def error_spectrum(
     return (sizes @ _components(np.exp(-2j * np.pi * f), c)).T[..., None] * lines
 
 
-def _components(
-    period_delay: Complex[np.ndarray, " E"], c: Coefficients
-) -> Float[np.ndarray, "2 E"]:
+def _components(delay: Complex[np.ndarray, " E"], c: Coefficients) -> Float[np.ndarray, "2 E"]:
     """Return the spectra of white noise and of noise that passes the system."""
-    return np.stack([np.ones(len(period_delay)), 1 / np.abs(chi(period_delay, c)) ** 2])
+    return np.stack([np.ones(len(delay)), 1 / np.abs(chi(delay, c)) ** 2])
 
 
 def _expected_products(

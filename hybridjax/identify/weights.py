@@ -93,7 +93,7 @@ def _product_of_factors(
     return size[same] * by_line
 
 
-def correlation_of_neighbors(
+def neighbor_correlation(
     error: Complex[np.ndarray, "M F ny nu"],
     values: Complex[np.ndarray, "M F ny nu"],
     f: Float[np.ndarray, " F"],

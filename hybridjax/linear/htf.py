@@ -1,7 +1,7 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
 from dataclasses import replace
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -180,8 +180,7 @@ class HTF(eqx.Module):
             _optional("scatter.roundness", scatter.roundness, shape)
 
     def __repr__(self) -> str:
-        count = self.f.shape[-1]
-        span = ""
+        count, span = self.f.shape[-1], ""
         if count and not is_traced(self.f):
             f = np.asarray(self.f)
             span = f" {f.min():.4g} to {f.max():.4g}"
@@ -383,9 +382,7 @@ class HasHTF(Protocol):
     def htf(self, f: Vector) -> HTF: ...
 
 
-def require_chain(
-    name: str, outputs: tuple[str, ...], inputs: tuple[str, ...], a: Any, b: Any
-) -> None:
+def require_chain(name: str, outputs: tuple[str, ...], inputs: tuple[str, ...], a, b) -> None:
     """**Raises:** `DefinitionError` if outputs are not the inputs that they become, by name and
     unit, or two systems differ in their sections."""
     require_same("systems to be connected", a, b, ("n_sections",))
@@ -405,42 +402,38 @@ def _require_same_lines(a: HTF, b: HTF) -> None:
 
 def _combined(
     operation: algebra.Operation,
-    operands: list[HTF],
+    terms: list[HTF],
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
 ) -> HTF:
     """Return the result of an operation on harmonic matrices, with its variances."""
-    first = operands[0]
+    first = terms[0]
     first.require_sampled("the algebra of HTFs")
     N, every = first.n_sections, check_harmonics(None, first.n_sections)
-    for x in operands:
+    for x in terms:
         _require_same_lines(first, x)
         if x.harmonics != every:
             raise DefinitionError(f"algebra needs all {N} harmonics: leave `harmonics` out.")
     lines = algebra.Lines.of(np.asarray(first.f), N)
     to_matrices = lambda x: lines.matrices(x, N // 2)  # noqa: E731
-    result, pairs = operation(*(to_matrices(x.H) for x in operands))
+    result, pairs = operation(*(to_matrices(x.H) for x in terms))
 
     def variance(name: str) -> Array | None:
-        given = [getattr(x, name) for x in operands]
-        exact = [x.source == "exact" for x in operands]
+        given = [getattr(x, name) for x in terms]
+        exact = [x.source == "exact" for x in terms]
         if all(exact) or any(v is None and not e for v, e in zip(given, exact, strict=True)):
             return None
-        filled = [
-            jnp.zeros(x.H.shape) if v is None else v for x, v in zip(operands, given, strict=True)
-        ]
-        return lines.entries(
-            algebra.variance_of(pairs, [to_matrices(v) for v in filled]), N // 2
-        ).real
+        full = [jnp.zeros(x.H.shape) if v is None else v for x, v in zip(terms, given, strict=True)]
+        return lines.entries(algebra.variance_of(pairs, [*map(to_matrices, full)]), N // 2).real
 
-    freedoms = [x.scatter.freedom for x in operands if x.scatter is not None]
+    freedoms = [x.scatter.freedom for x in terms if x.scatter is not None]
     scatter = None
     if freedoms:  # of all lines of a class, the least
         least = jnp.min(jnp.stack(freedoms), axis=0)[lines.row].min(axis=1)
         rows = np.zeros(len(first.f), int)
         rows[lines.row] = np.arange(len(lines.row))[:, None]
         scatter = Scatter(least[rows], shared=True)
-    source = "exact" if all(x.source == "exact" for x in operands) else "estimate"
+    source = "exact" if all(x.source == "exact" for x in terms) else "estimate"
     return HTF(
         first.f, lines.entries(result, N // 2), every, N, inputs, outputs, source,
         variance=variance("variance"), noise_variance=variance("noise_variance"), scatter=scatter,

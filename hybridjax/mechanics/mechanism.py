@@ -112,8 +112,7 @@ class Mechanism(eqx.Module):
         its value up to rounding, and c drifts accordingly.
         """
         mass, (jacobian, drift) = self.mass(q), _moving(contact, q, v)
-        pushes = jnp.concatenate([(force - self.bias(q, v))[None], jacobian])
-        solved = _solve(mass, pushes)
+        solved = _solve(mass, jnp.concatenate([(force - self.bias(q, v))[None], jacobian]))
         free, by_force = solved[0], solved[1:].T
         constraint = solve_positive(jacobian @ by_force, -(drift + jacobian @ free))
         return Constrained(free + by_force @ constraint, constraint)

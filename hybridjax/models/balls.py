@@ -159,8 +159,7 @@ class BouncingChain(HybridSystem):
 
     def guess(self):
         """The cycle of masses that are not coupled (see `PaddleJuggler.exact`)."""
-        juggler = PaddleJuggler(self.A, self.T, self.g, self.restitution)
-        first, lift, v, _ = juggler.exact()
+        first, lift, v, _ = PaddleJuggler(self.A, self.T, self.g, self.restitution).exact()
         past = -(first + jnp.arange(self.n) * self.T / self.n) % self.T
         y = lift + v * past - self.g * past**2 / 2
         return Guess("flight", jnp.concatenate([y, v - self.g * past]))

@@ -100,8 +100,7 @@ class TorsoWalker(HybridSystem):
     def mechanism(self) -> Mechanism:
         """The walker by three angles, and for the floating base also by the position (x, y) of the
         stance foot."""
-        half = self.r / 2
-        legs = half * np.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
+        legs = self.r / 2 * np.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
         arms = legs + self.l * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
         return chain(arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g)
 

@@ -145,10 +145,8 @@ class CompassGait(HybridSystem):
     def transitions(self):
         foot = lambda t, q, u: q[0] + q[1] + 2 * self.slope  # noqa: E731
         ahead = lambda t, q, u: q[1] < 0  # noqa: E731
-        strike = Transition(
-            "heelstrike", "step", "step", foot, reset=self._heelstrike, enabled=ahead
-        )
-        return (strike,)
+        hit = Transition("heelstrike", "step", "step", foot, reset=self._heelstrike, enabled=ahead)
+        return (hit,)
 
     def _heelstrike(self, t, q, u):
         """Angular momentum about the new foot, and of the new swing leg about the hip, are kept."""

@@ -69,7 +69,7 @@ def _verdict(systems, map: ReturnMap, anchor: Lanes, period, turn: Turn):
     return eqx.filter_vmap(judge)(systems, anchor, period, turn)
 
 
-def _settled(systems, map: ReturnMap, anchor: Lanes, period):
+def _settle(systems, map: ReturnMap, anchor: Lanes, period):
     """The ends of a simulation, at the guess's phase or section (NaN for systems that do not get
     there), and expected periods."""
     patient = Settings(TRANSIENT, TRANSIENT, 512 * _SETTLE, map.settings.scale)
@@ -166,9 +166,7 @@ class Tiles(NamedTuple):
             if self.known is None:
                 call.done, rows = 0, order[: self.size]
                 with uncollected():  # the programs are compiled during this call
-                    out = self._settled(
-                        rows, self._newton(rows, *self._given(len(rows)), FEW_STEPS)
-                    )
+                    out = self._settle(rows, self._newton(rows, *self._given(len(rows)), FEW_STEPS))
             else:
                 out = None
             while (done := 0 if out is None else len(out.result)) < S:
@@ -190,18 +188,18 @@ class Tiles(NamedTuple):
             better = part.result == Result.OK
             part = part._replace(steps=part.steps + out.steps[failed])
             out = _replace(out, failed[better], _pick(part, better))
-        return _pick(self._settled(order, out), np.argsort(order))
+        return _pick(self._settle(order, out), np.argsort(order))
 
     def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
         given = self.map.anchor, self.map.expected
         return jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], count, 0), given)
 
-    def _settled(self, rows, out: Rounds) -> Rounds:
+    def _settle(self, rows, out: Rounds) -> Rounds:
         """Another attempt for the systems that failed, from the end of a simulation."""
         failed = np.flatnonzero(out.result != Result.OK)
         if not len(failed):
             return out
-        begin = self._in_tiles(_settled, rows[failed], *self._given(len(failed)))
+        begin = self._in_tiles(_settle, rows[failed], *self._given(len(failed)))
         arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
         if not arrived.any():
             return out
@@ -255,8 +253,7 @@ class Tiles(NamedTuple):
                 break
             part = self._step(rows[going], *_pick((out.anchor, out.period), going))
             out = _replace(out, going, part._replace(steps=part.steps + out.steps[going]))
-        judged = self._in_tiles(_verdict, rows, out.anchor, out.period, out.turn)
-        anchor, period, result = judged
+        anchor, period, result = self._in_tiles(_verdict, rows, out.anchor, out.period, out.turn)
         return out._replace(anchor=anchor, period=period, result=result)
 
     def _step(self, rows, anchor: Lanes, period) -> Rounds:

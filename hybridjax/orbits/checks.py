@@ -11,17 +11,10 @@ from jaxtyping import Float, Int
 from .._core.compilation import at_ease
 from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
-from ..engine import kernels
+from ..engine import kernels, unresolved
 from ..engine.lanes import Tape
 from ..engine.trajectory import simulate
-from ..engine.unresolved import (
-    column_name,
-    jumps,
-    lines_of_jumps,
-    may_be_sudden,
-    may_have_pulses,
-    passed_over,
-)
+from ..engine.unresolved import column_name, jumps, lines_of_jumps, may_be_sudden, passed_over
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
 from ..systems.check import check_output, check_system
@@ -200,7 +193,7 @@ def check_jumps(cycle: LimitCycle, tapes: Tape | None = None) -> None:
     **Arguments:** `tapes`: see `orbit`.
     """
     s, period = cycle.structure, float(cycle.period)
-    charts = [a for a in range(len(s.charts)) if may_have_pulses(s, a)]
+    charts = [a for a in range(len(s.charts)) if unresolved.may_have_pulses(s, a)]
     if not charts:
         return
     scale, path = np.asarray(cycle.settings.scale), orbit(cycle.return_map, tapes)

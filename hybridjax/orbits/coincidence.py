@@ -85,8 +85,7 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
             orders = list(_orders(s, t, before, len(events), 10 * TOGETHER * period))
             names = tuple(tuple(s.transitions[g].name for g in x.events) for x in orders)
             commute = _commute(np.asarray(cycle.settings.scale), a, orders)
-            derivatives = tuple(x.derivative for x in orders)
-            groups.append(Coincidence(t, names, derivatives, commute))
+            groups.append(Coincidence(t, names, tuple(x.derivative for x in orders), commute))
     return groups
 
 

@@ -229,9 +229,7 @@ def _check(cycle, values) -> np.ndarray:
         raise DefinitionError(f"`cycle` was not found ({Result(int(cycle.result)).message}).")
     steps = np.diff(np.asarray(values))
     if not len(steps) or abs(np.sign(steps).sum()) < len(steps):
-        raise DefinitionError(
-            f"the values must be two or more, ascending or descending; got {values}."
-        )
+        raise DefinitionError(f"values must be two or more, ascending or descending; got {values}.")
     return np.asarray(values)
 
 
@@ -247,8 +245,7 @@ class _Trace(NamedTuple):
         """The points along a tangent, those of changes of stability among them, and the end."""
         points, length, moved = [start], self.step, None
         low, high = self.values[0], self.values[-1]
-        edge = high if start.tangent[-1] > 0 else low
-        over = start.value == edge
+        over = start.value == (high if start.tangent[-1] > 0 else low)
         while not over and len(points) < self.max_points:
             last = points[-1]
             say(f"{self.curve.parameter} = {last.value:.5g}, {len(points)} cycles")

@@ -92,8 +92,7 @@ class Crossing(Definition):
             value = s.resolve_outputs(self.function)(a, t, q, jnp.zeros(s.nu))[0]
         else:
             value = jnp.asarray(self.function(t, q), float)
-        sign = 1.0 if self.direction == "falling" else -1.0
-        return sign * (value - self.value)
+        return (1.0 if self.direction == "falling" else -1.0) * (value - self.value)
 
 
 @checked
@@ -129,8 +128,7 @@ class ListLevels(AbstractLevels):
                 return lambda: item.level(s, a, t, q)
             return lambda: jnp.ones(())
 
-        branches = [lambda: jnp.ones(()), *(branch(x) for x in self.items)]
-        return jax.lax.switch(i + 1, branches)
+        return jax.lax.switch(i + 1, [lambda: jnp.ones(()), *(branch(x) for x in self.items)])
 
 
 def to_section(target: Target, section: Crossing | AtEvent | None, event: int = -1) -> Target:

@@ -468,8 +468,7 @@ def _frame(map: ReturnMap, move: Link) -> tuple[Matrix, Matrix]:
     size = np.append(map.expected, np.asarray(map.settings.scale)[move.chart, :n])
     basis = np.eye(1 + n)
     if not clocked:
-        f = move.field[:n] / size[1:]
-        basis = np.zeros((1 + n, n - 1))
+        f, basis = move.field[:n] / size[1:], np.zeros((1 + n, n - 1))
         basis[1:] = np.linalg.svd(f[None])[2][1:].T
     padding = [(0, map.structure.d - n), (0, 0)]
     to, back = np.pad(basis / size[:, None], padding), np.pad(basis * size[:, None], padding)
@@ -480,6 +479,4 @@ def weakest(factor: Matrix, weaker: int = 0) -> float:
     """The gain of a factor in its weakest direction but for so many `weaker` ones, relative to the
     gain in its strongest, or to 1 if that is smaller."""
     singular = np.linalg.svd(factor, compute_uv=False)
-    if len(singular) <= weaker:
-        return np.inf
-    return singular[-1 - weaker] / max(singular[0], 1.0)
+    return singular[-1 - weaker] / max(singular[0], 1.0) if len(singular) > weaker else np.inf

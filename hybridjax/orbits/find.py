@@ -22,15 +22,7 @@ from ..errors import ComputationError, DefinitionError
 from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, integrated
-from .checks import (
-    check_clock,
-    check_conserved,
-    check_jumps,
-    check_periodic,
-    check_times,
-    closes_early,
-    explain,
-)
+from . import checks
 from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
@@ -117,15 +109,13 @@ def find_limit_cycle(
     if settings.solver == "auto":
         again: Any = dict(section=section, multiplicity=multiplicity, conserved=conserved)
         again |= dict(settings=dataclasses.replace(settings, solver=None), scale=scale, throw=throw)
-        first = dict(settle=settle, max_period=max_period)
-        return _find_with_auto(system, guess, first, again)
+        return _find_with_auto(system, guess, dict(settle=settle, max_period=max_period), again)
     system = settings.system(system)
     traced = is_traced((system, conserved))
     if not traced:
         require_x64(system, guess, section, settings)
-        check_periodic(system)
-    s = Structure(system)
-    settings = settings.filled(LIMIT_CYCLE)
+        checks.check_periodic(system)
+    s, settings = Structure(system), settings.filled(LIMIT_CYCLE)
     patient = settings.max_steps == Settings().max_steps
     if has_implicit(s) or has_kinks(s):
         settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
@@ -139,7 +129,7 @@ def find_limit_cycle(
             )
         section.check(s)
     if not traced:
-        check_clock(s)
+        checks.check_clock(s)
     if isinstance(guess, LimitCycle):
         _check_fits(guess, s, multiplicity, bool(settle) or max_period is not None)
         conserved = guess.conserved if conserved is None else conserved
@@ -165,14 +155,13 @@ def find_limit_cycle(
     solution = search(map, patient)
     if patient and int(solution.result) == Result.STEP_LIMIT:
         say("the same with more steps")
-        map = dataclasses.replace(
-            map, settings=dataclasses.replace(map.settings, max_steps=_ENOUGH)
-        )
+        settings = dataclasses.replace(map.settings, max_steps=_ENOUGH)
+        map = dataclasses.replace(map, settings=settings)
         solution = search(map)
     map, solution = _in_own_sizes(map, solution, given)
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
     failure = None
-    if solution.is_fixed_point and closes_early(cycle):
+    if solution.is_fixed_point and checks.closes_early(cycle):
         failure = Result.EXTRA_TURNS
     elif solution.is_fixed_point and coincident(map, solution.turn):
         if commutes(cycle):
@@ -182,14 +171,14 @@ def find_limit_cycle(
     if failure is not None:
         cycle = dataclasses.replace(cycle, result=jax.device_put(np.int32(failure)))
     code, legs = Result(int(cycle.result)), to_host(cycle.legs)
-    check_times(s, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
+    checks.check_times(s, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
         check_begin(cycle.return_map)
-        check_jumps(cycle, solution.turn.tapes)
+        checks.check_jumps(cycle, solution.turn.tapes)
         if conserved:
-            check_conserved(cycle)
+            checks.check_conserved(cycle)
     if throw and code != Result.OK:
-        raise ComputationError(explain(cycle, solution.turn, float(map.expected)))
+        raise ComputationError(checks.explain(cycle, solution.turn, float(map.expected)))
     return cycle
 
 

@@ -69,9 +69,7 @@ class Fluctuations(eqx.Module):
         **Raises:** `ComputationError` if an implicit method steps over fast decays.
         """
         if on_host(self.period) and self.unresolved > SINGULAR:
-            raise ComputationError(
-                "steps pass over decays: use an explicit method, or `durations`."
-            )
+            raise ComputationError("steps pass over decays: use an explicit method or `durations`.")
         C, d = self.at_nodes, self.at_nodes.shape[-1]
         if lag:
             turns = namespace(C).linalg.matrix_power(self.step[:d, :d], lag - 1)
@@ -173,7 +171,7 @@ def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:
 
 
 def _timing(by_state: Array, delay: Array, hit: Array, slot: Array) -> Float[Array, "P n n"]:
-    """From states, the delay of the last event and durations before an event to those after it."""
+    """Map states, the delay of the last event and durations before an event to those after it."""
     xp, ((P, d), E) = namespace(delay), (delay.shape, slot.shape[1])
     each = slot[..., None]
     return xp.block([

@@ -62,9 +62,7 @@ def return_map_near(
     system, period = s.system, s.system.period()
     guess = system.guess() if guess is None else guess
     if guess is None:
-        raise DefinitionError(
-            f"{type(system).__name__} has no guess: pass `guess=Guess(chart, state)`."
-        )
+        raise DefinitionError(f"{type(system).__name__} has no guess: pass `Guess(chart, state)`.")
     a, time = s.chart_index(guess.chart), np.array([guess.time])
     if guess.state.shape != (s.dims[a],):
         raise DefinitionError(

@@ -159,8 +159,7 @@ def find_limit_cycles(
     S = len(jax.tree_util.tree_leaves(arrays)[0])
     check_periodic(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
     map = map_for_sweep(guess, settings)
-    size = min(execution.batch or BATCH, S)
-    tiles = Tiles(systems, map, size, execution.threads, S > SMALL)
+    tiles = Tiles(systems, map, min(execution.batch or BATCH, S), execution.threads, S > SMALL)
     return as_cycles(tiles, tiles.solve(S))
 
 

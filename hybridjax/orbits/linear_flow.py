@@ -48,8 +48,7 @@ class Rule(NamedTuple):
 
 @ft.lru_cache
 def rule() -> Rule:
-    legendre = np.polynomial.legendre
-    last = np.eye(NODES)[-1]
+    legendre, last = np.polynomial.legendre, np.eye(NODES)[-1]
     x = np.r_[-1.0, np.sort(legendre.legroots(legendre.legder(last))), 1.0]
     x = (x - x[::-1]) / 2
     vander = legendre.legvander(x, NODES - 1)
@@ -122,8 +121,7 @@ class LinearFlow(eqx.Module):
         inverse = self._implicit(-1.0, slice(1, None), self.by_state)
         free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[1:, 0])
         free = xp.concatenate([xp.broadcast_to(xp.eye(d), (len(free), 1, d, d)), free], axis=1)
-        pad = [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)]
-        return free, xp.pad(inverse, pad)
+        return free, xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
 
     def adjoint(self) -> Float[Array, "P K d d"]:
         """Covectors at the nodes of each piece by that at its end."""
@@ -142,8 +140,7 @@ class LinearFlow(eqx.Module):
             before = jump.T @ after
             return free @ before, before
 
-        reverse = self.jumps.by_state[::-1], adjoint[::-1, 0]
-        return scan(back, end, reverse)[1][::-1]
+        return scan(back, end, (self.jumps.by_state[::-1], adjoint[::-1, 0]))[1][::-1]
 
     def at(
         self, phase: Array, period: Array, *values: Inexact[Array, "P K ..."]
@@ -289,10 +286,8 @@ def _joined(s: Structure, steps: _Pieces, longest: Array) -> tuple[np.ndarray, _
         if steps.code[k - 1] >= 0 or k - first[-1] == most or length + h > longest:
             first.append(k)
             length = 0.0
-    last = np.append(first[1:], len(steps.h)) - 1
-    h, code = np.add.reduceat(steps.h, first), steps.code[last]
-    begin = _Pieces(*(x[..., first] for x in steps))
-    return np.array(first), begin._replace(h=h, code=code)
+    h, code = np.add.reduceat(steps.h, first), steps.code[np.append(first[1:], len(steps.h)) - 1]
+    return np.array(first), _Pieces(*(x[..., first] for x in steps))._replace(h=h, code=code)
 
 
 def _linearized(
@@ -340,8 +335,7 @@ def _ahead(s: Structure, t, chart, q, h) -> Float[Array, "d L"]:
 
     def work(a, here, out):
         n = s.dims[a]
-        step = kernels.step(s, a, t[here], q[:n, here], np.zeros((s.nu, 1)), h[here])
-        out[:n, here] = step.q
+        out[:n, here] = kernels.step(s, a, t[here], q[:n, here], np.zeros((s.nu, 1)), h[here]).q
         return out
 
     return for_each_chart(s, chart, xp.ones(L, bool), work, xp.zeros_like(q))

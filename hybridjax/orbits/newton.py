@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.compilation import NotOnHostError, host_first, quick_jit
+from .._core.compilation import host_first, quick_jit
 from .._core.executor import Array, on_host
+from .._core.host_derivatives import NotOnHostError, by_columns
 from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
@@ -121,7 +122,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     return solution, nothing._replace(anchor=anchor, turn=moving)
 
 
-@ft.partial(host_first, along=_solve_along)
+@ft.partial(host_first, derived=ft.partial(by_columns, along=_solve_along))
 def solve(map: ReturnMap, once_more: bool = False) -> Solution:
     """Newton's method from the anchor's state.
 

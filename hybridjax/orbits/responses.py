@@ -18,15 +18,7 @@ from .._core.arguments import require_among, require_index
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers
 from .._core.boundary.values import Reals
-from .._core.executor import (
-    Array,
-    is_traced,
-    namespace,
-    on_host,
-    singular_values,
-    stop_gradient,
-    to_host,
-)
+from .._core.executor import Array, is_traced, namespace, on_host, stop_gradient, svdvals, to_host
 from .._core.signal import unit_of
 from .._core.text import number
 from ..engine import kernels
@@ -103,8 +95,7 @@ class Coupling(eqx.Module):
         """The least and the largest frequency of a push that the cycle follows, less that of the
         cycle, per strength of the push: the Arnold tongue, to first order."""
         c = to_host(self.coefficients)
-        slopes = 2j * np.pi * np.arange(len(c)) * c
-        values = _series(c, [x.lead for x in _zeros(slopes)] or [0.0])
+        values = _series(c, [x.lead for x in _zeros(2j * np.pi * np.arange(len(c)) * c)] or [0.0])
         return float(values.min()), float(values.max())
 
     def locked(self, detuning: float = 0.0, mutual: bool = False) -> tuple[Locked, ...]:
@@ -223,8 +214,7 @@ class Responses(eqx.Module):
         values = np.einsum("pki,pkiu->pku", of_phase, flow.by_input)
         values = values[..., column] / float(self.period)
         phase = (flow.t - flow.t[0, 0]) / float(self.period)
-        broken = flow.event >= 0
-        tail = np.where(broken, np.nan, values[:, -1])[:, None]
+        tail = np.where(flow.event >= 0, np.nan, values[:, -1])[:, None]
         values = np.concatenate([values, tail], axis=1).ravel()
         phase = np.concatenate([phase, phase[:, -1:]], axis=1).ravel()
         return PhaseCurve(phase, values, signal, time_unit=self.structure.system.time_unit)
@@ -358,13 +348,12 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
 
     **Raises:** `ComputationError` if it is not simple.
     """
-    xp = namespace(f)
-    size = map.sizes
+    xp, size = namespace(f), map.sizes
     along = f / size**2
     along = along / (along @ f)
     closed = monodromy - xp.eye(len(f)) + f[:, None] * along
     if on_host(f):
-        smallest = singular_values(closed * size / size[:, None])[-1]
+        smallest = svdvals(closed * size / size[:, None])[-1]
         if map.conserved or not smallest > SINGULAR:
             raise ComputationError(
                 "the cycle has no phase of its own: its multiplier 1 is double, as in a family of "
@@ -378,8 +367,7 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
 
     **Raises:** `ComputationError` for multipliers that coincide.
     """
-    xp = namespace(M)
-    scaled = M * size / size[:, None]
+    xp, scaled = namespace(M), M * size / size[:, None]
     values, right = xp.linalg.eig(stop_gradient(scaled))
     order = xp.argsort(-xp.abs(values) + 1e-9 * (xp.imag(values) < 0), stable=True)
     if on_host(M):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.executor import Array, namespace, on_host, put, scan, singular_values, stop_gradient
+from .._core.executor import Array, namespace, on_host, put, scan, stop_gradient, svdvals
 from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
@@ -258,7 +258,7 @@ class ReturnMap(eqx.Module):
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
         sizes, valid, xp = self.sizes, self.valid, namespace(q)
         defect = monodromy(turn.factors) - xp.diag(valid * 1.0) - self.held(q)[1]
-        singular = singular_values(defect * sizes / sizes[:, None])
+        singular = svdvals(defect * sizes / sizes[:, None])
         smallest = xp.min(xp.where(np.arange(len(q)) < valid.sum(), singular, np.inf))
         code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
         closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)

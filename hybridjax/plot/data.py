@@ -18,17 +18,7 @@ from ..recordings.beats.response import PhaseResponse
 from ..recordings.data import SectionData, input_spectrum
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase import Phase
-from .look import (
-    COLORS,
-    COLUMN,
-    CYCLE,
-    PAGE,
-    AxesLike,
-    Plot,
-    axis_of,
-    letters,
-    panels,
-)  # fmt: skip
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, axis_of, letters, panels  # fmt: skip
 
 
 # Factors of what is per one unit of time, per another.
@@ -177,8 +167,7 @@ def experiment(data: ExperimentData, index: int = 0, *, ax: AxesLike | None = No
     """
     S, n, _ = data.u.shape
     require_index("experiment", index, S)
-    index = index % S
-    time = np.arange(n) / data.n_sections
+    index, time = index % S, np.arange(n) / data.n_sections
     rows = [(name, data.u[index, :, k], True) for k, name in enumerate(data.inputs)]
     rows += [(name, data.y[index, :, k], False) for k, name in enumerate(data.outputs)]
     size = {"width": COLUMN, "height": 0.5 + 0.85 * len(rows)}
@@ -247,8 +236,7 @@ def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | Non
 
 def _stems(ax: Axes, lags, values, color, shift: float, limit: float) -> None:
     """Means over the sections of values that have variance 1 each."""
-    count = np.maximum((values != 0).sum(axis=0), 1)
-    mean = values.sum(axis=0) / np.sqrt(count)
+    mean = values.sum(axis=0) / np.sqrt(np.maximum((values != 0).sum(axis=0), 1))
     ax.axhspan(-limit, limit, color="0.9", zorder=0)
     ax.vlines(lags + shift, 0, mean, color=color, lw=1.2)
     ax.axhline(0, color="black", lw=0.5)

@@ -230,8 +230,7 @@ def _values(
 
 
 def _frequency_limits(ax: Axes, f) -> None:
-    step = f[1] - f[0] if len(f) > 1 else 1.0
-    ax.set_xlim(min(0.0, f[0]), f[-1] + step)
+    ax.set_xlim(min(0.0, f[0]), f[-1] + (f[1] - f[0] if len(f) > 1 else 1.0))
 
 
 def _name(m: int) -> str:

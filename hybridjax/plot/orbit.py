@@ -103,9 +103,7 @@ def _pieces(trajectory: Trajectory, x: str, y: str):
     _, px, py = trajectory(x, y)
     cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
     pieces = zip(np.split(chart, cuts), np.split(px, cuts), np.split(py, cuts), strict=True)
-    return [
-        (int(c[0]), px, py) for c, px, py in pieces if len(c) > 1 and np.any(np.isfinite(px + py))
-    ]
+    return [(int(c[0]), x, y) for c, x, y in pieces if len(c) > 1 and np.any(np.isfinite(x + y))]
 
 
 def _points(s: Structure, a: int, names, t, q) -> tuple[np.ndarray, np.ndarray]:
@@ -129,8 +127,7 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
         if not np.all(np.isfinite([before, after])):
             continue
         if np.any(np.abs(after - before) > 1e-9 * (1 + np.abs(before))):
-            ends = np.stack([before, after], axis=1)
-            ax.plot(*ends, "--", color="black", lw=0.8, zorder=2)
+            ax.plot(*np.stack([before, after], axis=1), "--", color="black", lw=0.8, zorder=2)
             ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
         ax.plot(*before, "o", ms=4, color="black", zorder=5)
         if not any(transition.name in there for there in texts.values()):

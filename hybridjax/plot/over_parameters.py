@@ -38,8 +38,7 @@ def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = N
     if len(names) != 1:
         raise DefinitionError(f"branches in one figure need one parameter, not {sorted(names)}.")
     with panels(ax) as axes:
-        panel = axes[0, 0]
-        shown = set()
+        panel, shown = axes[0, 0], set()
         for b, color in zip(branches, itertools.cycle(CYCLE)):
             first = b[0].structure.charts[int(b[0].anchor.chart[0])].states[0]
             name = first if output is None else output
@@ -56,8 +55,7 @@ def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = N
         gray = COLORS["gray"]
         panel.plot([], [], "-", color=gray, label="stable")
         panel.plot([], [], "--", color=gray, label="unstable")
-        system = branches[0][0].system
-        parameter = Signal(b.parameter, unit_of_parameter(system, b.parameter))
+        parameter = Signal(b.parameter, unit_of_parameter(branches[0][0].system, b.parameter))
         (output_name,) = branches[0][0].structure.resolve_outputs(name).names
         panel.set(xlabel=axis_of(parameter), ylabel=f"largest {axis_of(output_name)}")
         panel.locator_params(axis="x", nbins=6)

@@ -17,7 +17,7 @@ from .._core.text import p_value
 from ..errors import DefinitionError
 from ..identify.multiplier_estimate import compare_multipliers
 from ..identify.residuals import ANSWER, feedback_test
-from ..identify.series.fit import SeriesFit, delayed_outputs, ordinary_least_squares, refuse_order
+from ..identify.series.fit import SeriesFit, late_outputs, ordinary_least_squares, refuse_order
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validate import Validation, simulate
@@ -85,13 +85,11 @@ def advise(
     of an inspection and of other estimates, which come first. Default: none.
     """
     N, R, _, nu = fit.numerators.shape
-    d = len(fit.multipliers)
-    records = PreparedRecords(data)
+    d, records = len(fit.multipliers), PreparedRecords(data)
     problem = OutputErrorProblem.from_data(records, d, R - 1 - fit.lead - d * N, free_start=True)
-    delayed, grid = delayed_outputs(problem, d), records.whole()
+    delayed, grid = late_outputs(problem, d), records.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())
-    unknowns = R * nu + len(grid.y) * (d + 1)
-    plain = ordinary_least_squares(delayed)
+    unknowns, plain = R * nu + len(grid.y) * (d + 1), ordinary_least_squares(delayed)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
     warnings = list(findings)
     if sampled - unknowns < _FEW * sampled:

@@ -9,13 +9,7 @@ from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Covariance
-from ..identify.series.fit import (
-    SeriesFit,
-    assemble,
-    delayed_outputs,
-    fit_series,
-    total_least_squares,
-)
+from ..identify.series.fit import SeriesFit, assemble, fit_series, late_outputs, total_least_squares
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
@@ -54,7 +48,7 @@ class Split(NamedTuple):
         N = self.early.n_sections
         for d in range(1, most + 1):
             problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
-            solution = linearize(problem, total_least_squares(delayed_outputs(problem, d)))
+            solution = linearize(problem, total_least_squares(late_outputs(problem, d)))
             if (solution.freedom <= 2 * d).any():
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)

@@ -110,11 +110,9 @@ def impulse_responses(
         slope[(j + 1) * N :, j] -= whole[: max(longest - (j + 1) * N, 0)]
     slope, root = pushed(slope), pushed(fit.roots.transpose(2, 0, 1, 3, 4))
     by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
-    errors = np.sqrt((root**2).sum(axis=4) * fit.noise[:, None] ** 2 + by_coefficients)
+    std = np.sqrt((root**2).sum(axis=4) * fit.noise[:, None] ** 2 + by_coefficients)
     # From the section of the response to that of the push.
     m, r = np.arange(N)[:, None], np.arange(lags)
-    values, errors = (x[r, (m + r) % N] / (data.period / N) for x in (pushed(h), errors))
+    values, std = (x[r, (m + r) % N] / (data.period / N) for x in (pushed(h), std))
     phase, lag, period = np.arange(N) / N, np.arange(lags) / N, data.period
-    return ImpulseResponses(
-        values, errors, phase, lag, float(width), period, fit.inputs, fit.outputs
-    )
+    return ImpulseResponses(values, std, phase, lag, float(width), period, fit.inputs, fit.outputs)

@@ -66,8 +66,7 @@ def estimate_phase(
         if bandwidth is None:  # noise adds crossings of the samples themselves
             rough = _from_events(recording.mark(event.name, definition), event.name)
             bandwidth = HARMONICS / 2 / rough.period
-        marked = recording.mark(event.name, definition, bandwidth=bandwidth)
-        return _from_events(marked, event.name)
+        return _from_events(recording.mark(event.name, definition, bandwidth=bandwidth), event.name)
     if bandwidth is not None:
         raise DefinitionError("events are not smoothed: leave `bandwidth` out.")
     return _from_events(recording, definition.name)
@@ -107,8 +106,7 @@ def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
             total += len(part)
             t = time[part]
             unseen = gaps(t, bridgeable(t))[1:-1]
-            monotone = ((low + high) / 2)[rising]
-            stretches[-1] += (Winding(t[rising], monotone, False, unseen),)
+            stretches[-1] += (Winding(t[rising], ((low + high) / 2)[rising], False, unseen),)
     return Phase(tuple(stretches), n_sections=n_sections, backwards=backwards / max(total, 1))
 
 
@@ -196,13 +194,11 @@ def _angle_at(
 def _turns_per_time(angles: Sequence[_Angle]) -> float:
     """Return the signed rate. **Raises:** `DefinitionError` if the angle does not wind twice."""
     turns = sum(float(np.unwrap(a)[-1] - a[0]) for _, a in angles) / (2 * np.pi)
-    duration = sum(float(t[-1] - t[0]) for t, _ in angles)
+    span = sum(float(t[-1] - t[0]) for t, _ in angles)
     if abs(turns) < 2:
         text = "the center must lie within the loop of the signals, and two cycles are needed."
-        raise DefinitionError(
-            f"the phase does not wind: {turns:.2g} turns in {duration:.4g}; {text}"
-        )
-    return turns / duration
+        raise DefinitionError(f"the phase does not wind: {turns:.2g} turns in {span:.4g}; {text}")
+    return turns / span
 
 
 def _from_events(recording: Recording, name: str) -> Phase:

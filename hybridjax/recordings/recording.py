@@ -182,7 +182,7 @@ class Recording(eqx.Module):
         if len(units) < len(names):
             twice = next(x for x in names if names.count(x) > 1)
             raise DefinitionError(f"two recordings have a signal '{twice}': rename one.")
-        joined = []
+        out = []
         for trials in zip(*(x.trials for x in recordings), strict=True):
             name = trials[0].name
             time = np.unique(np.concatenate([t.time for t in trials]))
@@ -198,10 +198,8 @@ class Recording(eqx.Module):
                 values[-1][np.searchsorted(time, t.time)] = t.values
                 events |= t.events
             signals = dict(zip(names, np.concatenate(values, axis=1).T, strict=True))
-            joined.append(
-                Recording(time, signals, events=events, units=units, name=name, notes=notes)
-            )
-        return Recording.join(joined)
+            out.append(Recording(time, signals, events=events, units=units, name=name, notes=notes))
+        return Recording.join(out)
 
     def mark(self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf) -> "Recording":
         """Add an event at each time at which a signal crosses a level.

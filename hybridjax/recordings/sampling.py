@@ -229,12 +229,10 @@ def _with_times(
         late = np.split(z - (x @ z) / (x @ x) * x, np.cumsum([len(p.k) for p in parts])[:-1])
     sections = []
     for p, z in zip(parts, late, strict=True):
-        unknown = ~p.observed
+        hidden = ~p.observed
         if timing == "duration":
-            unknown |= np.insert(unknown, 0, True)[:-1]
-        sections.append(
-            p._replace(values=np.column_stack([p.values, np.where(unknown, np.nan, z)]))
-        )
+            hidden |= np.insert(hidden, 0, True)[:-1]
+        sections.append(p._replace(values=np.column_stack([p.values, np.where(hidden, np.nan, z)])))
     return sections
 
 

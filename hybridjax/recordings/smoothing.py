@@ -90,12 +90,10 @@ def gaps(time: Series, longest: int | float) -> Float[np.ndarray, "g 2"]:
     return np.stack([edges[wide], edges[wide + 1]], axis=1)
 
 
-def inside(
-    intervals: Float[np.ndarray, "g 2"], start: Series, end: Series
-) -> Bool[np.ndarray, " n"]:
+def inside(parts: Float[np.ndarray, "g 2"], start: Series, end: Series) -> Bool[np.ndarray, " n"]:
     """Return which intervals from start to end touch any of the given ones (disjoint, sorted)."""
-    before: Int[np.ndarray, " n"] = np.searchsorted(intervals[:, 0], end, side="left")
-    over: Int[np.ndarray, " n"] = np.searchsorted(intervals[:, 1], start, side="right")
+    before: Int[np.ndarray, " n"] = np.searchsorted(parts[:, 0], end, side="left")
+    over: Int[np.ndarray, " n"] = np.searchsorted(parts[:, 1], start, side="right")
     return before > over
 
 
@@ -123,8 +121,7 @@ def spike_heights(values: Series) -> Series:
 
     **Arguments:** `values`: the signal; NaN where a sample is missing.
     """
-    heights = np.zeros(len(values))
-    finite = np.isfinite(values)
+    heights, finite = np.zeros(len(values)), np.isfinite(values)
     x = values[finite]
     if len(x) <= _NEIGHBORHOOD:
         return heights

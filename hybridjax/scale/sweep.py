@@ -97,8 +97,7 @@ def sweep(
     family = Family(model, list(space.axes))
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
     system = family.check(middle)
-    wanted = Wanted(want, system)
-    total = math.prod(space.shape)
+    wanted, total = Wanted(want, system), math.prod(space.shape)
     most = chunk or (BATCH if wanted.measures else min(max(total // _PIECES, BATCH), _MOST))
     blocks = Blocks(space.shape, near_cube(space.shape, most))
     description = {
@@ -158,8 +157,7 @@ class SweepJob:
         begun = self._blank()
         say("a coarse pass")
         solved, cycles = dataclasses.replace(self, begun=begun).coarse()
-        variables = self.wanted.variables(cycles)
-        units = self.family.units(self.system)
+        variables, units = self.wanted.variables(cycles), self.family.units(self.system)
         points, states = self.space.constants(units), self.wanted.constants()
         layout = Layout(
             self.space.dims, self.blocks, variables, {**points, **states}, (*points, *states),

@@ -71,13 +71,11 @@ class Wanted:
             "state_unit": (("state_name",), units, {}),
         }
 
-    def values(
-        self, cycles: LimitCycles, variables: Mapping[str, Variable]
-    ) -> dict[str, np.ndarray]:
+    def values(self, cycles: LimitCycles, chosen: Mapping[str, Variable]) -> dict[str, np.ndarray]:
         """Return the results of some cycles."""
         values = self._values(cycles)
         for name, measure in self.measures.items():
-            values[name] = stacked(name, _measured(cycles, name, measure), variables[name])
+            values[name] = stacked(name, _measured(cycles, name, measure), chosen[name])
         return values
 
     def _values(self, cycles: LimitCycles) -> dict[str, np.ndarray]:

@@ -52,8 +52,7 @@ class BoundSections(eqx.Module):
     @classmethod
     def at_levels(cls, levels: AbstractLevels, n_sections: SectionCount) -> "BoundSections":
         """Sections at which level functions fall through zero."""
-        never = jnp.full(n_sections, jnp.inf)
-        return cls(never, jnp.full(n_sections, -1, jnp.int32), levels)
+        return cls(jnp.full(n_sections, jnp.inf), jnp.full(n_sections, -1, jnp.int32), levels)
 
 
 class AbstractSections(Definition):

@@ -9,8 +9,9 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
-from .._core.compilation import by_columns, host_first
+from .._core.compilation import host_first
 from .._core.executor import Array, is_traced, namespace
+from .._core.host_derivatives import by_columns
 from .._core.progress import working
 from ..engine import kernels
 from ..linear.ldtp import LDTP
@@ -96,10 +97,8 @@ def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     J = np.moveaxis(by[:, 1:], -1, 0)
     C, D = (x.reshape(N, P, *x.shape[1:]) for x in (J[..., :n] @ embed, J[..., n:]))
     each = A, after @ jacobians[..., n:], C, D
-    return _matrices_of(placed, outputs), (
-        *(np.moveaxis(x.imag / kernels.TINY, 1, 0) for x in each),
-        None,
-    )
+    columns = (np.moveaxis(x.imag / kernels.TINY, 1, 0) for x in each)
+    return _matrices_of(placed, outputs), (*columns, None)
 
 
 def _relevant(tangents: tuple) -> tuple:

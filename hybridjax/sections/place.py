@@ -8,11 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from .._core.boundary.checked import checked
-from .._core.compilation import NotOnHostError, at_ease, host_first, quick_jit, require_program
+from .._core.compilation import at_ease, host_first, quick_jit
 from .._core.executor import Array, is_traced, namespace, on_host, put, scan, stop_gradient, to_host
+from .._core.host_derivatives import NotOnHostError, require_program
 from .._core.lanes import by_lane
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -27,7 +28,7 @@ from ..errors import ComputationError, DefinitionError
 from ..orbits.coincidence import SAME, TOGETHER
 from ..orbits.crossing import Crossing, ListLevels, to_section
 from ..orbits.cycle import LimitCycle
-from ..orbits.return_map import PATIENCE, ReturnMap, with_derivatives
+from ..orbits.return_map import PATIENCE, ReturnMap
 from ..systems.structure import Structure
 from . import families
 from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
@@ -112,7 +113,7 @@ def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tu
 
 
 def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any, Any]:
-    """As `_place`; on the host `flows` gets the start, the target and the tape of every flow."""
+    """Do as `_place`; on the host `flows` gets the start, target and tape of every flow."""
     s, N = Structure(map.system), family.n_sections
     period, begin, xp = map.expected, map.anchor, namespace(map.expected)
     u = xp.zeros((s.nu, 1))
@@ -163,13 +164,12 @@ def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any,
         first = carry[2][0]
         _, flows = scan(lambda carry, k: to_next(carry, k, bound), carry, xp.arange(1, N + 1))
     lanes, end, result, tape = _side_by_side(flows)
-    normal = _normals(s, bound, lanes)
+    normal = _normals(s, bound, lanes, xp.arange(N), u)
     f = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
     share = xp.abs(normal.T * xp.concatenate([xp.ones((1, N)), f]))
     flat = xp.max(share, axis=0) == 0
     drop = xp.where(flat, -1, xp.argmax(share, axis=0))
-    with_time = xp.isinf(bound.time) & (map.base is None)
-    dims = xp.asarray(s.dims)[lanes.chart] + with_time - ~flat
+    dims = xp.asarray(s.dims)[lanes.chart] + (xp.isinf(bound.time) & (map.base is None)) - ~flat
     return first, (bound, lanes, tape, end - lanes.t, result, drop, dims, normal)
 
 
@@ -192,18 +192,15 @@ def place_along(
     def follow(flows, by_levels, times):
         levels = flows[0][1].levels
         flows = [(lanes, dataclasses.replace(to, levels=None), tape) for lanes, to, tape in flows]
-        stacked = jax.tree_util.tree_map(lambda *x: np.stack(x), *flows)
-        lanes, target, tape = _side_by_side(stacked)
+        lanes, target, tape = _side_by_side(jax.tree_util.tree_map(lambda *x: np.stack(x), *flows))
         target = dataclasses.replace(target, levels=levels)
-        by_levels = None if levels is None else by_levels
         along = kernels.Tangents(s, by_cycle.structure, levels, by_levels, P)
         flow = Variation(along, lanes, target, tape, times)
         return flow, flow.tangents(x), along
 
     if isinstance(family.anchor, Crossing):
-        x = follow(flows[:1], ListLevels((cast(Crossing, by_family.anchor),)), np.zeros((P, 1)))[1][
-            -1
-        ]
+        levels = ListLevels((cast(Crossing, by_family.anchor),))
+        x = follow(flows[:1], levels, np.zeros((P, 1)))[1][-1]
         flows = flows[1:]
     start, points = flows[0][0], x[None]
     orbit = Orbit(cycle.period, start.t, start.chart, start.q.T)
@@ -213,8 +210,7 @@ def place_along(
         points, flows = points[flow.first], flows[M:]
         orbit = Orbit(cycle.period, flow.starts.t, flow.starts.chart, flow.starts.q.T)
     moving = longer, np.moveaxis(points[:, 0], 1, 0), np.moveaxis(points[:, 1:], 2, 0)
-    directions = by_cycle.structure, by_family, moving
-    raw, by_bound = to_host(_bind_along(s, family, orbit, directions))
+    raw, by_bound = to_host(_bind_along(s, family, orbit, (by_cycle.structure, by_family, moving)))
     clock = np.isfinite(bound.time)
     late = np.rint((bound.time[0] - raw.time[0]) / cycle.period) if clock[0] else 0.0
     k = np.arange(N + 1)[-len(flows) :]
@@ -223,21 +219,11 @@ def place_along(
     flow, tangents, along = follow(flows, by_bound.levels, times)
     t, chart, q, u = (y[..., -N * P :] for y in flow.points(tangents))
     many = lambda y: np.repeat(y, P)  # noqa: E731
-    index, levels = many(np.arange(N, dtype=np.int32)), bound.levels
-
-    def gradient(a, t, q, u):
-        n = 2 + s.dims[a] + s.nu
-        if levels is None or not levels.present(s, a):
-            return np.zeros((1, n, N * P))
-        return kernels.watched(along, a, levels, t, q, u, index)[-1:]
-
-    normal = with_derivatives(along, gradient, chart, t, q, 1, u)[0, 1 : 2 + s.d].T
-    normal = np.where(many(np.isinf(bound.time) & (bound.event < 0))[:, None], normal, 0.0)
-    moved = dataclasses.replace(
-        placed, bound=dataclasses.replace(bound, time=many(bound.time)),
-        lanes=placed.lanes._replace(t=t, chart=chart, q=q), drop=many(placed.drop),
-        dims=many(placed.dims), normal=normal,
-    )  # fmt: skip
+    lanes = placed.lanes._replace(t=t, chart=chart, q=q)
+    bound = dataclasses.replace(bound, time=many(bound.time), event=many(bound.event))
+    normal = _normals(along, bound, lanes, many(np.arange(N)), u)
+    rows = dict(drop=many(placed.drop), dims=many(placed.dims), normal=normal)
+    moved = dataclasses.replace(placed, bound=bound, lanes=lanes, **rows)
     return placed, moved, along, flow.jacobians(tangents)[-N:]
 
 
@@ -293,10 +279,7 @@ def _bind(
         carry = anchor, (0.1 * period / M)[None], xp.zeros(1, xp.int32)
         lanes = _side_by_side(scan(later, carry, xp.arange(1, M + 1))[1])
     orbit = Orbit(period, lanes.t, lanes.chart, lanes.q.T)
-    if on_host(period):
-        bound = to_host(_bind_program(map, family, orbit))
-    else:
-        bound = family.bind(s, orbit)
+    bound = to_host(_bind_program(map, family, orbit)) if on_host(period) else family.bind(s, orbit)
     late = xp.ceil((t - bound.time[0]) / period - TOGETHER)
     late = xp.where(xp.isfinite(bound.time[0]), stop_gradient(late), 0.0)
     return dataclasses.replace(bound, time=bound.time + late * period)
@@ -307,27 +290,26 @@ def _bind_program(map: ReturnMap, family: AbstractSections, orbit: Orbit) -> Bou
     return family.bind(map.structure, orbit)
 
 
-def _normals(s: Structure, bound: BoundSections, lanes: Lanes) -> Float[Array, "N n"]:
-    """Gradients of the levels with respect to (t, q)."""
-    xp, N, levels = namespace(lanes.t), lanes.t.shape[0], bound.levels
-    out = xp.zeros((1 + s.d, N))
+def _normals(s: Structure, bound: BoundSections, lanes: Lanes, index, u) -> Array:
+    """Gradients (N, n) of the levels with respect to (t, q)."""
+    xp, levels = namespace(lanes.t), bound.levels
+    out = xp.zeros((1 + s.d, len(index)), lanes.t.dtype)
     if levels is None:
         return out.T
     state_based = xp.isinf(bound.time) & (bound.event < 0)
 
     def work(a, mask, out):
         n = s.dims[a]
-        point = only(mask, xp.arange(N)), only(mask, lanes.t), only(mask, lanes.q[:n])
-        gradients = put(out, slice(1 + n), _level_gradients(s, a, levels, *point))
+        point = only(mask, index), only(mask, lanes.t), only(mask, lanes.q[:n])
+        gradients = put(out, slice(1 + n), _level_gradients(s, a, levels, *point, u))
         return xp.where(mask, gradients, out) if levels.present(s, a) else out
 
     return for_each_chart(s, lanes.chart, state_based, work, out).T
 
 
-def _level_gradients(s: Structure, a: int, levels: AbstractLevels, i, t, q) -> Float[Array, "n N"]:
-    """Gradients of levels i with respect to (t, q) in chart a."""
+def _level_gradients(s: Structure, a: int, levels: AbstractLevels, i, t, q, u) -> Array:
+    """Gradients (n, N) of levels i with respect to (t, q) in chart a."""
     if on_host(t):
-        u = np.zeros((s.nu, 1))
         return kernels.watched(s, a, levels, t, q, u, i)[-1, 1 : 2 + len(q)]
 
     def gradient(i, t, q):

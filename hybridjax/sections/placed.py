@@ -128,8 +128,7 @@ class PlacedSections(eqx.Module):
         kept = (k != drop) & ((k > 0) | self.time_is_state[:, None])
         kept_first = xp.argsort(~kept, axis=1, stable=True)
         # One column more than a chart has states is never needed: (t, q) less the dropped entry.
-        valid = k < self.dims[:, None]
-        select = xp.where(valid[:, :, None], xp.eye(n)[kept_first], 0.0)
+        select = xp.where((k < self.dims[:, None])[:, :, None], xp.eye(n)[kept_first], 0.0)
         slope = -normal / xp.where(drops, xp.take_along_axis(normal, drop, axis=1), 1.0)
         along = xp.where((k == drop)[:, :, None] & drops[:, None], slope[:, None, :], 0.0)
         return (xp.eye(n) + along) @ xp.swapaxes(select, 1, 2), select

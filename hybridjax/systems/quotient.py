@@ -119,11 +119,8 @@ class Quotient(Derived):
         return {name: _Reduced(x, self.translation) for name, x in charts if name not in left_out}
 
     def transitions(self):
-        return [
-            self._transition(x)
-            for x in self.system.transitions()
-            if x.source not in self.swap.values()
-        ]
+        left_out = self.swap.values()
+        return [self._transition(x) for x in self.system.transitions() if x.source not in left_out]
 
     def _transition(self, x: Transition) -> Transition:
         at = self._reduced(x.source).lifted
@@ -174,7 +171,7 @@ class Quotient(Derived):
         charts, events = self.system.charts(), self.system.transitions()
         kept_of = {name: name for name in charts} | {b: a for a, b in self.swap.items()}
 
-        def functions(name, shift=0.0):
+        def parts(name, shift=0.0):
             """All functions of a chart, with rates mirrored back if it is left out."""
             kept = kept_of[name]
             back = lambda x: x if name == kept else self._mirrored(kept, x, back=True)  # noqa: E731
@@ -190,12 +187,10 @@ class Quotient(Derived):
             return function(t, state if name == kept else self._mirrored(kept, state), u)
 
         for name in charts if self.translation else ():
-            for (what, before), (_, after) in zip(
-                functions(name), functions(name, 0.7), strict=True
-            ):
+            for (what, before), (_, after) in zip(parts(name), parts(name, 0.7), strict=True):
                 yield f"the {what} changes under the translation", before, after
         for kept, other in self.swap.items():
-            ours, images = list(functions(kept)), list(functions(other))
+            ours, images = list(parts(kept)), list(parts(other))
             if len(ours) != len(images):
                 sentence = f"'{kept}' and '{other}' have different numbers of transitions"
                 yield sentence, lambda *_: 0.0, lambda *_: 1.0
@@ -250,9 +245,7 @@ class _Halves(Derived):
 
     def __check_init__(self):
         if (self.system.period() is not None) != (self.half_period is True):
-            sentence = (
-                "True if a clock drives the system, otherwise a state or a function of (t, q)"
-            )
+            sentence = "True if a clock drives the system, else a state or a function of (t, q)"
             raise DefinitionError(f"Quotient: `half_period` must be {sentence}.")
         if any(isinstance(x.guard, Scheduled) for x in self.system.transitions()):
             raise DefinitionError("Quotient: `half_period` does not cover scheduled transitions.")

@@ -63,9 +63,7 @@ def sliding(
         raise DefinitionError(f"sliding takes two charts, above and below, not {len(charts)}.")
     (above, f), (below, g) = charts.items()
     if f.states != g.states or f.inputs != g.inputs:
-        raise DefinitionError(
-            f"charts '{above}' and '{below}' must have the same states and inputs."
-        )
+        raise DefinitionError(f"charts '{above}' and '{below}' need the same states and inputs.")
     middle = SlidingChart(f, g, surface)
     height = lambda t, q, u: surface(t, q)  # noqa: E731
     held = lambda t, q, u: middle.rates(t, q, u)[1] >= 0  # noqa: E731
@@ -74,10 +72,8 @@ def sliding(
     up = lambda t, q, u: middle.rates(t, q, u)[0]  # noqa: E731
     down = lambda t, q, u: middle.rates(t, q, u)[1]  # noqa: E731
 
-    def event(source, target, guard, direction: Direction = "falling", enabled=None):
-        return Transition(
-            f"{source} to {target}", source, target, guard, direction, enabled=enabled
-        )
+    def event(source, target, guard, sense: Direction = "falling", enabled=None):
+        return Transition(f"{source} to {target}", source, target, guard, sense, enabled=enabled)
 
     transitions = [
         event(above, name, height, enabled=held),

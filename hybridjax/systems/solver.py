@@ -129,8 +129,7 @@ def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) ->
         a += np.diag(tableau.a_diagonal)
     if a[0, 0] != 0 or tableau.c1 != 0:
         raise _no_solver(name)
-    c = (0.0, *tableau.c)
-    return _method(name, a, tableau.b_sol, np.array(c), tableau.b_error, order)
+    return _method(name, a, tableau.b_sol, np.array((0.0, *tableau.c)), tableau.b_error, order)
 
 
 def _method(name: str, a, b, c, error, order: float, **controls: Any) -> Method:

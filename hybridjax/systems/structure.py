@@ -219,9 +219,7 @@ class Structure:
 
         return make() if name is None else self.once(name, trees, make)
 
-    def kernel(
-        self, function: Callable, form: Any, *static: Hashable, trees: tuple = (), lanes=1
-    ) -> Callable:
+    def kernel(self, function: Callable, form, *static: Hashable, trees=(), lanes=1) -> Callable:
         """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
         compiled (see `_core/compilation/kernel.py`)."""
         name = function, form, static, lanes
@@ -328,8 +326,7 @@ class Structure:
         alike = [self.transitions[x] for x in g.kind]
         if len(alike) == 1:
             return alike[0]
-        functions = member_of([(x.guard, x.reset, x.enabled) for x in alike], g.place)
-        guard, reset, enabled = functions
+        guard, reset, enabled = member_of([(x.guard, x.reset, x.enabled) for x in alike], g.place)
         return dataclasses.replace(alike[0], guard=guard, reset=reset, enabled=enabled)
 
     def guard(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:

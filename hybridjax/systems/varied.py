@@ -69,8 +69,7 @@ class Varied(Derived):
                 return function
             return lambda t, q, u: getattr(list(self.at(u[0]).transitions())[g], name)(t, q, still)
 
-        names = "guard", "reset", "enabled"
-        return dataclasses.replace(x, **{name: of(name) for name in names})
+        return dataclasses.replace(x, **{name: of(name) for name in ("guard", "reset", "enabled")})
 
     def _size(self, chart: str) -> int:
         inputs = self.system.charts()[chart].inputs

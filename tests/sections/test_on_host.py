@@ -8,7 +8,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import hybridjax as hj
-from hybridjax._core.compilation import NotOnHostError, only_on_host
+from hybridjax._core.host_derivatives import NotOnHostError, only_on_host
 
 from ..conftest import APEX
 

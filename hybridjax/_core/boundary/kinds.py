@@ -18,21 +18,9 @@ import numpy as np
 
 from .. import limits
 from ..arguments import Numbers
+from . import values
 from .containers import Either, Having, Instance, Items, Names, Table, Tuple
-from .values import (
-    FUNCTION,
-    NOTHING,
-    PATH,
-    TEXT,
-    Complexes,
-    Integers,
-    Kind,
-    Number,
-    OneOf,
-    Reals,
-    Switch,
-    Whole,
-)
+from .values import Complexes, Integers, Kind, Number, OneOf, Reals, Switch, Whole
 
 
 # Whole numbers.
@@ -71,7 +59,7 @@ OptionalNames = Annotated[str | Sequence[str], Names(empty=True)]
 NewOptionalNames = Annotated[str | Sequence[str] | Mapping[str, str], Names(units=True, empty=True)]
 NewNames = Annotated[str | Sequence[str] | Mapping[str, str], Names(units=True)]
 """Names that are given to something; or units by name, as in `{"yM": "m", "force": "N"}`."""
-FilePath = Annotated[str | os.PathLike[str], PATH]
+FilePath = Annotated[str | os.PathLike[str], values.PATH]
 
 
 _PLAIN = {
@@ -79,8 +67,8 @@ _PLAIN = {
     int: Whole(),
     float: Number(),
     complex: Number(),  # (in jaxtyping's `ArrayLike`; no number of this package is complex)
-    str: TEXT,
-    type(None): NOTHING,
+    str: values.TEXT,
+    type(None): values.NOTHING,
     typing.SupportsIndex: Whole(),
 }
 _SEQUENCES: dict[Any, dict[str, Any]] = {
@@ -111,7 +99,7 @@ def kind_of(hint: Any) -> Kind | None:
     if origin in (Union, types.UnionType):
         return _either(arguments)
     if hint is collections.abc.Callable or origin is collections.abc.Callable:
-        return FUNCTION
+        return values.FUNCTION
     if origin is tuple:
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             return Items(kind_of(arguments[0]), form=tuple)
@@ -137,7 +125,7 @@ def _either(arguments: tuple[Any, ...]) -> Kind | None:
     narrow = [kind for kind in kinds if kind is not None]
     if len(narrow) < len(kinds):
         return None
-    return Either(*sorted(narrow, key=lambda kind: kind is NOTHING))
+    return Either(*sorted(narrow, key=lambda kind: kind is values.NOTHING))
 
 
 def _of_class(cls: type) -> Kind:

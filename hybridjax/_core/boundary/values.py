@@ -58,11 +58,7 @@ def show(value: Any) -> str:
         return f"an array of {value.dtype} with shape {value.shape}"
     if isinstance(value, np.generic):
         return show(value.item())
-    if (
-        value is None
-        or value is ...
-        or isinstance(value, bool | int | float | complex | str | bytes)
-    ):
+    if value is None or value is ... or isinstance(value, int | float | complex | str | bytes):
         try:
             text = repr(value)
         except ValueError:  # an integer with more digits than Python writes
@@ -225,8 +221,7 @@ def _is_path(value: Any) -> bool:
 def _plain(value: Any, allowed: str) -> Any:
     """A number of Python for an array without axes."""
     refuse_traced(value, allowed)
-    is_array = isinstance(value, np.ndarray | jax.Array)
-    return value.item() if is_array and value.ndim == 0 else value
+    return value.item() if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0 else value
 
 
 def refuse_traced(value: Any, allowed: str) -> None:
@@ -303,15 +298,13 @@ class Reals(Kind):
                 ) from None
         raise self.refused(value) from None
 
-    def _wrong_type(self, value: Any, array: Any) -> Misfit:
-        if array.dtype.kind == "c":
+    def _wrong_type(self, value: Any, x: Any) -> Misfit:
+        if x.dtype.kind == "c":
             return Misfit(f"must be real, not {show(value)}", near=True)
-        if array.ndim == 0 or isinstance(value, str | dict | set):
+        if x.ndim == 0 or isinstance(value, str | dict | set):
             return self.refused(value)
         wrong = {"U": "strings", "S": "bytes", "O": "other objects"}
-        return Misfit(
-            f"must hold {self.items}, not {wrong.get(array.dtype.kind, array.dtype)}", near=True
-        )
+        return Misfit(f"must hold {self.items}, not {wrong.get(x.dtype.kind, x.dtype)}", near=True)
 
     def _fits(self, shape: tuple[int, ...]) -> bool:
         if self.shape == ("...",):

@@ -130,14 +130,12 @@ class ZarrStore:
                 for name in about["variables"]
             }
             first, p = next(iter(self._arrays.values())), len(about["dims"])
-            variables = {
+            arrays = {
                 name: Variable(x.dtype.str, tuple(x.metadata.dimension_names[p:]), x.shape[p:])
                 for name, x in self._arrays.items()
             }
             blocks = Blocks(first.shape[:p], first.chunks[:p])
-            self.layout = Layout(
-                tuple(about["dims"]), blocks, variables, {}, (), about["description"]
-            )
+            self.layout = Layout(tuple(about["dims"]), blocks, arrays, {}, (), about["description"])
             # (Zarr would read a chunk that was deleted as zeros.)
             kept = self._group[_START]
             start = [kept[f"{i}"] for i in range(about["start"])]

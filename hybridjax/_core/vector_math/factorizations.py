@@ -122,8 +122,7 @@ def triangular_solve(
     if not left_side:  # the transpose of the first form
         right, transpose_a = jnp.swapaxes(right, -1, -2), not transpose_a
     op = jnp.swapaxes(matrix, -1, -2) if transpose_a else matrix
-    downwards = lower != transpose_a
-    n = op.shape[-1]
+    downwards, n = lower != transpose_a, op.shape[-1]
     X: dict[int, Array] = {}
     for i in range(n) if downwards else reversed(range(n)):
         x = _less(right[..., i, :], [(op[..., i, k][..., None], X[k]) for k in X])
@@ -160,10 +159,8 @@ def lu(
         row, column = _row(X, k), _column(X, k)
         pivot = _row(column[..., None], k)
         share = jnp.where(index > k, column / jnp.where(pivot == 0, 1.0, pivot), 0.0)
-        beyond = jnp.where(index > k, row, 0.0)
-        X = X - share[..., :, None] * beyond[..., None, :]
-        below = (index == k) & (index[:, None] > k)
-        return jnp.where(below, share[..., :, None], X), pivots, order
+        X = X - share[..., :, None] * jnp.where(index > k, row, 0.0)[..., None, :]
+        return jnp.where((index == k) & (index[:, None] > k), share[..., :, None], X), pivots, order
 
     order = jnp.broadcast_to(jnp.arange(n, dtype=np.int32), matrix.shape[:-1])
     return jax.lax.fori_loop(0, n, eliminate, (matrix, jnp.zeros_like(order), order))

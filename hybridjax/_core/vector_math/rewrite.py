@@ -102,9 +102,7 @@ def _number(eqn: jex.JaxprEqn) -> int:
     """Return the number of our trigonometric functions in an equation."""
     if eqn.primitive in _TRIGONOMETRY:
         return 1
-    if eqn.primitive.name not in _OUTER:
-        return 0
-    return sum(map(_number, _inner(eqn)))
+    return sum(map(_number, _inner(eqn))) if eqn.primitive.name in _OUTER else 0
 
 
 def _inner(eqn: jex.JaxprEqn) -> list[jex.JaxprEqn]:
@@ -151,9 +149,7 @@ def _rows(*parts):
 
 def _replaced(jaxpr: jex.Jaxpr, trigonometry: bool) -> jex.Jaxpr:
     """A program of the same type with our functions; itself if there is nothing to replace."""
-    factors = {
-        v: eqn for eqn in jaxpr.eqns if eqn.primitive is primitives.lu_p for v in eqn.outvars
-    }
+    factors = {v: e for e in jaxpr.eqns if e.primitive is primitives.lu_p for v in e.outvars}
     solved = [_solved(eqn, factors) or eqn for eqn in jaxpr.eqns]
     places = [*jaxpr.outvars, *(v for eqn in solved for v in eqn.invars)] if factors else []
     needed = {v for v in places if isinstance(v, jex.Var)}

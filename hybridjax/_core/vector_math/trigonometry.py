@@ -66,8 +66,7 @@ def _polynomial(coefficients, z):
 def _sincos(x):
     n = _N
     k = jax.lax.round(x * (2 / jnp.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
-    a = x - k * n.pi_2[0]
-    b = k * n.pi_2[1]
+    a, b = x - k * n.pi_2[0], k * n.pi_2[1]
     r = a - b
     lost = (a - r) - b  # by rounding
     r = (r + (lost - k * n.pi_2[2])) - k * n.pi_2[3]

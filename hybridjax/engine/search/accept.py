@@ -91,8 +91,7 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
     chosen = lands & (np.arange(len(zero))[:, None] == aim.which)
     at_end = lands & (xp.abs(end.value) <= zero)
     positions = xp.where(chosen | at_end, xp.inf, crossing.position)
-    position = xp.min(positions, axis=0)
-    bent = fresh & new.bent
+    position, bent = xp.min(positions, axis=0), fresh & new.bent
     crosses = looked_at & xp.isfinite(position) & ~bent
     refine = bent | (looked_at & ~crosses & (crossing.near & ~chosen).any(axis=0))
     lands = lands & ~crosses & ~refine

@@ -80,8 +80,7 @@ def land(
     end = flow.locate(t + tau, step.q, step.f1, which, first)
     share = xp.abs(first) / xp.where(aim.reach > 0, aim.reach, 1.0)
     # (A short step is explicit: where modes die out within it, it has no orders of the method's.)
-    implicit = flow.method.implicit
-    weight = 1 / _LANDING_PART if implicit else xp.where(share > 0, share, 0.0) ** 2
+    weight = 1 / _LANDING_PART if flow.method.implicit else xp.where(share > 0, share, 0.0) ** 2
     error = xp.max(end.error / allowed * weight, axis=0)
     fine = xp.abs(end.last) <= LANDING * xp.abs(tau + end.past) + INSTANT * span
     lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(error) <= 1.0)
@@ -94,9 +93,7 @@ def land(
     )
 
 
-def attempt(
-    state: State, aim: Aim, task: Task, unroll: bool = False, in_step: bool = False
-) -> Attempt:
+def attempt(state: State, aim: Aim, task: Task, unroll=False, in_step: bool = False) -> Attempt:
     """Let the active lanes step, and land those that come close to the zero they aim at.
 
     With `in_step`, all lanes are assumed to go equally far from the same time, to no zero; then
@@ -119,36 +116,34 @@ def attempt(
         if along is not None and out.along is not None:
             along = put(out.along, slice(n), xp.where(here, along, out.along[:n]))
             out = out._replace(along=along)
-        landing = Landing(step.q, step.f1, zero, no, zero)
+        end = Landing(step.q, step.f1, zero, no, zero)
         if rows:
             before = Watch(*(take_rows(x, rows) for x in state.watched))
             which = xp.where(here, aim.which, -1)
             if not in_step:
                 goal = aim._replace(which=which, step=tau)
-                landing = cond(
+                end = cond(
                     (which >= 0).any(),
                     lambda: land(flow.only(which >= 0), before, step, allowed, t, goal, task.span),
-                    lambda: landing,
+                    lambda: end,
                 )
-            moved = tau if in_step else tau + xp.where(landing.lands, landing.past, 0.0)
-            after = cond(
-                present, lambda: flow.watch(t + moved, landing.q, landing.f), lambda: before
-            )
-            bent = _bent(flow, before, after, (q, step.f0), landing, t, moved, task.span)
-            chosen = (np.array(rows)[:, None] == which) & landing.lands
+            moved = tau if in_step else tau + xp.where(end.lands, end.past, 0.0)
+            after = cond(present, lambda: flow.watch(t + moved, end.q, end.f), lambda: before)
+            bent = _bent(flow, before, after, (q, step.f0), end, t, moved, task.span)
+            chosen = (np.array(rows)[:, None] == which) & end.lands
             far, slow = _clearance(before, after, moved, take_rows(state.ready, rows), chosen)
             calm = (far | chosen).all(axis=0) & ~bent & ~slow
             out = out._replace(
                 watched=write(out.watched, rows, here, after),
-                past=xp.where(here, landing.past, out.past),
-                lands=xp.where(here, landing.lands, out.lands),
+                past=xp.where(here, end.past, out.past),
+                lands=xp.where(here, end.lands, out.lands),
                 slow=xp.where(here, slow, out.slow),
                 bent=xp.where(here, bent, out.bent),
                 calm=xp.where(here, calm, out.calm),
             )
         return out._replace(
-            q=put(out.q, slice(n), xp.where(here, landing.q, out.q[:n])),
-            error=xp.where(here, error + landing.error, out.error),
+            q=put(out.q, slice(n), xp.where(here, end.q, out.q[:n])),
+            error=xp.where(here, error + end.error, out.error),
         )
 
     return for_each_chart(s, lanes.chart, state.active, work, empty)
@@ -218,9 +213,7 @@ def _errors(
     return allowed, xp.where(finite, error, xp.inf)
 
 
-def _bent(
-    flow: ChartFlow, before: Watch, after: Watch, start, end: Landing, t, moved, span
-) -> Mask:
+def _bent(flow: ChartFlow, before: Watch, after: Watch, start, end, t, moved, span) -> Mask:
     """Test whether the cubic interpolant misses a watched function halfway, or there is none.
     `start`: the state and the field at the start of the step."""
     xp, (q, f0) = namespace(moved), start
@@ -244,8 +237,7 @@ def _clearance(
     points = control_points(*ends)
     low = xp.minimum(xp.minimum(points[0], points[1]), xp.minimum(points[2], points[3]))
     high = xp.maximum(xp.maximum(points[0], points[1]), xp.maximum(points[2], points[3]))
-    scale = xp.maximum(xp.abs(ends[0]), xp.abs(ends[1]))
-    far = xp.where(armed, low > NEAR * scale, high <= 0)
+    far = xp.where(armed, low > NEAR * xp.maximum(xp.abs(ends[0]), xp.abs(ends[1])), high <= 0)
     fastest = xp.maximum(xp.abs(ends[2]), xp.abs(ends[0]))
     # (By rounding, the zero may lie a little before the start.)
     slow = (chosen & (xp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)

@@ -148,9 +148,7 @@ def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> App
     by."""
     approach, crosses, which = state.approach, verdict.crosses, verdict.which
     xp = namespace(moved)
-    fastest = xp.maximum(
-        xp.abs(of_row(state.watched.rate, which)), xp.abs(of_row(new.watched.rate, which))
-    )
+    fastest = xp.maximum(*(xp.abs(of_row(x.watched.rate, which)) for x in (state, new)))
     tau = xp.clip(approach.tau + new.past, 0.0, approach.reach)
     return Approach(
         crosses | verdict.closer,
@@ -172,8 +170,7 @@ def _next_step(
     h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
     h = xp.where(verdict.lost, 0.5 * aim.reach, h)
     h = xp.where(verdict.refine, 0.5 * aim.step, h)
-    rejected = too_long | verdict.refine | verdict.lost
-    return h, rejected & (h < INSTANT * task.span)
+    return h, (too_long | verdict.refine | verdict.lost) & (h < INSTANT * task.span)
 
 
 def level_counts(watched: Watch, span: Times) -> Mask:

@@ -99,16 +99,14 @@ def _calm_steps(state: State, tape: Tape | None, task: Task) -> State:
     trees, static = (target.levels, task.settings), ((a, bool(task.tangents), target.missed),)
     make = lambda: deferred(_calm_loop, ft.partial, static, (s, *trees))  # noqa: E731
     loop = s.once(("calm steps", static), trees, make)
-    ends = target.time, target.index, target.limit
-    taken = loop(state, task.u, ends, (task.span, task.stride))
+    taken = loop(state, task.u, (target.time, target.index, target.limit), (task.span, task.stride))
     if taken is None:
         return state
     moving, count, rows = taken
     if tape is not None and count > 0:
         h, code, t, *q = rows[:count].T[..., None]
         q = np.stack(q, axis=1)
-        row = Tape(h, code, t, q, q, state.lanes.chart)
-        write_row(tape, slice(state.i, state.i + count), row)
+        write_row(tape, slice(state.i, state.i + count), Tape(h, code, t, q, q, state.lanes.chart))
     return _with(state, moving)
 
 
@@ -210,8 +208,7 @@ def take_aim(state: State, task: Task) -> Aim:
     due = xp.minimum(target.time, scheduled)
     schedule = xp.where(scheduled <= target.time, which, -1)
     left = xp.maximum(due - lanes.t, 0.0)
-    steps = xp.where(xp.isfinite(left), left / state.h, 2.0)
-    pieces = xp.ceil(steps - SAME_TIME)
+    pieces = xp.ceil(xp.where(xp.isfinite(left), left / state.h, 2.0) - SAME_TIME)
     last = (pieces <= 1) & ~approach.on
     step = xp.where(xp.isfinite(left), left / xp.maximum(pieces, 1.0), state.h)
     which = xp.where(approach.on, approach.which, -1)
@@ -252,5 +249,4 @@ def initial_step(s: Structure, lanes: Lanes, u: Inputs, span: Times, settings: S
 
     assert settings.rtol is not None
     xp, rtol = namespace(lanes.t), settings.rtol
-    everywhere = xp.ones(lanes.t.shape[0], bool)
-    return for_each_chart(s, lanes.chart, everywhere, work, _FIRST_STEP * span)
+    return for_each_chart(s, lanes.chart, xp.ones(lanes.t.shape[0], bool), work, _FIRST_STEP * span)

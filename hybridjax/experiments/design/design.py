@@ -10,20 +10,10 @@ from jaxtyping import Float, Int
 
 from ..._core import limits
 from ..._core.arguments import Numbers, names, require_equal
+from ..._core.boundary import kinds
 from ..._core.boundary.checked import checked
 from ..._core.boundary.containers import Names
-from ..._core.boundary.kinds import (
-    Count,
-    ExperimentCount,
-    Index,
-    NonNegative,
-    PeriodCount,
-    Positive,
-    SectionCount,
-    Seed,
-    SignalNames,
-    Vector,
-)
+from ..._core.boundary.kinds import Count, Index, PeriodCount, SectionCount, SignalNames, Vector
 from ..._core.boundary.values import Integers
 from ...errors import DefinitionError
 from .partition import SINGULAR, check_sharing, is_real, needs_two_phases, regular
@@ -66,7 +56,7 @@ class Design(eqx.Module):
     phase: Float[np.ndarray, " K"]
     n_sections: SectionCount = eqx.field(static=True)
     periods: PeriodCount = eqx.field(static=True)
-    experiments: ExperimentCount = eqx.field(static=True)
+    experiments: kinds.ExperimentCount = eqx.field(static=True)
     input_names: Annotated[tuple[str, ...], Names()] = eqx.field(static=True, default=("u",))
 
     def __check_init__(self):
@@ -140,8 +130,7 @@ class Design(eqx.Module):
         for name in ("line", "channel", "amplitude", "phase"):
             shapes = self.experiment.shape, getattr(self, name).shape
             require_equal(f"`experiment` and `{name}`", "shapes", *shapes)
-        numbers = np.unique(self.experiment)
-        if not np.array_equal(numbers, np.arange(max(1, self.experiments))):
+        if not np.array_equal(np.unique(self.experiment), np.arange(max(1, self.experiments))):
             raise DefinitionError(
                 "every experiment needs a frequency: `frequencies` has none for some."
             )
@@ -234,10 +223,9 @@ class Design(eqx.Module):
         value = np.where(is_real(line, self.periods, self.n_sections), 2 * value.real, value)
         spectrum[experiment - first, line, channel] = value
         one = np.fft.irfft(spectrum, n=length, axis=1)
-        index = np.arange(cycles * self.n_sections) % length
-        return one[:, index]
+        return one[:, np.arange(cycles * self.n_sections) % length]
 
-    def scaled(self, rms: Positive) -> "Design":
+    def scaled(self, rms: kinds.Positive) -> "Design":
         """Return the design with amplitudes multiplied so that every signal has this rms value.
 
         Each signal (an input in one experiment) is scaled separately; the ratios of its amplitudes
@@ -246,7 +234,7 @@ class Design(eqx.Module):
         now = np.sqrt(np.mean(self.inputs() ** 2, axis=1))[self.experiment, self.channel]
         return eqx.tree_at(lambda d: d.amplitude, self, self.amplitude * rms / now)
 
-    def realizations(self, count: Count, seed: Seed = 0) -> "Design":
+    def realizations(self, count: Count, seed: kinds.Seed = 0) -> "Design":
         """Return the design `count` times over, each time with new random phases.
 
         The sample variance of their responses includes noise and nonlinear distortion, so it gives
@@ -290,7 +278,7 @@ class Design(eqx.Module):
         )
 
     def expected_variance(
-        self, noise: NonNegative = 1.0, repeats: Count = 1
+        self, noise: kinds.NonNegative = 1.0, repeats: Count = 1
     ) -> Float[np.ndarray, "F nu"]:
         """Return the variance of every H_m at `frequencies` for white output noise of this std.
 
@@ -313,8 +301,7 @@ class Design(eqx.Module):
     def crest_factors(self) -> Float[np.ndarray, " S"]:
         """Return max |u| / rms(u) of each experiment, the largest over its inputs."""
         u = self.inputs()
-        rms = np.sqrt(np.mean(u**2, axis=1))
-        peak = np.abs(u).max(axis=1)
+        rms, peak = np.sqrt(np.mean(u**2, axis=1)), np.abs(u).max(axis=1)
         return np.max(np.where(rms > 0, peak / np.where(rms > 0, rms, 1.0), 0.0), axis=1)
 
     def __repr__(self) -> str:

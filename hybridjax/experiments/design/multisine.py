@@ -6,25 +6,13 @@ from typing import Literal
 
 import numpy as np
 
+from ..._core.boundary import kinds
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import (
-    ExperimentCount,
-    NonNegative,
-    PeriodCount,
-    Positive,
-    SectionCount,
-    Seed,
-)
+from ..._core.boundary.kinds import ExperimentCount, NonNegative, PeriodCount, SectionCount, Seed
 from ...errors import DefinitionError
+from . import partition
 from .design import OFF_LINE, Design, InputNames, check_window, input_names
-from .partition import (
-    assign,
-    avoid_second_order,
-    fewest_experiments,
-    is_half_integer,
-    is_real,
-    needs_two_phases,
-)
+from .partition import assign, avoid_second_order, fewest_experiments, is_real, needs_two_phases
 
 
 Band = tuple[NonNegative, NonNegative]
@@ -44,7 +32,7 @@ def multisine(
     n_sections: SectionCount = 32,
     periods: PeriodCount = 64,
     band: Band | None = None,
-    amplitude: Positive | Callable[[np.ndarray], np.ndarray] = 0.01,
+    amplitude: kinds.Positive | Callable[[np.ndarray], np.ndarray] = 0.01,
     seed: Seed = 0,
     *,
     lines: Lines = "all",
@@ -159,13 +147,11 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
     """Return the lines j of a band."""
     f_min, f_max = band
     if not f_min <= f_max <= n_sections / 2:
-        raise DefinitionError(
-            f"the band from {f_min} to {f_max} must lie in [0, N/2 = {n_sections / 2}]."
-        )
+        raise DefinitionError(f"`band` {f_min} to {f_max} must lie in [0, N/2 = {n_sections / 2}].")
     low, high = int(np.ceil(f_min * periods - OFF_LINE)), int(np.floor(f_max * periods + OFF_LINE))
     j = np.arange(low, high + 1)
     if lines != "two-phase":
-        j = j[~is_half_integer(j, periods)]
+        j = j[~partition.is_half_integer(j, periods)]
     if lines == "odd":
         j = j[j % 2 == 1]
     if len(j) == 0:

@@ -74,8 +74,7 @@ def assign(
     at that moment (ties at random), so sizes differ by at most one. Needs
     `experiments >= fewest_experiments(line, periods)`, and then never fails.
     """
-    classes = line_class(line, periods)
-    load = np.zeros(experiments, int)
+    classes, load = line_class(line, periods), np.zeros(experiments, int)
     experiment = np.empty(len(line), int)
     for c in rng.permutation(np.unique(classes)):
         members = rng.permutation(np.flatnonzero(classes == c))
@@ -100,8 +99,7 @@ def avoid_second_order(
 
     **Raises:** `DefinitionError` if no such partition was found.
     """
-    classes = line_class(line, periods).tolist()
-    products = _products(periods)
+    classes, products = line_class(line, periods).tolist(), _products(periods)
     members = [np.flatnonzero(experiment == e).tolist() for e in range(experiment.max() + 1)]
     held = [[classes[i] for i in m] for m in members]
     hits = [_hits(c, products) for c in held]

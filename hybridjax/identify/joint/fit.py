@@ -26,13 +26,7 @@ from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
-from ..weights import (
-    SMALLEST_ERROR,
-    are_alike,
-    check_values,
-    correlation_of_neighbors,
-    error_weights,
-)
+from ..weights import SMALLEST_ERROR, are_alike, check_values, error_weights, neighbor_correlation
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
@@ -264,8 +258,7 @@ def fit_ldtp(
 
 
 def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
-    scale = check_values(htf)
-    direct = _is_direct(guess)
+    scale, direct = check_values(htf), _is_direct(guess)
     if not isinstance(guess, LDTP):
         guess = realize(htf, np.array(given_dims(guess, htf.n_sections, "guess")))
     require_same("guess and data", guess, htf)
@@ -308,11 +301,9 @@ def _fit_to_series(
     first = [n for part in parts for n in part.first.tolist()]
     drift = sum(round(float((part.drift**2).sum())) for part in parts)
     numbers = int(records.sampled.sum()) - drift
-    same = np.tile(np.eye(ny), (N, 1, 1))
-    problem = SeriesProblem(parts, same, innovations, free_start, numbers)
+    problem = SeriesProblem(parts, np.tile(np.eye(ny), (N, 1, 1)), innovations, free_start, numbers)
     if not isinstance(guess, LDTP):
-        dims = given_dims(guess, N, "guess") or []
-        model = subspace_model(records, dims, innovations, direct)
+        model = subspace_model(records, given_dims(guess, N, "guess") or [], innovations, direct)
     else:
         require_same("guess and data", guess, records)
         model = PeriodicModel.of(guess, scale, ny if innovations else 0)
@@ -332,8 +323,7 @@ def _fit_to_series(
         )
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the responses of `guess` are infinite: give a stable model.")
-    start = ModelPoint(problem.reweighted(model), model, direct)
-    point, converged = descend(start, FIRST_DAMPING)
+    point, converged = descend(ModelPoint(problem.reweighted(model), model, direct), FIRST_DAMPING)
     if check and not innovations:
         _require_answer(point)
     return _finished(point, converged, records, scale, freedom)
@@ -418,7 +408,7 @@ def _finished(
         known, harmonics = data.variance is not None, data.harmonics
         problem = cast(FrequencyProblem, point.problem)
         size = problem.weight * problem.target
-        correlation = correlation_of_neighbors(problem.errors(model), size, np.asarray(data.f))
+        correlation = neighbor_correlation(problem.errors(model), size, np.asarray(data.f))
     else:
         noise = noise_model(model, cast(SeriesProblem, point.problem).S, scale, data.outputs)
     c, slopes = characteristic_slopes(point.coordinates)

@@ -146,8 +146,7 @@ class SeriesProblem(NamedTuple):
                 gram += flat.T @ flat
                 gradient += _times(path.whiten[n], path.error[n]).ravel() @ flat
                 along += path.starts[n].swapaxes(1, 2) @ J.reshape(R, -1, P)
-            solved = _solve_starts(path.start_gram, along)
-            gram -= np.tensordot(along, solved, ((0, 1), (0, 1)))
+            gram -= np.tensordot(along, _solve_starts(path.start_gram, along), ((0, 1), (0, 1)))
         return NormalEquations(gram, gradient)
 
     def path(self, model: PeriodicModel, part: SeriesPart) -> Path:
@@ -168,8 +167,7 @@ class SeriesProblem(NamedTuple):
                 x[begins, 0, :, 1 : 1 + x.shape[2]] = np.eye(x.shape[2])
 
         def drive(n: int, later: Columns) -> None:
-            forced = _times(gain[n], y[n] * part.sampled[n])
-            later[..., 0] += part.u[n] @ model.B[n].T + forced
+            later[..., 0] += part.u[n] @ model.B[n].T + _times(gain[n], y[n] * part.sampled[n])
 
         states, left, starts = [], [], []
         gram, along = np.zeros((R, s, s)), np.zeros((R, s, 1))

@@ -157,8 +157,7 @@ def _from_htf(htf: HTF, dims: Any, order: int) -> LDTP:
     p = min(default_horizon(N), F - 1)
     if p < 1:
         raise DefinitionError("one frequency is too few: give HTFs at two or more.")
-    m = np.array(all_harmonics(N))
-    H = np.zeros((N, F, ny, nu), complex)
+    m, H = np.array(all_harmonics(N)), np.zeros((N, F, ny, nu), complex)
     H[np.isin(m, htf.harmonics)] = htf.H
     G = np.tensordot(np.exp(2j * np.pi * np.outer(np.arange(N), m) / N), H, 1)
     if htf.variance is None:

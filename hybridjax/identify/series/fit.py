@@ -17,18 +17,8 @@ from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..denominator import (
-    SLOWEST,
-    Covariance,
-    block_freedom,
-    chi,
-    correlated_cycles,
-    fading,
-    in_blocks,
-    inverse_of_remainder,
-    multipliers_of,
-    sandwich,
-)
+from .. import denominator
+from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import refuse_invented
@@ -99,8 +89,7 @@ class SeriesFit(MultiplierEstimate):
         powers = np.exp(-2j * np.pi / N * f[:, None] * (np.arange(R) - self.lead))
         period_delay = np.exp(-2j * np.pi * f)
         below = chi(period_delay, self.coefficients)
-        n = np.arange(N)
-        to_harmonics = np.exp(-2j * np.pi * np.outer(harmonics, n) / N) / N
+        to_harmonics = np.exp(-2j * np.pi * np.outer(harmonics, np.arange(N)) / N) / N
 
         def sum_up(b):  # (..., N, R, ny, nu) -> (..., M, F, ny, nu)
             G = np.einsum("fr,...nrij->...nfij", powers, b) / below[:, None, None]
@@ -163,7 +152,7 @@ def fit_series(
     records = data if isinstance(data, PreparedRecords) else PreparedRecords(data)
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
-    delayed = delayed_outputs(problem, order)
+    delayed = late_outputs(problem, order)
     solution, _ = minimize(problem, total_least_squares(delayed))
     _require_freedom(problem, solution)
     noise = _noise(solution)  # the weights that the residuals suggest
@@ -171,8 +160,7 @@ def fit_series(
     solution, converged = minimize(problem, solution.c)
     if check:
         refuse_order(delayed, noise * _noise(solution))
-    covariance = coefficient_covariance(problem, solution, errors)
-    return assemble(problem, solution, covariance, converged)
+    return assemble(problem, solution, coefficient_covariance(problem, solution, errors), converged)
 
 
 def assemble(
@@ -236,7 +224,7 @@ class DelayedOutputs(NamedTuple):
     matrices that large."""
 
 
-def delayed_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
+def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
     """Return the Gram matrix from the rows whose lagged inputs and outputs are all measured."""
     N, _, ny = problem.shape
     delays = range(order + 1)
@@ -271,7 +259,7 @@ def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
     if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
         return np.zeros(order)
     roots = np.roots(null / null[0])
-    size = np.maximum(np.abs(roots) / SLOWEST, 1.0)
+    size = np.maximum(np.abs(roots) / denominator.SLOWEST, 1.0)
     return np.pad(np.poly(roots / size).real[1:], (0, order - len(roots)))
 
 
@@ -308,7 +296,7 @@ def coefficient_covariance(
     curvature, whole = (solution.curvature - noise).sum(axis=0), solution.curvature.sum(axis=0)
     if errors == "white" or not np.linalg.eigvalsh(whole)[0] > 0:
         return sandwich(curvature, whole)
-    lags = correlated_cycles(multipliers_of(solution.c), problem.records.cycles)
+    lags = denominator.correlated_cycles(multipliers_of(solution.c), problem.records.cycles)
     gradient = gradient_covariance(problem, solution, lags + 1)
     return sandwich(curvature, gradient.matrix)._replace(freedom=gradient.freedom)
 
@@ -326,8 +314,7 @@ def gradient_covariance(
     white noise, and noise filtered by 1 / chi, as process noise is. The amounts of both follow from
     two sums of squares of the residuals (variance components: Rao 1971).
     """
-    d = len(solution.c)
-    memory = fading(solution.c)
+    d, memory = len(solution.c), fading(solution.c)
 
     def outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         """Return the outputs, and noise filtered by the system."""
@@ -343,9 +330,8 @@ def gradient_covariance(
             return divide_by_chi(memory, (sampled * x)[:, ::-1])
 
         rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)
-        bases = rows, regression.basis
-        inputs, starts = (in_blocks(basis, count) for basis in bases)
-        weights = inverse_of_remainder(inputs @ inputs.swapaxes(1, 2))
+        inputs, starts = (in_blocks(basis, count) for basis in (rows, regression.basis))
+        weights = denominator.inverse_of_remainder(inputs @ inputs.swapaxes(1, 2))
         x = outputs(k, part, n)[:, :, fit.outputs]
         error = regression.residual(fit.coefficients, x).reshape(x.shape)
         _, slopes = fit.first.samples(solution.c, regression, x[..., :1])
@@ -385,4 +371,4 @@ def gradient_covariance(
     # Scores add up to zero at the minimum, which takes this part of the sum away.
     taken = np.einsum("bij,bji->", share, share) / d
     matrix = true @ scaled.T @ scaled @ true.T / max(1 - taken, 0.5)
-    return Covariance(matrix, block_freedom(scaled, share))
+    return Covariance(matrix, denominator.block_freedom(scaled, share))

@@ -43,8 +43,7 @@ class SectionFit(NamedTuple):
         The derivatives omit the term that vanishes with the residuals (Kaufman 1975).
         """
         fitted = filtered_response(self.coefficients, c, regression, x)
-        left = regression.residual(self.coefficients, x)
-        return left, regression.residual(self.slopes, fitted)
+        return regression.residual(self.coefficients, x), regression.residual(self.slopes, fitted)
 
 
 class SectionSums(NamedTuple):

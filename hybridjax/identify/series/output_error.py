@@ -127,8 +127,7 @@ class OutputErrorProblem(NamedTuple):
                 f"numerators of {lags} lags reach beyond the longest record, of "
                 f"{records.cycles * N} samples: lower `order` or `overhang`."
             )
-        triangles = [np.zeros((0, lags * nu))] * N
-        equal = np.ones((N, ny, ny), bool)
+        triangles, equal = [np.zeros((0, lags * nu))] * N, np.ones((N, ny, ny), bool)
         for grid in records.grids:
             for i in range(ny):
                 equal[:, i] &= (grid.sampled == grid.sampled[..., [i]]).all(axis=(0, 1))

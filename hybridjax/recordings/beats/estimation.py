@@ -145,8 +145,7 @@ def projected(
     square = np.maximum(intervals.sums(by_rate**2 * fit.used), np.finfo(float).tiny)
     columns = np.column_stack([fit.residual, slopes]) * (by_rate * fit.used)[:, None]
     along = np.stack([intervals.sums(x) for x in columns.T], axis=1) / square[:, None]
-    explained = by_rate[:, None] * along[intervals.trial, 1:]
-    return (slopes - explained) * fit.used[:, None], along
+    return (slopes - by_rate[:, None] * along[intervals.trial, 1:]) * fit.used[:, None], along
 
 
 def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
@@ -173,8 +172,7 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     determined = values > 1e-6 * values[-1]  # beyond rounding
     excess = float(((sums @ axes[:, determined]) ** 2 / values[determined]).sum())
     excess = max(excess / int(determined.sum()) / variance, 1.0) if variance > 0 else 1.0
-    noise = variance * excess
-    weight = np.arange(1.0, p) ** 4
+    noise, weight = variance * excess, np.arange(1.0, p) ** 4
     score = pull + curvature @ fit.coefficients
     # The mean is free: its part is taken out.
     share = curvature[1:, 0] / curvature[0, 0]

@@ -75,8 +75,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     **Raises:** `DefinitionError` for a phase that is an angle or has other trials, an input that is
     missing or constant, and too few intervals during which it is finite.
     """
-    samples = recording.samples(name)
-    pairs = phase.by_trial(recording)
+    samples, pairs = recording.samples(name), phase.by_trial(recording)
     if not all(w.linear for _, parts in pairs for w in parts):
         raise DefinitionError("`phase` must be of events or a Crossing, not a KinematicPhase.")
     starts, durations, steps, inputs = [], [], [], []

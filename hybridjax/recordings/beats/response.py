@@ -147,8 +147,7 @@ def phase_response(
     say("smooth")
     fit = fit_curve(intervals, WAVES, flat)
     covariance, left_out, detail = accuracy_of(intervals, fit)
-    matrix = covariance.matrix
-    x = np.arange(200) / 200
+    matrix, x = covariance.matrix, np.arange(200) / 200
     waves = basis(x, WAVES)
     return PhaseResponse(
         coefficients=fit.coefficients,

@@ -129,10 +129,8 @@ def _read_tree(
     return list(tables.values())
 
 
-def _columns(
-    path: Path, name: str, leaf: Leaf, table: Columns
-) -> dict[str, Float[np.ndarray, " n"]]:
-    clock, times = next(iter(table.values.items()))
+def _columns(path: Path, name: str, leaf: Leaf, out: Columns) -> dict[str, Float[np.ndarray, " n"]]:
+    clock, times = next(iter(out.values.items()))
     values = np.atleast_1d(np.squeeze(leaf.array[()]))
     if values.ndim == 2 and len(values) != len(times):
         values = values.T

@@ -27,8 +27,7 @@ def read_bag(path: Path, wanted: Wanted) -> list[Columns]:
     **Raises:** `DefinitionError` for a topic that does not exist; `FileFormatError` for a damaged
     file, and arrays whose length changes.
     """
-    reader = package("rosbags.highlevel").AnyReader
-    typesys = package("rosbags.typesys")
+    reader, typesys = package("rosbags.highlevel").AnyReader, package("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.LATEST)
     with reading(path, "bag of ROS"), reader([path], default_typestore=store) as bag:
         names = {x.topic.lstrip("/") for x in bag.connections}

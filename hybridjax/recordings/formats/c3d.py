@@ -27,8 +27,7 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
     """
     ezc3d = package("ezc3d")
     with reading(path, "C3D file"):
-        file = ezc3d.c3d(str(path))
-        declared = _declared_frames(path)
+        file, declared = ezc3d.c3d(str(path)), _declared_frames(path)
     header, parameters, data = file["header"]["points"], file["parameters"], file["data"]
     first, frames = header["first_frame"], data["points"].shape[2]
     check_rows(path, frames, declared, "frames")

@@ -81,8 +81,7 @@ def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
         parts = int(np.nan_to_num(sub).max()) + 1
         if not np.isfinite(frame + sub).all() or (np.diff(frame + sub / parts) <= 0).any():
             raise FileFormatError(f"'{path}' has frames that are missing, or not in order.")
-        time = ((frame - 1) * parts + sub) / rate
-        yield Columns({"time (s)": time} | table.values, table.notes)
+        yield Columns({"time (s)": ((frame - 1) * parts + sub) / rate} | table.values, table.notes)
         rates.add(rate / parts)
     if len(rates) > 1:
         raise FileFormatError(f"'{path}' has blocks of different rates: export them one by one.")

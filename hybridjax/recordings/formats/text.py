@@ -104,7 +104,7 @@ def to_number(text: str) -> float | None:
 
 
 def read_table(
-    path: Path, headers: Sequence[str], lines: Sequence[str], start: int, separator: str
+    path: Path, headers: Sequence[str], lines: Sequence[str], start: int, sep: str
 ) -> Columns:
     """Read the numbers in `lines[start:]`, with one field for each header.
 
@@ -117,7 +117,7 @@ def read_table(
     two_columns(path, [x for x in headers if x])
     notes = []
     lines = ["" if x.lstrip().startswith(_COMMENTS) else x for x in lines[start:]]
-    if separator != "," and any("," in x for x in lines):
+    if sep != "," and any("," in x for x in lines):
         notes.append("decimal commas were read as such")
         mixed = next((k for k, x in enumerate(lines) if "." in x), None)
         if mixed is not None:
@@ -128,13 +128,11 @@ def read_table(
     try:  # a number in every field
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about an empty table
-            values = np.loadtxt(
-                lines, delimiter=separator or None, ndmin=2, comments=None, quotechar='"'
-            )
+            values = np.loadtxt(lines, delimiter=sep or None, ndmin=2, comments=None, quotechar='"')
     except ValueError:
         pass
     if values.shape[1] != len(headers):
-        values = _by_line(path, headers, lines, start, separator)
+        values = _by_line(path, headers, lines, start, sep)
     if not values.size:
         raise FileFormatError(f"'{path}' has a header, but no samples.")
     if not all(headers):

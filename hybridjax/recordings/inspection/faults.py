@@ -159,9 +159,7 @@ def doubled_signals(recording: Recording, names: Sequence[str]) -> Iterator[Find
                 break
 
 
-def repeated_samples(
-    recording: Recording, names: Sequence[str]
-) -> tuple[list[Rows], list[Finding]]:
+def repeated_rows(recording: Recording, names: Sequence[str]) -> tuple[list[Rows], list[Finding]]:
     """Return for each trial the samples that an earlier trial holds already.
 
     Windows of successive samples are compared first. If most of those that two trials share are at
@@ -207,9 +205,9 @@ def other_settings(
     width = high - low
     for s, trial in enumerate(recording.trials if len(recording.trials) > 1 else ()):
         peers = np.delete(middle, s, axis=1)
-        usual, range_ = np.median(peers, axis=1), np.median(np.delete(width, s, axis=1), axis=1)
+        usual, span = np.median(peers, axis=1), np.median(np.delete(width, s, axis=1), axis=1)
         # alike[i, j]: signal i is where signal j usually is.
-        widths = np.broadcast_arrays(width[:, s, None], range_)
+        widths = np.broadcast_arrays(width[:, s, None], span)
         alike = np.abs(middle[:, s, None] - usual) < np.minimum(*widths)
         alike &= np.minimum(*widths) * _ALIKE > np.maximum(*widths)
         of_outputs = [k for k, name in enumerate(names) if name in outputs]
@@ -220,9 +218,9 @@ def other_settings(
                 yield Finding("swapped columns", text, "refused")
                 return
         for k, name in enumerate(names):
-            if not (width[k, s] > 0 and range_[k] > 0):
+            if not (width[k, s] > 0 and span[k] > 0):
                 continue
-            ratio, is_output = width[k, s] / range_[k], name in outputs
+            ratio, is_output = width[k, s] / span[k], name in outputs
             power = round(np.log10(ratio))
             off = abs(middle[k, s] - usual[k])
             # Pushes may be chosen to be ten times as strong.
@@ -230,9 +228,7 @@ def other_settings(
             if abs(power) in units and abs(np.log(ratio / 10.0**power)) < np.log(_ALIKE):
                 text = f"{name} varies {ratio:.3g} times as much in trial '{trial.name}': its unit?"
                 yield Finding("another unit", text, "refused" if is_output else "warned")
-            elif is_output and off > max(
-                range_[k] / _OFF, _OFF * np.abs(peers[k] - usual[k]).max()
-            ):
+            elif is_output and off > max(span[k] / _OFF, _OFF * np.abs(peers[k] - usual[k]).max()):
                 place = f"{middle[k, s]:.4g} in trial '{trial.name}', at {usual[k]:.4g} elsewhere"
                 yield Finding("another zero", f"the median of {name} lies at {place}.")
 

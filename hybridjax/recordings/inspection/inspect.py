@@ -84,7 +84,7 @@ def inspect(
         findings += () if name in inputs else faults.wrapped(clean, name)
     findings += faults.silent_inputs(clean, [name for name in names if name in inputs])
     findings += faults.doubled_signals(clean, names)
-    copies, more = faults.repeated_samples(clean, names)
+    copies, more = faults.repeated_rows(clean, names)
     findings += more
     clean = _masked(clean, names, copies)
     kept = []
@@ -259,8 +259,7 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
         y = (record.y[where] / size_y).reshape(b - a, N, -1)[:, at].reshape(b - a, -1)
         y = np.clip(y, -8, 8)  # outliers
         means = [x.mean(axis=1) for x in np.array_split(u, sections, axis=1)]
-        u = np.stack(means, axis=1)
-        rows = np.arange(1, b - a - ahead)
+        u, rows = np.stack(means, axis=1), np.arange(1, b - a - ahead)
         inputs = np.stack([u[rows + c] for c in range(-1, ahead + 1)], axis=1)
         usable = np.isfinite(inputs).all(axis=(1, 2, 3))
         usable &= np.isfinite(y[rows - 1]).all(axis=1) & np.isfinite(y[rows]).all(axis=1)

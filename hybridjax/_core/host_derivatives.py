@@ -1,0 +1,85 @@
+"""Derivatives of compiled functions that come from the host, outside of programs."""
+
+import contextlib
+import contextvars
+from collections.abc import Callable, Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import eval_context
+from jax.flatten_util import ravel_pytree
+
+from .compilation import at_ease, uncollected
+from .executor import from_host, is_inside_program, is_traced, on_cpu, to_host
+from .lanes import JACOBIAN_COLUMNS
+
+
+class NotOnHostError(Exception):
+    """The host has no derivatives for these arguments."""
+
+
+_only_on_host = contextvars.ContextVar("only on host", default=False)
+
+
+@contextlib.contextmanager
+def only_on_host() -> Iterator[None]:
+    """A context in which derivatives that the host does not have raise `NotOnHostError`."""
+    before = _only_on_host.set(True)
+    try:
+        yield
+    finally:
+        _only_on_host.reset(before)
+
+
+def require_program() -> None:
+    """**Raises:** `NotOnHostError` where a derivative must come from the host."""
+    if _only_on_host.get() and not is_inside_program():
+        raise NotOnHostError
+
+
+def by_columns(compiled: Callable, along: Callable, relevant: Callable = lambda t: t) -> Callable:
+    """`compiled`, whose derivatives outside of programs come from the host.
+
+    `along(arguments, directions)` returns the result and its derivatives in P directions. A
+    direction moves a single number of the arguments: `directions` is a tree of their form with
+    arrays (P, ...), and `None` for what does not move; so is the second result. Values are
+    concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
+    raises `NotOnHostError`, or many numbers move, derivatives are compiled, as inside of programs.
+    `relevant` replaces tangents that make no difference by `None`.
+    """
+    derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
+
+    @derived.def_jvp
+    def rule(arguments, tangents):
+        moving = jax.tree_util.tree_map(
+            lambda t, x: None if t is None else x,
+            relevant(tangents), arguments, is_leaf=lambda t: t is None,
+        )  # fmt: skip
+        leaves, structure = jax.tree_util.tree_flatten(moving)
+        ends = np.cumsum([x.size for x in leaves])
+        is_small = len(leaves) and ends[-1] <= JACOBIAN_COLUMNS
+        if not on_cpu() or is_traced(arguments) or is_inside_program() or not is_small:
+            return eqx.filter_jvp(compiled, arguments, tangents)
+        parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
+        parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
+        directions = jax.tree_util.tree_unflatten(structure, parts)
+        try:
+            with eval_context(), uncollected(), at_ease():
+                result, columns = along(to_host(arguments), directions)
+        except NotOnHostError:
+            require_program()
+            return eqx.filter_jvp(compiled, arguments, tangents)
+        weights = jax.tree_util.tree_leaves(relevant(tangents))
+        return from_host(result), _combined(from_host(columns), weights)
+
+    return derived
+
+
+@jax.jit
+def _combined(columns, tangents):
+    """Tangents by the columns of derivatives. (One product: one for each array compiles longer.)"""
+    _, parts = ravel_pytree(jax.tree_util.tree_map(lambda x: x[0], columns))
+    matrix = jnp.concatenate([x.reshape(len(x), -1) for x in jax.tree_util.tree_leaves(columns)], 1)
+    return parts(jnp.concatenate([jnp.ravel(x) for x in tangents]) @ matrix)
