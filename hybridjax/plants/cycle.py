@@ -1,0 +1,345 @@
+"""The limit cycle of a plant: the sections on it, outputs there, and experiments around it."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from .._core.arguments import require_among
+from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.containers import Having
+from .._core.boundary.kinds import FilePath, Index, Positive, Seed, SignalNames
+from .._core.boundary.values import Whole
+from .._core.execution import core_count
+from .._core.progress import working
+from .._core.signal import Signal, signals, unit_of
+from .._core.text import listed
+from ..errors import ComputationError, DefinitionError
+from ..experiments.data import ExperimentData
+from ..experiments.design.design import DISCARD
+from ..experiments.run import DesignLike, check_inputs
+from ..orbits.crossing import AtEvent, Crossing
+from ..sections.families import (
+    AbstractSections,
+    ClockPhase,
+    FamilyLike,
+    KinematicPhase,
+    SectionList,
+    as_family,
+)
+from .drive import AngleWatch, ClockWatch, Crossed, Drive, Experiment, ListWatch, Start, Stopped
+from .plant import Plant, optional
+from .returns import Returns, newton
+from .stored import PlantJob, collect, restore
+from .processes import Workers
+
+
+PlantLike = Annotated[Plant, Having(Plant)]
+# Steps after which a plant that makes no cycle is given up. Fewer: slow rhythms with short steps are
+# refused.
+_MOST_STEPS = 1_000_000
+
+
+@checked_methods
+@dataclasses.dataclass(frozen=True, eq=False)
+class SettledCycle:
+    """The limit cycle of a plant, as `hj.plants.settle` measures it.
+
+    **Fields:**
+
+    - `plant`, `sections`, `inputs`, `outputs`.
+    - `period`: mean duration of a cycle.
+    - `cycle_outputs` (N, ny): mean outputs at the sections.
+    - `noise` (N, ny): their standard deviations from cycle to cycle, without inputs.
+    - `late`: largest time by which a step ended after its section.
+    """
+
+    plant: Plant
+    sections: AbstractSections
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    period: float
+    cycle_outputs: Float[np.ndarray, "N ny"]
+    noise: Float[np.ndarray, "N ny"]
+    late: float
+    experiment: Experiment = dataclasses.field(repr=False)
+    seed: int = 0
+
+    @property
+    def n_sections(self) -> int:
+        return self.sections.n_sections
+
+    def run_experiments(
+        self,
+        design: DesignLike,
+        *,
+        discard: Index = DISCARD,
+        processes: Annotated[int, Whole(0, 4096)] | None = None,
+        limit: Positive = 600.0,
+        store: FilePath | None = None,
+    ) -> ExperimentData:
+        """Excite the plant around its cycle, and record its outputs at the sections.
+
+        An input is held from section to section. Experiments start on section 0: from the settled
+        state, or, if the plant's state cannot be set, after `reset` and the time of settling.
+        Experiment s resets the plant with the seed `seed + 1 + s`.
+
+        **Arguments:**
+
+        - `design`: a `Design`, or inputs (S, n, nu).
+        - `discard`: number of cycles before those for estimation. Default: 20.
+        - `processes`: number of processes, each with a copy of the plant. 0: this process, without
+            limit of time. Default: one for each core.
+        - `limit`: time in seconds after which a process that has not finished an experiment is
+            ended. Default: 600.
+        - `store`: folder of a Zarr group that keeps finished experiments. After an interruption,
+            repeat the call. Default: none.
+
+        **Returns:** `ExperimentData`. Failures are listed by `summary()`: missed sections, errors
+        that the plant raised (a fall), NaN, other signals, no answer within the limit, random
+        numbers that do not follow the seed. `simulated.late` (S, n) are the times by which steps
+        ended after their sections.
+
+        **Raises:** `DefinitionError` for a design that does not fit, and for a plant that cannot be
+        made in other processes; `ComputationError` if the cycle has not settled.
+        """
+        inputs = check_inputs(design, discard, self.n_sections, len(self.inputs))
+        processes = core_count() if processes is None else processes
+        processes = min(processes, len(inputs))
+        with working("run_experiments"), Workers(self.experiment, processes, limit) as workers:
+            job = PlantJob(self, inputs, workers)
+            if store is not None:
+                return restore(job, store)
+            return collect(self, inputs, job.trials(slice(0, len(inputs))))
+
+    def perturbed_returns(
+        self,
+        coordinates: SignalNames | None = None,
+        *,
+        steps: Index = 5,
+    ) -> Returns:
+        """Estimate the multipliers from returns of perturbed states to section 0.
+
+        Broyden's method with the measured Jacobian moves the state onto the cycle. Each coordinate
+        is then perturbed by six steps, and differences of fourth order give the Jacobian of the
+        return map. The scatter of returns from nearly equal states is measured by differences along
+        a line (Moré and Wild 2011), and determines the size of the steps.
+
+        **Arguments:**
+
+        - `coordinates`: names among `plant.states` to perturb. Others keep their values. Leave out
+          those on which nothing depends, such as the distance walked. Default: all; at
+          clock sections all but `time`.
+        - `steps`: largest number of steps of Broyden's method. Default: 5.
+
+        **Returns:** `Returns`, a `MultiplierEstimate`.
+
+        **Raises:** `DefinitionError` for a plant whose state cannot be set, or unknown names;
+        `ComputationError` if a perturbed state does not return.
+        """
+        return newton(self, coordinates, steps)
+
+    def __repr__(self) -> str:
+        spread = f"{self.noise.max() / max(np.ptp(self.cycle_outputs), 1e-300):.1g}"
+        return (
+            f"SettledCycle({type(self.plant).__name__}: period {self.period:.9g}, "
+            f"{self.n_sections} sections, {listed(self.inputs)} -> {listed(self.outputs)}; "
+            f"scatter {spread} of the range, sections late by at most {self.late:.1g})"
+        )
+
+
+@checked
+@working("settle")
+def settle(
+    plant: PlantLike,
+    sections: FamilyLike,
+    outputs: SignalNames,
+    *,
+    cycles: Annotated[int, Whole(8, 1_000_000)] = 100,
+    seed: Seed = 0,
+) -> SettledCycle:
+    """Let a plant run without inputs until it repeats itself, and locate sections on its cycle.
+
+    **Arguments:**
+
+    - `sections`: `ClockPhase` for a plant with a `period`, `KinematicPhase` of two signals, or one
+      or several `Crossing`s of signals.
+    - `outputs`: names of signals.
+    - `cycles`: number of cycles before the sections are located. A quarter as many are then
+      recorded. Default: 100.
+    - `seed`: seed of `reset`. Default: 0.
+
+    **Returns:** a `SettledCycle`.
+
+    **Raises:** `DefinitionError` for unknown signals, sections that need equations (events, functions
+    of a state), and a plant that does not follow its seed or does not continue from the state that
+    it returned; `ComputationError` if the plant fails or has not settled.
+    """
+    family = as_family(sections)
+    drive = Drive(plant)
+    try:
+        drive.reset(seed)
+        require_among("output", outputs, drive.names, "")
+        drive.watch = _bound(drive, family, cycles)
+        warmup = drive.t
+        drive.watch.begin(drive.t, drive.z)
+        drive.advance(drive.zero, 0)
+        return _measure(plant, family, drive, tuple(outputs), max(cycles // 4, 2), warmup, seed)
+    except Stopped as stop:
+        raise ComputationError(f"without inputs the plant failed: {stop}.") from stop
+
+
+def _measure(
+    plant: Plant, family: AbstractSections, drive: Drive, outputs: tuple[str, ...],
+    cycles: int, warmup: float, seed: int,
+) -> SettledCycle:  # fmt: skip
+    """Record cycles, and prepare experiments. The plant is on section 0."""
+    N, names = family.n_sections, drive.names
+    columns = tuple(names.index(x) for x in outputs)
+
+    def turn(pause: float) -> tuple[Start, list[Crossed]]:
+        start = drive.here()
+        drive.watch.begin(drive.t, drive.z, on_section=True)
+        return start, [drive.advance(drive.zero, k, pause) for k in range(1, N + 1)]
+
+    start, at = turn(0.0)
+    drive.longest = 2 * (at[-1].t - start.t)
+    # Bounces and noise last for less than an eighth of the time between sections.
+    pause = drive.longest / N / 16 if isinstance(drive.watch, ListWatch) else 0.0
+    turns = [turn(pause) for _ in range(cycles + 1)]
+    values = np.array([[[x.z[c] for c in columns] for x in at] for _, at in turns])
+    values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
+    _require_settled(values)
+    start, at = turns[-1]
+    experiment = Experiment(
+        plant, drive.watch, names, columns, start, warmup, drive.longest, pause
+    )
+    if drive.sets:
+        drive.restore(start)
+        _, again = turn(pause)
+        change = np.abs(np.array([x.z for x in again]) - [x.z for x in at])[:, columns]
+        if (change > 1e-6 * np.ptp(values, axis=(0, 1))).any():
+            raise DefinitionError(
+                "after `set_state` the plant does not continue as before: `get_state` must return "
+                "all that its future depends on."
+            )
+    given, units = plant.inputs, optional(plant, "units", {})
+    of_inputs = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, "")
+    ends = np.array([at[-1].t for _, at in turns])
+    return SettledCycle(
+        plant=plant,
+        sections=family,
+        inputs=signals(of_inputs, of_inputs.values()),
+        outputs=tuple(Signal(x, unit_of(x) or units.get(x, "")) for x in outputs),
+        period=float(np.diff(ends).mean()),
+        cycle_outputs=values.mean(axis=0),
+        noise=values.std(axis=0),
+        late=max(x.late for _, at in turns for x in at),
+        experiment=experiment,
+        seed=seed,
+    )
+
+
+def _require_settled(values: Float[np.ndarray, "c N ny"]) -> None:
+    """**Raises:** `ComputationError` if outputs change more from one half of the cycles to the other
+    than they scatter."""
+    half = len(values) // 2
+    first, last = values[:half], values[-half:]
+    change = np.abs(first.mean(axis=0) - last.mean(axis=0)).max(axis=0)
+    scatter = np.sqrt((first.var(axis=0) + last.var(axis=0)) / half).max(axis=0)
+    size = np.ptp(values, axis=(0, 1))
+    if (change > np.maximum(1e-4 * size, 5 * scatter)).any() or not (size > 0).all():
+        worst = float((change / np.maximum(size, 1e-300)).max())
+        raise ComputationError(
+            f"the plant has not settled: outputs still change by {worst:.1g} of their range; give "
+            "more `cycles`, or stabilize the plant."
+        )
+
+
+def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
+    """Run the plant for some cycles, and return the sections with the numbers of its cycle."""
+    plant = drive.plant
+    if isinstance(family, SectionList):
+        items = tuple(_item(drive, x) for x in family.items)
+        watch: Any = ListWatch(items)
+        column, sign, value = items[0]
+        _trace(drive, (column,), lambda z: _crossings(sign * (z[:, 0] - value)), cycles)
+        return watch
+    if isinstance(family, ClockPhase):
+        period = optional(plant, "period", None)
+        if period is None:
+            raise DefinitionError(
+                "sections at equal times need a plant with a clock: set its `period`, or use "
+                "KinematicPhase or a Crossing."
+            )
+        drive.run(cycles * period)
+        first, _ = _anchor(drive, family.anchor, period)
+        return ClockWatch(family.n_sections, period, float(family.anchor) * period if first is None else first)
+    if isinstance(family, KinematicPhase):
+        pair = family.position, family.velocity
+        require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
+        columns = drive.names.index(pair[0]), drive.names.index(pair[1])
+        plane: dict[str, np.ndarray] = {}
+
+        def turns(z: np.ndarray) -> float:
+            low, high = z[len(z) // 2 :].min(axis=0), z[len(z) // 2 :].max(axis=0)
+            plane["center"] = (low + high) / 2 if family.center is None else np.asarray(family.center)
+            plane["scale"] = (high - low) / 2 if family.scale is None else np.asarray(family.scale)
+            x, y = ((z - plane["center"]) / plane["scale"]).T
+            angle = np.unwrap(np.arctan2(y, x))
+            return (angle[-1] - angle[0]) / (2 * np.pi)
+
+        total = _trace(drive, columns, turns, cycles)
+        center, scale = (tuple(map(float, plane[x])) for x in ("center", "scale"))
+        watch = AngleWatch(family.n_sections, columns, center, scale, 0.0, np.sign(total))
+        _, z = _anchor(drive, family.anchor, drive.t / abs(total))
+        first = float(family.anchor) if z is None else watch.angle(z)
+        return dataclasses.replace(watch, first=first)
+    raise DefinitionError(
+        f"{type(family).__name__} needs equations: use ClockPhase, KinematicPhase, or Crossings of "
+        "signals."
+    )
+
+
+def _item(drive: Drive, section: Crossing | AtEvent) -> tuple[int, float, float]:
+    """Return the column, sign and value of a crossing."""
+    if not isinstance(section, Crossing) or not isinstance(section.function, str):
+        raise DefinitionError(f"{section}: sections of a plant are crossings of its signals.")
+    require_among("signal", [section.function], drive.names, "Crossing: ")
+    sign = 1.0 if section.direction == "falling" else -1.0
+    return drive.names.index(section.function), sign, float(section.value)
+
+
+def _anchor(drive: Drive, anchor: Any, period: float) -> tuple[float | None, Any]:
+    """Return time and signals at a crossing on the cycle; None if the anchor is a number."""
+    if not isinstance(anchor, Crossing):
+        return None, None
+    drive.watch, drive.longest = ListWatch((_item(drive, anchor),)), 3 * period
+    at = [drive.advance(drive.zero, 0, period / 4) for _ in range(2)][-1]
+    return at.t, at.z
+
+
+def _crossings(level: Float[np.ndarray, " n"]) -> float:
+    return float(((level[:-1] > 0) & (level[1:] <= 0)).sum())
+
+
+def _trace(drive: Drive, columns: tuple[int, ...], count: Any, cycles: int) -> float:
+    """Run until `count` of the signals so far is so many cycles, and return it.
+
+    **Raises:** `ComputationError` if there is no rhythm.
+    """
+    rows: list[list[float]] = []
+    while True:
+        for _ in range(max(256, len(rows) // 8)):
+            drive.step(drive.zero, drive.dt)
+            rows.append([drive.z[c] for c in columns])
+        turns = count(np.array(rows))
+        if abs(turns) >= cycles:
+            return turns
+        if len(rows) > _MOST_STEPS:
+            raise ComputationError(
+                f"the plant made {abs(turns):.3g} cycles in {len(rows)} steps: choose sections that "
+                "its cycle crosses, or fewer `cycles`."
+            )

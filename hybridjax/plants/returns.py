@@ -1,0 +1,197 @@
+"""Multipliers of a plant from returns of perturbed states."""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from .._core.arguments import require_among
+from .._core.progress import counted, say
+from ..errors import ComputationError, DefinitionError
+from ..identify.multiplier_estimate import MultiplierEstimate
+from ..sections.families import ClockPhase
+from .drive import Drive, Start, Stopped
+from .plant import optional
+
+
+class Returns(MultiplierEstimate):
+    """Multipliers from returns of perturbed states to section 0.
+
+    **Fields** beside those of all estimates of multipliers:
+
+    - `jacobian` (d, d): derivatives of the returned coordinates with respect to those at the start.
+      `jacobian_error` (d, d): their standard errors, from the noise of the returns, and from the
+      difference between steps of two sizes.
+    - `coordinates`: their names. `state` (d,): their values on the cycle, on section 0.
+    - `noise` (d,): standard deviation of returns from nearly equal states. `steps` (d,): the
+      smallest perturbations used.
+    - `residual`: largest distance between state and return, in units of the range of the
+      coordinate on the cycle.
+    - `bound`: multipliers that are not listed cannot be told from 0; this is the largest modulus
+      that they may have (0 if all are listed).
+    """
+
+    jacobian: Float[np.ndarray, "d d"]
+    jacobian_error: Float[np.ndarray, "d d"]
+    state: Float[np.ndarray, " d"]
+    noise: Float[np.ndarray, " d"]
+    steps: Float[np.ndarray, " d"]
+    coordinates: tuple[str, ...] = eqx.field(static=True)
+    residual: float = eqx.field(static=True)
+    bound: float = eqx.field(static=True)
+
+    def _about(self) -> str:
+        more = len(self.coordinates) - len(self.multipliers)
+        hidden = f"{more} more below {self.bound:.1g}; " if more else ""
+        return f"{hidden}from {len(self.coordinates)} coordinates, residual {self.residual:.1g}"
+
+
+class _Map:
+    """The return map of some coordinates of a plant."""
+
+    def __init__(self, cycle: Any, names: Any):
+        plant, self.experiment = cycle.plant, cycle.experiment
+        self.drive = Drive(plant, self.experiment.names, self.experiment.longest)
+        if not self.drive.sets or self.drive.fixed:
+            raise DefinitionError(
+                "returns of perturbed states need a plant whose state can be set (`get_state`, "
+                "`set_state`) and whose steps can end on a section: use `run_experiments`."
+            )
+        self.seed, self.n = cycle.seed, cycle.n_sections
+        self.drive.watch = self.experiment.watch
+        self.base = np.array(self.experiment.start.state, float)
+        states = optional(plant, "states", tuple(f"x{i}" for i in range(self.base.size)))
+        clocked = optional(plant, "period", None)
+        timeless = clocked is None or isinstance(cycle.sections, ClockPhase)
+        if names is None:
+            names = [x for x in states if not (timeless and x == "time")]
+        require_among("coordinate", names, states, "perturbed_returns: ")
+        self.names, self.columns = tuple(names), [tuple(states).index(x) for x in names]
+        turn = 0.0 if clocked is None else round(cycle.period / clocked) * clocked
+        self.shift = np.array([turn if x == "time" else 0.0 for x in names])
+        course = self._course()
+        self.size = np.ptp(course, axis=0)[self.columns]
+        largest = np.abs(course).max(axis=0)[self.columns]
+        still = self.size <= 1e-9 * largest
+        self.size = np.where(still, np.where(largest > 0, largest, 1.0), self.size)
+
+    def __call__(self, x: Float[np.ndarray, " d"], each: Any = None) -> Float[np.ndarray, " d"]:
+        """Return coordinates after one cycle. **Raises:** `ComputationError` if it is not closed."""
+        state, drive, experiment = self.base.copy(), self.drive, self.experiment
+        state[self.columns] = x
+        try:
+            drive.reset(self.seed)
+            drive.restore(Start(experiment.start.t, experiment.start.z, state))
+            drive.watch.begin(drive.t, drive.z, on_section=True)
+            for k in range(1, self.n + 1):
+                drive.advance(drive.zero, k, experiment.pause)
+                if each is not None:
+                    each(np.array(drive.plant.get_state(), float))
+        except Stopped as stop:
+            raise ComputationError(f"a perturbed state does not return: {stop}.") from stop
+        return np.array(drive.plant.get_state(), float)[self.columns] - self.shift
+
+    @property
+    def start(self) -> Float[np.ndarray, " d"]:
+        return self.base[self.columns]
+
+    def _course(self) -> Float[np.ndarray, "n m"]:
+        self.size, rows = np.ones(len(self.columns)), [self.base]
+        self(self.start, rows.append)
+        return np.array(rows)
+
+    def noise(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+        """Return the standard deviation of returns from nearly equal states.
+
+        Fourth differences along two lines: their variance is 70 times that of the noise (Moré and
+        Wild 2011, Estimating computational noise).
+        """
+        rng, squares = np.random.default_rng(0), []
+        for _ in range(2):
+            along = 1e-6 * self.size * rng.choice([-1.0, 1.0], len(x)) * rng.uniform(0.5, 1, len(x))
+            line = np.array([self(x + j * along) for j in range(9)])
+            squares.append(np.diff(line, 4, axis=0) ** 2 / 70)
+        rounding = np.finfo(float).eps * np.maximum(np.abs(x), self.size)
+        return np.maximum(np.sqrt(np.concatenate(squares).mean(axis=0)), rounding)
+
+    def slopes(
+        self, x: Float[np.ndarray, " d"], h: Float[np.ndarray, " d"], orders: tuple[int, ...]
+    ) -> list[Float[np.ndarray, "d d"]]:
+        """Return central differences of the second order with steps h times each of `orders`."""
+        slopes = np.empty((len(orders), len(x), len(x)))
+        for j in counted(range(len(x)), "coordinates", len(x)):
+            for i, order in enumerate(orders):
+                e = np.zeros(len(x))
+                e[j] = order * h[j]
+                slopes[i, :, j] = (self(x + e) - self(x - e)) / (2 * e[j])
+        return list(slopes)
+
+
+def newton(cycle: Any, names: Any, steps: int) -> Returns:
+    """See `SettledCycle.perturbed_returns`."""
+    map = _Map(cycle, names)
+    x, size = map.start, map.size
+    say("noise of returns")
+    noise = map.noise(x)
+    # Steps at which noise and the error of fourth order are equal for a function of unit
+    # derivatives; at most half a percent of the range, since steps of four times this are used, too.
+    h = size * min((noise / size).max() ** 0.2, 0.005)
+    (J,) = map.slopes(x, h, (1,))
+    y = map(x)
+    eye = np.eye(len(x))
+    for _ in range(steps):
+        residual = (y - x) / size
+        if (np.abs(residual) <= 3 * noise / size).all():
+            break
+        scaled = (J - eye) * size / size[:, None]
+        move = -size * np.linalg.lstsq(scaled, residual, rcond=1e-9)[0]
+        new = map(x + move)
+        J = J + np.outer(new - y - J @ move, move / size**2) / np.sum((move / size) ** 2)
+        x, y = x + move, new
+    one, two, four = map.slopes(x, h, (1, 2, 4))
+    J, coarse = (4 * one - two) / 3, (4 * two - four) / 3
+    # (Weights 8/12 and -1/12 of four returns, each with this noise.)
+    random = np.sqrt(2 * (8**2 + 1)) / 12 * noise[:, None] / h
+    error = np.hypot(random, (J - coarse) / 3)
+    values, covariance, hidden = _resolved(J * size / size[:, None], error * size / size[:, None])
+    return Returns(
+        multipliers=values,
+        coefficients=np.poly(values).real[1:] if len(values) else np.zeros(0),
+        covariance=covariance,
+        covariance_freedom=10.0,  # (fourth differences along two lines)
+        jacobian=J,
+        jacobian_error=error,
+        state=x,
+        noise=noise,
+        steps=h,
+        coordinates=map.names,
+        residual=float(np.abs((y - x) / size).max()),
+        bound=hidden,
+    )
+
+
+def _resolved(J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]) -> Any:
+    """Return the eigenvalues that differ from 0 by three standard errors, the covariance of their
+    polynomial's coefficients, and a bound of the others.
+
+    To first order, dλ = wᴴ dJ v / wᴴ v with left and right eigenvectors w and v.
+    """
+    values, V = np.linalg.eig(J)
+    # (Perturbed within the errors, so that a defective eigenvalue 0 has eigenvectors.)
+    values, V = values.astype(complex), V.astype(complex)
+    W = np.linalg.pinv(V, rcond=1e-14)
+    gradient = np.einsum("ia,bi->iab", W, V)
+    spread = np.sqrt(np.einsum("iab,ab->i", np.abs(gradient) ** 2, error**2))
+    order = np.argsort(-np.abs(values))
+    values, gradient, spread = values[order], gradient[order], spread[order]
+    sure = np.abs(values) > 3 * spread
+    count = int(np.argmin(sure)) if not sure.all() else len(sure)
+    if count and count < len(values) and np.isclose(values[count - 1], values[count].conj()):
+        count -= int(values[count].imag != 0)
+    kept, gradient = values[:count], gradient[:count]
+    slopes = [-np.poly(np.delete(kept, i)) for i in range(count)]  # of coefficients
+    change = np.einsum("ij,iab->jab", np.reshape(slopes, (count, count)), gradient).real
+    covariance = np.einsum("jab,kab,ab->jk", change, change, error**2)
+    bound = float((np.abs(values) + 3 * spread)[count:].max(initial=0.0))
+    return kept, covariance, bound
