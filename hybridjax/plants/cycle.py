@@ -226,7 +226,7 @@ def _measure(
                 "all that its future depends on."
             )
     given, units = plant.inputs, optional(plant, "units", {})
-    of_inputs = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, "")
+    of_inputs = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
     ends = np.array([at[-1].t for _, at in turns])
     return SettledCycle(
         plant=plant,

@@ -77,11 +77,12 @@ class MuJoCoPlant:
         self._mujoco = mujoco = package("mujoco")
         model = self.model
         self.data = mujoco.MjData(model)
+        whole = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+        self._integrate = mujoco.mj_step if whole else mujoco.mj_step2
+        self._refresh = mujoco.mj_step1
         self._actuators = [model.actuator(name).id for name in self.inputs]
-        joint = mujoco.mjtJoint
-        single = [
-            i for i in range(model.njnt) if model.jnt_type[i] in (joint.mjJNT_SLIDE, joint.mjJNT_HINGE)
-        ]
+        scalar = {int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)}
+        single = [i for i in range(model.njnt) if int(model.jnt_type[i]) in scalar]
         names = [model.joint(i).name or f"joint{i}" for i in single]
         self._positions = [int(model.jnt_qposadr[i]) for i in single]
         self._velocities = [int(model.jnt_dofadr[i]) for i in single]
@@ -109,7 +110,7 @@ class MuJoCoPlant:
         else:
             self._mujoco.mj_resetData(self.model, self.data)
         self.data.time = 0.0
-        self._mujoco.mj_step1(self.model, self.data)
+        self._refresh(self.model, self.data)
         return self._observe()
 
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]:
@@ -136,11 +137,8 @@ class MuJoCoPlant:
             data.ctrl[i] += x
         # The positions of bodies, contacts and sensors then belong to the present state, which they
         # do not after `mj_step`. (Runge-Kutta steps cannot be divided.)
-        if model.opt.integrator == self._mujoco.mjtIntegrator.mjINT_RK4:
-            self._mujoco.mj_step(model, data)
-        else:
-            self._mujoco.mj_step2(model, data)
-        self._mujoco.mj_step1(model, data)
+        self._integrate(model, data)
+        self._refresh(model, data)
 
     def _observe(self) -> Mapping[str, float]:
         data = self.data
@@ -158,4 +156,4 @@ class MuJoCoPlant:
         sizes = np.cumsum([1, model.nq, model.nv, model.na])
         time, data.qpos[:], data.qvel[:], data.act[:], data.qacc_warmstart[:] = np.split(x, sizes)
         data.time = float(time[0])
-        self._mujoco.mj_step1(model, data)
+        self._refresh(model, data)

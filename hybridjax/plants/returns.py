@@ -104,16 +104,17 @@ class _Map:
     def noise(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
         """Return the standard deviation of returns from nearly equal states.
 
-        Fourth differences along two lines: their variance is 70 times that of the noise (Moré and
-        Wild 2011, Estimating computational noise).
+        Fourth differences along lines: their variance is 70 times that of the noise (Moré and Wild
+        2011, Estimating computational noise). With narrow spacing they show rounding and tolerances,
+        with wide spacing the events that move through the time steps of a simulator.
         """
-        rng, squares = np.random.default_rng(0), []
-        for _ in range(2):
-            along = 1e-6 * self.size * rng.choice([-1.0, 1.0], len(x)) * rng.uniform(0.5, 1, len(x))
-            line = np.array([self(x + j * along) for j in range(9)])
-            squares.append(np.diff(line, 4, axis=0) ** 2 / 70)
-        rounding = np.finfo(float).eps * np.maximum(np.abs(x), self.size)
-        return np.maximum(np.sqrt(np.concatenate(squares).mean(axis=0)), rounding)
+        rng, noise = np.random.default_rng(0), np.finfo(float).eps * np.maximum(np.abs(x), self.size)
+        for spacing in (1e-6, 1e-4, 1e-3):
+            along = spacing * self.size * rng.uniform(0.5, 1, len(x)) * rng.choice([-1, 1], len(x))
+            line = np.array([self(x + j * along) for j in range(-7, 8)])
+            squares = np.diff(line, 4, axis=0) ** 2 / 70
+            noise = np.maximum(noise, np.sqrt(squares.mean(axis=0)))
+        return noise
 
     def slopes(
         self, x: Float[np.ndarray, " d"], h: Float[np.ndarray, " d"], orders: tuple[int, ...]
@@ -135,8 +136,8 @@ def newton(cycle: Any, names: Any, steps: int) -> Returns:
     say("noise of returns")
     noise = map.noise(x)
     # Steps at which noise and the error of fourth order are equal for a function of unit
-    # derivatives; at most half a percent of the range, since steps of four times this are used, too.
-    h = size * min((noise / size).max() ** 0.2, 0.005)
+    # derivatives; at most two percent of the range.
+    h = size * min((noise / size).max() ** 0.2, 0.02)
     (J,) = map.slopes(x, h, (1,))
     y = map(x)
     eye = np.eye(len(x))
@@ -149,17 +150,13 @@ def newton(cycle: Any, names: Any, steps: int) -> Returns:
         new = map(x + move)
         J = J + np.outer(new - y - J @ move, move / size**2) / np.sum((move / size) ** 2)
         x, y = x + move, new
-    one, two, four = map.slopes(x, h, (1, 2, 4))
-    J, coarse = (4 * one - two) / 3, (4 * two - four) / 3
-    # (Weights 8/12 and -1/12 of four returns, each with this noise.)
-    random = np.sqrt(2 * (8**2 + 1)) / 12 * noise[:, None] / h
-    error = np.hypot(random, (J - coarse) / 3)
+    J, error, h = _best(map, x, noise, h / 8)
     values, covariance, hidden = _resolved(J * size / size[:, None], error * size / size[:, None])
     return Returns(
         multipliers=values,
         coefficients=np.poly(values).real[1:] if len(values) else np.zeros(0),
         covariance=covariance,
-        covariance_freedom=10.0,  # (fourth differences along two lines)
+        covariance_freedom=10.0,  # (eleven fourth differences)
         jacobian=J,
         jacobian_error=error,
         state=x,
@@ -169,6 +166,27 @@ def newton(cycle: Any, names: Any, steps: int) -> Returns:
         residual=float(np.abs((y - x) / size).max()),
         bound=hidden,
     )
+
+
+def _best(map: _Map, x: np.ndarray, noise: np.ndarray, h: np.ndarray) -> Any:
+    """Return the Jacobian by differences of fourth order, its standard errors, and the steps: for
+    each coordinate those from h to 8 h, in powers of two, with the smallest error."""
+    second = map.slopes(x, h, (1, 2, 4, 8, 16, 32))
+    fourth = [(4 * a - b) / 3 for a, b in zip(second, second[1:], strict=False)]
+    best = None
+    for k, (J, coarse) in enumerate(zip(fourth, fourth[1:], strict=False)):
+        # (Weights 8/12 and -1/12 of four returns, each with this noise.)
+        random = np.sqrt(2 * (8**2 + 1)) / 12 * noise[:, None] / (2**k * h)
+        error = np.hypot(random, (J - coarse) / 3)
+        total = np.linalg.norm(error / map.size[:, None], axis=0) * map.size
+        new = J, error, np.full(len(x), 2.0**k) * h
+        if best is None:
+            best, least = list(new), total
+            continue
+        better = total < least
+        least = np.where(better, total, least)
+        best = [np.where(better, a, b) for a, b in zip(new, best, strict=True)]
+    return best
 
 
 def _resolved(J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]) -> Any:
