@@ -60,7 +60,12 @@ class _Map:
             )
         self.seed, self.n = cycle.seed, cycle.n_sections
         self.drive.watch = self.experiment.watch
-        self.base = np.array(self.experiment.start.state, float)
+        try:
+            self.base = np.array(self.experiment.start.state, float)
+        except (TypeError, ValueError):
+            raise DefinitionError(
+                "`get_state` returns no numbers that can be changed: use `run_experiments`."
+            ) from None
         states = optional(plant, "states", tuple(f"x{i}" for i in range(self.base.size)))
         clocked = optional(plant, "period", None)
         timeless = clocked is None or isinstance(cycle.sections, ClockPhase)
