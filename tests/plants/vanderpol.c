@@ -1,7 +1,7 @@
 /* A van der Pol oscillator, x'' = 2 (1 - x^2) x' - x + u, as an FMU: Runge-Kutta steps. */
 #include <stdlib.h>
 #include <string.h>
-#include "fmi2Functions.h"
+#include "fmi2FunctionTypes.h"
 
 typedef struct { double x, v, u; } Model;
 
@@ -63,3 +63,12 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte b[], size_t n
     memcpy(*s, b, n);
     return fmi2OK;
 }
+
+/* Others must exist, and are never called. */
+#define OTHER(name) int name(void) { return fmi2Error; }
+OTHER(fmi2GetTypesPlatform) OTHER(fmi2GetVersion) OTHER(fmi2SetDebugLogging)
+OTHER(fmi2GetInteger) OTHER(fmi2GetBoolean) OTHER(fmi2GetString)
+OTHER(fmi2SetInteger) OTHER(fmi2SetBoolean) OTHER(fmi2SetString)
+OTHER(fmi2GetDirectionalDerivative) OTHER(fmi2SetRealInputDerivatives) OTHER(fmi2GetRealOutputDerivatives)
+OTHER(fmi2CancelStep) OTHER(fmi2GetStatus) OTHER(fmi2GetRealStatus)
+OTHER(fmi2GetIntegerStatus) OTHER(fmi2GetBooleanStatus) OTHER(fmi2GetStringStatus)
