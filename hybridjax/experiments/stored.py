@@ -275,9 +275,7 @@ def layout_of(
         "output": (("output",), np.array(list(map(str, outputs))), {}),
         "cycle_outputs": (("section", "output"), on_cycle, {}),
     }
-    return Layout(
-        ("experiment",), blocks, variables, constants, ("input", "output"), description
-    )
+    return Layout(("experiment",), blocks, variables, constants, ("input", "output"), description)
 
 
 def _design(source: Design | np.ndarray) -> str:

@@ -31,15 +31,12 @@ from ..sections.families import (
 )
 from .drive import AngleWatch, ClockWatch, Crossed, Drive, Experiment, ListWatch, Start, Stopped
 from .plant import Plant, optional
+from .processes import Workers
 from .returns import Returns, newton
 from .stored import PlantJob, collect, restore
-from .processes import Workers
 
 
 PlantLike = Annotated[Plant, Having(Plant)]
-# Steps after which a plant that makes no cycle is given up. Fewer: slow rhythms with short steps are
-# refused.
-_MOST_STEPS = 1_000_000
 
 
 @checked_methods
@@ -173,9 +170,8 @@ def settle(
 
     **Returns:** a `SettledCycle`.
 
-    **Raises:** `DefinitionError` for unknown signals, sections that need equations (events, functions
-    of a state), and a plant that does not follow its seed or does not continue from the state that
-    it returned; `ComputationError` if the plant fails or has not settled.
+    **Raises:** `DefinitionError` for unknown signals, sections that need equations (events,
+    functions of a state), and a plant that does not continue from the state that it returned; `ComputationError` if the plant fails or has not settled.
     """
     family = as_family(sections)
     drive = Drive(plant)
@@ -213,9 +209,7 @@ def _measure(
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
     _require_settled(values)
     start, at = turns[-1]
-    experiment = Experiment(
-        plant, drive.watch, names, columns, start, warmup, drive.longest, pause
-    )
+    experiment = Experiment(plant, drive.watch, names, columns, start, warmup, drive.longest, pause)
     if drive.sets:
         drive.restore(start)
         _, again = turn(pause)
@@ -243,8 +237,8 @@ def _measure(
 
 
 def _require_settled(values: Float[np.ndarray, "c N ny"]) -> None:
-    """**Raises:** `ComputationError` if outputs change more from one half of the cycles to the other
-    than they scatter."""
+    """**Raises:** `ComputationError` if outputs differ between halves of the cycles by more than their
+    scatter."""
     half = len(values) // 2
     first, last = values[:half], values[-half:]
     change = np.abs(first.mean(axis=0) - last.mean(axis=0)).max(axis=0)
@@ -276,27 +270,31 @@ def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
             )
         drive.run(cycles * period)
         first, _ = _anchor(drive, family.anchor, period)
-        return ClockWatch(family.n_sections, period, float(family.anchor) * period if first is None else first)
+        if not isinstance(family.anchor, Crossing):
+            first = float(family.anchor) * period
+        return ClockWatch(family.n_sections, period, first)
     if isinstance(family, KinematicPhase):
         pair = family.position, family.velocity
         require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
         columns = drive.names.index(pair[0]), drive.names.index(pair[1])
-        plane: dict[str, np.ndarray] = {}
+        center, scale = np.zeros(2), np.ones(2)
 
         def turns(z: np.ndarray) -> float:
-            low, high = z[len(z) // 2 :].min(axis=0), z[len(z) // 2 :].max(axis=0)
-            plane["center"] = (low + high) / 2 if family.center is None else np.asarray(family.center)
-            plane["scale"] = (high - low) / 2 if family.scale is None else np.asarray(family.scale)
-            x, y = ((z - plane["center"]) / plane["scale"]).T
+            nonlocal center, scale
+            low, high = np.min(z[len(z) // 2 :], axis=0), np.max(z[len(z) // 2 :], axis=0)
+            center = (low + high) / 2 if family.center is None else np.asarray(family.center)
+            scale = (high - low) / 2 if family.scale is None else np.asarray(family.scale)
+            x, y = ((z - center) / scale).T
             angle = np.unwrap(np.arctan2(y, x))
-            return (angle[-1] - angle[0]) / (2 * np.pi)
+            return float(angle[-1] - angle[0]) / (2 * np.pi)
 
         total = _trace(drive, columns, turns, cycles)
-        center, scale = (tuple(map(float, plane[x])) for x in ("center", "scale"))
-        watch = AngleWatch(family.n_sections, columns, center, scale, 0.0, np.sign(total))
+        N, sense = family.n_sections, float(np.sign(total))
+        watch = AngleWatch(N, columns, center.tolist(), scale.tolist(), 0.0, sense)
         _, z = _anchor(drive, family.anchor, drive.t / abs(total))
-        first = float(family.anchor) if z is None else watch.angle(z)
-        return dataclasses.replace(watch, first=first)
+        if isinstance(family.anchor, Crossing):
+            return dataclasses.replace(watch, first=watch.angle(z))
+        return dataclasses.replace(watch, first=float(family.anchor))
     raise DefinitionError(
         f"{type(family).__name__} needs equations: use ClockPhase, KinematicPhase, or Crossings of "
         "signals."
@@ -312,10 +310,10 @@ def _item(drive: Drive, section: Crossing | AtEvent) -> tuple[int, float, float]
     return drive.names.index(section.function), sign, float(section.value)
 
 
-def _anchor(drive: Drive, anchor: Any, period: float) -> tuple[float | None, Any]:
-    """Return time and signals at a crossing on the cycle; None if the anchor is a number."""
+def _anchor(drive: Drive, anchor: Any, period: float) -> tuple[float, Any]:
+    """Return time and signals at a crossing on the cycle; zero and none for a number."""
     if not isinstance(anchor, Crossing):
-        return None, None
+        return 0.0, None
     drive.watch, drive.longest = ListWatch((_item(drive, anchor),)), 3 * period
     at = [drive.advance(drive.zero, 0, period / 4) for _ in range(2)][-1]
     return at.t, at.z
@@ -338,8 +336,8 @@ def _trace(drive: Drive, columns: tuple[int, ...], count: Any, cycles: int) -> f
         turns = count(np.array(rows))
         if abs(turns) >= cycles:
             return turns
-        if len(rows) > _MOST_STEPS:
+        if len(rows) > 1_000_000:  # (fewer: slow rhythms with short steps are refused)
             raise ComputationError(
-                f"the plant made {abs(turns):.3g} cycles in {len(rows)} steps: choose sections that "
-                "its cycle crosses, or fewer `cycles`."
+                f"the plant made {abs(turns):.3g} cycles in {len(rows)} steps: choose sections "
+                "that its cycle crosses, or fewer `cycles`."
             )

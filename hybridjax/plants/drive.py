@@ -41,8 +41,8 @@ class AngleWatch:
 
     n: int
     columns: tuple[int, int]
-    center: tuple[float, float]
-    scale: tuple[float, float]
+    center: Sequence[float]
+    scale: Sequence[float]
     first: float
     sense: float
     phase: float = 0.0
@@ -113,7 +113,8 @@ class Drive:
         self.dt, self.fixed = float(plant.dt), bool(getattr(plant, "fixed_step", False))
         self.sets = hasattr(plant, "get_state") and hasattr(plant, "set_state")
         self.zero = [0.0] * len(plant.inputs)
-        self.t, self.z = 0.0, ()
+        self.t = 0.0
+        self.z: tuple[float, ...] = ()
         self.recent: list[tuple[float, tuple[float, ...]]] = []
         self.watch: Any = None
 
@@ -155,7 +156,7 @@ class Drive:
         self.t, self.z = t, tuple(observation.values())
         total = sum(self.z)
         if not total - total == 0:
-            k = next((k for k, x in enumerate(self.z) if not x - x == 0), 0)
+            k = [not x - x == 0 for x in self.z].index(True)
             raise Stopped(f"{names[k]} became {self.z[k]} (t = {t:.6g})")
 
     def run(self, duration: float) -> None:

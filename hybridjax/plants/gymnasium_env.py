@@ -33,8 +33,8 @@ def from_gymnasium(
     - `inputs`: names of the actions, or units by name. An input is added to what `policy` returns.
     - `signals`: names of the entries of an observation.
     - `dt`: time between two steps in seconds.
-    - `policy`: function of the observation that returns the actions and keeps nothing between calls.
-        Default: zero.
+    - `policy`: function of the observation that returns the actions, without memory. Default:
+        zero.
     - `period`: period of the clock in seconds. Default: no clock.
 
     **Raises:** `DefinitionError` for names that do not fit.
@@ -61,7 +61,11 @@ class GymnasiumPlant:
         self._signals, self._policy = signals, policy
         gym = package("gymnasium")
         # (Time limits of a registered environment would end experiments.)
-        make = (lambda: gym.make(environment).unwrapped) if isinstance(environment, str) else environment
+        make = (
+            (lambda: gym.make(environment).unwrapped)
+            if isinstance(environment, str)
+            else environment
+        )
         self._environment = make()
         shapes = self._environment.observation_space.shape, self._environment.action_space.shape
         if shapes != ((len(signals),), (len(inputs),)):

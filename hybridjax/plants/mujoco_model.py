@@ -86,7 +86,10 @@ class MuJoCoPlant:
         names = [model.joint(i).name or f"joint{i}" for i in single]
         self._positions = [int(model.jnt_qposadr[i]) for i in single]
         self._velocities = [int(model.jnt_dofadr[i]) for i in single]
-        sensors = [(model.sensor(i).name or f"sensor{i}", int(model.sensor_dim[i])) for i in range(model.nsensor)]
+        sensors = [
+            (model.sensor(i).name or f"sensor{i}", int(model.sensor_dim[i]))
+            for i in range(model.nsensor)
+        ]
         several = [x if n == 1 else f"{x}[{k}]" for x, n in sensors for k in range(n)]
         self._names = [*names, *(f"{x}_rate" for x in names), *several]
         q = [f"q{i}" for i in range(model.nq)]
@@ -143,7 +146,9 @@ class MuJoCoPlant:
     def _observe(self) -> Mapping[str, float]:
         data = self.data
         q, v = data.qpos[self._positions], data.qvel[self._velocities]
-        return dict(zip(self._names, [*q.tolist(), *v.tolist(), *data.sensordata.tolist()], strict=True))
+        return dict(
+            zip(self._names, [*q.tolist(), *v.tolist(), *data.sensordata.tolist()], strict=True)
+        )
 
     def get_state(self) -> np.ndarray:
         """Return `states`, then where the solver of contacts begins."""

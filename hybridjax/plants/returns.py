@@ -82,7 +82,7 @@ class _Map:
         self.size = np.where(still, np.where(largest > 0, largest, 1.0), self.size)
 
     def __call__(self, x: Float[np.ndarray, " d"], each: Any = None) -> Float[np.ndarray, " d"]:
-        """Return coordinates after one cycle. **Raises:** `ComputationError` if it is not closed."""
+        """Return coordinates after one cycle. **Raises:** `ComputationError`."""
         state, drive, experiment = self.base.copy(), self.drive, self.experiment
         state[self.columns] = x
         try:
@@ -110,10 +110,13 @@ class _Map:
         """Return the standard deviation of returns from nearly equal states.
 
         Fourth differences along lines: their variance is 70 times that of the noise (Moré and Wild
-        2011, Estimating computational noise). With narrow spacing they show rounding and tolerances,
-        with wide spacing the events that move through the time steps of a simulator.
+        2011, Estimating computational noise). Narrow spacing shows rounding and tolerances, wide
+        spacing the events that move through the time steps of a simulator.
         """
-        rng, noise = np.random.default_rng(0), np.finfo(float).eps * np.maximum(np.abs(x), self.size)
+        rng, noise = (
+            np.random.default_rng(0),
+            np.finfo(float).eps * np.maximum(np.abs(x), self.size),
+        )
         for spacing in (1e-6, 1e-4, 1e-3):
             along = spacing * self.size * rng.uniform(0.5, 1, len(x)) * rng.choice([-1, 1], len(x))
             line = np.array([self(x + j * along) for j in range(-7, 8)])

@@ -18,10 +18,6 @@ from .drive import Trial
 from .processes import Workers
 
 
-# Characters of a cause that a store keeps. More: the store grows. Fewer: errors are cut off.
-_CAUSE = 200
-
-
 def collect(cycle: Any, inputs: Inputs, trials: Iterable[Trial], first: int = 0) -> ExperimentData:
     """Return the data of consecutive experiments, the first of which is number `first`."""
     trials = list(trials)
@@ -74,14 +70,14 @@ class PlantJob:
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
         """Return the records of piece k."""
         (rows,) = self.blocks.slices(k)
-        data = collect(self.cycle, self.inputs, self.trials(rows), rows.start)
-        causes = np.zeros((len(data.u), _CAUSE), np.int32)
-        for s, cause in enumerate(data.simulated.causes):  # type: ignore[union-attr]
-            codes = [ord(x) for x in cause[:_CAUSE]]
+        data: Any = collect(self.cycle, self.inputs, self.trials(rows), rows.start)
+        causes = np.zeros((len(data.u), 200), np.int32)  # (longer ones are cut off)
+        for s, cause in enumerate(data.simulated.causes):
+            codes = [ord(x) for x in cause[:200]]
             causes[s, : len(codes)] = codes
         return {
             "u": data.u, "y": data.y, "result": data.result, "failed_at": data.failed_at,
-            "error": data.error, "late": data.simulated.late, "cause": causes,  # type: ignore[union-attr]
+            "error": data.error, "late": data.simulated.late, "cause": causes,
         }  # fmt: skip
 
     def begin(self) -> tuple["PlantJob", Layout]:
@@ -93,7 +89,7 @@ class PlantJob:
         )
         layout.variables.update(  # type: ignore[attr-defined]
             late=Variable("<f8", ("sample",), (n,)),
-            cause=Variable("<i4", ("character",), (_CAUSE,)),
+            cause=Variable("<i4", ("character",), (200,)),
         )
         return self, layout
 
@@ -133,8 +129,8 @@ def restore(job: PlantJob, address: Any) -> ExperimentData:
     """Run the experiments that a store lacks, and return all of them."""
     store = fill(job, address)
     stored = StoredExperiments(address)
-    x = {name: store.array(name) for name in store.layout.variables}
-    causes = ("".join(chr(c) for c in row if c > 0) for row in x["cause"])  # type: ignore[union-attr]
+    x: Any = {name: store.array(name) for name in store.layout.variables}
+    causes = ("".join(chr(c) for c in row if c > 0) for row in x["cause"])
     return ExperimentData(
         x["u"],
         x["y"],
@@ -144,7 +140,11 @@ def restore(job: PlantJob, address: Any) -> ExperimentData:
         outputs=job.cycle.outputs,
         result=x["result"],
         simulated=Simulated(
-            x["failed_at"], None, job.cycle.sections.label, x["late"], tuple(causes)  # type: ignore[arg-type]
+            x["failed_at"],
+            None,
+            job.cycle.sections.label,
+            x["late"],
+            tuple(causes),
         ),
         cycle_outputs=store.array("cycle_outputs"),
     )

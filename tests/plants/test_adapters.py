@@ -78,7 +78,9 @@ def truth():
         return q[1]
 
     falling.direction = -1
-    out = solve_ivp(f, (0, 200), [2, 0], "DOP853", args=(0,), events=falling, rtol=1e-11, atol=1e-11)
+    out = solve_ivp(
+        f, (0, 200), [2, 0], "DOP853", args=(0,), events=falling, rtol=1e-11, atol=1e-11
+    )
     times = out.t_events[0]
     return float(np.diff(times)[-10:].mean()), float(out.y_events[0][-1][0])
 

@@ -129,9 +129,7 @@ def hopper():
     return hj.find_limit_cycle(hj.models.VerticalHopper())
 
 
-@pytest.mark.parametrize(
-    "family", ["isochron", pytest.param("kinematic", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("family", ["isochron", pytest.param("kinematic", marks=pytest.mark.slow)])
 def test_the_hopper_is_that_of_the_equations(hopper, family):
     """Perturbed returns against the exact multipliers; records against exact experiments."""
     cycle = hj.plants.settle(Hopper(), SECTIONS[family], ("yM", "vM"))
