@@ -171,7 +171,8 @@ def settle(
     **Returns:** a `SettledCycle`.
 
     **Raises:** `DefinitionError` for unknown signals, sections that need equations (events,
-    functions of a state), and a plant that does not continue from the state that it returned; `ComputationError` if the plant fails or has not settled.
+    functions of a state), and a plant that does not continue from the state that it returned;
+    `ComputationError` if the plant fails or has not settled.
     """
     family = as_family(sections)
     drive = Drive(plant)
@@ -237,8 +238,7 @@ def _measure(
 
 
 def _require_settled(values: Float[np.ndarray, "c N ny"]) -> None:
-    """**Raises:** `ComputationError` if outputs differ between halves of the cycles by more than their
-    scatter."""
+    """**Raises:** `ComputationError` if outputs of both halves differ by more than they scatter."""
     half = len(values) // 2
     first, last = values[:half], values[-half:]
     change = np.abs(first.mean(axis=0) - last.mean(axis=0)).max(axis=0)

@@ -145,7 +145,7 @@ class Drive:
             text = f"{type(error).__name__}: {error}"
             raise Stopped(f"`step` raised {text} (t = {self.t:.6g})") from error
         self._observe(observation, self.t + h)
-        self.recent = [*self.recent[-2:], last]
+        self.recent = [*self.recent[-1:], last]
 
     def _observe(self, observation: Any, t: float) -> None:
         names = tuple(observation)
@@ -183,7 +183,7 @@ class Drive:
             wait = self.dt if self.fixed or x <= 0 else _wait(times, levels, self.watch)
             if armed and x > 0 and wait <= near:
                 return Crossed(self.t, self.z, -wait)
-            closing = self.sets and not self.fixed and wait <= 2 * self.dt
+            closing = self.sets and not self.fixed and wait <= self.dt
             before = self.here() if closing else Start(self.t, self.z, None)
             self.step(u, min(wait, self.dt))
             y = level(k, self.t, self.z)

@@ -6,8 +6,8 @@ import time
 
 
 class Circle:
-    """The distance from the unit circle, which the input changes, decays at a rate of 0.2. The angle
-    grows at a rate of 1: the multiplier is exp(-0.4 pi)."""
+    """The distance from the unit circle, which the input changes, decays at a rate of 0.2.
+    The angle grows at a rate of 1: the multiplier is exp(-0.4 pi)."""
 
     inputs = {"push": "m/s"}
     units = {"x": "m"}
