@@ -1,9 +1,10 @@
 # %% [markdown]
 # # A hopper that is not ours
 #
-# A hopper in MuJoCo, from its XML to multipliers with confidence regions, and the pushes that it stands. It has
-# the masses, spring and motor of the paper's hopper, but its foot lands on soft ground. Nothing of this notebook
-# uses its equations. It needs `pip install 'hybridjax[mujoco,scale]'`.
+# A hopper in MuJoCo, from its XML to multipliers with confidence regions, and the pushes that it
+# stands. It has the masses, spring and motor of the paper's hopper, but its foot lands on soft
+# ground. Nothing of this notebook uses its equations. It needs `pip install
+# 'hybridjax[mujoco,scale]'`.
 
 # %%
 import math
@@ -51,7 +52,8 @@ plant = hj.plants.from_mujoco(XML, {"push": "N"}, control=drive, period=1.0, sub
 # %% [markdown]
 # ## Its cycle
 #
-# `settle` lets the hopper run without pushes until it repeats itself, and finds ten sections at equal times.
+# `settle` lets the hopper run without pushes until it repeats itself, and finds ten sections at
+# equal times.
 
 # %%
 cycle = hj.plants.settle(plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"))
@@ -72,8 +74,8 @@ plt.show()
 # %% [markdown]
 # ## Multipliers from perturbed returns
 #
-# The state can be set, so that each of its numbers can be perturbed. The scatter of returns from nearly equal
-# states comes from contacts that begin in one time step or the next.
+# The state can be set, so that each of its numbers can be perturbed. The scatter of returns from
+# nearly equal states comes from contacts that begin in one time step or the next.
 
 # %%
 returns = cycle.perturbed_returns()
@@ -83,8 +85,9 @@ hard = hj.find_limit_cycle(hj.models.VerticalHopper())
 print(returns.compare(hard.multipliers))
 
 # %% [markdown]
-# On hard ground the paper's hopper has two multipliers, because the foot's height and velocity are zero in
-# stance. On soft ground they are not: a third, small multiplier appears, and the fourth cannot be told from 0.
+# On hard ground the paper's hopper has two multipliers, because the foot's height and velocity
+# are zero in stance. On soft ground they are not: a third, small multiplier appears, and the
+# fourth cannot be told from 0.
 #
 # ## Multipliers from experiments
 #
@@ -114,8 +117,8 @@ plt.show()
 # %% [markdown]
 # ## The pushes that it stands
 #
-# The trunk gets a random velocity at the apex. The hopper stands the push if it is back on its cycle after 12
-# periods.
+# The trunk gets a random velocity at the apex. The hopper stands the push if it is back on its
+# cycle after 12 periods.
 
 # %%
 start = cycle.experiment.start.state

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import operator
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 
 class Stopped(Exception):
@@ -19,6 +19,8 @@ class Stopped(Exception):
 class ClockWatch:
     """Sections at equal times in a period. `first`: a time of section 0."""
 
+    known: ClassVar[bool] = True  # (the time until a section)
+    ordered: ClassVar[bool] = True  # (sections cannot be crossed in another order)
     n: int
     period: float
     first: float
@@ -39,6 +41,8 @@ class AngleWatch:
     """Sections at equal angles of two signals: columns, center, scale, angle of section 0, and the
     sense of rotation."""
 
+    known: ClassVar[bool] = False
+    ordered: ClassVar[bool] = True
     n: int
     columns: tuple[int, int]
     center: Sequence[float]
@@ -69,6 +73,8 @@ class ListWatch:
     """Sections one by one: for each its column, +1 if it is falling and -1 if rising, and the
     value."""
 
+    known: ClassVar[bool] = False
+    ordered: ClassVar[bool] = False
     items: tuple[tuple[int, float, float], ...]
 
     @property
@@ -170,33 +176,41 @@ class Drive:
 
         **Arguments:** `pause`: time in which a section is not crossed again (bounces, noise).
         """
-        level, began, near = self.watch.level, self.t, 1e-9 * self.dt
-        times = [t for t, _ in self.recent]
-        levels = [level(k, t, z) for t, z in self.recent]
+        watch, began, near = self.watch, self.t, 1e-9 * self.dt
+        level, known, ordered = watch.level, watch.known, watch.ordered
+        points: list[tuple[float, float]] = []
+        if not known:
+            points = [(t, level(k, t, z)) for t, z in self.recent]
         x = level(k, self.t, self.z)
-        ordered = not isinstance(self.watch, ListWatch)
-        if x <= 0 and ordered and levels and levels[-1] > 0:  # two sections in one step
-            return self._between(*self.recent[-1], levels[-1], x)
-        armed = ordered
+        if x <= 0 and ordered and self.recent:  # two sections in one step
+            last = level(k, *self.recent[-1])
+            level(k, self.t, self.z)
+            if last > 0:
+                return self._between(*self.recent[-1], last, x)
+        armed, lands = ordered, self.sets and not self.fixed and not known
         while True:
-            times, levels = [*times[-3:], self.t], [*levels[-3:], x]
-            wait = self.dt if self.fixed or x <= 0 else _wait(times, levels, self.watch)
-            if armed and x > 0 and wait <= near:
+            wait = x if known else self.dt
+            if not known and x > 0 and not self.fixed:
+                points = [*points[-2:], (self.t, x)]
+                wait = _wait(points)
+            if armed and 0 < x and wait <= near:
                 return Crossed(self.t, self.z, -wait)
-            closing = self.sets and not self.fixed and wait <= self.dt
-            before = self.here() if closing else Start(self.t, self.z, None)
+            wait = wait if armed and x > 0 and not self.fixed else self.dt
+            t, z = self.t, self.z
+            closing = lands and wait <= self.dt
+            before = self.here() if closing else None
             self.step(u, min(wait, self.dt))
             y = level(k, self.t, self.z)
             if armed and y <= 0 and self.t - began > pause:
-                if closing:
+                if before is not None:
                     self._land(u, k, before, x, y)
                     y = level(k, self.t, self.z)
                 if y <= 0:
-                    return self._between(before.t, before.z, x, y)
-            armed = ordered or y > 0 or (armed and self.t - began > pause)
+                    return self._between(t, z, x, y)
+            armed = ordered or y > 0
             x = y
             if self.t - began > self.longest:
-                text = f"section {k % self.watch.n} was not reached within {self.longest:.4g}"
+                text = f"section {k % watch.n} was not reached within {self.longest:.4g}"
                 raise Stopped(f"{text} (t = {self.t:.6g})", missed=True)
 
     def _between(self, t: float, z: Sequence[float], x: float, y: float) -> Crossed:
@@ -229,22 +243,19 @@ class Drive:
                 side = -1
 
 
-def _wait(times: Sequence[float], levels: Sequence[float], watch: Any) -> float:
-    """Return the time until the level is zero, by inverse interpolation (infinite if unknown)."""
-    if isinstance(watch, ClockWatch):
-        return levels[-1]
-    first = len(levels) - 1
-    while first and levels[first - 1] > levels[first]:
-        first -= 1
-    x, t = levels[first:], [time - times[-1] for time in times[first:]]
-    if len(x) < 2:
+def _wait(points: Sequence[tuple[float, float]]) -> float:
+    """Return the time until the level is zero, by inverse interpolation through the last two or
+    three points (infinite if unknown)."""
+    if len(points) < 2 or points[-2][1] <= points[-1][1]:
         return math.inf
-    secant = x[-1] * -t[-2] / (x[-2] - x[-1])
-    for width in range(1, len(x)):  # Neville's scheme at level 0
-        for i in range(len(x) - width):
-            j = i + width
-            t[i] = (x[j] * t[i] - x[i] * t[i + 1]) / (x[j] - x[i])
-    return t[0] if secant / 2 < t[0] < 2 * secant else secant
+    (t1, x1), (t2, x2) = points[-2:]
+    secant = x2 * (t2 - t1) / (x1 - x2)
+    if len(points) == 2 or points[-3][1] <= x1:
+        return secant
+    t0, x0 = points[-3]
+    first = (x1 * (t0 - t2) - x0 * (t1 - t2)) / (x1 - x0)
+    third = (x2 * first - x0 * secant) / (x2 - x0)
+    return third if secant / 2 < third < 2 * secant else secant
 
 
 class Trial(NamedTuple):
