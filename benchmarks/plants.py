@@ -97,15 +97,15 @@ def accuracy():
         returns = cycle.perturbed_returns()
         error = returns.compare(hopper.multipliers).max_error
         print(f"{family.label}: {returns}\n  error {error:.1e}")
-        design = hj.multisine(
-            n_sections=32, periods=32, lines="odd", realizations=4, amplitude=0.005
-        )
-        data = cycle.run_experiments(design, discard=32)
+        design = hj.multisine(32, periods=8, band=(0, 4), amplitude=0.002).realizations(4)
+        data = cycle.run_experiments(design, discard=24)
         estimate = hj.estimate_htf(data)
         model = hj.linearize(hopper, family, outputs=OUTPUTS)
-        exact = model.htf(estimate.f, harmonics=tuple(estimate.harmonics.tolist()))
+        exact = model.htf(estimate.f, harmonics=estimate.harmonics)
         inside = np.abs(estimate.H - exact.H) <= estimate.confidence_radius(0.95)
         print(f"  {data.summary()}; {100 * inside.mean():.1f} % of HTFs within their discs")
+        design = hj.multisine(32, periods=16, band=(0, 8), amplitude=0.002)
+        estimate = hj.estimate_htf(cycle.run_experiments(design, discard=40))
         fit = hj.fit_multipliers(estimate, order=2)
         print(f"  {fit}\n  true ones within the region: {fit.contains(hopper.multipliers)}")
 

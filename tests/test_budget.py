@@ -25,19 +25,19 @@ PRONOUNS = set(
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
 # a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
-# 890 the responses of cycles; of the tests, 630 are those of both.
+# 890 the responses of cycles, 1180 simulators of others; of the tests, 630 are those of both.
 LIMITS = {
-    "code": 25_370,
-    "files": 222,
+    "code": 26_560,
+    "files": 233,
     "longest": 500,
-    "public_names": 170,
+    "public_names": 174,
     "many_parameters": 8,
     "thresholds": 300,
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_685,
-    "doc_words": 36_000,
+    "test_lines": 17_140,
+    "doc_words": 36_570,
 }
 
 

@@ -19,7 +19,7 @@ class Stopped(Exception):
 class ClockWatch:
     """Sections at equal times in a period. `first`: a time of section 0."""
 
-    known: ClassVar[bool] = True  # (the time until a section)
+    timed: ClassVar[bool] = True  # (the time until a section)
     ordered: ClassVar[bool] = True  # (sections cannot be crossed in another order)
     n: int
     period: float
@@ -41,7 +41,7 @@ class AngleWatch:
     """Sections at equal angles of two signals: columns, center, scale, angle of section 0, and the
     sense of rotation."""
 
-    known: ClassVar[bool] = False
+    timed: ClassVar[bool] = False
     ordered: ClassVar[bool] = True
     n: int
     columns: tuple[int, int]
@@ -73,7 +73,7 @@ class ListWatch:
     """Sections one by one: for each its column, +1 if it is falling and -1 if rising, and the
     value."""
 
-    known: ClassVar[bool] = False
+    timed: ClassVar[bool] = False
     ordered: ClassVar[bool] = False
     items: tuple[tuple[int, float, float], ...]
 
@@ -177,9 +177,9 @@ class Drive:
         **Arguments:** `pause`: time in which a section is not crossed again (bounces, noise).
         """
         watch, began, near = self.watch, self.t, 1e-9 * self.dt
-        level, known, ordered = watch.level, watch.known, watch.ordered
+        level, timed, ordered = watch.level, watch.timed, watch.ordered
         points: list[tuple[float, float]] = []
-        if not known:
+        if not timed:
             points = [(t, level(k, t, z)) for t, z in self.recent]
         x = level(k, self.t, self.z)
         if x <= 0 and ordered and self.recent:  # two sections in one step
@@ -187,10 +187,10 @@ class Drive:
             level(k, self.t, self.z)
             if last > 0:
                 return self._between(*self.recent[-1], last, x)
-        armed, lands = ordered, self.sets and not self.fixed and not known
+        armed, lands = ordered, self.sets and not self.fixed and not timed
         while True:
-            wait = x if known else self.dt
-            if not known and x > 0 and not self.fixed:
+            wait = x if timed else self.dt
+            if not timed and x > 0 and not self.fixed:
                 points = [*points[-2:], (self.t, x)]
                 wait = _wait(points)
             if armed and 0 < x and wait <= near:

@@ -120,11 +120,11 @@ class MuJoCoPlant:
         """Hold the inputs for some time."""
         model, data, whole = self.model, self.data, float(self.model.opt.timestep)
         steps = int(duration / whole + 1e-9)
-        rest = duration - steps * whole
+        left = duration - steps * whole
         for _ in range(steps):
             self._advance(u)
-        if rest > 1e-9 * whole:
-            model.opt.timestep = rest
+        if left > 1e-9 * whole:
+            model.opt.timestep = left
             try:
                 self._advance(u)
             finally:
