@@ -1,7 +1,7 @@
 """Experiments in a Zarr store: more than memory holds, run by any number of processes."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -192,9 +192,27 @@ class ExperimentJob:
         """Return the job, and the form of its records."""
         campaign, description = self.campaign, self.description
         placed, values = campaign.placed, campaign.at_sections
-        n = campaign.inputs.cycles * placed.n_sections
-        u, y = placed.cycle.system.inputs, values.outputs.names
-        layout = layout_of(self.blocks, n, u, y, values.on_cycle, description)
+        n, u = campaign.inputs.cycles * placed.n_sections, placed.cycle.system.inputs
+        codes = {
+            "flag_values": [int(x) for x in Result],
+            "flag_meanings": " ".join(x.name.lower() for x in Result),
+        }
+        variables = {
+            "u": Variable("<f8", ("sample", "input"), (n, len(u))),
+            "y": Variable("<f8", ("sample", "output"), (n, len(values.outputs.names))),
+            "result": Variable("<i8", attributes=codes),
+            "failed_at": Variable("<i8"),
+            "error": Variable("<f8"),
+        }
+        constants: dict[str, Constant] = {
+            "input": (("input",), np.array(list(map(str, u))), {}),
+            "output": (("output",), np.array(list(map(str, values.outputs.names))), {}),
+            "cycle_outputs": (("section", "output"), values.on_cycle, {}),
+        }
+        coordinates = "input", "output"
+        layout = Layout(
+            ("experiment",), self.blocks, variables, constants, coordinates, description
+        )
         return self, layout
 
     def arrays(self) -> list[np.ndarray]:
@@ -248,34 +266,6 @@ class ExperimentJob:
             },
             "outputs": [x if isinstance(x, str) else digest_of(x) for x in z.items],
         }
-
-
-def layout_of(
-    blocks: Blocks,
-    n: int,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    on_cycle: np.ndarray,
-    description: dict[str, Any],
-) -> Layout:
-    """Return the form of records of n samples."""
-    codes = {
-        "flag_values": [int(x) for x in Result],
-        "flag_meanings": " ".join(x.name.lower() for x in Result),
-    }
-    variables = {
-        "u": Variable("<f8", ("sample", "input"), (n, len(inputs))),
-        "y": Variable("<f8", ("sample", "output"), (n, len(outputs))),
-        "result": Variable("<i8", attributes=codes),
-        "failed_at": Variable("<i8"),
-        "error": Variable("<f8"),
-    }
-    constants: dict[str, Constant] = {
-        "input": (("input",), np.array(list(map(str, inputs))), {}),
-        "output": (("output",), np.array(list(map(str, outputs))), {}),
-        "cycle_outputs": (("section", "output"), on_cycle, {}),
-    }
-    return Layout(("experiment",), blocks, variables, constants, ("input", "output"), description)
 
 
 def _design(source: Design | np.ndarray) -> str:

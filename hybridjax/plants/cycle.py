@@ -1,7 +1,7 @@
 """The limit cycle of a plant: the sections on it, outputs there, and experiments around it."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,7 +13,8 @@ from .._core.boundary.containers import Having
 from .._core.boundary.kinds import FilePath, Index, Positive, Seed, SignalNames
 from .._core.boundary.values import Whole
 from .._core.execution import core_count
-from .._core.progress import working
+from .._core.pieces.description import digest_of
+from .._core.progress import counted, working
 from .._core.signal import Signal, signals, unit_of
 from .._core.text import listed
 from ..errors import ComputationError, DefinitionError
@@ -29,11 +30,11 @@ from ..sections.families import (
     SectionList,
     as_family,
 )
-from .drive import AngleWatch, ClockWatch, Crossed, Drive, Experiment, ListWatch, Start, Stopped
+from .drive import Crossed, Drive, Experiment, ListWatch, PhaseWatch, Start, Stopped, Trial
 from .plant import Plant, optional
-from .processes import Workers
-from .returns import Returns, newton
-from .stored import PlantJob, collect, restore
+from .processes import run_all
+from .returns import Returns, returns_of
+from .stored import collect, resume
 
 
 PlantLike = Annotated[Plant, Having(Plant)]
@@ -91,7 +92,7 @@ class SettledCycle:
             limit of time. Default: one for each core.
         - `limit`: time in seconds after which a process that has not finished an experiment is
             ended. Default: 600.
-        - `store`: folder of a Zarr group that keeps finished experiments. After an interruption,
+        - `store`: file of JSON lines that keeps finished experiments. After an interruption,
             repeat the call. Default: none.
 
         **Returns:** `ExperimentData`. Failures are listed by `summary()`: missed sections, errors
@@ -104,39 +105,43 @@ class SettledCycle:
         """
         inputs = check_inputs(design, discard, self.n_sections, len(self.inputs))
         processes = core_count() if processes is None else processes
-        processes = min(processes, len(inputs))
-        with working("run_experiments"), Workers(self.experiment, processes, limit) as workers:
-            job = PlantJob(self, inputs, workers)
-            if store is not None:
-                return restore(job, store)
-            return collect(self, inputs, job.trials(slice(0, len(inputs))))
+        processes, S = min(processes, len(inputs)), len(inputs)
+        u = inputs.part(slice(0, S))
 
-    def perturbed_returns(
-        self,
-        coordinates: SignalNames | None = None,
-        *,
-        steps: Index = 5,
-    ) -> Returns:
+        def run(rows: list[int]) -> Iterator[Trial]:
+            items = ((self.seed + 1 + s, u[s].tolist()) for s in rows)
+            yield from counted(
+                run_all(self.experiment, items, processes, limit), "experiments", len(rows)
+            )
+
+        with working("run_experiments"):
+            if store is None:
+                return collect(self, inputs, list(run([*range(S)])))
+            # (A plant is described by the cycle that was measured.)
+            course = [f"{x:.6g}" for x in (self.period, *np.ravel(self.cycle_outputs))]
+            names = type(self.plant).__name__, self.outputs, inputs.periods
+            about = digest_of(names, course, self.sections, u, self.seed)
+            return collect(self, inputs, resume(store, about, S, run))
+
+    def perturbed_returns(self, coordinates: SignalNames | None = None) -> Returns:
         """Estimate the multipliers from returns of perturbed states to section 0.
 
-        Broyden's method with the measured Jacobian moves the state onto the cycle. Each coordinate
-        is then perturbed by six steps, and differences of fourth order give the Jacobian of the
-        return map. The scatter of returns from nearly equal states is measured by differences along
-        a line (Moré and Wild 2011), and determines the size of the steps.
+        Newton's method moves the state onto the cycle. Central differences of fourth order then
+        give the Jacobian of the return map. The scatter of returns from nearly equal states is measured
+        by differences along a line (Moré and Wild 2011), and determines the size of the steps.
 
         **Arguments:**
 
         - `coordinates`: names among `plant.states` to perturb. Others keep their values. Leave out
           those on which nothing depends, such as the distance walked. Default: all; at
           clock sections all but `time`.
-        - `steps`: largest number of steps of Broyden's method. Default: 5.
 
         **Returns:** `Returns`, a `MultiplierEstimate`.
 
         **Raises:** `DefinitionError` for a plant whose state cannot be set, or unknown names;
         `ComputationError` if a perturbed state does not return.
         """
-        return newton(self, coordinates, steps)
+        return returns_of(self, coordinates)
 
     def __repr__(self) -> str:
         spread = f"{self.noise.max() / max(np.ptp(self.cycle_outputs), 1e-300):.1g}"
@@ -183,17 +188,17 @@ def settle(
         warmup = drive.t
         drive.watch.begin(drive.t, drive.z)
         drive.advance(drive.zero, 0)
-        return _measure(plant, family, drive, tuple(outputs), max(cycles // 4, 2), warmup, seed)
+        return _measure(drive, family, tuple(outputs), max(cycles // 4, 2), warmup, seed)
     except Stopped as stop:
         raise ComputationError(f"without inputs the plant failed: {stop}.") from stop
 
 
 def _measure(
-    plant: Plant, family: AbstractSections, drive: Drive, outputs: tuple[str, ...],
+    drive: Drive, family: AbstractSections, outputs: tuple[str, ...],
     cycles: int, warmup: float, seed: int,
 ) -> SettledCycle:  # fmt: skip
     """Record cycles, and prepare experiments. The plant is on section 0."""
-    N, names = family.n_sections, drive.names
+    N, names, plant = family.n_sections, drive.names, drive.plant
     columns = tuple(names.index(x) for x in outputs)
 
     def turn(pause: float) -> tuple[Start, list[Crossed]]:
@@ -210,11 +215,9 @@ def _measure(
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
     _require_settled(values)
     start, at = turns[-1]
-    experiment = Experiment(plant, drive.watch, names, columns, start, warmup, drive.longest, pause)
     if drive.sets:
         drive.restore(start)
-        _, again = turn(pause)
-        change = np.abs(np.array([x.z for x in again]) - [x.z for x in at])[:, columns]
+        change = np.abs(np.array([x.z for x in turn(pause)[1]]) - [x.z for x in at])[:, columns]
         if (change > 1e-6 * np.ptp(values, axis=(0, 1))).any():
             raise DefinitionError(
                 "after `set_state` the plant does not continue as before: `get_state` must return "
@@ -222,17 +225,18 @@ def _measure(
             )
     given, units = plant.inputs, optional(plant, "units", {})
     of_inputs = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
-    ends = np.array([at[-1].t for _, at in turns])
     return SettledCycle(
         plant=plant,
         sections=family,
         inputs=signals(of_inputs, of_inputs.values()),
         outputs=tuple(Signal(x, unit_of(x) or units.get(x, "")) for x in outputs),
-        period=float(np.diff(ends).mean()),
+        period=float(np.diff([at[-1].t for _, at in turns]).mean()),
         cycle_outputs=values.mean(axis=0),
         noise=values.std(axis=0),
         late=max(x.late for _, at in turns for x in at),
-        experiment=experiment,
+        experiment=Experiment(
+            plant, drive.watch, names, columns, start, warmup, drive.longest, pause
+        ),
         seed=seed,
     )
 
@@ -254,47 +258,52 @@ def _require_settled(values: Float[np.ndarray, "c N ny"]) -> None:
 
 def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
     """Run the plant for some cycles, and return the sections with the numbers of its cycle."""
-    plant = drive.plant
+    N = family.n_sections
     if isinstance(family, SectionList):
-        items = tuple(_item(drive, x) for x in family.items)
-        watch: Any = ListWatch(items)
-        column, sign, value = items[0]
-        _trace(drive, (column,), lambda z: _crossings(sign * (z[:, 0] - value)), cycles)
+        drive.watch = watch = ListWatch(tuple(_item(drive, x) for x in family.items))
+        drive.longest = 100_000 * drive.dt
+        for _ in range(cycles):
+            drive.advance(drive.zero, 0)
         return watch
     if isinstance(family, ClockPhase):
-        period = optional(plant, "period", None)
+        period = optional(drive.plant, "period", None)
         if period is None:
             raise DefinitionError(
                 "sections at equal times need a plant with a clock: set its `period`, or use "
                 "KinematicPhase or a Crossing."
             )
         drive.run(cycles * period)
-        first, _ = _anchor(drive, family.anchor, period)
-        if not isinstance(family.anchor, Crossing):
-            first = float(family.anchor) * period
-        return ClockWatch(family.n_sections, period, first)
+        if isinstance(family.anchor, Crossing):
+            return PhaseWatch(N, period, _anchor(drive, family.anchor, period).t)
+        return PhaseWatch(N, period, float(family.anchor) * period)
     if isinstance(family, KinematicPhase):
         pair = family.position, family.velocity
         require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
-        columns = drive.names.index(pair[0]), drive.names.index(pair[1])
+        i, j = map(drive.names.index, pair)
+        rows, turns = [], 0.0
         center, scale = np.zeros(2), np.ones(2)
-
-        def turns(z: np.ndarray) -> float:
-            nonlocal center, scale
+        while abs(turns) < cycles:
+            if len(rows) > 1_000_000:  # (fewer: slow rhythms with short steps are refused)
+                raise ComputationError(
+                    f"the plant made {abs(turns):.3g} cycles in {len(rows)} steps: choose signals "
+                    "that turn around a center, or fewer `cycles`."
+                )
+            for _ in range(max(256, len(rows) // 8)):
+                drive.step(drive.zero, drive.dt)
+                rows.append((drive.z[i], drive.z[j]))
+            z = np.array(rows)
             low, high = np.min(z[len(z) // 2 :], axis=0), np.max(z[len(z) // 2 :], axis=0)
             center = (low + high) / 2 if family.center is None else np.asarray(family.center)
             scale = (high - low) / 2 if family.scale is None else np.asarray(family.scale)
             x, y = ((z - center) / scale).T
             angle = np.unwrap(np.arctan2(y, x))
-            return float(angle[-1] - angle[0]) / (2 * np.pi)
-
-        total = _trace(drive, columns, turns, cycles)
-        N, sense = family.n_sections, float(np.sign(total))
-        watch = AngleWatch(N, columns, center.tolist(), scale.tolist(), 0.0, sense)
-        _, z = _anchor(drive, family.anchor, drive.t / abs(total))
+            turns = float(angle[-1] - angle[0]) / (2 * np.pi)
+        watch = PhaseWatch(N, 1.0, 0.0, (i, j), center.tolist(), scale.tolist(), np.sign(turns))
         if isinstance(family.anchor, Crossing):
-            return dataclasses.replace(watch, first=watch.angle(z))
-        return dataclasses.replace(watch, first=float(family.anchor))
+            first = watch.angle(_anchor(drive, family.anchor, drive.t / abs(turns)).z)
+        else:
+            first = float(family.anchor)
+        return dataclasses.replace(watch, first=first)
     raise DefinitionError(
         f"{type(family).__name__} needs equations: use ClockPhase, KinematicPhase, or Crossings of "
         "signals."
@@ -310,34 +319,7 @@ def _item(drive: Drive, section: Crossing | AtEvent) -> tuple[int, float, float]
     return drive.names.index(section.function), sign, float(section.value)
 
 
-def _anchor(drive: Drive, anchor: Any, period: float) -> tuple[float, Any]:
-    """Return time and signals at a crossing on the cycle; zero and none for a number."""
-    if not isinstance(anchor, Crossing):
-        return 0.0, None
+def _anchor(drive: Drive, anchor: Crossing, period: float) -> Crossed:
+    """Return a crossing on the cycle."""
     drive.watch, drive.longest = ListWatch((_item(drive, anchor),)), 3 * period
-    at = [drive.advance(drive.zero, 0, period / 4) for _ in range(2)][-1]
-    return at.t, at.z
-
-
-def _crossings(level: Float[np.ndarray, " n"]) -> float:
-    return float(((level[:-1] > 0) & (level[1:] <= 0)).sum())
-
-
-def _trace(drive: Drive, columns: tuple[int, ...], count: Any, cycles: int) -> float:
-    """Run until `count` of the signals so far is so many cycles, and return it.
-
-    **Raises:** `ComputationError` if there is no rhythm.
-    """
-    rows: list[list[float]] = []
-    while True:
-        for _ in range(max(256, len(rows) // 8)):
-            drive.step(drive.zero, drive.dt)
-            rows.append([drive.z[c] for c in columns])
-        turns = count(np.array(rows))
-        if abs(turns) >= cycles:
-            return turns
-        if len(rows) > 1_000_000:  # (fewer: slow rhythms with short steps are refused)
-            raise ComputationError(
-                f"the plant made {abs(turns):.3g} cycles in {len(rows)} steps: choose sections "
-                "that its cycle crosses, or fewer `cycles`."
-            )
+    return [drive.advance(drive.zero, 0, period / 4) for _ in range(2)][-1]

@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
-import operator
+import os
+import pickle
+import sys
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -16,54 +18,51 @@ class Stopped(Exception):
 
 
 @dataclasses.dataclass
-class ClockWatch:
-    """Sections at equal times in a period. `first`: a time of section 0."""
+class PhaseWatch:
+    """Sections at equal phases of a period (`columns` None), or of the angle of two signals.
 
-    timed: ClassVar[bool] = True  # (the time until a section)
+    **Fields:** `first`: time or angle of section 0. `scale`, `center`: of the two signals. `sense`:
+    +1 if the angle grows, otherwise -1.
+    """
+
     ordered: ClassVar[bool] = True  # (sections cannot be crossed in another order)
     n: int
     period: float
-    first: float
-    start: float = 0.0
-
-    def begin(self, t: float, z: Sequence[float], on_section: bool = False) -> None:
-        """Count sections from the next section 0 on, or from the one on which the plant is."""
-        turns = (t - self.first) / self.period
-        self.start = self.first + self.period * (round(turns) if on_section else math.ceil(turns))
-
-    def level(self, k: int, t: float, z: Sequence[float]) -> float:
-        """Return a number that falls through zero at section k, counted from `begin` on."""
-        return self.start + k / self.n * self.period - t
-
-
-@dataclasses.dataclass
-class AngleWatch:
-    """Sections at equal angles of two signals: columns, center, scale, angle of section 0, and the
-    sense of rotation."""
-
-    timed: ClassVar[bool] = False
-    ordered: ClassVar[bool] = True
-    n: int
-    columns: tuple[int, int]
-    center: Sequence[float]
-    scale: Sequence[float]
-    first: float
-    sense: float
+    first: float = 0.0
+    columns: tuple[int, int] | None = None
+    center: Sequence[float] = (0.0, 0.0)
+    scale: Sequence[float] = (1.0, 1.0)
+    sense: float = 1.0
     phase: float = 0.0
+
+    @property
+    def timed(self) -> bool:
+        return self.columns is None
 
     def angle(self, z: Sequence[float]) -> float:
         """Return the angle in radians."""
-        (i, j), (a, b), (p, q) = self.columns, self.center, self.scale
+        (i, j), (a, b), (p, q) = self.columns or (0, 1), self.center, self.scale
         return math.atan2((z[j] - b) / q, (z[i] - a) / p)
 
+    def turns(self, t: float, z: Sequence[float]) -> float:
+        """Return the phase from section 0 in turns, for angles up to whole turns."""
+        if self.columns is None:
+            return (t - self.first) / self.period
+        return self.sense * (self.angle(z) - self.first) / (2 * math.pi)
+
     def begin(self, t: float, z: Sequence[float], on_section: bool = False) -> None:
-        """Count sections as `ClockWatch.begin` does."""
-        turns = self.sense * (self.angle(z) - self.first) / (2 * math.pi)
-        self.phase = turns - (round(turns) if on_section else math.ceil(turns))
+        """Count sections from the next section 0 on, or from the one on which the plant is."""
+        turns = self.turns(t, z)
+        self.phase = round(turns) if on_section else math.ceil(turns)
+        if self.columns is not None:
+            self.phase = turns - self.phase
 
     def level(self, k: int, t: float, z: Sequence[float]) -> float:
-        """Return a number that falls through zero at section k. The angle is unwrapped."""
-        turns = self.sense * (self.angle(z) - self.first) / (2 * math.pi) - self.phase
+        """Return a number that falls through zero at section k, counted from `begin` on: the time
+        until then, or an angle, which is unwrapped."""
+        if self.columns is None:
+            return self.first + (self.phase + k / self.n) * self.period - t
+        turns = self.turns(t, z) - self.phase
         self.phase += turns - round(turns)
         return k / self.n - self.phase
 
@@ -76,10 +75,6 @@ class ListWatch:
     timed: ClassVar[bool] = False
     ordered: ClassVar[bool] = False
     items: tuple[tuple[int, float, float], ...]
-
-    @property
-    def n(self) -> int:
-        return len(self.items)
 
     def begin(self, t: float, z: Sequence[float], on_section: bool = False) -> None:
         """Nothing is counted: each section is crossed in its turn."""
@@ -121,22 +116,18 @@ class Drive:
         self.zero = [0.0] * len(plant.inputs)
         self.t = 0.0
         self.z: tuple[float, ...] = ()
-        self.recent: list[tuple[float, tuple[float, ...]]] = []
+        self.last: Start | None = None
         self.watch: Any = None
 
     def reset(self, seed: int) -> None:
         """Begin at time 0. **Raises:** `Stopped`, like all methods, if the plant fails."""
-        try:
-            observation = self.plant.reset(seed)
-        except Exception as error:
-            raise Stopped(f"`reset` raised {type(error).__name__}: {error}") from error
-        self._observe(observation, 0.0)
-        self.recent = []
+        self._observe("reset", 0.0, seed)
+        self.last = None
 
     def restore(self, start: Start) -> None:
         """Continue from a state that was kept."""
         self.plant.set_state(start.state)
-        self.t, self.z, self.recent = start.t, start.z, []
+        self.t, self.z, self.last = start.t, start.z, None
 
     def here(self) -> Start:
         """Return the present time, signals and state."""
@@ -144,26 +135,21 @@ class Drive:
 
     def step(self, u: Sequence[float], h: float) -> None:
         """Hold the input for some time."""
-        last = self.t, self.z
-        try:
-            observation = self.plant.step(u, h)
-        except Exception as error:
-            text = f"{type(error).__name__}: {error}"
-            raise Stopped(f"`step` raised {text} (t = {self.t:.6g})") from error
-        self._observe(observation, self.t + h)
-        self.recent = [*self.recent[-1:], last]
+        self._observe("step", self.t + h, u, h)
 
-    def _observe(self, observation: Any, t: float) -> None:
+    def _observe(self, method: str, t: float, *arguments: Any) -> None:
+        try:
+            observation = getattr(self.plant, method)(*arguments)
+        except Exception as error:
+            text = f"`{method}` raised {type(error).__name__}: {error}"
+            raise Stopped(f"{text} (t = {self.t:.6g})") from error
         names = tuple(observation)
-        if names != self.names:
-            if self.names:
-                raise Stopped(f"signals changed from {self.names} to {names} (t = {t:.6g})")
-            self.names = names
-        self.t, self.z = t, tuple(observation.values())
-        total = sum(self.z)
-        if not total - total == 0:
-            k = [not x - x == 0 for x in self.z].index(True)
-            raise Stopped(f"{names[k]} became {self.z[k]} (t = {t:.6g})")
+        if self.names and names != self.names:
+            raise Stopped(f"signals changed from {self.names} to {names} (t = {t:.6g})")
+        self.t, self.z, self.names = t, tuple(observation.values()), names
+        for name, x in zip(names, self.z, strict=True):
+            if not x - x == 0:
+                raise Stopped(f"{name} became {x} (t = {t:.6g})")
 
     def run(self, duration: float) -> None:
         """Let the plant run without input."""
@@ -171,91 +157,58 @@ class Drive:
             self.step(self.zero, self.dt)
 
     def advance(self, u: Sequence[float], k: int, pause: float = 0.0) -> Crossed:
-        """Hold the input until section k. Steps end on the section, unless the plant's steps are
-        fixed.
+        """Hold the input until section k. Steps end on it if its time is known, or if the state can
+        be set; steps of fixed length end after it.
 
         **Arguments:** `pause`: time in which a section is not crossed again (bounces, noise).
         """
-        watch, began, near = self.watch, self.t, 1e-9 * self.dt
-        level, timed, ordered = watch.level, watch.timed, watch.ordered
-        points: list[tuple[float, float]] = []
-        if not timed:
-            points = [(t, level(k, t, z)) for t, z in self.recent]
-        x = level(k, self.t, self.z)
-        if x <= 0 and ordered and self.recent:  # two sections in one step
-            last = level(k, *self.recent[-1])
-            level(k, self.t, self.z)
-            if last > 0:
-                return self._between(*self.recent[-1], last, x)
-        armed, lands = ordered, self.sets and not self.fixed and not timed
-        while True:
-            wait = x if timed else self.dt
-            if not timed and x > 0 and not self.fixed:
-                points = [*points[-2:], (self.t, x)]
-                wait = _wait(points)
-            if armed and 0 < x and wait <= near:
-                return Crossed(self.t, self.z, -wait)
-            wait = wait if armed and x > 0 and not self.fixed else self.dt
-            t, z = self.t, self.z
-            closing = lands and wait <= self.dt
-            before = self.here() if closing else None
-            self.step(u, min(wait, self.dt))
-            y = level(k, self.t, self.z)
+        watch, began = self.watch, self.t
+        x, last, armed = watch.level(k, self.t, self.z), self.last, watch.ordered
+        if watch.timed and not self.fixed:
+            while x > 1e-9 * self.dt:
+                self.step(u, min(x, self.dt))
+                x = watch.level(k, self.t, self.z)
+            return Crossed(self.t, self.z, -x)
+        if x <= 0 and armed and last is not None:  # two sections in one step
+            before = watch.level(k, last.t, last.z)
+            x = watch.level(k, self.t, self.z)
+            if before > 0:
+                return self._between(last, before, x)
+        while self.t - began <= self.longest:
+            lands = self.sets and not self.fixed and armed and x > 0
+            last = self.here() if lands else Start(self.t, self.z, None)
+            self.step(u, self.dt)
+            self.last = last
+            y = watch.level(k, self.t, self.z)
             if armed and y <= 0 and self.t - began > pause:
-                if before is not None:
-                    self._land(u, k, before, x, y)
-                    y = level(k, self.t, self.z)
-                if y <= 0:
-                    return self._between(t, z, x, y)
-            armed = ordered or y > 0
-            x = y
-            if self.t - began > self.longest:
-                text = f"section {k % watch.n} was not reached within {self.longest:.4g}"
-                raise Stopped(f"{text} (t = {self.t:.6g})", missed=True)
+                return self._land(u, k, last, x, y) if lands else self._between(last, x, y)
+            armed, x = watch.ordered or y > 0, y
+        text = f"a section was not reached within {self.longest:.4g}"
+        raise Stopped(f"{text} (t = {self.t:.6g})", missed=True)
 
-    def _between(self, t: float, z: Sequence[float], x: float, y: float) -> Crossed:
+    def _between(self, last: Start, x: float, y: float) -> Crossed:
         """Return the section between an earlier point and the present one."""
         share = x / (x - y) if x > y else 1.0
-        at = t + share * (self.t - t)
-        values = tuple(a + share * (b - a) for a, b in zip(z, self.z, strict=True))
+        at = last.t + share * (self.t - last.t)
+        values = tuple(a + share * (b - a) for a, b in zip(last.z, self.z, strict=True))
         return Crossed(at, values, self.t - at)
 
-    def _land(self, u: Sequence[float], k: int, before: Start, x: float, y: float) -> None:
+    def _land(self, u: Sequence[float], k: int, before: Start, x: float, y: float) -> Crossed:
         """Repeat a step that went beyond a section, so that it ends there (Illinois method)."""
-        low, high, side = 0.0, self.t - before.t, 0
-        recent = self.recent[:-1]
+        low, high, side = 0.0, self.t - before.t, 0.0
         for _ in range(40):
-            beyond = (self.t - before.t - low) * -y / (x - y) if y <= 0 else 0.0
-            if y <= 0 and beyond <= 1e-9 * self.dt:
-                return
             h = low + (high - low) * x / (x - y)
-            self.plant.set_state(before.state)
-            self.t, self.z, self.recent = before.t, before.z, recent
+            self.restore(before)
             self.step(u, h)
             level = self.watch.level(k, self.t, self.z)
+            late = -level * (high - low) / (x - y)
+            if abs(late) <= 1e-9 * self.dt or high - low <= 1e-9 * self.dt:
+                break
             if level > 0:
-                low, x, y = h, level, y / 2 if side > 0 else y
-                side = 1
-                if (high - low) <= 1e-9 * self.dt:
-                    return
+                low, x, y, side = h, level, y / 2 if side > 0 else y, 1.0
             else:
-                high, y, x = h, level, x / 2 if side < 0 else x
-                side = -1
-
-
-def _wait(points: Sequence[tuple[float, float]]) -> float:
-    """Return the time until the level is zero, by inverse interpolation through the last two or
-    three points (infinite if unknown)."""
-    if len(points) < 2 or points[-2][1] <= points[-1][1]:
-        return math.inf
-    (t1, x1), (t2, x2) = points[-2:]
-    secant = x2 * (t2 - t1) / (x1 - x2)
-    if len(points) == 2 or points[-3][1] <= x1:
-        return secant
-    t0, x0 = points[-3]
-    first = (x1 * (t0 - t2) - x0 * (t1 - t2)) / (x1 - x0)
-    third = (x2 * first - x0 * secant) / (x2 - x0)
-    return third if secant / 2 < third < 2 * secant else secant
+                high, y, x, side = h, level, x / 2 if side < 0 else x, -1.0
+        return Crossed(self.t, self.z, late)
 
 
 class Trial(NamedTuple):
@@ -291,14 +244,10 @@ class Experiment:
         drive = Drive(self.plant, self.names, self.longest)
         y: list[list[float]] = []
         late: list[float] = []
-        take = operator.itemgetter(*self.columns)
-        single = len(self.columns) == 1
         try:
-            self._require_repeatable(drive, seed)
-            at = self.begin(drive)
+            at = self.begin(drive, seed)
             for k, held in enumerate(u, 1):
-                values = take(at.z)
-                y.append([values] if single else list(values))
+                y.append([float(at.z[c]) for c in self.columns])
                 late.append(at.late)
                 if k < len(u):
                     at = drive.advance(held, k, self.pause)
@@ -308,19 +257,8 @@ class Experiment:
             return Trial(y, late, f"{type(error).__name__}: {error} (t = {drive.t:.6g})")
         return Trial(y, late)
 
-    def begin(self, drive: Drive) -> Crossed:
-        """Bring a plant to section 0, right after its `reset`."""
-        drive.watch = dataclasses.replace(self.watch)
-        if drive.sets:
-            drive.restore(self.start)
-            drive.watch.begin(drive.t, drive.z, on_section=True)
-            return Crossed(drive.t, drive.z, 0.0)
-        drive.run(self.warmup)
-        drive.watch.begin(drive.t, drive.z)
-        return drive.advance(drive.zero, 0)
-
-    def _require_repeatable(self, drive: Drive, seed: int) -> None:
-        """Compare the first steps after two equal resets; the plant is then reset once more."""
+    def begin(self, drive: Drive, seed: int) -> Crossed:
+        """Bring a plant to section 0. The first steps after two equal resets are compared."""
         courses = []
         for _ in range(2):
             drive.reset(seed)
@@ -331,3 +269,30 @@ class Experiment:
         if courses[0] != courses[1]:
             raise Stopped("the plant is not deterministic after `reset(seed)`")
         drive.reset(seed)
+        drive.watch = dataclasses.replace(self.watch)
+        if drive.sets:
+            drive.restore(self.start)
+            drive.watch.begin(drive.t, drive.z, on_section=True)
+            return Crossed(drive.t, drive.z, 0.0)
+        drive.run(self.warmup)
+        drive.watch.begin(drive.t, drive.z)
+        return drive.advance(drive.zero, 0)
+
+
+def serve() -> None:
+    """Run experiments in a worker: standard input holds pickles that only the parent writes (the
+    packed `Experiment`, then the seed and inputs of each), standard output the answers."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a plant prints goes to standard error
+    problem, packed = "", pickle.load(sys.stdin.buffer)
+    try:
+        experiment = pickle.loads(packed)
+    except Exception as error:
+        problem = f"{type(error).__name__}: {error}"
+    while True:
+        try:
+            item = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        pickle.dump(problem or tuple(experiment.run(*item)), answers)
+        answers.flush()

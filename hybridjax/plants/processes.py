@@ -4,10 +4,8 @@ The processes are not those of `multiprocessing`: these would run the main scrip
 be ended one by one.
 """
 
-import contextlib
 import os
 import pickle
-import queue
 import subprocess
 import sys
 import threading
@@ -19,121 +17,68 @@ from ..errors import DefinitionError
 from .drive import Experiment, Trial
 
 
-class Worker:
-    """A process with its own copy of a plant. `limit`: time for one answer in seconds.
+def run_all(
+    experiment: Experiment, items: Iterable[tuple[int, Any]], processes: int, limit: float
+) -> Iterator[Trial]:
+    """Run experiments (seed, inputs) in processes with a limit of time, and yield them in order.
+    Processes that ended are replaced.
 
     **Raises:** `DefinitionError` if the plant cannot be made in another process.
     """
+    if not processes:
+        yield from (experiment.run(*item) for item in items)
+        return
+    packed, local, begun = _pack(experiment), threading.local(), []
 
-    def __init__(self, packed: bytes, limit: float):
-        # (One thread of BLAS: the processes use all cores. Path: that of this process.)
-        threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        command = [sys.executable, "-m", "hybridjax.plants.worker"]
-        path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), *sys.path]))
-        environment = {**os.environ, **threads, "PYTHONPATH": path}
-        pipe = subprocess.PIPE
-        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment)
-        self._limit, self._late = limit, False
-        self._send(sys.path)
-        self._send(packed)
-        problem = self._receive()
-        if problem != "":
-            self.close()
-            text = "ended" if problem is None else f"raised {problem}"
-            raise DefinitionError(
-                f"the plant cannot be made in another process, which {text}: define it in a module "
-                "that can be imported, or use `processes=0`."
-            )
-
-    def run(self, seed: int, u: Any) -> Trial:
-        """Run one experiment. The worker cannot be used again if the trial is empty."""
-        self._send((seed, u))
-        answer = self._receive()
-        if answer is not None:
-            return Trial(*answer)
-        code = self._process.wait()
-        hung = f"no answer within the limit of {self._limit:g} s"
-        return Trial([], [], hung if self._late else f"the process ended with code {code}")
-
-    @property
-    def alive(self) -> bool:
-        return self._process.poll() is None
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.kill()
-        for stream in (self._process.stdin, self._process.stdout):
-            with contextlib.suppress(OSError):
-                stream.close()  # type: ignore[union-attr]
-        self._process.wait()
-
-    def _send(self, x: Any) -> None:
-        with contextlib.suppress(OSError):  # (of an ended process: there will be no answer)
-            pickle.dump(x, self._process.stdin)  # type: ignore[arg-type]
-            self._process.stdin.flush()  # type: ignore[union-attr]
-
-    def _receive(self) -> Any:
-        """Return an answer; None if the process has ended, or was ended at its limit of time."""
-
-        def expire() -> None:
-            self._late = True
-            self._process.kill()
-
-        timer = threading.Timer(self._limit, expire)
+    def run(item: tuple[int, Any]) -> Trial:
+        worker = getattr(local, "worker", None)
+        work = [item]
+        if worker is None:
+            worker = local.worker = _start()
+            begun.append(worker)
+            work = [packed, item]
+        expired = threading.Event()
+        timer = threading.Timer(limit, lambda: (expired.set(), worker.kill()))
         timer.start()
         try:
-            return pickle.load(self._process.stdout)  # type: ignore[arg-type]
+            for x in work:
+                pickle.dump(x, worker.stdin)
+            worker.stdin.flush()
+            answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
-            return None
+            local.worker, code = None, worker.wait()
+            hung = f"no answer within the limit of {limit:g} s"
+            return Trial(
+                [], [], hung if expired.is_set() else f"the process ended with code {code}"
+            )
         finally:
             timer.cancel()
+        if isinstance(answer, str):
+            raise DefinitionError(
+                f"the plant cannot be made in another process, which raised {answer}: define it in "
+                "a module that can be imported, or use `processes=0`."
+            )
+        return Trial(*answer)
 
-
-class Workers:
-    """Any number of workers; a context. Workers that ended are replaced."""
-
-    def __init__(self, experiment: Experiment, processes: int, limit: float):
-        self._experiment, self._processes, self._limit = experiment, processes, limit
-        self._idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
-        if processes:
-            self._packed = pack(experiment)
-
-    def __enter__(self) -> "Workers":
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        with contextlib.suppress(queue.Empty):
-            while True:
-                self._idle.get_nowait().close()
-
-    def run(self, items: Iterable[tuple[int, Any]]) -> Iterator[Trial]:
-        """Run experiments (seed, inputs), and yield them in order."""
-        if not self._processes:
-            yield from (self._experiment.run(*item) for item in items)
-            return
-        with ThreadPoolExecutor(self._processes) as pool:
-            running = [pool.submit(self._one, *item) for item in items]
-            try:
-                for future in running:
-                    yield future.result()
-            finally:
-                for future in running:
-                    future.cancel()
-
-    def _one(self, seed: int, u: Any) -> Trial:
+    with ThreadPoolExecutor(processes) as pool:
         try:
-            worker = self._idle.get_nowait()
-        except queue.Empty:
-            worker = Worker(self._packed, self._limit)
-        trial = worker.run(seed, u)
-        if worker.alive:
-            self._idle.put(worker)
-        else:
-            worker.close()
-        return trial
+            yield from pool.map(run, items)
+        finally:
+            for worker in begun:
+                worker.kill()
+                worker.communicate()
 
 
-def pack(experiment: Experiment) -> bytes:
+def _start() -> Any:
+    # (One thread of BLAS: the processes use all cores. Path: that of this process.)
+    threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), *sys.path]))
+    command = [sys.executable, "-c", "from hybridjax.plants.drive import serve; serve()"]
+    pipe, environment = subprocess.PIPE, {**os.environ, **threads, "PYTHONPATH": path}
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment)
+
+
+def _pack(experiment: Experiment) -> bytes:
     """Return a pickle; of classes in notebooks and scripts by cloudpickle, where it is installed.
 
     **Raises:** `DefinitionError` for a plant that cannot be pickled.

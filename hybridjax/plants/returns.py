@@ -11,7 +11,7 @@ from .._core.progress import counted, say
 from ..errors import ComputationError, DefinitionError
 from ..identify.multiplier_estimate import MultiplierEstimate
 from ..sections.families import ClockPhase
-from .drive import Drive, Start, Stopped
+from .drive import Drive, Stopped
 from .plant import optional
 
 
@@ -51,35 +51,35 @@ class _Map:
     """The return map of some coordinates of a plant."""
 
     def __init__(self, cycle: Any, names: Any):
-        plant, self.experiment = cycle.plant, cycle.experiment
-        self.drive = Drive(plant, self.experiment.names, self.experiment.longest)
-        if not self.drive.sets or self.drive.fixed:
+        plant, self.experiment, self.n = cycle.plant, cycle.experiment, cycle.n_sections
+        self.drive = drive = Drive(plant, self.experiment.names, self.experiment.longest)
+        if not drive.sets or drive.fixed:
             raise DefinitionError(
                 "returns of perturbed states need a plant whose state can be set (`get_state`, "
                 "`set_state`) and whose steps can end on a section: use `run_experiments`."
             )
-        self.seed, self.n = cycle.seed, cycle.n_sections
-        self.drive.watch = self.experiment.watch
+        drive.watch, self.seed = self.experiment.watch, cycle.seed
         try:
             self.base = np.array(self.experiment.start.state, float)
         except (TypeError, ValueError):
             raise DefinitionError(
                 "`get_state` returns no numbers that can be changed: use `run_experiments`."
             ) from None
-        states = optional(plant, "states", tuple(f"x{i}" for i in range(self.base.size)))
-        clocked = optional(plant, "period", None)
-        timeless = clocked is None or isinstance(cycle.sections, ClockPhase)
+        states = tuple(optional(plant, "states", [f"x{i}" for i in range(self.base.size)]))
+        period = optional(plant, "period", None)
         if names is None:
+            timeless = period is None or isinstance(cycle.sections, ClockPhase)
             names = [x for x in states if not (timeless and x == "time")]
         require_among("coordinate", names, states, "perturbed_returns: ")
-        self.names, self.columns = tuple(names), [tuple(states).index(x) for x in names]
-        turn = 0.0 if clocked is None else round(cycle.period / clocked) * clocked
+        self.names, self.columns = tuple(names), [states.index(x) for x in names]
+        turn = 0.0 if period is None else round(cycle.period / period) * period
         self.shift = np.array([turn if x == "time" else 0.0 for x in names])
-        course = self._course()
-        self.size = np.ptp(course, axis=0)[self.columns]
-        largest = np.abs(course).max(axis=0)[self.columns]
+        rows = [self.base]
+        self(self.base[self.columns], rows.append)
+        course = np.array(rows)[:, self.columns]
+        largest, self.size = np.abs(course).max(axis=0), np.ptp(course, axis=0)
         still = self.size <= 1e-9 * largest
-        self.size = np.where(still, np.where(largest > 0, largest, 1.0), self.size)
+        self.size[still] = np.where(largest > 0, largest, 1.0)[still]
 
     def __call__(self, x: Float[np.ndarray, " d"], each: Any = None) -> Float[np.ndarray, " d"]:
         """Return coordinates after one cycle. **Raises:** `ComputationError`."""
@@ -87,7 +87,7 @@ class _Map:
         state[self.columns] = x
         try:
             drive.reset(self.seed)
-            drive.restore(Start(experiment.start.t, experiment.start.z, state))
+            drive.restore(experiment.start._replace(state=state))
             drive.watch.begin(drive.t, drive.z, on_section=True)
             for k in range(1, self.n + 1):
                 drive.advance(drive.zero, k, experiment.pause)
@@ -97,15 +97,6 @@ class _Map:
             raise ComputationError(f"a perturbed state does not return: {stop}.") from stop
         return np.array(drive.plant.get_state(), float)[self.columns] - self.shift
 
-    @property
-    def start(self) -> Float[np.ndarray, " d"]:
-        return self.base[self.columns]
-
-    def _course(self) -> Float[np.ndarray, "n m"]:
-        self.size, rows = np.ones(len(self.columns)), [self.base]
-        self(self.start, rows.append)
-        return np.array(rows)
-
     def noise(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
         """Return the standard deviation of returns from nearly equal states.
 
@@ -113,10 +104,8 @@ class _Map:
         2011, Estimating computational noise). Narrow spacing shows rounding and tolerances, wide
         spacing the events that move through the time steps of a simulator.
         """
-        rng, noise = (
-            np.random.default_rng(0),
-            np.finfo(float).eps * np.maximum(np.abs(x), self.size),
-        )
+        rng = np.random.default_rng(0)
+        noise = np.finfo(float).eps * np.maximum(np.abs(x), self.size)
         for spacing in (1e-6, 1e-4, 1e-3):
             along = spacing * self.size * rng.uniform(0.5, 1, len(x)) * rng.choice([-1, 1], len(x))
             line = np.array([self(x + j * along) for j in range(-7, 8)])
@@ -124,42 +113,37 @@ class _Map:
             noise = np.maximum(noise, np.sqrt(squares.mean(axis=0)))
         return noise
 
-    def slopes(
-        self, x: Float[np.ndarray, " d"], h: Float[np.ndarray, " d"], orders: tuple[int, ...]
-    ) -> list[Float[np.ndarray, "d d"]]:
-        """Return central differences of the second order with steps h times each of `orders`."""
-        slopes = np.empty((len(orders), len(x), len(x)))
-        for j in counted(range(len(x)), "coordinates", len(x)):
-            for i, order in enumerate(orders):
-                e = np.zeros(len(x))
-                e[j] = order * h[j]
-                slopes[i, :, j] = (self(x + e) - self(x - e)) / (2 * e[j])
-        return list(slopes)
+    def slopes(self, x: Float[np.ndarray, " d"], h: Float[np.ndarray, " d"]) -> Any:
+        """Return central differences of second order with steps h."""
+        columns = [
+            (self(x + e) - self(x - e)) / (2 * e.sum())
+            for e in counted(np.diag(h), "coordinates", len(x))
+        ]
+        return np.array(columns).T
 
 
-def newton(cycle: Any, names: Any, steps: int) -> Returns:
+def returns_of(cycle: Any, names: Any) -> Returns:
     """See `SettledCycle.perturbed_returns`."""
     map = _Map(cycle, names)
-    x, size = map.start, map.size
+    x, size = map.base[map.columns], map.size
     say("noise of returns")
     noise = map.noise(x)
     # Steps at which noise and the error of fourth order are equal for a function of unit
     # derivatives; at most two percent of the range.
     h = size * min((noise / size).max() ** 0.2, 0.02)
-    (J,) = map.slopes(x, h, (1,))
-    y = map(x)
-    eye = np.eye(len(x))
-    for _ in range(steps):
+    J, y = map.slopes(x, h), map(x)
+    scale = size / size[:, None]  # (of derivatives)
+    for _ in range(5):
         residual = (y - x) / size
         if (np.abs(residual) <= 3 * noise / size).all():
             break
-        scaled = (J - eye) * size / size[:, None]
-        move = -size * np.linalg.lstsq(scaled, residual, rcond=1e-9)[0]
-        new = map(x + move)
-        J = J + np.outer(new - y - J @ move, move / size**2) / np.sum((move / size) ** 2)
-        x, y = x + move, new
-    J, error, h = _best(map, x, noise, h / 8)
-    values, covariance, hidden = _resolved(J * size / size[:, None], error * size / size[:, None])
+        x = x - size * np.linalg.lstsq((J - np.eye(len(x))) * scale, residual, rcond=1e-9)[0]
+        y = map(x)
+    fine, middle, wide = (map.slopes(x, k * h) for k in (1, 2, 4))
+    J, coarse = (4 * fine - middle) / 3, (4 * middle - wide) / 3
+    # (Weights 8/12 and -1/12 of four returns, each with this noise.)
+    error = np.hypot(np.sqrt(2 * (8**2 + 1)) / 12 * noise[:, None] / h, (J - coarse) / 3)
+    values, covariance, bound = _resolved(J * scale, error * scale)
     return Returns(
         multipliers=values,
         coefficients=np.poly(values).real[1:] if len(values) else np.zeros(0),
@@ -172,29 +156,8 @@ def newton(cycle: Any, names: Any, steps: int) -> Returns:
         steps=h,
         coordinates=map.names,
         residual=float(np.abs((y - x) / size).max()),
-        bound=hidden,
+        bound=bound,
     )
-
-
-def _best(map: _Map, x: np.ndarray, noise: np.ndarray, h: np.ndarray) -> Any:
-    """Return the Jacobian by differences of fourth order, its standard errors, and the steps: for
-    each coordinate those from h to 8 h, in powers of two, with the smallest error."""
-    second = map.slopes(x, h, (1, 2, 4, 8, 16, 32))
-    fourth = [(4 * a - b) / 3 for a, b in zip(second, second[1:], strict=False)]
-    best = None
-    for k, (J, coarse) in enumerate(zip(fourth, fourth[1:], strict=False)):
-        # (Weights 8/12 and -1/12 of four returns, each with this noise.)
-        random = np.sqrt(2 * (8**2 + 1)) / 12 * noise[:, None] / (2**k * h)
-        error = np.hypot(random, (J - coarse) / 3)
-        total = np.linalg.norm(error / map.size[:, None], axis=0) * map.size
-        new = J, error, np.full(len(x), 2.0**k) * h
-        if best is None:
-            best, least = list(new), total
-            continue
-        better = total < least
-        least = np.where(better, total, least)
-        best = [np.where(better, a, b) for a, b in zip(new, best, strict=True)]
-    return best
 
 
 def _resolved(J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]) -> Any:

@@ -78,13 +78,12 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
         return run(self, seed, u)
 
     monkeypatch.setattr(experiment, "run", interrupted)
-    store = tmp_path / "store.zarr"
+    store = tmp_path / "store.jsonl"
     with pytest.raises(KeyboardInterrupt):
         circle.run_experiments(u, discard=0, processes=0, store=store)
     data = circle.run_experiments(u, discard=0, processes=0, store=store)
-    assert seeds == [1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 10]
+    assert seeds == [*range(1, 10), 9, 10]
     assert np.array_equal(data.y, whole.y) and data.simulated.causes == 10 * ("",)
-    assert hj.experiments.StoredExperiments(store)[1].y.shape == (2, 16, 2)
     with pytest.raises(hj.DefinitionError, match="holds other results"):
         circle.run_experiments(2 * u, discard=0, processes=0, store=store)
     hj.save(tmp_path / "data.npz", data)
