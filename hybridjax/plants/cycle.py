@@ -126,9 +126,9 @@ class SettledCycle:
     def perturbed_returns(self, coordinates: SignalNames | None = None) -> Returns:
         """Estimate the multipliers from returns of perturbed states to section 0.
 
-        Newton's method moves the state onto the cycle. Central differences of fourth order then
-        give the Jacobian of the return map. The scatter of returns from nearly equal states is measured
-        by differences along a line (Moré and Wild 2011), and determines the size of the steps.
+        Newton's method moves the state onto the cycle. Central differences of fourth order give the
+        Jacobian of the return map, with steps that the scatter of returns from nearly equal states
+        determines (measured by differences along lines: Moré and Wild 2011).
 
         **Arguments:**
 
@@ -280,7 +280,8 @@ def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
         pair = family.position, family.velocity
         require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
         i, j = map(drive.names.index, pair)
-        rows, turns = [], 0.0
+        rows: list[tuple[float, float]] = []
+        turns = 0.0
         center, scale = np.zeros(2), np.ones(2)
         while abs(turns) < cycles:
             if len(rows) > 1_000_000:  # (fewer: slow rhythms with short steps are refused)

@@ -1,16 +1,17 @@
 """Functional mock-up units (FMI 2.0, co-simulation) as plants."""
 
+import dataclasses
 import os
 import shutil
 import tempfile
 import weakref
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from .._core.arguments import package, require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, NewOptionalNames, Positive, SignalNames
 from ..errors import DefinitionError
+from .plant import Made
 
 
 @checked
@@ -42,50 +43,44 @@ def from_fmu(
     return FMUPlant(os.path.abspath(file), inputs, tuple(signals), dt, period, dict(parameters))
 
 
-class FMUPlant:
+@dataclasses.dataclass(eq=False)
+class FMUPlant(Made):
     """An FMU as a plant: see `from_fmu`."""
 
-    def __init__(
-        self,
-        file: str,
-        inputs: Sequence[str] | Mapping[str, str],
-        signals: tuple[str, ...],
-        dt: float,
-        period: float | None,
-        parameters: dict[str, float],
-    ):
-        self._given = file, inputs, signals, dt, period, parameters
-        self.inputs, self.dt, self.period, self._signals = inputs, dt, period, signals
+    file: str
+    inputs: Sequence[str] | Mapping[str, str]
+    signals: tuple[str, ...]
+    dt: float
+    period: float | None
+    parameters: dict[str, float]
+
+    def __post_init__(self) -> None:
         fmpy = package("fmpy")
         try:
-            about = fmpy.read_model_description(file)
+            about = fmpy.read_model_description(self.file)
         except Exception as error:  # (of many kinds)
-            raise DefinitionError(f"'{file}' is no FMU: {error}") from error
-        if not about.fmiVersion.startswith("2.") or about.coSimulation is None:
-            raise DefinitionError(
-                f"'{file}' is no FMU of FMI 2.0 for co-simulation: export it as one."
-            )
-        variables = {x.name: x for x in about.modelVariables if x.type == "Real"}
-        names = [*inputs, *signals, *parameters]
-        require_among("real variable", names, variables, "from_fmu: ")
-        references = {name: variables[name].valueReference for name in names}
-        self._at = [[references[x] for x in group] for group in (inputs, signals, parameters)]
-        self.units = {x: variables[x].unit for x in signals if variables[x].unit}
+            raise DefinitionError(f"'{self.file}' is no FMU: {error}") from error
         can = about.coSimulation
+        if not about.fmiVersion.startswith("2.") or can is None:
+            raise DefinitionError(
+                f"'{self.file}' is no FMU of FMI 2.0 for co-simulation: export it as one."
+            )
+        groups = self.inputs, self.signals, self.parameters
+        variables = {x.name: x for x in about.modelVariables if x.type == "Real"}
+        require_among("real variable", [x for y in groups for x in y], variables, "from_fmu: ")
+        self._at = [[variables[x].valueReference for x in group] for group in groups]
+        self.units = {x: variables[x].unit for x in self.signals if variables[x].unit}
         self.fixed_step = not can.canHandleVariableCommunicationStepSize
         if can.canGetAndSetFMUstate and can.canSerializeFMUstate:
             self.get_state, self.set_state = self._get_state, self._set_state
         folder = tempfile.mkdtemp()
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        fmpy.extract(file, unzipdir=folder)
+        fmpy.extract(self.file, unzipdir=folder)
         self._slave = fmpy.fmi2.FMU2Slave(
             guid=about.guid, unzipDirectory=folder, modelIdentifier=can.modelIdentifier
         )
         self._slave.instantiate()
         self._t, self._begun = 0.0, False
-
-    def __reduce__(self) -> Any:
-        return FMUPlant, self._given
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin at time 0."""
@@ -93,9 +88,8 @@ class FMUPlant:
             self._slave.reset()
         self._begun, self._t = True, 0.0
         self._slave.setupExperiment(startTime=0.0)
-        values = self._given[-1]
-        if values:
-            self._slave.setReal(self._at[2], list(values.values()))
+        if self.parameters:
+            self._slave.setReal(self._at[2], list(self.parameters.values()))
         self._slave.enterInitializationMode()
         self._slave.exitInitializationMode()
         return self._observe()
@@ -109,7 +103,7 @@ class FMUPlant:
         return self._observe()
 
     def _observe(self) -> Mapping[str, float]:
-        return dict(zip(self._signals, self._slave.getReal(self._at[1]), strict=True))
+        return dict(zip(self.signals, self._slave.getReal(self._at[1]), strict=True))
 
     def _get_state(self) -> tuple[float, bytes]:
         state = self._slave.getFMUState()

@@ -1,5 +1,6 @@
 """Environments of Gymnasium as plants."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ from .._core.arguments import package
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewOptionalNames, Positive, SignalNames
 from ..errors import ComputationError, DefinitionError
+from .plant import Made
 
 
 @checked
@@ -42,54 +44,41 @@ def from_gymnasium(
     return GymnasiumPlant(environment, inputs, tuple(signals), dt, policy, period)
 
 
-class GymnasiumPlant:
+@dataclasses.dataclass(eq=False)
+class GymnasiumPlant(Made):
     """An environment as a plant: see `from_gymnasium`."""
 
     fixed_step = True
+    environment: Any
+    inputs: Sequence[str] | Mapping[str, str]
+    signals: tuple[str, ...]
+    dt: float
+    policy: Any
+    period: float | None
 
-    def __init__(
-        self,
-        environment: Any,
-        inputs: Sequence[str] | Mapping[str, str],
-        signals: tuple[str, ...],
-        dt: float,
-        policy: Any,
-        period: float | None,
-    ):
-        self._given = environment, inputs, signals, dt, policy, period
-        self.inputs, self.dt, self.period = inputs, dt, period
-        self._signals, self._policy = signals, policy
-        gym = package("gymnasium")
+    def __post_init__(self) -> None:
+        gym, make = package("gymnasium"), self.environment
         # (Time limits of a registered environment would end experiments.)
-        make = (
-            (lambda: gym.make(environment).unwrapped)
-            if isinstance(environment, str)
-            else environment
-        )
-        self._environment = make()
-        shapes = self._environment.observation_space.shape, self._environment.action_space.shape
-        if shapes != ((len(signals),), (len(inputs),)):
+        self._made = gym.make(make).unwrapped if isinstance(make, str) else make()
+        shapes = self._made.observation_space.shape, self._made.action_space.shape
+        if shapes != ((len(self.signals),), (len(self.inputs),)):
             raise DefinitionError(
                 f"observations and actions have the shapes {shapes}: give as many `signals` and "
                 "`inputs`."
             )
-        self._dtype = self._environment.action_space.dtype
-        self._seen: Any = None
-
-    def __reduce__(self) -> Any:
-        return GymnasiumPlant, self._given
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin an episode."""
-        self._seen, _ = self._environment.reset(seed=seed)
-        return dict(zip(self._signals, self._seen.tolist(), strict=True))
+        self._z, _ = self._made.reset(seed=seed)
+        return dict(zip(self.signals, self._z.tolist(), strict=True))
 
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]:
         """Take one step."""
         action = np.array(u, float)
-        if self._policy is not None:
-            action += self._policy(self._seen)
-        self._seen, _, terminated, truncated, _ = self._environment.step(action.astype(self._dtype))
+        if self.policy is not None:
+            action += self.policy(self._z)
+        action = action.astype(self._made.action_space.dtype)
+        self._z, _, terminated, truncated, _ = self._made.step(action)
         if terminated or truncated:
             raise ComputationError(f"the episode was {'terminated' if terminated else 'truncated'}")
-        return dict(zip(self._signals, self._seen.tolist(), strict=True))
+        return dict(zip(self.signals, self._z.tolist(), strict=True))

@@ -1,5 +1,6 @@
 """Models of MuJoCo as plants."""
 
+import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -10,6 +11,7 @@ from .._core.arguments import package, require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewOptionalNames, Positive
 from ..errors import ComputationError, DefinitionError
+from .plant import Made
 
 
 @checked
@@ -55,56 +57,38 @@ def from_mujoco(
     return MuJoCoPlant(model, inputs, control, fallen, period, substeps)
 
 
-class MuJoCoPlant:
+@dataclasses.dataclass(eq=False)
+class MuJoCoPlant(Made):
     """A model of MuJoCo as a plant: see `from_mujoco`."""
 
-    def __init__(
-        self,
-        model: Any,
-        inputs: Sequence[str] | Mapping[str, str],
-        control: Any,
-        fallen: Any,
-        period: float | None,
-        substeps: int,
-    ):
-        self.model, self.inputs, self.period = model, inputs, period
-        self.control, self.fallen = control, fallen
-        self.dt = float(model.opt.timestep) * substeps
-        self.substeps = substeps
-        self._make()
+    model: Any
+    inputs: Sequence[str] | Mapping[str, str]
+    control: Any
+    fallen: Any
+    period: float | None
+    substeps: int
 
-    def _make(self) -> None:
-        self._mujoco = mujoco = package("mujoco")
-        model = self.model
-        self.data = mujoco.MjData(model)
-        whole = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-        self._integrate = mujoco.mj_step if whole else mujoco.mj_step2
-        self._refresh = mujoco.mj_step1
+    def __post_init__(self) -> None:
+        self._mujoco, model = package("mujoco"), self.model
+        self.data, self.dt = self._mujoco.MjData(model), float(model.opt.timestep) * self.substeps
+        kinds, parts = self._mujoco.mjtJoint, self._mujoco.mjtState
+        whole = model.opt.integrator == self._mujoco.mjtIntegrator.mjINT_RK4
+        self._integrate = self._mujoco.mj_step if whole else self._mujoco.mj_step2
         self._actuators = [model.actuator(name).id for name in self.inputs]
-        scalar = {int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)}
-        single = [i for i in range(model.njnt) if int(model.jnt_type[i]) in scalar]
-        names = [model.joint(i).name or f"joint{i}" for i in single]
-        self._positions = [int(model.jnt_qposadr[i]) for i in single]
-        self._velocities = [int(model.jnt_dofadr[i]) for i in single]
-        sensors = [
-            (model.sensor(i).name or f"sensor{i}", int(model.sensor_dim[i]))
-            for i in range(model.nsensor)
-        ]
-        several = [x if n == 1 else f"{x}[{k}]" for x, n in sensors for k in range(n)]
-        self._names = [*names, *(f"{x}_rate" for x in names), *several]
-        q = [f"q{i}" for i in range(model.nq)]
-        v = [f"v{i}" for i in range(model.nv)]
-        for name, i, j in zip(names, self._positions, self._velocities, strict=True):
+        scalar = np.isin(model.jnt_type, [int(kinds.mjJNT_SLIDE), int(kinds.mjJNT_HINGE)])
+        self._q, self._v = model.jnt_qposadr[scalar], model.jnt_dofadr[scalar]
+        names = [model.joint(i).name or f"joint{i}" for i in np.flatnonzero(scalar)]
+        self._names = [*names, *(f"{x}_rate" for x in names)]
+        for i in range(model.nsensor):
+            name, n = model.sensor(i).name or f"sensor{i}", int(model.sensor_dim[i])
+            self._names += [name] if n == 1 else [f"{name}[{k}]" for k in range(n)]
+        q, v = [f"q{i}" for i in range(model.nq)], [f"v{i}" for i in range(model.nv)]
+        for name, i, j in zip(names, self._q, self._v, strict=True):
             q[i], v[j] = name, f"{name}_rate"
         self.states = ("time", *q, *v, *(f"act{i}" for i in range(model.na)))
-
-    def __getstate__(self) -> dict[str, Any]:
-        kept = "model", "inputs", "period", "control", "fallen", "dt", "substeps"
-        return {name: getattr(self, name) for name in kept}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._make()
+        # (The last part is where the solver of contacts begins.)
+        kept = "TIME", "QPOS", "QVEL", "ACT", "WARMSTART"
+        self._kept = sum(int(getattr(parts, f"mjSTATE_{x}")) for x in kept)
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin at the first keyframe."""
@@ -113,7 +97,7 @@ class MuJoCoPlant:
         else:
             self._mujoco.mj_resetData(self.model, self.data)
         self.data.time = 0.0
-        self._refresh(self.model, self.data)
+        self._mujoco.mj_step1(self.model, self.data)
         return self._observe()
 
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]:
@@ -121,44 +105,34 @@ class MuJoCoPlant:
         model, data, whole = self.model, self.data, float(self.model.opt.timestep)
         steps = int(duration / whole + 1e-9)
         left = duration - steps * whole
-        for _ in range(steps):
-            self._advance(u)
-        if left > 1e-9 * whole:
-            model.opt.timestep = left
-            try:
-                self._advance(u)
-            finally:
-                model.opt.timestep = whole
+        try:
+            for h in [whole] * steps + [left] * (left > 1e-9 * whole):
+                model.opt.timestep = h
+                data.ctrl[:] = 0.0 if self.control is None else self.control(model, data)
+                for i, x in zip(self._actuators, u, strict=True):
+                    data.ctrl[i] += x
+                # The positions of bodies, contacts and sensors then belong to the present state,
+                # which they do not after `mj_step`. (Runge-Kutta steps cannot be divided.)
+                self._integrate(model, data)
+                self._mujoco.mj_step1(model, data)
+        finally:
+            model.opt.timestep = whole
         if self.fallen is not None and self.fallen(data):
             raise ComputationError("the walker has fallen")
         return self._observe()
 
-    def _advance(self, u: Sequence[float]) -> None:
-        model, data = self.model, self.data
-        data.ctrl[:] = 0.0 if self.control is None else self.control(model, data)
-        for i, x in zip(self._actuators, u, strict=True):
-            data.ctrl[i] += x
-        # The positions of bodies, contacts and sensors then belong to the present state, which they
-        # do not after `mj_step`. (Runge-Kutta steps cannot be divided.)
-        self._integrate(model, data)
-        self._refresh(model, data)
-
     def _observe(self) -> Mapping[str, float]:
         data = self.data
-        q, v = data.qpos[self._positions], data.qvel[self._velocities]
-        return dict(
-            zip(self._names, [*q.tolist(), *v.tolist(), *data.sensordata.tolist()], strict=True)
-        )
+        values = np.concatenate([data.qpos[self._q], data.qvel[self._v], data.sensordata])
+        return dict(zip(self._names, values.tolist(), strict=True))
 
     def get_state(self) -> np.ndarray:
-        """Return `states`, then where the solver of contacts begins."""
-        x = self.data
-        return np.concatenate([[x.time], x.qpos, x.qvel, x.act, x.qacc_warmstart])
+        """Return `states`, and then what the solver of contacts keeps."""
+        x = np.empty(self._mujoco.mj_stateSize(self.model, self._kept))
+        self._mujoco.mj_getState(self.model, self.data, x, self._kept)
+        return x
 
     def set_state(self, x: Any) -> None:
         """Continue from a state."""
-        data, model = self.data, self.model
-        sizes = np.cumsum([1, model.nq, model.nv, model.na])
-        time, data.qpos[:], data.qvel[:], data.act[:], data.qacc_warmstart[:] = np.split(x, sizes)
-        data.time = float(time[0])
-        self._refresh(model, data)
+        self._mujoco.mj_setState(self.model, self.data, x, self._kept)
+        self._mujoco.mj_step1(self.model, self.data)

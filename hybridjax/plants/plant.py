@@ -1,5 +1,6 @@
 """The protocol between this package and a simulator of another package."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -43,3 +44,11 @@ def optional(plant: Any, name: str, default: Any) -> Any:
     """Return an optional field of a plant."""
     value = getattr(plant, name, None)
     return default if value is None else value
+
+
+class Made:
+    """A dataclass that another process makes again from its arguments."""
+
+    def __reduce__(self) -> Any:
+        arguments: Any = self
+        return type(self), tuple(getattr(self, x.name) for x in dataclasses.fields(arguments))

@@ -38,7 +38,12 @@ def run_all(
             begun.append(worker)
             work = [packed, item]
         expired = threading.Event()
-        timer = threading.Timer(limit, lambda: (expired.set(), worker.kill()))
+
+        def expire() -> None:
+            expired.set()
+            worker.kill()
+
+        timer = threading.Timer(limit, expire)
         timer.start()
         try:
             for x in work:

@@ -128,9 +128,9 @@ def returns_of(cycle: Any, names: Any) -> Returns:
     x, size = map.base[map.columns], map.size
     say("noise of returns")
     noise = map.noise(x)
-    # Steps at which noise and the error of fourth order are equal for a function of unit
+    # Steps at which noise and the error of fourth order are nearly equal for a function of unit
     # derivatives; at most two percent of the range.
-    h = size * min((noise / size).max() ** 0.2, 0.02)
+    h = size * min((noise / size).max() ** 0.2 / 2, 0.02)
     J, y = map.slopes(x, h), map(x)
     scale = size / size[:, None]  # (of derivatives)
     for _ in range(5):
