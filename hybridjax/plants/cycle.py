@@ -1,7 +1,7 @@
 """The limit cycle of a plant: the sections on it, outputs there, and experiments around it."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -15,12 +15,13 @@ from .._core.boundary.values import Whole
 from .._core.execution import core_count
 from .._core.pieces.description import digest_of
 from .._core.progress import counted, working
+from .._core.results import Result
 from .._core.signal import Signal, signals, unit_of
 from .._core.text import listed
 from ..errors import ComputationError, DefinitionError
-from ..experiments.data import ExperimentData
+from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.design import DISCARD
-from ..experiments.run import DesignLike, check_inputs
+from ..experiments.run import DesignLike, Inputs, check_inputs
 from ..orbits.crossing import AtEvent, Crossing
 from ..sections.families import (
     AbstractSections,
@@ -30,11 +31,10 @@ from ..sections.families import (
     SectionList,
     as_family,
 )
-from .drive import Crossed, Drive, Experiment, ListWatch, PhaseWatch, Start, Stopped, Trial
+from .drive import At, Drive, Experiment, ListWatch, PhaseWatch, Stopped, Trial
 from .plant import Plant, optional
-from .processes import run_all
+from .processes import resume, run_all
 from .returns import Returns, returns_of
-from .stored import collect, resume
 
 
 PlantLike = Annotated[Plant, Having(Plant)]
@@ -104,24 +104,20 @@ class SettledCycle:
         made in other processes; `ComputationError` if the cycle has not settled.
         """
         inputs = check_inputs(design, discard, self.n_sections, len(self.inputs))
-        processes = core_count() if processes is None else processes
-        processes, S = min(processes, len(inputs)), len(inputs)
-        u = inputs.part(slice(0, S))
+        count = min(core_count() if processes is None else processes, len(inputs))
+        u = inputs.part(slice(0, len(inputs)))
 
         def run(rows: list[int]) -> Iterator[Trial]:
             items = ((self.seed + 1 + s, u[s].tolist()) for s in rows)
-            yield from counted(
-                run_all(self.experiment, items, processes, limit), "experiments", len(rows)
-            )
+            trials = run_all(self.experiment, items, count, limit)
+            yield from counted(trials, "experiments", len(rows))
 
         with working("run_experiments"):
-            if store is None:
-                return collect(self, inputs, list(run([*range(S)])))
             # (A plant is described by the cycle that was measured.)
             course = [f"{x:.6g}" for x in (self.period, *np.ravel(self.cycle_outputs))]
             names = type(self.plant).__name__, self.outputs, inputs.periods
-            about = digest_of(names, course, self.sections, u, self.seed)
-            return collect(self, inputs, resume(store, about, S, run))
+            about = digest_of(names, course, self.sections, u, self.seed) if store else ""
+            return _collect(self, inputs, resume(store, about, len(u), run))
 
     def perturbed_returns(self, coordinates: SignalNames | None = None) -> Returns:
         """Estimate the multipliers from returns of perturbed states to section 0.
@@ -201,7 +197,7 @@ def _measure(
     N, names, plant = family.n_sections, drive.names, drive.plant
     columns = tuple(names.index(x) for x in outputs)
 
-    def turn(pause: float) -> tuple[Start, list[Crossed]]:
+    def turn(pause: float) -> tuple[At, list[At]]:
         start = drive.here()
         drive.watch.begin(drive.t, drive.z, on_section=True)
         return start, [drive.advance(drive.zero, k, pause) for k in range(1, N + 1)]
@@ -225,20 +221,16 @@ def _measure(
             )
     given, units = plant.inputs, optional(plant, "units", {})
     of_inputs = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
+    ends = [at[-1].t for _, at in turns]
     return SettledCycle(
-        plant=plant,
-        sections=family,
-        inputs=signals(of_inputs, of_inputs.values()),
-        outputs=tuple(Signal(x, unit_of(x) or units.get(x, "")) for x in outputs),
-        period=float(np.diff([at[-1].t for _, at in turns]).mean()),
-        cycle_outputs=values.mean(axis=0),
-        noise=values.std(axis=0),
-        late=max(x.late for _, at in turns for x in at),
+        plant, family, signals(of_inputs, of_inputs.values()),
+        tuple(Signal(x, unit_of(x) or units.get(x, "")) for x in outputs),
+        period=float(np.diff(ends).mean()), cycle_outputs=values.mean(axis=0),
+        noise=values.std(axis=0), late=max(x.late for _, at in turns for x in at), seed=seed,
         experiment=Experiment(
             plant, drive.watch, names, columns, start, warmup, drive.longest, pause
         ),
-        seed=seed,
-    )
+    )  # fmt: skip
 
 
 def _require_settled(values: Float[np.ndarray, "c N ny"]) -> None:
@@ -258,13 +250,13 @@ def _require_settled(values: Float[np.ndarray, "c N ny"]) -> None:
 
 def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
     """Run the plant for some cycles, and return the sections with the numbers of its cycle."""
-    N = family.n_sections
+    N, anchor = family.n_sections, getattr(family, "anchor", None)
     if isinstance(family, SectionList):
-        drive.watch = watch = ListWatch(tuple(_item(drive, x) for x in family.items))
+        drive.watch = ListWatch(tuple(_item(drive, x) for x in family.items))
         drive.longest = 100_000 * drive.dt
         for _ in range(cycles):
             drive.advance(drive.zero, 0)
-        return watch
+        return drive.watch
     if isinstance(family, ClockPhase):
         period = optional(drive.plant, "period", None)
         if period is None:
@@ -273,9 +265,9 @@ def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
                 "KinematicPhase or a Crossing."
             )
         drive.run(cycles * period)
-        if isinstance(family.anchor, Crossing):
-            return PhaseWatch(N, period, _anchor(drive, family.anchor, period).t)
-        return PhaseWatch(N, period, float(family.anchor) * period)
+        if isinstance(anchor, Crossing):
+            return PhaseWatch(N, period, _anchor(drive, anchor, period).t)
+        return PhaseWatch(N, period, float(anchor) * period)
     if isinstance(family, KinematicPhase):
         pair = family.position, family.velocity
         require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
@@ -299,12 +291,12 @@ def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
             x, y = ((z - center) / scale).T
             angle = np.unwrap(np.arctan2(y, x))
             turns = float(angle[-1] - angle[0]) / (2 * np.pi)
-        watch = PhaseWatch(N, 1.0, 0.0, (i, j), center.tolist(), scale.tolist(), np.sign(turns))
-        if isinstance(family.anchor, Crossing):
-            first = watch.angle(_anchor(drive, family.anchor, drive.t / abs(turns)).z)
-        else:
-            first = float(family.anchor)
-        return dataclasses.replace(watch, first=first)
+        sense = float(np.sign(turns))
+        watch = PhaseWatch(N, 1.0, 0.0, (i, j), center.tolist(), scale.tolist(), sense)
+        if isinstance(anchor, Crossing):
+            z = _anchor(drive, anchor, drive.t / abs(turns)).z
+            return dataclasses.replace(watch, first=2 * np.pi * sense * watch.turns(0.0, z))
+        return dataclasses.replace(watch, first=float(anchor))
     raise DefinitionError(
         f"{type(family).__name__} needs equations: use ClockPhase, KinematicPhase, or Crossings of "
         "signals."
@@ -320,7 +312,29 @@ def _item(drive: Drive, section: Crossing | AtEvent) -> tuple[int, float, float]
     return drive.names.index(section.function), sign, float(section.value)
 
 
-def _anchor(drive: Drive, anchor: Crossing, period: float) -> Crossed:
+def _anchor(drive: Drive, anchor: Crossing, period: float) -> At:
     """Return a crossing on the cycle."""
     drive.watch, drive.longest = ListWatch((_item(drive, anchor),)), 3 * period
     return [drive.advance(drive.zero, 0, period / 4) for _ in range(2)][-1]
+
+
+def _collect(cycle: SettledCycle, inputs: Inputs, trials: Sequence[Trial]) -> ExperimentData:
+    """Return the data of all experiments."""
+    u, N = inputs.part(slice(0, len(inputs))), cycle.n_sections
+    S, n, _ = u.shape
+    y, late = np.full((S, n, len(cycle.outputs)), np.nan), np.full((S, n), np.nan)
+    failed_at, result = np.full(S, -1), np.full(S, int(Result.OK))
+    for s, trial in enumerate(trials):
+        k = len(trial.late)
+        if k:
+            y[s, :k] = trial.y - cycle.cycle_outputs[np.arange(k) % N]
+        late[s, :k] = trial.late
+        if trial.cause:
+            failed_at[s] = k
+            result[s] = Result.SECTION_MISSED if trial.missed else Result.PLANT_STOPPED
+    causes = tuple(x.cause for x in trials)
+    return ExperimentData(
+        u, y, n_sections=N, periods=inputs.periods, inputs=cycle.inputs, outputs=cycle.outputs,
+        result=result, cycle_outputs=cycle.cycle_outputs,
+        simulated=Simulated(failed_at, None, cycle.sections.label, late, causes),
+    )  # fmt: skip

@@ -34,37 +34,33 @@ class PhaseWatch:
     scale: Sequence[float] = (1.0, 1.0)
     sense: float = 1.0
     phase: float = 0.0
+    start: float = 0.0
 
     @property
     def timed(self) -> bool:
         return self.columns is None
 
-    def angle(self, z: Sequence[float]) -> float:
-        """Return the angle in radians."""
-        (i, j), (a, b), (p, q) = self.columns or (0, 1), self.center, self.scale
-        return math.atan2((z[j] - b) / q, (z[i] - a) / p)
-
     def turns(self, t: float, z: Sequence[float]) -> float:
         """Return the phase from section 0 in turns, for angles up to whole turns."""
         if self.columns is None:
             return (t - self.first) / self.period
-        return self.sense * (self.angle(z) - self.first) / (2 * math.pi)
+        (i, j), (a, b), (p, q) = self.columns, self.center, self.scale
+        angle = math.atan2((z[j] - b) / q, (z[i] - a) / p)
+        return self.sense * (angle - self.first) / (2 * math.pi)
 
     def begin(self, t: float, z: Sequence[float], on_section: bool = False) -> None:
         """Count sections from the next section 0 on, or from the one on which the plant is."""
-        turns = self.turns(t, z)
-        self.phase = round(turns) if on_section else math.ceil(turns)
-        if self.columns is not None:
-            self.phase = turns - self.phase
+        self.phase = self.turns(t, z)
+        self.start = round(self.phase) if on_section else math.ceil(self.phase)
 
     def level(self, k: int, t: float, z: Sequence[float]) -> float:
         """Return a number that falls through zero at section k, counted from `begin` on: the time
-        until then, or an angle, which is unwrapped."""
-        if self.columns is None:
-            return self.first + (self.phase + k / self.n) * self.period - t
-        turns = self.turns(t, z) - self.phase
-        self.phase += turns - round(turns)
-        return k / self.n - self.phase
+        until then, or an angle in turns, which is unwrapped."""
+        turns = self.turns(t, z)
+        if self.columns is not None:
+            turns += round(self.phase - turns)
+        self.phase = turns
+        return (self.start + k / self.n - turns) * self.period
 
 
 @dataclasses.dataclass
@@ -85,21 +81,14 @@ class ListWatch:
         return sign * (z[column] - value)
 
 
-class Crossed(NamedTuple):
-    """A section: the time at which it was crossed, the signals there, interpolated between two
-    steps, and the time by which the plant is beyond it."""
+class At(NamedTuple):
+    """A point of a course: time and signals, at sections interpolated between two steps; the time
+    by which the plant is beyond it; and the state of a plant that can be set."""
 
     t: float
     z: Sequence[float]
-    late: float
-
-
-class Start(NamedTuple):
-    """A start on section 0: time, signals, and the state of a plant that can be set."""
-
-    t: float
-    z: tuple[float, ...]
-    state: Any
+    late: float = 0.0
+    state: Any = None
 
 
 class Drive:
@@ -115,8 +104,8 @@ class Drive:
         self.sets = hasattr(plant, "get_state") and hasattr(plant, "set_state")
         self.zero = [0.0] * len(plant.inputs)
         self.t = 0.0
-        self.z: tuple[float, ...] = ()
-        self.last: Start | None = None
+        self.z: Sequence[float] = ()
+        self.last: At | None = None
         self.watch: Any = None
 
     def reset(self, seed: int) -> None:
@@ -124,14 +113,14 @@ class Drive:
         self._observe("reset", 0.0, seed)
         self.last = None
 
-    def restore(self, start: Start) -> None:
+    def restore(self, start: At) -> None:
         """Continue from a state that was kept."""
         self.plant.set_state(start.state)
         self.t, self.z, self.last = start.t, start.z, None
 
-    def here(self) -> Start:
+    def here(self) -> At:
         """Return the present time, signals and state."""
-        return Start(self.t, self.z, self.plant.get_state() if self.sets else None)
+        return At(self.t, self.z, 0.0, self.plant.get_state() if self.sets else None)
 
     def step(self, u: Sequence[float], h: float) -> None:
         """Hold the input for some time."""
@@ -156,7 +145,7 @@ class Drive:
         for _ in range(round(duration / self.dt)):
             self.step(self.zero, self.dt)
 
-    def advance(self, u: Sequence[float], k: int, pause: float = 0.0) -> Crossed:
+    def advance(self, u: Sequence[float], k: int, pause: float = 0.0) -> At:
         """Hold the input until section k. Steps end on it if its time is known, or if the state can
         be set; steps of fixed length end after it.
 
@@ -168,7 +157,7 @@ class Drive:
             while x > 1e-9 * self.dt:
                 self.step(u, min(x, self.dt))
                 x = watch.level(k, self.t, self.z)
-            return Crossed(self.t, self.z, -x)
+            return At(self.t, self.z, -x)
         if x <= 0 and armed and last is not None:  # two sections in one step
             before = watch.level(k, last.t, last.z)
             x = watch.level(k, self.t, self.z)
@@ -176,7 +165,7 @@ class Drive:
                 return self._between(last, before, x)
         while self.t - began <= self.longest:
             lands = self.sets and not self.fixed and armed and x > 0
-            last = self.here() if lands else Start(self.t, self.z, None)
+            last = self.here() if lands else At(self.t, self.z)
             self.step(u, self.dt)
             self.last = last
             y = watch.level(k, self.t, self.z)
@@ -186,14 +175,14 @@ class Drive:
         text = f"a section was not reached within {self.longest:.4g}"
         raise Stopped(f"{text} (t = {self.t:.6g})", missed=True)
 
-    def _between(self, last: Start, x: float, y: float) -> Crossed:
+    def _between(self, last: At, x: float, y: float) -> At:
         """Return the section between an earlier point and the present one."""
         share = x / (x - y) if x > y else 1.0
         at = last.t + share * (self.t - last.t)
         values = tuple(a + share * (b - a) for a, b in zip(last.z, self.z, strict=True))
-        return Crossed(at, values, self.t - at)
+        return At(at, values, self.t - at)
 
-    def _land(self, u: Sequence[float], k: int, before: Start, x: float, y: float) -> Crossed:
+    def _land(self, u: Sequence[float], k: int, before: At, x: float, y: float) -> At:
         """Repeat a step that went beyond a section, so that it ends there (Illinois method)."""
         low, high, side = 0.0, self.t - before.t, 0.0
         for _ in range(40):
@@ -208,7 +197,7 @@ class Drive:
                 low, x, y, side = h, level, y / 2 if side > 0 else y, 1.0
             else:
                 high, y, x, side = h, level, x / 2 if side < 0 else x, -1.0
-        return Crossed(self.t, self.z, late)
+        return At(self.t, self.z, late)
 
 
 class Trial(NamedTuple):
@@ -234,7 +223,7 @@ class Experiment:
     watch: Any
     names: tuple[str, ...]
     columns: tuple[int, ...]
-    start: Start
+    start: At
     warmup: float
     longest: float
     pause: float
@@ -257,7 +246,7 @@ class Experiment:
             return Trial(y, late, f"{type(error).__name__}: {error} (t = {drive.t:.6g})")
         return Trial(y, late)
 
-    def begin(self, drive: Drive, seed: int) -> Crossed:
+    def begin(self, drive: Drive, seed: int) -> At:
         """Bring a plant to section 0. The first steps after two equal resets are compared."""
         courses = []
         for _ in range(2):
@@ -273,7 +262,7 @@ class Experiment:
         if drive.sets:
             drive.restore(self.start)
             drive.watch.begin(drive.t, drive.z, on_section=True)
-            return Crossed(drive.t, drive.z, 0.0)
+            return At(drive.t, drive.z)
         drive.run(self.warmup)
         drive.watch.begin(drive.t, drive.z)
         return drive.advance(drive.zero, 0)

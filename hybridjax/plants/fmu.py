@@ -22,7 +22,6 @@ def from_fmu(
     *,
     dt: Positive,
     period: Positive | None = None,
-    parameters: Mapping[str, float] = {},  # noqa: B006 (never changed)
 ) -> "FMUPlant":
     """Make a plant of an FMU (`pip install 'hybridjax[fmu]'`).
 
@@ -36,11 +35,10 @@ def from_fmu(
     - `inputs`, `signals`: names of real variables.
     - `dt`: longest communication step in seconds.
     - `period`: period of the clock in seconds. Default: no clock.
-    - `parameters`: values of real variables that are set before the start. Default: none.
 
     **Raises:** `DefinitionError` for another kind of FMU, and for unknown variables.
     """
-    return FMUPlant(os.path.abspath(file), inputs, tuple(signals), dt, period, dict(parameters))
+    return FMUPlant(os.path.abspath(file), inputs, tuple(signals), dt, period)
 
 
 @dataclasses.dataclass(eq=False)
@@ -52,7 +50,6 @@ class FMUPlant(Made):
     signals: tuple[str, ...]
     dt: float
     period: float | None
-    parameters: dict[str, float]
 
     def __post_init__(self) -> None:
         fmpy = package("fmpy")
@@ -65,7 +62,7 @@ class FMUPlant(Made):
             raise DefinitionError(
                 f"'{self.file}' is no FMU of FMI 2.0 for co-simulation: export it as one."
             )
-        groups = self.inputs, self.signals, self.parameters
+        groups = self.inputs, self.signals
         variables = {x.name: x for x in about.modelVariables if x.type == "Real"}
         require_among("real variable", [x for y in groups for x in y], variables, "from_fmu: ")
         self._at = [[variables[x].valueReference for x in group] for group in groups]
@@ -88,8 +85,6 @@ class FMUPlant(Made):
             self._slave.reset()
         self._begun, self._t = True, 0.0
         self._slave.setupExperiment(startTime=0.0)
-        if self.parameters:
-            self._slave.setReal(self._at[2], list(self.parameters.values()))
         self._slave.enterInitializationMode()
         self._slave.exitInitializationMode()
         return self._observe()

@@ -4,12 +4,15 @@ The processes are not those of `multiprocessing`: these would run the main scrip
 be ended one by one.
 """
 
+import contextlib
+import json
 import os
+import pathlib
 import pickle
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -37,10 +40,10 @@ def run_all(
             worker = local.worker = _start()
             begun.append(worker)
             work = [packed, item]
-        expired = threading.Event()
+        expired: list[bool] = []
 
         def expire() -> None:
-            expired.set()
+            expired.append(True)
             worker.kill()
 
         timer = threading.Timer(limit, expire)
@@ -52,10 +55,8 @@ def run_all(
             answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
             local.worker, code = None, worker.wait()
-            hung = f"no answer within the limit of {limit:g} s"
-            return Trial(
-                [], [], hung if expired.is_set() else f"the process ended with code {code}"
-            )
+            hung = expired and f"no answer within the limit of {limit:g} s"
+            return Trial([], [], hung or f"the process ended with code {code}")
         finally:
             timer.cancel()
         if isinstance(answer, str):
@@ -74,6 +75,32 @@ def run_all(
                 worker.communicate()
 
 
+def resume(
+    file: Any, about: str, count: int, run: Callable[[list[int]], Iterator[Trial]]
+) -> list[Trial]:
+    """Run the experiments that a file of JSON lines (None: no file) lacks, and append each.
+
+    **Raises:** `DefinitionError` if the first line of the file is not `about`.
+    """
+    if file is None:
+        return [*run([*range(count)])]
+    path, trials = pathlib.Path(file), {}
+    lines = path.read_text(errors="replace").splitlines() if path.exists() else []
+    if lines and lines[0] != about:
+        raise DefinitionError(f"'{file}' holds other results: give another file, or delete it.")
+    for line in lines[1:]:
+        with contextlib.suppress(ValueError):  # (an interrupted line)
+            s, *trial = json.loads(line)
+            trials[s] = Trial(*trial)
+    missing = [s for s in range(count) if s not in trials]
+    with path.open("a") as stream:
+        print("" if lines else about, file=stream, flush=True)
+        for s, done in zip(missing, run(missing), strict=True):
+            trials[s] = done
+            print(json.dumps([s, *done]), file=stream, flush=True)
+    return [trials[s] for s in range(count)]
+
+
 def _start() -> Any:
     # (One thread of BLAS: the processes use all cores. Path: that of this process.)
     threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -88,11 +115,15 @@ def _pack(experiment: Experiment) -> bytes:
 
     **Raises:** `DefinitionError` for a plant that cannot be pickled.
     """
+    module = sys.modules.get(type(experiment.plant).__module__)
     try:
-        import cloudpickle as packer
-    except ImportError:
-        packer = pickle
-    try:
+        try:
+            import cloudpickle as packer
+        except ImportError:
+            packer = pickle
+        else:
+            if module is not None and module.__spec__ is None:  # (in no file)
+                packer.register_pickle_by_value(module)
         return packer.dumps(experiment)
     except Exception as error:
         raise DefinitionError(

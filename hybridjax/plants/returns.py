@@ -21,11 +21,8 @@ class Returns(MultiplierEstimate):
     **Fields** beside those of all estimates of multipliers:
 
     - `jacobian` (d, d): derivatives of the returned coordinates with respect to those at the start.
-      `jacobian_error` (d, d): their standard errors, from the noise of the returns, and from the
-      difference between steps of two sizes.
     - `coordinates`: their names. `state` (d,): their values on the cycle, on section 0.
-    - `noise` (d,): standard deviation of returns from nearly equal states. `steps` (d,): the
-      smallest perturbations used.
+    - `noise` (d,): standard deviation of returns from nearly equal states.
     - `residual`: largest distance between state and return, in units of the range of the
       coordinate on the cycle.
     - `bound`: multipliers that are not listed cannot be told from 0; this is the largest modulus
@@ -33,10 +30,8 @@ class Returns(MultiplierEstimate):
     """
 
     jacobian: Float[np.ndarray, "d d"]
-    jacobian_error: Float[np.ndarray, "d d"]
     state: Float[np.ndarray, " d"]
     noise: Float[np.ndarray, " d"]
-    steps: Float[np.ndarray, " d"]
     coordinates: tuple[str, ...] = eqx.field(static=True)
     residual: float = eqx.field(static=True)
     bound: float = eqx.field(static=True)
@@ -145,19 +140,11 @@ def returns_of(cycle: Any, names: Any) -> Returns:
     error = np.hypot(np.sqrt(2 * (8**2 + 1)) / 12 * noise[:, None] / h, (J - coarse) / 3)
     values, covariance, bound = _resolved(J * scale, error * scale)
     return Returns(
-        multipliers=values,
+        multipliers=values, covariance=covariance, covariance_freedom=10.0,  # (eleven differences)
         coefficients=np.poly(values).real[1:] if len(values) else np.zeros(0),
-        covariance=covariance,
-        covariance_freedom=10.0,  # (eleven fourth differences)
-        jacobian=J,
-        jacobian_error=error,
-        state=x,
-        noise=noise,
-        steps=h,
-        coordinates=map.names,
-        residual=float(np.abs((y - x) / size).max()),
-        bound=bound,
-    )
+        jacobian=J, state=x, noise=noise, coordinates=map.names,
+        residual=float(np.abs((y - x) / size).max()), bound=bound,
+    )  # fmt: skip
 
 
 def _resolved(J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]) -> Any:
