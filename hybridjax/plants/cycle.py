@@ -23,16 +23,9 @@ from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.design import DISCARD
 from ..experiments.run import DesignLike, Inputs, check_inputs
 from ..orbits.crossing import AtEvent, Crossing
-from ..sections.families import (
-    AbstractSections,
-    ClockPhase,
-    FamilyLike,
-    KinematicPhase,
-    SectionList,
-    as_family,
-)
+from ..sections import families
 from .drive import At, Drive, Experiment, ListWatch, PhaseWatch, Stopped, Trial
-from .plant import Plant, optional
+from .plant import Plant
 from .processes import resume, run_all
 from .returns import Returns, returns_of
 
@@ -55,7 +48,7 @@ class SettledCycle:
     """
 
     plant: Plant
-    sections: AbstractSections
+    sections: families.AbstractSections
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
     period: float
@@ -152,7 +145,7 @@ class SettledCycle:
 @working("settle")
 def settle(
     plant: PlantLike,
-    sections: FamilyLike,
+    sections: families.FamilyLike,
     outputs: SignalNames,
     *,
     cycles: Annotated[int, Whole(8, 1_000_000)] = 100,
@@ -175,7 +168,7 @@ def settle(
     functions of a state), and a plant that does not continue from the state that it returned;
     `ComputationError` if the plant fails or has not settled.
     """
-    family = as_family(sections)
+    family = families.as_family(sections)
     drive = Drive(plant)
     try:
         drive.reset(seed)
@@ -190,7 +183,7 @@ def settle(
 
 
 def _measure(
-    drive: Drive, family: AbstractSections, outputs: tuple[str, ...],
+    drive: Drive, family: families.AbstractSections, outputs: tuple[str, ...],
     cycles: int, warmup: float, seed: int,
 ) -> SettledCycle:  # fmt: skip
     """Record cycles, and prepare experiments. The plant is on section 0."""
@@ -219,7 +212,7 @@ def _measure(
                 "after `set_state` the plant does not continue as before: `get_state` must return "
                 "all that its future depends on."
             )
-    given, units = plant.inputs, optional(plant, "units", {})
+    given, units = plant.inputs, getattr(plant, "units", {})
     of_inputs = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
     ends = [at[-1].t for _, at in turns]
     return SettledCycle(
@@ -248,17 +241,17 @@ def _require_settled(values: Float[np.ndarray, "c N ny"]) -> None:
         )
 
 
-def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
+def _bound(drive: Drive, family: families.AbstractSections, cycles: int) -> Any:
     """Run the plant for some cycles, and return the sections with the numbers of its cycle."""
     N, anchor = family.n_sections, getattr(family, "anchor", None)
-    if isinstance(family, SectionList):
+    if isinstance(family, families.SectionList):
         drive.watch = ListWatch(tuple(_item(drive, x) for x in family.items))
         drive.longest = 100_000 * drive.dt
         for _ in range(cycles):
             drive.advance(drive.zero, 0)
         return drive.watch
-    if isinstance(family, ClockPhase):
-        period = optional(drive.plant, "period", None)
+    if isinstance(family, families.ClockPhase):
+        period = getattr(drive.plant, "period", None)
         if period is None:
             raise DefinitionError(
                 "sections at equal times need a plant with a clock: set its `period`, or use "
@@ -268,7 +261,7 @@ def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
         if isinstance(anchor, Crossing):
             return PhaseWatch(N, period, _anchor(drive, anchor, period).t)
         return PhaseWatch(N, period, float(anchor) * period)
-    if isinstance(family, KinematicPhase):
+    if isinstance(family, families.KinematicPhase):
         pair = family.position, family.velocity
         require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
         i, j = map(drive.names.index, pair)
@@ -277,10 +270,7 @@ def _bound(drive: Drive, family: AbstractSections, cycles: int) -> Any:
         center, scale = np.zeros(2), np.ones(2)
         while abs(turns) < cycles:
             if len(rows) > 1_000_000:  # (fewer: slow rhythms with short steps are refused)
-                raise ComputationError(
-                    f"the plant made {abs(turns):.3g} cycles in {len(rows)} steps: choose signals "
-                    "that turn around a center, or fewer `cycles`."
-                )
+                raise Stopped(f"its signals made {abs(turns):.3g} turns in {len(rows)} steps")
             for _ in range(max(256, len(rows) // 8)):
                 drive.step(drive.zero, drive.dt)
                 rows.append((drive.z[i], drive.z[j]))

@@ -228,13 +228,18 @@ class Experiment:
     longest: float
     pause: float
 
-    def run(self, seed: int, u: Sequence[Sequence[float]]) -> Trial:
-        """Run one experiment with inputs u (n, nu), each held until the next section."""
+    def run(self, seed: int, u: Sequence[Sequence[float]], repeats: bool = False) -> Trial:
+        """Run one experiment with inputs u (n, nu), each held until the next section.
+
+        **Arguments:** `repeats`: whether the plant is known to repeat itself after `reset`.
+        """
         drive = Drive(self.plant, self.names, self.longest)
         y: list[list[float]] = []
         late: list[float] = []
         try:
-            at = self.begin(drive, seed)
+            if not repeats:
+                self._require_repeatable(drive, seed)
+            at = self._begin(drive, seed)
             for k, held in enumerate(u, 1):
                 y.append([float(at.z[c]) for c in self.columns])
                 late.append(at.late)
@@ -246,17 +251,19 @@ class Experiment:
             return Trial(y, late, f"{type(error).__name__}: {error} (t = {drive.t:.6g})")
         return Trial(y, late)
 
-    def begin(self, drive: Drive, seed: int) -> At:
-        """Bring a plant to section 0. The first steps after two equal resets are compared."""
-        courses = []
-        for _ in range(2):
+    def _require_repeatable(self, drive: Drive, seed: int) -> None:
+        """Compare the first steps after two equal resets."""
+        courses: list[list[Sequence[float]]] = [[], []]
+        for course in courses:
             drive.reset(seed)
-            courses.append([drive.z])
             for _ in range(16):
+                course.append(drive.z)
                 drive.step(drive.zero, drive.dt)
-                courses[-1].append(drive.z)
         if courses[0] != courses[1]:
             raise Stopped("the plant is not deterministic after `reset(seed)`")
+
+    def _begin(self, drive: Drive, seed: int) -> At:
+        """Bring a plant to section 0."""
         drive.reset(seed)
         drive.watch = dataclasses.replace(self.watch)
         if drive.sets:

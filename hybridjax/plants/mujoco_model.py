@@ -49,8 +49,7 @@ def from_mujoco(
             model = mujoco.MjModel.from_xml_string(model)
         elif isinstance(model, str | os.PathLike):
             model = mujoco.MjModel.from_xml_path(os.fspath(model))
-        model.opt.timestep  # noqa: B018
-    except (ValueError, AttributeError) as error:
+    except ValueError as error:
         raise DefinitionError(f"`model` is no model of MuJoCo: {error}") from error
     actuators = [model.actuator(i).name for i in range(model.nu)]
     require_among("actuator", list(inputs), actuators, "from_mujoco: ")

@@ -40,12 +40,6 @@ class Plant(Protocol):
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]: ...
 
 
-def optional(plant: Any, name: str, default: Any) -> Any:
-    """Return an optional field of a plant."""
-    value = getattr(plant, name, None)
-    return default if value is None else value
-
-
 class Made:
     """A dataclass that another process makes again from its arguments."""
 

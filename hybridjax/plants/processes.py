@@ -12,6 +12,7 @@ import pickle
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -40,13 +41,7 @@ def run_all(
             worker = local.worker = _start()
             begun.append(worker)
             work = [packed, item]
-        expired: list[bool] = []
-
-        def expire() -> None:
-            expired.append(True)
-            worker.kill()
-
-        timer = threading.Timer(limit, expire)
+        timer, began = threading.Timer(limit, worker.kill), time.monotonic()
         timer.start()
         try:
             for x in work:
@@ -55,7 +50,9 @@ def run_all(
             answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
             local.worker, code = None, worker.wait()
-            hung = expired and f"no answer within the limit of {limit:g} s"
+            hung = (
+                time.monotonic() - began >= limit and f"no answer within the limit of {limit:g} s"
+            )
             return Trial([], [], hung or f"the process ended with code {code}")
         finally:
             timer.cancel()

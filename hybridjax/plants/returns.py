@@ -1,5 +1,6 @@
 """Multipliers of a plant from returns of perturbed states."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -11,8 +12,6 @@ from .._core.progress import counted, say
 from ..errors import ComputationError, DefinitionError
 from ..identify.multiplier_estimate import MultiplierEstimate
 from ..sections.families import ClockPhase
-from .drive import Drive, Stopped
-from .plant import optional
 
 
 class Returns(MultiplierEstimate):
@@ -46,22 +45,18 @@ class _Map:
     """The return map of some coordinates of a plant."""
 
     def __init__(self, cycle: Any, names: Any):
-        plant, self.experiment, self.n = cycle.plant, cycle.experiment, cycle.n_sections
-        self.drive = drive = Drive(plant, self.experiment.names, self.experiment.longest)
-        if not drive.sets or drive.fixed:
-            raise DefinitionError(
-                "returns of perturbed states need a plant whose state can be set (`get_state`, "
-                "`set_state`) and whose steps can end on a section: use `run_experiments`."
-            )
-        drive.watch, self.seed = self.experiment.watch, cycle.seed
+        plant, self.cycle, self.experiment = cycle.plant, cycle, cycle.experiment
         try:
             self.base = np.array(self.experiment.start.state, float)
         except (TypeError, ValueError):
+            self.base = np.full(1, np.nan)
+        if not np.isfinite(self.base).all() or getattr(plant, "fixed_step", False):
             raise DefinitionError(
-                "`get_state` returns no numbers that can be changed: use `run_experiments`."
-            ) from None
-        states = tuple(optional(plant, "states", [f"x{i}" for i in range(self.base.size)]))
-        period = optional(plant, "period", None)
+                "returns of perturbed states need a plant whose `get_state` returns numbers that "
+                "can be changed, and whose steps can end on a section: use `run_experiments`."
+            )
+        states = tuple(getattr(plant, "states", [f"x{i}" for i in range(self.base.size)]))
+        period = getattr(plant, "period", None)
         if names is None:
             timeless = period is None or isinstance(cycle.sections, ClockPhase)
             names = [x for x in states if not (timeless and x == "time")]
@@ -69,28 +64,25 @@ class _Map:
         self.names, self.columns = tuple(names), [states.index(x) for x in names]
         turn = 0.0 if period is None else round(cycle.period / period) * period
         self.shift = np.array([turn if x == "time" else 0.0 for x in names])
-        rows = [self.base]
-        self(self.base[self.columns], rows.append)
-        course = np.array(rows)[:, self.columns]
-        largest, self.size = np.abs(course).max(axis=0), np.ptp(course, axis=0)
+        rows = [self(self.base[self.columns], k) for k in range(cycle.n_sections)]
+        largest, self.size = np.abs(rows).max(axis=0), np.ptp(rows, axis=0)
         still = self.size <= 1e-9 * largest
         self.size[still] = np.where(largest > 0, largest, 1.0)[still]
 
-    def __call__(self, x: Float[np.ndarray, " d"], each: Any = None) -> Float[np.ndarray, " d"]:
-        """Return coordinates after one cycle. **Raises:** `ComputationError`."""
-        state, drive, experiment = self.base.copy(), self.drive, self.experiment
+    def __call__(self, x: Float[np.ndarray, " d"], n: int | None = None) -> Any:
+        """Return coordinates (d,) after n sections. Default: after one cycle, at its beginning.
+
+        **Raises:** `ComputationError`.
+        """
+        state, cycle = self.base.copy(), self.cycle
         state[self.columns] = x
-        try:
-            drive.reset(self.seed)
-            drive.restore(experiment.start._replace(state=state))
-            drive.watch.begin(drive.t, drive.z, on_section=True)
-            for k in range(1, self.n + 1):
-                drive.advance(drive.zero, k, experiment.pause)
-                if each is not None:
-                    each(np.array(drive.plant.get_state(), float))
-        except Stopped as stop:
-            raise ComputationError(f"a perturbed state does not return: {stop}.") from stop
-        return np.array(drive.plant.get_state(), float)[self.columns] - self.shift
+        u = [[0.0] * len(cycle.inputs)] * (1 + (cycle.n_sections if n is None else n))
+        start = self.experiment.start._replace(state=state)
+        trial = dataclasses.replace(self.experiment, start=start).run(cycle.seed, u, repeats=True)
+        if trial.cause:
+            raise ComputationError(f"a perturbed state does not return: {trial.cause}.")
+        y = np.array(cycle.plant.get_state(), float)[self.columns]
+        return y - self.shift if n is None else y
 
     def noise(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
         """Return the standard deviation of returns from nearly equal states.

@@ -94,7 +94,7 @@ def test_an_fmu_settles_where_scipy_does_and_runs_in_processes(fmu, truth):
     data = cycle.run_experiments(u, discard=0, processes=0)
     again = cycle.run_experiments(u, discard=0, processes=1)
     assert np.array_equal(data.y, again.y) and data.ok.all() and np.abs(data.y).max() > 1e-3
-    with pytest.raises(hj.DefinitionError, match="no numbers that can be changed"):
+    with pytest.raises(hj.DefinitionError, match="numbers that can be changed"):
         cycle.perturbed_returns()
     with pytest.raises(hj.DefinitionError, match="no real variable 'z'"):
         hj.plants.from_fmu(fmu, "u", ("z",), dt=0.05)
