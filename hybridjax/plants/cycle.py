@@ -85,8 +85,8 @@ class SettledCycle:
             limit of time. Default: one for each core.
         - `limit`: time in seconds after which a process that has not finished an experiment is
             ended. Default: 600.
-        - `store`: file of JSON lines that keeps finished experiments. After an interruption,
-            repeat the call. Default: none.
+        - `store`: file of SQLite that keeps finished experiments. After an interruption, repeat the
+            call. Default: none.
 
         **Returns:** `ExperimentData`. Failures are listed by `summary()`: missed sections, errors
         that the plant raised (a fall), NaN, other signals, no answer within the limit, random
@@ -321,7 +321,7 @@ def _collect(cycle: SettledCycle, inputs: Inputs, trials: Sequence[Trial]) -> Ex
         late[s, :k] = trial.late
         if trial.cause:
             failed_at[s] = k
-            result[s] = Result.SECTION_MISSED if trial.missed else Result.PLANT_STOPPED
+            result[s] = Result.PLANT_STOPPED
     causes = tuple(x.cause for x in trials)
     return ExperimentData(
         u, y, n_sections=N, periods=inputs.periods, inputs=cycle.inputs, outputs=cycle.outputs,

@@ -6,15 +6,11 @@ import os
 import pickle
 import sys
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 
 class Stopped(Exception):
-    """The end of an experiment: its cause, and whether a section was missed."""
-
-    def __init__(self, cause: str, missed: bool = False):
-        super().__init__(cause)
-        self.missed = missed
+    """The end of an experiment, with its cause."""
 
 
 @dataclasses.dataclass
@@ -25,7 +21,6 @@ class PhaseWatch:
     +1 if the angle grows, otherwise -1.
     """
 
-    ordered: ClassVar[bool] = True  # (sections cannot be crossed in another order)
     n: int
     period: float
     first: float = 0.0
@@ -35,10 +30,6 @@ class PhaseWatch:
     sense: float = 1.0
     phase: float = 0.0
     start: float = 0.0
-
-    @property
-    def timed(self) -> bool:
-        return self.columns is None
 
     def turns(self, t: float, z: Sequence[float]) -> float:
         """Return the phase from section 0 in turns, for angles up to whole turns."""
@@ -68,8 +59,6 @@ class ListWatch:
     """Sections one by one: for each its column, +1 if it is falling and -1 if rising, and the
     value."""
 
-    timed: ClassVar[bool] = False
-    ordered: ClassVar[bool] = False
     items: tuple[tuple[int, float, float], ...]
 
     def begin(self, t: float, z: Sequence[float], on_section: bool = False) -> None:
@@ -152,8 +141,9 @@ class Drive:
         **Arguments:** `pause`: time in which a section is not crossed again (bounces, noise).
         """
         watch, began = self.watch, self.t
-        x, last, armed = watch.level(k, self.t, self.z), self.last, watch.ordered
-        if watch.timed and not self.fixed:
+        ordered = isinstance(watch, PhaseWatch)  # (sections cannot be crossed in another order)
+        x, last, armed = watch.level(k, self.t, self.z), self.last, ordered
+        if ordered and watch.columns is None and not self.fixed:
             while x > 1e-9 * self.dt:
                 self.step(u, min(x, self.dt))
                 x = watch.level(k, self.t, self.z)
@@ -171,9 +161,9 @@ class Drive:
             y = watch.level(k, self.t, self.z)
             if armed and y <= 0 and self.t - began > pause:
                 return self._land(u, k, last, x, y) if lands else self._between(last, x, y)
-            armed, x = watch.ordered or y > 0, y
+            armed, x = ordered or y > 0, y
         text = f"a section was not reached within {self.longest:.4g}"
-        raise Stopped(f"{text} (t = {self.t:.6g})", missed=True)
+        raise Stopped(f"{text} (t = {self.t:.6g})")
 
     def _between(self, last: At, x: float, y: float) -> At:
         """Return the section between an earlier point and the present one."""
@@ -201,13 +191,12 @@ class Drive:
 
 
 class Trial(NamedTuple):
-    """One experiment: signals (n, ny) at the sections, lateness (n,), number of samples that it
-    holds, cause of its end ("" if it ran to its end), and whether it missed a section."""
+    """One experiment: signals (n, ny) at the sections, lateness (n,), and the cause of its end, ""
+    if it ran to its end."""
 
     y: list[list[float]]
     late: list[float]
     cause: str = ""
-    missed: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,7 +235,7 @@ class Experiment:
                 if k < len(u):
                     at = drive.advance(held, k, self.pause)
         except Stopped as stop:
-            return Trial(y, late, str(stop), stop.missed)
+            return Trial(y, late, str(stop))
         except Exception as error:
             return Trial(y, late, f"{type(error).__name__}: {error} (t = {drive.t:.6g})")
         return Trial(y, late)

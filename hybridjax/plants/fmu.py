@@ -3,7 +3,6 @@
 import dataclasses
 import os
 import shutil
-import tempfile
 import weakref
 from collections.abc import Mapping, Sequence
 
@@ -70,20 +69,15 @@ class FMUPlant(Made):
         self.fixed_step = not can.canHandleVariableCommunicationStepSize
         if can.canGetAndSetFMUstate and can.canSerializeFMUstate:
             self.get_state, self.set_state = self._get_state, self._set_state
-        folder = tempfile.mkdtemp()
+        folder = fmpy.extract(self.file)
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        fmpy.extract(self.file, unzipdir=folder)
-        self._slave = fmpy.fmi2.FMU2Slave(
-            guid=about.guid, unzipDirectory=folder, modelIdentifier=can.modelIdentifier
-        )
-        self._slave.instantiate()
-        self._t, self._begun = 0.0, False
+        self._slave = fmpy.instantiate_fmu(folder, about, "CoSimulation")
+        self._t = 0.0
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin at time 0."""
-        if self._begun:
-            self._slave.reset()
-        self._begun, self._t = True, 0.0
+        self._slave.reset()
+        self._t = 0.0
         self._slave.setupExperiment(startTime=0.0)
         self._slave.enterInitializationMode()
         self._slave.exitInitializationMode()

@@ -7,8 +7,8 @@ be ended one by one.
 import contextlib
 import json
 import os
-import pathlib
 import pickle
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -50,10 +50,9 @@ def run_all(
             answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
             local.worker, code = None, worker.wait()
-            hung = (
-                time.monotonic() - began >= limit and f"no answer within the limit of {limit:g} s"
-            )
-            return Trial([], [], hung or f"the process ended with code {code}")
+            hung = f"no answer within the limit of {limit:g} s"
+            ended = f"the process ended with code {code}"
+            return Trial([], [], hung if time.monotonic() - began >= limit else ended)
         finally:
             timer.cancel()
         if isinstance(answer, str):
@@ -75,27 +74,21 @@ def run_all(
 def resume(
     file: Any, about: str, count: int, run: Callable[[list[int]], Iterator[Trial]]
 ) -> list[Trial]:
-    """Run the experiments that a file of JSON lines (None: no file) lacks, and append each.
+    """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends.
 
-    **Raises:** `DefinitionError` if the first line of the file is not `about`.
+    **Raises:** `DefinitionError` for a file of another kind.
     """
-    if file is None:
-        return [*run([*range(count)])]
-    path, trials = pathlib.Path(file), {}
-    lines = path.read_text(errors="replace").splitlines() if path.exists() else []
-    if lines and lines[0] != about:
-        raise DefinitionError(f"'{file}' holds other results: give another file, or delete it.")
-    for line in lines[1:]:
-        with contextlib.suppress(ValueError):  # (an interrupted line)
-            s, *trial = json.loads(line)
-            trials[s] = Trial(*trial)
-    missing = [s for s in range(count) if s not in trials]
-    with path.open("a") as stream:
-        print("" if lines else about, file=stream, flush=True)
-        for s, done in zip(missing, run(missing), strict=True):
-            trials[s] = done
-            print(json.dumps([s, *done]), file=stream, flush=True)
-    return [trials[s] for s in range(count)]
+    try:
+        with contextlib.closing(sqlite3.connect(file or ":memory:", isolation_level=None)) as base:
+            base.execute("create table if not exists trials (about, s, trial, unique (about, s))")
+            kept = dict(base.execute("select s, trial from trials where about = ?", [about]))
+            missing = [s for s in range(count) if s not in kept]
+            for s, trial in zip(missing, run(missing), strict=True):
+                kept[s] = json.dumps(trial)
+                base.execute("replace into trials values (?, ?, ?)", (about, s, kept[s]))
+    except sqlite3.Error as error:
+        raise DefinitionError(f"'{file}' is no store of experiments ({error}).") from error
+    return [Trial(*json.loads(kept[s])) for s in range(count)]
 
 
 def _start() -> Any:
