@@ -243,7 +243,7 @@ def _require_settled(values: Float[np.ndarray, "c N ny"]) -> None:
 
 def _bound(drive: Drive, family: families.AbstractSections, cycles: int) -> Any:
     """Run the plant for some cycles, and return the sections with the numbers of its cycle."""
-    N, anchor = family.n_sections, getattr(family, "anchor", None)
+    N, anchor = family.n_sections, getattr(family, "anchor", 0.0)
     if isinstance(family, families.SectionList):
         drive.watch = ListWatch(tuple(_item(drive, x) for x in family.items))
         drive.longest = 100_000 * drive.dt

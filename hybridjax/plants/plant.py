@@ -1,8 +1,7 @@
 """The protocol between this package and a simulator of another package."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 
 @runtime_checkable
@@ -38,11 +37,3 @@ class Plant(Protocol):
     def reset(self, seed: int) -> Mapping[str, float]: ...
 
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]: ...
-
-
-class Made:
-    """A dataclass that another process makes again from its arguments."""
-
-    def __reduce__(self) -> Any:
-        arguments: Any = self
-        return type(self), tuple(getattr(self, x.name) for x in dataclasses.fields(arguments))
