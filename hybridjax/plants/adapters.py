@@ -28,14 +28,10 @@ class Made:
 
 @checked
 def from_mujoco(
-    model: Any,
-    inputs: NewOptionalNames,
-    *,
-    control: Callable[[Any, Any], Any] | None = None,
-    fallen: Callable[[Any], Any] | None = None,
-    period: Positive | None = None,
+    model: Any, inputs: NewOptionalNames, *, control: Callable[[Any, Any], Any] | None = None,
+    fallen: Callable[[Any], Any] | None = None, period: Positive | None = None,
     substeps: Count = 1,
-) -> "MuJoCoPlant":
+) -> "MuJoCoPlant":  # fmt: skip
     """Make a plant of a MuJoCo model (`pip install 'hybridjax[mujoco]'`).
 
     The signals are positions and velocities of all slides and hinges (`hip`, `hip_rate`), then all
@@ -103,10 +99,9 @@ class MuJoCoPlant(Made):
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin at the first keyframe."""
+        self._mujoco.mj_resetData(self.model, self.data)
         if self.model.nkey:
             self._mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
-        else:
-            self._mujoco.mj_resetData(self.model, self.data)
         self.data.time = 0.0
         self._mujoco.mj_step1(self.model, self.data)
         return self._observe()
@@ -151,13 +146,9 @@ class MuJoCoPlant(Made):
 
 @checked
 def from_fmu(
-    file: FilePath,
-    inputs: NewOptionalNames,
-    signals: SignalNames,
-    *,
-    dt: Positive,
+    file: FilePath, inputs: NewOptionalNames, signals: SignalNames, *, dt: Positive,
     period: Positive | None = None,
-) -> "FMUPlant":
+) -> "FMUPlant":  # fmt: skip
     """Make a plant of an FMU (`pip install 'hybridjax[fmu]'`).
 
     Running an FMU runs the machine code in it. Units come from the file. If the FMU can save its
@@ -194,9 +185,8 @@ class FMUPlant(Made):
             raise DefinitionError(f"'{self.file}' is no FMU: {error}") from error
         can = about.coSimulation
         if not about.fmiVersion.startswith("2.") or can is None:
-            raise DefinitionError(
-                f"'{self.file}' is no FMU of FMI 2.0 for co-simulation: export it as one."
-            )
+            text = f"'{self.file}' is no FMU of FMI 2.0 for co-simulation"
+            raise DefinitionError(f"{text}: export it as one.")
         groups = self.inputs, self.signals
         variables = {x.name: x for x in about.modelVariables if x.type == "Real"}
         require_among("real variable", [x for y in groups for x in y], variables, "from_fmu: ")
@@ -245,14 +235,9 @@ class FMUPlant(Made):
 
 @checked
 def from_gymnasium(
-    environment: str | Callable[[], Any],
-    inputs: NewOptionalNames,
-    signals: SignalNames,
-    *,
-    dt: Positive,
-    policy: Callable[[Any], Any] | None = None,
-    period: Positive | None = None,
-) -> "GymnasiumPlant":
+    environment: str | Callable[[], Any], inputs: NewOptionalNames, signals: SignalNames, *,
+    dt: Positive, policy: Callable[[Any], Any] | None = None, period: Positive | None = None,
+) -> "GymnasiumPlant":  # fmt: skip
     """Make a plant of a Gymnasium environment (`pip install 'hybridjax[gym]'`).
 
     Environments have fixed steps and states that cannot be set: sections are interpolated between
@@ -292,10 +277,8 @@ class GymnasiumPlant(Made):
         self._made = gym.make(make).unwrapped if isinstance(make, str) else make()
         shapes = self._made.observation_space.shape, self._made.action_space.shape
         if shapes != ((len(self.signals),), (len(self.inputs),)):
-            raise DefinitionError(
-                f"observations and actions have the shapes {shapes}: give as many `signals` and "
-                "`inputs`."
-            )
+            text = f"observations and actions have the shapes {shapes}"
+            raise DefinitionError(f"{text}: give as many `signals` and `inputs`.")
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin an episode."""

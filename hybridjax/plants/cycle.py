@@ -58,19 +58,10 @@ class SettledCycle:
     experiment: Experiment = dataclasses.field(repr=False)
     seed: int = 0
 
-    @property
-    def n_sections(self) -> int:
-        return self.sections.n_sections
-
     def run_experiments(
-        self,
-        design: DesignLike,
-        *,
-        discard: Index = DISCARD,
-        processes: Annotated[int, Whole(0, 4096)] | None = None,
-        limit: Positive = 600.0,
-        store: FilePath | None = None,
-    ) -> ExperimentData:
+        self, design: DesignLike, *, discard: Index = DISCARD, limit: Positive = 600.0,
+        processes: Annotated[int, Whole(0, 4096)] | None = None, store: FilePath | None = None,
+    ) -> ExperimentData:  # fmt: skip
         """Excite the plant around its cycle, and record its outputs at the sections.
 
         An input is held from section to section. Experiments start on section 0: from the settled
@@ -96,7 +87,7 @@ class SettledCycle:
         **Raises:** `DefinitionError` for a design that does not fit, and for a plant that cannot be
         made in other processes; `ComputationError` if the cycle has not settled.
         """
-        inputs = check_inputs(design, discard, self.n_sections, len(self.inputs))
+        inputs = check_inputs(design, discard, self.sections.n_sections, len(self.inputs))
         count = min(core_count() if processes is None else processes, len(inputs))
         u = inputs.part(slice(0, len(inputs)))
 
@@ -136,7 +127,7 @@ class SettledCycle:
         spread = f"{self.noise.max() / max(np.ptp(self.cycle_outputs), 1e-300):.1g}"
         return (
             f"SettledCycle({type(self.plant).__name__}: period {self.period:.9g}, "
-            f"{self.n_sections} sections, {listed(self.inputs)} -> {listed(self.outputs)}; "
+            f"{self.sections.n_sections} sections, {listed(self.inputs)} -> {listed(self.outputs)}; "
             f"scatter {spread} of the range, sections late by at most {self.late:.1g})"
         )
 
@@ -144,13 +135,9 @@ class SettledCycle:
 @checked
 @working("settle")
 def settle(
-    plant: PlantLike,
-    sections: families.FamilyLike,
-    outputs: SignalNames,
-    *,
-    cycles: Annotated[int, Whole(8, 1_000_000)] = 100,
-    seed: Seed = 0,
-) -> SettledCycle:
+    plant: PlantLike, sections: families.FamilyLike, outputs: SignalNames, *,
+    cycles: Annotated[int, Whole(8, 1_000_000)] = 100, seed: Seed = 0,
+) -> SettledCycle:  # fmt: skip
     """Let a plant run without inputs until it repeats itself, and locate sections on its cycle.
 
     **Arguments:**
@@ -310,7 +297,7 @@ def _anchor(drive: Drive, anchor: Crossing, period: float) -> At:
 
 def _collect(cycle: SettledCycle, inputs: Inputs, trials: Sequence[Trial]) -> ExperimentData:
     """Return the data of all experiments."""
-    u, N = inputs.part(slice(0, len(inputs))), cycle.n_sections
+    u, N = inputs.part(slice(0, len(inputs))), cycle.sections.n_sections
     S, n, _ = u.shape
     y, late = np.full((S, n, len(cycle.outputs)), np.nan), np.full((S, n), np.nan)
     failed_at, result = np.full(S, -1), np.full(S, int(Result.OK))

@@ -64,7 +64,7 @@ class _Map:
         self.names, self.columns = tuple(names), [states.index(x) for x in names]
         turn = 0.0 if period is None else round(cycle.period / period) * period
         self.shift = np.array([turn if x == "time" else 0.0 for x in names])
-        rows = [self(self.base[self.columns], k) for k in range(cycle.n_sections)]
+        rows = [self(self.base[self.columns], k) for k in range(cycle.sections.n_sections)]
         largest, self.size = np.abs(rows).max(axis=0), np.ptp(rows, axis=0)
         still = self.size <= 1e-9 * largest
         self.size[still] = np.where(largest > 0, largest, 1.0)[still]
@@ -76,7 +76,7 @@ class _Map:
         """
         state, cycle = self.base.copy(), self.cycle
         state[self.columns] = x
-        u = [[0.0] * len(cycle.inputs)] * (1 + (cycle.n_sections if n is None else n))
+        u = [[0.0] * len(cycle.inputs)] * (1 + (cycle.sections.n_sections if n is None else n))
         start = self.experiment.start._replace(state=state)
         trial = dataclasses.replace(self.experiment, start=start).run(cycle.seed, u, repeats=True)
         if trial.cause:

@@ -12,6 +12,8 @@ import pytest
 
 import hybridjax as hj
 
+from .toys import Circle
+
 
 HERE = pathlib.Path(__file__).parent
 DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
@@ -32,25 +34,19 @@ def drive(model, data):
     return [20 * math.sin(2 * math.pi * data.time), 0.0]
 
 
-class VanDerPol(gymnasium.Env):
-    """The same oscillator, with fixed steps."""
+class Environment(gymnasium.Env):
+    """The circle, with steps of 0.02 s."""
 
     observation_space = gymnasium.spaces.Box(-9, 9, (2,), np.float64)
     action_space = gymnasium.spaces.Box(-9, 9, (1,), np.float64)
 
     def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.q = np.array([0.1, 0.0])
-        return self.q, {}
+        self.circle = Circle()
+        return np.array([*self.circle.reset(seed).values()]), {}
 
     def step(self, action):
-        f = lambda q: np.array([q[1], 2 * (1 - q[0] ** 2) * q[1] - q[0] + action[0]])  # noqa: E731
-        h, q = 0.02, self.q
-        a = f(q)
-        b = f(q + h / 2 * a)
-        c = f(q + h / 2 * b)
-        self.q = q + h / 6 * (a + 2 * b + 2 * c + f(q + h * c))
-        return self.q, 0.0, bool(abs(self.q[0]) > 2.5), False, {}
+        z = np.array([*self.circle.step(action, 0.02).values()])
+        return z, 0.0, bool(np.hypot(*z) > 1.5), False, {}
 
 
 @pytest.fixture(scope="module")
@@ -66,30 +62,11 @@ def fmu(tmp_path_factory):
     return folder / "vdp.fmu"
 
 
-@pytest.fixture(scope="module")
-def truth():
-    """Period and response of scipy's integration, by events."""
-    from scipy.integrate import solve_ivp
-
-    def f(t, q, u):
-        return [q[1], 2 * (1 - q[0] ** 2) * q[1] - q[0] + u]
-
-    def falling(t, q, u):
-        return q[1]
-
-    falling.direction = -1
-    out = solve_ivp(
-        f, (0, 200), [2, 0], "DOP853", args=(0,), events=falling, rtol=1e-11, atol=1e-11
-    )
-    times = out.t_events[0]
-    return float(np.diff(times)[-10:].mean()), float(out.y_events[0][-1][0])
-
-
-def test_an_fmu_settles_where_scipy_does_and_runs_in_processes(fmu, truth):
+def test_an_fmu_settles_where_the_equations_do_and_runs_in_processes(fmu):
     plant = hj.plants.from_fmu(fmu, "u", ("x", "v"), dt=0.05)
     cycle = hj.plants.settle(plant, SECTIONS, "x", cycles=20)
-    assert abs(cycle.period - truth[0]) < 1e-8
-    assert abs(cycle.cycle_outputs[0, 0] - truth[1]) < 1e-8
+    exact = hj.find_limit_cycle(hj.models.VanDerPol(mu=2.0))
+    assert abs(cycle.period - exact.period) < 1e-8
     u = 0.05 * np.random.default_rng(0).standard_normal((3, 80, 1))
     data = cycle.run_experiments(u, discard=0, processes=0)
     again = cycle.run_experiments(u, discard=0, processes=1)
@@ -99,18 +76,18 @@ def test_an_fmu_settles_where_scipy_does_and_runs_in_processes(fmu, truth):
     with pytest.raises(hj.DefinitionError, match="no real variable 'z'"):
         hj.plants.from_fmu(fmu, "u", ("z",), dt=0.05)
 
-    # The same oscillator as an environment with fixed steps: sections are interpolated.
-    def make():
-        return VanDerPol()
 
-    other = hj.plants.from_gymnasium(make, "u", ("x", "v"), dt=0.02)
-    gym = hj.plants.settle(other, SECTIONS, "x", cycles=10)
-    assert abs(gym.period - truth[0]) < 1e-3 and 0 < gym.late <= 0.02 * (1 + 1e-9)
-    fixed = gym.run_experiments(u[:1], discard=0, processes=0)
-    late = fixed.simulated.late
-    assert 0 < late.max() <= 0.02 * (1 + 1e-9)
-    assert np.abs(fixed.y - data.y[:1]).max() < 0.05 * np.abs(data.y).max()
-    fallen = gym.run_experiments(np.full((1, 80, 1), 4.0), discard=0, processes=0)
+def test_sections_are_interpolated_between_fixed_steps():
+    plant = hj.plants.from_gymnasium(Environment, "u", ("x", "y"), dt=0.02)
+    cycle = hj.plants.settle(plant, hj.KinematicPhase(8, "x", "y"), "x", cycles=10)
+    assert abs(cycle.period - 2 * np.pi) < 1e-4 and 0.01 < cycle.late <= 0.02 * (1 + 1e-9)
+    u = 0.05 * np.random.default_rng(0).standard_normal((1, 80, 1))
+    data = cycle.run_experiments(u, discard=0, processes=0)
+    exact = hj.plants.settle(Circle(), hj.KinematicPhase(8, "x", "y"), "x", cycles=10)
+    true = exact.run_experiments(u, discard=0, processes=0)
+    assert np.abs(data.y - true.y).max() < 0.05 * np.abs(true.y).max() and data.ok.all()
+    assert 0.01 < data.simulated.late.max() <= 0.02 * (1 + 1e-9)
+    fallen = cycle.run_experiments(np.full((1, 80, 1), 4.0), discard=0, processes=0)
     assert "terminated" in fallen.summary()
 
 
