@@ -124,11 +124,12 @@ class SettledCycle:
         return returns_of(self, coordinates)
 
     def __repr__(self) -> str:
-        spread = f"{self.noise.max() / max(np.ptp(self.cycle_outputs), 1e-300):.1g}"
+        spread = self.noise.max() / max(np.ptp(self.cycle_outputs), 1e-300)
+        names = f"{listed(self.inputs)} -> {listed(self.outputs)}"
         return (
             f"SettledCycle({type(self.plant).__name__}: period {self.period:.9g}, "
-            f"{self.sections.n_sections} sections, {listed(self.inputs)} -> {listed(self.outputs)}; "
-            f"scatter {spread} of the range, sections late by at most {self.late:.1g})"
+            f"{self.sections.n_sections} sections, {names}; scatter {spread:.1g} of the range, "
+            f"sections late by at most {self.late:.1g})"
         )
 
 
@@ -195,10 +196,11 @@ def _measure(
         drive.restore(start)
         change = np.abs(np.array([x.z for x in turn(pause)[1]]) - [x.z for x in at])[:, columns]
         if (change > 1e-6 * np.ptp(values, axis=(0, 1))).any():
+            text = "`get_state` must return all that its future depends on"
             raise DefinitionError(
-                "after `set_state` the plant does not continue as before: `get_state` must return "
-                "all that its future depends on."
+                f"after `set_state` the plant does not continue as before: {text}."
             )
+    experiment = Experiment(plant, drive.watch, names, columns, start, warmup, drive.longest, pause)
     given, units = plant.inputs, getattr(plant, "units", {})
     of_inputs = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
     ends = [at[-1].t for _, at in turns]
@@ -206,10 +208,8 @@ def _measure(
         plant, family, signals(of_inputs, of_inputs.values()),
         tuple(Signal(x, unit_of(x) or units.get(x, "")) for x in outputs),
         period=float(np.diff(ends).mean()), cycle_outputs=values.mean(axis=0),
-        noise=values.std(axis=0), late=max(x.late for _, at in turns for x in at), seed=seed,
-        experiment=Experiment(
-            plant, drive.watch, names, columns, start, warmup, drive.longest, pause
-        ),
+        noise=values.std(axis=0), late=max(x.late for _, at in turns for x in at),
+        experiment=experiment, seed=seed,
     )  # fmt: skip
 
 
@@ -222,10 +222,8 @@ def _require_settled(values: Float[np.ndarray, "c N ny"]) -> None:
     size = np.ptp(values, axis=(0, 1))
     if (change > np.maximum(1e-4 * size, 5 * scatter)).any() or not (size > 0).all():
         worst = float((change / np.maximum(size, 1e-300)).max())
-        raise ComputationError(
-            f"the plant has not settled: outputs still change by {worst:.1g} of their range; give "
-            "more `cycles`, or stabilize the plant."
-        )
+        text = f"outputs still change by {worst:.1g} of their range; give more `cycles`"
+        raise ComputationError(f"the plant has not settled: {text}, or stabilize the plant.")
 
 
 def _bound(drive: Drive, family: families.AbstractSections, cycles: int) -> Any:
@@ -240,13 +238,11 @@ def _bound(drive: Drive, family: families.AbstractSections, cycles: int) -> Any:
     if isinstance(family, families.ClockPhase):
         period = getattr(drive.plant, "period", None)
         if period is None:
-            raise DefinitionError(
-                "sections at equal times need a plant with a clock: set its `period`, or use "
-                "KinematicPhase or a Crossing."
-            )
+            text = "set its `period`, or use KinematicPhase or a Crossing"
+            raise DefinitionError(f"sections at equal times need a plant with a clock: {text}.")
         drive.run(cycles * period)
         if isinstance(anchor, Crossing):
-            return PhaseWatch(N, period, _anchor(drive, anchor, period).t)
+            anchor = _anchor(drive, anchor, period).t / period
         return PhaseWatch(N, period, float(anchor) * period)
     if isinstance(family, families.KinematicPhase):
         pair = family.position, family.velocity
@@ -272,12 +268,10 @@ def _bound(drive: Drive, family: families.AbstractSections, cycles: int) -> Any:
         watch = PhaseWatch(N, 1.0, 0.0, (i, j), center.tolist(), scale.tolist(), sense)
         if isinstance(anchor, Crossing):
             z = _anchor(drive, anchor, drive.t / abs(turns)).z
-            return dataclasses.replace(watch, first=2 * np.pi * sense * watch.turns(0.0, z))
+            anchor = 2 * np.pi * sense * watch.turns(0.0, z)
         return dataclasses.replace(watch, first=float(anchor))
-    raise DefinitionError(
-        f"{type(family).__name__} needs equations: use ClockPhase, KinematicPhase, or Crossings of "
-        "signals."
-    )
+    text = "use ClockPhase, KinematicPhase, or Crossings of signals"
+    raise DefinitionError(f"{type(family).__name__} needs equations: {text}.")
 
 
 def _item(drive: Drive, section: Crossing | AtEvent) -> tuple[int, float, float]:

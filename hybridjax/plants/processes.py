@@ -56,10 +56,8 @@ def run_all(
         finally:
             timer.cancel()
         if isinstance(answer, str):
-            raise DefinitionError(
-                f"the plant cannot be made in another process, which raised {answer}: define it in "
-                "a module that can be imported, or use `processes=0`."
-            )
+            text = "define it in a module that can be imported, or use `processes=0`"
+            raise DefinitionError(f"another process cannot make the plant ({answer}): {text}.")
         return Trial(*answer)
 
     with ThreadPoolExecutor(processes) as pool:
@@ -116,6 +114,5 @@ def _pack(experiment: Experiment) -> bytes:
                 packer.register_pickle_by_value(module)
         return packer.dumps(experiment)
     except Exception as error:
-        raise DefinitionError(
-            f"the plant cannot be pickled ({error}): give it `__getstate__`, or use `processes=0`."
-        ) from error
+        text = f"the plant cannot be pickled ({error})"
+        raise DefinitionError(f"{text}: give it `__getstate__`, or use `processes=0`.") from error

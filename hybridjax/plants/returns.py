@@ -51,10 +51,8 @@ class _Map:
         except (TypeError, ValueError):
             self.base = np.full(1, np.nan)
         if not np.isfinite(self.base).all() or getattr(plant, "fixed_step", False):
-            raise DefinitionError(
-                "returns of perturbed states need a plant whose `get_state` returns numbers that "
-                "can be changed, and whose steps can end on a section: use `run_experiments`."
-            )
+            text = "numbers that can be changed, and whose steps can end on a section"
+            raise DefinitionError(f"this needs a plant whose `get_state` returns {text}.")
         states = tuple(getattr(plant, "states", [f"x{i}" for i in range(self.base.size)]))
         period = getattr(plant, "period", None)
         if names is None:
@@ -102,11 +100,8 @@ class _Map:
 
     def slopes(self, x: Float[np.ndarray, " d"], h: Float[np.ndarray, " d"]) -> Any:
         """Return central differences of second order with steps h."""
-        columns = [
-            (self(x + e) - self(x - e)) / (2 * e.sum())
-            for e in counted(np.diag(h), "coordinates", len(x))
-        ]
-        return np.array(columns).T
+        moves = counted(np.diag(h), "coordinates", len(x))
+        return np.array([(self(x + e) - self(x - e)) / (2 * e.sum()) for e in moves]).T
 
 
 def returns_of(cycle: Any, names: Any) -> Returns:
