@@ -25,7 +25,7 @@ PRONOUNS = set(
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
 # a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
-# 890 the responses of cycles, 1180 simulators of others; of the tests, 630 are those of both.
+# 890 the responses of cycles, 790 simulators of others; of the tests, 630 are those of both.
 LIMITS = {
     "code": 26_560,
     "files": 233,

@@ -152,8 +152,8 @@ def from_fmu(
     """Make a plant of an FMU (`pip install 'hybridjax[fmu]'`).
 
     Running an FMU runs the machine code in it. Units come from the file. If the FMU can save its
-    state, experiments begin at the settled state; if it takes steps of any size, steps end on the
-    sections.
+    state, experiments begin at the settled state; if it also takes steps of any size, steps end on
+    the sections.
 
     **Arguments:**
 

@@ -147,7 +147,7 @@ class Drive:
             while x > 1e-9 * self.dt:
                 self.step(u, min(x, self.dt))
                 x = watch.level(k, self.t, self.z)
-            return At(self.t, self.z, -x)
+            return At(self.t, self.z, max(0.0, -x))
         if x <= 0 and armed and last is not None:  # two sections in one step
             before = watch.level(k, last.t, last.z)
             x = watch.level(k, self.t, self.z)

@@ -27,7 +27,8 @@ class Plant(Protocol):
       `perturbed_returns` it is an array of numbers, which can be changed by small amounts.
     - `states`: names of these numbers. `time` is the clock's.
     - `period`: period of the clock, on which the plant depends.
-    - `fixed_step`: True if a step always lasts `dt`. Otherwise steps end on the sections.
+    - `fixed_step`: True if a step always lasts `dt`. Otherwise steps end on clock sections, and on
+      others if the state can be set.
     - `units`: units of signals by name.
     """
 

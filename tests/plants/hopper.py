@@ -16,20 +16,12 @@ class Hopper:
 
     def __init__(self, accuracy=1e-10, dt=1 / 40):
         self.accuracy, self.dt = accuracy, dt
-        self._make()
+        how = {"rtol": accuracy, "atol": accuracy, "nsteps": 10000}
+        fields = self.stance, self.flight
+        self.solvers = [ode(f).set_integrator("dop853", **how) for f in fields]
 
-    def _make(self):
-        self.solvers = [
-            ode(f).set_integrator("dop853", rtol=self.accuracy, atol=self.accuracy, nsteps=10000)
-            for f in (self.stance, self.flight)
-        ]
-
-    def __getstate__(self):
-        return {"accuracy": self.accuracy, "dt": self.dt}
-
-    def __setstate__(self, state):
-        self.__dict__.update(state)
-        self._make()
+    def __reduce__(self):
+        return type(self), (self.accuracy, self.dt)
 
     @staticmethod
     def leg(t, yM, ym):

@@ -39,19 +39,19 @@ class Troubled(Circle):
 
     def step(self, u, duration):
         observation = super().step(u, duration)
-        late = self.steps > 60
-        if self.seed == 2 and late:
+        late = self.seed if self.steps > 60 else 0
+        if late == 2:
             raise ValueError("the hip broke")
-        if self.seed == 3 and late:
+        if late == 3:
             time.sleep(600)
-        if self.seed == 4 and late:
+        if late == 4:
             observation["y"] = math.nan
-        if self.seed == 5 and late:
+        if late == 5:
             return {"x": 1.0, "z": 1.0}
         if self.seed == 6:
             observation["x"] += 1e-9 * time.perf_counter()
-        if self.seed == 7 and late:
+        if late == 7:
             os._exit(3)
-        if self.seed == 8 and late:
+        if late == 8:
             self.q = (1.0, 0.0)
         return observation
