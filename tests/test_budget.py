@@ -27,8 +27,8 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
 # 890 the responses of cycles, 790 simulators of others; of the tests, 630 are those of both.
 LIMITS = {
-    "code": 26_560,
-    "files": 233,
+    "code": 26_166,
+    "files": 229,
     "longest": 500,
     "public_names": 174,
     "many_parameters": 8,
@@ -36,8 +36,8 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_140,
-    "doc_words": 36_570,
+    "test_lines": 17_085,
+    "doc_words": 36_565,
 }
 
 

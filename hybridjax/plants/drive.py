@@ -234,10 +234,9 @@ class Experiment:
                 late.append(at.late)
                 if k < len(u):
                     at = drive.advance(held, k, self.pause)
-        except Stopped as stop:
-            return Trial(y, late, str(stop))
         except Exception as error:
-            return Trial(y, late, f"{type(error).__name__}: {error} (t = {drive.t:.6g})")
+            text = f"{type(error).__name__}: {error} (t = {drive.t:.6g})"
+            return Trial(y, late, str(error) if isinstance(error, Stopped) else text)
         return Trial(y, late)
 
     def _require_repeatable(self, drive: Drive, seed: int) -> None:
