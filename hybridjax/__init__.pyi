@@ -5,6 +5,7 @@ from . import (
     experiments as experiments,
     identify as identify,
     models as models,
+    plants as plants,
     plot as plot,
     recordings as recordings,
     testing as testing,

@@ -28,6 +28,7 @@ class Result(enum.IntEnum):
     FIELD_NOT_FINITE = 15
     GUARD_PASSED = 16
     PULSE_PASSED = 17
+    PLANT_STOPPED = 18
 
     @property
     def message(self) -> str:
@@ -62,6 +63,7 @@ _MESSAGES = {
         "the field or a guard has a pulse, or another sudden change, over which steps pass: begin "
         "and end it by transitions (`hj.Scheduled` at known times)"
     ),
+    Result.PLANT_STOPPED: "the plant ended the experiment: see `data.simulated.causes`",
     Result.STEP_COLLAPSE: (
         "steps shrank to nothing although the state hardly moves: a field that jumps must do so at "
         "the guard of a transition"

@@ -32,11 +32,15 @@ class Simulated(eqx.Module):
     - `error`: (S,) estimates of the largest error of the states at any section, relative to their
       sizes (`LimitCycle.scale`), or None.
     - `label`: name of the section family.
+    - `late`: (S, n) times by which steps of a plant ended after its sections, or None.
+    - `causes`: for each experiment on a plant, the cause of its end; "" if it ran to its end.
     """
 
     failed_at: Int[np.ndarray, " S"]
     error: Float[np.ndarray, " S"] | None = None
     label: str = eqx.field(static=True, default="")
+    late: Float[np.ndarray, "S n"] | None = None
+    causes: tuple[str, ...] = eqx.field(static=True, default=())
 
     __repr__ = fields
 
@@ -189,7 +193,8 @@ class ExperimentData(eqx.Module):
     def summary(self, limit: Index = 5) -> str:
         """Return `80/80 ok`, or the number of OK experiments with the causes of the first `limit`
         failures."""
-        return summary(self.result, self.failed_at, self.n_sections, limit)
+        causes = () if self.simulated is None else self.simulated.causes
+        return summary(self.result, self.failed_at, self.n_sections, limit, causes)
 
     def __repr__(self) -> str:
         S, n, _ = self.u.shape
@@ -234,15 +239,17 @@ class ExperimentData(eqx.Module):
 
 
 def summary(
-    result: Int[np.ndarray, " S"], failed_at: Int[np.ndarray, " S"], n_sections: int, limit: int
-) -> str:
+    result: Int[np.ndarray, " S"], failed_at: Int[np.ndarray, " S"], n_sections: int, limit: int,
+    causes: tuple[str, ...] = (),
+) -> str:  # fmt: skip
     """Return the number of OK experiments, with place and cause of the first `limit` failures."""
     failed = np.flatnonzero(result != Result.OK)
     text = [f"{len(result) - len(failed)}/{len(result)} ok"]
     for s in failed[:limit]:
         cycle, section = divmod(int(failed_at[s]), n_sections)
         where = f"section {section}, cycle {cycle}: " if failed_at[s] >= 0 else ""
-        text.append(f"#{s}: {where}{Result(int(result[s])).message}")
+        cause = causes[s] if causes else Result(int(result[s])).message
+        text.append(f"#{s}: {where}{cause}")
     if len(failed) > limit:
         text.append(f"and {len(failed) - limit} more")
     return "; ".join(text)

@@ -1,0 +1,138 @@
+"""Plants: accuracy, overhead, processes and memory, of the paper's hopper and of MuJoCo's.
+
+python -m benchmarks.plants [overhead] [accuracy] [mujoco]
+"""
+
+import math
+import pathlib
+import resource
+import sys
+import time
+
+import numpy as np
+
+import hybridjax as hj
+from tests.plants.hopper import Hopper
+
+
+OUTPUTS = ("yM", "vM")
+APEX = hj.Crossing("vM", "falling")
+FAMILIES = (
+    hj.ClockPhase(32, anchor=APEX),
+    hj.KinematicPhase(32, "yM", "vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX),
+)
+
+
+class Timed(Hopper):
+    """Measures the time that it computes itself."""
+
+    spent, calls = 0.0, 0
+
+    def step(self, u, duration):
+        began = time.process_time()
+        observation = super().step(u, duration)
+        Timed.spent += time.process_time() - began
+        Timed.calls += 1
+        return observation
+
+
+def loop(plant, cycle, inputs):
+    """The shortest loop that a user would write, for clock sections."""
+    for u in inputs:
+        plant.reset(0)
+        plant.set_state(cycle.experiment.start.state)
+        for held in u:
+            plant.step(held, 1 / 32)
+
+
+def cpu(work, *arguments):
+    began = time.process_time()
+    work(*arguments)
+    return time.process_time() - began
+
+
+def overhead(cycles=84, experiments=80):
+    """Time of the package beside that of the plant, in one process; and of two processes."""
+    design = hj.paper_design(seed=0)
+    u = design.inputs(cycles)[:experiments]
+    for family in FAMILIES:
+        cycle = hj.plants.settle(Timed(), family, OUTPUTS)
+        few = u[:4]
+        Timed.spent, Timed.calls = 0.0, 0
+        total = cpu(lambda: cycle.run_experiments(few, discard=20, processes=0))  # noqa: B023
+        print(
+            f"{family.label}: 4 experiments {total:.2f} CPU s, {total / Timed.spent:.3f} times the "
+            f"plant's own; {Timed.calls / few[..., 0].size:.2f} steps per section"
+        )
+        if family.label == "isochron":
+            plain = hj.plants.settle(Hopper(), family, OUTPUTS)
+            alone = cpu(loop, Hopper(), plain, few)
+            total = cpu(lambda: plain.run_experiments(few, discard=20, processes=0))  # noqa: B023
+            print(f"  {total / alone:.3f} times a loop of its steps from section to section")
+    cycle = hj.plants.settle(Hopper(dt=1 / 32), FAMILIES[0], OUTPUTS)
+    walls = {}
+    for processes in (1, 2):
+        began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+        data = cycle.run_experiments(u, discard=20, processes=processes)
+        walls[processes] = time.perf_counter() - began
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        print(
+            f"{len(u)} experiments, {processes} processes: {walls[processes]:.1f} s, {spent:.1f} "
+            f"CPU s in workers; {data.summary()}"
+        )
+    print(f"two processes are {walls[1] / walls[2]:.2f} times as fast")
+    for name, who in (
+        ("this process", resource.RUSAGE_SELF),
+        ("a worker", resource.RUSAGE_CHILDREN),
+    ):
+        print(f"memory of {name}: {resource.getrusage(who).ru_maxrss / 1024:.0f} MB")
+
+
+def accuracy():
+    """Perturbed returns and HTFs against the exact linearization."""
+    hopper = hj.find_limit_cycle(hj.models.VerticalHopper())
+    for family in FAMILIES:
+        cycle = hj.plants.settle(Hopper(), family, OUTPUTS)
+        returns = cycle.perturbed_returns()
+        error = returns.compare(hopper.multipliers).max_error
+        print(f"{family.label}: {returns}\n  error {error:.1e}")
+        design = hj.multisine(32, periods=8, band=(0, 4), amplitude=0.002).realizations(4)
+        data = cycle.run_experiments(design, discard=24)
+        estimate = hj.estimate_htf(data)
+        model = hj.linearize(hopper, family, outputs=OUTPUTS)
+        exact = model.htf(estimate.f, harmonics=estimate.harmonics)
+        inside = np.abs(estimate.H - exact.H) <= estimate.confidence_radius(0.95)
+        print(f"  {data.summary()}; {100 * inside.mean():.1f} % of HTFs within their discs")
+        design = hj.multisine(32, periods=16, band=(0, 8), amplitude=0.002)
+        estimate = hj.estimate_htf(cycle.run_experiments(design, discard=40))
+        fit = hj.fit_multipliers(estimate, order=2)
+        print(f"  {fit}\n  true ones within the region: {fit.contains(hopper.multipliers)}")
+
+
+def drive(model, data):
+    return [20 * math.sin(2 * math.pi * data.time), 0.0]
+
+
+def mujoco():
+    """Perturbed returns against experiments, on ground of several hardness."""
+    file = pathlib.Path(__file__).parents[1] / "tests" / "plants" / "hopper.xml"
+    for solref in ("0.02 1", "0.1 1"):
+        xml = file.read_text().replace("0.02 1", solref)
+        plant = hj.plants.from_mujoco(xml, {"push": "N"}, control=drive, period=1.0, substeps=20)
+        cycle = hj.plants.settle(plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"))
+        returns = cycle.perturbed_returns()
+        print(f"solref {solref}: {returns}")
+        design = hj.multisine(n_sections=10, periods=16, amplitude=0.02)
+        estimate = hj.estimate_htf(cycle.run_experiments(design))
+        fit = hj.fit_multipliers(estimate, order=2)
+        print(f"  {fit}")
+        print(f"  returns within the region of HTFs: {fit.contains(returns.multipliers)}")
+        print(f"  HTFs within the region of returns: {returns.contains(fit.multipliers)}")
+
+
+if __name__ == "__main__":
+    hj.enable_x64()
+    chosen = sys.argv[1:] or ["overhead", "accuracy", "mujoco"]
+    for name in chosen:
+        {"overhead": overhead, "accuracy": accuracy, "mujoco": mujoco}[name]()

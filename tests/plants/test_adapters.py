@@ -1,0 +1,129 @@
+"""Simulators of others against models of this package, and against each other."""
+
+import math
+import pathlib
+import subprocess
+import zipfile
+
+import fmpy
+import gymnasium
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from .toys import Circle
+
+
+HERE = pathlib.Path(__file__).parent
+DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName="vdp" guid="{vdp}">
+  <CoSimulation modelIdentifier="vdp" canHandleVariableCommunicationStepSize="true"
+    canGetAndSetFMUstate="true" canSerializeFMUstate="true"/>
+  <ModelVariables>
+    <ScalarVariable name="x" valueReference="0" causality="output"><Real/></ScalarVariable>
+    <ScalarVariable name="v" valueReference="1" causality="output"><Real/></ScalarVariable>
+    <ScalarVariable name="u" valueReference="2" causality="input"><Real start="0"/></ScalarVariable>
+  </ModelVariables>
+  <ModelStructure/>
+</fmiModelDescription>"""
+SECTIONS = hj.KinematicPhase(8, "x", "v", anchor=hj.Crossing("v", "falling"))
+
+
+def drive(model, data):
+    return [20 * math.sin(2 * math.pi * data.time), 0.0]
+
+
+class Environment(gymnasium.Env):
+    """The circle, with steps of 0.02 s."""
+
+    observation_space = gymnasium.spaces.Box(-9, 9, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-9, 9, (1,), np.float64)
+
+    def reset(self, seed=None, options=None):
+        self.circle = Circle()
+        return np.array([*self.circle.reset(seed).values()]), {}
+
+    def step(self, action):
+        z = np.array([*self.circle.step(action, 0.02).values()])
+        return z, 0.0, bool(np.hypot(*z) > 1.5), False, {}
+
+
+@pytest.fixture(scope="module")
+def fmu(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fmu")
+    headers = pathlib.Path(fmpy.__file__).parent / "c-code"
+    library = folder / f"vdp{fmpy.sharedLibraryExtension}"
+    command = ["cc", "-O2", "-shared", "-fPIC", f"-I{headers}", str(HERE / "vanderpol.c")]
+    subprocess.run([*command, "-o", str(library)], check=True)
+    with zipfile.ZipFile(folder / "vdp.fmu", "w") as archive:
+        archive.writestr("modelDescription.xml", DESCRIPTION)
+        archive.write(library, f"binaries/{fmpy.platform}/{library.name}")
+    return folder / "vdp.fmu"
+
+
+def test_an_fmu_settles_where_the_equations_do_and_runs_in_processes(fmu):
+    plant = hj.plants.from_fmu(fmu, "u", ("x", "v"), dt=0.05)
+    cycle = hj.plants.settle(plant, SECTIONS, "x", cycles=20)
+    exact = hj.find_limit_cycle(hj.models.VanDerPol(mu=2.0))
+    assert abs(cycle.period - exact.period) < 1e-8
+    u = 0.05 * np.random.default_rng(0).standard_normal((3, 80, 1))
+    data = cycle.run_experiments(u, discard=0, processes=0)
+    again = cycle.run_experiments(u, discard=0, processes=1)
+    assert np.array_equal(data.y, again.y) and data.ok.all() and np.abs(data.y).max() > 1e-3
+    with pytest.raises(hj.DefinitionError, match="numbers that can be changed"):
+        cycle.perturbed_returns()
+    with pytest.raises(hj.DefinitionError, match="no real variable 'z'"):
+        hj.plants.from_fmu(fmu, "u", ("z",), dt=0.05)
+
+
+def test_sections_are_interpolated_between_fixed_steps():
+    plant = hj.plants.from_gymnasium(Environment, "u", ("x", "y"), dt=0.02)
+    cycle = hj.plants.settle(plant, hj.KinematicPhase(8, "x", "y"), "x", cycles=10)
+    assert abs(cycle.period - 2 * np.pi) < 1e-4 and 0.01 < cycle.late <= 0.02 * (1 + 1e-9)
+    u = 0.05 * np.random.default_rng(0).standard_normal((1, 80, 1))
+    data = cycle.run_experiments(u, discard=0, processes=0)
+    exact = hj.plants.settle(Circle(), hj.KinematicPhase(8, "x", "y"), "x", cycles=10)
+    true = exact.run_experiments(u, discard=0, processes=0)
+    assert np.abs(data.y - true.y).max() < 0.05 * np.abs(true.y).max() and data.ok.all()
+    assert 0.01 < data.simulated.late.max() <= 0.02 * (1 + 1e-9)
+    fallen = cycle.run_experiments(np.full((1, 80, 1), 4.0), discard=0, processes=0)
+    assert "terminated" in fallen.summary()
+
+
+@pytest.fixture(scope="module")
+def ground():
+    plant = hj.plants.from_mujoco(
+        HERE / "hopper.xml", {"push": "N"}, control=drive, period=1.0, substeps=20
+    )
+    sections = hj.ClockPhase(10, anchor=0.7)
+    return hj.plants.settle(plant, sections, ("yM", "yM_rate"), cycles=32)
+
+
+def test_mujoco_continues_from_its_state(ground):
+    """On soft ground the paper's hopper settles near its cycle on hard ground."""
+    hard = hj.find_limit_cycle(hj.models.VerticalHopper())
+    at = hj.place_sections(hard, hj.ClockPhase(10, anchor=0.7))
+    true = np.asarray(at.observe(("yM", "vM")))
+    assert np.abs(ground.cycle_outputs - true).max() < 0.05
+    plant = ground.plant
+    start = ground.experiment.start
+    courses = []
+    for _ in range(2):
+        plant.set_state(start.state)
+        courses.append([plant.step([0.1], h) for h in (0.02, 0.0123, 0.5)])
+    assert courses[0] == courses[1]
+    assert courses[0][-1].keys() == {"yM", "ym", "yM_rate", "ym_rate"}
+
+
+@pytest.mark.slow
+def test_mujoco_returns_and_htfs_agree(ground):
+    """Two multipliers are those of hard ground; soft ground adds a third one, near 0.007."""
+    returns = ground.perturbed_returns()
+    hard = hj.find_limit_cycle(hj.models.VerticalHopper()).multipliers
+    assert np.abs(returns.multipliers[:2] - hard).max() < 0.01
+    assert 0.002 < returns.multipliers[2].real < 0.02 and len(returns.multipliers) == 3
+    design = hj.multisine(n_sections=10, periods=16, amplitude=0.02)
+    fit = hj.fit_multipliers(hj.estimate_htf(ground.run_experiments(design)), order=2)
+    assert fit.contains(returns.multipliers[:2]).all()
+    assert returns.contains(fit.multipliers).all()

@@ -1,0 +1,141 @@
+"""Plants: closed forms, the paper's hopper against its exact model, and plants that fail."""
+
+import math
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from .hopper import Hopper
+from .toys import Circle, Troubled
+
+
+ANGLE = hj.KinematicPhase(8, "x", "y", center=(0.0, 0.0), scale=(1.0, 1.0))
+APEX = hj.Crossing("vM", "falling")
+ELLIPSE = {"center": (1.9, 0.0), "scale": (0.3, 1.9)}
+SECTIONS = {
+    "isochron": hj.ClockPhase(16, anchor=APEX),
+    "kinematic": hj.KinematicPhase(16, "yM", "vM", anchor=APEX, **ELLIPSE),
+}
+DESIGN = hj.multisine(16, periods=16, amplitude=0.002)
+
+
+@pytest.fixture(scope="module")
+def circle():
+    return hj.plants.settle(Circle(), ANGLE, ("x", "y"), cycles=20)
+
+
+def test_a_plant_in_closed_form(circle):
+    assert abs(circle.period - 2 * math.pi) < 1e-9 and circle.late < 1e-9
+    angle = 2 * math.pi * np.arange(8) / 8
+    assert np.abs(circle.cycle_outputs - np.c_[np.cos(angle), np.sin(angle)]).max() < 1e-9
+    returns = circle.perturbed_returns()
+    assert returns.contains(math.exp(-0.4 * math.pi)).all() and len(returns.multipliers) == 1
+    assert abs(returns.multipliers[0] - math.exp(-0.4 * math.pi)) < 1e-9 and returns.bound < 1e-6
+    # A push held over one eighth of a turn moves the radius by push / rate (1 - exp(-rate T / 8)).
+    u = np.zeros((1, 16, 1))
+    u[0, 3] = 0.1
+    data = circle.run_experiments(u, discard=0, processes=0)
+    away = 0.5 * (1 - math.exp(-0.05 * math.pi)) * math.exp(-0.05 * math.pi) ** np.arange(12)
+    y = data.y[0, 4:, 0] * np.cos(angle)[np.arange(4, 16) % 8]
+    y += data.y[0, 4:, 1] * np.sin(angle)[np.arange(4, 16) % 8]
+    assert np.abs(y - away).max() < 1e-8 and np.abs(data.y[0, :4]).max() < 1e-8
+    assert data.outputs[0].unit == "m" and data.inputs[0].unit == "m/s"
+    single = hj.plants.settle(Circle(), hj.Crossing("x", "falling"), "y", cycles=20)
+    assert abs(single.cycle_outputs[0, 0] - 1) < 1e-9
+    assert single.perturbed_returns().contains(math.exp(-0.4 * math.pi)).all()
+
+
+def test_failures_are_named_and_the_others_go_on():
+    cycle = hj.plants.settle(Troubled(), ANGLE, "x", cycles=20)
+    u = np.zeros((9, 24, 1))
+    data = cycle.run_experiments(u, discard=0, processes=2, limit=4.0)
+    assert data.ok.tolist() == [True] + 7 * [False] + [True]
+    causes = data.simulated.causes
+    expected = (
+        "", "`step` raised ValueError: the hip broke", "no answer within the limit of 4 s",
+        "y became nan", "signals changed from ('x', 'y') to ('x', 'z')",
+        "the plant is not deterministic after `reset(seed)`", "the process ended with code 3",
+        "was not reached within", "",
+    )  # fmt: skip
+    assert [x in cause for x, cause in zip(expected, causes, strict=True)] == [True] * 9
+    assert (data.result[1:8] == 7 * [hj.Result.PLANT_STOPPED]).all()
+    assert np.isfinite(data.y[[0, 8]]).all() and np.isnan(data.y[1, data.failed_at[1] :]).all()
+    assert "#1: section" in data.summary(9) and "the hip broke" in data.summary(9)
+
+
+def test_a_store_continues(circle, tmp_path, monkeypatch):
+    u = 0.01 * np.random.default_rng(0).standard_normal((10, 16, 1))
+    whole = circle.run_experiments(u, discard=0, processes=0)
+    experiment, seeds = type(circle.experiment), []
+    run = experiment.run
+
+    def interrupted(self, seed, u):
+        seeds.append(seed)
+        if len(seeds) == 9:
+            raise KeyboardInterrupt
+        return run(self, seed, u)
+
+    monkeypatch.setattr(experiment, "run", interrupted)
+    options = {"discard": 0, "processes": 0, "store": tmp_path / "store.sqlite"}
+    with pytest.raises(KeyboardInterrupt):
+        circle.run_experiments(u, **options)
+    data = circle.run_experiments(u, **options)
+    assert seeds == [*range(1, 10), 9, 10]
+    assert np.array_equal(data.y, whole.y) and data.simulated.causes == 10 * ("",)
+    other = circle.run_experiments(2 * u[:1], **options)
+    assert not np.array_equal(other.y, data.y[:1])
+    hj.save(tmp_path / "data.npz", data)
+    assert np.array_equal(hj.load(tmp_path / "data.npz").y, data.y)
+
+
+def test_what_does_not_fit_is_refused(circle):
+    for sections, message in (
+        (hj.ClockPhase(8), "set its `period`"),
+        (hj.AtEvent("touchdown"), "crossings of its signals"),
+        (hj.Crossing("z", "falling"), "no signal 'z'"),
+        (hj.ArcLength(8, "x", hj.Crossing("x", "falling")), "needs equations"),
+    ):
+        with pytest.raises(hj.DefinitionError, match=message):
+            hj.plants.settle(Circle(), sections, "x")
+    with pytest.raises(hj.DefinitionError, match="no output 'z'"):
+        hj.plants.settle(Circle(), hj.KinematicPhase(8, "x", "y"), "z")
+
+    class Slow(Circle):
+        rate = 0.01
+
+    with pytest.raises(hj.ComputationError, match="has not settled"):
+        hj.plants.settle(Slow(), ANGLE, "x", cycles=8)
+
+    class Forgetful(Circle):
+        def step(self, u, duration):  # (`get_state` lacks the number of steps)
+            return super().step([0.05 * math.sin(0.03 * self.steps)], duration)
+
+    with pytest.raises(hj.DefinitionError, match="does not continue as before"):
+        hj.plants.settle(Forgetful(), ANGLE, "x", cycles=20)
+    with pytest.raises(hj.DefinitionError, match="no coordinate 'z'"):
+        circle.perturbed_returns("z")
+
+
+@pytest.fixture(scope="module")
+def hopper():
+    return hj.find_limit_cycle(hj.models.VerticalHopper())
+
+
+@pytest.mark.parametrize("family", ["isochron", pytest.param("kinematic", marks=pytest.mark.slow)])
+def test_the_hopper_is_that_of_the_equations(hopper, family):
+    """Perturbed returns against the exact multipliers; records against exact experiments."""
+    cycle = hj.plants.settle(Hopper(), SECTIONS[family], ("yM", "vM"))
+    returns = cycle.perturbed_returns()
+    assert np.abs(returns.compare(hopper.multipliers).error).max() < 1e-7
+    assert returns.contains(hopper.multipliers).all() and len(returns.multipliers) == 2
+    u = 0.02 * np.random.default_rng(0).standard_normal((2, 64, 1))
+    data = cycle.run_experiments(u, discard=0, processes=0)
+    exact = hj.run_experiments(hopper, SECTIONS[family], u, ("yM", "vM"), discard=0)
+    assert np.abs(data.cycle_outputs - exact.cycle_outputs).max() < 1e-9
+    assert np.abs(data.y - exact.y).max() < 1e-8 < 1e-3 < np.abs(data.y).max()
+    assert data.simulated.late.max() < 1e-9
+    if family == "kinematic":
+        estimate = hj.estimate_htf(cycle.run_experiments(DESIGN, discard=40))
+        assert hj.fit_multipliers(estimate, order=2).contains(hopper.multipliers).all()
