@@ -1,0 +1,165 @@
+r"""Means of estimates whose errors are known: restricted maximum likelihood, small samples.
+
+The estimates of subject s, one for each of its conditions, are
+
+$$y_s = X_s \beta + b_s + e_s, \quad b_s \sim N(0, \Psi), \quad e_s \sim N(0, \mathrm{diag}(v_s))$$
+
+with known v_s (meta-analysis: Hardy and Thompson 1996; Jackson, Riley and White 2011).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import optimize, stats
+
+
+class Cells(NamedTuple):
+    """Estimates of n subjects in q cells (conditions); where `seen` is False there is none."""
+
+    y: Float[np.ndarray, "n q"]
+    v: Float[np.ndarray, "n q"]
+    x: Float[np.ndarray, "n q p"]
+    seen: Bool[np.ndarray, "n q"]
+
+
+class Mixed(NamedTuple):
+    """Coefficients, their Kenward-Roger covariance, and what their degrees of freedom need."""
+
+    coefficients: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "p p"]
+    between: Float[np.ndarray, "q q"]
+    plain: Float[np.ndarray, "p p"]
+    slopes: Float[np.ndarray, "k p p"]
+    uncertainty: Float[np.ndarray, "k k"]
+    most: int
+
+    def freedom(self, weights: Float[np.ndarray, " p"]) -> float:
+        """Return the degrees of freedom of a contrast (for one contrast, those of Kenward and Roger
+        are Satterthwaite's), at most those of subjects without a model of their spread."""
+        gradient = -np.einsum("i,kij,j->k", weights, self.slopes, weights)
+        spread = gradient @ self.uncertainty @ gradient
+        square = (weights @ self.plain @ weights) ** 2
+        return float(np.clip(2 * square / max(spread, 1e-300), 1.0, self.most))
+
+
+def mixed(cells: Cells) -> Mixed:
+    """Fit by restricted maximum likelihood, with covariances after Kenward and Roger (1997).
+
+    Psi is free between cells that some subject shares, and zero between others (Welch's case).
+    """
+    seen, q = cells.seen, cells.y.shape[1]
+    shared = np.einsum("ni,nj->ij", seen, seen.astype(int)) > 0
+    scale = max(float(np.std(cells.y[seen])), float(np.sqrt(np.mean(cells.v[seen]))), 1e-300)
+    y = np.where(seen, cells.y, 0.0) / scale
+    x = np.where(seen[..., None], cells.x, 0.0)
+    # Cells without an estimate have variance 1, zero regressors and a zero: they add constants.
+    v = np.where(seen, cells.v / scale**2, 1.0)
+    pairs = seen[:, :, None] & seen[:, None, :]
+    rows, columns = np.nonzero(np.tril(shared))
+
+    def root(free: Float[np.ndarray, " k"]) -> Float[np.ndarray, "q q"]:
+        lower = np.zeros((q, q))
+        lower[rows, columns] = free
+        return lower
+
+    def inverse(between):
+        total = np.where(pairs, between, 0.0)
+        total[:, np.arange(q), np.arange(q)] += v
+        return np.linalg.inv(total), np.linalg.slogdet(total)[1].sum()
+
+    def cost(free):
+        lower = root(free)
+        w, size = inverse(lower @ lower.T)
+        wx = w @ x
+        information = np.einsum("nip,niq->pq", x, wx)
+        phi = np.linalg.inv(information)
+        beta = phi @ np.einsum("nip,ni->p", wx, y)
+        r = np.einsum("nij,nj->ni", w, y - x @ beta)
+        value = size + np.linalg.slogdet(information)[1] + np.sum(r * (y - x @ beta))
+        slope = w - wx @ phi @ np.swapaxes(wx, 1, 2) - r[:, :, None] * r[:, None, :]
+        slope = np.where(pairs, slope, 0.0).sum(axis=0)
+        return value / 2, (slope @ lower)[rows, columns]
+
+    start = np.where(rows == columns, 0.7, 0.0)
+    free = optimize.minimize(cost, start, jac=True, method="L-BFGS-B").x
+    between = root(free) @ root(free).T
+    w, _ = inverse(between)
+    wx = w @ x
+    phi = np.linalg.inv(np.einsum("nip,niq->pq", x, wx))
+    beta = phi @ np.einsum("nip,ni->p", wx, y)
+    units = np.zeros((len(rows), q, q))
+    units[np.arange(len(rows)), rows, columns] = units[np.arange(len(rows)), columns, rows] = 1.0
+    d = np.where(pairs, units[:, None], 0.0)  # (k, n, q, q)
+    dw = d @ w
+    slopes = -np.einsum("nip,knij,njq->kpq", wx, d, wx)
+    second = np.einsum("nip,knij,lnjm,nmq->klpq", wx, d, w @ d, wx)
+    traces = np.einsum("knij,lnji->kl", dw, dw) - 2 * np.einsum("ij,klji->kl", phi, second)
+    traces += np.einsum("kij,lji->kl", phi @ slopes, phi @ slopes)
+    uncertainty = np.linalg.pinv(traces / 2, hermitian=True)
+    extra = np.einsum("kl,klpq->pq", uncertainty, second)
+    extra -= np.einsum("kl,kpi,ij,ljq->pq", uncertainty, slopes, phi, slopes)
+    covariance = phi + 2 * phi @ extra @ phi
+    scaled = phi @ slopes @ phi * scale**2
+    # `slopes` are those of the inverse of phi: d phi = -phi slope phi.
+    most = max(len(y) - np.linalg.matrix_rank(x.sum(axis=1)), 1)
+    square = scale**2
+    return Mixed(beta * scale, covariance * square, between * square, phi * square, scaled,
+                 uncertainty, most)  # fmt: skip
+
+
+class Meta(NamedTuple):
+    """A regression of single estimates: covariance after Knapp and Hartung."""
+
+    coefficients: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "p p"]
+    freedom: int
+    variance: float
+    """Between subjects."""
+    variance_error: float
+
+
+def meta(
+    y: Float[np.ndarray, " n"], v: Float[np.ndarray, " n"], x: Float[np.ndarray, "n p"]
+) -> Meta:
+    """Return the regression by restricted maximum likelihood, with the covariance of Hartung and
+    Knapp (2001; Knapp and Hartung 2003), scaled by the weighted residuals."""
+    variance = between_variance(y, v, x)
+    beta, phi, square = weighted(y, v + variance, x)
+    freedom = len(y) - x.shape[1]
+    error = np.sqrt(2 / np.sum((v + variance) ** -2.0))
+    return Meta(beta, phi * square / freedom, freedom, variance, float(error))
+
+
+def between_variance(y, v, x) -> float:
+    """Return the variance at which the derivative of the restricted likelihood is zero, or 0."""
+
+    def score(variance):
+        w = 1 / (v + variance)
+        phi = np.linalg.inv((x * w[:, None]).T @ x)
+        r = w * (y - x @ (phi @ (x.T @ (w * y))))
+        return r @ r - w.sum() + np.einsum("ip,pq,iq,i->", x, phi, x, w**2)
+
+    high = float(v.max() + y @ y) * 10
+    return 0.0 if score(0.0) <= 0 else float(optimize.brentq(score, 0.0, high, xtol=1e-12 * high))
+
+
+def weighted(y, v, x) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return coefficients, their covariance and the sum of squares of the weighted residuals."""
+    phi = np.linalg.inv((x / v[:, None]).T @ x)
+    beta = phi @ (x / v[:, None]).T @ y
+    return beta, phi, float(np.sum((y - x @ beta) ** 2 / v))
+
+
+def spread_interval(y, v, x, level: float = 0.95) -> tuple[float, float]:
+    """Return bounds of the standard deviation between subjects: those for which the sum of squares
+    lies between quantiles of chi-squared (Q profile: Viechtbauer 2007)."""
+    freedom = len(y) - x.shape[1]
+    upper, lower = stats.chi2.isf([(1 - level) / 2, (1 + level) / 2], freedom)
+    largest = 1e3 * (np.ptp(y) ** 2 + v.max())
+
+    def bound(quantile):
+        excess = lambda variance: weighted(y, v + variance, x)[2] - quantile  # noqa: E731
+        return 0.0 if excess(0.0) < 0 else float(optimize.brentq(excess, 0.0, largest))
+
+    return np.sqrt(bound(upper)), np.sqrt(bound(lower))
