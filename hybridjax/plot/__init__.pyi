@@ -22,3 +22,4 @@ from .look import (
 from .orbit import cycle as cycle
 from .over_parameters import branch as branch, sweep as sweep
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros
+from .subjects import forest as forest, paired as paired, subject_maps as subject_maps

@@ -65,7 +65,8 @@ class MapTest:
     **Fields:** `values` (*grid): the mean difference. `t` (*grid): its statistic. `p` (*grid):
     p-value of each point by the largest statistic. `labels` (*grid): number of the cluster, 0
     outside; `cluster_p` (clusters,): their p-values. `significant` (*grid): points of the chosen
-    method at `level`. `relabelings`, `exact`; `each`, `axes`, `unit`, `methods`.
+    method at `level`. `relabelings`, `exact`; `each`: paired differences (none of
+    groups); `axes`, `unit`, `methods`.
     """
 
     values: Inexact[np.ndarray, "*grid"]
@@ -281,7 +282,7 @@ class PopulationMaps:
             y[relabelings.signs[0] > 0].mean(axis=0) - y[relabelings.signs[0] < 0].mean(axis=0))
         return MapTest(
             value, t, p, labels, cluster_p, significant, level, len(relabelings.signs),
-            relabelings.exact, y, self.axes, self.unit, text,
+            relabelings.exact, y if paired else y[:0], self.axes, self.unit, text,
         )  # fmt: skip
 
     def _by_subject(self, rows=None, factor: str = "") -> tuple[list[tuple[str, str]], np.ndarray]:
