@@ -99,8 +99,8 @@ class Job:
         enable_x64()
         try:
             with matplotlib.rc_context({"backend": "agg"}):
-                options = {"signals": self.signals} if self.signals else {}
-                recording = read_recording(*self.files, time=self.time, **options)
+                signals = self.signals or None
+                recording = read_recording(*self.files, time=self.time, signals=signals)
                 result = self.identify(recording)
                 with report_folder(self.folder, result.data.inputs, self.formats) as new:
                     write_results(new, result, self.formats)
@@ -249,12 +249,13 @@ def _population(fits, columns, summaries) -> Population:
     quantities: list[Any] = ["modulus"]
     quantities += ["angle"] * all(fit.multipliers[0].imag != 0 for fit in fits)
     quantities += ["coefficients"] * (len({len(fit.coefficients) for fit in fits}) == 1)
-    values, errors, units = measured(fits, columns["subject"], quantities)
+    values, errors, units = measured(fits, list(columns["subject"]), quantities)
     error = np.array([s["period_standard_error"] for s in summaries])
     if (error > 0).all():
         values["period"] = np.array([s["period_mean"] for s in summaries])
         errors["period"], units["period"] = error, "s"
-    return Population(columns, values, errors, units)
+    freedom = [fit.covariance_freedom for fit in fits]
+    return Population(columns, values, errors, units, freedom)
 
 
 def _maps(fits, columns, summaries) -> dict[tuple[str, str], PopulationMaps]:
@@ -305,7 +306,8 @@ def _write(study: Study, names: list[str], summaries: list[dict]) -> None:
     images = _images(study)
     results = ["subjects.csv", "population.csv", "failures.csv", "population.html"]
     with results_folder(study.folder, "population", results) as new:
-        for name, each in zip(results, (reports, columns, failed), strict=False):
+        contents: tuple[dict[str, Any], ...] = (reports, columns, failed)
+        for name, each in zip(results, contents, strict=False):
             PopulationTable({k: np.array(x) for k, x in each.items()}, "").write(new / name)
         links = "".join(f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>' for n in names)
         failures = "".join(
@@ -321,8 +323,8 @@ def _write(study: Study, names: list[str], summaries: list[dict]) -> None:
         )  # fmt: skip
         (new / "population.html").write_text(
             '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>Population'
-            f"</title><style>{_STYLE}</style></head>\n<body>\n<h1>{len(names)} reports</h1>{failures}"
-            f"<ul>{links}</ul>{tables}{figures}{methods}</body></html>\n",
+            f"</title><style>{_STYLE}</style></head>\n<body>\n<h1>{len(names)} reports</h1>"
+            f"{failures}<ul>{links}</ul>{tables}{figures}{methods}</body></html>\n",
             encoding="utf-8",
         )
 

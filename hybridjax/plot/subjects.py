@@ -60,7 +60,8 @@ def paired(
     chosen = population.predictions(quantity).columns
     means = population.mean(quantity)
     with panels(ax, width=0.75 * COLUMN) as axes:
-        panel, places = axes[0, 0], {}
+        panel = axes[0, 0]
+        places: dict[str, list[tuple[float, float]]] = {}
         sides = [[c for c in dict.fromkeys(chosen["cell"]) if x in c.split(", ")] for x in (a, b)]
         for k, cells in enumerate(sides):
             for j, cell in enumerate(cells):
@@ -132,7 +133,7 @@ def _map(found: MapMean | MapTest, panel: Axes) -> None:
         vmax=top, shading="nearest", rasterized=True,
     )  # fmt: skip
     kind = "difference" if isinstance(found, MapTest) else "response"
-    panel.get_figure().colorbar(image, ax=panel, label=with_unit(kind, found.unit))
+    panel.figure.colorbar(image, ax=panel, label=with_unit(kind, found.unit))
     inside = found.significant if isinstance(found, MapTest) else np.abs(found.values) > found.reach
     # Outlines along the edges of the points: cells are bounded halfway between coordinates.
     across, along = _edges(x), _edges(y)

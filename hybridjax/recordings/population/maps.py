@@ -132,8 +132,8 @@ class PopulationMaps:
         grid = tuple(len(np.asarray(x)) for x in axes.values())
         if values.shape[1:] != grid:
             raise DefinitionError(
-                f"`values` must have the shape (rows, {', '.join(axes)}), so {grid} after the rows, "
-                f"but has {values.shape}."
+                f"`values` must have the shape (rows, {', '.join(axes)}), with {grid} after the "
+                f"rows, but has {values.shape}."
             )
         named = {str(name): np.asarray(x, float) for name, x in axes.items()}
         columns = as_columns(table, len(values))
@@ -253,7 +253,9 @@ class PopulationMaps:
         flat = y.reshape(len(y), -1)
         threshold = point_threshold(point_level, len(y), paired, np.iscomplexobj(y))
         t = statistics(flat, relabelings.signs[:1], paired).reshape(grid)
-        largest, mass, observed = [], [], np.zeros(0)
+        largest: list[np.ndarray] = []
+        mass: list[np.ndarray] = []
+        observed = np.zeros(0)
         for part in in_parts(len(relabelings.signs), flat.shape[1]):
             drawn = statistics(flat, relabelings.signs[part], paired)
             largest.append(np.abs(drawn).max(axis=1))
@@ -275,11 +277,16 @@ class PopulationMaps:
         amount = "all" if relabelings.exact else "random"
         text = (
             f"Maps of {len(y)} subjects ({a} - {b}) were compared by {method}{beyond} with a "
-            f"family-wise error of {100 * level:g} %, from {amount} {len(relabelings.signs)} {way}; "
-            f"hybridjax {__version__}."
+            f"family-wise error of {100 * level:g} %, from {amount} {len(relabelings.signs)} "
+            f"{way}; hybridjax {__version__}."
         )
-        value = y.mean(axis=0) if paired else (
-            y[relabelings.signs[0] > 0].mean(axis=0) - y[relabelings.signs[0] < 0].mean(axis=0))
+        value = (
+            y.mean(axis=0)
+            if paired
+            else (
+                y[relabelings.signs[0] > 0].mean(axis=0) - y[relabelings.signs[0] < 0].mean(axis=0)
+            )
+        )
         return MapTest(
             value, t, p, labels, cluster_p, significant, level, len(relabelings.signs),
             relabelings.exact, y if paired else y[:0], self.axes, self.unit, text,

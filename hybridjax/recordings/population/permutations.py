@@ -9,7 +9,7 @@ and Oostenveld 2007).
 import itertools
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -86,11 +86,12 @@ def clusters(
     inside[[0, 2]] = False  # no neighbors in other relabelings
     labels, last = np.zeros(t.shape, int), 0
     for side in (t > threshold, t < -threshold):
-        one, count = ndimage.label(side, inside)
+        label: Any = ndimage.label(side, inside)
+        regions, count = label
         for axis, wraps in enumerate(cyclic, 1):
             if wraps:
-                one, count = _joined(one, count, axis)
-        labels += np.where(one > 0, one + last, 0)
+                regions, count = _joined(regions, count, axis)
+        labels += np.where(regions > 0, regions + last, 0)
         last += count
     return labels
 

@@ -35,7 +35,8 @@ def allocate(y, v, strides, who, between: float, costs) -> Allocation:
     within = float(np.mean(v * strides))
     groups = [who == name for name in dict.fromkeys(who)]
     extra = [(y[i].var(ddof=1) - v[i].mean(), i.sum() - 1) for i in groups if i.sum() > 1]
-    trial = max(float(np.average(*zip(*extra, strict=True))) if extra else 0.0, 0.0)
+    freedom = sum(n for _, n in extra)
+    trial = max(sum(x * n for x, n in extra) / max(freedom, 1), 0.0)
     subject_cost, trial_cost, stride_cost = costs
     if trial > 0:
         length = np.sqrt(trial_cost / stride_cost * within / trial)

@@ -9,13 +9,19 @@ from scipy import stats
 
 from ..._core.arguments import Numbers
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Count, ExperimentCount, OptionalNames, Probability, Seed
+from ..._core.boundary.kinds import (
+    Count,
+    ExperimentCount,
+    OptionalNames,
+    Positive,
+    Probability,
+    Seed,
+)
 from ..._core.boundary.values import Reals
-from ..._core.boundary.kinds import Positive
 from ...errors import DefinitionError
 from .planning import Allocation, allocate, power_of
-from .quantities import Fit, Quantity, measured
-from .reml import Cells, meta, mixed, spread_interval
+from .quantities import Fit, Quantity, fit_of, measured
+from .reml import Cells, meta, mixed, moderated, spread_interval
 from .summary import PopulationTable, table_of
 from .table import as_columns, cells_of, require_subjects, rows_with
 
@@ -49,6 +55,9 @@ class Population:
       condition are trials.
     - `values`, `errors`: by name of a quantity, an estimate and its standard error in each row.
     - `units`: by name of a quantity. Default: none.
+    - `freedom`: degrees of freedom of the errors, in each row. Where they are few, errors are
+      moderated by those of the other subjects (Smyth 2004), with the trend of the column `strides`
+      if there is one. Default: infinite.
 
     **Raises:** `DefinitionError` for a table without subjects, columns of different lengths, a
     subject in two groups, or errors that are not positive.
@@ -58,6 +67,7 @@ class Population:
     values: dict[str, np.ndarray]
     errors: dict[str, np.ndarray]
     units: dict[str, str]
+    freedom: np.ndarray
 
     def __init__(
         self,
@@ -65,9 +75,12 @@ class Population:
         values: Mapping[str, Values],
         errors: Mapping[str, Values],
         units: Mapping[str, str] | None = None,
+        freedom: Annotated[Numbers, Reals("rows", infinite=True, sign="positive")] | None = None,
     ):
         if not values or set(values) != set(errors):
-            raise DefinitionError("`values` and `errors` must hold the same quantities, at least 1.")
+            raise DefinitionError(
+                "`values` and `errors` must hold the same quantities, one or more."
+            )
         rows = len(np.asarray(next(iter(values.values()))))
         columns = as_columns(table, rows)
         for name in values:
@@ -84,6 +97,7 @@ class Population:
             ("table", columns), ("values", {k: np.asarray(x, float) for k, x in values.items()}),
             ("errors", {k: np.asarray(x, float) for k, x in errors.items()}),
             ("units", dict.fromkeys(values, "") | dict(units or {})),
+            ("freedom", np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)),
         )  # fmt: skip
         for name, value in fields:
             object.__setattr__(self, name, value)
@@ -103,7 +117,8 @@ class Population:
         coefficients of different orders, and the angle of a real multiplier.
         """
         columns = as_columns(table, len(fits))
-        return cls(columns, *measured(fits, columns["subject"], quantities))
+        freedom = [fit_of(x).covariance_freedom for x in fits]
+        return cls(columns, *measured(fits, list(columns["subject"]), quantities), freedom)
 
     def __repr__(self) -> str:
         subjects, cells = self.table["subject"], cells_of(self.table)
@@ -194,16 +209,16 @@ class Population:
             d, v = grid.y[paired] @ weights[:2], grid.v[paired].sum(axis=1)
             bounds = spread_interval(d, v, np.ones((len(d), 1)), level)
             spread = float(np.sqrt(weights[:2] @ fit.between @ weights[:2])), *bounds
-        rows_out = []
+        results = []
         for k, name in enumerate([effect, *(f"slope of {c}" for c in covariates)]):
             w = weights if k == 0 else np.eye(len(weights))[len(names) + k - 1]
-            rows_out.append(
+            results.append(
                 self._row(quantity, name, len(subjects), w @ fit.coefficients,
                           np.sqrt(w @ fit.covariance @ w), fit.freedom(w), level,
                           spread if k == 0 else (np.nan,) * 3, test=True)
             )  # fmt: skip
         return table_of(
-            rows_out,
+            results,
             f"The difference of {quantity} ({effect}; {len(subjects)} subjects, {paired.sum()} of "
             "them with all conditions) was tested in a linear mixed model with the known variance "
             "of each estimate and free variances between subjects (restricted maximum likelihood), "
@@ -286,7 +301,7 @@ class Population:
             both = grid.seen.all(axis=1)
             if len(names) != 2 or both.sum() < 3:
                 raise DefinitionError(
-                    f"`labels` needs three or more subjects in both '{a}' and '{b}', without groups."
+                    f"`labels` needs three or more subjects in both '{a}' and '{b}', and no groups."
                 )
             y, v = grid.y[both] @ np.array([1.0, -1.0]), grid.v[both].sum(axis=1)
         rows = power_of(y, v, difference, subjects, labels is not None, draws, level, seed)
@@ -320,7 +335,7 @@ class Population:
             meta(chosen.y[i], chosen.v[i], np.ones((i.sum(), 1))).variance for i in each
         ])  # fmt: skip
         who = np.char.add(np.char.add(self.table["subject"], "\n"), cells)
-        y, v = self.values[quantity], self.errors[quantity] ** 2
+        y, v = self.values[quantity], self._variance(quantity)
         return allocate(y, v, self.table["strides"].astype(float), who, float(between), costs)
 
     def _require(self, quantity: str, columns: Sequence[str]) -> None:
@@ -340,15 +355,23 @@ class Population:
         keys = list(dict.fromkeys(zip(subjects[rows], cells[rows], strict=True)))
         extra = np.stack([self.table[c].astype(float) for c in covariates], axis=1) if (
             covariates) else np.zeros((len(cells), 0))  # fmt: skip
+        variance = self._variance(quantity)
         y, v, x = [], [], []
         for subject, cell in keys:
             of = (subjects == subject) & (cells == cell)
-            weight = self.errors[quantity][of] ** -2.0
+            weight = 1 / variance[of]
             y.append(weight @ self.values[quantity][of] / weight.sum())
             v.append(1 / weight.sum())
             x.append(extra[of].mean(axis=0))
         subject, cell = (np.array(part) for part in zip(*keys, strict=True))
         return Selection(np.array(y), np.array(v), subject, cell, np.array(x))
+
+    def _variance(self, quantity: str) -> np.ndarray:
+        """Return the variances of the estimates, moderated."""
+        columns, strides = [np.ones(len(self.freedom))], self.table.get("strides")
+        if strides is not None and strides.dtype.kind in "iuf" and np.ptp(strides) > 0:
+            columns.append(np.log(np.maximum(strides.astype(float), 1.0)))
+        return moderated(self.errors[quantity] ** 2, self.freedom, np.stack(columns, axis=1))
 
     def _row(self, quantity, effect, subjects, value, error, freedom, level, spread, test):
         reach = stats.t.ppf((1 + level) / 2, freedom) * error
@@ -373,5 +396,3 @@ def _grid(chosen: Selection, subjects: list[str], names: list[str]) -> Cells:
         i, j = subjects.index(subject), names.index(cell)
         y[i, j], v[i, j], seen[i, j], x[i, j, q:] = chosen.y[k], chosen.v[k], True, centered[k]
     return Cells(y, v, x, seen)
-
-

@@ -1,7 +1,7 @@
 """Numbers of a fit that have an order, with standard errors: of multipliers, and of the period."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from ..identification import Identification
 
 
 Quantity = Literal["modulus", "angle", "coefficients", "period"]
-Fit = MultiplierEstimate | Identification
+Fit: TypeAlias = MultiplierEstimate | Identification
 _UNITS = {"angle": "rad", "period": "s"}
 
 
@@ -23,7 +23,7 @@ def measured(
 
     **Raises:** `DefinitionError` for fits without covariance, or that cannot be compared.
     """
-    estimates = [x.fit if isinstance(x, Identification) else x for x in fits]
+    estimates = list(map(fit_of, fits))
     first = _signals(estimates[0])
     for subject, fit in zip(subjects, estimates, strict=True):
         if not np.isfinite(fit.covariance).all():
@@ -33,8 +33,8 @@ def measured(
             )
         if _signals(fit) != first:
             raise DefinitionError(
-                f"the fit of subject '{subject}' is of {_signals(fit)}, but that of '{subjects[0]}' "
-                f"is of {first}: use the same outputs, in the same units."
+                f"the fit of subject '{subject}' is of {_signals(fit)}, but that of "
+                f"'{subjects[0]}' is of {first}: use the same outputs, in the same units."
             )
     values, errors = {}, {}
     for name in quantities:
@@ -51,6 +51,10 @@ def measured(
             label = f"c{k + 1}" if name == "coefficients" else name
             values[label], errors[label] = (np.array([row[i][k] for row in rows]) for i in (0, 1))
     return values, errors, {name: _UNITS.get(name, "") for name in values}
+
+
+def fit_of(source: Fit) -> MultiplierEstimate:
+    return source.fit if isinstance(source, Identification) else source
 
 
 def _signals(fit: MultiplierEstimate) -> str:

@@ -7,11 +7,12 @@ $$y_s = X_s \beta + b_s + e_s, \quad b_s \sim N(0, \Psi), \quad e_s \sim N(0, \m
 with known v_s (meta-analysis: Hardy and Thompson 1996; Jackson, Riley and White 2011).
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import optimize, stats
+from scipy import optimize, special, stats
 
 
 class Cells(NamedTuple):
@@ -141,7 +142,7 @@ def between_variance(y, v, x) -> float:
         return r @ r - w.sum() + np.einsum("ip,pq,iq,i->", x, phi, x, w**2)
 
     high = float(v.max() + y @ y) * 10
-    return 0.0 if score(0.0) <= 0 else float(optimize.brentq(score, 0.0, high, xtol=1e-12 * high))
+    return 0.0 if score(0.0) <= 0 else _root(score, 0.0, high)
 
 
 def weighted(y, v, x) -> tuple[np.ndarray, np.ndarray, float]:
@@ -160,6 +161,37 @@ def spread_interval(y, v, x, level: float = 0.95) -> tuple[float, float]:
 
     def bound(quantile):
         excess = lambda variance: weighted(y, v + variance, x)[2] - quantile  # noqa: E731
-        return 0.0 if excess(0.0) < 0 else float(optimize.brentq(excess, 0.0, largest))
+        return 0.0 if excess(0.0) < 0 else _root(excess, 0.0, largest)
 
     return np.sqrt(bound(upper)), np.sqrt(bound(lower))
+
+
+def moderated(
+    v: Float[np.ndarray, " n"], freedom: Float[np.ndarray, " n"], trend: Float[np.ndarray, "n k"]
+) -> Float[np.ndarray, " n"]:
+    """Return variances with less scatter: means of each, weighted by its degrees of freedom, and of
+    the common trend of their logarithms, weighted by the freedom that fits their scatter (empirical
+    Bayes: Smyth 2004).
+
+    Variances that are estimated from few blocks would otherwise give the largest weights to
+    subjects whose errors happen to be underestimated.
+    """
+    half = np.minimum(freedom, 1e9) / 2
+    if len(v) - trend.shape[1] < 3 or half.min() > 1e6:
+        return v
+    log = np.log(v) - special.digamma(half) + np.log(half)
+    mean = trend @ np.linalg.lstsq(trend, log)[0]
+    excess = np.sum((log - mean) ** 2) / (len(v) - trend.shape[1])
+    excess -= float(np.mean(special.polygamma(1, half)))
+    # The half of the prior freedom, at which a log chi-squared has the variance of the excess.
+    prior = 1e9
+    if excess > 1e-9:
+        scatter = lambda x: float(special.polygamma(1, x)) - excess  # noqa: E731
+        prior = _root(scatter, 1e-3, 1e9)
+    common = np.exp(mean + special.digamma(prior) - np.log(prior))
+    return (prior * common + half * v) / (prior + half)
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    root: Any = optimize.brentq(function, low, high, xtol=1e-12 * high)
+    return float(root)
