@@ -317,13 +317,13 @@ def _exceeding(draws: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _map_of(x, output: str | int, input: str | int):
     """Return values, axes, cyclic axes, unit and names of one subject's response."""
     if isinstance(x, PhaseResponse):
-        return x.values, {"phase": x.phase}, (), curve_unit(x.input), (x.input,)
+        return x.values, {"phase": x.phase}, (), curve_unit(x.input), (str(x.input),)
     i, j = channel_index("output", output, x.outputs), channel_index("input", input, x.inputs)
-    names = (x.outputs[i], x.inputs[j])
-    unit = ratio(*names)
+    signals = (x.outputs[i], x.inputs[j])
+    unit, names = ratio(*signals), tuple(map(str, signals))
     if isinstance(x, HTF):
         axes = {"harmonic": np.asarray(x.harmonics, float), "frequency": np.asarray(x.f)}
         return np.asarray(x.H)[:, :, i, j], axes, (), unit, names
-    unit = unit and f"{unit_of(names[0])}/({unit_of(names[1])} s)"
+    unit = unit and f"{unit_of(signals[0])}/({unit_of(signals[1])} s)"
     axes = {"phase": x.phase, "lag": x.lag}
     return x.values[:, :, i, j], axes, ("phase",), unit, names

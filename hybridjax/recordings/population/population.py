@@ -168,7 +168,6 @@ class Population:
         a: str,
         b: str,
         *,
-        between: Sequence[str] | None = None,
         covariates: OptionalNames = (),
         level: Probability = 0.95,
     ) -> PopulationTable:
@@ -179,18 +178,12 @@ class Population:
         degrees of freedom are those of Kenward and Roger (1997). If the table also has the other
         factor, the difference is averaged over it.
 
-        **Arguments:** `between`: two labels of the other factor: the difference of the differences
-        (interaction), of the first minus the second. `covariates`: columns with common slopes.
+        **Arguments:** `covariates`: columns with common slopes. Default: none.
 
         **Raises:** `DefinitionError` as `mean`, and for labels that the table does not have.
         """
         factor, rows = rows_with(self.table, (a, b))
         signs = np.where(self.table[factor] == a, 1.0, -1.0)
-        if between is not None:
-            other, further = rows_with(self.table, tuple(between))
-            if other == factor or len(set(between)) != 2:
-                raise DefinitionError("`between` must be two labels of the other factor.")
-            rows, signs = rows & further, signs * np.where(self.table[other] == between[0], 1, -1)
         chosen = self._select(quantity, rows, covariates)
         require_subjects(chosen.cell, chosen.subject)
         names = list(dict.fromkeys(chosen.cell))
@@ -200,9 +193,8 @@ class Population:
         labels = cells_of(self.table)
         side = np.array([signs[rows & (labels == name)][0] for name in names])
         weights = np.where(side > 0, 1 / (side > 0).sum(), -1 / (side < 0).sum())
-        weights = weights if between is None else 2 * weights
         weights = np.append(weights, np.zeros(len(covariates)))
-        effect = f"{a} - {b}" + (f", {between[0]} - {between[1]}" if between else "")
+        effect = f"{a} - {b}"
         paired = grid.seen.all(axis=1)
         spread: tuple[float, ...] = (np.nan,) * 3
         if len(names) == 2 and paired.sum() > 2:
