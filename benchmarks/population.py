@@ -229,7 +229,8 @@ def command(subjects: int = 20, trials: int = 3, strides: int = 300, rate: int =
                 hj.testing.random_force(strides, rate, bandwidth=8, rms=0.02, seed=100 * s + k)
                 for k in range(trials)
             ]
-            made = hj.testing.simulate_recording(cycle, np.stack(force), OUTPUTS, rate=rate, steps=1)
+            made = np.stack(force)
+            made = hj.testing.simulate_recording(cycle, made, OUTPUTS, rate=rate, steps=1)
             made = hj.testing.spoil(made, OUTPUTS, noise=3e-4, seed=s)
             for k, trial in enumerate(made.trials):
                 header = ",".join(("time", *made.signals))

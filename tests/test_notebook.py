@@ -85,8 +85,14 @@ def walking(found):
     assert abs(found.known.multipliers[0] - 0.6) < 0.2
 
 
+def population(found):
+    low, high = found.test["low"][0], found.test["high"][0]
+    assert low < np.mean(found.true[6:]) - np.mean(found.true[:6]) < high < 0
+
+
 CHECKS = (
-    fit, how_to_push, neurons, own_system, paper, recording, robot, strides, sweep, walking,
+    fit, how_to_push, neurons, own_system, paper, population, recording, robot, strides, sweep,
+    walking,
 )  # fmt: skip
 
 

@@ -59,7 +59,7 @@ def paired(
     test = population.difference(quantity, a, b)
     chosen = population.predictions(quantity).columns
     means = population.mean(quantity)
-    with panels(ax, width=0.75 * COLUMN) as axes:
+    with panels(ax) as axes:
         panel = axes[0, 0]
         places: dict[str, list[tuple[float, float]]] = {}
         sides = [[c for c in dict.fromkeys(chosen["cell"]) if x in c.split(", ")] for x in (a, b)]
@@ -87,54 +87,55 @@ def paired(
 
 
 @checked
-def subject_maps(found: MapMean | MapTest, *, ax: AxesLike | None = None) -> Plot:
+def subject_maps(result: MapMean | MapTest, *, ax: AxesLike | None = None) -> Plot:
     """Draw a mean or a difference over subjects. A curve: each subject as a thin line, the mean,
     and its band or the significant points (bar). A map: its values, with outlined significant
     points; of complex values the magnitude.
 
     **Raises:** `DefinitionError` for maps with more than two axes.
     """
-    if len(found.axes) > 2:
+    if len(result.axes) > 2:
         raise DefinitionError("a figure has at most two axes, but the maps have more.")
-    with panels(ax, width=COLUMN if len(found.axes) == 1 else 0.6 * PAGE) as axes:
+    with panels(ax, width=COLUMN if len(result.axes) == 1 else 0.6 * PAGE) as axes:
         panel = axes[0, 0]
-        if len(found.axes) == 1:
-            _curves(found, panel)
+        if len(result.axes) == 1:
+            _curves(result, panel)
         else:
-            _map(found, panel)
+            _map(result, panel)
     return Plot(axes)
 
 
-def _curves(found: MapMean | MapTest, panel: Axes) -> None:
-    ((name, x),) = found.axes.items()
-    size = np.abs if np.iscomplexobj(found.values) else np.asarray
-    if len(found.each):
-        panel.plot(x, size(found.each).T, color=COLORS["gray"], lw=0.4, alpha=0.7)
-    mean = size(found.values)
+def _curves(result: MapMean | MapTest, panel: Axes) -> None:
+    ((name, x),) = result.axes.items()
+    size = np.abs if np.iscomplexobj(result.values) else np.asarray
+    if len(result.each):
+        panel.plot(x, size(result.each).T, color=COLORS["gray"], lw=0.4, alpha=0.7)
+    mean = size(result.values)
     panel.plot(x, mean, color=CYCLE[0], lw=1.5, zorder=3)
-    if isinstance(found, MapMean):
-        panel.fill_between(x, mean - found.reach, mean + found.reach, color=CYCLE[0], alpha=0.3,
+    if isinstance(result, MapMean):
+        panel.fill_between(x, mean - result.reach, mean + result.reach, color=CYCLE[0], alpha=0.3,
                            lw=0, zorder=2)  # fmt: skip
     else:
-        foot = np.where(found.significant, panel.get_ylim()[0], np.nan)
+        foot = np.where(result.significant, panel.get_ylim()[0], np.nan)
         panel.plot(x, foot, color=CYCLE[1], lw=4, solid_capstyle="butt", zorder=4)
     panel.axhline(0, color="black", lw=0.4)
-    kind = "difference" if isinstance(found, MapTest) else "response"
-    panel.set(xlabel=name, ylabel=with_unit(kind, found.unit))
+    kind = "difference" if isinstance(result, MapTest) else "response"
+    panel.set(xlabel=name, ylabel=with_unit(kind, result.unit))
 
 
-def _map(found: MapMean | MapTest, panel: Axes) -> None:
-    (vertical, y), (horizontal, x) = found.axes.items()
-    is_complex = np.iscomplexobj(found.values)
-    values = np.abs(found.values) if is_complex else found.values
+def _map(result: MapMean | MapTest, panel: Axes) -> None:
+    (vertical, y), (horizontal, x) = result.axes.items()
+    is_complex = np.iscomplexobj(result.values)
+    values = np.abs(result.values) if is_complex else result.values
     top = np.abs(values).max()
     image = panel.pcolormesh(
         x, y, values, cmap="viridis" if is_complex else "RdBu_r", vmin=0 if is_complex else -top,
         vmax=top, shading="nearest", rasterized=True,
     )  # fmt: skip
-    kind = "difference" if isinstance(found, MapTest) else "response"
-    panel.figure.colorbar(image, ax=panel, label=with_unit(kind, found.unit))
-    inside = found.significant if isinstance(found, MapTest) else np.abs(found.values) > found.reach
+    kind = "difference" if isinstance(result, MapTest) else "response"
+    panel.figure.colorbar(image, ax=panel, label=with_unit(kind, result.unit))
+    is_test = isinstance(result, MapTest)
+    inside = result.significant if is_test else np.abs(result.values) > result.reach
     # Outlines along the edges of the points: cells are bounded halfway between coordinates.
     across, along = _edges(x), _edges(y)
     padded = np.pad(inside, 1)

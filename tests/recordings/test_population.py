@@ -81,16 +81,16 @@ def test_complete_pairs_give_the_paired_t_test():
 def test_the_mixed_model_maximizes_the_restricted_likelihood():
     """Of errors that differ and conditions that miss, compared with a likelihood written anew."""
     y, v = RNG.normal(size=(8, 2)) + RNG.normal(size=(8, 1)), RNG.uniform(0.1, 1, (8, 2))
-    seen = np.ones((8, 2), bool)
-    seen[0, 0] = seen[1, 1] = False
+    present = np.ones((8, 2), bool)
+    present[0, 0] = present[1, 1] = False
     x = np.broadcast_to(np.eye(2), (8, 2, 2))
-    fit = mixed(Cells(y, v, x, seen))
+    fit = mixed(Cells(y, v, x, present))
 
     def cost(free):
         root = np.array([[free[0], 0], [free[1], free[2]]])
         total, information, right = 0.0, np.zeros((2, 2)), np.zeros(2)
         for i in range(8):
-            k = seen[i]
+            k = present[i]
             V = (root @ root.T + np.diag(v[i]))[np.ix_(k, k)]
             W, X = np.linalg.inv(V), np.eye(2)[k]
             information += X.T @ W @ X
@@ -100,7 +100,7 @@ def test_the_mixed_model_maximizes_the_restricted_likelihood():
         return total - right @ beta + np.log(np.linalg.det(information)), beta
 
     best = optimize.minimize(lambda z: cost(z)[0], [1.0, 0.5, 1.0], method="Nelder-Mead",
-                             options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 4000}).x  # fmt: skip
+                             options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 999}).x  # fmt: skip
     root = np.array([[best[0], 0], [best[1], best[2]]])
     np.testing.assert_allclose(fit.between, root @ root.T, atol=2e-4)
     np.testing.assert_allclose(fit.coefficients, cost(best)[1], atol=1e-4)

@@ -87,18 +87,19 @@ class MapTest:
         lines = [
             f"MapTest({' x '.join(self.axes)}, {self.relabelings} relabelings"
             f"{' (all)' * self.exact}: largest |t| {np.abs(self.t).max():.3g}, "
-            f"{p_value(self.p.min())})"
+            f"{p_value(float(self.p.min()))})"
         ]
-        for k, p in enumerate(self.cluster_p, 1):
+        for k in 1 + np.argsort(self.cluster_p, stable=True)[:3]:
+            p = float(self.cluster_p[k - 1])
             inside = self.labels == k
             places = zip(self.axes.items(), np.nonzero(inside), strict=True)
             where = ", ".join(f"{n} {a[i].min():.3g} to {a[i].max():.3g}" for (n, a), i in places)
             lines.append(f"  cluster {k}: {inside.sum()} points, {where}, {p_value(p)}")
-        return "\n".join(lines)
+        more = len(self.cluster_p) - 3
+        return "\n".join([*lines, *([f"  and {more} more clusters"] if more > 0 else [])])
 
 
 @checked
-@dataclasses.dataclass(frozen=True, repr=False, init=False)
 class PopulationMaps:
     """Curves or maps of several subjects on one grid.
 
@@ -112,12 +113,6 @@ class PopulationMaps:
 
     **Raises:** `DefinitionError` for shapes that do not fit together, and as `Population`.
     """
-
-    table: dict[str, np.ndarray]
-    values: Inexact[np.ndarray, "rows *grid"]
-    axes: dict[str, np.ndarray]
-    cyclic: tuple[str, ...]
-    unit: str
 
     def __init__(
         self,
@@ -137,11 +132,8 @@ class PopulationMaps:
             )
         named = {str(name): np.asarray(x, float) for name, x in axes.items()}
         columns = as_columns(table, len(values))
-        for name, value in zip(
-            ("table", "values", "axes", "cyclic", "unit"),
-            (columns, values, named, tuple(cyclic), unit), strict=True,
-        ):  # fmt: skip
-            object.__setattr__(self, name, value)
+        self.table, self.values, self.axes = columns, values, named
+        self.cyclic, self.unit = tuple(cyclic), unit
 
     @classmethod
     def from_responses(

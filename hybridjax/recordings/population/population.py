@@ -1,6 +1,5 @@
 """`Population`: estimates of several subjects, with their errors, and what they say together."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
@@ -29,6 +28,9 @@ from .table import as_columns, cells_of, require_subjects, rows_with
 Values = Annotated[Numbers, Reals("rows")]
 
 
+_NONE: tuple[float, ...] = (np.nan, np.nan, np.nan)
+
+
 class Selection(NamedTuple):
     """One estimate for each subject and cell; several trials are averaged by their precision."""
 
@@ -40,7 +42,6 @@ class Selection(NamedTuple):
 
 
 @checked
-@dataclasses.dataclass(frozen=True, repr=False, init=False)
 class Population:
     r"""Estimates of several subjects, each with its own error.
 
@@ -63,12 +64,6 @@ class Population:
     subject in two groups, or errors that are not positive.
     """
 
-    table: dict[str, np.ndarray]
-    values: dict[str, np.ndarray]
-    errors: dict[str, np.ndarray]
-    units: dict[str, str]
-    freedom: np.ndarray
-
     def __init__(
         self,
         table: Any,
@@ -78,9 +73,7 @@ class Population:
         freedom: Annotated[Numbers, Reals("rows", infinite=True, sign="positive")] | None = None,
     ):
         if not values or set(values) != set(errors):
-            raise DefinitionError(
-                "`values` and `errors` must hold the same quantities, one or more."
-            )
+            raise DefinitionError("`values` and `errors` must hold the same quantities.")
         rows = len(np.asarray(next(iter(values.values()))))
         columns = as_columns(table, rows)
         for name in values:
@@ -93,14 +86,9 @@ class Population:
                     f"the standard error of '{name}' of subject '{subject}' must be positive: "
                     "leave out estimates without an error."
                 )
-        fields = (
-            ("table", columns), ("values", {k: np.asarray(x, float) for k, x in values.items()}),
-            ("errors", {k: np.asarray(x, float) for k, x in errors.items()}),
-            ("units", dict.fromkeys(values, "") | dict(units or {})),
-            ("freedom", np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)),
-        )  # fmt: skip
-        for name, value in fields:
-            object.__setattr__(self, name, value)
+        self.table, self.units = columns, dict.fromkeys(values, "") | dict(units or {})
+        self.values, self.errors = dict(values), dict(errors)
+        self.freedom = np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)
 
     @classmethod
     def from_fits(
@@ -152,7 +140,7 @@ class Population:
                 error = np.sqrt(fit.covariance[k, k])
                 rows.append(
                     self._row(quantity, name, len(y), fit.coefficients[k], error, fit.freedom,
-                              level, spread if k == 0 else (np.nan,) * 3, test=k > 0)
+                              level, _NONE if k else spread, test=k > 0)
                 )  # fmt: skip
         return table_of(
             rows,
@@ -183,36 +171,35 @@ class Population:
         **Raises:** `DefinitionError` as `mean`, and for labels that the table does not have.
         """
         factor, rows = rows_with(self.table, (a, b))
-        signs = np.where(self.table[factor] == a, 1.0, -1.0)
         chosen = self._select(quantity, rows, covariates)
         require_subjects(chosen.cell, chosen.subject)
         names = list(dict.fromkeys(chosen.cell))
         subjects = list(dict.fromkeys(chosen.subject))
         grid = _grid(chosen, subjects, names)
         fit = mixed(grid)
-        labels = cells_of(self.table)
-        side = np.array([signs[rows & (labels == name)][0] for name in names])
-        weights = np.where(side > 0, 1 / (side > 0).sum(), -1 / (side < 0).sum())
+        cells = cells_of(self.table)
+        side = np.array([self.table[factor][rows & (cells == name)][0] == a for name in names])
+        weights = np.where(side, 1 / side.sum(), -1 / (~side).sum())
         weights = np.append(weights, np.zeros(len(covariates)))
-        effect = f"{a} - {b}"
-        paired = grid.seen.all(axis=1)
-        spread: tuple[float, ...] = (np.nan,) * 3
+        paired = grid.present.all(axis=1)
+        spread = _NONE
         if len(names) == 2 and paired.sum() > 2:
             d, v = grid.y[paired] @ weights[:2], grid.v[paired].sum(axis=1)
             bounds = spread_interval(d, v, np.ones((len(d), 1)), level)
             spread = float(np.sqrt(weights[:2] @ fit.between @ weights[:2])), *bounds
         results = []
-        for k, name in enumerate([effect, *(f"slope of {c}" for c in covariates)]):
+        for k, name in enumerate([f"{a} - {b}", *(f"slope of {c}" for c in covariates)]):
             w = weights if k == 0 else np.eye(len(weights))[len(names) + k - 1]
             results.append(
                 self._row(quantity, name, len(subjects), w @ fit.coefficients,
                           np.sqrt(w @ fit.covariance @ w), fit.freedom(w), level,
-                          spread if k == 0 else (np.nan,) * 3, test=True)
+                          _NONE if k else spread, test=True)
             )  # fmt: skip
+        design = f"{paired.sum()} of them in all conditions" if paired.any() else "in groups"
         return table_of(
             results,
-            f"The difference of {quantity} ({effect}; {len(subjects)} subjects, {paired.sum()} of "
-            "them with all conditions) was tested in a linear mixed model with the known variance "
+            f"The difference of {quantity} ({a} - {b}; {len(subjects)} subjects, {design}) "
+            "was tested in a linear mixed model with the known variance "
             "of each estimate and free variances between subjects (restricted maximum likelihood), "
             f"with standard errors and degrees of freedom after Kenward and Roger and "
             f"{100 * level:g} % intervals.",
@@ -240,11 +227,9 @@ class Population:
             reach = stats.t.ppf((1 + level) / 2, fit.freedom) * np.sqrt(square)
             columns = (y, np.sqrt(v), value, np.sqrt(square), value - reach, value + reach)
             names = "estimate standard_error prediction prediction_error low high".split()
-            for i, name in enumerate(subject):
+            for name, *numbers in zip(subject, *columns, strict=True):
                 first = {"quantity": quantity, "unit": self.units[quantity], "subject": name}
-                rows.append(
-                    first | {"cell": cell} | {n: c[i] for n, c in zip(names, columns, strict=True)}
-                )
+                rows.append(first | {"cell": cell} | dict(zip(names, numbers, strict=True)))
         return table_of(
             rows,
             f"Single subjects are best linear unbiased predictions of {quantity} (shrunken towards "
@@ -279,9 +264,7 @@ class Population:
         if labels is None:
             chosen = self._select(quantity, None, ())
             if len(set(chosen.cell)) > 1:
-                raise DefinitionError(
-                    "`labels` must be two conditions if the table has groups or conditions."
-                )
+                raise DefinitionError("`labels` must be two conditions of the table.")
             require_subjects(chosen.cell, chosen.subject, 3)
             y, v = chosen.y, chosen.v
         else:
@@ -290,11 +273,9 @@ class Population:
             chosen = self._select(quantity, rows, ())
             names = list(dict.fromkeys(chosen.cell))
             grid = _grid(chosen, list(dict.fromkeys(chosen.subject)), names)
-            both = grid.seen.all(axis=1)
+            both = grid.present.all(axis=1)
             if len(names) != 2 or both.sum() < 3:
-                raise DefinitionError(
-                    f"`labels` needs three or more subjects in both '{a}' and '{b}', and no groups."
-                )
+                raise DefinitionError(f"fewer than three subjects have both '{a}' and '{b}'.")
             y, v = grid.y[both] @ np.array([1.0, -1.0]), grid.v[both].sum(axis=1)
         rows = power_of(y, v, difference, subjects, labels is not None, draws, level, seed)
         design = "two groups" if labels is None else "paired differences"
@@ -332,8 +313,8 @@ class Population:
 
     def _require(self, quantity: str, columns: Sequence[str]) -> None:
         if quantity not in self.values:
-            there = ", ".join(self.values)
-            raise DefinitionError(f"there is no quantity '{quantity}'; there are {there}.")
+            listed = ", ".join(self.values)
+            raise DefinitionError(f"there is no quantity '{quantity}'; quantities are {listed}.")
         for name in columns:
             if name not in self.table:
                 raise DefinitionError(f"`table` has no column '{name}'.")
@@ -348,15 +329,12 @@ class Population:
         extra = np.stack([self.table[c].astype(float) for c in covariates], axis=1) if (
             covariates) else np.zeros((len(cells), 0))  # fmt: skip
         variance = self._variance(quantity)
-        y, v, x = [], [], []
-        for subject, cell in keys:
-            of = (subjects == subject) & (cells == cell)
-            weight = 1 / variance[of]
-            y.append(weight @ self.values[quantity][of] / weight.sum())
-            v.append(1 / weight.sum())
-            x.append(extra[of].mean(axis=0))
+        of = [(subjects == subject) & (cells == cell) for subject, cell in keys]
+        v = np.array([1 / np.sum(1 / variance[i]) for i in of])
+        y = v * np.array([np.sum(self.values[quantity][i] / variance[i]) for i in of])
+        x = np.array([extra[i].mean(axis=0) for i in of])
         subject, cell = (np.array(part) for part in zip(*keys, strict=True))
-        return Selection(np.array(y), np.array(v), subject, cell, np.array(x))
+        return Selection(y, v, subject, cell, x)
 
     def _variance(self, quantity: str) -> np.ndarray:
         """Return the variances of the estimates, moderated."""
@@ -380,11 +358,11 @@ class Population:
 def _grid(chosen: Selection, subjects: list[str], names: list[str]) -> Cells:
     """Return the estimates by subject and cell, with an indicator of each cell and covariates."""
     n, q, p = len(subjects), len(names), chosen.covariates.shape[1]
-    y, v, seen = np.zeros((n, q)), np.ones((n, q)), np.zeros((n, q), bool)
+    y, v, present = np.zeros((n, q)), np.ones((n, q)), np.zeros((n, q), bool)
     x = np.zeros((n, q, q + p))
     x[:, np.arange(q), np.arange(q)] = 1.0
     centered = chosen.covariates - chosen.covariates.mean(axis=0)
     for k, (subject, cell) in enumerate(zip(chosen.subject, chosen.cell, strict=True)):
         i, j = subjects.index(subject), names.index(cell)
-        y[i, j], v[i, j], seen[i, j], x[i, j, q:] = chosen.y[k], chosen.v[k], True, centered[k]
-    return Cells(y, v, x, seen)
+        y[i, j], v[i, j], present[i, j], x[i, j, q:] = chosen.y[k], chosen.v[k], True, centered[k]
+    return Cells(y, v, x, present)

@@ -16,12 +16,12 @@ from scipy import optimize, special, stats
 
 
 class Cells(NamedTuple):
-    """Estimates of n subjects in q cells (conditions); where `seen` is False there is none."""
+    """Estimates of n subjects in q cells (conditions); where `present` is False there is none."""
 
     y: Float[np.ndarray, "n q"]
     v: Float[np.ndarray, "n q"]
     x: Float[np.ndarray, "n q p"]
-    seen: Bool[np.ndarray, "n q"]
+    present: Bool[np.ndarray, "n q"]
 
 
 class Mixed(NamedTuple):
@@ -49,14 +49,14 @@ def mixed(cells: Cells) -> Mixed:
 
     Psi is free between cells that some subject shares, and zero between others (Welch's case).
     """
-    seen, q = cells.seen, cells.y.shape[1]
-    shared = np.einsum("ni,nj->ij", seen, seen.astype(int)) > 0
-    scale = max(float(np.std(cells.y[seen])), float(np.sqrt(np.mean(cells.v[seen]))), 1e-300)
-    y = np.where(seen, cells.y, 0.0) / scale
-    x = np.where(seen[..., None], cells.x, 0.0)
+    present, q = cells.present, cells.y.shape[1]
+    shared = np.einsum("ni,nj->ij", present, present.astype(int)) > 0
+    scale = max(float(np.std(cells.y[present])), float(np.sqrt(np.mean(cells.v[present]))), 1e-300)
+    y = np.where(present, cells.y, 0.0) / scale
+    x = np.where(present[..., None], cells.x, 0.0)
     # Cells without an estimate have variance 1, zero regressors and a zero: they add constants.
-    v = np.where(seen, cells.v / scale**2, 1.0)
-    pairs = seen[:, :, None] & seen[:, None, :]
+    v = np.where(present, cells.v / scale**2, 1.0)
+    pairs = present[:, :, None] & present[:, None, :]
     rows, columns = np.nonzero(np.tril(shared))
 
     def root(free: Float[np.ndarray, " k"]) -> Float[np.ndarray, "q q"]:

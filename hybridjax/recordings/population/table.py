@@ -56,12 +56,13 @@ def rows_with(columns: dict[str, np.ndarray], labels: Sequence[str]) -> tuple[st
     **Raises:** `DefinitionError` if no factor has all of them.
     """
     for factor in FACTORS:
-        if factor in columns and set(labels) <= set(columns[factor]):
+        different = len(set(labels)) == len(labels)
+        if different and factor in columns and set(labels) <= set(columns[factor]):
             return factor, np.isin(columns[factor], labels)
-    there = ", ".join(f"'{x}'" for f in FACTORS for x in dict.fromkeys(columns.get(f, ())))
+    listed = ", ".join(f"'{x}'" for f in FACTORS for x in dict.fromkeys(columns.get(f, ())))
     raise DefinitionError(
         f"{' and '.join(map(repr, labels))} are no two conditions or groups of `table`, which has "
-        f"{there or 'neither'}."
+        f"{listed or 'neither'}."
     )
 
 
