@@ -134,8 +134,10 @@ def _map(result: MapMean | MapTest, panel: Axes) -> None:
     )  # fmt: skip
     kind = "difference" if isinstance(result, MapTest) else "response"
     panel.figure.colorbar(image, ax=panel, label=with_unit(kind, result.unit))
-    is_test = isinstance(result, MapTest)
-    inside = result.significant if is_test else np.abs(result.values) > result.reach
+    if isinstance(result, MapTest):
+        inside = result.significant
+    else:
+        inside = np.abs(result.values) > result.reach
     # Outlines along the edges of the points: cells are bounded halfway between coordinates.
     across, along = _edges(x), _edges(y)
     padded = np.pad(inside, 1)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
@@ -27,7 +27,7 @@ from .permutations import (
     sign_flips,
     statistics,
 )
-from .table import as_columns, require_subjects, rows_with
+from .table import Columns, as_columns, require_subjects, rows_with
 
 
 Curves = Sequence[ImpulseResponses] | Sequence[PhaseResponse] | Sequence[HTF]
@@ -116,7 +116,7 @@ class PopulationMaps:
 
     def __init__(
         self,
-        table: Any,
+        table: Columns,
         values: Annotated[Numbers, Complexes()],
         axes: Mapping[str, Vector],
         cyclic: OptionalNames = (),
@@ -137,7 +137,7 @@ class PopulationMaps:
 
     @classmethod
     def from_responses(
-        cls, responses: Curves, table: Any, *, output: str | int = 0, input: str | int = 0
+        cls, responses: Curves, table: Columns, *, output: str | int = 0, input: str | int = 0
     ) -> "PopulationMaps":
         """Return the maps of impulse responses (phase, lag), phase response curves (phase) or HTFs
         (harmonic, frequency) of one output to one input, with a row of the table for each.

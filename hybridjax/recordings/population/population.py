@@ -1,7 +1,7 @@
 """`Population`: estimates of several subjects, with their errors, and what they say together."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -22,7 +22,7 @@ from .planning import Allocation, allocate, power_of
 from .quantities import Fit, Quantity, fit_of, measured
 from .reml import Cells, meta, mixed, moderated, spread_interval
 from .summary import PopulationTable, table_of
-from .table import as_columns, cells_of, require_subjects, rows_with
+from .table import Columns, as_columns, cells_of, require_subjects, rows_with
 
 
 Values = Annotated[Numbers, Reals("rows")]
@@ -66,7 +66,7 @@ class Population:
 
     def __init__(
         self,
-        table: Any,
+        table: Columns,
         values: Mapping[str, Values],
         errors: Mapping[str, Values],
         units: Mapping[str, str] | None = None,
@@ -92,7 +92,7 @@ class Population:
 
     @classmethod
     def from_fits(
-        cls, fits: Sequence[Fit], table: Any, quantities: Sequence[Quantity] = ("modulus",)
+        cls, fits: Sequence[Fit], table: Columns, quantities: Sequence[Quantity] = ("modulus",)
     ) -> "Population":
         """Return the population of some fits, with a row of the table for each.
 

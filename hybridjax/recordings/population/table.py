@@ -1,26 +1,29 @@
 """Tables of a study: who was recorded, in which group and condition."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from ...errors import DefinitionError
 
 
+@runtime_checkable
+class Columns(Protocol):
+    """A mapping of columns by name, or a data frame."""
+
+    def items(self) -> Any: ...
+
+
 FACTORS = ("group", "condition")
 
 
-def as_columns(table: Any, rows: int) -> dict[str, np.ndarray]:
+def as_columns(table: Columns, rows: int) -> dict[str, np.ndarray]:
     """Return the columns of a mapping, or of a data frame, by name.
 
     **Raises:** `DefinitionError` for a table without subjects or of another length, and for a
     subject in two groups.
     """
-    if not hasattr(table, "items"):
-        raise DefinitionError(
-            "`table` must be a mapping of columns or a data frame, with a column 'subject'."
-        )
     columns = {str(name): np.asarray(values) for name, values in table.items()}
     if "subject" not in columns:
         raise DefinitionError("`table` has no column 'subject': add one, with a name in each row.")
