@@ -174,14 +174,39 @@ def write_results(folder: Path, found: Identification, formats: Sequence[Format]
     (folder / PAGE).write_text(_page(found, images), encoding="utf-8")
 
 
-def picture_of(drawn: look.Plot) -> str:
-    """Return a figure as PNG in base 64, and close it."""
+def off_screen() -> contextlib.AbstractContextManager:
+    """Return a context in which figures need no window."""
+    import matplotlib
+
+    return matplotlib.rc_context({"backend": "agg"})
+
+
+def figure_of(drawn: look.Plot, caption: str) -> str:
+    """Return a figure as HTML, and close it."""
     from matplotlib import pyplot
 
     file = io.BytesIO()
     drawn.figure.savefig(file, format="png")
     pyplot.close(drawn.figure)
-    return base64.b64encode(file.getvalue()).decode()
+    return _figure(caption, base64.b64encode(file.getvalue()).decode(), caption)
+
+
+def _figure(name: str, image: str, caption: str) -> str:
+    return (
+        f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{image}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def page_of(title: str, parts: Iterable[str]) -> str:
+    """Return a page that needs no other file."""
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"<title>{escape(title)}</title>"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<style>{_STYLE}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
+        + "\n".join(parts) + "\n</body></html>\n"
+    )  # fmt: skip
 
 
 def _written(*arrays: np.ndarray) -> Iterable[list[str]]:
@@ -226,9 +251,7 @@ def summarize(found: Identification) -> dict[str, Any]:
 
 
 def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
-    import matplotlib
-
-    with matplotlib.rc_context({"backend": "agg"}):
+    with off_screen():
         figures = {
             "multipliers": plot.multipliers(found.fit, {"plain regression": found.advice.plain}),
             "validation": plot.validation(found.held_out.validation),
@@ -250,7 +273,6 @@ def _page(found: Identification, images: dict[str, str]) -> str:
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
     expected = zip(found.advice.strides, found.advice.expected, strict=True)
     parts = [
-        "<h1>Floquet multipliers from a recording</h1>",
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",
         found.fit._repr_html_(),
@@ -273,8 +295,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         "nonlinearity, smoothing), not that the multipliers are wrong.</p>",
         found.held_out.validation._repr_html_(),
         *(
-            f'<figure><img alt="{name}" src="data:image/png;base64,{image}">'
-            f"<figcaption>{caption}</figcaption></figure>"
+            _figure(name, image, caption)
             for name, image in images.items()
             for figure, caption in _CAPTIONS.items()
             if name.startswith(figure)
@@ -283,12 +304,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         f"{data.bandwidth:.3g} Hz; output-error fit with {found.fit.numerators.shape[1]} lags; "
         "regions from the residuals, cycle by cycle.</p>",
     ]  # fmt: skip
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f"<title>Multipliers of {trials}</title>"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(parts) + "\n</body></html>\n"
-    )
+    return page_of("Floquet multipliers from a recording", parts)
 
 
 def _left_out(found: Identification) -> dict[str, Any]:

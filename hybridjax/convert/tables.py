@@ -12,7 +12,7 @@ from ..linear.htf import HTF
 from ..orbits.continuation import Branch
 from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
-from ..recordings.population.summary import PopulationTable
+from ..recordings.population.tables import PopulationTable
 from ..recordings.recording import Recording
 from .xarray_datasets import to_xarray
 

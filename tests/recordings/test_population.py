@@ -1,6 +1,5 @@
 """Populations: closed forms, other software's numbers, exact permutations, and refusals."""
 
-import functools
 import itertools
 import json
 
@@ -152,7 +151,6 @@ def test_plans_agree_with_closed_forms():
     best = people.allocation("gain", subject_cost=3, trial_cost=1, stride_cost=0.01)
     assert best.within == pytest.approx(1.0) and best.trials == 1
     assert best.strides == pytest.approx(np.sqrt(400) / best.between)
-    assert best.standard_error(12, 1, 100) == pytest.approx(stats.sem(y))
     spread = np.sqrt(best.between**2 + 0.01)
     (power,) = people.power("gain", 0.25, (12,), draws=60)["power"]
     noncentral, t = 0.25 / (spread * np.sqrt(2 / 12)), stats.t.isf(0.025, 22)
@@ -171,21 +169,21 @@ def maps_of(values, n, **labels):
 def test_all_sign_flips_give_the_exact_p_value():
     y = RNG.normal(size=(7, 6, 8))
     both = maps_of(np.concatenate([y, 0 * y]), 7, condition=np.repeat(["a", "b"], 7))
-    test = both.difference("a", "b", statistic="maximum")
+    test = both.difference("a", "b")
     largest = [np.abs(stats.ttest_1samp(np.array(s)[:, None, None] * y, 0).statistic).max()
                for s in itertools.product([1, -1], repeat=7)]  # fmt: skip
     t = stats.ttest_1samp(y, 0).statistic
     np.testing.assert_allclose(test.t, t)
     expected = (np.array(largest)[:, None, None] >= np.abs(t) * (1 - 1e-9)).mean(axis=0)
     np.testing.assert_allclose(test.p, expected)
-    assert test.exact and test.relabelings == 64
+    assert "all 64 sign flips" in test.methods
 
 
 def test_groups_and_clusters_across_the_end_of_the_cycle():
     y = RNG.normal(size=(12, 6, 8))
     y[:6, [0, 5], 2:5] += 4.0
     test = maps_of(y, 12, group=np.repeat(["a", "b"], 6)).difference("a", "b")
-    assert test.relabelings == 924 and test.significant[[0, 5], 2:5].all()
+    assert "all 924 permutations" in test.methods and test.significant[[0, 5], 2:5].all()
     assert len(set(test.labels[[0, 5], 2:5].ravel())) == 1 and test.cluster_p.min() < 0.01
     np.testing.assert_allclose(test.t, stats.ttest_ind(y[:6], y[6:]).statistic)
     turned = maps_of(y * np.exp(1j), 12, group=np.repeat(["a", "b"], 6)).difference("a", "b")
@@ -259,11 +257,11 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     page = (tmp_path / "out/population.html").read_text()
     assert page.count("report.html") == 4 and "Hartung" in page and "S9-a failed" in page
     table = (tmp_path / "out/subjects.csv").read_text().splitlines()
-    assert len(table) == 5 and table[0].startswith("report,subject,group,age,strides,modulus")
-    monkeypatch.setattr(subjects.Job, "run", functools.partialmethod(lambda self: "again"))
+    assert len(table) == 5 and table[0].startswith("report,subject,group,age,strides,period")
+    monkeypatch.setattr(subjects, "read_recording", lambda *files, **options: 1 / 0)
     assert main(["identify", "--table", "subjects.csv", *options]) == 1
     printed = capsys.readouterr().out
-    assert "S9-a failed: again" in printed and "S0-a failed" not in printed
+    assert "S9-a failed: ZeroDivisionError" in printed and "S0-a failed" not in printed
 
 
 def write_numbers(folder, result, formats):
@@ -289,7 +287,7 @@ def test_figures():
     y = RNG.normal(size=(12, 6, 8))
     y[:6, 2:4, 2:5] += 4.0
     maps = maps_of(y, 12, group=np.repeat(["a", "b"], 6))
-    outlines = hj.plot.subject_maps(maps.difference("a", "b")).ax.get_lines()
-    assert len(outlines) >= 10  # edges of two by three points
+    panel = hj.plot.subject_maps(maps.difference("a", "b")).ax
+    assert len(panel.collections) == 2  # the map and its outline
     curves = PopulationMaps({"subject": np.arange(12)}, y[:, 0], {"lag": AXES["lag"]})
-    assert len(hj.plot.subject_maps(curves.mean()).ax.get_lines()) == 12 + 2
+    assert len(hj.plot.subject_maps(curves.mean()).ax.get_lines()) == 12 + 3

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
@@ -18,85 +18,51 @@ from ...errors import DefinitionError
 from ...linear.htf import HTF
 from ..beats.response import PhaseResponse, curve_unit
 from ..impulse import ImpulseResponses
-from .permutations import (
-    clusters,
-    in_parts,
-    label_permutations,
-    masses,
-    point_threshold,
-    sign_flips,
-    statistics,
-)
-from .table import Columns, as_columns, require_subjects, rows_with
+from .permutations import clusters, exceeding, largest, point_threshold, relabelings, statistics
+from .tables import Columns, as_columns, require_subjects, rows_with
 
 
 Curves = Sequence[ImpulseResponses] | Sequence[PhaseResponse] | Sequence[HTF]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class MapMean:
-    """Mean of the maps of n subjects, with a band that holds all of the true mean.
+class MapResult:
+    """A mean, or a tested difference, of the maps of subjects.
 
-    **Fields:** `values` (*grid); `reach` (*grid): half the width of the band (a radius for complex
-    maps); `each` (n, *grid): the maps; `axes`, `unit`; `level`; `methods`.
+    **Fields:** `values` (*grid): the mean or difference. `each` (n, *grid): maps of the subjects,
+    or paired differences (none of groups). `reach` (*grid): half the width of the band (a radius
+    for complex maps) of a mean, NaN of a difference. `t` (*grid): the statistic; `p` (*grid): of
+    each point, by the largest statistic. `labels` (*grid): number of the cluster, 0 outside;
+    `cluster_p` (clusters,). `significant` (*grid): points of significant clusters, or where the
+    band does not contain zero. `axes`, `unit`, `methods`.
     """
 
     values: Inexact[np.ndarray, "*grid"]
-    reach: Float[np.ndarray, "*grid"]
     each: Inexact[np.ndarray, "n *grid"]
-    axes: dict[str, np.ndarray]
-    unit: str
-    level: float
-    methods: str
-
-    def __repr__(self) -> str:
-        size = np.abs(self.values).max()
-        return (
-            f"MapMean({len(self.each)} subjects, {' x '.join(self.axes)}: largest "
-            f"{size:.4g} {self.unit}".rstrip()
-            + f", {100 * self.level:g} % band of +- {np.median(self.reach):.3g} (median))"
-        )
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class MapTest:
-    """Difference of maps, tested with a family-wise error over all points.
-
-    **Fields:** `values` (*grid): the mean difference. `t` (*grid): its statistic. `p` (*grid):
-    p-value of each point by the largest statistic. `labels` (*grid): number of the cluster, 0
-    outside; `cluster_p` (clusters,): their p-values. `significant` (*grid): points of the chosen
-    method at `level`. `relabelings`, `exact`; `each`: paired differences (none of
-    groups); `axes`, `unit`, `methods`.
-    """
-
-    values: Inexact[np.ndarray, "*grid"]
+    reach: Float[np.ndarray, "*grid"]
     t: Float[np.ndarray, "*grid"]
     p: Float[np.ndarray, "*grid"]
     labels: Int[np.ndarray, "*grid"]
     cluster_p: Float[np.ndarray, " clusters"]
     significant: Bool[np.ndarray, "*grid"]
-    level: float
-    relabelings: int
-    exact: bool
-    each: Inexact[np.ndarray, "n *grid"]
     axes: dict[str, np.ndarray]
     unit: str
     methods: str
 
     def __repr__(self) -> str:
-        lines = [
-            f"MapTest({' x '.join(self.axes)}, {self.relabelings} relabelings"
-            f"{' (all)' * self.exact}: largest |t| {np.abs(self.t).max():.3g}, "
-            f"{p_value(float(self.p.min()))})"
-        ]
+        size = f"{np.abs(self.values).max():.4g} {self.unit}".rstrip()
+        band = f", band of +- {np.median(self.reach):.3g} (median)"
+        test = f", largest |t| {np.abs(self.t).max():.3g}, {p_value(float(self.p.min()))}"
+        end = test if np.isnan(self.reach).all() else band
+        lines = [f"MapResult({' x '.join(self.axes)}: largest {size}{end})"]
         for k in 1 + np.argsort(self.cluster_p, stable=True)[:3]:
-            p = float(self.cluster_p[k - 1])
             inside = self.labels == k
             places = zip(self.axes.items(), np.nonzero(inside), strict=True)
             where = ", ".join(f"{n} {a[i].min():.3g} to {a[i].max():.3g}" for (n, a), i in places)
-            lines.append(f"  cluster {k}: {inside.sum()} points, {where}, {p_value(p)}")
+            p = p_value(float(self.cluster_p[k - 1]))
+            lines.append(f"  cluster {k}: {inside.sum()} points, {where}, {p}")
         more = len(self.cluster_p) - 3
-        return "\n".join([*lines, *([f"  and {more} more clusters"] if more > 0 else [])])
+        return "\n".join([*lines, *[f"  and {more} more clusters"] * (more > 0)])
 
 
 @checked
@@ -115,24 +81,19 @@ class PopulationMaps:
     """
 
     def __init__(
-        self,
-        table: Columns,
-        values: Annotated[Numbers, Complexes()],
-        axes: Mapping[str, Vector],
-        cyclic: OptionalNames = (),
-        unit: str = "",
-    ):
+        self, table: Columns, values: Annotated[Numbers, Complexes()], axes: Mapping[str, Vector],
+        cyclic: OptionalNames = (), unit: str = "",
+    ):  # fmt: skip
         values = np.asarray(values)
         values = values if values.imag.any() else values.real
-        grid = tuple(len(np.asarray(x)) for x in axes.values())
+        self.axes = {str(name): np.asarray(x, float) for name, x in axes.items()}
+        grid = tuple(map(len, self.axes.values()))
         if values.shape[1:] != grid:
             raise DefinitionError(
                 f"`values` must have the shape (rows, {', '.join(axes)}), with {grid} after the "
                 f"rows, but has {values.shape}."
             )
-        named = {str(name): np.asarray(x, float) for name, x in axes.items()}
-        columns = as_columns(table, len(values))
-        self.table, self.values, self.axes = columns, values, named
+        self.table, self.values = as_columns(table, len(values)), values
         self.cyclic, self.unit = tuple(cyclic), unit
 
     @classmethod
@@ -146,18 +107,17 @@ class PopulationMaps:
         """
         rows = [_map_of(x, output, input) for x in responses]
         subjects = as_columns(table, len(rows))["subject"]
-        for k, (_, axes, _, unit, names) in enumerate(rows):
-            alike = all(np.array_equal(axes[n], a) for n, a in rows[0][1].items() if n in axes)
-            differs = (
-                "signals" if names != rows[0][4] else "units" if unit != rows[0][3]
-                else "" if alike and axes.keys() == rows[0][1].keys() else "grids"
-            )  # fmt: skip
+        values, axes, unit, names = rows[0]
+        for subject, (_, others, other_unit, other_names) in zip(subjects, rows, strict=True):
+            alike = all(np.array_equal(others.get(n, ()), a) for n, a in axes.items())
+            same = {"signals": other_names == names, "units": other_unit == unit, "grids": alike}
+            differs = " and ".join(what for what in same if not same[what])
             if differs:
                 raise DefinitionError(
-                    f"{differs} of subject '{subjects[k]}' differ from those of '{subjects[0]}': "
+                    f"{differs} of subject '{subject}' differ from those of '{subjects[0]}': "
                     "compute all responses with the same signals, units, sections and lags."
                 )
-        _, axes, cyclic, unit, _ = rows[0]
+        cyclic = ("phase",) if "lag" in axes else ()
         return cls(table, np.stack([row[0] for row in rows]), axes, cyclic, unit)
 
     def __repr__(self) -> str:
@@ -165,13 +125,9 @@ class PopulationMaps:
         return f"PopulationMaps({count} subjects, {len(self.values)} maps: {' x '.join(self.axes)})"
 
     def mean(
-        self,
-        label: str | None = None,
-        *,
-        level: Probability = 0.95,
-        draws: Count = 10_000,
+        self, label: str | None = None, *, level: Probability = 0.95, draws: Count = 10_000,
         seed: Seed = 0,
-    ) -> MapMean:
+    ) -> MapResult:  # fmt: skip
         """Return the mean of a group or condition with a simultaneous band.
 
         The band has the width at which the largest statistic of sign flips of the deviations from
@@ -181,42 +137,35 @@ class PopulationMaps:
 
         **Raises:** `DefinitionError` for an unknown label, or fewer than three subjects.
         """
-        rows = None if label is None else rows_with(self.table, (label,))[1]
-        _, maps = self._by_subject(rows)
-        n, flat = len(maps), maps.reshape(len(maps), -1)
-        relabelings = sign_flips(n, draws, np.random.default_rng(seed))
-        mean = flat.mean(axis=0)
-        largest = _largest(flat - mean, relabelings.signs[1:], True)
-        error = np.sqrt(np.sum(np.abs(flat - mean) ** 2, axis=0) / n / (n - 1))
-        reach = np.quantile(largest, level, method="higher") * error
-        grid = maps.shape[1:]
-        text = (
-            f"Mean over {n} subjects with a simultaneous band of {100 * level:g} % from the "
-            f"largest statistic of {len(relabelings.signs)} sign flips"
-            f"{' (all)' * relabelings.exact}; hybridjax {__version__}."
-        )
-        return MapMean(
-            mean.reshape(grid), reach.reshape(grid), maps, self.axes, self.unit, level, text
-        )
+        all_rows = np.ones(len(self.values), bool)
+        rows = all_rows if label is None else rows_with(self.table, (label,))[1]
+        subjects, _, maps = self._by_subject(rows)
+        n = len(maps)
+        require_subjects(np.full(n, label or "all"), subjects, 3)
+        signs = relabelings(np.ones(n), True, draws, np.random.default_rng(seed))
+        mean = maps.mean(axis=0)
+        points, _ = largest(maps - mean, signs[1:], True, np.inf, self._cyclic())
+        error = np.sqrt(np.sum(np.abs(maps - mean) ** 2, axis=0) / n / (n - 1))
+        reach = np.quantile(points, level, method="higher") * error
+        t = statistics(maps.reshape(n, -1), signs[:1], True).reshape(mean.shape)
+        text = f"Mean of {n} subjects with a simultaneous band of {100 * level:g} % from {{}}."
+        return MapResult(
+            mean, maps, reach, t, exceeding(points, np.abs(t)), np.zeros(t.shape, int), np.zeros(0),
+            np.abs(mean) > reach, self.axes, self.unit, _methods(text, signs, "sign flips"),
+        )  # fmt: skip
 
     def difference(
-        self,
-        a: str,
-        b: str,
-        *,
-        statistic: Literal["clusters", "maximum"] = "clusters",
-        point_level: Probability = 0.01,
-        level: Probability = 0.05,
-        draws: Count = 10_000,
-        seed: Seed = 0,
-    ) -> MapTest:
+        self, a: str, b: str, *, point_level: Probability = 0.01, level: Probability = 0.05,
+        draws: Count = 10_000, seed: Seed = 0,
+    ) -> MapResult:  # fmt: skip
         """Test the difference a - b of two conditions (sign flips of paired differences) or two
         groups (permutations of labels), with the family-wise error held over all points.
 
+        Clusters are connected points beyond the threshold of `point_level`, with the sum of |t| as
+        their mass.
+
         **Arguments:**
 
-        - `statistic`: "clusters": mass (sum of |t|) of connected points beyond the threshold of
-          `point_level`; "maximum": largest |t|. Default: "clusters".
         - `point_level`: probability with which a single point exceeds the threshold. Default: 0.01.
         - `level`: family-wise error. Default: 0.05.
         - `draws`: number of relabelings for more than 12 subjects (all for fewer). Default: 10000.
@@ -225,97 +174,63 @@ class PopulationMaps:
         than three subjects in both conditions, or in a group.
         """
         factor, rows = rows_with(self.table, (a, b))
-        rng = np.random.default_rng(seed)
-        keys, maps = self._by_subject(rows, factor)
-        if factor == "condition":
-            index = {key: i for i, key in enumerate(keys)}
-            both = [s for s, label in keys if label == a and (s, b) in index]
-            if len(both) < 3:
-                raise DefinitionError(
-                    f"{len(both)} subjects have both '{a}' and '{b}': three or more are needed."
-                )
-            y = np.stack([maps[index[s, a]] - maps[index[s, b]] for s in both])
-            relabelings, paired = sign_flips(len(y), draws, rng), True
+        subjects, labels, y = self._by_subject(rows, factor)
+        paired = factor == "condition"
+        if paired:
+            index = {key: i for i, key in enumerate(zip(subjects, labels, strict=True))}
+            both = [s for s in subjects[labels == a] if (s, b) in index]
+            require_subjects(np.full(len(both) or 1, f"{a} and {b}"), np.array(both or [""]), 3)
+            y = np.stack([y[index[s, a]] - y[index[s, b]] for s in both])
         else:
-            labels = np.array([label for _, label in keys])
-            require_subjects(labels, np.array([s for s, _ in keys]), 3)
-            y, paired = maps, False
-            relabelings = label_permutations(labels == a, draws, rng)
-        grid, cyclic = y.shape[1:], tuple(name in self.cyclic for name in self.axes)
-        flat = y.reshape(len(y), -1)
-        threshold = point_threshold(point_level, len(y), paired, np.iscomplexobj(y))
-        t = statistics(flat, relabelings.signs[:1], paired).reshape(grid)
-        largest: list[np.ndarray] = []
-        mass: list[np.ndarray] = []
-        observed = np.zeros(0)
-        for part in in_parts(len(relabelings.signs), flat.shape[1]):
-            drawn = statistics(flat, relabelings.signs[part], paired)
-            largest.append(np.abs(drawn).max(axis=1))
-            drawn = drawn.reshape(-1, *grid)
-            heaviest, first = masses(drawn, clusters(drawn, threshold, cyclic))
-            observed = first if not mass else observed
-            mass.append(heaviest)
-        p = _exceeding(np.concatenate(largest), np.abs(t).ravel()).reshape(grid)
-        cluster_p = _exceeding(np.concatenate(mass), observed)
-        labels = clusters(t[None], threshold, cyclic)[0]
-        numbers = np.unique(labels[labels > 0])
-        labels = np.searchsorted(numbers, labels) + 1 if len(numbers) else labels
-        labels = np.where(np.abs(t) > threshold, labels, 0)
-        by_cluster = np.append(1.0, cluster_p)[labels]
-        significant = (p if statistic == "maximum" else by_cluster) <= level
-        way = "sign flips of paired differences" if paired else "permutations of group labels"
-        method = "cluster mass" if statistic == "clusters" else "the maximum statistic"
-        beyond = f" (points beyond p = {point_level:g})" if statistic == "clusters" else ""
-        amount = "all" if relabelings.exact else "random"
+            require_subjects(labels, subjects, 3)
+        n = len(y)
+        true = np.ones(n) if paired else np.where(labels == a, 1.0, -1.0)
+        signs = relabelings(true, paired, draws, np.random.default_rng(seed))
+        threshold = point_threshold(point_level, n - 2 + paired, np.iscomplexobj(y))
+        t = statistics(y.reshape(n, -1), signs[:1], paired).reshape(1, *y.shape[1:])
+        points, masses = largest(y, signs, paired, threshold, self._cyclic())
+        (regions,), (t,) = clusters(t, threshold, self._cyclic()), t
+        mass = np.bincount(regions.ravel(), np.abs(t).ravel())
+        cluster_p = exceeding(masses, mass[1:])
+        value = y.mean(axis=0) if paired else y[true > 0].mean(axis=0) - y[true < 0].mean(axis=0)
         text = (
-            f"Maps of {len(y)} subjects ({a} - {b}) were compared by {method}{beyond} with a "
-            f"family-wise error of {100 * level:g} %, from {amount} {len(relabelings.signs)} "
-            f"{way}; hybridjax {__version__}."
+            f"Maps of {n} subjects ({a} - {b}) were compared by cluster mass (points beyond "
+            f"p = {point_level:g}) with a family-wise error of {100 * level:g} %, from {{}}."
         )
-        value = (
-            y.mean(axis=0)
-            if paired
-            else (
-                y[relabelings.signs[0] > 0].mean(axis=0) - y[relabelings.signs[0] < 0].mean(axis=0)
-            )
-        )
-        return MapTest(
-            value, t, p, labels, cluster_p, significant, level, len(relabelings.signs),
-            relabelings.exact, y if paired else y[:0], self.axes, self.unit, text,
+        return MapResult(
+            value, y if paired else y[:0], np.full(t.shape, np.nan), t,
+            exceeding(points, np.abs(t)), regions, cluster_p,
+            np.append(1.0, cluster_p)[regions] <= level,
+            self.axes, self.unit,
+            _methods(text, signs, "sign flips" if paired else "permutations of labels"),
         )  # fmt: skip
 
-    def _by_subject(self, rows=None, factor: str = "") -> tuple[list[tuple[str, str]], np.ndarray]:
-        """Return the mean map of each subject (in each label of a factor)."""
+    def _cyclic(self) -> tuple[bool, ...]:
+        return tuple(name in self.cyclic for name in self.axes)
+
+    def _by_subject(self, rows: np.ndarray, factor: str = ""):
+        """Return subjects, labels and the mean map of each subject (in each label of a factor)."""
         subjects = self.table["subject"]
-        rows = np.ones(len(subjects), bool) if rows is None else rows
         labels = self.table[factor] if factor else np.full(len(subjects), "")
         keys = list(dict.fromkeys(zip(subjects[rows], labels[rows], strict=True)))
-        require_subjects(np.array([k[1] or "all" for k in keys]), np.array([k[0] for k in keys]), 2)
         maps = [self.values[rows & (subjects == s) & (labels == c)].mean(axis=0) for s, c in keys]
-        return keys, np.stack(maps)
+        return *map(np.array, zip(*keys, strict=True)), np.stack(maps)
 
 
-def _largest(y, signs, paired: bool) -> np.ndarray:
-    parts = in_parts(len(signs), y.shape[1])
-    return np.concatenate([np.abs(statistics(y, signs[i], paired)).max(axis=1) for i in parts])
-
-
-def _exceeding(draws: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the fraction of draws that are at least as large, up to rounding."""
-    draws = np.sort(draws)
-    return 1 - np.searchsorted(draws, values * (1 - 1e-9)) / len(draws)
+def _methods(text: str, signs: np.ndarray, way: str) -> str:
+    amount = "all" if signs.shape[1] <= 12 else "random"
+    return f"{text.format(f'{amount} {len(signs)} {way}')} Computed by hybridjax {__version__}."
 
 
 def _map_of(x, output: str | int, input: str | int):
-    """Return values, axes, cyclic axes, unit and names of one subject's response."""
+    """Return values, axes, unit and names of one subject's response."""
     if isinstance(x, PhaseResponse):
-        return x.values, {"phase": x.phase}, (), curve_unit(x.input), (str(x.input),)
+        return x.values, {"phase": x.phase}, curve_unit(x.input), (str(x.input),)
     i, j = channel_index("output", output, x.outputs), channel_index("input", input, x.inputs)
     signals = (x.outputs[i], x.inputs[j])
     unit, names = ratio(*signals), tuple(map(str, signals))
     if isinstance(x, HTF):
         axes = {"harmonic": np.asarray(x.harmonics, float), "frequency": np.asarray(x.f)}
-        return np.asarray(x.H)[:, :, i, j], axes, (), unit, names
+        return np.asarray(x.H)[:, :, i, j], axes, unit, names
     unit = unit and f"{unit_of(signals[0])}/({unit_of(signals[1])} s)"
-    axes = {"phase": x.phase, "lag": x.lag}
-    return x.values[:, :, i, j], axes, ("phase",), unit, names
+    return x.values[:, :, i, j], {"phase": x.phase, "lag": x.lag}, unit, names

@@ -6,50 +6,35 @@ therefore gives p-values that hold the family-wise error (Nichols and Holmes 200
 and Oostenveld 2007).
 """
 
-import itertools
-import math
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Inexact, Int
 from scipy import ndimage, stats
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 
-class Relabelings(NamedTuple):
-    """Rows of weights +1 and -1 for each subject, the true ones first; `exact` if they are all."""
-
-    signs: Float[np.ndarray, "P n"]
-    exact: bool
-
-
-def sign_flips(n: int, draws: int, rng: np.random.Generator) -> Relabelings:
-    """Return all flips of up to 12 signs (those of all signs alike give the same), else draws."""
-    if n <= 12:
-        bits = (np.arange(2 ** (n - 1))[:, None] >> np.arange(n)) & 1
-        return Relabelings(1.0 - 2.0 * bits, True)
-    signs = rng.choice([-1.0, 1.0], (draws, n))
-    signs[0] = 1.0
-    return Relabelings(signs, False)
-
-
-def label_permutations(first, draws: int, rng: np.random.Generator) -> Relabelings:
-    """Return all divisions of up to 12 subjects into two groups, else draws."""
-    n, k = len(first), int(first.sum())
-    true = np.where(first, 1.0, -1.0)
-    if n <= 12:
-        signs = -np.ones((math.comb(n, k), n))
-        for row, chosen in zip(signs, itertools.combinations(range(n), k), strict=True):
-            row[list(chosen)] = 1.0
-        other = signs[(signs != true).any(axis=1)]
-        return Relabelings(np.concatenate([true[None], other]), True)
-    return Relabelings(np.stack([true, *(rng.permutation(true) for _ in range(draws - 1))]), False)
+def relabelings(
+    true: Float[np.ndarray, " n"], paired: bool, draws: int, rng: np.random.Generator
+) -> Float[np.ndarray, "P n"]:
+    """Return weights +1 and -1 of the subjects, the true ones first: of up to 12 subjects all flips
+    of signs (those of all signs alike give the same) or divisions into two groups, else draws."""
+    n = len(true)
+    if n > 12 and paired:
+        signs = rng.choice([-1.0, 1.0], (draws, n))
+    elif n > 12:
+        signs = np.stack([rng.permutation(true) for _ in range(draws)])
+    else:
+        signs = 1.0 - 2.0 * ((np.arange(2 ** (n - paired))[:, None] >> np.arange(n)) & 1)
+        signs = signs if paired else signs[signs.sum(axis=1) == true.sum()]
+        signs = signs[np.argsort((signs != true).any(axis=1), stable=True)]
+    signs[0] = true
+    return signs
 
 
 def statistics(
-    y: Float[np.ndarray, "n V"], signs: Float[np.ndarray, "P n"], paired: bool
+    y: Inexact[np.ndarray, "n V"], signs: Float[np.ndarray, "P n"], paired: bool
 ) -> Float[np.ndarray, "P V"]:
     """Return Student's t for each relabeling; for complex maps the root of the F ratio of a complex
     mean, which has no sign."""
@@ -70,12 +55,33 @@ def statistics(
     return np.abs(mean) / size if np.iscomplexobj(y) else mean / size
 
 
-def point_threshold(level: float, n: int, paired: bool, is_complex: bool) -> float:
+def point_threshold(level: float, freedom: int, is_complex: bool) -> float:
     """Return the statistic that one point exceeds with probability `level` (two-sided)."""
-    freedom = n - 1 if paired else n - 2
     if is_complex:
         return float(np.sqrt(stats.f.isf(level, 2, 2 * freedom)))
     return float(stats.t.isf(level / 2, freedom))
+
+
+def largest(
+    y: Inexact[np.ndarray, "n *grid"], signs: Float[np.ndarray, "P n"], paired: bool,
+    threshold: float, cyclic: tuple[bool, ...],
+) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:  # fmt: skip
+    """Return the largest |t| and the largest cluster mass (sum of |t|) of each relabeling."""
+    points, masses = [], []
+    step = max(1, 8_000_000 // y[0].size)  # statistics of a part fit into 64 MB
+    for part in (signs[i : i + step] for i in range(0, len(signs), step)):
+        t = statistics(y.reshape(len(y), -1), part, paired)
+        labels = clusters(t.reshape(-1, *y.shape[1:]), threshold, cyclic).reshape(t.shape)
+        mass = np.bincount(labels.ravel(), np.abs(t).ravel())
+        mass[0] = 0.0
+        points.append(np.abs(t).max(axis=1))
+        masses.append(mass[labels].max(axis=1))
+    return np.concatenate(points), np.concatenate(masses)
+
+
+def exceeding(draws: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the fraction of draws that are at least as large, up to rounding."""
+    return 1 - np.searchsorted(np.sort(draws), values * (1 - 1e-9)) / len(draws)
 
 
 def clusters(
@@ -88,9 +94,8 @@ def clusters(
     for side in (t > threshold, t < -threshold):
         label: Any = ndimage.label(side, inside)
         regions, count = label
-        for axis, wraps in enumerate(cyclic, 1):
-            if wraps:
-                regions, count = _joined(regions, count, axis)
+        for axis in (k for k, wraps in enumerate(cyclic, 1) if wraps):
+            regions, count = _joined(regions, count, axis)
         labels += np.where(regions > 0, regions + last, 0)
         last += count
     return labels
@@ -101,24 +106,6 @@ def _joined(labels, count: int, axis: int):
     a, b = np.take(labels, 0, axis), np.take(labels, -1, axis)
     touch = (a > 0) & (b > 0)
     edges = coo_array((np.ones(touch.sum()), (a[touch], b[touch])), (count + 1, count + 1))
+    # Number 0 is the outside, which no region touches.
     new = connected_components(edges, directed=False)[1]
-    new = new - new[0]  # number 0 is the outside, which no region touches
-    return np.where(labels > 0, new[labels], 0), int(new.max())
-
-
-def masses(
-    t: Float[np.ndarray, "P *grid"], labels: Int[np.ndarray, "P *grid"]
-) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " clusters"]]:
-    """Return the largest cluster mass (sum of |t|) of each relabeling, and the masses of the
-    clusters of the first."""
-    flat = labels.reshape(len(t), -1)
-    mass = np.bincount(flat.ravel(), np.abs(t).ravel())
-    mass[0] = 0.0
-    first = np.unique(flat[0][flat[0] > 0])
-    return mass[flat].max(axis=1), mass[first]
-
-
-def in_parts(count: int, size: int) -> Iterator[slice]:
-    """Return parts of the relabelings, so that statistics of a part fit into 64 MB."""
-    step = max(1, 8_000_000 // max(size, 1))
-    return (slice(i, i + step) for i in range(0, count, step))
+    return new[labels], int(new.max())

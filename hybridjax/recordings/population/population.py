@@ -1,7 +1,7 @@
 """`Population`: estimates of several subjects, with their errors, and what they say together."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -17,28 +17,49 @@ from ..._core.boundary.kinds import (
     Seed,
 )
 from ..._core.boundary.values import Reals
+from ..._core.signal import unit_of
 from ...errors import DefinitionError
-from .planning import Allocation, allocate, power_of
-from .quantities import Fit, Quantity, fit_of, measured
+from ...identify.multiplier_estimate import MultiplierEstimate
+from ...scale.draws import monte_carlo
 from .reml import Cells, meta, mixed, moderated, spread_interval
-from .summary import PopulationTable, table_of
-from .table import Columns, as_columns, cells_of, require_subjects, rows_with
+from .tables import (
+    Columns,
+    PopulationTable,
+    as_columns,
+    cells_of,
+    require_subjects,
+    rows_with,
+    table_of,
+)
 
 
-Values = Annotated[Numbers, Reals("rows")]
+Quantity = Literal["modulus", "angle", "coefficients"]
+Numeric = Mapping[str, Annotated[Numbers, Reals("rows")]]
 
 
-_NONE: tuple[float, ...] = (np.nan, np.nan, np.nan)
+class Estimate(NamedTuple):
+    """What a row of a table of means or differences holds."""
+
+    value: float
+    error: float
+    freedom: float
+    spread: tuple[float, ...] = (np.nan, np.nan, np.nan)
+    is_test: bool = True
 
 
-class Selection(NamedTuple):
-    """One estimate for each subject and cell; several trials are averaged by their precision."""
+class Allocation(NamedTuple):
+    """Standard deviations between subjects, between trials of a subject, and within a trial (of one
+    stride), and the best numbers of `trials` per subject and `strides` per trial.
 
-    y: np.ndarray
-    v: np.ndarray
-    subject: np.ndarray
-    cell: np.ndarray
-    covariates: np.ndarray
+    The variance of the mean of n subjects is `(between² + (trial² + within² / strides) / trials) /
+    n`.
+    """
+
+    between: float
+    trial: float
+    within: float
+    trials: float
+    strides: float
 
 
 @checked
@@ -65,48 +86,61 @@ class Population:
     """
 
     def __init__(
-        self,
-        table: Columns,
-        values: Mapping[str, Values],
-        errors: Mapping[str, Values],
+        self, table: Columns, values: Numeric, errors: Numeric,
         units: Mapping[str, str] | None = None,
         freedom: Annotated[Numbers, Reals("rows", infinite=True, sign="positive")] | None = None,
-    ):
+    ):  # fmt: skip
         if not values or set(values) != set(errors):
             raise DefinitionError("`values` and `errors` must hold the same quantities.")
         rows = len(np.asarray(next(iter(values.values()))))
-        columns = as_columns(table, rows)
-        for name in values:
-            if not len(values[name]) == len(errors[name]) == rows:
+        self.table = as_columns(table, rows)
+        self.values, self.errors = dict(values), dict(errors)
+        for name, error in self.errors.items():
+            if not len(self.values[name]) == len(error) == rows:
                 raise DefinitionError(f"`values` and `errors` of '{name}' must have {rows} rows.")
-            bad = ~(np.asarray(errors[name]) > 0)
-            if bad.any():
-                subject = columns["subject"][bad.argmax()]
+            if not (np.asarray(error) > 0).all():
+                subject = self.table["subject"][np.argmin(error)]
                 raise DefinitionError(
                     f"the standard error of '{name}' of subject '{subject}' must be positive: "
                     "leave out estimates without an error."
                 )
-        self.table, self.units = columns, dict.fromkeys(values, "") | dict(units or {})
-        self.values, self.errors = dict(values), dict(errors)
+        self.units = dict.fromkeys(values, "") | dict(units or {})
         self.freedom = np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)
 
     @classmethod
     def from_fits(
-        cls, fits: Sequence[Fit], table: Columns, quantities: Sequence[Quantity] = ("modulus",)
-    ) -> "Population":
+        cls, fits: Sequence[MultiplierEstimate], table: Columns,
+        quantities: Sequence[Quantity] = ("modulus",),
+    ) -> "Population":  # fmt: skip
         """Return the population of some fits, with a row of the table for each.
 
-        **Arguments:** `fits`: estimates of multipliers, or results of `identify_recording`.
-        `quantities`: "modulus" and "angle" (rad, upper half plane) of the leading multiplier,
-        "coefficients" c1, c2, ... of the characteristic polynomial, "period" (s, of results of
-        `identify_recording`; the error assumes independent cycles). Default: the modulus.
+        **Arguments:** `quantities`: "modulus" and "angle" (rad, upper half plane) of the leading
+        multiplier, "coefficients" c1, c2, ... of the characteristic polynomial. Default: the
+        modulus.
 
         **Raises:** `DefinitionError` for a fit without covariance, outputs or units that differ,
         coefficients of different orders, and the angle of a real multiplier.
         """
         columns = as_columns(table, len(fits))
-        freedom = [fit_of(x).covariance_freedom for x in fits]
-        return cls(columns, *measured(fits, list(columns["subject"]), quantities), freedom)
+        subjects = columns["subject"]
+        parts = [_of(fit, s, quantities) for fit, s in zip(fits, subjects, strict=True)]
+        signals = [_signals(fit) for fit in fits]
+        for subject, part, names in zip(subjects, parts, signals, strict=True):
+            if names != signals[0]:
+                raise DefinitionError(
+                    f"the fit of subject '{subject}' is of {names}, but that of '{subjects[0]}' is "
+                    f"of {signals[0]}: use the same outputs, in the same units."
+                )
+            if part.keys() != parts[0].keys():
+                raise DefinitionError(
+                    f"orders differ between the fits of '{subjects[0]}' and '{subject}', so their "
+                    "coefficients cannot be averaged: give all fits the same `order`, or take the "
+                    "modulus."
+                )
+        values, errors = ({n: np.array([p[n][i] for p in parts]) for n in parts[0]} for i in (0, 1))
+        freedom = [fit.covariance_freedom for fit in fits]
+        units = {"angle": "rad"} if "angle" in values else {}
+        return cls(columns, values, errors, units, freedom)
 
     def __repr__(self) -> str:
         subjects, cells = self.table["subject"], cells_of(self.table)
@@ -127,38 +161,28 @@ class Population:
         **Raises:** `DefinitionError` for an unknown quantity or covariate, and for too few
         subjects.
         """
-        chosen = self._select(quantity, None, covariates)
-        require_subjects(chosen.cell, chosen.subject, 2 + len(covariates))
         rows = []
-        for cell in dict.fromkeys(chosen.cell):
-            y, v, _, _, extra = (x[chosen.cell == cell] for x in chosen)
+        for cell, (_, y, v, extra) in self._cells(quantity, 2 + len(covariates), covariates):
             x = np.column_stack([np.ones(len(y)), extra - extra.mean(axis=0)])
             fit = meta(y, v, x)
+            errors = np.sqrt(np.diag(fit.covariance))
             spread = (np.sqrt(fit.variance), *spread_interval(y, v, x, level))
             for k, effect in enumerate(["mean", *(f"slope of {c}" for c in covariates)]):
                 name = effect if cell == "all" else f"{effect}, {cell}"
-                error = np.sqrt(fit.covariance[k, k])
-                rows.append(
-                    self._row(quantity, name, len(y), fit.coefficients[k], error, fit.freedom,
-                              level, _NONE if k else spread, test=k > 0)
-                )  # fmt: skip
+                row = Estimate(fit.coefficients[k], errors[k], fit.freedom)
+                row = row if k else row._replace(spread=spread, is_test=False)
+                rows.append(self._row(quantity, name, len(y), row, level))
         return table_of(
             rows,
-            f"Means of {quantity} over subjects were estimated by restricted maximum likelihood "
-            "from the estimate and the standard error of each subject (random-effects model), with "
-            f"{100 * level:g} % intervals after Hartung and Knapp; intervals of the standard "
-            "deviation between subjects follow from the Q profile.",
+            f"Means of {quantity} over subjects and {100 * level:g} % intervals are those of a "
+            "random-effects model with the standard error of each subject (restricted maximum "
+            "likelihood, Hartung and Knapp; standard deviations between subjects: Q profile).",
         )
 
     def difference(
-        self,
-        quantity: str,
-        a: str,
-        b: str,
-        *,
-        covariates: OptionalNames = (),
+        self, quantity: str, a: str, b: str, *, covariates: OptionalNames = (),
         level: Probability = 0.95,
-    ) -> PopulationTable:
+    ) -> PopulationTable:  # fmt: skip
         """Return the mean difference a - b of two conditions or two groups, and test it.
 
         Differences are paired in subjects that have both; subjects with one of them count, too.
@@ -170,39 +194,28 @@ class Population:
 
         **Raises:** `DefinitionError` as `mean`, and for labels that the table does not have.
         """
-        factor, rows = rows_with(self.table, (a, b))
-        chosen = self._select(quantity, rows, covariates)
-        require_subjects(chosen.cell, chosen.subject)
-        names = list(dict.fromkeys(chosen.cell))
-        subjects = list(dict.fromkeys(chosen.subject))
-        grid = _grid(chosen, subjects, names)
+        grid, names, is_a = self._grid(quantity, a, b, covariates)
         fit = mixed(grid)
-        cells = cells_of(self.table)
-        side = np.array([self.table[factor][rows & (cells == name)][0] == a for name in names])
-        weights = np.where(side, 1 / side.sum(), -1 / (~side).sum())
-        weights = np.append(weights, np.zeros(len(covariates)))
-        paired = grid.present.all(axis=1)
-        spread = _NONE
-        if len(names) == 2 and paired.sum() > 2:
-            d, v = grid.y[paired] @ weights[:2], grid.v[paired].sum(axis=1)
-            bounds = spread_interval(d, v, np.ones((len(d), 1)), level)
-            spread = float(np.sqrt(weights[:2] @ fit.between @ weights[:2])), *bounds
-        results = []
-        for k, name in enumerate([f"{a} - {b}", *(f"slope of {c}" for c in covariates)]):
-            w = weights if k == 0 else np.eye(len(weights))[len(names) + k - 1]
-            results.append(
-                self._row(quantity, name, len(subjects), w @ fit.coefficients,
-                          np.sqrt(w @ fit.covariance @ w), fit.freedom(w), level,
-                          _NONE if k else spread, test=True)
-            )  # fmt: skip
-        design = f"{paired.sum()} of them in all conditions" if paired.any() else "in groups"
+        weights = np.eye(len(names) + len(covariates))[len(names) - 1 :]
+        weights[0] = 0.0
+        weights[0, : len(names)] = np.where(is_a, 1 / is_a.sum(), -1 / (~is_a).sum())
+        paired, rows = grid.present.all(axis=1), []
+        for k, effect in enumerate([f"{a} - {b}", *(f"slope of {c}" for c in covariates)]):
+            w = weights[k]
+            row = Estimate(w @ fit.coefficients, np.sqrt(w @ fit.covariance @ w), fit.freedom(w))
+            if k == 0 and len(names) == 2 and paired.sum() > 2:
+                d, v = grid.y[paired] @ w[:2], grid.v[paired].sum(axis=1)
+                spread = np.sqrt(w[:2] @ fit.between @ w[:2])
+                bounds = spread_interval(d, v, np.ones((len(d), 1)), level)
+                row = row._replace(spread=(spread, *bounds))
+            rows.append(self._row(quantity, effect, len(paired), row, level))
+        design = f"{paired.sum()} in all conditions" if paired.any() else "in groups"
         return table_of(
-            results,
-            f"The difference of {quantity} ({a} - {b}; {len(subjects)} subjects, {design}) "
-            "was tested in a linear mixed model with the known variance "
-            "of each estimate and free variances between subjects (restricted maximum likelihood), "
-            f"with standard errors and degrees of freedom after Kenward and Roger and "
-            f"{100 * level:g} % intervals.",
+            rows,
+            f"The difference of {quantity} ({a} - {b}; {len(paired)} subjects, {design}) was "
+            "tested in a linear mixed model with the known variance of each estimate and free "
+            f"variances between subjects (restricted maximum likelihood; standard errors, degrees "
+            f"of freedom and {100 * level:g} % intervals of Kenward and Roger).",
         )
 
     def predictions(self, quantity: str, *, level: Probability = 0.95) -> PopulationTable:
@@ -214,39 +227,33 @@ class Population:
 
         **Raises:** `DefinitionError` as `mean`; three subjects are needed.
         """
-        chosen = self._select(quantity, None, ())
-        require_subjects(chosen.cell, chosen.subject, 3)
         rows = []
-        for cell in dict.fromkeys(chosen.cell):
-            y, v, subject, _, _ = (x[chosen.cell == cell] for x in chosen)
+        for cell, (subject, y, v, _) in self._cells(quantity, 3):
             fit = meta(y, v, np.ones((len(y), 1)))
             share = fit.variance / (fit.variance + v)
             value = fit.coefficients[0] + share * (y - fit.coefficients[0])
             square = share * v + (1 - share) ** 2 * fit.covariance[0, 0]
             square += 2 * v**2 / (v + fit.variance) ** 3 * fit.variance_error**2
             reach = stats.t.ppf((1 + level) / 2, fit.freedom) * np.sqrt(square)
-            columns = (y, np.sqrt(v), value, np.sqrt(square), value - reach, value + reach)
-            names = "estimate standard_error prediction prediction_error low high".split()
-            for name, *numbers in zip(subject, *columns, strict=True):
-                first = {"quantity": quantity, "unit": self.units[quantity], "subject": name}
-                rows.append(first | {"cell": cell} | dict(zip(names, numbers, strict=True)))
+            columns = {
+                "subject": subject, "cell": [cell] * len(y), "estimate": y,
+                "standard_error": np.sqrt(v), "prediction": value,
+                "prediction_error": np.sqrt(square), "low": value - reach, "high": value + reach,
+            }  # fmt: skip
+            first = {"quantity": quantity, "unit": self.units[quantity]}
+            for row in zip(*columns.values(), strict=True):
+                rows.append(first | dict(zip(columns, row, strict=True)))
         return table_of(
             rows,
             f"Single subjects are best linear unbiased predictions of {quantity} (shrunken towards "
-            "the mean), with standard errors after Prasad and Rao.",
+            "the mean), with standard errors of Prasad and Rao.",
         )
 
     def power(
-        self,
-        quantity: str,
-        difference: float,
-        subjects: Sequence[Count] = (8, 12, 16, 24),
-        *,
-        labels: Sequence[str] | None = None,
-        draws: ExperimentCount = 400,
-        level: Probability = 0.05,
+        self, quantity: str, difference: float, subjects: Sequence[Count] = (8, 12, 16, 24), *,
+        labels: Sequence[str] = (), draws: ExperimentCount = 400, level: Probability = 0.05,
         seed: Seed = 0,
-    ) -> PopulationTable:
+    ) -> PopulationTable:  # fmt: skip
         """Return the power of tests of a difference, by simulation of populations like this pilot.
 
         Simulated subjects have the spread of the pilot, and standard errors drawn from its own.
@@ -261,29 +268,35 @@ class Population:
 
         **Raises:** `DefinitionError` as `difference`, and if xarray is not installed.
         """
-        if labels is None:
-            chosen = self._select(quantity, None, ())
-            if len(set(chosen.cell)) > 1:
-                raise DefinitionError("`labels` must be two conditions of the table.")
-            require_subjects(chosen.cell, chosen.subject, 3)
-            y, v = chosen.y, chosen.v
+        if labels:
+            grid, names, _ = self._grid(quantity, *labels)
+            both = grid.present.all(axis=1) & (len(names) == 2)
+            y, v = (
+                grid.y[both] @ np.array([1.0, *[-1.0] * (len(names) - 1)]),
+                grid.v[both].sum(axis=1),
+            )
         else:
-            a, b = labels
-            _, rows = rows_with(self.table, (a, b))
-            chosen = self._select(quantity, rows, ())
-            names = list(dict.fromkeys(chosen.cell))
-            grid = _grid(chosen, list(dict.fromkeys(chosen.subject)), names)
-            both = grid.present.all(axis=1)
-            if len(names) != 2 or both.sum() < 3:
-                raise DefinitionError(f"fewer than three subjects have both '{a}' and '{b}'.")
-            y, v = grid.y[both] @ np.array([1.0, -1.0]), grid.v[both].sum(axis=1)
-        rows = power_of(y, v, difference, subjects, labels is not None, draws, level, seed)
-        design = "two groups" if labels is None else "paired differences"
+            ((_, (_, y, v, _)), *more) = self._cells(quantity, 3)
+            if more:
+                raise DefinitionError("`labels` must be two conditions of the table.")
+        if len(y) < 3:
+            raise DefinitionError("fewer than three subjects have both conditions.")
+        ones, rows = np.ones((len(y), 1)), []
+        low, high = spread_interval(y, v, ones)
+        spreads = [float(np.sqrt(meta(y, v, ones).variance)), high, low]
+        for n in subjects:
+            tests = [_test(v, n, x, difference, bool(labels), level) for x in spreads]
+            count, *bounds = (int(monte_carlo(f, draws, seed).value.sum()) for f in tests)
+            least, most = (stats.binomtest(k, draws).proportion_ci() for k in bounds)
+            rows.append({
+                "subjects": n, "power": count / draws, "power_low": least.low,
+                "power_high": most.high, "spread": spreads[0], "draws": draws,
+            })  # fmt: skip
         return table_of(
             rows,
-            f"The power to detect a difference of {difference:g} in {quantity} ({design}) was "
-            f"computed from {draws} simulated populations with the spread and the standard errors "
-            f"of a pilot of {len(y)} subjects.",
+            f"The power to detect a difference of {difference:g} in {quantity} "
+            f"({'paired differences' if labels else 'two groups'}) was computed from {draws} "
+            f"simulated populations with the spread and errors of a pilot of {len(y)} subjects.",
         )
 
     def allocation(
@@ -299,42 +312,70 @@ class Population:
 
         **Raises:** `DefinitionError` without a column `strides`, and as `mean`.
         """
-        self._require(quantity, ("strides",))
-        cells, costs = cells_of(self.table), (subject_cost, trial_cost, stride_cost)
-        chosen = self._select(quantity, None, ())
-        require_subjects(chosen.cell, chosen.subject, 3)
-        each = [chosen.cell == cell for cell in dict.fromkeys(chosen.cell)]
-        between = np.mean([
-            meta(chosen.y[i], chosen.v[i], np.ones((i.sum(), 1))).variance for i in each
-        ])  # fmt: skip
-        who = np.char.add(np.char.add(self.table["subject"], "\n"), cells)
-        y, v = self.values[quantity], self._variance(quantity)
-        return allocate(y, v, self.table["strides"].astype(float), who, float(between), costs)
+        variances = [meta(y, v, np.ones((len(y), 1))).variance
+                     for _, (_, y, v, _) in self._cells(quantity, 3)]  # fmt: skip
+        between, y, v = float(np.mean(variances)), self.values[quantity], self._variance(quantity)
+        within = float(np.mean(v * self._numbers("strides")))
+        who = np.char.add(np.char.add(self.table["subject"], "\n"), cells_of(self.table))
+        groups = [i for i in (who == name for name in dict.fromkeys(who)) if i.sum() > 1]
+        extra = [(y[i].var(ddof=1) - v[i].mean()) * (i.sum() - 1) for i in groups]
+        trial = max(sum(extra) / max(sum(i.sum() - 1 for i in groups), 1), 0.0)
+        if trial > 0:
+            length = np.sqrt(trial_cost / stride_cost * within / trial)
+            count = max(np.sqrt(subject_cost / trial_cost * trial / max(between, 1e-300)), 1.0)
+        else:  # trials differ no more than their strides: one long trial
+            cost = (subject_cost + trial_cost) / stride_cost
+            length, count = np.sqrt(cost * within / max(between, 1e-300)), 1.0
+        parts = (np.sqrt(between), np.sqrt(trial), np.sqrt(within), count, length)
+        return Allocation(*map(float, parts))
 
-    def _require(self, quantity: str, columns: Sequence[str]) -> None:
+    def _numbers(self, name: str) -> np.ndarray:
+        values = self.table.get(name, np.array(""))
+        if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+            raise DefinitionError(f"`table` needs a column '{name}' with a number in each row.")
+        return values.astype(float)
+
+    def _merged(self, quantity: str, covariates: Sequence[str], rows: np.ndarray):
+        """Return subject, cell, estimate, variance and covariates of each subject in each cell;
+        several trials are averaged by their precision."""
         if quantity not in self.values:
             listed = ", ".join(self.values)
             raise DefinitionError(f"there is no quantity '{quantity}'; quantities are {listed}.")
-        for name in columns:
-            if name not in self.table:
-                raise DefinitionError(f"`table` has no column '{name}'.")
-            if self.table[name].dtype.kind not in "iuf" or not np.isfinite(self.table[name]).all():
-                raise DefinitionError(f"column '{name}' must hold a finite number in each row.")
-
-    def _select(self, quantity: str, rows: np.ndarray | None, covariates) -> Selection:
-        self._require(quantity, covariates)
         cells, subjects = cells_of(self.table), self.table["subject"]
-        rows = np.ones(len(cells), bool) if rows is None else rows
         keys = list(dict.fromkeys(zip(subjects[rows], cells[rows], strict=True)))
-        extra = np.stack([self.table[c].astype(float) for c in covariates], axis=1) if (
-            covariates) else np.zeros((len(cells), 0))  # fmt: skip
+        extra = np.array([self._numbers(c) for c in covariates]).reshape(-1, len(cells)).T
         variance = self._variance(quantity)
         of = [(subjects == subject) & (cells == cell) for subject, cell in keys]
         v = np.array([1 / np.sum(1 / variance[i]) for i in of])
         y = v * np.array([np.sum(self.values[quantity][i] / variance[i]) for i in of])
         x = np.array([extra[i].mean(axis=0) for i in of])
-        subject, cell = (np.array(part) for part in zip(*keys, strict=True))
-        return Selection(y, v, subject, cell, x)
+        return *map(np.array, zip(*keys, strict=True)), y, v, x
+
+    def _cells(self, quantity: str, needed: int, covariates: Sequence[str] = ()):
+        """Return subjects, estimates, variances and covariates by group and condition."""
+        every = np.ones(len(self.freedom), bool)
+        subjects, cells, *numbers = self._merged(quantity, covariates, every)
+        require_subjects(cells, subjects, needed)
+        parts = (subjects, *numbers)
+        return [(cell, [x[cells == cell] for x in parts]) for cell in dict.fromkeys(cells)]
+
+    def _grid(self, quantity: str, a: str, b: str, covariates: Sequence[str] = ()):
+        """Return the estimates by subject and cell, with an indicator of each cell and covariates;
+        the names of the cells, and which belong to `a`."""
+        factor, rows = rows_with(self.table, (a, b))
+        subjects, cells, y, v, extra = self._merged(quantity, covariates, rows)
+        require_subjects(cells, subjects)
+        names, all_cells = list(dict.fromkeys(cells)), cells_of(self.table)
+        row = [list(dict.fromkeys(subjects)).index(subject) for subject in subjects]
+        place, q = (row, [names.index(cell) for cell in cells]), len(names)
+        shape = (max(row) + 1, q)
+        grid = Cells(np.zeros(shape), np.ones(shape), np.zeros((*shape, q + len(covariates))),
+                     np.zeros(shape, bool))  # fmt: skip
+        grid.x[:, np.arange(q), np.arange(q)] = 1.0
+        grid.y[place], grid.v[place], grid.present[place] = y, v, True
+        grid.x[..., q:][place] = extra - extra.mean(axis=0)
+        side = [self.table[factor][rows & (all_cells == name)][0] == a for name in names]
+        return grid, names, np.array(side)
 
     def _variance(self, quantity: str) -> np.ndarray:
         """Return the variances of the estimates, moderated."""
@@ -343,26 +384,62 @@ class Population:
             columns.append(np.log(np.maximum(strides.astype(float), 1.0)))
         return moderated(self.errors[quantity] ** 2, self.freedom, np.stack(columns, axis=1))
 
-    def _row(self, quantity, effect, subjects, value, error, freedom, level, spread, test):
+    def _row(self, quantity: str, effect: str, subjects: int, row: Estimate, level: float):
+        value, error, freedom, (spread, low, high), is_test = row
         reach = stats.t.ppf((1 + level) / 2, freedom) * error
-        p = float(2 * stats.t.sf(abs(value) / error, freedom)) if test else np.nan
-        first = {"quantity": quantity, "unit": self.units[quantity], "effect": effect}
-        numbers = {
+        p = 2 * stats.t.sf(abs(value) / error, freedom) if is_test else np.nan
+        return {
+            "quantity": quantity, "unit": self.units[quantity], "effect": effect,
             "subjects": subjects, "estimate": value, "standard_error": error, "freedom": freedom,
-            "low": value - reach, "high": value + reach, "p": p,
+            "low": value - reach, "high": value + reach, "p": float(p), "spread": spread,
+            "spread_low": low, "spread_high": high,
         }  # fmt: skip
-        names = ("spread", "spread_low", "spread_high")
-        return first | numbers | dict(zip(names, spread, strict=True))
 
 
-def _grid(chosen: Selection, subjects: list[str], names: list[str]) -> Cells:
-    """Return the estimates by subject and cell, with an indicator of each cell and covariates."""
-    n, q, p = len(subjects), len(names), chosen.covariates.shape[1]
-    y, v, present = np.zeros((n, q)), np.ones((n, q)), np.zeros((n, q), bool)
-    x = np.zeros((n, q, q + p))
-    x[:, np.arange(q), np.arange(q)] = 1.0
-    centered = chosen.covariates - chosen.covariates.mean(axis=0)
-    for k, (subject, cell) in enumerate(zip(chosen.subject, chosen.cell, strict=True)):
-        i, j = subjects.index(subject), names.index(cell)
-        y[i, j], v[i, j], present[i, j], x[i, j, q:] = chosen.y[k], chosen.v[k], True, centered[k]
-    return Cells(y, v, x, present)
+def _test(v, n: int, spread: float, difference: float, paired: bool, level: float):
+    """Return a function of a random generator that simulates subjects, and returns whether the
+    difference differs from zero."""
+    cells = 1 if paired else 2
+    table = {"subject": np.arange(n * cells), "group": np.repeat(["a", "b"][:cells], n)}
+
+    def draw(rng: np.random.Generator) -> int:
+        variance = rng.choice(v, (n, cells))
+        y = np.sqrt(spread**2 + variance) * rng.normal(size=(n, cells))
+        y[:, 0] += difference
+        people = Population(table, {"y": y.T.ravel()}, {"y": np.sqrt(variance.T.ravel())})
+        test: Any = people.difference("y", "a", "b", level=1 - level) if not paired else (
+            people.mean("y", level=1 - level))  # fmt: skip
+        return int(test["low"][0] * test["high"][0] > 0)
+
+    return draw
+
+
+def _signals(fit: MultiplierEstimate) -> str:
+    names = getattr(fit, "outputs", ())
+    return ", ".join(f"{x} ({unit_of(x)})" if unit_of(x) else str(x) for x in names)
+
+
+def _of(fit: MultiplierEstimate, subject: str, quantities: Sequence[Quantity]):
+    """Return values and standard errors of one fit by name."""
+    if not np.isfinite(fit.covariance).all():
+        raise DefinitionError(
+            f"the fit of subject '{subject}' has no covariance: record more strides, or leave the "
+            "subject out."
+        )
+    z, covariance = complex(fit.multipliers[0]), fit.multiplier_covariances[0]
+    parts: dict[str, tuple[float, float]] = {}
+    if "modulus" in quantities:
+        slope = np.array([z.real, z.imag]) / abs(z)
+        parts["modulus"] = abs(z), float(np.sqrt(slope @ covariance @ slope))
+    if "angle" in quantities:
+        if z.imag == 0:
+            raise DefinitionError(
+                f"the leading multiplier of subject '{subject}' is real, so its angle has no "
+                "standard error: take the modulus or the coefficients."
+            )
+        slope = np.array([-z.imag, z.real]) / abs(z) ** 2
+        parts["angle"] = abs(float(np.angle(z))), float(np.sqrt(slope @ covariance @ slope))
+    if "coefficients" in quantities:
+        pairs = zip(fit.coefficients, np.sqrt(np.diag(fit.covariance)), strict=True)
+        parts |= {f"c{k}": pair for k, pair in enumerate(pairs, 1)}
+    return parts

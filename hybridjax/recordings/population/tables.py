@@ -1,10 +1,18 @@
-"""Tables of a study: who was recorded, in which group and condition."""
+"""Tables of a study: who was recorded, and the results, as real columns for CSV, pandas and R."""
 
+import csv
+import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from ... import __version__
+from ..._core.boundary.checked import checked_methods
+from ..._core.boundary.kinds import FilePath
+from ..._core.text import columns as aligned
+from ..._core.writing import replacing
 from ...errors import DefinitionError
 
 
@@ -16,6 +24,48 @@ class Columns(Protocol):
 
 
 FACTORS = ("group", "condition")
+
+
+@checked_methods
+@dataclasses.dataclass(frozen=True, repr=False)
+class PopulationTable:
+    """A table of results.
+
+    **Fields:** `columns`, arrays by name (NaN where a column does not apply; empty in files);
+    `methods`: sentences for the methods section of a paper.
+    """
+
+    columns: dict[str, np.ndarray]
+    methods: str = ""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.columns[name]
+
+    def write(self, path: FilePath) -> Path:
+        """Write the table as CSV, with all digits, and return the path.
+
+        **Raises:** `DefinitionError` if it cannot be written.
+        """
+        with replacing(Path(path)) as new, open(new, "w", newline="", encoding="utf-8") as file:
+            rows = zip(*self.columns.values(), strict=True)
+            csv.writer(file).writerows([self.columns, *([_cell(x) for x in row] for row in rows)])
+        return Path(path)
+
+    def __repr__(self) -> str:
+        shown = {k: [_cell(x, 4) for x in v] for k, v in self.columns.items()}
+        rows = [*zip(*[(k, *v) for k, v in shown.items() if any(v)], strict=True)]
+        return f"PopulationTable({len(rows) - 1} rows)" + aligned(rows)
+
+
+def _cell(x, digits: int | None = None) -> str:
+    if isinstance(x, float | np.floating):
+        return "" if np.isnan(x) else f"{x:.{digits}g}" if digits else repr(float(x))
+    return str(x)
+
+
+def table_of(rows: list[dict], methods: str) -> PopulationTable:
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return PopulationTable(columns, f"{methods} Computed by hybridjax {__version__}.")
 
 
 def as_columns(table: Columns, rows: int) -> dict[str, np.ndarray]:
@@ -35,13 +85,12 @@ def as_columns(table: Columns, rows: int) -> dict[str, np.ndarray]:
             )
         if name in ("subject", *FACTORS) or values.dtype.kind == "O":
             columns[name] = values.astype(str)
-    groups = columns.get("group", np.full(rows, ""))
-    for subject in dict.fromkeys(columns["subject"]):
-        of = sorted(set(groups[columns["subject"] == subject]))
-        if len(of) > 1:
+    groups: dict[str, str] = {}
+    for subject, group in zip(columns["subject"], columns.get("group", ()), strict=False):
+        if groups.setdefault(subject, group) != group:
             raise DefinitionError(
-                f"subject '{subject}' is in the groups '{of[0]}' and '{of[1]}': give one group, or "
-                "call the column 'condition' if subjects were recorded in both."
+                f"subject '{subject}' is in the groups '{groups[subject]}' and '{group}': give one "
+                "group, or call the column 'condition' if subjects were recorded in both."
             )
     return columns
 
@@ -49,8 +98,8 @@ def as_columns(table: Columns, rows: int) -> dict[str, np.ndarray]:
 def cells_of(columns: dict[str, np.ndarray]) -> np.ndarray:
     """Return the group and condition of each row, joined by a comma."""
     names = [columns[name] for name in FACTORS if name in columns]
-    return np.array([", ".join(x) for x in zip(*names, strict=True)] or ["all"] * len(
-        columns["subject"]))  # fmt: skip
+    joined = [", ".join(x) for x in zip(*names, strict=True)]
+    return np.array(joined or ["all"] * len(columns["subject"]))
 
 
 def rows_with(columns: dict[str, np.ndarray], labels: Sequence[str]) -> tuple[str, np.ndarray]:
@@ -59,8 +108,7 @@ def rows_with(columns: dict[str, np.ndarray], labels: Sequence[str]) -> tuple[st
     **Raises:** `DefinitionError` if no factor has all of them.
     """
     for factor in FACTORS:
-        different = len(set(labels)) == len(labels)
-        if different and factor in columns and set(labels) <= set(columns[factor]):
+        if len(set(labels)) == len(labels) and set(labels) <= set(columns.get(factor, ())):
             return factor, np.isin(columns[factor], labels)
     listed = ", ".join(f"'{x}'" for f in FACTORS for x in dict.fromkeys(columns.get(f, ())))
     raise DefinitionError(
