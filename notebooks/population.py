@@ -102,11 +102,11 @@ print(difference.methods)
 # ## The next study
 #
 # Power for a difference of 0.03 between two groups, and the best number of strides if a subject
-# costs as much as 500 strides, and a trial as much as 100.
+# costs as much as 500 strides.
 
 # %%
 young = hj.recordings.Population.from_fits(
     fits[:6], {"subject": table["subject"][:6], "strides": table["strides"][:6]}
 )
 print(young.power("modulus", 0.03, (6, 10), draws=100))
-print(young.allocation("modulus", subject_cost=5, trial_cost=1, stride_cost=0.01))
+print(young.allocation("modulus", subject_cost=5, stride_cost=0.01))

@@ -107,15 +107,13 @@ class PopulationMaps:
         """
         rows = [_map_of(x, output, input) for x in responses]
         subjects = as_columns(table, len(rows))["subject"]
-        values, axes, unit, names = rows[0]
-        for subject, (_, others, other_unit, other_names) in zip(subjects, rows, strict=True):
+        _, axes, unit, names = rows[0]
+        for subject, (_, others, *signals) in zip(subjects, rows, strict=True):
             alike = all(np.array_equal(others.get(n, ()), a) for n, a in axes.items())
-            same = {"signals": other_names == names, "units": other_unit == unit, "grids": alike}
-            differs = " and ".join(what for what in same if not same[what])
-            if differs:
+            if signals != [unit, names] or not alike:
                 raise DefinitionError(
-                    f"{differs} of subject '{subject}' differ from those of '{subjects[0]}': "
-                    "compute all responses with the same signals, units, sections and lags."
+                    f"{'units or signals' if alike else 'grids'} of subject '{subject}' differ "
+                    f"from those of '{subjects[0]}': compute all responses alike."
                 )
         cyclic = ("phase",) if "lag" in axes else ()
         return cls(table, np.stack([row[0] for row in rows]), axes, cyclic, unit)

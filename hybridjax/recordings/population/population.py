@@ -1,7 +1,7 @@
 """`Population`: estimates of several subjects, with their errors, and what they say together."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from scipy import stats
@@ -37,29 +37,7 @@ Quantity = Literal["modulus", "angle", "coefficients"]
 Numeric = Mapping[str, Annotated[Numbers, Reals("rows")]]
 
 
-class Estimate(NamedTuple):
-    """What a row of a table of means or differences holds."""
-
-    value: float
-    error: float
-    freedom: float
-    spread: tuple[float, ...] = (np.nan, np.nan, np.nan)
-    is_test: bool = True
-
-
-class Allocation(NamedTuple):
-    """Standard deviations between subjects, between trials of a subject, and within a trial (of one
-    stride), and the best numbers of `trials` per subject and `strides` per trial.
-
-    The variance of the mean of n subjects is `(between² + (trial² + within² / strides) / trials) /
-    n`.
-    """
-
-    between: float
-    trial: float
-    within: float
-    trials: float
-    strides: float
+_NONE = (np.nan, np.nan, np.nan)
 
 
 @checked
@@ -98,11 +76,10 @@ class Population:
         for name, error in self.errors.items():
             if not len(self.values[name]) == len(error) == rows:
                 raise DefinitionError(f"`values` and `errors` of '{name}' must have {rows} rows.")
-            if not (np.asarray(error) > 0).all():
+            if np.min(error) <= 0:
                 subject = self.table["subject"][np.argmin(error)]
                 raise DefinitionError(
-                    f"the standard error of '{name}' of subject '{subject}' must be positive: "
-                    "leave out estimates without an error."
+                    f"the standard error of '{name}' of subject '{subject}' must be positive."
                 )
         self.units = dict.fromkeys(values, "") | dict(units or {})
         self.freedom = np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)
@@ -124,18 +101,13 @@ class Population:
         columns = as_columns(table, len(fits))
         subjects = columns["subject"]
         parts = [_of(fit, s, quantities) for fit, s in zip(fits, subjects, strict=True)]
-        signals = [_signals(fit) for fit in fits]
-        for subject, part, names in zip(subjects, parts, signals, strict=True):
-            if names != signals[0]:
+        kinds = [(_signals(x), f"of order {len(x.coefficients)}") for x in fits]
+        for subject, kind, part in zip(subjects, kinds, parts, strict=True):
+            if kind[0] != kinds[0][0] or part.keys() != parts[0].keys():
                 raise DefinitionError(
-                    f"the fit of subject '{subject}' is of {names}, but that of '{subjects[0]}' is "
-                    f"of {signals[0]}: use the same outputs, in the same units."
-                )
-            if part.keys() != parts[0].keys():
-                raise DefinitionError(
-                    f"orders differ between the fits of '{subjects[0]}' and '{subject}', so their "
-                    "coefficients cannot be averaged: give all fits the same `order`, or take the "
-                    "modulus."
+                    f"the fit of subject '{subject}' is {' '.join(kind)}, but that of "
+                    f"'{subjects[0]}' is {' '.join(kinds[0])}: use the same outputs, units and "
+                    "`order`, or take the modulus."
                 )
         values, errors = ({n: np.array([p[n][i] for p in parts]) for n in parts[0]} for i in (0, 1))
         freedom = [fit.covariance_freedom for fit in fits]
@@ -169,14 +141,13 @@ class Population:
             spread = (np.sqrt(fit.variance), *spread_interval(y, v, x, level))
             for k, effect in enumerate(["mean", *(f"slope of {c}" for c in covariates)]):
                 name = effect if cell == "all" else f"{effect}, {cell}"
-                row = Estimate(fit.coefficients[k], errors[k], fit.freedom)
-                row = row if k else row._replace(spread=spread, is_test=False)
-                rows.append(self._row(quantity, name, len(y), row, level))
+                estimate = fit.coefficients[k], errors[k], fit.freedom
+                row = self._row(quantity, name, len(y), estimate, level, _NONE if k else spread)
+                rows.append(row if k else row | {"p": np.nan})
         return table_of(
             rows,
-            f"Means of {quantity} over subjects and {100 * level:g} % intervals are those of a "
-            "random-effects model with the standard error of each subject (restricted maximum "
-            "likelihood, Hartung and Knapp; standard deviations between subjects: Q profile).",
+            f"Means of {quantity} and {100 * level:g} % intervals: random-effects model with the "
+            "standard error of each subject, by restricted maximum likelihood (Hartung and Knapp).",
         )
 
     def difference(
@@ -201,21 +172,18 @@ class Population:
         weights[0, : len(names)] = np.where(is_a, 1 / is_a.sum(), -1 / (~is_a).sum())
         paired, rows = grid.present.all(axis=1), []
         for k, effect in enumerate([f"{a} - {b}", *(f"slope of {c}" for c in covariates)]):
-            w = weights[k]
-            row = Estimate(w @ fit.coefficients, np.sqrt(w @ fit.covariance @ w), fit.freedom(w))
+            w, spread = weights[k], _NONE
             if k == 0 and len(names) == 2 and paired.sum() > 2:
                 d, v = grid.y[paired] @ w[:2], grid.v[paired].sum(axis=1)
-                spread = np.sqrt(w[:2] @ fit.between @ w[:2])
                 bounds = spread_interval(d, v, np.ones((len(d), 1)), level)
-                row = row._replace(spread=(spread, *bounds))
-            rows.append(self._row(quantity, effect, len(paired), row, level))
-        design = f"{paired.sum()} in all conditions" if paired.any() else "in groups"
+                spread = np.sqrt(w[:2] @ fit.between @ w[:2]), *bounds
+            estimate = w @ fit.coefficients, np.sqrt(w @ fit.covariance @ w), fit.freedom(w)
+            rows.append(self._row(quantity, effect, len(paired), estimate, level, spread))
         return table_of(
             rows,
-            f"The difference of {quantity} ({a} - {b}; {len(paired)} subjects, {design}) was "
-            "tested in a linear mixed model with the known variance of each estimate and free "
-            f"variances between subjects (restricted maximum likelihood; standard errors, degrees "
-            f"of freedom and {100 * level:g} % intervals of Kenward and Roger).",
+            f"Difference of {quantity} ({a} - {b}; {len(paired)} subjects, {paired.sum()} with "
+            f"all conditions) and {100 * level:g} % interval: linear mixed model with the variance "
+            "of each estimate, by restricted maximum likelihood (Kenward and Roger).",
         )
 
     def predictions(self, quantity: str, *, level: Probability = 0.95) -> PopulationTable:
@@ -241,13 +209,10 @@ class Population:
                 "prediction_error": np.sqrt(square), "low": value - reach, "high": value + reach,
             }  # fmt: skip
             first = {"quantity": quantity, "unit": self.units[quantity]}
-            for row in zip(*columns.values(), strict=True):
-                rows.append(first | dict(zip(columns, row, strict=True)))
-        return table_of(
-            rows,
-            f"Single subjects are best linear unbiased predictions of {quantity} (shrunken towards "
-            "the mean), with standard errors of Prasad and Rao.",
-        )
+            rows += [first | dict(zip(columns, row, strict=True))
+                     for row in zip(*columns.values(), strict=True)]  # fmt: skip
+        text = f"Single subjects: best linear unbiased predictions of {quantity} (Prasad and Rao)."
+        return table_of(rows, text)
 
     def power(
         self, quantity: str, difference: float, subjects: Sequence[Count] = (8, 12, 16, 24), *,
@@ -271,16 +236,12 @@ class Population:
         if labels:
             grid, names, _ = self._grid(quantity, *labels)
             both = grid.present.all(axis=1) & (len(names) == 2)
-            y, v = (
-                grid.y[both] @ np.array([1.0, *[-1.0] * (len(names) - 1)]),
-                grid.v[both].sum(axis=1),
-            )
+            y, v = grid.y[both, 0] - grid.y[both, -1], grid.v[both].sum(axis=1)
         else:
-            ((_, (_, y, v, _)), *more) = self._cells(quantity, 3)
-            if more:
-                raise DefinitionError("`labels` must be two conditions of the table.")
+            ((_, (_, y, v, _)), *others) = self._cells(quantity, 3)
+            y = y[: 0 if others else None]
         if len(y) < 3:
-            raise DefinitionError("fewer than three subjects have both conditions.")
+            raise DefinitionError("`labels` must be two conditions of three or more subjects.")
         ones, rows = np.ones((len(y), 1)), []
         low, high = spread_interval(y, v, ones)
         spreads = [float(np.sqrt(meta(y, v, ones).variance)), high, low]
@@ -292,42 +253,32 @@ class Population:
                 "subjects": n, "power": count / draws, "power_low": least.low,
                 "power_high": most.high, "spread": spreads[0], "draws": draws,
             })  # fmt: skip
+        design = "paired differences" if labels else "two groups"
         return table_of(
             rows,
-            f"The power to detect a difference of {difference:g} in {quantity} "
-            f"({'paired differences' if labels else 'two groups'}) was computed from {draws} "
-            f"simulated populations with the spread and errors of a pilot of {len(y)} subjects.",
+            f"Power for a difference of {difference:g} in {quantity} ({design}): {draws} simulated "
+            f"populations with the spread and errors of a pilot of {len(y)} subjects.",
         )
 
     def allocation(
-        self, quantity: str, subject_cost: Positive = 1.0, trial_cost: Positive = 1.0,
-        stride_cost: Positive = 0.01,
-    ) -> Allocation:  # fmt: skip
-        """Return the numbers of strides and trials that give the mean its smallest variance for a
-        given cost, from the table's column `strides` (closed form: Cochran, *Sampling Techniques*,
-        1977, ch. 10).
+        self, quantity: str, subject_cost: Positive = 1.0, stride_cost: Positive = 0.01
+    ) -> float:
+        r"""Return the number of strides per subject that gives the mean its smallest variance for a
+        given cost, from the table's column `strides`.
 
-        **Arguments:** costs of one more subject, trial and stride, in the same unit. Default: 1, 1
-        and 0.01.
+        It is $\sigma_w / \sigma_b \sqrt{c_s / c}$ with the standard deviations of one stride and
+        between subjects and the costs of a subject and a stride (Cochran, *Sampling Techniques*,
+        1977, ch. 10); the variance of the mean of n subjects with m strides is $(\sigma_b^2 +
+        \sigma_w^2 / m) / n$.
+
+        **Arguments:** costs in the same unit. Default: 1 and 0.01.
 
         **Raises:** `DefinitionError` without a column `strides`, and as `mean`.
         """
-        variances = [meta(y, v, np.ones((len(y), 1))).variance
-                     for _, (_, y, v, _) in self._cells(quantity, 3)]  # fmt: skip
-        between, y, v = float(np.mean(variances)), self.values[quantity], self._variance(quantity)
-        within = float(np.mean(v * self._numbers("strides")))
-        who = np.char.add(np.char.add(self.table["subject"], "\n"), cells_of(self.table))
-        groups = [i for i in (who == name for name in dict.fromkeys(who)) if i.sum() > 1]
-        extra = [(y[i].var(ddof=1) - v[i].mean()) * (i.sum() - 1) for i in groups]
-        trial = max(sum(extra) / max(sum(i.sum() - 1 for i in groups), 1), 0.0)
-        if trial > 0:
-            length = np.sqrt(trial_cost / stride_cost * within / trial)
-            count = max(np.sqrt(subject_cost / trial_cost * trial / max(between, 1e-300)), 1.0)
-        else:  # trials differ no more than their strides: one long trial
-            cost = (subject_cost + trial_cost) / stride_cost
-            length, count = np.sqrt(cost * within / max(between, 1e-300)), 1.0
-        parts = (np.sqrt(between), np.sqrt(trial), np.sqrt(within), count, length)
-        return Allocation(*map(float, parts))
+        cells = [(y, v, np.ones((len(y), 1))) for _, (_, y, v, _) in self._cells(quantity, 3)]
+        between = np.mean([meta(*cell).variance for cell in cells])
+        within = np.mean(self._variance(quantity) * self._numbers("strides"))
+        return float(np.sqrt(subject_cost / stride_cost * within / max(between, 1e-300)))
 
     def _numbers(self, name: str) -> np.ndarray:
         values = self.table.get(name, np.array(""))
@@ -384,15 +335,15 @@ class Population:
             columns.append(np.log(np.maximum(strides.astype(float), 1.0)))
         return moderated(self.errors[quantity] ** 2, self.freedom, np.stack(columns, axis=1))
 
-    def _row(self, quantity: str, effect: str, subjects: int, row: Estimate, level: float):
-        value, error, freedom, (spread, low, high), is_test = row
+    def _row(self, quantity: str, effect: str, subjects: int, estimate, level: float, spread):
+        value, error, freedom = estimate
         reach = stats.t.ppf((1 + level) / 2, freedom) * error
-        p = 2 * stats.t.sf(abs(value) / error, freedom) if is_test else np.nan
         return {
             "quantity": quantity, "unit": self.units[quantity], "effect": effect,
             "subjects": subjects, "estimate": value, "standard_error": error, "freedom": freedom,
-            "low": value - reach, "high": value + reach, "p": float(p), "spread": spread,
-            "spread_low": low, "spread_high": high,
+            "low": value - reach, "high": value + reach,
+            "p": float(2 * stats.t.sf(abs(value) / error, freedom)),
+            **dict(zip(("spread", "spread_low", "spread_high"), spread, strict=True)),
         }  # fmt: skip
 
 
@@ -415,8 +366,8 @@ def _test(v, n: int, spread: float, difference: float, paired: bool, level: floa
 
 
 def _signals(fit: MultiplierEstimate) -> str:
-    names = getattr(fit, "outputs", ())
-    return ", ".join(f"{x} ({unit_of(x)})" if unit_of(x) else str(x) for x in names)
+    names = getattr(fit, "outputs", ("multipliers",))
+    return "of " + ", ".join(f"{x} ({unit_of(x)})" if unit_of(x) else str(x) for x in names)
 
 
 def _of(fit: MultiplierEstimate, subject: str, quantities: Sequence[Quantity]):
@@ -428,17 +379,16 @@ def _of(fit: MultiplierEstimate, subject: str, quantities: Sequence[Quantity]):
         )
     z, covariance = complex(fit.multipliers[0]), fit.multiplier_covariances[0]
     parts: dict[str, tuple[float, float]] = {}
-    if "modulus" in quantities:
-        slope = np.array([z.real, z.imag]) / abs(z)
-        parts["modulus"] = abs(z), float(np.sqrt(slope @ covariance @ slope))
-    if "angle" in quantities:
-        if z.imag == 0:
-            raise DefinitionError(
-                f"the leading multiplier of subject '{subject}' is real, so its angle has no "
-                "standard error: take the modulus or the coefficients."
-            )
-        slope = np.array([-z.imag, z.real]) / abs(z) ** 2
-        parts["angle"] = abs(float(np.angle(z))), float(np.sqrt(slope @ covariance @ slope))
+    if "angle" in quantities and z.imag == 0:
+        raise DefinitionError(
+            f"the leading multiplier of subject '{subject}' is real, so its angle has no standard "
+            "error: take the modulus or the coefficients."
+        )
+    slopes = {"modulus": (abs(z), z / abs(z)), "angle": (abs(np.angle(z)), 1j * z / abs(z) ** 2)}
+    for name in (x for x in slopes if x in quantities):
+        value, slope = slopes[name]
+        w = np.array([slope.real, slope.imag])
+        parts[name] = value, float(np.sqrt(w @ covariance @ w))
     if "coefficients" in quantities:
         pairs = zip(fit.coefficients, np.sqrt(np.diag(fit.covariance)), strict=True)
         parts |= {f"c{k}": pair for k, pair in enumerate(pairs, 1)}
