@@ -35,15 +35,7 @@ from ..recordings.population.population import Population
 from ..recordings.population.tables import FACTORS, PopulationTable, as_columns
 from ..recordings.read import read_recording
 from ..recordings.recording import Recording
-from .identify import (
-    PAGE,
-    figure_of,
-    off_screen,
-    page_of,
-    report_folder,
-    steps_of,
-    write_results,
-)
+from .identify import PAGE, figure_of, off_screen, page_of, report_folder, steps_of, write_results
 
 
 # Columns of the table of a study, and their names in the summaries.
@@ -117,15 +109,11 @@ def run(options: Any) -> int:
     **Returns:** the exit status: 1 if a subject failed.
     """
     signals, identify = steps_of(options)
-    with contextlib.ExitStack() as stack:
-        pool = None
-        if options.workers > 1:
-            spawn = multiprocessing.get_context("spawn")
-            pool = concurrent.futures.ProcessPoolExecutor(options.workers, mp_context=spawn)
-            stack.enter_context(pool)
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(options.workers, mp_context=spawn) as pool:
         study = identify_subjects(
             options.table, options.out, identify, time=options.time, signals=signals,
-            formats=options.formats, client=pool,
+            formats=options.formats, client=pool if options.workers > 1 else None,
         )  # fmt: skip
     print(study)
     print(Path(options.out) / "population.html")
@@ -135,15 +123,10 @@ def run(options: Any) -> int:
 @checked
 @working("identify_subjects")
 def identify_subjects(
-    table: FilePath,
-    folder: FilePath,
-    identify: Callable,
-    *,
-    time: str = "time",
-    signals: OptionalNames = (),
-    formats: tuple[Format, ...] = ("png",),
+    table: FilePath, folder: FilePath, identify: Callable, *, time: str = "time",
+    signals: OptionalNames = (), formats: tuple[Format, ...] = ("png",),
     client: DaskClient | concurrent.futures.Executor | None = None,
-) -> Study:
+) -> Study:  # fmt: skip
     """Identify all subjects of a table, write a report for each, and one for all of them.
 
     Rows with the same subject, group and condition are trials of one recording. A subject that
@@ -169,9 +152,9 @@ def identify_subjects(
     **Raises:** `DefinitionError` for a table without these columns or rows, a subject in two
     groups, and a folder that cannot be written.
     """
-    rows = _rows(Path(table))
-    files = rows.pop("file")
-    labels = as_columns(rows, len(files))
+    texts = _rows(Path(table))
+    files = texts.pop("file")
+    labels = as_columns(texts, len(files))
     keys = list(zip(*(labels[n] for n in ("subject", *FACTORS) if n in labels), strict=True))
     jobs: dict[str, Callable[[], str]] = {}
     for key in dict.fromkeys(keys):
@@ -182,30 +165,23 @@ def identify_subjects(
         reading = {"time": time, "signals": tuple(signals) or None}
         job = Job(trials, Path(folder) / name, identify, reading, tuple(formats))
         jobs[name] = functools.partial(_cause, job)
-    names = list(jobs)
+    names, firsts = list(jobs), dict(zip(jobs, dict.fromkeys(keys), strict=True))
     if client is not None:
         jobs = {name: client.submit(job).result for name, job in jobs.items()}
     causes = {name: _cause(jobs[name]) for name in counted(names, "subjects", len(names))}
     failures = {name: text for name, text in causes.items() if text}
-    done, fits, summaries = [], [], []
-    for name, key in zip(names, dict.fromkeys(keys), strict=True):
-        if name not in failures:
-            fit: Any = load(Path(folder) / name / "fit.npz")
-            if fit.result == Result.OK:
-                done.append(keys.index(key))
-                fits.append(fit)
-                summaries.append(json.loads((Path(folder) / name / "summary.json").read_text()))
-            else:
-                failures[name] = "the fit did not converge."
-    columns = {n: x[done] for n, x in labels.items() if n != "trial"}
-    for name, number in _COLUMNS.items():
-        columns[name] = np.array([float(s[number]) for s in summaries])
-    several = len(fits) > 1
-    population = Population.from_fits(fits, columns) if several else None
-    maps = _maps(fits, columns) if several else {}
+    fits = {name: load(Path(folder) / name / "fit.npz") for name in names if name not in failures}
+    failures |= {n: "the fit did not converge." for n, x in fits.items() if x.result != Result.OK}
+    done = [name for name in names if name not in failures]
+    fits, rows = tuple(fits[name] for name in done), [keys.index(firsts[n]) for n in done]
+    summaries = [json.loads((Path(folder) / n / "summary.json").read_text()) for n in done]
+    columns = {n: x[rows] for n, x in labels.items() if n != "trial"}
+    columns |= {n: np.array([float(s[k]) for s in summaries]) for n, k in _COLUMNS.items()}
+    population = Population.from_fits(fits, columns) if len(fits) > 1 else None
+    maps = _maps(fits, columns) if len(fits) > 1 else {}
     tables = _tables(population) if population else ()
-    study = Study(columns, tuple(fits), population, maps, failures, tables, Path(folder))
-    _write(study, [name for name in names if name not in failures])
+    study = Study(columns, fits, population, maps, failures, tables, Path(folder))
+    _write(study, done)
     return study
 
 
@@ -216,11 +192,9 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
             rows = list(csv.DictReader(file, skipinitialspace=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DefinitionError(f"cannot read the table '{path}': {error}.") from None
-    missing = [n for n in ("file", "subject") if not rows or not all(row.get(n) for row in rows)]
-    if missing:
+    if not rows or not all(row.get("file") and row.get("subject") for row in rows):
         raise DefinitionError(
-            f"the table '{path}' needs rows with the columns 'file' and 'subject' (separated by "
-            f"commas), but '{missing[0]}' is empty or not there."
+            f"the table '{path}' needs 'file' and 'subject' in each row, separated by commas."
         )
     columns = {n: np.array([row[n] or "" for row in rows]) for n in rows[0] if n}
     for name in columns.keys() - {"file", "subject", *FACTORS}:
@@ -264,7 +238,7 @@ def _write(study: Study, names: list[str]) -> None:
     """Write the tables, and the report for all."""
     reports = {"report": np.array(names)} | study.table
     if study.population is not None:
-        reports["modulus"] = study.population.values["modulus"]
+        reports |= study.population.values
         reports["modulus_error"] = study.population.errors["modulus"]
     columns = study.tables[0].columns if study.tables else ()
     results = {n: np.concatenate([t[n] for t in study.tables]) for n in columns}
@@ -292,10 +266,10 @@ def _figures(study: Study) -> list[str]:
             drawn = plot.forest(study.population, "modulus")
             figures.append(figure_of(drawn, "Modulus of the leading multiplier"))
             for (y, u), maps in study.maps.items():
-                text = f"Response of {y} to {u}"
-                figures.append(figure_of(plot.subject_maps(maps.mean()), text))
+                results = {"mean": maps.mean()}
                 for a, b in _pairs(study.population):
-                    test = maps.difference(a, b)
-                    text = f"Response of {y} to {u}, {a} - {b}: {test.methods}"
-                    figures.append(figure_of(plot.subject_maps(test), text))
+                    results[f"{a} - {b}"] = maps.difference(a, b)
+                for name, x in results.items():
+                    text = f"Response of {y} to {u}, {name}: {x.methods}"
+                    figures.append(figure_of(plot.subject_maps(x), text))
     return figures

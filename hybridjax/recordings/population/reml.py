@@ -59,39 +59,38 @@ def mixed(cells: Cells) -> Mixed:
     pairs = present[:, :, None] & present[:, None, :]
     rows, columns = np.nonzero(np.tril(shared))
 
-    def root(free: Float[np.ndarray, " k"]) -> Float[np.ndarray, "q q"]:
+    def matrix(free: Float[np.ndarray, " k"]) -> Float[np.ndarray, "q q"]:
         lower = np.zeros((q, q))
         lower[rows, columns] = free
         return lower
 
-    def inverse(between):
+    def fitted(between):
         total = np.where(pairs, between, 0.0)
         total[:, np.arange(q), np.arange(q)] += v
-        return np.linalg.inv(total), np.linalg.slogdet(total)[1].sum()
+        w = np.linalg.inv(total)
+        phi = np.linalg.inv(np.einsum("nip,nij,njq->pq", x, w, x))
+        return total, w, phi, phi @ np.einsum("nip,nij,nj->p", x, w, y)
 
     def cost(free):
-        lower = root(free)
-        w, size = inverse(lower @ lower.T)
-        wx = w @ x
-        information = np.einsum("nip,niq->pq", x, wx)
-        phi = np.linalg.inv(information)
-        beta = phi @ np.einsum("nip,ni->p", wx, y)
-        r = np.einsum("nij,nj->ni", w, y - x @ beta)
-        value = size + np.linalg.slogdet(information)[1] + np.sum(r * (y - x @ beta))
+        lower = matrix(free)
+        total, w, phi, beta = fitted(lower @ lower.T)
+        wx, r = w @ x, np.einsum("nij,nj->ni", w, y - x @ beta)
+        value = np.linalg.slogdet(total)[1].sum() - np.linalg.slogdet(phi)[1]
+        value += np.sum(r * (y - x @ beta))
         slope = w - wx @ phi @ np.swapaxes(wx, 1, 2) - r[:, :, None] * r[:, None, :]
         slope = np.where(pairs, slope, 0.0).sum(axis=0)
         return value / 2, (slope @ lower)[rows, columns]
 
     start = np.where(rows == columns, 0.7, 0.0)
     free = optimize.minimize(cost, start, jac=True, method="L-BFGS-B").x
-    between = root(free) @ root(free).T
-    w, _ = inverse(between)
+    between = matrix(free) @ matrix(free).T
+    _, w, phi, beta = fitted(between)
     wx = w @ x
-    phi = np.linalg.inv(np.einsum("nip,niq->pq", x, wx))
-    beta = phi @ np.einsum("nip,ni->p", wx, y)
-    units = np.zeros((len(rows), q, q))
-    units[np.arange(len(rows)), rows, columns] = units[np.arange(len(rows)), columns, rows] = 1.0
-    d = np.where(pairs, units[:, None], 0.0)  # (k, n, q, q)
+    # Derivatives by the free elements of Psi, (k, n, q, q).
+    k = np.arange(len(rows))
+    d = np.zeros((len(rows), 1, q, q))
+    d[k, 0, rows, columns] = d[k, 0, columns, rows] = 1.0
+    d = np.where(pairs, d, 0.0)
     dw = d @ w
     slopes = -np.einsum("nip,knij,njq->kpq", wx, d, wx)
     second = np.einsum("nip,knij,lnjm,nmq->klpq", wx, d, w @ d, wx)
