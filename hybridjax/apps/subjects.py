@@ -30,7 +30,6 @@ from ..errors import DefinitionError, HybridJaxError
 from ..identify.series.fit import SeriesFit
 from ..io import load
 from ..recordings.identification import Identification
-from ..recordings.population.maps import PopulationMaps
 from ..recordings.population.population import Population
 from ..recordings.population.tables import FACTORS, PopulationTable, as_columns
 from ..recordings.read import read_recording
@@ -48,15 +47,13 @@ class Study:
 
     **Fields:** `table`: columns of the subjects that were identified, with `strides` and `period`
     (s); `fits`, one for each row; `population`: their modulus (None for fewer than two rows);
-    `maps`: responses of each output to each input held for a section, (phase, lag); `failures`:
-    sentences by name of the report; `tables`: means, and differences of all pairs of groups and
-    conditions; `folder`.
+    `failures`: sentences by name of the report; `tables`: means, and differences of all pairs of
+    groups and conditions; `folder`.
     """
 
     table: dict[str, np.ndarray]
     fits: tuple[SeriesFit, ...]
     population: Population | None
-    maps: dict[tuple[str, str], PopulationMaps]
     failures: dict[str, str]
     tables: tuple[PopulationTable, ...]
     folder: Path
@@ -170,17 +167,18 @@ def identify_subjects(
         jobs = {name: client.submit(job).result for name, job in jobs.items()}
     causes = {name: _cause(jobs[name]) for name in counted(names, "subjects", len(names))}
     failures = {name: text for name, text in causes.items() if text}
-    fits = {name: load(Path(folder) / name / "fit.npz") for name in names if name not in failures}
-    failures |= {n: "the fit did not converge." for n, x in fits.items() if x.result != Result.OK}
+    saved: dict[str, Any] = {
+        name: load(Path(folder) / name / "fit.npz") for name in names if name not in failures
+    }
+    failures |= {n: "the fit did not converge." for n, x in saved.items() if x.result != Result.OK}
     done = [name for name in names if name not in failures]
-    fits, rows = tuple(fits[name] for name in done), [keys.index(firsts[n]) for n in done]
+    fits, rows = tuple(saved[name] for name in done), [keys.index(firsts[n]) for n in done]
     summaries = [json.loads((Path(folder) / n / "summary.json").read_text()) for n in done]
     columns = {n: x[rows] for n, x in labels.items() if n != "trial"}
     columns |= {n: np.array([float(s[k]) for s in summaries]) for n, k in _COLUMNS.items()}
     population = Population.from_fits(fits, columns) if len(fits) > 1 else None
-    maps = _maps(fits, columns) if len(fits) > 1 else {}
     tables = _tables(population) if population else ()
-    study = Study(columns, fits, population, maps, failures, tables, Path(folder))
+    study = Study(columns, fits, population, failures, tables, Path(folder))
     _write(study, done)
     return study
 
@@ -203,30 +201,13 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
     return columns
 
 
-def _maps(fits, columns) -> dict[tuple[str, str], PopulationMaps]:
-    """Return responses over three cycles, by output and input, if all have the same sections."""
-    N = fits[0].n_sections
-    if any(fit.n_sections != N or fit.inputs != fits[0].inputs for fit in fits):
-        return {}
-    m, r = np.arange(N)[:, None], np.arange(3 * N + 1)
-    areas = columns["period"] / N
-    # From the section of the response to that of the push.
-    h = [f.impulse_response(len(r))[(m + r) % N, r] / a for f, a in zip(fits, areas, strict=True)]
-    axes = {"phase (cycles)": np.arange(N) / N, "lag (cycles)": r / N}
-    return {
-        (y, u): PopulationMaps(columns, np.stack(h)[..., i, j], axes, "phase (cycles)")
-        for i, y in enumerate(fits[0].outputs)
-        for j, u in enumerate(fits[0].inputs)
-    }
-
-
 def _pairs(population: Population) -> list[tuple[str, str]]:
     labels = (list(dict.fromkeys(population.table.get(factor, ()))) for factor in FACTORS)
     return [(b, a) for x in labels for i, a in enumerate(x) for b in x[i + 1 :]]
 
 
 def _tables(population: Population) -> tuple[PopulationTable, ...]:
-    """Return means, and differences of all pairs; none for too few subjects."""
+    """Return the means, and differences of all pairs; none for too few subjects."""
     tables = []
     with contextlib.suppress(DefinitionError):
         tables.append(population.mean("modulus"))
@@ -265,11 +246,7 @@ def _figures(study: Study) -> list[str]:
         if study.population is not None:
             drawn = plot.forest(study.population, "modulus")
             figures.append(figure_of(drawn, "Modulus of the leading multiplier"))
-            for (y, u), maps in study.maps.items():
-                results = {"mean": maps.mean()}
-                for a, b in _pairs(study.population):
-                    results[f"{a} - {b}"] = maps.difference(a, b)
-                for name, x in results.items():
-                    text = f"Response of {y} to {u}, {name}: {x.methods}"
-                    figures.append(figure_of(plot.subject_maps(x), text))
+            for a, b in _pairs(study.population):
+                drawn = plot.paired(study.population, "modulus", a, b)
+                figures.append(figure_of(drawn, f"Modulus, {a} and {b}"))
     return figures

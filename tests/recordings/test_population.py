@@ -203,8 +203,8 @@ def test_the_band_holds_the_mean_and_draws_repeat():
     {
         "'a' is in the groups 'x' and 'y'": lambda: study([1.0, 2], [1.0, 1], subject=["a", "a"],
                                                            group=["x", "y"]),
-        "'x' has one subject": lambda: study([1.0, 2, 3], [1.0, 1, 1], condition=list("xyy")).mean(
-            "gain"),
+        "'x' has too few subjects": lambda: study([1.0, 2, 3], [1.0, 1, 1], condition=list("xyy")
+                                                ).mean("gain"),
         "no covariance": lambda: Population.from_fits([fit_of([0.5], scale=np.inf)],
                                                       {"subject": ["a"]}),
         "of order 2, but that": lambda: Population.from_fits(

@@ -15,14 +15,9 @@ from ..._core.boundary.values import Complexes
 from ..._core.signal import ratio, unit_of
 from ..._core.text import p_value
 from ...errors import DefinitionError
-from ...linear.htf import HTF
-from ..beats.response import PhaseResponse, curve_unit
 from ..impulse import ImpulseResponses
 from .permutations import clusters, exceeding, largest, point_threshold, relabelings, statistics
 from .tables import Columns, as_columns, require_subjects, rows_with
-
-
-Curves = Sequence[ImpulseResponses] | Sequence[PhaseResponse] | Sequence[HTF]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -51,16 +46,15 @@ class MapResult:
 
     def __repr__(self) -> str:
         size = f"{np.abs(self.values).max():.4g} {self.unit}".rstrip()
-        band = f", band of +- {np.median(self.reach):.3g} (median)"
-        test = f", largest |t| {np.abs(self.t).max():.3g}, {p_value(float(self.p.min()))}"
+        band = f"band of +- {np.median(self.reach):.3g} (median)"
+        test = f"largest |t| {np.abs(self.t).max():.3g}, {p_value(float(self.p.min()))}"
         end = test if np.isnan(self.reach).all() else band
-        lines = [f"MapResult({' x '.join(self.axes)}: largest {size}{end})"]
+        lines = [f"MapResult({' x '.join(self.axes)}: largest {size}, {end})"]
         for k in 1 + np.argsort(self.cluster_p, stable=True)[:3]:
-            inside = self.labels == k
-            places = zip(self.axes.items(), np.nonzero(inside), strict=True)
+            places = zip(self.axes.items(), np.nonzero(self.labels == k), strict=True)
             where = ", ".join(f"{n} {a[i].min():.3g} to {a[i].max():.3g}" for (n, a), i in places)
-            p = p_value(float(self.cluster_p[k - 1]))
-            lines.append(f"  cluster {k}: {inside.sum()} points, {where}, {p}")
+            lines.append(f"  cluster {k}: {(self.labels == k).sum()} points, {where}, "
+                         f"{p_value(float(self.cluster_p[k - 1]))}")  # fmt: skip
         more = len(self.cluster_p) - 3
         return "\n".join([*lines, *[f"  and {more} more clusters"] * (more > 0)])
 
@@ -98,25 +92,32 @@ class PopulationMaps:
 
     @classmethod
     def from_responses(
-        cls, responses: Curves, table: Columns, *, output: str | int = 0, input: str | int = 0
-    ) -> "PopulationMaps":
-        """Return the maps of impulse responses (phase, lag), phase response curves (phase) or HTFs
-        (harmonic, frequency) of one output to one input, with a row of the table for each.
+        cls, responses: Sequence[ImpulseResponses], table: Columns, *, output: str | int = 0,
+        input: str | int = 0,
+    ) -> "PopulationMaps":  # fmt: skip
+        """Return the maps (phase, lag) of impulse responses of one output to one input, with a row
+        of the table for each.
 
         **Raises:** `DefinitionError` if names, units or grids differ between subjects.
         """
-        rows = [_map_of(x, output, input) for x in responses]
-        subjects = as_columns(table, len(rows))["subject"]
-        _, axes, unit, names = rows[0]
-        for subject, (_, others, *signals) in zip(subjects, rows, strict=True):
-            alike = all(np.array_equal(others.get(n, ()), a) for n, a in axes.items())
-            if signals != [unit, names] or not alike:
+        subjects = as_columns(table, len(responses))["subject"]
+        first = responses[0]
+        i = channel_index("output", output, first.outputs)
+        j = channel_index("input", input, first.inputs)
+        y, u = first.outputs[i], first.inputs[j]
+        axes = {"phase": first.phase, "lag": first.lag}
+        expected = [(str(n), unit_of(n)) for n in (*first.outputs, *first.inputs)]
+        for subject, x in zip(subjects, responses, strict=True):
+            alike = np.array_equal(x.phase, first.phase) and np.array_equal(x.lag, first.lag)
+            signals = [(str(n), unit_of(n)) for n in (*x.outputs, *x.inputs)]
+            if not alike or signals != expected:
                 raise DefinitionError(
                     f"{'units or signals' if alike else 'grids'} of subject '{subject}' differ "
                     f"from those of '{subjects[0]}': compute all responses alike."
                 )
-        cyclic = ("phase",) if "lag" in axes else ()
-        return cls(table, np.stack([row[0] for row in rows]), axes, cyclic, unit)
+        unit = f"{unit_of(y)}/({unit_of(u)} s)" if ratio(y, u) else ""
+        values = np.stack([x.values[:, :, i, j] for x in responses])
+        return cls(table, values, axes, ("phase",), unit)
 
     def __repr__(self) -> str:
         count = len(set(self.table["subject"]))
@@ -175,10 +176,10 @@ class PopulationMaps:
         subjects, labels, y = self._by_subject(rows, factor)
         paired = factor == "condition"
         if paired:
-            index = {key: i for i, key in enumerate(zip(subjects, labels, strict=True))}
-            both = [s for s in subjects[labels == a] if (s, b) in index]
-            require_subjects(np.full(len(both) or 1, f"{a} and {b}"), np.array(both or [""]), 3)
-            y = np.stack([y[index[s, a]] - y[index[s, b]] for s in both])
+            side = [dict(zip(subjects[labels == x], y[labels == x], strict=True)) for x in (a, b)]
+            both = [s for s in side[0] if s in side[1]] or [""]
+            require_subjects(np.full(len(both), f"{a} and {b}"), np.array(both), 3)
+            y = np.stack([side[0][s] - side[1][s] for s in both])
         else:
             require_subjects(labels, subjects, 3)
         n = len(y)
@@ -218,17 +219,3 @@ class PopulationMaps:
 def _methods(text: str, signs: np.ndarray, way: str) -> str:
     amount = "all" if signs.shape[1] <= 12 else "random"
     return f"{text.format(f'{amount} {len(signs)} {way}')} Computed by hybridjax {__version__}."
-
-
-def _map_of(x, output: str | int, input: str | int):
-    """Return values, axes, unit and names of one subject's response."""
-    if isinstance(x, PhaseResponse):
-        return x.values, {"phase": x.phase}, curve_unit(x.input), (str(x.input),)
-    i, j = channel_index("output", output, x.outputs), channel_index("input", input, x.inputs)
-    signals = (x.outputs[i], x.inputs[j])
-    unit, names = ratio(*signals), tuple(map(str, signals))
-    if isinstance(x, HTF):
-        axes = {"harmonic": np.asarray(x.harmonics, float), "frequency": np.asarray(x.f)}
-        return np.asarray(x.H)[:, :, i, j], axes, unit, names
-    unit = unit and f"{unit_of(signals[0])}/({unit_of(signals[1])} s)"
-    return x.values[:, :, i, j], {"phase": x.phase, "lag": x.lag}, unit, names

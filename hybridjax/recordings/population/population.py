@@ -170,18 +170,18 @@ class Population:
         weights = np.eye(len(names) + len(covariates))[len(names) - 1 :]
         weights[0] = 0.0
         weights[0, : len(names)] = np.where(is_a, 1 / is_a.sum(), -1 / (~is_a).sum())
-        paired, rows = grid.present.all(axis=1), []
+        paired, rows = np.flatnonzero(grid.present.all(axis=1)), []
         for k, effect in enumerate([f"{a} - {b}", *(f"slope of {c}" for c in covariates)]):
             w, spread = weights[k], _NONE
-            if k == 0 and len(names) == 2 and paired.sum() > 2:
+            if k == 0 and len(names) == 2 and len(paired) > 2:
                 d, v = grid.y[paired] @ w[:2], grid.v[paired].sum(axis=1)
                 bounds = spread_interval(d, v, np.ones((len(d), 1)), level)
                 spread = np.sqrt(w[:2] @ fit.between @ w[:2]), *bounds
             estimate = w @ fit.coefficients, np.sqrt(w @ fit.covariance @ w), fit.freedom(w)
-            rows.append(self._row(quantity, effect, len(paired), estimate, level, spread))
+            rows.append(self._row(quantity, effect, len(grid.y), estimate, level, spread))
         return table_of(
             rows,
-            f"Difference of {quantity} ({a} - {b}; {len(paired)} subjects, {paired.sum()} with "
+            f"Difference of {quantity} ({a} - {b}; {len(grid.y)} subjects, {len(paired)} with "
             f"all conditions) and {100 * level:g} % interval: linear mixed model with the variance "
             "of each estimate, by restricted maximum likelihood (Kenward and Roger).",
         )
@@ -233,14 +233,14 @@ class Population:
 
         **Raises:** `DefinitionError` as `difference`, and if xarray is not installed.
         """
+        others = []
         if labels:
             grid, names, _ = self._grid(quantity, *labels)
-            both = grid.present.all(axis=1) & (len(names) == 2)
+            both = np.flatnonzero(grid.present.all(axis=1) & (len(names) == 2))
             y, v = grid.y[both, 0] - grid.y[both, -1], grid.v[both].sum(axis=1)
         else:
             ((_, (_, y, v, _)), *others) = self._cells(quantity, 3)
-            y = y[: 0 if others else None]
-        if len(y) < 3:
+        if len(y) < 3 or others:
             raise DefinitionError("`labels` must be two conditions of three or more subjects.")
         ones, rows = np.ones((len(y), 1)), []
         low, high = spread_interval(y, v, ones)

@@ -122,8 +122,6 @@ def require_subjects(cells: np.ndarray, subjects: np.ndarray, needed: int = 2) -
     for cell in dict.fromkeys(cells):
         names = sorted(set(subjects[cells == cell]))
         if len(names) < needed:
-            where = "the table" if cell == "all" else f"'{cell}'"
-            text = "one subject" if len(names) == 1 else f"{len(names)} subjects"
             raise DefinitionError(
-                f"{where} has {text} ({', '.join(names)}): {needed} or more are needed."
+                f"'{cell}' has too few subjects ({', '.join(names)}): at least {needed} are needed."
             )
