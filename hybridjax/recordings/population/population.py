@@ -233,14 +233,14 @@ class Population:
 
         **Raises:** `DefinitionError` as `difference`, and if xarray is not installed.
         """
-        others = []
+        more = []
         if labels:
             grid, names, _ = self._grid(quantity, *labels)
             both = np.flatnonzero(grid.present.all(axis=1) & (len(names) == 2))
             y, v = grid.y[both, 0] - grid.y[both, -1], grid.v[both].sum(axis=1)
         else:
-            ((_, (_, y, v, _)), *others) = self._cells(quantity, 3)
-        if len(y) < 3 or others:
+            ((_, (_, y, v, _)), *more) = self._cells(quantity, 3)
+        if len(y) < 3 or more:
             raise DefinitionError("`labels` must be two conditions of three or more subjects.")
         ones, rows = np.ones((len(y), 1)), []
         low, high = spread_interval(y, v, ones)
