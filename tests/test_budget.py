@@ -27,17 +27,17 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
 # 890 the responses of cycles; of the tests, 630 are those of both.
 LIMITS = {
-    "code": 26_730,
-    "files": 233,
+    "code": 26_370,
+    "files": 230,
     "longest": 500,
     "public_names": 173,
-    "many_parameters": 8,
+    "many_parameters": 7,
     "thresholds": 300,
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_985,
-    "doc_words": 36_850,
+    "test_lines": 16_970,
+    "doc_words": 36_770,
 }
 
 

@@ -17,7 +17,7 @@ from ..._core.text import p_value
 from ...errors import DefinitionError
 from ..impulse import ImpulseResponses
 from .permutations import clusters, exceeding, largest, point_threshold, relabelings, statistics
-from .tables import Columns, as_columns, require_subjects, rows_with
+from .tables import Columns, as_columns, require, rows_with
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -140,7 +140,7 @@ class PopulationMaps:
         rows = all_rows if label is None else rows_with(self.table, (label,))[1]
         subjects, _, maps = self._by_subject(rows)
         n = len(maps)
-        require_subjects(np.full(n, label or "all"), subjects, 3)
+        require(np.full(n, label or "all"), subjects, 3)
         signs = relabelings(np.ones(n), True, draws, np.random.default_rng(seed))
         mean = maps.mean(axis=0)
         points, _ = largest(maps - mean, signs[1:], True, np.inf, self._cyclic())
@@ -178,10 +178,10 @@ class PopulationMaps:
         if paired:
             side = [dict(zip(subjects[labels == x], y[labels == x], strict=True)) for x in (a, b)]
             both = [s for s in side[0] if s in side[1]] or [""]
-            require_subjects(np.full(len(both), f"{a} and {b}"), np.array(both), 3)
+            require(np.full(len(both), f"{a} and {b}"), np.array(both), 3)
             y = np.stack([side[0][s] - side[1][s] for s in both])
         else:
-            require_subjects(labels, subjects, 3)
+            require(labels, subjects, 3)
         n = len(y)
         true = np.ones(n) if paired else np.where(labels == a, 1.0, -1.0)
         signs = relabelings(true, paired, draws, np.random.default_rng(seed))

@@ -8,29 +8,14 @@ from scipy import stats
 
 from ..._core.arguments import Numbers
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import (
-    Count,
-    ExperimentCount,
-    OptionalNames,
-    Positive,
-    Probability,
-    Seed,
-)
+from ..._core.boundary.kinds import Count, OptionalNames, Positive, Probability, Seed
 from ..._core.boundary.values import Reals
 from ..._core.signal import unit_of
 from ...errors import DefinitionError
 from ...identify.multiplier_estimate import MultiplierEstimate
 from ...scale.draws import monte_carlo
 from .reml import Cells, meta, mixed, moderated, spread_interval
-from .tables import (
-    Columns,
-    PopulationTable,
-    as_columns,
-    cells_of,
-    require_subjects,
-    rows_with,
-    table_of,
-)
+from .tables import Columns, PopulationTable, as_columns, cells_of, require, rows_with, table_of
 
 
 Quantity = Literal["modulus", "angle", "coefficients"]
@@ -216,7 +201,7 @@ class Population:
 
     def power(
         self, quantity: str, difference: float, subjects: Sequence[Count] = (8, 12, 16, 24), *,
-        labels: Sequence[str] = (), draws: ExperimentCount = 400, level: Probability = 0.05,
+        labels: Sequence[str] = (), draws: Count = 400, level: Probability = 0.05,
         seed: Seed = 0,
     ) -> PopulationTable:  # fmt: skip
         """Return the power of tests of a difference, by simulation of populations like this pilot.
@@ -233,9 +218,9 @@ class Population:
 
         **Raises:** `DefinitionError` as `difference`, and if xarray is not installed.
         """
-        more = []
+        more: Any = len(labels) not in (0, 2)
         if labels:
-            grid, names, _ = self._grid(quantity, *labels)
+            grid, names, _ = self._grid(quantity, labels[0], labels[-1])
             both = np.flatnonzero(grid.present.all(axis=1) & (len(names) == 2))
             y, v = grid.y[both, 0] - grid.y[both, -1], grid.v[both].sum(axis=1)
         else:
@@ -306,7 +291,7 @@ class Population:
         """Return subjects, estimates, variances and covariates by group and condition."""
         every = np.ones(len(self.freedom), bool)
         subjects, cells, *numbers = self._merged(quantity, covariates, every)
-        require_subjects(cells, subjects, needed)
+        require(cells, subjects, needed)
         parts = (subjects, *numbers)
         return [(cell, [x[cells == cell] for x in parts]) for cell in dict.fromkeys(cells)]
 
@@ -315,7 +300,7 @@ class Population:
         the names of the cells, and which belong to `a`."""
         factor, rows = rows_with(self.table, (a, b))
         subjects, cells, y, v, extra = self._merged(quantity, covariates, rows)
-        require_subjects(cells, subjects)
+        require(cells, subjects)
         names, all_cells = list(dict.fromkeys(cells)), cells_of(self.table)
         row = [list(dict.fromkeys(subjects)).index(subject) for subject in subjects]
         place, q = (row, [names.index(cell) for cell in cells]), len(names)

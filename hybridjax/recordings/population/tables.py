@@ -117,7 +117,7 @@ def rows_with(columns: dict[str, np.ndarray], labels: Sequence[str]) -> tuple[st
     )
 
 
-def require_subjects(cells: np.ndarray, subjects: np.ndarray, needed: int = 2) -> None:
+def require(cells: np.ndarray, subjects: np.ndarray, needed: int = 2) -> None:
     """**Raises:** `DefinitionError` for a cell with fewer subjects."""
     for cell in dict.fromkeys(cells):
         names = sorted(set(subjects[cells == cell]))
