@@ -21,6 +21,7 @@ CASES = {
     "in-loop": ("in_loop.py --draws 60", 3, "plant and controller apart, in a loop"),
     "state-space": ("joint.py --draws 12", 5, "fits of whole models beside their bound"),
     "recordings": ("recordings.py", 30, "multipliers from recordings, clean and corrupted"),
+    "population": ("population.py", 25, "means, maps and power over simulated subjects"),
     "designs": ("designs.py --draws 40", 25, "strides that optimal designs save"),
     "parameters": ("fitting.py --seeds 10 --draws 40", 10, "physical parameters from data"),
     "second-order": ("second_order.py", 2, "second-order products on lines, and draws without"),

@@ -90,6 +90,11 @@ def walking(found):
     assert abs(found.known.multipliers[0] - 0.6) < 0.2
 
 
+def population(found):
+    low, high = found.test["low"][0], found.test["high"][0]
+    assert low < np.mean(found.true[6:]) - np.mean(found.true[:6]) < high < 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_notebook_runs(name, monkeypatch):

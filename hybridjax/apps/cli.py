@@ -143,8 +143,13 @@ def _add_identify(commands) -> None:
         "multipliers, harmonic transfer functions and impulse responses, with a report.",
     )
     add = identify.add_argument
-    add("files", nargs="+", metavar="FILE", help="one trial in each: CSV, Excel, Parquet, MATLAB, "
+    add("files", nargs="*", metavar="FILE", help="one trial in each: CSV, Excel, Parquet, MATLAB, "
         "HDF5, C3D, OpenSim, ROS and more")  # fmt: skip
+    add("--table", type=_place, metavar="TABLE.csv", help="in place of files: a table of a study, "
+        "with the columns file and subject, and condition, group, age, ...; a report for each "
+        "subject and one for all; a later call goes on")  # fmt: skip
+    add("--workers", type=_count, default=1, metavar="N",
+        help="processes for the subjects of --table (default: %(default)s)")  # fmt: skip
     add("--input", required=True, type=_names, metavar="NAMES", help="measured perturbations")
     add("--outputs", required=True, type=_names, metavar="NAMES", help="measured outputs")
     phase = identify.add_mutually_exclusive_group(required=True)
@@ -216,7 +221,13 @@ def _sweep(options) -> int:
 def _identify(options) -> int:
     if options.phase is None and (options.center or options.scale):
         options.parser.error("--center and --scale are of the angle of --phase, which is not given")
+    if bool(options.files) == bool(options.table):
+        options.parser.error("give either files of one subject or --table TABLE.csv")
     _begin(cache=False)
+    if options.table:
+        from .subjects import run as run_table
+
+        return run_table(options)
     from .identify import run
 
     return _status(run(options))

@@ -6,10 +6,12 @@
 import base64
 import contextlib
 import csv
+import functools
+import io
 import json
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from ..orbits.crossing import AtEvent, Crossing
 from ..plot import look
 from ..recordings.identification import Identification, identify_recording
 from ..recordings.read import read_recording
+from ..recordings.recording import Recording
 from ..sections.families import KinematicPhase
 from .paper_report import complex_pairs
 
@@ -59,29 +62,35 @@ def run(options: Any) -> bool:
     """Identify, print and write a report, from the options of the command; whether the fit has
     converged."""
     with report_folder(options.out, options.input, options.formats) as folder:
-        named = (*options.input, *options.outputs, *(options.phase or (options.crossing or ())[:1]))
-        signals = tuple(dict.fromkeys(named))
+        signals, identify = steps_of(options)
         recording = read_recording(*options.files, time=options.time, signals=signals)
         print(recording)
-        if options.phase is not None:
-            position, velocity = options.phase
-            sections: Any = KinematicPhase(
-                options.sections, position=position, velocity=velocity,
-                center=options.center, scale=options.scale,
-            )  # fmt: skip
-        elif options.crossing is not None:
-            sections = Crossing(*options.crossing)
-        else:
-            sections = AtEvent(options.event)
-        result = identify_recording(
-            recording, sections, inputs=options.input, outputs=options.outputs,
-            n_sections=options.sections, order=options.order, bandwidth=options.bandwidth,
-            timing=options.timing, drift=options.drift,
-        )  # fmt: skip
+        result = identify(recording)
         print(result)
         write_results(folder, result, options.formats)
     print(os.path.join(options.out, PAGE))
     return result.fit.result == Result.OK
+
+
+def steps_of(options: Any) -> tuple[tuple[str, ...], Callable[[Recording], Identification]]:
+    """Return the names of the signals to be read, and the function that identifies a recording."""
+    named = (*options.input, *options.outputs, *(options.phase or (options.crossing or ())[:1]))
+    if options.phase is not None:
+        position, velocity = options.phase
+        sections: Any = KinematicPhase(
+            options.sections, position=position, velocity=velocity,
+            center=options.center, scale=options.scale,
+        )  # fmt: skip
+    elif options.crossing is not None:
+        sections = Crossing(*options.crossing)
+    else:
+        sections = AtEvent(options.event)
+    identify = functools.partial(
+        identify_recording, phase=sections, inputs=options.input, outputs=options.outputs,
+        n_sections=options.sections, order=options.order, bandwidth=options.bandwidth,
+        timing=options.timing, drift=options.drift,
+    )  # fmt: skip
+    return tuple(dict.fromkeys(named)), identify
 
 
 @checked
@@ -165,6 +174,41 @@ def write_results(folder: Path, found: Identification, formats: Sequence[Format]
     (folder / PAGE).write_text(_page(found, images), encoding="utf-8")
 
 
+def off_screen() -> contextlib.AbstractContextManager:
+    """Return a context in which figures need no window."""
+    import matplotlib
+
+    return matplotlib.rc_context({"backend": "agg"})
+
+
+def figure_of(drawn: look.Plot, caption: str) -> str:
+    """Return a figure as HTML, and close it."""
+    from matplotlib import pyplot
+
+    file = io.BytesIO()
+    drawn.figure.savefig(file, format="png")
+    pyplot.close(drawn.figure)
+    return _figure(caption, base64.b64encode(file.getvalue()).decode(), caption)
+
+
+def _figure(name: str, image: str, caption: str) -> str:
+    return (
+        f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{image}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def page_of(title: str, parts: Iterable[str]) -> str:
+    """Return a page that needs no other file."""
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"<title>{escape(title)}</title>"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<style>{_STYLE}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
+        + "\n".join(parts) + "\n</body></html>\n"
+    )  # fmt: skip
+
+
 def _written(*arrays: np.ndarray) -> Iterable[list[str]]:
     return ([f"{x:.9g}" for x in row] for row in np.concatenate(arrays, axis=1))
 
@@ -177,6 +221,7 @@ def _write_table(path: Path, header: list[str], rows: Iterable[Sequence]) -> Non
 def summarize(found: Identification) -> dict[str, Any]:
     """Return the numbers of the report, ready for JSON."""
     data, fit, held = found.data, found.fit, found.held_out
+    periods = np.concatenate(found.phase.periods)
     return {
         "version": __version__,
         "trials": [t.name for t in found.recording.trials],
@@ -191,6 +236,8 @@ def summarize(found: Identification) -> dict[str, Any]:
         "records": len(data.records),
         "period": data.period,
         "period_jitter": found.phase.jitter,
+        "period_mean": float(periods.mean()),
+        "period_standard_error": float(periods.std() / np.sqrt(max(len(periods) - 1, 1))),
         "period_drift_per_cycle": found.phase.drift,
         "multipliers": complex_pairs(fit.multipliers),
         "standard_errors": fit.standard_errors.tolist(),
@@ -204,9 +251,7 @@ def summarize(found: Identification) -> dict[str, Any]:
 
 
 def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
-    import matplotlib
-
-    with matplotlib.rc_context({"backend": "agg"}):
+    with off_screen():
         figures = {
             "multipliers": plot.multipliers(found.fit, {"plain regression": found.advice.plain}),
             "validation": plot.validation(found.held_out.validation),
@@ -228,7 +273,6 @@ def _page(found: Identification, images: dict[str, str]) -> str:
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
     expected = zip(found.advice.strides, found.advice.expected, strict=True)
     parts = [
-        "<h1>Floquet multipliers from a recording</h1>",
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",
         found.fit._repr_html_(),
@@ -251,8 +295,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         "nonlinearity, smoothing), not that the multipliers are wrong.</p>",
         found.held_out.validation._repr_html_(),
         *(
-            f'<figure><img alt="{name}" src="data:image/png;base64,{image}">'
-            f"<figcaption>{caption}</figcaption></figure>"
+            _figure(name, image, caption)
             for name, image in images.items()
             for figure, caption in _CAPTIONS.items()
             if name.startswith(figure)
@@ -261,12 +304,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         f"{data.bandwidth:.3g} Hz; output-error fit with {found.fit.numerators.shape[1]} lags; "
         "regions from the residuals, cycle by cycle.</p>",
     ]  # fmt: skip
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f"<title>Multipliers of {trials}</title>"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(parts) + "\n</body></html>\n"
-    )
+    return page_of("Floquet multipliers from a recording", parts)
 
 
 def _left_out(found: Identification) -> dict[str, Any]:

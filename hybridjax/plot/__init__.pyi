@@ -12,3 +12,4 @@ from .look import COLORS as COLORS, PAGE as PAGE, save as save, style as style
 from .orbit import cycle as cycle
 from .over_parameters import branch as branch, sweep as sweep
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros
+from .subjects import forest as forest, paired as paired, subject_maps as subject_maps

@@ -6,4 +6,6 @@ from .impulse import impulse_responses as impulse_responses
 from .inspection.inspect import inspect as inspect
 from .natural import natural_multipliers as natural_multipliers
 from .phase_estimation import estimate_phase as estimate_phase
+from .population.maps import PopulationMaps as PopulationMaps
+from .population.population import Population as Population
 from .sampling import section_data as section_data

@@ -1,0 +1,277 @@
+"""Populations: closed forms, other software's numbers, exact permutations, and refusals."""
+
+import itertools
+import json
+
+import equinox as eqx
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+import hybridjax as hj
+from hybridjax._core.results import Result
+from hybridjax.apps import subjects
+from hybridjax.apps.cli import main
+from hybridjax.apps.identify import summarize
+from hybridjax.identify.multiplier_estimate import MultiplierEstimate
+from hybridjax.recordings import Population, PopulationMaps
+from hybridjax.recordings.population.reml import Cells, mixed, moderated
+
+
+RNG = np.random.default_rng(0)
+N = 10
+
+
+def fit_of(c, freedom=np.inf, scale=1e-4):
+    c = np.asarray(c, float)
+    roots = np.roots([1.0, *c])
+    roots = roots[np.argsort(-np.abs(roots))].astype(complex)
+    return MultiplierEstimate(roots, c, scale * np.eye(len(c)), freedom)
+
+
+def study(y, error, **columns):
+    columns = {name: list(column) for name, column in columns.items()}
+    table = {"subject": [f"s{i}" for i in range(len(y))]} | columns
+    return Population(table, {"gain": y}, {"gain": error}, {"gain": "m/N"})
+
+
+def test_equal_errors_give_the_t_interval():
+    """Hartung and Knapp's interval is then Student's, and the spread what errors leave."""
+    y, error = RNG.normal(size=N), np.full(N, 0.3)
+    row = study(y, error).mean("gain")
+    low, high = stats.t.interval(0.95, N - 1, y.mean(), stats.sem(y))
+    assert (row["low"][0], row["high"][0]) == pytest.approx((low, high))
+    assert row["spread"][0] == pytest.approx(np.sqrt(y.var(ddof=1) - 0.09))
+
+
+def test_the_bcg_trials():
+    """Vaccination trials of the R package metafor (Viechtbauer 2010): `rma(yi, vi, test="knha")`
+    prints -0.7145 (0.1808), tau^2 0.3132, and `confint` tau 0.3460 to 1.0543."""
+    y = [-0.8893, -1.5854, -1.3481, -1.4416, -0.2175, -0.7861, -1.6209, 0.0120, -0.4694, -1.3713,
+         -0.3394, 0.4459, -0.0173]  # fmt: skip
+    v = [0.3256, 0.1946, 0.4154, 0.0200, 0.0512, 0.0069, 0.2230, 0.0040, 0.0564, 0.0730, 0.0124,
+         0.5325, 0.0714]  # fmt: skip
+    row = study(np.array(y), np.sqrt(v)).mean("gain")
+    assert row["estimate"][0] == pytest.approx(-0.7145, abs=2e-4)
+    assert row["standard_error"][0] == pytest.approx(0.1808, abs=2e-4)
+    assert row["spread"][0] ** 2 == pytest.approx(0.3132, abs=2e-4)
+    assert (row["spread_low"][0], row["spread_high"][0]) == pytest.approx((0.346, 1.0543), abs=2e-4)
+
+
+def test_complete_pairs_give_the_paired_t_test():
+    """And two groups with equal errors give Welch's, with nearly its degrees of freedom."""
+    y, error = RNG.normal(size=2 * N), np.full(2 * N, 0.01)
+    y[N:] += RNG.normal(size=N)
+    labels = np.repeat(["a", "b"], N)
+    table = {"subject": np.tile(np.arange(N), 2), "condition": labels}
+    row = Population(table, {"q": y}, {"q": error}).difference("q", "a", "b")
+    paired = stats.ttest_rel(y[:N], y[N:])
+    assert row["p"][0] == pytest.approx(paired.pvalue, rel=1e-3)
+    assert row["freedom"][0] == pytest.approx(N - 1, rel=1e-3)
+    y[N:] *= 3
+    row = study(y, error, group=labels).difference("gain", "a", "b")
+    welch = stats.ttest_ind(y[:N], y[N:], equal_var=False)
+    size = abs(y[:N].mean() - y[N:].mean()) / abs(welch.statistic)
+    assert row["standard_error"][0] == pytest.approx(size, rel=1e-3)
+    assert row["freedom"][0] == pytest.approx(welch.df, rel=0.02)
+
+
+def test_the_mixed_model_maximizes_the_restricted_likelihood():
+    """Of errors that differ and conditions that miss, compared with a likelihood written anew."""
+    y, v = RNG.normal(size=(8, 2)) + RNG.normal(size=(8, 1)), RNG.uniform(0.1, 1, (8, 2))
+    present = np.ones((8, 2), bool)
+    present[0, 0] = present[1, 1] = False
+    x = np.broadcast_to(np.eye(2), (8, 2, 2))
+    fit = mixed(Cells(y, v, x, present))
+
+    def cost(free):
+        root = np.array([[free[0], 0], [free[1], free[2]]])
+        total, information, right = 0.0, np.zeros((2, 2)), np.zeros(2)
+        for i in range(8):
+            k = present[i]
+            V = (root @ root.T + np.diag(v[i]))[np.ix_(k, k)]
+            W, X = np.linalg.inv(V), np.eye(2)[k]
+            information += X.T @ W @ X
+            right += X.T @ W @ y[i, k]
+            total += np.log(np.linalg.det(V)) + y[i, k] @ W @ y[i, k]
+        beta = np.linalg.solve(information, right)
+        return total - right @ beta + np.log(np.linalg.det(information)), beta
+
+    best = optimize.minimize(lambda z: cost(z)[0], [1.0, 0.5, 1.0], method="Nelder-Mead",
+                             options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 999}).x  # fmt: skip
+    root = np.array([[best[0], 0], [best[1], best[2]]])
+    np.testing.assert_allclose(fit.between, root @ root.T, atol=2e-4)
+    np.testing.assert_allclose(fit.coefficients, cost(best)[1], atol=1e-4)
+    assert (np.linalg.eigvalsh(fit.covariance - fit.plain) > -1e-12).all()
+
+
+def test_predictions_shrink_and_covariates_explain():
+    age, error = np.linspace(20, 60, N), RNG.uniform(0.1, 0.4, N)
+    people = study(0.1 * age + 0.01 * RNG.normal(size=N), error, age=age)
+    row = people.mean("gain", covariates="age")
+    assert list(row["effect"]) == ["mean", "slope of age"]
+    assert row["estimate"][1] == pytest.approx(0.1, abs=0.01) and row["p"][1] < 1e-4
+    flat = study(5 + error * RNG.normal(size=N), error).predictions("gain")
+    mean = study(flat["estimate"], error).mean("gain")["estimate"][0]
+    assert (np.abs(flat["prediction"] - mean) <= np.abs(flat["estimate"] - mean)).all()
+
+
+def test_moderated_variances_are_closer_to_the_true_ones():
+    strides, freedom = RNG.uniform(60, 300, 400), np.full(400, 6.0)
+    true = 1 / strides
+    v = true * RNG.chisquare(6, 400) / 6
+    trend = np.column_stack([np.ones(400), np.log(strides)])
+    better = moderated(v, freedom, trend)
+    assert np.std(np.log(better / true)) < 0.2 * np.std(np.log(v / true))
+    assert abs(np.log(better / true).mean()) < 0.1
+    np.testing.assert_array_equal(moderated(v, np.full(400, np.inf), trend), v)
+
+
+def test_quantities_of_fits():
+    """The modulus of a pair is the root of c2, whose error is known."""
+    fits = [fit_of([0.5, 0.5 + 0.01 * k]) for k in range(4)]
+    table = {"subject": list("abcd")}
+    people = Population.from_fits(fits, table, ("modulus", "angle", "coefficients"))
+    modulus = np.sqrt([0.5, 0.51, 0.52, 0.53])
+    np.testing.assert_allclose(people.values["modulus"], modulus)
+    np.testing.assert_allclose(people.errors["modulus"], 1e-2 / (2 * modulus))
+    np.testing.assert_allclose(np.cos(people.values["angle"]), -0.25 / modulus)
+    assert people.units["angle"] == "rad" and set(people.values) > {"c1", "c2"}
+
+
+def test_plans_agree_with_closed_forms():
+    y = 1 + 0.2 * RNG.normal(size=12)
+    people = study(y, np.full(12, 0.1), strides=np.full(12, 100))
+    between = np.sqrt(y.var(ddof=1) - 0.01)
+    strides = people.allocation("gain", subject_cost=4, stride_cost=0.01)
+    assert strides == pytest.approx(np.sqrt(400) / between)
+    spread = np.sqrt(between**2 + 0.01)
+    (power,) = people.power("gain", 0.25, (12,), draws=40)["power"]
+    noncentral, t = 0.25 / (spread * np.sqrt(2 / 12)), stats.t.isf(0.025, 22)
+    expected = stats.nct.sf(t, 22, noncentral)
+    assert abs(power - expected) < 3 * np.sqrt(expected * (1 - expected) / 40)
+
+
+AXES = {"phase": np.arange(6) / 6, "lag": np.arange(8.0)}
+
+
+def maps_of(values, n, **labels):
+    table = {"subject": np.tile(np.arange(n), len(values) // n)} | labels
+    return PopulationMaps(table, values, AXES, "phase")
+
+
+def test_all_sign_flips_give_the_exact_p_value():
+    y = RNG.normal(size=(7, 6, 8))
+    both = maps_of(np.concatenate([y, 0 * y]), 7, condition=np.repeat(["a", "b"], 7))
+    test = both.difference("a", "b")
+    largest = [np.abs(stats.ttest_1samp(np.array(s)[:, None, None] * y, 0).statistic).max()
+               for s in itertools.product([1, -1], repeat=7)]  # fmt: skip
+    t = stats.ttest_1samp(y, 0).statistic
+    np.testing.assert_allclose(test.t, t)
+    expected = (np.array(largest)[:, None, None] >= np.abs(t) * (1 - 1e-9)).mean(axis=0)
+    np.testing.assert_allclose(test.p, expected)
+    assert "all 64 sign flips" in test.methods
+
+
+def test_groups_and_clusters_across_the_end_of_the_cycle():
+    y = RNG.normal(size=(12, 6, 8))
+    y[:6, [0, 5], 2:5] += 4.0
+    test = maps_of(y, 12, group=np.repeat(["a", "b"], 6)).difference("a", "b")
+    assert "all 924 permutations" in test.methods and test.significant[[0, 5], 2:5].all()
+    assert len(set(test.labels[[0, 5], 2:5].ravel())) == 1 and test.cluster_p.min() < 0.01
+    np.testing.assert_allclose(test.t, stats.ttest_ind(y[:6], y[6:]).statistic)
+    turned = maps_of(y * np.exp(1j), 12, group=np.repeat(["a", "b"], 6)).difference("a", "b")
+    np.testing.assert_allclose(turned.t, np.abs(test.t))  # complex maps
+
+
+def test_the_band_holds_the_mean_and_draws_repeat():
+    y = RNG.normal(size=(15, 6, 8))
+    first, second = (maps_of(y, 15).mean(draws=500, seed=1) for _ in range(2))
+    np.testing.assert_array_equal(first.reach, second.reach)
+    assert (first.reach > 1.2 * stats.t.isf(0.025, 14) * stats.sem(y)).all()
+
+
+@pytest.mark.parametrize("sentence, call", {
+    "'a' is in the groups 'x'": lambda: study([1.0, 2], [1.0, 1], subject=["a", "a"], group="xy"),
+    "'x' has too few": lambda: study([1.0, 2, 3], np.ones(3), condition="xyy").mean("gain"),
+    "no covariance": lambda: fitted([fit_of([0.5], scale=np.inf)]),
+    "of order 2, but that": lambda: fitted([fit_of([0.5]), fit_of([0.5, 0.5])], "coefficients"),
+    "is real, so its angle": lambda: fitted([fit_of([0.5])], "angle"),
+    "no column 'subject'": lambda: Population({}, {"q": [1.0]}, {"q": [1.0]}),
+    "must be positive": lambda: study([1.0], [0.0]),
+    "no two conditions": lambda: study([1.0, 2], [1.0, 1]).difference("gain", "a", "b"),
+    "no quantity 'x'": lambda: study([1.0, 2], [1.0, 1]).mean("x"),
+    "units or signals of subject 'b'": lambda: responses(response("m"), response("mm")),
+    "grids of subject 'b' differ": lambda: responses(response("m"), response("m", 5)),
+}.items())  # fmt: skip
+def test_refusals(sentence, call):
+    with pytest.raises(hj.DefinitionError, match=sentence):
+        call()
+
+
+def fitted(fits, *quantities):
+    return Population.from_fits(fits, {"subject": list("ab")[: len(fits)]}, quantities)
+
+
+def responses(*each):
+    return PopulationMaps.from_responses(each, {"subject": ["a", "b"]})
+
+
+def response(unit, lags=4):
+    from hybridjax._core.signal import Signal
+    from hybridjax.recordings.impulse import ImpulseResponses
+
+    values = np.zeros((6, lags, 1, 1))
+    names = (Signal("u", "N"),), (Signal("y", unit),)
+    return ImpulseResponses(values, values, AXES["phase"], np.arange(lags) / 6, 0.0, 1.0, *names)
+
+
+def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
+    """Each subject has a report, failures are named, and a second call computes nothing anew."""
+    rows = ["file,subject,group,age"]
+    for k in range(4):
+        dirty = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3, seed=k)
+        (trial,) = dirty.trials
+        table = np.column_stack([trial.time, trial.values])
+        np.savetxt(tmp_path / f"{k}.csv", table, "%.6g", delimiter=",", comments="",
+                   header="time (s),force (N),x (m),v (m/s)")  # fmt: skip
+        rows.append(f"{k}.csv,S{k},{'ab'[k % 2]},{30 + k}")
+    (tmp_path / "subjects.csv").write_text("\n".join([*rows, "none.csv,S9,a,40"]) + "\n")
+    # The figures of single reports are tested elsewhere and take long.
+    monkeypatch.setattr(subjects, "write_results", write_numbers)
+    monkeypatch.chdir(tmp_path)
+    options = "--input force --outputs x,v --phase x,v --sections 8 --order 1 --out out".split()
+    assert main(["identify", "--table", "subjects.csv", *options]) == 1
+    printed = capsys.readouterr().out
+    assert "S9-a failed: cannot read" in printed and "a - b" in printed.replace("b - a", "a - b")
+    page = (tmp_path / "out/population.html").read_text()
+    assert page.count("report.html") == 4 and "Hartung" in page and "S9-a failed" in page
+    table = (tmp_path / "out/subjects.csv").read_text().splitlines()
+    assert len(table) == 5 and table[0].startswith("report,subject,group,age,strides,period")
+    monkeypatch.setattr(subjects, "read_recording", lambda *files, **options: 1 / 0)
+    assert main(["identify", "--table", "subjects.csv", *options]) == 1
+    printed = capsys.readouterr().out
+    assert "S9-a failed: ZeroDivisionError" in printed and "S0-a failed" not in printed
+
+
+def write_numbers(folder, result, formats):
+    assert result.fit.result == Result.OK
+    (folder / "report.html").write_text("")
+    hj.save(folder / "fit.npz", eqx.filter(result.fit, lambda x: True))
+    (folder / "summary.json").write_text(json.dumps(summarize(result)))
+
+
+def test_figures():
+    table = {"subject": np.tile(np.arange(N), 2), "condition": np.repeat(["a", "b"], N)}
+    people = Population(table, {"q": RNG.normal(size=2 * N)}, {"q": np.ones(2 * N)})
+    labels = [x.get_text() for x in hj.plot.forest(people, "q").ax.get_yticklabels()]
+    assert labels.count("3") == 2 and {"mean, a", "mean, b"} < set(labels)
+    panel = hj.plot.paired(people, "q", "a", "b").ax
+    assert sum(len(line.get_xdata()) == 2 for line in panel.get_lines()) >= N
+    y = RNG.normal(size=(12, 6, 8))
+    y[:6, 2:4, 2:5] += 4.0
+    maps = maps_of(y, 12, group=np.repeat(["a", "b"], 6))
+    panel = hj.plot.subject_maps(maps.difference("a", "b")).ax
+    assert len(panel.collections) == 2  # the map and its outline
+    curves = PopulationMaps({"subject": np.arange(12)}, y[:, 0], {"lag": AXES["lag"]})
+    assert len(hj.plot.subject_maps(curves.mean()).ax.get_lines()) == 12 + 3
