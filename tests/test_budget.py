@@ -24,21 +24,21 @@ PRONOUNS = set(
     "found own known one seen here some there these those it them others rest thing things".split()
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
-# a change that needs less lowers it. Of the code, 630 lines are the algebra of HTFs and loops, and
-# 1220 the responses of cycles with noise, coupling and symmetry in time; of the tests, 770 are
-# those of both.
+# a change that needs less lowers it. Of the code, 670 lines are the algebra of HTFs and loops, 1220
+# the responses of cycles with noise, coupling and symmetry in time, 1000 populations of subjects,
+# 790 simulators of others; of the tests, 1450 are those of all four.
 LIMITS = {
-    "code": 25_700,
-    "files": 223,
+    "code": 27_680,
+    "files": 240,
     "longest": 500,
-    "public_names": 174,
+    "public_names": 180,
     "many_parameters": 8,
     "thresholds": 300,
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 16_835,
-    "doc_words": 36_600,
+    "test_lines": 17_170,
+    "doc_words": 38_240,
 }
 
 
