@@ -26,9 +26,9 @@ PRONOUNS = set(
 # What the package may have at most. A change that needs more says why, and raises the number here;
 # a change that needs less lowers it. Of the code, 670 lines are the algebra of HTFs and loops, 1220
 # the responses of cycles with noise, coupling and symmetry in time, 1000 populations of subjects,
-# 790 simulators of others; of the tests, 1450 are those of all four.
+# 800 simulators of others; of the tests, 1530 are those of all four.
 LIMITS = {
-    "code": 27_680,
+    "code": 27_690,
     "files": 240,
     "longest": 500,
     "public_names": 180,
@@ -37,7 +37,7 @@ LIMITS = {
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_170,
+    "test_lines": 17_250,
     "doc_words": 38_240,
 }
 

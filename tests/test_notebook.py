@@ -95,6 +95,10 @@ def population(found):
     assert low < np.mean(found.true[6:]) - np.mean(found.true[:6]) < high < 0
 
 
+def simulator(found):
+    assert found.fit.contains(found.returns.multipliers[:2]).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_notebook_runs(name, monkeypatch):

@@ -59,6 +59,9 @@ def from_mujoco(
             model = mujoco.MjModel.from_xml_path(os.fspath(model))
     except ValueError as error:
         raise DefinitionError(f"`model` is no model of MuJoCo: {error}") from error
+    if not isinstance(model, mujoco.MjModel):
+        given = type(model).__name__
+        raise DefinitionError(f"`model` must be an MjModel, a file, or XML, not of type {given}.")
     actuators = [model.actuator(i).name for i in range(model.nu)]
     require_among("actuator", list(inputs), actuators, "from_mujoco: ")
     return MuJoCoPlant(model, inputs, control, fallen, period, substeps)
@@ -182,7 +185,9 @@ class FMUPlant(Made):
         try:
             about = fmpy.read_model_description(self.file)
         except Exception as error:  # (of many kinds)
-            raise DefinitionError(f"'{self.file}' is no FMU: {error}") from error
+            raise DefinitionError(
+                f"'{self.file}' is not there, or no FMU: give a file of FMI 2.0 for co-simulation."
+            ) from error
         can = about.coSimulation
         if not about.fmiVersion.startswith("2.") or can is None:
             text = f"'{self.file}' is no FMU of FMI 2.0 for co-simulation"
@@ -274,7 +279,11 @@ class GymnasiumPlant(Made):
     def __post_init__(self) -> None:
         gym, make = package("gymnasium"), self.environment
         # (Time limits of a registered environment would end experiments.)
-        self._made = gym.make(make).unwrapped if isinstance(make, str) else make()
+        try:
+            self._made = gym.make(make).unwrapped if isinstance(make, str) else make()
+        except gym.error.Error as error:
+            text = f"Gymnasium has no environment '{make}'"
+            raise DefinitionError(f"{text}: `gymnasium.pprint_registry()` lists them.") from error
         shapes = self._made.observation_space.shape, self._made.action_space.shape
         if shapes != ((len(self.signals),), (len(self.inputs),)):
             text = f"observations and actions have the shapes {shapes}"

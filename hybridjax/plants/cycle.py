@@ -157,6 +157,8 @@ def settle(
     `ComputationError` if the plant fails or has not settled.
     """
     family = families.as_family(sections)
+    if missing := [x for x in ("inputs", "dt", "reset", "step") if not hasattr(plant, x)]:
+        raise DefinitionError(f"the plant has no `{missing[0]}` (see `hj.plants.Plant`).")
     drive = Drive(plant)
     try:
         drive.reset(seed)

@@ -239,6 +239,35 @@ def recordings(t):
     yield positional(hj.read_recording), dict(values="nope.csv")
 
 
+def subjects(t):
+    population, maps = t.population, t.maps
+    yield population.from_fits, dict(fits=[t.fit, t.fit], table={"subject": ["a", "b"]})
+    for call in (population.mean, population.predictions, population.allocation):
+        yield call, dict(quantity="m")
+    two = dict(a="old", b="new")
+    yield population.difference, dict(quantity="m") | two
+    yield population.power, dict(quantity="m", difference=0.1, subjects=(4,), draws=2)
+    about = dict(responses=[t.found.responses] * 2, table={"subject": ["a", "b"]})
+    yield maps.from_responses, about
+    yield maps.mean, dict(label="old")
+    yield maps.difference, two
+    yield hj.plot.forest, dict(population=population, quantity="m")
+    yield hj.plot.paired, dict(population=population, quantity="m") | two
+    yield hj.plot.subject_maps, dict(result=maps.mean())
+    study = dict(table="nope.csv", folder="missing/x", identify=hj.identify_recording)
+    yield hj.identify_subjects, study
+
+
+def plants(t):
+    yield hj.plants.settle, dict(plant=t.plant, sections=hj.ClockPhase(4), outputs=("x", "v"))
+    yield t.settled.run_experiments, dict(design=np.zeros((1, 88, 1)))
+    yield t.settled.perturbed_returns, dict(coordinates=("x", "v"))
+    names = dict(inputs=("u",), signals=("x",), dt=0.1)
+    yield hj.plants.from_mujoco, dict(model="<mujoco/>", inputs=())
+    yield hj.plants.from_fmu, dict(file="nope.fmu") | names
+    yield hj.plants.from_gymnasium, dict(environment="nope") | names
+
+
 def testing(t):
     yield hj.testing.spoil, dict(recording=t.recording, signals=("x",))
     yield hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5)
@@ -313,5 +342,6 @@ def without_arguments(t):
 
 PARTS = (
     without_arguments, scale, systems, sections, cycles, linear, designs, experiments, estimates,
-    series, fitting, designs_data, recordings, testing, files, conversions, plots, rhythms,
+    series, fitting, designs_data, recordings, subjects, plants, testing,
+    files, conversions, plots, rhythms,
 )  # fmt: skip

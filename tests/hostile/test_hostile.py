@@ -14,8 +14,8 @@ CALLED_BY_THE_ENGINE = {
     "AbstractLevels", "AbstractObservation", "AbstractSections", "ArcLength", "AtEvent",
     "BoundSections",
     "BuckConverter", "Chart", "ClockPhase", "CompliantHopper", "Crossing", "KinematicPhase",
-    "Lanes", "Mechanism", "ObservedSeries", "PaddleJuggler", "PlacedSections", "Plan", "Points",
-    "ProcessNoise", "SLIPRunner", "Scheduled", "SectionList", "Settings", "TwoLeggedBar",
+    "Lanes", "Mechanism", "ObservedSeries", "PaddleJuggler", "PlacedSections", "Plan", "Plant",
+    "Points", "ProcessNoise", "SLIPRunner", "Scheduled", "SectionList", "Settings", "TwoLeggedBar",
     "VerticalHopper",
 }  # fmt: skip
 SLOW_TO_MAKE = {"ModelFit", "StoredExperiments"}
@@ -50,7 +50,7 @@ def test_all_public_names_are_called(outcome):
             continue
         if name.removesuffix(".__call__") not in outcome["calls"]:
             missing.append(name)
-    assert not missing
+    assert not missing, missing
 
 
 @pytest.mark.slow

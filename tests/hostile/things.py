@@ -62,7 +62,51 @@ def plot(t):
     return hj.plot.multipliers(np.array([0.5]))
 
 
+def population(t):
+    table = {"subject": list("abcdef"), "group": ["old", "new"] * 3, "strides": [50.0] * 6}
+    values = {"m": np.array([0.5, 0.6, 0.55, 0.7, 0.52, 0.63])}
+    return hj.recordings.Population(table, values, {"m": np.full(6, 0.01)})
+
+
+def maps(t):
+    values = np.random.default_rng(0).normal(size=(6, 5))
+    return hj.recordings.PopulationMaps(t.population.table, values, {"lag": np.arange(5.0)})
+
+
+class Turning:
+    """A plant that turns by the angle 2 pi t, and is pushed."""
+
+    def reset(self, seed):
+        self.state = np.array([0.0, 1.0])
+        return self.signals()
+
+    def step(self, u, duration):
+        t, x = self.state
+        self.state = np.array([t + duration, 1 + (x - 1 + u[0] * duration) * np.exp(-duration)])
+        return self.signals()
+
+    def signals(self):
+        t, x = self.state
+        return {"x": x * np.cos(2 * np.pi * t), "v": -x * np.sin(2 * np.pi * t)}
+
+    def get_state(self):
+        return self.state
+
+    def set_state(self, x):
+        self.state = np.asarray(x)
+
+
+def plant(t):
+    plant = Turning()
+    plant.inputs, plant.period, plant.dt = ("u",), 1.0, 0.25
+    return plant
+
+
 MAKE = {
+    "population": population,
+    "maps": maps,
+    "plant": plant,
+    "settled": lambda t: hj.plants.settle(t.plant, hj.ClockPhase(4), ("x", "v")),
     "system": lambda t: hj.models.HopfOscillator(),
     "cycle": lambda t: hj.find_limit_cycle(t.system),
     "cycles": lambda t: many(t.cycle, 2),
