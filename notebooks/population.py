@@ -60,30 +60,29 @@ for k in range(12):
 # towards the mean of its group (circle), and the means (diamonds).
 
 # %%
-people = hj.recordings.Population.from_fits(fits, table, ("modulus", "angle"))
+people = hj.recordings.Population.from_fits(fits, table)
 hj.plot.forest(people, "modulus")
-people.mean("modulus")
+people.mean("modulus").T
 
 # %%
 test = people.difference("modulus", "old", "young")
 print("true difference of the subjects:", np.mean(true[6:]) - np.mean(true[:6]))
-test
-
-# %%
-hj.convert.to_pandas(test).T
+test.T
 
 # %%
 hj.plot.paired(people, "modulus", "old", "young")
-print(test.methods)
+print(test.attrs["methods"])
 
 # %% [markdown]
 # ## The response to a push
 #
-# The map has the phase of the push and the time since then. All 924 divisions count, and
-# clusters that are larger than in 95 % of these are outlined.
+# The map has the phase of the push and the time since then. All 924 divisions into two groups count;
+# points are outlined where |t| is larger than the largest |t| of 95 % of these.
 
 # %%
-maps = hj.recordings.PopulationMaps.from_responses(responses, table, output="yM")
+values = np.stack([response.values[:, :, 0, 0] for response in responses])  # of yM
+axes = {"phase": responses[0].phase, "lag (cycles)": responses[0].lag}
+maps = hj.recordings.PopulationMaps(table, values, axes, unit="m/(N s)")
 difference = maps.difference("old", "young")
 hj.plot.subject_maps(difference)
 difference
@@ -93,7 +92,7 @@ difference
 
 # %%
 curves = hj.recordings.PopulationMaps(
-    table, maps.values[:, 0], {"lag (cycles)": maps.axes["lag"]}, unit=maps.unit
+    table, values[:, 0], {"lag (cycles)": axes["lag (cycles)"]}, unit=maps.unit
 )
 hj.plot.subject_maps(curves.mean("young"))
 print(difference.methods)

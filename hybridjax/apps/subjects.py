@@ -3,9 +3,9 @@ all."""
 
 import concurrent.futures
 import contextlib
-import csv
 import dataclasses
 import functools
+import itertools
 import json
 import multiprocessing
 import re
@@ -14,10 +14,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .. import __version__, plot
-from .._core import html
+from .._core.arguments import package
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, OptionalNames
 from .._core.pieces.description import digest_of
@@ -26,42 +24,40 @@ from .._core.precision import enable_x64
 from .._core.progress import counted, working
 from .._core.results import Result
 from .._core.writing import Format, results_folder
-from ..errors import DefinitionError, HybridJaxError
+from ..errors import ComputationError, DefinitionError, HybridJaxError
 from ..identify.series.fit import SeriesFit
 from ..io import load
-from ..recordings.identification import Identification
 from ..recordings.population.population import Population
-from ..recordings.population.tables import FACTORS, PopulationTable, as_columns
+from ..recordings.population.tables import factors_of, table_of
 from ..recordings.read import read_recording
-from ..recordings.recording import Recording
 from .identify import PAGE, figure_of, off_screen, page_of, report_folder, steps_of, write_results
 
 
 # Columns of the table of a study, and their names in the summaries.
 _COLUMNS = {"strides": "cycles", "period": "period", "period_error": "period_standard_error"}
+_FILES = ("subjects.csv", "population.csv", "population.html")
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Study:
     """Results of `identify_subjects`.
 
-    **Fields:** `table`: columns of the subjects that were identified, with `strides` and `period`
-    (s); `fits`, one for each row; `population`: their modulus (None for fewer than two rows);
-    `failures`: sentences by name of the report; `tables`: means, and differences of all pairs of
-    groups and conditions; `folder`.
+    **Fields:** `population` of the subjects that were identified; its table also has `report`,
+    `strides`, `period` and `period_error` (s). `fits`, one for each row; `failures`: sentences by
+    name of the report; `results`: data frame of means, and differences of all pairs of groups and
+    conditions; `folder`.
     """
 
-    table: dict[str, np.ndarray]
+    population: Population
     fits: tuple[SeriesFit, ...]
-    population: Population | None
     failures: dict[str, str]
-    tables: tuple[PopulationTable, ...]
+    results: Any
     folder: Path
 
     def __repr__(self) -> str:
         lines = [f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"]
         lines += [f"  {name} failed: {text}" for name, text in self.failures.items()]
-        return "\n".join([*lines, *map(repr, self.tables)])
+        return "\n".join([*lines, self.results.T.to_string(header=False)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +66,7 @@ class Job:
 
     files: tuple[Path, ...]
     folder: Path
-    identify: Callable[[Recording], Identification]
+    identify: Callable[..., Any]
     options: dict[str, Any]
     formats: tuple[Format, ...]
 
@@ -84,10 +80,11 @@ class Job:
             return ""
         enable_x64()
         result = self.identify(read_recording(*self.files, **self.options))
+        converged = result.fit.result == Result.OK
         with report_folder(self.folder, result.data.inputs, self.formats) as new:
             write_results(new, result, self.formats)
-            (new / mark.name).write_text(key)
-        return ""
+            (new / mark.name).write_text(key if converged else "")
+        return "" if converged else "the fit did not converge."
 
 
 def _cause(call: Callable[[], str]) -> str:
@@ -95,9 +92,8 @@ def _cause(call: Callable[[], str]) -> str:
     try:
         return call()
     except Exception as error:
-        return (
-            str(error) if isinstance(error, HybridJaxError) else f"{type(error).__name__}: {error}"
-        )
+        kind = "" if isinstance(error, HybridJaxError) else f"{type(error).__name__}: "
+        return f"{kind}{error}"
 
 
 def run(options: Any) -> int:
@@ -106,24 +102,28 @@ def run(options: Any) -> int:
     **Returns:** the exit status: 1 if a subject failed.
     """
     signals, identify = steps_of(options)
+    reading: Any = {"time": options.time, "signals": signals, "formats": options.formats}
     spawn = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(options.workers, mp_context=spawn) as pool:
-        study = identify_subjects(
-            options.table, options.out, identify, time=options.time, signals=signals,
-            formats=options.formats, client=pool if options.workers > 1 else None,
-        )  # fmt: skip
+        reading["client"] = pool if options.workers > 1 else None
+        study = identify_subjects(options.table, options.out, identify, **reading)
     print(study)
-    print(Path(options.out) / "population.html")
+    print(Path(options.out) / _FILES[-1])
     return 1 if study.failures else 0
 
 
 @checked
 @working("identify_subjects")
 def identify_subjects(
-    table: FilePath, folder: FilePath, identify: Callable, *, time: str = "time",
-    signals: OptionalNames = (), formats: tuple[Format, ...] = ("png",),
+    table: FilePath,
+    folder: FilePath,
+    identify: Callable,
+    *,
+    time: str = "time",
+    signals: OptionalNames = (),
+    formats: tuple[Format, ...] = ("png",),
     client: DaskClient | concurrent.futures.Executor | None = None,
-) -> Study:  # fmt: skip
+) -> Study:
     """Identify all subjects of a table, write a report for each, and one for all of them.
 
     Rows with the same subject, group and condition are trials of one recording. A subject that
@@ -147,106 +147,78 @@ def identify_subjects(
       work and see the same files. Default: this process.
 
     **Raises:** `DefinitionError` for a table without these columns or rows, a subject in two
-    groups, and a folder that cannot be written.
+    groups, a folder that cannot be written, and if pandas is not installed; `ComputationError` if
+    all subjects fail.
     """
-    texts = _rows(Path(table))
-    files = texts.pop("file")
-    labels = as_columns(texts, len(files))
-    keys = list(zip(*(labels[n] for n in ("subject", *FACTORS) if n in labels), strict=True))
-    jobs: dict[str, Callable[[], str]] = {}
-    for key in dict.fromkeys(keys):
-        name = re.sub(r"[^\w.+-]+", "_", "-".join(key))
-        if name in jobs:
+    rows, root, calls = _rows(Path(table)), Path(folder), {}
+    reading = {"time": time, "signals": tuple(signals) or None}
+    for name, trials in rows.groupby("report", sort=False):
+        if (trials[["subject", *factors_of(rows)]].nunique() > 1).any():
             raise DefinitionError(f"two subjects would have the report '{name}': rename one.")
-        trials = tuple(Path(table).parent / f for f, k in zip(files, keys, strict=True) if k == key)
-        reading = {"time": time, "signals": tuple(signals) or None}
-        job = Job(trials, Path(folder) / name, identify, reading, tuple(formats))
-        jobs[name] = functools.partial(_cause, job)
-    names, firsts = list(jobs), dict(zip(jobs, dict.fromkeys(keys), strict=True))
-    if client is not None:
-        jobs = {name: client.submit(job).result for name, job in jobs.items()}
-    causes = {name: _cause(jobs[name]) for name in counted(names, "subjects", len(names))}
+        files = tuple(Path(table).parent / file for file in trials["file"])
+        calls[name] = functools.partial(_cause, Job(files, root / name, identify, reading, formats))
+        if client is not None:
+            calls[name] = client.submit(calls[name]).result
+    causes = {name: _cause(calls[name]) for name in counted(list(calls), "subjects", len(calls))}
     failures = {name: text for name, text in causes.items() if text}
-    saved: dict[str, Any] = {
-        name: load(Path(folder) / name / "fit.npz") for name in names if name not in failures
-    }
-    failures |= {n: "the fit did not converge." for n, x in saved.items() if x.result != Result.OK}
-    done = [name for name in names if name not in failures]
-    fits, rows = tuple(saved[name] for name in done), [keys.index(firsts[n]) for n in done]
-    summaries = [json.loads((Path(folder) / n / "summary.json").read_text()) for n in done]
-    columns = {n: x[rows] for n, x in labels.items() if n != "trial"}
-    columns |= {n: np.array([float(s[k]) for s in summaries]) for n, k in _COLUMNS.items()}
-    population = Population.from_fits(fits, columns) if len(fits) > 1 else None
-    tables = _tables(population) if population else ()
-    study = Study(columns, fits, population, failures, tables, Path(folder))
-    _write(study, done)
+    frame = rows[~rows["report"].isin(failures)].drop_duplicates("report", ignore_index=True)
+    if not len(frame):
+        raise ComputationError(
+            f"all subjects failed: {'; '.join(map(': '.join, failures.items()))}"
+        )
+    fits: Any = tuple(load(root / name / "fit.npz") for name in frame["report"])
+    texts = [(root / name / "summary.json").read_text() for name in frame["report"]]
+    for name, key in _COLUMNS.items():
+        frame[name] = [float(json.loads(text)[key]) for text in texts]
+    population = Population.from_fits(fits, frame.drop(columns=["file", "trial"], errors="ignore"))
+    parts = [package("pandas").DataFrame()]
+    with contextlib.suppress(DefinitionError):  # for too few subjects
+        parts.append(population.mean("modulus"))
+        for factor in factors_of(frame):
+            pairs = itertools.combinations(frame[factor].unique()[::-1], 2)
+            parts += [population.difference("modulus", a, b) for a, b in pairs]
+    results = package("pandas").concat(parts, ignore_index=True)
+    study = Study(population, fits, failures, results, root)
+    _write(study, dict.fromkeys(part.attrs["methods"] for part in parts[1:]))
     return study
 
 
-def _rows(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of the table; those with numbers in all rows as numbers."""
+def _rows(path: Path) -> Any:
+    """Return the table with the names of reports; columns with numbers in all rows as numbers."""
+    text = dict.fromkeys(("file", "subject", "group", "condition"), str)
+    how = {"dtype": text, "keep_default_na": False, "skipinitialspace": True, "index_col": False}
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = package("pandas").read_csv(path, encoding="utf-8-sig", **how)
+    except (OSError, ValueError) as error:
         raise DefinitionError(f"cannot read the table '{path}': {error}.") from None
-    if not rows or not all(row.get("file") and row.get("subject") for row in rows):
+    if not all(name in rows and len(rows) and rows[name].all() for name in ("file", "subject")):
         raise DefinitionError(
             f"the table '{path}' needs 'file' and 'subject' in each row, separated by commas."
         )
-    columns = {n: np.array([row[n] or "" for row in rows]) for n in rows[0] if n}
-    for name in columns.keys() - {"file", "subject", *FACTORS}:
-        with contextlib.suppress(ValueError):
-            columns[name] = columns[name].astype(float)
-    return columns
+    rows = table_of(rows, len(rows))
+    names = rows[["subject", *factors_of(rows)]].agg("-".join, axis=1)
+    rows.insert(0, "report", [re.sub(r"[^\w.+-]+", "_", name) for name in names])
+    return rows
 
 
-def _pairs(population: Population) -> list[tuple[str, str]]:
-    labels = (list(dict.fromkeys(population.table.get(factor, ()))) for factor in FACTORS)
-    return [(b, a) for x in labels for i, a in enumerate(x) for b in x[i + 1 :]]
-
-
-def _tables(population: Population) -> tuple[PopulationTable, ...]:
-    """Return the means, and differences of all pairs; none for too few subjects."""
-    tables = []
-    with contextlib.suppress(DefinitionError):
-        tables.append(population.mean("modulus"))
-        tables += [population.difference("modulus", a, b) for a, b in _pairs(population)]
-    return tuple(tables)
-
-
-def _write(study: Study, names: list[str]) -> None:
+def _write(study: Study, methods: dict[str, None]) -> None:
     """Write the tables, and the report for all."""
-    reports = {"report": np.array(names)} | study.table
-    if study.population is not None:
-        reports |= study.population.values
-        reports["modulus_error"] = study.population.errors["modulus"]
-    columns = study.tables[0].columns if study.tables else ()
-    results = {n: np.concatenate([t[n] for t in study.tables]) for n in columns}
-    links = "".join(f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>' for n in names)
+    population, figures = study.population, []
+    with off_screen(), contextlib.suppress(DefinitionError):  # for too few subjects
+        drawn = plot.forest(population, "modulus")
+        figures.append(figure_of(drawn, "Modulus of the leading multiplier"))
+    links = (f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>' for n in population.table["report"])
     parts = [
         *(f'<p class="warn">{escape(f"{n} failed: {x}")}</p>' for n, x in study.failures.items()),
-        f"<ul>{links}</ul>",
-        *(html.text(repr(table)) for table in study.tables),
-        *_figures(study),
-        *(f"<p>{escape(x)}</p>" for x in dict.fromkeys(t.methods for t in study.tables)),
+        f"<ul>{''.join(links)}</ul>",
+        study.results.T.to_html(header=False, float_format="{:.4g}".format, na_rep=""),
+        *figures,
+        *(f"<p>{escape(x)}</p>" for x in methods),
     ]
-    files = ["subjects.csv", "population.csv", "population.html"]
-    with results_folder(study.folder, "population", files) as new:
-        PopulationTable(reports).write(new / files[0])
-        PopulationTable(results).write(new / files[1])
-        page = page_of(f"{len(names)} reports", parts)
-        (new / files[2]).write_text(page, encoding="utf-8")
-
-
-def _figures(study: Study) -> list[str]:
-    """Return figures as HTML; those that need more subjects are left out."""
-    figures: list[str] = []
-    with off_screen(), contextlib.suppress(DefinitionError):
-        if study.population is not None:
-            drawn = plot.forest(study.population, "modulus")
-            figures.append(figure_of(drawn, "Modulus of the leading multiplier"))
-            for a, b in _pairs(study.population):
-                drawn = plot.paired(study.population, "modulus", a, b)
-                figures.append(figure_of(drawn, f"Modulus, {a} and {b}"))
-    return figures
+    errors = {f"{name}_error": error for name, error in population.errors.items()}
+    with results_folder(study.folder, "population", _FILES) as new:
+        subjects = population.table.assign(**population.values, **errors)
+        subjects.to_csv(new / _FILES[0], index=False)
+        study.results.to_csv(new / _FILES[1], index=False)
+        page = page_of(f"{len(study.fits)} reports", parts)
+        (new / _FILES[2]).write_text(page, encoding="utf-8")

@@ -12,15 +12,11 @@ from ..linear.htf import HTF
 from ..orbits.continuation import Branch
 from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
-from ..recordings.population.tables import PopulationTable
 from ..recordings.recording import Recording
 from .xarray_datasets import to_xarray
 
 
-Tabular = (
-    Recording | SectionData | HTF | LimitCycles | Branch | MultiplierEstimate | RationalFit
-    | PopulationTable
-)  # fmt: skip
+Tabular = Recording | SectionData | HTF | LimitCycles | Branch | MultiplierEstimate | RationalFit
 
 
 @checked
@@ -33,13 +29,10 @@ def to_pandas(thing: Tabular) -> Any:
     - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
     - Fits: a row for each multiplier, with its standard error. A `RationalFit` gives a row for each
       output and pole.
-    - Results of `Population`: their columns.
 
     **Raises:** `DefinitionError` where pandas, or xarray, is not installed.
     """
     frame = package("pandas").DataFrame
-    if isinstance(thing, PopulationTable):
-        return frame(thing.columns)
     if isinstance(thing, MultiplierEstimate):
         values, errors = thing.multipliers, thing.standard_errors
         return frame({"multiplier": values, "modulus": np.abs(values), "standard_error": errors})

@@ -1,7 +1,6 @@
 """Figures of populations: forest plots, paired dots, and curves or maps of subjects."""
 
 import numpy as np
-from scipy import stats
 
 from .._core.boundary.checked import checked
 from .._core.signal import with_unit
@@ -15,31 +14,25 @@ from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, panels
 def forest(population: Population, quantity: str, *, ax: AxesLike | None = None) -> Plot:
     """Draw the estimate of each subject with its 95 % interval, its prediction (open circle), and
     the mean of each group and condition (diamond: its 95 % interval)."""
-    means = population.mean(quantity)
-    subjects = population.predictions(quantity)
-    names, at, count = [], 0, len(subjects["cell"]) + 2 * len(means["low"])
-    numbers = zip(*(means[n] for n in ("effect", "low", "estimate", "high")), strict=True)
-    with panels(ax, height=0.7 + 0.15 * count) as axes:
-        panel = axes[0, 0]
-        for k, (effect, low, mean, high) in enumerate(numbers):
-            color = CYCLE[k % len(CYCLE)]
-            cell = effect.removeprefix("mean, ") if effect != "mean" else "all"
-            of = np.flatnonzero(subjects["cell"] == cell)
-            rows, bottom = at - np.arange(len(of)), at - len(of)
-            reach = stats.norm.ppf(0.975) * subjects["standard_error"][of]
-            panel.errorbar(subjects["estimate"][of], rows, xerr=reach, fmt="s", ms=3, lw=0.8,
-                           color=color, zorder=3)  # fmt: skip
-            panel.plot(subjects["prediction"][of], rows, "o", ms=4, mfc="none", mec=COLORS["gray"],
-                       mew=0.8, zorder=4)  # fmt: skip
+    means, subjects = population.mean(quantity), population.predictions(quantity)
+    names, at = [], 0
+    with panels(ax, height=0.7 + 0.15 * (len(subjects) + 2 * len(means))) as axes:
+        panel, open_circle = axes[0, 0], {"ms": 4, "mfc": "none", "mew": 0.8}
+        cells = zip(means.itertuples(), subjects.groupby("cell", sort=False), strict=True)
+        for k, (mean, (_, part)) in enumerate(cells):
+            rows, bottom = at - np.arange(len(part)), at - len(part)
+            line = {"color": CYCLE[k % len(CYCLE)], "lw": 0.8}
+            reach = 1.96 * part["standard_error"]
+            panel.errorbar(part["estimate"], rows, xerr=reach, fmt="s", ms=3, **line)
+            panel.plot(part["prediction"], rows, "o", color=COLORS["gray"], **open_circle)
             diamond = bottom + 0.35 * np.array([0, 1, 0, -1])
-            panel.fill([low, mean, high, mean], diamond, color=color, lw=0)
-            panel.plot([mean, mean], [bottom, at + 0.5], color=color, lw=0.5, ls=":")
-            names += [*zip(rows, subjects["subject"][of], strict=True), (bottom, effect)]
+            panel.fill([mean.low, mean.estimate, mean.high, mean.estimate], diamond, **line)
+            panel.plot([mean.estimate] * 2, [bottom, at + 0.5], ls=":", **line)
+            names += [*zip(rows, part["subject"], strict=True), (bottom, mean.effect)]
             at = bottom - 2
         panel.set_yticks(*zip(*names, strict=True))
         panel.tick_params(axis="y", length=0)
-        panel.set_ylim(at + 1, 1)
-        panel.set_xlabel(with_unit(quantity, population.units[quantity]))
+        panel.set(ylim=(at + 1, 1), xlabel=with_unit(quantity, population.units[quantity]))
     return Plot(axes)
 
 
@@ -52,27 +45,24 @@ def paired(
 
     **Raises:** `DefinitionError` as `Population.difference`.
     """
-    test, means = population.difference(quantity, a, b), population.mean(quantity)
-    rows = population.predictions(quantity)
+    (test,) = population.difference(quantity, a, b).itertuples()
+    subjects, means = population.predictions(quantity), population.mean(quantity)
     with panels(ax) as axes:
         panel = axes[0, 0]
-        side = {c: k for k, x in enumerate((a, b)) for c in rows["cell"] if x in c.split(", ")}
-        place = np.array([side.get(cell, np.nan) for cell in rows["cell"]])
-        panel.errorbar(place, rows["estimate"], rows["standard_error"], fmt="o", ms=3, lw=0.5,
-                       color=CYCLE[0], zorder=3)  # fmt: skip
-        for subject in dict.fromkeys(rows["subject"]):
-            of = rows["subject"] == subject
-            panel.plot(place[of], rows["estimate"][of], lw=0.5, color=COLORS["gray"], zorder=1)
-        for cell, k in side.items():
-            i = list(means["effect"]).index(f"mean, {cell}")
-            low, value, high = (means[n][i] for n in ("low", "estimate", "high"))
-            panel.errorbar(1.3 * k - 0.15, value, [[value - low], [high - value]], fmt="D", ms=5,
-                           color="black", capsize=2)  # fmt: skip
+        cells = zip(means.itertuples(), subjects.groupby("cell", sort=False), strict=True)
+        for mean, (cell, part) in cells:
+            side = [k for k, label in enumerate((a, b)) if label in cell.split(", ")]
+            for k in side:
+                subjects.loc[part.index, "side"] = k
+                error = part["standard_error"]
+                panel.errorbar([k] * len(part), part["estimate"], error, fmt="o", ms=3, lw=0.5)
+                reach = [[mean.estimate - mean.low], [mean.high - mean.estimate]]
+                panel.errorbar(1.3 * k - 0.15, mean.estimate, reach, fmt="D", ms=5, color="black")
+        for _, part in subjects.groupby("subject"):
+            panel.plot(part["side"], part["estimate"], lw=0.5, color=COLORS["gray"], zorder=1)
         panel.set_xticks([0, 1], [a, b])
-        panel.set_xlim(-0.4, 1.4)
-        panel.set_ylabel(with_unit(quantity, population.units[quantity]))
-        value, low, high = (test[n][0] for n in ("estimate", "low", "high"))
-        panel.set_title(f"{a} - {b}: {value:.3g} [{low:.3g}, {high:.3g}]")
+        panel.set(xlim=(-0.4, 1.4), ylabel=with_unit(quantity, population.units[quantity]))
+        panel.set_title(f"{a} - {b}: {test.estimate:.3g} [{test.low:.3g}, {test.high:.3g}]")
     return Plot(axes)
 
 
@@ -84,21 +74,22 @@ def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
 
     **Raises:** `DefinitionError` for maps with more than two axes.
     """
-    is_complex, is_mean = np.iscomplexobj(result.values), np.isfinite(result.reach).all()
+    is_complex = np.iscomplexobj(result.values)
     size = np.abs if is_complex else np.asarray
-    values, inside = size(result.values), result.significant
-    label = with_unit("response" if is_mean else "difference", result.unit)
+    values, inside, label = (
+        size(result.values),
+        result.significant,
+        with_unit("response", result.unit),
+    )
     if len(result.axes) > 2:
         raise DefinitionError("a figure has at most two axes, but the maps have more.")
     with panels(ax, width=COLUMN if len(result.axes) == 1 else 0.6 * PAGE) as axes:
         panel, (name, *other) = axes[0, 0], result.axes
         if not other:
-            x = result.axes[name]
-            if len(result.each):
-                panel.plot(x, size(result.each).T, color=COLORS["gray"], lw=0.4, alpha=0.7)
+            x, low, high = result.axes[name], values - result.reach, values + result.reach
+            panel.plot(x, size(result.each).T, color=COLORS["gray"], lw=0.4, alpha=0.7)
             panel.plot(x, values, color=CYCLE[0], lw=1.5, zorder=3)
-            panel.fill_between(x, values - result.reach, values + result.reach, color=CYCLE[0],
-                               alpha=0.3, lw=0, zorder=2)  # fmt: skip
+            panel.fill_between(x, low, high, color=CYCLE[0], alpha=0.3, lw=0, zorder=2)
             foot = np.where(inside, panel.get_ylim()[0], np.nan)
             panel.plot(x, foot, color=CYCLE[1], lw=4, solid_capstyle="butt", zorder=4)
             panel.axhline(0, color="black", lw=0.4)
@@ -106,11 +97,11 @@ def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
         else:
             y, x = result.axes.values()
             top = np.abs(values).max()
-            image = panel.pcolormesh(
-                x, y, values, cmap="viridis" if is_complex else "RdBu_r",
-                vmin=0 if is_complex else -top, vmax=top, shading="nearest", rasterized=True,
-            )  # fmt: skip
-            panel.figure.colorbar(image, ax=panel, label=label)
+            look = (
+                {"cmap": "viridis", "vmin": 0} if is_complex else {"cmap": "RdBu_r", "vmin": -top}
+            )
+            look |= {"vmax": top, "shading": "nearest", "rasterized": True}
+            panel.figure.colorbar(panel.pcolormesh(x, y, values, **look), ax=panel, label=label)
             if inside.any() and not inside.all():
                 panel.contour(x, y, inside, [0.5], colors="black", linewidths=1.2)
             panel.set(xlabel=other[0], ylabel=name)

@@ -247,8 +247,6 @@ def subjects(t):
     two = dict(a="old", b="new")
     yield population.difference, dict(quantity="m") | two
     yield population.power, dict(quantity="m", difference=0.1, subjects=(4,), draws=2)
-    about = dict(responses=[t.found.responses] * 2, table={"subject": ["a", "b"]})
-    yield maps.from_responses, about
     yield maps.mean, dict(label="old")
     yield maps.difference, two
     yield hj.plot.forest, dict(population=population, quantity="m")

@@ -1,28 +1,26 @@
 """`Population`: estimates of several subjects, with their errors, and what they say together."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from scipy import stats
 
-from ..._core.arguments import Numbers
+from ..._core.arguments import Numbers, package
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Count, OptionalNames, Positive, Probability, Seed
+from ..._core.boundary.kinds import Count, OptionalNames, Positive, Seed
 from ..._core.boundary.values import Reals
 from ..._core.signal import unit_of
 from ...errors import DefinitionError
 from ...identify.multiplier_estimate import MultiplierEstimate
 from ...scale.draws import monte_carlo
-from .reml import Cells, meta, mixed, moderated, spread_interval
-from .tables import Columns, PopulationTable, as_columns, cells_of, require, rows_with, table_of
+from .reml import Mixed, meta, mixed, moderated, spread_interval
+from .tables import Columns, cells_of, factors_of, require, rows_with, signed, table_of
 
 
-Quantity = Literal["modulus", "angle", "coefficients"]
-Numeric = Mapping[str, Annotated[Numbers, Reals("rows")]]
-
-
-_NONE = (np.nan, np.nan, np.nan)
+Numeric = Mapping[str, Annotated[Numbers, Reals("rows", missing=True, infinite=True)]]
+_SLOPE = "slope of "
+Freedom = Annotated[Numbers, Reals("rows", infinite=True, sign="positive")]
 
 
 @checked
@@ -32,82 +30,94 @@ class Population:
     The model is $\theta_s = \mu + b_s + e_s$: $e_s$ has the standard error of the estimate, and
     $b_s$ an unknown variance between subjects, estimated by restricted maximum likelihood.
 
+    Results are data frames of pandas with 95 % intervals (`low`, `high`); their
+    `attrs["methods"]` are sentences for the methods section of a paper.
+
     **Arguments:**
 
     - `table`: columns by name, or a data frame, with a row for each estimate. `subject` is
       required. `condition` (each subject may have several) and `group` (each subject has one) are
       factors; other columns with numbers can be covariates. Rows with the same subject, group and
-      condition are trials.
-    - `values`, `errors`: by name of a quantity, an estimate and its standard error in each row.
+      condition are trials, averaged by their precision.
+    - `values`, `errors`: by name of a quantity, an estimate and its standard error in each row; NaN
+      where it is missing.
     - `units`: by name of a quantity. Default: none.
     - `freedom`: degrees of freedom of the errors, in each row. Where they are few, errors are
       moderated by those of the other subjects (Smyth 2004), with the trend of the column `strides`
       if there is one. Default: infinite.
 
     **Raises:** `DefinitionError` for a table without subjects, columns of different lengths, a
-    subject in two groups, or errors that are not positive.
+    subject in two groups, errors that are not positive, and if pandas is not installed.
     """
 
     def __init__(
-        self, table: Columns, values: Numeric, errors: Numeric,
+        self,
+        table: Columns,
+        values: Numeric,
+        errors: Numeric,
         units: Mapping[str, str] | None = None,
-        freedom: Annotated[Numbers, Reals("rows", infinite=True, sign="positive")] | None = None,
-    ):  # fmt: skip
+        freedom: Freedom | None = None,
+    ):
         if not values or set(values) != set(errors):
             raise DefinitionError("`values` and `errors` must hold the same quantities.")
-        rows = len(np.asarray(next(iter(values.values()))))
-        self.table = as_columns(table, rows)
-        self.values, self.errors = dict(values), dict(errors)
+        rows = len(next(iter(values.values())))
+        self.table = table_of(table, rows)
+        self.values = {name: np.asarray(x, float) for name, x in values.items()}
+        self.errors = {name: np.asarray(x, float) for name, x in errors.items()}
         for name, error in self.errors.items():
-            if not len(self.values[name]) == len(error) == rows:
+            if not len(values[name]) == len(error) == rows:
                 raise DefinitionError(f"`values` and `errors` of '{name}' must have {rows} rows.")
-            if np.min(error) <= 0:
-                subject = self.table["subject"][np.argmin(error)]
+            wrong = np.isfinite(values[name]) & ~((0 < error) & (error < np.inf))
+            for subject, number in zip(self.table["subject"][wrong], error[wrong], strict=True):
                 raise DefinitionError(
-                    f"the standard error of '{name}' of subject '{subject}' must be positive."
+                    f"'{name}' of subject '{subject}' has the standard error {number:.3g}, not a "
+                    "positive number: give one, or NaN in place of the value."
                 )
         self.units = dict.fromkeys(values, "") | dict(units or {})
         self.freedom = np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)
 
     @classmethod
-    def from_fits(
-        cls, fits: Sequence[MultiplierEstimate], table: Columns,
-        quantities: Sequence[Quantity] = ("modulus",),
-    ) -> "Population":  # fmt: skip
+    def from_fits(cls, fits: Sequence[MultiplierEstimate], table: Columns) -> "Population":
         """Return the population of some fits, with a row of the table for each.
 
-        **Arguments:** `quantities`: "modulus" and "angle" (rad, upper half plane) of the leading
-        multiplier, "coefficients" c1, c2, ... of the characteristic polynomial. Default: the
-        modulus.
+        Quantities are `modulus` and `angle` (rad; missing if real) of the leading multiplier, and
+        the coefficients `c1`, `c2`, ... of the characteristic polynomial (missing in fits of lower
+        order).
 
-        **Raises:** `DefinitionError` for a fit without covariance, outputs or units that differ,
-        coefficients of different orders, and the angle of a real multiplier.
+        **Raises:** `DefinitionError` for a fit without covariance, and outputs or units that
+        differ.
         """
-        columns = as_columns(table, len(fits))
-        subjects = columns["subject"]
-        parts = [_of(fit, s, quantities) for fit, s in zip(fits, subjects, strict=True)]
-        kinds = [(_signals(x), f"of order {len(x.coefficients)}") for x in fits]
-        for subject, kind, part in zip(subjects, kinds, parts, strict=True):
-            if kind[0] != kinds[0][0] or part.keys() != parts[0].keys():
+        frame, names = table_of(table, len(fits)), [_signals(fit) for fit in fits]
+        most = max((len(fit.coefficients) for fit in fits), default=0)
+        numbers = np.full((2, 2 + most, len(fits)), np.nan)
+        for row, (subject, fit) in enumerate(zip(frame["subject"], fits, strict=True)):
+            if names[row] != names[0]:
                 raise DefinitionError(
-                    f"the fit of subject '{subject}' is {' '.join(kind)}, but that of "
-                    f"'{subjects[0]}' is {' '.join(kinds[0])}: use the same outputs, units and "
-                    "`order`, or take the modulus."
+                    f"the fit of subject '{subject}' is of {names[row]}, but that of "
+                    f"'{frame['subject'][0]}' of {names[0]}: use the same outputs and units."
                 )
-        values, errors = ({n: np.array([p[n][i] for p in parts]) for n in parts[0]} for i in (0, 1))
-        freedom = [fit.covariance_freedom for fit in fits]
-        units = {"angle": "rad"} if "angle" in values else {}
-        return cls(columns, values, errors, units, freedom)
+            if not np.isfinite(fit.covariance).all():
+                raise DefinitionError(
+                    f"the fit of subject '{subject}' has no covariance: record more strides, or "
+                    "leave the subject out."
+                )
+            z, covariance = complex(fit.multipliers[0]), fit.multiplier_covariances[0]
+            radial = np.array([z.real, z.imag]) / abs(z)
+            angular = np.array([-z.imag, z.real]) / abs(z) ** 2
+            squares = [w @ covariance @ w for w in (radial, angular)]
+            errors = np.sqrt([*squares, *np.diag(fit.covariance)])
+            angle = abs(np.angle(z)) if z.imag else np.nan
+            numbers[:, : len(errors), row] = [abs(z), angle, *fit.coefficients], errors
+        kinds = ["modulus", "angle", *(f"c{k}" for k in range(1, most + 1))]
+        values, errors = (dict(zip(kinds, x, strict=True)) for x in numbers)
+        return cls(frame, values, errors, {"angle": "rad"}, [x.covariance_freedom for x in fits])
 
     def __repr__(self) -> str:
-        subjects, cells = self.table["subject"], cells_of(self.table)
-        count = {c: len(set(subjects[cells == c])) for c in dict.fromkeys(cells)}
-        listed = "; ".join(f"{c}: {n} subjects" for c, n in count.items())
-        return f"Population({', '.join(self.values)}; {listed}; {len(subjects)} estimates)"
+        count = self.table.assign(cell=cells_of(self.table)).groupby("cell", sort=False)["subject"]
+        listed = "; ".join(f"{c}: {n} subjects" for c, n in count.nunique().items())
+        return f"Population({', '.join(self.values)}; {listed}; {len(self.table)} estimates)"
 
-    def mean(
-        self, quantity: str, *, covariates: OptionalNames = (), level: Probability = 0.95
-    ) -> PopulationTable:
+    def mean(self, quantity: str, *, covariates: OptionalNames = ()) -> Any:
         """Return the mean over subjects, and the spread between them, in each group and condition.
 
         Intervals of the mean, and of the slopes of covariates, are those of Hartung and Knapp
@@ -118,27 +128,22 @@ class Population:
         **Raises:** `DefinitionError` for an unknown quantity or covariate, and for too few
         subjects.
         """
-        rows = []
-        for cell, (_, y, v, extra) in self._cells(quantity, 2 + len(covariates), covariates):
-            x = np.column_stack([np.ones(len(y)), extra - extra.mean(axis=0)])
-            fit = meta(y, v, x)
-            errors = np.sqrt(np.diag(fit.covariance))
-            spread = (np.sqrt(fit.variance), *spread_interval(y, v, x, level))
-            for k, effect in enumerate(["mean", *(f"slope of {c}" for c in covariates)]):
-                name = effect if cell == "all" else f"{effect}, {cell}"
-                estimate = fit.coefficients[k], errors[k], fit.freedom
-                row = self._row(quantity, name, len(y), estimate, level, _NONE if k else spread)
-                rows.append(row if k else row | {"p": np.nan})
-        return table_of(
-            rows,
-            f"Means of {quantity} and {100 * level:g} % intervals: random-effects model with the "
-            "standard error of each subject, by restricted maximum likelihood (Hartung and Knapp).",
+        parts = []
+        for cell, data in self._cells(quantity, 2 + len(covariates), covariates):
+            y, v, slopes = data["y"].to_numpy(), data["v"].to_numpy(), data.filter(like=_SLOPE)
+            x = np.column_stack([np.ones(len(y)), slopes - slopes.mean()])
+            fit, weights = meta(y, v, x), np.eye(x.shape[1])
+            spread = np.sqrt(fit.between[0, 0]), *spread_interval(y, v, x)
+            names = [n if cell == "all" else f"{n}, {cell}" for n in ("mean", *slopes)]
+            parts.append(self._effects(quantity, names, len(y), fit, weights, spread))
+            parts[-1].loc[0, "p"] = np.nan
+        return _result(
+            parts,
+            f"Means of {quantity} and 95 % intervals: random-effects model with the standard error "
+            "of each subject, by restricted maximum likelihood (Hartung and Knapp).",
         )
 
-    def difference(
-        self, quantity: str, a: str, b: str, *, covariates: OptionalNames = (),
-        level: Probability = 0.95,
-    ) -> PopulationTable:  # fmt: skip
+    def difference(self, quantity: str, a: str, b: str, *, covariates: OptionalNames = ()) -> Any:
         """Return the mean difference a - b of two conditions or two groups, and test it.
 
         Differences are paired in subjects that have both; subjects with one of them count, too.
@@ -150,28 +155,25 @@ class Population:
 
         **Raises:** `DefinitionError` as `mean`, and for labels that the table does not have.
         """
-        grid, names, is_a = self._grid(quantity, a, b, covariates)
-        fit = mixed(grid)
-        weights = np.eye(len(names) + len(covariates))[len(names) - 1 :]
-        weights[0] = 0.0
-        weights[0, : len(names)] = np.where(is_a, 1 / is_a.sum(), -1 / (~is_a).sum())
-        paired, rows = np.flatnonzero(grid.present.all(axis=1)), []
-        for k, effect in enumerate([f"{a} - {b}", *(f"slope of {c}" for c in covariates)]):
-            w, spread = weights[k], _NONE
-            if k == 0 and len(names) == 2 and len(paired) > 2:
-                d, v = grid.y[paired] @ w[:2], grid.v[paired].sum(axis=1)
-                bounds = spread_interval(d, v, np.ones((len(d), 1)), level)
-                spread = np.sqrt(w[:2] @ fit.between @ w[:2]), *bounds
-            estimate = w @ fit.coefficients, np.sqrt(w @ fit.covariance @ w), fit.freedom(w)
-            rows.append(self._row(quantity, effect, len(grid.y), estimate, level, spread))
-        return table_of(
-            rows,
-            f"Difference of {quantity} ({a} - {b}; {len(grid.y)} subjects, {len(paired)} with "
-            f"all conditions) and {100 * level:g} % interval: linear mixed model with the variance "
-            "of each estimate, by restricted maximum likelihood (Kenward and Roger).",
+        data, cell, w, pairs = self._contrast(quantity, a, b, covariates)
+        subject, slopes = data["subject"].factorize()[0], data.filter(like=_SLOPE)
+        x = np.column_stack([np.eye(len(w))[cell], slopes - slopes.mean()])
+        fit = mixed(data["y"].to_numpy(), data["v"].to_numpy(), x, subject, cell)
+        weights = np.eye(x.shape[1])[len(w) - 1 :]
+        weights[0, : len(w)] = w
+        spread, (y, v) = (np.nan,) * 3, pairs.to_numpy().T
+        if len(y) > 2:
+            spread = np.sqrt(w @ fit.between @ w), *spread_interval(y, v, np.ones((len(y), 1)))
+        n = subject.max() + 1
+        rows = self._effects(quantity, [f"{a} - {b}", *slopes], n, fit, weights, spread)
+        return _result(
+            [rows],
+            f"Difference of {quantity} ({a} - {b}; {n} subjects, {len(y)} with all conditions) and "
+            "95 % interval: linear mixed model with the variance of each estimate, by restricted "
+            "maximum likelihood (Kenward and Roger).",
         )
 
-    def predictions(self, quantity: str, *, level: Probability = 0.95) -> PopulationTable:
+    def predictions(self, quantity: str) -> Any:
         """Return the best linear unbiased prediction of each subject: its estimate, shrunken
         towards the mean of its group and condition the more, the larger its error.
 
@@ -180,201 +182,194 @@ class Population:
 
         **Raises:** `DefinitionError` as `mean`; three subjects are needed.
         """
-        rows = []
-        for cell, (subject, y, v, _) in self._cells(quantity, 3):
+        parts = []
+        for _, data in self._cells(quantity, 3):
+            y, v = data["y"].to_numpy(), data["v"].to_numpy()
             fit = meta(y, v, np.ones((len(y), 1)))
-            share = fit.variance / (fit.variance + v)
-            value = fit.coefficients[0] + share * (y - fit.coefficients[0])
+            mean, between = fit.coefficients[0], fit.between[0, 0]
+            share = between / (between + v)
             square = share * v + (1 - share) ** 2 * fit.covariance[0, 0]
-            square += 2 * v**2 / (v + fit.variance) ** 3 * fit.variance_error**2
-            reach = stats.t.ppf((1 + level) / 2, fit.freedom) * np.sqrt(square)
-            columns = {
-                "subject": subject, "cell": [cell] * len(y), "estimate": y,
-                "standard_error": np.sqrt(v), "prediction": value,
-                "prediction_error": np.sqrt(square), "low": value - reach, "high": value + reach,
-            }  # fmt: skip
-            first = {"quantity": quantity, "unit": self.units[quantity]}
-            rows += [first | dict(zip(columns, row, strict=True))
-                     for row in zip(*columns.values(), strict=True)]  # fmt: skip
+            square += 2 * v**2 / (v + between) ** 3 * fit.uncertainty[0, 0]
+            value, error = mean + share * (y - mean), np.sqrt(square)
+            reach = stats.t.ppf(0.975, fit.most) * error
+            part = data[["subject", "cell"]].assign(quantity=quantity, unit=self.units[quantity])
+            part = part.assign(estimate=y, standard_error=np.sqrt(v), prediction=value)
+            parts.append(part.assign(prediction_error=error, low=value - reach, high=value + reach))
         text = f"Single subjects: best linear unbiased predictions of {quantity} (Prasad and Rao)."
-        return table_of(rows, text)
+        return _result(parts, text)
 
     def power(
-        self, quantity: str, difference: float, subjects: Sequence[Count] = (8, 12, 16, 24), *,
-        labels: Sequence[str] = (), draws: Count = 400, level: Probability = 0.05,
+        self,
+        quantity: str,
+        difference: float,
+        subjects: Sequence[Count] = (8, 12, 16, 24),
+        *,
+        labels: Sequence[str] = (),
+        draws: Count = 400,
         seed: Seed = 0,
-    ) -> PopulationTable:  # fmt: skip
-        """Return the power of tests of a difference, by simulation of populations like this pilot.
+    ) -> Any:
+        """Return the power of 5 % tests of a difference, by simulation of populations like this
+        pilot.
 
         Simulated subjects have the spread of the pilot, and standard errors drawn from its own.
         With `labels` of two conditions the test is that of paired differences; without labels, that
         of two groups of the pilot's spread, with `subjects` in each.
 
         **Arguments:** `difference`: true difference, in units of the quantity. `subjects`: their
-        numbers. `level`: that of the test. Default: 0.05.
+        numbers. `draws`: number of simulated populations.
 
         **Returns:** power at the pilot's spread, with a 95 % interval that contains the error of
         the simulation and the interval of the spread.
 
         **Raises:** `DefinitionError` as `difference`, and if xarray is not installed.
         """
-        more: Any = len(labels) not in (0, 2)
-        if labels:
-            grid, names, _ = self._grid(quantity, labels[0], labels[-1])
-            both = np.flatnonzero(grid.present.all(axis=1) & (len(names) == 2))
-            y, v = grid.y[both, 0] - grid.y[both, -1], grid.v[both].sum(axis=1)
+        if len(labels) == 2:
+            pilots = [self._contrast(quantity, *labels)[-1]]
         else:
-            ((_, (_, y, v, _)), *more) = self._cells(quantity, 3)
-        if len(y) < 3 or more:
+            pilots = [data[["y", "v"]] for _, data in self._cells(quantity, 3)]
+        y, v = pilots[0].to_numpy().T
+        if len(y) < 3 or len(pilots) > 1:
             raise DefinitionError("`labels` must be two conditions of three or more subjects.")
         ones, rows = np.ones((len(y), 1)), []
         low, high = spread_interval(y, v, ones)
-        spreads = [float(np.sqrt(meta(y, v, ones).variance)), high, low]
+        spread = np.sqrt(meta(y, v, ones).between[0, 0])
         for n in subjects:
-            tests = [_test(v, n, x, difference, bool(labels), level) for x in spreads]
+            tests = [_test(v, n, x, difference, bool(labels)) for x in (spread, high, low)]
             count, *bounds = (int(monte_carlo(f, draws, seed).value.sum()) for f in tests)
             least, most = (stats.binomtest(k, draws).proportion_ci() for k in bounds)
-            rows.append({
-                "subjects": n, "power": count / draws, "power_low": least.low,
-                "power_high": most.high, "spread": spreads[0], "draws": draws,
-            })  # fmt: skip
-        design = "paired differences" if labels else "two groups"
-        return table_of(
-            rows,
-            f"Power for a difference of {difference:g} in {quantity} ({design}): {draws} simulated "
-            f"populations with the spread and errors of a pilot of {len(y)} subjects.",
+            rows.append((n, count / draws, least.low, most.high, spread, draws))
+        columns = ("subjects", "power", "power_low", "power_high", "spread", "draws")
+        return _result(
+            [package("pandas").DataFrame(rows, columns=columns)],
+            f"Power for a difference of {difference:g} in {quantity} "
+            f"({'paired differences' if labels else 'two groups'}): {draws} simulated populations "
+            f"with the spread and errors of a pilot of {len(y)} subjects.",
         )
 
     def allocation(
-        self, quantity: str, subject_cost: Positive = 1.0, stride_cost: Positive = 0.01
-    ) -> float:
-        r"""Return the number of strides per subject that gives the mean its smallest variance for a
-        given cost, from the table's column `strides`.
+        self,
+        quantity: str,
+        subject_cost: Positive = 1.0,
+        trial_cost: Positive = 0.1,
+        stride_cost: Positive = 0.01,
+    ) -> Any:
+        r"""Return the numbers of trials per subject and of strides per trial that give the mean its
+        smallest variance for a given cost, from the table's column `strides`.
 
-        It is $\sigma_w / \sigma_b \sqrt{c_s / c}$ with the standard deviations of one stride and
-        between subjects and the costs of a subject and a stride (Cochran, *Sampling Techniques*,
-        1977, ch. 10); the variance of the mean of n subjects with m strides is $(\sigma_b^2 +
-        \sigma_w^2 / m) / n$.
+        The mean of n subjects with k trials of m strides has the variance $(\sigma_s^2 + \sigma_t^2
+        / k + \sigma^2 / k m) / n$ and costs $n (c_s + k c_t + k m c)$. The best numbers are $k^2 =
+        \sigma_t^2 c_s / \sigma_s^2 c_t$, rounded, and $m^2 = \sigma^2 (c_s + k c_t) / (k^2
+        \sigma_s^2 + k \sigma_t^2) c$ (Cochran, *Sampling Techniques*, 1977, ch. 10). If no subject
+        has several trials, k is 1, and the variance of trials is part of that of subjects.
 
-        **Arguments:** costs in the same unit. Default: 1 and 0.01.
+        **Arguments:** costs in the same unit. Default: 1, 0.1 and 0.01.
 
         **Raises:** `DefinitionError` without a column `strides`, and as `mean`.
         """
-        cells = [(y, v, np.ones((len(y), 1))) for _, (_, y, v, _) in self._cells(quantity, 3)]
-        between = np.mean([meta(*cell).variance for cell in cells])
-        within = np.mean(self._variance(quantity) * self._numbers("strides"))
-        return float(np.sqrt(subject_cost / stride_cost * within / max(between, 1e-300)))
+        cells = [data[["y", "v"]].to_numpy().T for _, data in self._cells(quantity, 3)]
+        between = np.mean([meta(y, v, np.ones((len(y), 1))).between for y, v in cells])
+        trials = self._trials(quantity).assign(strides=self._numbers("strides")).dropna()
+        by = trials.groupby(["subject", "cell"])
+        count = by["y"].count()
+        scatter = (count - 1) * (by["y"].var().fillna(0.0) - by["v"].mean())
+        trial = max(scatter.sum() / max((count - 1).sum(), 1), 0.0)
+        between = max(between - trial * np.mean(1 / count) * (trial > 0), 1e-300)
+        stride = np.mean(trials["v"] * trials["strides"])
+        k = max(round(np.sqrt(trial / between * subject_cost / trial_cost)), 1)
+        cost = (subject_cost + k * trial_cost) / stride_cost
+        row = {"quantity": quantity, "trials": k}
+        row |= {"strides": np.sqrt(stride * cost / (k**2 * between + k * trial))}
+        row |= {"subject_spread": np.sqrt(between), "trial_spread": np.sqrt(trial)}
+        row |= {"stride_spread": np.sqrt(stride)}
+        text = "Trials and strides: smallest variance of the mean for its cost (Cochran)."
+        return _result([package("pandas").DataFrame([row])], text)
 
     def _numbers(self, name: str) -> np.ndarray:
-        values = self.table.get(name, np.array(""))
+        values = np.asarray(self.table.get(name, ""))
         if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
             raise DefinitionError(f"`table` needs a column '{name}' with a number in each row.")
         return values.astype(float)
 
-    def _merged(self, quantity: str, covariates: Sequence[str], rows: np.ndarray):
-        """Return subject, cell, estimate, variance and covariates of each subject in each cell;
-        several trials are averaged by their precision."""
+    def _trials(self, quantity: str) -> Any:
+        """Return subject, factors, cell, estimate and moderated variance of each row."""
         if quantity not in self.values:
             listed = ", ".join(self.values)
             raise DefinitionError(f"there is no quantity '{quantity}'; quantities are {listed}.")
-        cells, subjects = cells_of(self.table), self.table["subject"]
-        keys = list(dict.fromkeys(zip(subjects[rows], cells[rows], strict=True)))
-        extra = np.array([self._numbers(c) for c in covariates]).reshape(-1, len(cells)).T
-        variance = self._variance(quantity)
-        of = [(subjects == subject) & (cells == cell) for subject, cell in keys]
-        v = np.array([1 / np.sum(1 / variance[i]) for i in of])
-        y = v * np.array([np.sum(self.values[quantity][i] / variance[i]) for i in of])
-        x = np.array([extra[i].mean(axis=0) for i in of])
-        return *map(np.array, zip(*keys, strict=True)), y, v, x
+        y, v = np.asarray(self.values[quantity]), np.asarray(self.errors[quantity]) ** 2
+        trend, strides = np.ones((len(y), 1)), np.asarray(self.table.get("strides", ""))
+        if strides.dtype.kind in "iuf" and np.ptp(strides) > 0:
+            trend = np.column_stack([trend, np.log(np.maximum(strides, 1.0))])
+        v[~np.isfinite(y)] = np.nan
+        i = np.isfinite(y)
+        v[i] = moderated(v[i], self.freedom[i], trend[i])
+        frame = self.table[["subject", *factors_of(self.table)]]
+        return frame.assign(cell=cells_of(frame), y=y, v=v)
 
-    def _cells(self, quantity: str, needed: int, covariates: Sequence[str] = ()):
-        """Return subjects, estimates, variances and covariates by group and condition."""
-        every = np.ones(len(self.freedom), bool)
-        subjects, cells, *numbers = self._merged(quantity, covariates, every)
-        require(cells, subjects, needed)
-        parts = (subjects, *numbers)
-        return [(cell, [x[cells == cell] for x in parts]) for cell in dict.fromkeys(cells)]
+    def _merged(self, quantity: str, covariates: Sequence[str], rows: Any = None) -> Any:
+        """Return a row for each subject in each group and condition; trials are averaged."""
+        slopes = {_SLOPE + name: self._numbers(name) for name in covariates}
+        frame = self._trials(quantity).assign(**slopes)
+        frame = frame.assign(w=1 / frame["v"], wy=frame["y"] / frame["v"])
+        frame = frame[np.isfinite(frame["y"]) & (True if rows is None else rows)]
+        by = frame.groupby(["subject", *factors_of(frame), "cell"], sort=False)
+        data = by[["w", "wy"]].sum().join(by[list(slopes)].mean()).reset_index()
+        return data.assign(y=data["wy"] / data["w"], v=1 / data["w"])
 
-    def _grid(self, quantity: str, a: str, b: str, covariates: Sequence[str] = ()):
-        """Return the estimates by subject and cell, with an indicator of each cell and covariates;
-        the names of the cells, and which belong to `a`."""
-        factor, rows = rows_with(self.table, (a, b))
-        subjects, cells, y, v, extra = self._merged(quantity, covariates, rows)
-        require(cells, subjects)
-        names, all_cells = list(dict.fromkeys(cells)), cells_of(self.table)
-        row = [list(dict.fromkeys(subjects)).index(subject) for subject in subjects]
-        place, q = (row, [names.index(cell) for cell in cells]), len(names)
-        shape = (max(row) + 1, q)
-        grid = Cells(np.zeros(shape), np.ones(shape), np.zeros((*shape, q + len(covariates))),
-                     np.zeros(shape, bool))  # fmt: skip
-        grid.x[:, np.arange(q), np.arange(q)] = 1.0
-        grid.y[place], grid.v[place], grid.present[place] = y, v, True
-        grid.x[..., q:][place] = extra - extra.mean(axis=0)
-        side = [self.table[factor][rows & (all_cells == name)][0] == a for name in names]
-        return grid, names, np.array(side)
+    def _cells(self, quantity: str, needed: int, covariates: Sequence[str] = ()) -> Any:
+        data = self._merged(quantity, covariates)
+        cells = dict(list(data.groupby("cell", sort=False)))
+        require({c: x["subject"] for c, x in cells.items()} or {"all": ()}, needed)
+        return cells.items()
 
-    def _variance(self, quantity: str) -> np.ndarray:
-        """Return the variances of the estimates, moderated."""
-        columns, strides = [np.ones(len(self.freedom))], self.table.get("strides")
-        if strides is not None and strides.dtype.kind in "iuf" and np.ptp(strides) > 0:
-            columns.append(np.log(np.maximum(strides.astype(float), 1.0)))
-        return moderated(self.errors[quantity] ** 2, self.freedom, np.stack(columns, axis=1))
+    def _contrast(self, quantity: str, a: str, b: str, covariates: Sequence[str] = ()):
+        """Return the estimates in two conditions or groups, the numbers and the weights of their
+        cells, and the differences of subjects that have all."""
+        factor, rows = rows_with(self.table, a, b)
+        data = self._merged(quantity, covariates, rows)
+        require(dict(list(data.groupby("cell")["subject"])), 2)
+        cell, names = data["cell"].factorize()
+        is_a = data.drop_duplicates("cell")[factor].to_numpy() == a
+        w = np.where(is_a, 1 / max(is_a.sum(), 1), -1 / max((~is_a).sum(), 1))
+        parts = data.assign(y=data["y"] * w[cell], v=data["v"] * w[cell] ** 2).groupby("subject")
+        return data, cell, w, parts[["y", "v"]].sum()[parts.size() == len(names)]
 
-    def _row(self, quantity: str, effect: str, subjects: int, estimate, level: float, spread):
-        value, error, freedom = estimate
-        reach = stats.t.ppf((1 + level) / 2, freedom) * error
-        return {
-            "quantity": quantity, "unit": self.units[quantity], "effect": effect,
-            "subjects": subjects, "estimate": value, "standard_error": error, "freedom": freedom,
-            "low": value - reach, "high": value + reach,
-            "p": float(2 * stats.t.sf(abs(value) / error, freedom)),
-            **dict(zip(("spread", "spread_low", "spread_high"), spread, strict=True)),
-        }  # fmt: skip
+    def _effects(
+        self, quantity: str, names: list[str], subjects: int, fit: Mixed, weights, spread
+    ) -> Any:
+        value, error, freedom = np.array([fit.contrast(w) for w in weights]).T
+        reach = stats.t.ppf(0.975, freedom) * error
+        frame = package("pandas").DataFrame({"quantity": quantity, "effect": names})
+        frame = frame.assign(unit=self.units[quantity], subjects=subjects, estimate=value)
+        frame = frame.assign(standard_error=error, freedom=freedom, low=value - reach)
+        frame = frame.assign(high=value + reach, p=2 * stats.t.sf(abs(value) / error, freedom))
+        frame.loc[0, ["spread", "spread_low", "spread_high"]] = spread
+        return frame
 
 
-def _test(v, n: int, spread: float, difference: float, paired: bool, level: float):
+def _result(parts: list, text: str) -> Any:
+    frame = package("pandas").concat(parts, ignore_index=True)
+    frame.attrs["methods"] = signed(text)
+    return frame
+
+
+def _test(v, n: int, spread: float, difference: float, paired: bool):
     """Return a function of a random generator that simulates subjects, and returns whether the
     difference differs from zero."""
-    cells = 1 if paired else 2
-    table = {"subject": np.arange(n * cells), "group": np.repeat(["a", "b"][:cells], n)}
+    subjects = np.arange(n if paired else 2 * n)
+    group = subjects // n
+    x, w = np.eye(group[-1] + 1)[group], np.array([1.0, -1.0])[: group[-1] + 1]
 
     def draw(rng: np.random.Generator) -> int:
-        variance = rng.choice(v, (n, cells))
-        y = np.sqrt(spread**2 + variance) * rng.normal(size=(n, cells))
-        y[:, 0] += difference
-        people = Population(table, {"y": y.T.ravel()}, {"y": np.sqrt(variance.T.ravel())})
-        test: Any = people.difference("y", "a", "b", level=1 - level) if not paired else (
-            people.mean("y", level=1 - level))  # fmt: skip
-        return int(test["low"][0] * test["high"][0] > 0)
+        variance = rng.choice(v, len(subjects))
+        y = np.sqrt(spread**2 + variance) * rng.normal(size=len(subjects))
+        y += difference * (group == 0)
+        fit = meta(y, variance, x) if paired else mixed(y, variance, x, subjects, group)
+        value, error, freedom = fit.contrast(w)
+        return int(abs(value) > stats.t.isf(0.025, freedom) * error)
 
     return draw
 
 
 def _signals(fit: MultiplierEstimate) -> str:
     names = getattr(fit, "outputs", ("multipliers",))
-    return "of " + ", ".join(f"{x} ({unit_of(x)})" if unit_of(x) else str(x) for x in names)
-
-
-def _of(fit: MultiplierEstimate, subject: str, quantities: Sequence[Quantity]):
-    """Return values and standard errors of one fit by name."""
-    if not np.isfinite(fit.covariance).all():
-        raise DefinitionError(
-            f"the fit of subject '{subject}' has no covariance: record more strides, or leave the "
-            "subject out."
-        )
-    z, covariance = complex(fit.multipliers[0]), fit.multiplier_covariances[0]
-    parts: dict[str, tuple[float, float]] = {}
-    if "angle" in quantities and z.imag == 0:
-        raise DefinitionError(
-            f"the leading multiplier of subject '{subject}' is real, so its angle has no standard "
-            "error: take the modulus or the coefficients."
-        )
-    slopes = {"modulus": (abs(z), z / abs(z)), "angle": (abs(np.angle(z)), 1j * z / abs(z) ** 2)}
-    for name in (x for x in slopes if x in quantities):
-        value, slope = slopes[name]
-        w = np.array([slope.real, slope.imag])
-        parts[name] = value, float(np.sqrt(w @ covariance @ w))
-    if "coefficients" in quantities:
-        pairs = zip(fit.coefficients, np.sqrt(np.diag(fit.covariance)), strict=True)
-        parts |= {f"c{k}": pair for k, pair in enumerate(pairs, 1)}
-    return parts
+    return ", ".join(f"{x} ({unit_of(x)})" if unit_of(x) else str(x) for x in names)

@@ -1,18 +1,12 @@
-"""Tables of a study: who was recorded, and the results, as real columns for CSV, pandas and R."""
+"""Tables of a study, as data frames: who was recorded, and results."""
 
-import csv
-import dataclasses
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from ... import __version__
-from ..._core.boundary.checked import checked_methods
-from ..._core.boundary.kinds import FilePath
-from ..._core.text import columns as aligned
-from ..._core.writing import replacing
+from ..._core.arguments import package
 from ...errors import DefinitionError
 
 
@@ -23,53 +17,8 @@ class Columns(Protocol):
     def items(self) -> Any: ...
 
 
-FACTORS = ("group", "condition")
-
-
-@checked_methods
-@dataclasses.dataclass(frozen=True, repr=False)
-class PopulationTable:
-    """A table of results.
-
-    **Fields:** `columns`, arrays by name (NaN where a column does not apply; empty in files);
-    `methods`: sentences for the methods section of a paper.
-    """
-
-    columns: dict[str, np.ndarray]
-    methods: str = ""
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return self.columns[name]
-
-    def write(self, path: FilePath) -> Path:
-        """Write the table as CSV, with all digits, and return the path.
-
-        **Raises:** `DefinitionError` if it cannot be written.
-        """
-        with replacing(Path(path)) as new, open(new, "w", newline="", encoding="utf-8") as file:
-            rows = zip(*self.columns.values(), strict=True)
-            csv.writer(file).writerows([self.columns, *([_cell(x) for x in row] for row in rows)])
-        return Path(path)
-
-    def __repr__(self) -> str:
-        shown = {k: [_cell(x, 4) for x in v] for k, v in self.columns.items()}
-        rows = [*zip(*[(k, *v) for k, v in shown.items() if any(v)], strict=True)]
-        return f"PopulationTable({len(rows) - 1} rows)" + aligned(rows)
-
-
-def _cell(x, digits: int | None = None) -> str:
-    if isinstance(x, float | np.floating):
-        return "" if np.isnan(x) else f"{x:.{digits}g}" if digits else repr(float(x))
-    return str(x)
-
-
-def table_of(rows: list[dict], methods: str) -> PopulationTable:
-    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    return PopulationTable(columns, f"{methods} Computed by hybridjax {__version__}.")
-
-
-def as_columns(table: Columns, rows: int) -> dict[str, np.ndarray]:
-    """Return the columns of a mapping, or of a data frame, by name.
+def table_of(table: Columns, rows: int) -> Any:
+    """Return a data frame whose subjects, groups and conditions are strings.
 
     **Raises:** `DefinitionError` for a table without subjects or of another length, and for a
     subject in two groups.
@@ -83,45 +32,52 @@ def as_columns(table: Columns, rows: int) -> dict[str, np.ndarray]:
                 f"column '{name}' of `table` must have one value for each of the {rows} estimates, "
                 f"but has shape {values.shape}."
             )
-        if name in ("subject", *FACTORS) or values.dtype.kind == "O":
-            columns[name] = values.astype(str)
-    groups: dict[str, str] = {}
-    for subject, group in zip(columns["subject"], columns.get("group", ()), strict=False):
-        if groups.setdefault(subject, group) != group:
+    frame = package("pandas").DataFrame(columns)
+    frame = frame.astype(dict.fromkeys(["subject", *factors_of(frame)], str))
+    for subject, groups in frame.groupby("subject")["group"] if "group" in frame else ():
+        if len(groups.unique()) > 1:
             raise DefinitionError(
-                f"subject '{subject}' is in the groups '{groups[subject]}' and '{group}': give one "
-                "group, or call the column 'condition' if subjects were recorded in both."
+                f"subject '{subject}' is in the groups {' and '.join(map(repr, groups.unique()))}: "
+                "give one group, or call the column 'condition' if subjects were recorded in both."
             )
-    return columns
+    return frame
 
 
-def cells_of(columns: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the group and condition of each row, joined by a comma."""
-    names = [columns[name] for name in FACTORS if name in columns]
-    joined = [", ".join(x) for x in zip(*names, strict=True)]
-    return np.array(joined or ["all"] * len(columns["subject"]))
+def factors_of(table: Any) -> list[str]:
+    return [name for name in ("group", "condition") if name in table]
 
 
-def rows_with(columns: dict[str, np.ndarray], labels: Sequence[str]) -> tuple[str, np.ndarray]:
-    """Return the factor to which some labels belong, and its rows with one of them.
+def cells_of(table: Any) -> Any:
+    """Return the group and condition of each row, joined by a comma, or "all"."""
+    factors = factors_of(table)
+    return table[factors].agg(", ".join, axis=1) if factors else "all"
+
+
+def rows_with(table: Any, *labels: str) -> tuple[str, Any]:
+    """Return the factor to which different labels belong, and whether a row has one of them.
 
     **Raises:** `DefinitionError` if no factor has all of them.
     """
-    for factor in FACTORS:
-        if len(set(labels)) == len(labels) and set(labels) <= set(columns.get(factor, ())):
-            return factor, np.isin(columns[factor], labels)
-    listed = ", ".join(f"'{x}'" for f in FACTORS for x in dict.fromkeys(columns.get(f, ())))
+    for factor in factors_of(table):
+        if len(set(labels)) == len(labels) and set(labels) <= set(table[factor]):
+            return factor, table[factor].isin(labels)
+    listed = ", ".join(f"'{x}'" for factor in factors_of(table) for x in table[factor].unique())
     raise DefinitionError(
         f"{' and '.join(map(repr, labels))} are no two conditions or groups of `table`, which has "
         f"{listed or 'neither'}."
     )
 
 
-def require(cells: np.ndarray, subjects: np.ndarray, needed: int = 2) -> None:
-    """**Raises:** `DefinitionError` for a cell with fewer subjects."""
-    for cell in dict.fromkeys(cells):
-        names = sorted(set(subjects[cells == cell]))
-        if len(names) < needed:
+def require(subjects: Mapping[str, Iterable[str]], needed: int) -> None:
+    """**Raises:** `DefinitionError` if a group or condition has fewer subjects."""
+    for cell, names in subjects.items():
+        if len(set(names)) < needed:
             raise DefinitionError(
-                f"'{cell}' has too few subjects ({', '.join(names)}): at least {needed} are needed."
+                f"'{cell}' has too few subjects ({', '.join(sorted(set(names))) or 'none'}): at "
+                f"least {needed} are needed."
             )
+
+
+def signed(text: str) -> str:
+    """Return sentences for a methods section with the version of the software."""
+    return f"{text} Computed by hybridjax {__version__}."
