@@ -44,8 +44,8 @@ def to_pandas(thing: Tabular) -> Any:
     if isinstance(thing, PopulationTable):
         return frame(thing.columns)
     if isinstance(thing, MultiplierEstimate):
-        parts = np.sqrt(np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)).T
-        errors = dict(zip(("real_error", "imaginary_error"), parts, strict=True))
+        real, imaginary = np.sqrt(np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)).T
+        errors = {"real_error": real, "imaginary_error": imaginary}
         errors["standard_error"] = thing.standard_errors
         return frame({**_parts("", thing.multipliers), **errors})
     if isinstance(thing, RationalFit):
@@ -73,5 +73,5 @@ def to_pandas(thing: Tabular) -> Any:
 
 
 def _parts(prefix: str, z: np.ndarray) -> dict[str, np.ndarray]:
-    parts = {"real": z.real, "imaginary": z.imag, "modulus": np.abs(z)}
+    parts = {"real": np.real(z), "imaginary": np.imag(z), "modulus": np.abs(z)}
     return {f"{prefix}{name}": values for name, values in parts.items()}
