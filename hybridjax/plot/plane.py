@@ -70,11 +70,10 @@ def multipliers(
                 box.plot(np.real(z), np.imag(z), ls="", label=text, **line)
                 for border in borders.get(label, ()):
                     # Of a real multiplier it is an interval, whose ends would not be seen.
-                    ends = (
-                        [] if np.ptp(border.imag) else [border.real.argmin(), border.real.argmax()]
-                    )
+                    x, y = np.real(border), np.imag(border)
+                    ends = [] if np.ptp(y) else [int(x.argmin()), int(x.argmax())]
                     edge = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
-                    box.plot(border.real, border.imag, color=line["color"], **edge)
+                    box.plot(x, y, color=line["color"], **edge)
         _complex_axes(panel, r"\lambda")
         if ax is None and series:
             shown = panel.get_legend_handles_labels()
