@@ -174,8 +174,8 @@ def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders)
     )
     inset.tick_params(labelsize="xx-small", length=2)
     inset.spines[:].set(visible=True, color="0.4")
-    inset.locator_params(axis="x", nbins=1)  # long labels would overlap
-    inset.locator_params(axis="y", nbins=3)
+    inset.locator_params(nbins=3)
+    inset.tick_params(axis="x", labelrotation=30)  # long labels would overlap
     ax.indicate_inset_zoom(inset, edgecolor="0.4")
     return inset
 
