@@ -1,5 +1,19 @@
 """The exceptions that hybridjax raises. All derive from `HybridJaxError`."""
 
+import warnings
+
+
+class FindingWarning(UserWarning):
+    """A finding about data or a fit, which results print too.
+
+    It is silent by default. A pipeline stops at the first one after
+    `warnings.simplefilter("error", hybridjax.errors.FindingWarning)`.
+    """
+
+
+# With the lowest priority, so that every filter of a user comes first.
+warnings.simplefilter("ignore", FindingWarning, append=True)
+
 
 class HybridJaxError(Exception):
     """Base class of every error raised by hybridjax on purpose."""

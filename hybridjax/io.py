@@ -33,11 +33,13 @@ KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)
 def save(path: FilePath, thing: Saved) -> None:
     """Write an object to an npz file; `load` gives back an equal one, bit by bit.
 
-    The file appears complete or not at all: an old file of that name stays until then.
+    The file appears complete or not at all: an old file of that name stays until then. With the
+    suffix `.mat` it is a MATLAB file of the same arrays, with `_` for `.` in their names, and of
+    the JSON text `header`; `load` does not read it.
 
     **Arguments:**
 
-    - `path`: ends in `.npz`; its folder must exist.
+    - `path`: ends in `.npz` or `.mat`; its folder must exist.
     - `thing`: a `Design`, `ExperimentData`, `HTF`, `LDTP`, `RationalFit`, `Record`, `SeriesFit`
       or `StructuredFit`.
 
@@ -47,8 +49,8 @@ def save(path: FilePath, thing: Saved) -> None:
     path, kind = Path(path), type(thing).__name__
     if type(thing) is not KINDS.get(kind):
         raise DefinitionError(f"save takes {', '.join(KINDS)}; it cannot write a {kind}.")
-    if path.suffix != ".npz":
-        raise DefinitionError(f"save writes npz files: let the name '{path.name}' end in '.npz'.")
+    if path.suffix not in (".npz", ".mat"):
+        raise DefinitionError(f"let the name '{path.name}' end in '.npz', or in '.mat' for MATLAB.")
     require_x64(thing)
     write_module(path, thing)
 

@@ -96,8 +96,8 @@ hj.plot.strides(study.plan, {"this study": study})
 # ## Comparison with the truth
 #
 # The data determined when the study stopped. The region still contains the true multipliers in 95 %
-# of studies (`docs/experiments.md`). This study is one of the others: its error is twice the
-# standard error.
+# of studies (`docs/experiments.md`). A single study shows little: signs and phases of a design
+# depend on rounding, so that another machine has other blocks and errors.
 
 # %%
 print("in the region of 95 %:", study.fit.contains(cycle.multipliers))

@@ -67,6 +67,8 @@ def test_python_control(model):
     np.testing.assert_array_equal(data(1j * data.omega)[1], np.asarray(H[-1])[:, 0].T)
     np.testing.assert_allclose(data.omega, np.pi * f)
     assert isinstance(data, control.FrequencyResponseData)
+    lines = control.bode_plot(convert.to_control(H.select([0]))[0, 0]).lines
+    np.testing.assert_allclose(lines[0, 0][0].get_ydata(), np.abs(H[0][:, 0, 0]))
 
 
 def test_the_norm_of_the_lifted_system_is_that_of_the_transfer_functions():
@@ -138,15 +140,23 @@ def test_pandas(model):
     again = hj.Recording.from_frame(first, units={"a": "N"})
     np.testing.assert_array_equal(again.trials[0].values, recording().trials[0].values)
     H = model.htf(np.linspace(0.01, 0.4, 5))
-    assert convert.to_pandas(H)["H"][-1, H.f[1].item(), "y", "w"] == complex(H[-1][1, 0, 1])
+    row = convert.to_pandas(H).loc[-1, H.f[1].item(), "y", "w"]
+    z = complex(H[-1][1, 0, 1])
+    assert tuple(row) == (z.real, z.imag, np.abs(z))
+    assert np.asarray(H).tobytes() == H.H.tobytes()
     u = np.random.default_rng(3).normal(size=(60 * N, 2))
     fit = hj.fit_series(hj.Record(u, model.simulate(u), n_sections=N), order=1)
     table = convert.to_pandas(fit)
-    np.testing.assert_array_equal(table["multiplier"], fit.multipliers)
+    np.testing.assert_array_equal(table["real"] + 1j * table["imaginary"], fit.multipliers)
+    np.testing.assert_array_equal(
+        np.hypot(table["real_error"], table["imaginary_error"]), fit.standard_errors
+    )
     np.testing.assert_array_equal(table["standard_error"], fit.standard_errors)
     rational = hj.fit_rational(model.htf(np.linspace(0.01, 0.4, 20)), input="u")
     table = convert.to_pandas(rational)
-    np.testing.assert_array_equal(table["pole"], rational.poles[0])
+    np.testing.assert_array_equal(
+        table["pole_real"] + 1j * table["pole_imaginary"], rational.poles[0]
+    )
 
 
 def test_what_is_refused(model, monkeypatch):

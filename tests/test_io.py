@@ -1,10 +1,12 @@
 import json
+import operator
 import os
 import pickle
 
 import jax
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
@@ -168,9 +170,19 @@ def test_pickles_are_not_executed(folder, things):
         hj.load(path)
 
 
+def test_a_matlab_file(folder, ldtp, htf):
+    for thing, names in ((ldtp, "A dims"), (htf, "H scatter_freedom")):
+        hj.save(folder / "thing.mat", thing)
+        read = scipy.io.loadmat(folder / "thing.mat")
+        for name in names.split():
+            value = operator.attrgetter(name.replace("_", "."))(thing)
+            np.testing.assert_array_equal(read[name].squeeze(), np.squeeze(value))
+        assert json.loads(read["header"].item())["kind"] == type(thing).__name__
+
+
 def test_where_nothing_can_be_written_or_read(folder, things):
     with pytest.raises(hj.DefinitionError, match="end in '.npz'"):
-        hj.save(folder / "data.mat", things[0])
+        hj.save(folder / "data.txt", things[0])
     (folder / "taken.npz").mkdir()
     with pytest.raises(hj.DefinitionError, match="cannot write .*Is a directory"):
         hj.save(folder / "taken.npz", things[0])

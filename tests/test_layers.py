@@ -98,6 +98,8 @@ def test_old_names_give_the_new_ones():
         with pytest.raises(AttributeError, match="is gone"):
             for part in old.split("."):
                 owner = getattr(owner, part)
+    with pytest.raises(AttributeError, match="did you mean 'linearize'"):
+        hybridjax.linearise  # noqa: B018
     for new in re.findall(r"\bhj\.((?:\w+\.)*\w+)", " ".join(new for _, _, new in rows)):
         owner = hybridjax
         for part in new.split("."):

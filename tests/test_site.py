@@ -2,11 +2,14 @@
 
 import ast
 import html
+import importlib
 import re
 from collections import Counter
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
+from matplotlib import pyplot
 
 import hybridjax as hj
 
@@ -33,8 +36,8 @@ def test_every_public_name_is_in_the_reference_once():
 
 # Results of functions, and classes of errors.
 GIVEN = UNCHECKED["made by this package"] | {
-    "ComputationError", "Design", "FileFormatError", "LDTP", "PrecisionError", "SettledCycle",
-    "StoredExperiments", "from_fmu",  # (an example would need an FMU)
+    "ComputationError", "Design", "FileFormatError", "FindingWarning", "LDTP", "PrecisionError",
+    "SettledCycle", "StoredExperiments", "from_fmu",  # (an example would need an FMU)
 }  # fmt: skip
 
 
@@ -55,6 +58,16 @@ def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     run_python("-m", "mkdocs", "build", "--strict", "--site-dir", folder, cwd=ROOT)
     return folder
+
+
+@pytest.mark.slow
+def test_the_pictures_of_the_home_page_are_those_that_are_drawn_now(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs/_site")
+    pictures = importlib.import_module("pictures")
+    for name, plot in pictures.draw().items():
+        close = dict(rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(pictures.numbers(plot), pictures.drawn(name), **close)
+    pyplot.close("all")
 
 
 def test_nothing_is_fetched_from_another_host(site):

@@ -22,7 +22,9 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown: str, page, **_) -> str:
-    """Links between docs/ and the files beside it."""
+    """Links between docs/ and the files beside it. The home page takes the whole width."""
+    if page.is_homepage:
+        page.meta["hide"] = ["navigation", "toc"]
     up = "../" * page.file.src_uri.count("/")
     markdown = re.sub(r"\]\((?:\.\./)+(notebooks/\w+)\.ipynb", rf"]({up}\1.md", markdown)
     for name, target in LISTS.items():

@@ -22,6 +22,33 @@ def _special(word: str) -> bool:
     return "_" in word or not word.islower()
 
 
+# Terms of the glossary, by their anchors.
+_TERMS = {
+    "chart": "charts?", "excited-line": "excited (?:line|frequenc)s?", "isochron": "isochrons?",
+    "htf": r"harmonic transfer functions?(?: \(HTFs?\))?|HTFs?", "ldtp": "LDTPs?(?: systems?)?",
+    "limit-cycle": "limit cycles?", "multiplier": "(?:Floquet )?multipliers?",
+    "section": "(?:Poincaré )?sections?", "return-map": "return maps?",
+    "saltation": "saltation matri(?:x|ces)",
+}  # fmt: skip
+# Where no link may begin: in code, equations, headings, tables, HTML and other links.
+_OTHER = r"```.*?^```|`[^`]*`|\$[^$]*\$|^[#|<!].*?$|\[[^\]]*\](?:\([^)]*\))?|^ {4}.*?$"
+
+
+def on_page_markdown(markdown: str, page, **_) -> str:
+    """The first mention of a term on a page leads to its entry in the glossary."""
+    source = page.file.src_uri
+    if source in ("glossary.md", "changelog.md") or source.startswith("reference/"):
+        return markdown
+    glossary = "../" * source.count("/") + "glossary.md"
+    for anchor, term in _TERMS.items():
+        pattern = re.compile(rf"{_OTHER}|\b(?P<term>{term})\b", re.MULTILINE | re.DOTALL)
+        first = next((x for x in pattern.finditer(markdown) if x["term"]), None)
+        if first:
+            link = f"[{first['term']}]({glossary}#{anchor})"
+            markdown = markdown[: first.start()] + link + markdown[first.end() :]
+    return markdown
+
+
 def on_page_content(content: str, page, **_) -> str:
     entries = _entries()
     # What does not exist stops a strict build; the changelog also names what once was.

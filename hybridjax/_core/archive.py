@@ -22,6 +22,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import jaxtyped
 
 from .. import __version__
@@ -36,7 +37,8 @@ _HEADER = "header"
 
 
 def write_module(path: Path, thing: eqx.Module) -> None:
-    """Write a module whose fields are arrays, modules, `None`, or static values of JSON.
+    """Write a module whose fields are arrays, modules, `None`, or static values of JSON, to an npz
+    or MATLAB file.
 
     **Raises:** `DefinitionError` if a field is not what its annotation says, or the file cannot be
     written.
@@ -57,7 +59,11 @@ def write_module(path: Path, thing: eqx.Module) -> None:
     }
     text = json.dumps(header, indent=1, default=lambda x: x.item())
     with replacing(path) as temporary, open(temporary, "xb") as file:
-        np.savez(file, allow_pickle=False, **{_HEADER: np.array(text)}, **arrays)
+        if path.suffix == ".mat":
+            named = {name.replace(".", "_"): array for name, array in arrays.items()}
+            scipy.io.savemat(file, {_HEADER: text, **named})
+        else:
+            np.savez(file, allow_pickle=False, **{_HEADER: np.array(text)}, **arrays)
         file.flush()
         os.fsync(file.fileno())
 

@@ -79,28 +79,29 @@ def complex_number(z: complex, digits: int = 6) -> str:
 
 
 def multiplier_table(
-    values: Complex[np.ndarray, " d"], half_widths: Float[np.ndarray, "d 2"] | None = None
+    values: Complex[np.ndarray, " d"], covariances: Float[np.ndarray, "d 2 2"] | None = None
 ) -> str:
-    """The multipliers and their moduli, with the half-widths of the 95 % intervals of their real
-    and imaginary parts if these are given."""
-    if half_widths is None:
+    """The multipliers and their moduli, with the standard errors of their real and imaginary parts
+    if covariances of these are given."""
+    if covariances is None:
         rows = [(complex_number(z), f"{abs(z):.6g}") for z in values]
         return table(("multiplier", "modulus"), rows)
+    errors = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
     rows = [
-        (_interval(z.real, a), _interval(z.imag, b) if z.imag else "", f"{abs(z):.4g}")
-        for z, (a, b) in zip(values, half_widths, strict=True)
+        (_with_error(z.real, a), _with_error(z.imag, b) if z.imag else "", f"{abs(z):.4g}")
+        for z, (a, b) in zip(values, errors, strict=True)
     ]
-    return table(("multiplier, 95 % interval", "imaginary part", "modulus"), rows)
+    return table(("multiplier ± standard error", "imaginary part", "modulus"), rows)
 
 
-def _interval(value: float, half_width: float) -> str:
-    """A text such as `-0.24898 ± 0.00012`, with two digits of the half-width."""
-    if not np.isfinite(half_width):
+def _with_error(value: float, error: float) -> str:
+    """A text such as `-0.24898 ± 0.00012`, with two digits of the standard error."""
+    if not np.isfinite(error):
         return f"{value:.4g} (unknown)"
-    if not half_width:
+    if not error:
         return f"{value:.6g}"
-    digits = int(np.clip(1 - np.floor(np.log10(half_width)), 0, 12))
-    return f"{value:.{digits}f} ± {half_width:.{digits}f}"
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 12))
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 class Curve(NamedTuple):

@@ -1,7 +1,8 @@
 """Public names by their tables, and one line for names that are gone or have a new name."""
 
+import difflib
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import lazy_loader
 
@@ -22,13 +23,14 @@ def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
                 raise AttributeError
             return find(name)
         except AttributeError as error:
-            raise AttributeError(_message(package, prefix, name)) from error
+            raise AttributeError(_message(package, prefix, name, listed())) from error
 
     return __getattr__, listed, names
 
 
-def _message(package: str, prefix: str, name: str) -> str:
-    """The line of `moved.txt` for this name, or for all names of a namespace that is gone."""
+def _message(package: str, prefix: str, name: str, names: Iterable[str]) -> str:
+    """The line of `moved.txt` for this name, or for all names of a namespace that is gone, or the
+    public name that is spelled most like it."""
     old = f"{prefix}.{name}".removeprefix(".")
     table = (pathlib.Path(__file__).with_name("moved.txt")).read_text().splitlines()
     rows = (row.partition(" -> ") for row in table if " -> " in row)
@@ -38,4 +40,6 @@ def _message(package: str, prefix: str, name: str) -> str:
     inside = [f"{key}: {new}" for key, new in moved.items() if key.startswith(f"{old}.")]
     if inside:
         return f"the namespace hj.{old} is gone: {'; '.join(inside)}."
-    return f"module {package!r} has no attribute {name!r}"
+    close = difflib.get_close_matches(name, names, n=1)
+    suggestion = f"; did you mean {close[0]!r}?" if close else ""
+    return f"module {package!r} has no attribute {name!r}{suggestion}"

@@ -89,7 +89,8 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     outputs = [f"{y}[{m}]" for m in thing.harmonics for y in thing.outputs]
     H = np.moveaxis(np.asarray(thing.H), 1, -1).reshape(len(outputs), len(inputs), -1)
     frequencies = 2 * np.pi * np.asarray(thing.f) / period
-    return package("control").FrequencyResponseData(H, frequencies, inputs=inputs, outputs=outputs)
+    about = {"inputs": inputs, "outputs": outputs, "sysname": "HTF"}
+    return package("control").FrequencyResponseData(H, frequencies, **about)
 
 
 @checked

@@ -25,30 +25,46 @@ def to_pandas(thing: Tabular) -> Any:
 
     - `Recording`, `SectionData`: a row for each sample, with time and trial;
       `Recording.from_frame` reads one trial of it.
-    - `LimitCycles`, `Branch`: a row for each cycle, with its parameters; `multipliers.0`, ...
+    - `LimitCycles`, `Branch`: a row for each cycle, with its parameters; `multipliers.0.real`, ...
     - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
-    - Fits: a row for each multiplier, with its standard error. A `RationalFit` gives a row for each
-      output and pole.
+    - Fits: a row for each multiplier. A `RationalFit` gives a row for each output and pole.
+
+    Complex numbers get columns for their real and imaginary part, which R and CSV files can hold; H
+    and multipliers their modulus, too. `standard_error` is the root of the expected squared
+    distance from the true value; `real_error` and `imaginary_error` are those of the parts.
 
     **Raises:** `DefinitionError` where pandas, or xarray, is not installed.
     """
     frame = package("pandas").DataFrame
     if isinstance(thing, MultiplierEstimate):
-        values, errors = thing.multipliers, thing.standard_errors
-        return frame({"multiplier": values, "modulus": np.abs(values), "standard_error": errors})
+        real, imaginary = np.sqrt(np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)).T
+        errors = {"real_error": real, "imaginary_error": imaginary}
+        errors["standard_error"] = thing.standard_errors
+        return frame({**_parts("", thing.multipliers), **errors})
     if isinstance(thing, RationalFit):
         outputs = np.repeat(list(map(str, thing.outputs)), thing.poles.shape[1])
-        poles, multipliers = thing.poles.ravel(), thing.multipliers.ravel()
-        return frame({"output": outputs, "pole": poles, "multiplier": multipliers})
+        poles = _parts("pole_", thing.poles.ravel())
+        return frame({"output": outputs, **poles, **_parts("", thing.multipliers.ravel())})
     dataset = to_xarray(thing)
     if isinstance(thing, HTF):
-        extra = [x for x in ("input_unit", "output_unit", "scatter.freedom") if x in dataset]
-        return dataset.drop_vars(extra).to_dataframe()
+        rows = dataset[[x for x in ("H", "variance") if x in dataset]].to_dataframe()
+        parts = _parts("", rows["H"].values)
+        if "variance" in rows:
+            parts["standard_error"] = np.sqrt(rows["variance"].values)
+        return rows[[]].assign(**parts)
     row = next(iter(dataset.data_vars.values())).dims[0]
     table = {}
     for name, x in {**dataset.coords, **dataset.data_vars}.items():
-        if x.dims == (row,):
-            table[name] = x.values
-        elif x.dims[0] == row:
-            table |= {f"{name}.{k}": values for k, values in enumerate(x.values.T)}
+        if x.dims[0] != row:
+            continue
+        numbers = {name: x.values}
+        if x.ndim > 1:
+            numbers = {f"{name}.{k}": values for k, values in enumerate(x.values.T)}
+        for key, values in numbers.items():
+            table |= _parts(f"{key}.", values) if np.iscomplexobj(values) else {key: values}
     return frame(table)
+
+
+def _parts(prefix: str, z: np.ndarray) -> dict[str, np.ndarray]:
+    parts = {"real": np.real(z), "imaginary": np.imag(z), "modulus": np.abs(z)}
+    return {f"{prefix}{name}": values for name, values in parts.items()}

@@ -234,17 +234,16 @@ class Study(eqx.Module):
         else:
             rows = ["  strides  standard errors"]
             rows += [f"  {n:>7}  {errors}" for n, errors in self._rows()]
-            rows.append(f"  multipliers {self.fit.show_multipliers()}")
+            rows.append(f"  {self.fit.show_multipliers()}")
             rows += [f"  {x}" for x in self._outlook(self.fit).splitlines()]
         return "\n".join([f"Study({self._state()})", *rows])
 
     def _repr_html_(self) -> str:
         if self.fit is None:
             return card("Study", self._state())
-        return card(
-            "Study", self._state(), multiplier_table(self.fit.multipliers, self.fit.half_widths()),
-            table(("strides", "standard errors"), self._rows()), text(self._outlook(self.fit)),
-        )  # fmt: skip
+        multipliers = multiplier_table(self.fit.multipliers, self.fit.multiplier_covariances)
+        strides = table(("strides", "standard errors"), self._rows())
+        return card("Study", self._state(), multipliers, strides, text(self._outlook(self.fit)))
 
     def _state(self) -> str:
         if self.fit is None:

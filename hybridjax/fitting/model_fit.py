@@ -219,9 +219,9 @@ class ModelFit(eqx.Module):
     def __repr__(self) -> str:
         width = max(map(len, self.names))
         lines = [f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"]
-        lines.append(f"  {self._cost()}")
+        lines.append(f"  {self._cost()}; values ± standard errors of noise, without distortion:")
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            shown = f"+- {error:.2g}" if np.isfinite(error) else "not seen by itself"
+            shown = f"± {error:.2g}" if np.isfinite(error) else "not seen by itself"
             lines.append(f"  {name:{width}}  {value:<14.9g} {shown}")
         lines += [f"  not seen: {text}" for text in self.identifiability.descriptions()]
         return "\n".join(lines)
@@ -238,9 +238,9 @@ class ModelFit(eqx.Module):
     def _repr_html_(self) -> str:
         rows = []
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            shown = f"{1.96 * error:.2g}" if np.isfinite(error) else "not seen by itself"
+            shown = f"{error:.2g}" if np.isfinite(error) else "not seen by itself"
             rows.append((name, f"{value:.9g}", shown, unit_of_parameter(self.system, name)))
-        parameters = table(("parameter", "value", "± 95 %", "unit"), rows)
+        parameters = table(("parameter", "value", "± standard error", "unit"), rows)
         unseen = [f"not seen: {x}" for x in self.identifiability.descriptions()]
         of = f"of {type(self.system).__name__}: {Result(self.result).message}"
         return card("ModelFit", of, parameters, text("\n".join([self._cost(), *unseen])))

@@ -54,7 +54,8 @@ class MultiplierComparison(eqx.Module):
 
 
 def _show(value: complex) -> str:
-    return f"{value.real:+.9f} {value.imag:+.9f}i"
+    imaginary = f" {value.imag:+.9f}i" if value.imag else 14 * " "
+    return f"{value.real:+.9f}{imaginary}"
 
 
 def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComparison:
@@ -177,24 +178,15 @@ class MultiplierEstimate(eqx.Module):
         """Pair the multipliers with the true ones; printing the result shows a table."""
         return compare_multipliers(self.multipliers, true)
 
-    @checked
-    def half_widths(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
-        """Return half the widths of the confidence intervals of real and imaginary parts.
-
-        To first order, for each multiplier.
-        """
-        variances = np.diagonal(self.multiplier_covariances, axis1=1, axis2=2)
-        return np.sqrt(self._radius(level, 1) * np.maximum(variances, 0))
-
     def __repr__(self) -> str:
         about = "; ".join(filter(None, [self.show_multipliers(), self._about()]))
-        return f"{type(self).__name__}(multipliers {about})"
+        return f"{type(self).__name__}({about})"
 
     def _repr_html_(self) -> str:
         regions = []
         if np.isfinite(self.multiplier_covariances).all():
             regions = [self.ellipse(k) for k in range(len(self.multipliers))]
-        shown = multiplier_table(self.multipliers, self.half_widths())
+        shown = multiplier_table(self.multipliers, self.multiplier_covariances)
         circle = unit_circle(self.multipliers, regions)
         return card(type(self).__name__, "", shown, circle, text(self._about()))
 
@@ -204,10 +196,11 @@ class MultiplierEstimate(eqx.Module):
 
     def show_multipliers(self) -> str:
         """Return the multipliers and their standard errors, for a `repr`."""
-        return ", ".join(
-            f"{x.real:+.7f}{x.imag:+.7f}i ± {s:.1e}"
-            for x, s in zip(self.multipliers, self.standard_errors, strict=True)
+        shown = (
+            f"{x.real:+.7f}{f'{x.imag:+.7f}i' if x.imag else ''} ± {error:.1e}"
+            for x, error in zip(self.multipliers, self.standard_errors, strict=True)
         )
+        return f"multipliers (± standard error) {', '.join(shown)}"
 
     def _radius(self, level: float, degrees: int | np.ndarray) -> np.ndarray | float:
         """Quantile of `distance`."""

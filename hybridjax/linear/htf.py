@@ -1,7 +1,7 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
 from dataclasses import replace
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -217,6 +217,10 @@ class HTF(eqx.Module):
         **Raises:** `DefinitionError` if it is not among the harmonics stored.
         """
         return self.H[self._index(m)]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """`H`, for functions of NumPy."""
+        return np.array(self.H, dtype) if copy else np.asarray(self.H, dtype)
 
     def select(self, harmonics: Harmonics) -> "HTF":
         """The same with fewer harmonics."""

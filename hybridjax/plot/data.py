@@ -13,6 +13,7 @@ from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from .._core.text import p_value
 from ..experiments.data import ExperimentData
 from ..identify.validate import Validation
+from ..linear.ldtp import LDTP
 from ..orbits.responses import PhaseCurve
 from ..recordings.beats.response import PhaseResponse
 from ..recordings.data import SectionData, input_spectrum
@@ -90,13 +91,18 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
 
 @checked
 def impulse_responses(
-    found: ImpulseResponses, *, input: str | int = 0, ax: AxesLike | None = None
+    found: ImpulseResponses,
+    *,
+    model: LDTP | None = None,
+    input: str | int = 0,
+    ax: AxesLike | None = None,
 ) -> Plot:
     """Left: responses to a push against its phase and the time since. Right: some of them with
-    bands of 95 %."""
+    bands of 95 %, and dashed those of a model with the same sections."""
     ny, N = len(found.outputs), len(found.phase)
     pushing = channel_index("input", input, found.inputs)
     chosen = [0, N // 4, N // 2, 3 * N // 4]
+    theory = None if model is None else found.of_model(model)
     with panels(ax, ny, 2, width=PAGE, height=0.4 + 1.9 * ny) as axes:
         for i, name in enumerate(found.outputs):
             plane, curves = axes[i]
@@ -115,12 +121,19 @@ def impulse_responses(
                 band = 1.96 * found.errors[m, :, i, pushing]
                 line = {"color": CYCLE[k % len(CYCLE)]}
                 curves.plot(found.lag, values[m], label=f"phase {found.phase[m]:.2f}", **line)
+                if theory is not None:
+                    curves.plot(found.lag, theory[m, :, i, pushing], "k--", lw=0.8)
                 curves.fill_between(
                     found.lag, values[m] - band, values[m] + band, alpha=0.25, lw=0, **line
                 )
             curves.axhline(0, color="black", lw=0.4)
-            curves.set_ylabel(label)
-        axes[0, 1].legend(loc="upper right")
+        if theory is not None:
+            axes[0, 1].plot([], [], "k--", lw=0.8, label="model")
+        if ax is None:
+            shown = axes[0, 1].get_legend_handles_labels()
+            axes[0, 1].get_figure(root=True).legend(*shown, loc="outside lower right", ncols=5)
+        else:
+            axes[0, 1].legend()
         for panel in axes[-1]:
             panel.set_xlabel("time since the push (cycles)")
         letters(axes)
@@ -225,7 +238,7 @@ def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | Non
                 values = found.cross_correlation[:, :, i, j]
                 _stems(cross, lags, values, CYCLE[(1 + j) % len(CYCLE)], 0.2 * j, limit)
             cross.set_title(f"with the input: {p_value(found.independence[i])}")
-        axes[0, 0].legend(loc="best")
+        axes[0, 0].legend(loc="lower left", bbox_to_anchor=(0, 1.12), ncols=2)
         axes[-1, 0].set_xlabel("time (cycles)")
         for lags in axes[-1, 1:]:
             lags.set_xlabel("lag (sections)")

@@ -69,7 +69,11 @@ def multipliers(
             for label, text, z, line in drawn:
                 box.plot(np.real(z), np.imag(z), ls="", label=text, **line)
                 for border in borders.get(label, ()):
-                    box.plot(np.real(border), np.imag(border), lw=0.7, color=line["color"])
+                    # Of a real multiplier it is an interval, whose ends would not be seen.
+                    x, y = np.real(border), np.imag(border)
+                    ends = [] if np.ptp(y) else [int(x.argmin()), int(x.argmax())]
+                    edge = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
+                    box.plot(x, y, color=line["color"], **edge)
         _complex_axes(panel, r"\lambda")
         if ax is None and series:
             shown = panel.get_legend_handles_labels()
@@ -171,6 +175,7 @@ def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders)
     inset.tick_params(labelsize="xx-small", length=2)
     inset.spines[:].set(visible=True, color="0.4")
     inset.locator_params(nbins=3)
+    inset.tick_params(axis="x", labelrotation=30)  # long labels would overlap
     ax.indicate_inset_zoom(inset, edgecolor="0.4")
     return inset
 

@@ -4,6 +4,7 @@ Findings about signals are made in `inspection/`, those about estimates in `fit_
 """
 
 import textwrap
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
@@ -11,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..errors import DefinitionError
+from ..errors import DefinitionError, FindingWarning
 from .recording import Recording, Trial
 
 
@@ -66,6 +67,12 @@ def refuse(findings: Iterable[Finding]) -> None:
         if finding.action == "refused":
             also = listed([x.text for x in findings if x.action == "warned"])
             raise DefinitionError(finding.text + f" (Found, too: {also})" * bool(also))
+
+
+def warn_of(findings: Iterable[Finding]) -> None:
+    """Emit a `FindingWarning` for each finding."""
+    for finding in findings:
+        warnings.warn(repr(finding), FindingWarning, stacklevel=4)
 
 
 def print_findings(findings: Iterable[Finding], indent: str = "") -> str:

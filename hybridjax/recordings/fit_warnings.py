@@ -22,7 +22,7 @@ from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validate import Validation, simulate
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
-from .findings import NAME_REFERENCE, Finding, print_findings
+from .findings import NAME_REFERENCE, Finding, print_findings, warn_of
 
 
 # Fraction of samples: if fewer remain beyond the number of unknowns, strides are few; if more are
@@ -126,6 +126,7 @@ def advise(
     later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
     with np.errstate(divide="ignore"):
         expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
+    warn_of(warnings)
     return Advice(tuple(warnings), plain, tuple(band), strides, expected)
 
 
@@ -180,16 +181,13 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
 
 
 def _about_residuals(validation: Validation) -> Iterator[Finding]:
-    text = "residuals of the held-out strides "
-    if not validation.white:
-        of_time = f"{text}are correlated in time ({p_value(validation.whiteness.min())}), as by "
-        of_time += "smoothing and disturbances of the state, which standard errors allow for; if "
-        of_time += "multipliers change with the `bandwidth` or `order`, the model lacks something."
-        yield Finding("left over", of_time)
+    # Correlation in time is no reason to doubt: smoothing and disturbances of the state cause it,
+    # and standard errors allow for it.
     if not validation.independent:
-        of_input = f"{text}depend on the input ({p_value(validation.independence.min())}), as with "
-        of_input += "few strides or pushes beyond the linear range: record more, or push less; if "
-        yield Finding("left over", f"{of_input}it remains, raise the `order`.")
+        text = "residuals of the held-out strides depend on the input "
+        text += f"({p_value(validation.independence.min())}), as with few strides or pushes beyond "
+        text += "the linear range: record more, or push less; if it remains, raise the `order`."
+        yield Finding("left over", text)
 
 
 def about_natural_multipliers(result: Any) -> Iterator[Finding]:

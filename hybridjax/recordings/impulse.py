@@ -1,6 +1,6 @@
 """Phase-dependent impulse responses: the effect of a brief push at each phase, and its duration."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
@@ -12,6 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.values import Number
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit
+from ..linear.ldtp import LDTP
 from .data import WHOLE_BAND, SectionData, input_band
 
 
@@ -47,6 +48,23 @@ class ImpulseResponses(eqx.Module):
     period: float = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def n_sections(self) -> int:
+        return len(self.phase)
+
+    @checked
+    def of_model(self, model: LDTP) -> Float[np.ndarray, "N lags ny nu"]:
+        """Return the responses of a model to the same pushes: what `values` estimate.
+
+        **Raises:** `DefinitionError` if the model has other sections or names.
+        """
+        require_same("model and responses", model, self)
+        N, lags = self.values.shape[:2]
+        weights = _push(self.width * N)
+        h = np.asarray(model.impulse_response(lags + len(weights) // 2)).swapaxes(0, 1)
+        h = ndimage.correlate1d(h, weights, axis=0, mode="constant")
+        return _by_push(h, lags, self.period)
 
 
 ResponseCycles = Annotated[float, Number("a number above 0, up to 10000", above=0, high=1e4)]
@@ -84,11 +102,11 @@ def impulse_responses(
     lags = round(cycles * N) + 1
     if lags < 2:
         raise DefinitionError(f"`cycles` must hold one section or more, but is {cycles:g}.")
-    reach = int(np.ceil(_PUSH_REACH * width * N))
+    weights = _push(width * N)
+    reach = len(weights) // 2
     if reach >= lags:
         text = f"responses of {cycles:g} cycles: lower it, or raise `cycles`"
         raise DefinitionError(f"`width` {width:g} is too large for {text}.")
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
     # Responses to inputs of one section continue by the recursion from cycle to cycle.
     recursion = np.zeros(len(fit.coefficients) * N + 1)
     recursion[::N] = [1.0, *fit.coefficients]
@@ -98,7 +116,7 @@ def impulse_responses(
         """Return responses to a push, which begins some sections before its middle."""
         x = np.pad(x, [(0, longest - len(x))] + [(0, 0)] * (x.ndim - 1))
         x = np.asarray(signal.lfilter([1.0], recursion, x, axis=0))
-        x = ndimage.correlate1d(x, weights / weights.sum(), axis=0, mode="constant")
+        x = ndimage.correlate1d(x, weights, axis=0, mode="constant")
         return x[fit.lead : fit.lead + lags]
 
     h = fit.numerators.swapaxes(0, 1)
@@ -111,8 +129,20 @@ def impulse_responses(
     slope, root = pushed(slope), pushed(fit.roots.transpose(2, 0, 1, 3, 4))
     by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
     std = np.sqrt((root**2).sum(axis=4) * fit.noise[:, None] ** 2 + by_coefficients)
-    # From the section of the response to that of the push.
-    m, r = np.arange(N)[:, None], np.arange(lags)
-    values, std = (x[r, (m + r) % N] / (data.period / N) for x in (pushed(h), std))
+    values, std = (_by_push(x, lags, data.period) for x in (pushed(h), std))
     phase, lag, period = np.arange(N) / N, np.arange(lags) / N, data.period
     return ImpulseResponses(values, std, phase, lag, float(width), period, fit.inputs, fit.outputs)
+
+
+def _push(width: float) -> Float[np.ndarray, " n"]:
+    """A Gaussian of this standard deviation in sections, as weights of sum 1 around its middle."""
+    reach = int(np.ceil(_PUSH_REACH * width))
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width, 1e-9)) ** 2)
+    return weights / weights.sum()
+
+
+def _by_push(h: Float[np.ndarray, "r N ..."], lags: int, period: float) -> Any:
+    """Responses to a push of area 1 by its section, from those by the section of the response."""
+    N = h.shape[1]
+    m, r = np.arange(N)[:, None], np.arange(lags)
+    return h[r, (m + r) % N] / (period / N)

@@ -232,6 +232,7 @@ def recordings(t):
     yield hj.recordings.choose_order, dict(data=t.section_data)
     yield hj.recordings.hold_out, dict(data=t.section_data, order=1)
     yield hj.recordings.impulse_responses, dict(fit=t.found.fit, data=t.found.data)
+    yield t.found.responses.of_model, dict(model=t.model)
     yield without_drift, dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0)
     table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
     yield hj.recordings.add_command, table
@@ -333,7 +334,7 @@ def without_arguments(t):
         hj.Execution, hj.designs.Multipliers, hj.experiments.Options, natural.interval,
         t.trajectory, t.trajectory.dense, t.cycle.trajectory, t.cycles.summary, t.model.monodromy,
         t.model.rank, t.estimate.confidence_radius, design.inputs, design.expected_variance,
-        design.cycles, data.windows, data.summary, t.structured.ellipse, t.structured.half_widths,
+        design.cycles, data.windows, data.summary, t.structured.ellipse,
     ):  # fmt: skip
         yield call, {}
 

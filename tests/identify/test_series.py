@@ -132,7 +132,7 @@ def test_experiments_are_used_from_their_start(small):
     data = dataclasses.replace(data, y=y, result=result)
     fit = hj.fit_series(data, 2)
     assert fit.compare(small.multipliers).max_error < 1e-8
-    assert f"SeriesFit(multipliers {small.multipliers[0].real:.4f}" in repr(fit)
+    assert f"SeriesFit(multipliers (± standard error) {small.multipliers[0].real:.4f}" in repr(fit)
     fits = [
         hj.fit_series(same, 2, start="cycle")
         for same in (data, data.records, [data], iter(data.records))

@@ -169,6 +169,20 @@ def test_validation_draws_signals_and_correlations(found):
         np.testing.assert_allclose(heights, values.sum(axis=0).ravel() / np.sqrt(32), atol=1e-12)
 
 
+def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():
+    estimate = MultiplierEstimate(
+        np.array([0.3 + 0j]), np.array([-0.3]), np.array([[0.01]]), np.inf
+    )
+    plot = hj.plot.multipliers([0.3], {"fit": estimate}, zoom=False)
+    plot.figure.canvas.draw()
+    picture = np.asarray(plot.figure.canvas.buffer_rgba())
+    blue = np.abs(picture[..., :3] - [0, 0x72, 0xB2]).sum(axis=2) < 60
+    for x in (0.3 - 0.196, 0.3 + 0.196):
+        column, row = plot.ax.transData.transform((x, 0)).round().astype(int)
+        cap = blue[len(blue) - row - 8 : len(blue) - row + 8, column - 2 : column + 3]
+        assert cap.any(axis=1).sum() > 6  # pixels high, where the line is one or two
+
+
 def test_regions_are_drawn_around_estimates(hopper):
     true = hopper.multipliers
     c = np.poly(true).real[1:]

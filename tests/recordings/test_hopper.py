@@ -58,12 +58,14 @@ def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
     fit = hj.fit_series(data.records, order=2)
     found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
     sections = dataclasses.replace(angle, anchor=hj.Crossing("vM", "falling"))
-    exact = hj.linearize(hopper_cycle, sections, ("yM", "vM")).impulse_response(64)
-    reach, step = 4, found.period / 16
-    k = np.arange(-reach, reach + 1)
+    model = hj.linearize(hopper_cycle, sections, ("yM", "vM"))
+    exact, theory = model.impulse_response(64), found.of_model(model)
+    k = np.arange(-4, 5)
     push = np.exp(-0.5 * (k / (16 * found.width)) ** 2)
+    push *= 16 / found.period / push.sum()
     for m, r in [(0, 8), (5, 20), (11, 31)]:
         n = (m + r) % 16
-        value = sum(w * exact[n, r - j] for w, j in zip(push / push.sum(), k, strict=True))
-        miss = np.abs(found.values[m, r, :, 0] - value[:, 0] / step)
+        value = sum(w * exact[n, r - j] for w, j in zip(push, k, strict=True))
+        np.testing.assert_allclose(theory[m, r], value, rtol=1e-12)
+        miss = np.abs(found.values[m, r] - value)[:, 0]
         assert (miss < 0.03 * np.abs(found.values[..., 0]).max(axis=(0, 1))).all()

@@ -1,6 +1,7 @@
 """Faults of recordings are named, and nothing is found where there is none."""
 
 import functools
+import warnings
 
 import numpy as np
 import pytest
@@ -53,6 +54,15 @@ def causes(recording, phase=TOP):
 @pytest.mark.parametrize(("force", "noise"), [(0.1, 1e-3), (0.3, 0.0)])
 def test_nothing_is_found_where_nothing_is_wrong(seed, force, noise):
     assert findings(made_up(seed, force, noise)) == ()
+
+
+def test_findings_are_warnings_on_which_a_pipeline_can_stop():
+    names = {"inputs": "f", "outputs": ("x", "v")}
+    bad = mishandle(made_up(0), "clipped at the top", **NAMES)
+    with pytest.warns(hj.errors.FindingWarning, match="^Clipp"):
+        hj.recordings.inspect(bad, **names)
+    with pytest.raises(hj.errors.FindingWarning), warnings.catch_warnings(action="error"):
+        hj.recordings.inspect(bad, **names)
 
 
 CAUSES = {

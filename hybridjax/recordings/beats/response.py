@@ -99,7 +99,7 @@ class PhaseResponse(PhaseCurve):
         return (
             f"PhaseResponse(detail of {self.detail:.1f} numbers, {self.intervals} intervals of "
             f"{len(self.rates)} trials, {self.miscounted} of them miscounted)\n"
-            f"  mean {with_unit('Z', self.unit)}  {mean:.4g} +- {error:.2g}; from "
+            f"  mean {with_unit('Z', self.unit)}  {mean:.4g} ± {error:.2g} (standard error); from "
             f"{self.values.min():.4g} to {self.values.max():.4g}\n"
             f"  rates        {self.rates.min():.4g} to {self.rates.max():.4g} cycles/s, jitter "
             f"{100 * self.jitter:.2g} % of a cycle\n"

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import OptionalNames, SignalNames
 from ..data import SectionData
-from ..findings import CLEAR, NAME_REFERENCE, Finding, Inspection, listed, place, places
+from ..findings import CLEAR, NAME_REFERENCE, Finding, Inspection, listed, place, places, warn_of
 from ..phase import Phase
 from ..recording import Recording
 from ..smoothing import FEWEST
@@ -103,6 +103,7 @@ def inspect(
     if phase is not None and data is not None:
         same = len(phase.stretches) == len(recording.trials)
         findings += inspect_cycles(recording if same else clean, phase, data)
+    warn_of(findings)
     return Inspection(tuple(findings), clean)
 
 
