@@ -76,8 +76,8 @@ print(test.attrs["methods"])
 # %% [markdown]
 # ## The response to a push
 #
-# The map has the phase of the push and the time since then. All 924 divisions into two groups count;
-# points are outlined where |t| is larger than the largest |t| of 95 % of these.
+# The map has the phase of the push and the time since then. All 924 divisions into two groups
+# count; points are outlined where |t| is larger than the largest |t| of 95 % of these.
 
 # %%
 values = np.stack([response.values[:, :, 0, 0] for response in responses])  # of yM

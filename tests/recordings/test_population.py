@@ -27,7 +27,10 @@ class Fit(MultiplierEstimate):
     outputs: tuple = (Signal("y", "m"),)
 
 
-def fit_of(c, freedom=np.inf, scale=1e-4, outputs=(Signal("y", "m"),)):
+OUTPUTS = (Signal("y", "m"),)
+
+
+def fit_of(c, freedom=np.inf, scale=1e-4, outputs=OUTPUTS):
     c = np.asarray(c, float)
     roots = np.roots([1.0, *c])
     roots = roots[np.argsort(-np.abs(roots))].astype(complex)

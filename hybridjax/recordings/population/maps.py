@@ -47,14 +47,13 @@ class MapResult:
     def __repr__(self) -> str:
         size, t = np.abs(self.values).max(), np.abs(self.t).max()
         found = zip(self.axes.items(), np.nonzero(self.significant), strict=True)
-        where = ", ".join(
-            f"{n} {x[i].min():.3g} to {x[i].max():.3g}" for (n, x), i in found if len(i)
-        )
+        spans = (f"{n} {x[i].min():.3g} to {x[i].max():.3g}" for (n, x), i in found if len(i))
+        where = ", ".join(spans) or "none"
         return (
             f"MapResult({' x '.join(self.axes)}: largest {size:.4g} {self.unit}".rstrip()
             + f", band of +- {np.median(self.reach):.3g} (median)\n"
             f"  largest |t| {t:.3g}, {p_value(float(self.p.min()))}\n"
-            f"  significant: {self.significant.sum()} of {self.t.size} points {where})"
+            f"  significant: {self.significant.sum()} of {self.t.size} points, {where})"
         )
 
 
