@@ -1,11 +1,35 @@
 """DC-DC converters with a switch that a controller closes and opens."""
 
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..systems.chart import FieldChart
+from ..systems.drawing import Drawing
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Scheduled, Transition
+
+
+# Symbols of a circuit, as steps from their begin, in units of their length.
+_COIL = [(k / 48, 0.1 * math.sin(math.pi * (k % 12) / 12)) for k in range(49)]
+_LOAD = [(0.0, 0.0), (0.2, 0.0), (0.2, 0.12), (0.8, 0.12), (0.8, -0.12), (0.2, -0.12), (0.2, 0.0)]
+
+
+def _along(symbol: Sequence[tuple[float, float]], x: float, y: float, down: bool = False) -> list:
+    """A symbol of length 1 from (x, y) to the right, or down."""
+    return [(x - b, y - a) if down else (x + a, y + b) for a, b in symbol]
+
+
+def _plates(x: float, y: float, charge: ArrayLike, down: bool = True) -> dict[str, list]:
+    """A capacitor from (x, y) on, the distance of whose plates shows its charge, from 0 to 1."""
+    gap = 0.05 + 0.1 * jnp.clip(charge, 0, 1)
+    bars = {f"C {x:g} {k}": [(s * gap, -0.25), (s * gap, 0.25)] for k, s in ((1, -1), (2, 1))}
+    wires = {f"wire {x:g} 1": [(-0.5, 0), (-gap, 0)], f"wire {x:g} 2": [(gap, 0), (0.5, 0)]}
+    turned = lambda a, b: (x + b, y - 0.5 - a) if down else (x + 0.5 + a, y + b)  # noqa: E731
+    return {name: [turned(*p) for p in line] for name, line in (bars | wires).items()}
 
 
 class BuckConverter(HybridSystem):
@@ -59,6 +83,22 @@ class BuckConverter(HybridSystem):
 
     def period(self):
         return self.T
+
+    def draw(self, chart, t, q):
+        """The circuit: supply, switch (or diode), coil, capacitor, load."""
+        blade = (0.9, 1.0) if chart == "closed" else (0.7, 1.4)
+        lines = {
+            "supply": [(1.0, 1.0), (0.9, 1.0)],
+            "switch": [(0.0, 1.0), (0.2, 1.0), blade],
+            "diode": [(1.0, 0.0), (1.0, 0.35), (0.85, 0.35), (1.0, 0.65), (1.15, 0.35),
+                      (1.0, 0.35), (1.0, 0.65), (0.85, 0.65), (1.15, 0.65), (1.0, 0.65), (1.0, 1.0)],
+            "coil": _along(_COIL, 1.0, 1.0),
+            **_plates(2.0, 1.0, q["v"] / self.Vin),
+            "top": [(2.0, 1.0), (3.0, 1.0)],
+            "load": _along([*_LOAD, (0.8, 0.0), (1.0, 0.0)], 3.0, 1.0, down=True),
+            "bottom": [(0.0, 0.0), (3.0, 0.0)],
+        }  # fmt: skip
+        return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
     def guess(self):
         return Guess("open", (12.0, 0.6, self.lower))
@@ -114,6 +154,24 @@ class CukConverter(HybridSystem):
 
     def period(self):
         return self.T
+
+    def draw(self, chart, t, q):
+        """The circuit: supply, first coil, switch, capacitor, diode, second coil, load."""
+        foot = (1.0, 0.2) if chart == "closed" else (1.35, 0.3)
+        lines = {
+            "first coil": _along(_COIL, 0.0, 1.0),
+            "switch": [(1.0, 1.0), (1.0, 0.8), foot],
+            "below": [(1.0, 0.2), (1.0, 0.0)],
+            **_plates(1.0, 1.0, q["v1"] / (4 * self.E), down=False),
+            "diode": [(2.0, 1.0), (2.0, 0.65), (1.85, 0.65), (2.0, 0.35), (2.15, 0.65), (2.0, 0.65),
+                      (2.0, 0.35), (1.85, 0.35), (2.15, 0.35), (2.0, 0.35), (2.0, 0.0)],
+            "second coil": _along(_COIL, 2.0, 1.0),
+            **_plates(3.0, 1.0, q["v2"] / (2 * self.E)),
+            "top": [(3.0, 1.0), (3.7, 1.0)],
+            "load": _along([*_LOAD, (0.8, 0.0), (1.0, 0.0)], 3.7, 1.0, down=True),
+            "bottom": [(0.0, 0.0), (3.7, 0.0)],
+        }  # fmt: skip
+        return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
     def guess(self):
         return Guess("open", (0.55, 25.0, 0.85, 10.0), 0.9 * self.T)
