@@ -114,8 +114,8 @@ class Trajectory(eqx.Module):
     def at(
         self, t: Annotated[Numbers, Reals("p")]
     ) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "p d"]]:
-        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant; at an event
-        those after it.
+        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. At an
+        event they are those after it.
 
         **Raises:** `DefinitionError` for times before its begin or after its end.
         """

@@ -45,16 +45,18 @@ def perturbed_trajectory(
         if experiment >= len(inputs.u):
             raise DefinitionError(f"the data hold {len(inputs.u)} experiments, none {experiment}.")
         inputs = inputs.u[experiment]
+    held: np.ndarray = np.asarray(inputs)
     s, placed, N = placed.structure(), to_host(placed), placed.n_sections
-    require_shape((1, *inputs.shape), N, s.nu)
+    require_shape((1, *held.shape), N, s.nu)
     lanes = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
     period, turn = float(placed.cycle.period), len(placed.cycle.event_sequence)
     settings, pieces, shift = placed.cycle.settings, [], 0.0
-    for k, u in enumerate(inputs[..., None]):
+    for k, u in enumerate(held[..., None]):
         j, turns = (k + 1) % N, int((k + 1) % N == 0)
         target = placed.target(np.array([j]), lanes.t, np.array([turns]))
         with at_ease():
             moved, tape = move(s, lanes, u, target, settings, options=Options(tape=True))
+        assert tape is not None
         if (code := Result(int(moved.result[0]))) != Result.OK:
             raise ComputationError(f"the motion stops after sample {k}: {code.message}.")
         piece = recorded(s, lanes, [tape], u, code)

@@ -4,7 +4,6 @@ import itertools
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
@@ -171,12 +170,12 @@ class BouncingChain(HybridSystem):
         return self.T
 
     def draw(self, chart, t, q):
-        tables = {f"table {i + 1}": ChainContact(self, i).table(t)[0] for i in range(self.n)}
-        x, y = (0.6 * np.arange(self.n)).tolist(), [q[f"y{i + 1}"] + 0.1 for i in range(self.n)]
-        places = list(zip(x, y, strict=True))
+        places = [(0.6 * i, q[f"y{i + 1}"] + 0.1) for i in range(self.n)]
         springs = [Drawing.spring(a, b, 0.04) for a, b in itertools.pairwise(places)]
-        lines = {name: [(a - 0.2, z), (a + 0.2, z)] for a, (name, z) in zip(x, tables.items())}
-        lines |= {f"spring {i + 1}": spring for i, spring in enumerate(springs)}
+        lines: dict = {f"spring {i + 1}": spring for i, spring in enumerate(springs)}
+        for i, (x, _) in enumerate(places):
+            height, _ = ChainContact(self, i).table(t)
+            lines[f"table {i + 1}"] = [(x - 0.2, height), (x + 0.2, height)]
         return Drawing(lines, circles={f"mass {i + 1}": (*p, 0.1) for i, p in enumerate(places)})
 
     def guess(self):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any, Literal
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -15,21 +16,41 @@ from ..systems.transition import Scheduled, Transition
 
 # Symbols of a circuit, as steps from their begin, in units of their length.
 _COIL = [(k / 48, 0.1 * math.sin(math.pi * (k % 12) / 12)) for k in range(49)]
-_LOAD = [(0.0, 0.0), (0.2, 0.0), (0.2, 0.12), (0.8, 0.12), (0.8, -0.12), (0.2, -0.12), (0.2, 0.0)]
+_LOAD = [
+    (0.0, 0.0),
+    (0.2, 0.0),
+    (0.2, 0.12),
+    (0.8, 0.12),
+    (0.8, -0.12),
+    (0.2, -0.12),
+    (0.2, 0.12),
+    (0.8, 0.12),
+    (0.8, 0.0),
+    (1.0, 0.0),
+]
+_DIODE = [
+    *((0.0, 0.0), (0.35, 0.0), (0.35, 0.15), (0.65, 0.0), (0.35, -0.15), (0.35, 0.0), (0.65, 0.0)),
+    *((0.65, 0.15), (0.65, -0.15), (0.65, 0.0), (1.0, 0.0)),
+]
+_Way = Literal["right", "up", "down"]
 
 
-def _along(symbol: Sequence[tuple[float, float]], x: float, y: float, down: bool = False) -> list:
-    """A symbol of length 1 from (x, y) to the right, or down."""
-    return [(x - b, y - a) if down else (x + a, y + b) for a, b in symbol]
+def _along(symbol: Sequence[tuple[Any, Any]], x: float, y: float, way: _Way = "right") -> list:
+    """A symbol of length 1 from (x, y) on."""
+    if way == "right":
+        return [(x + a, y + b) for a, b in symbol]
+    side = 1 if way == "up" else -1
+    return [(x + b, y + side * a) for a, b in symbol]
 
 
-def _plates(x: float, y: float, charge: ArrayLike, down: bool = True) -> dict[str, list]:
-    """A capacitor from (x, y) on, the distance of whose plates shows its charge, from 0 to 1."""
+def _capacitor(x: float, y: float, charge: ArrayLike, way: _Way = "down") -> dict[str, list]:
+    """Two plates, the distance of which shows the charge, from 0 to 1."""
     gap = 0.05 + 0.1 * jnp.clip(charge, 0, 1)
-    bars = {f"C {x:g} {k}": [(s * gap, -0.25), (s * gap, 0.25)] for k, s in ((1, -1), (2, 1))}
-    wires = {f"wire {x:g} 1": [(-0.5, 0), (-gap, 0)], f"wire {x:g} 2": [(gap, 0), (0.5, 0)]}
-    turned = lambda a, b: (x + b, y - 0.5 - a) if down else (x + 0.5 + a, y + b)  # noqa: E731
-    return {name: [turned(*p) for p in line] for name, line in (bars | wires).items()}
+    first, second = 0.5 - gap, 0.5 + gap
+    return {
+        f"plate {x:g}": _along([(0, 0), (first, 0), (first, -0.25), (first, 0.25)], x, y, way),
+        f"plate {x:g}'": _along([(1, 0), (second, 0), (second, -0.25), (second, 0.25)], x, y, way),
+    }
 
 
 class BuckConverter(HybridSystem):
@@ -88,16 +109,15 @@ class BuckConverter(HybridSystem):
         """The circuit: supply, switch (or diode), coil, capacitor, load."""
         blade = (0.9, 1.0) if chart == "closed" else (0.7, 1.4)
         lines = {
-            "supply": [(1.0, 1.0), (0.9, 1.0)],
             "switch": [(0.0, 1.0), (0.2, 1.0), blade],
-            "diode": [(1.0, 0.0), (1.0, 0.35), (0.85, 0.35), (1.0, 0.65), (1.15, 0.35),
-                      (1.0, 0.35), (1.0, 0.65), (0.85, 0.65), (1.15, 0.65), (1.0, 0.65), (1.0, 1.0)],
+            "contact": [(0.9, 1.0), (1.0, 1.0)],
+            "diode": _along(_DIODE, 1.0, 0.0, "up"),
             "coil": _along(_COIL, 1.0, 1.0),
-            **_plates(2.0, 1.0, q["v"] / self.Vin),
+            **_capacitor(2.0, 1.0, q["v"] / self.Vin),
             "top": [(2.0, 1.0), (3.0, 1.0)],
-            "load": _along([*_LOAD, (0.8, 0.0), (1.0, 0.0)], 3.0, 1.0, down=True),
+            "load": _along(_LOAD, 3.0, 1.0, "down"),
             "bottom": [(0.0, 0.0), (3.0, 0.0)],
-        }  # fmt: skip
+        }
         return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
     def guess(self):
@@ -162,15 +182,14 @@ class CukConverter(HybridSystem):
             "first coil": _along(_COIL, 0.0, 1.0),
             "switch": [(1.0, 1.0), (1.0, 0.8), foot],
             "below": [(1.0, 0.2), (1.0, 0.0)],
-            **_plates(1.0, 1.0, q["v1"] / (4 * self.E), down=False),
-            "diode": [(2.0, 1.0), (2.0, 0.65), (1.85, 0.65), (2.0, 0.35), (2.15, 0.65), (2.0, 0.65),
-                      (2.0, 0.35), (1.85, 0.35), (2.15, 0.35), (2.0, 0.35), (2.0, 0.0)],
+            **_capacitor(1.0, 1.0, q["v1"] / (4 * self.E), "right"),
+            "diode": _along(_DIODE, 2.0, 1.0, "down"),
             "second coil": _along(_COIL, 2.0, 1.0),
-            **_plates(3.0, 1.0, q["v2"] / (2 * self.E)),
+            **_capacitor(3.0, 1.0, q["v2"] / (2 * self.E)),
             "top": [(3.0, 1.0), (3.7, 1.0)],
-            "load": _along([*_LOAD, (0.8, 0.0), (1.0, 0.0)], 3.7, 1.0, down=True),
+            "load": _along(_LOAD, 3.7, 1.0, "down"),
             "bottom": [(0.0, 0.0), (3.7, 0.0)],
-        }  # fmt: skip
+        }
         return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
     def guess(self):

@@ -13,14 +13,13 @@ from ..systems.transition import Transition
 def _block(x: Array, reach: Parameter | float, speed: Parameter | float = 0.0) -> Drawing:
     """A block at x on a spring, whose rest length is twice the `reach`, above a ground that moves
     with this speed."""
-    low, size, wall = 0.0, 0.25 * reach, -2 * reach
-    half, middle = size, low + size
-    block = [(x - half, low), (x - half, low + 2 * size), (x + half, low + 2 * size), (x + half, low)]
+    half, wall = 0.25 * reach, -2 * reach
+    corners = (-1, 0), (-1, 2), (1, 2), (1, 0), (-1, 0)
     lines = {
-        "ground": [(wall, low), (2 * reach, low)],
-        "wall": [(wall, low), (wall, low + 4 * size)],
-        "block": [*block, block[0]],
-        "spring": Drawing.spring((wall, middle), (x - half, middle), 0.4 * size),
+        "ground": [(wall, 0.0), (-wall, 0.0)],
+        "block": [(x + a * half, b * half) for a, b in corners],
+        "wall": [(wall, 0.0), (wall, reach)],
+        "spring": Drawing.spring((wall, half), (x - half, half), 0.4 * half),
     }
     return Drawing(lines, velocity=(-speed, 0.0))
 

@@ -24,7 +24,8 @@ from ..errors import DefinitionError
 from ..orbits.continuation import Branch
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import PlacedSections
-from .film import frames, gif, player
+from ..systems.structure import Structure
+from .film import BODY, frames, gif, player
 from .look import COLORS, CYCLE, axis_of, style
 from .orbit import cycle as draw_cycle, pieces, plane_of
 from .over_parameters import branch as draw_branch
@@ -32,6 +33,13 @@ from .pictures import Pictures, drawing_of
 from .plane import multipliers as draw_multipliers
 
 
+# Small labels, close to small panels.
+_SMALL: dict[Any, Any] = {
+    **dict.fromkeys(("font.size", "xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 6),
+    **dict.fromkeys(("axes.labelsize", "axes.titlesize"), 7),
+    **dict.fromkeys(("xtick.major.pad", "ytick.major.pad", "axes.labelpad", "axes.titlepad"), 1),
+    **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 2),
+}
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 Draw = Callable[[int], Sequence[Artist]]
 """A function that draws frame k, and returns what it has moved."""
@@ -72,12 +80,12 @@ class Motion(FuncAnimation):
             raise DefinitionError("an .mp4 needs the program ffmpeg: write a .gif or .html.")
         with replacing(path) as new:
             if path.suffix == ".gif":
-                new.write_bytes(gif(self._frames(100), self.interval))
+                new.write_bytes(gif(self._frames(100)[1:], self.interval))
             elif path.suffix == ".html":
                 new.write_text(self._repr_html_())
             else:
                 film = new.with_suffix(".mp4")
-                super().save(str(film), writer="ffmpeg", fps=1 / self.interval, dpi=200)
+                super().save(str(film), writer="ffmpeg", fps=round(1 / self.interval), dpi=200)
                 film.rename(new)
         return path
 
@@ -85,7 +93,8 @@ class Motion(FuncAnimation):
         return frames(self.figure, self._draw, len(self.times), dpi)
 
     def _repr_html_(self) -> str:
-        return player(self._frames(150), self.interval, self._title)
+        still, *images = self._frames(150)
+        return player(still, images, self.interval, self._title)
 
 
 class Track(NamedTuple):
@@ -134,7 +143,8 @@ def animate(
         value of the parameter.
     - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
     - `sections`: from `place_sections`, on this cycle.
-    - `perturbed`: a trajectory from `simulate` or `hj.experiments.perturbed_trajectory`, drawn beside the cycle.
+    - `perturbed`: a trajectory beside the cycle, from `hj.experiments.perturbed_trajectory` or
+        `simulate`.
     - `traces`: names of states or outputs that are drawn over time. Default: `x` if the system has
         a picture, else up to four states.
     - `speed`: multiple of real speed. Default: 1. A motion of less than 0.25 s or more than 20 s,
@@ -149,63 +159,64 @@ def animate(
     """
     if isinstance(motion, Branch):
         return _of_branch(motion, x, y, 1 / fps / (speed or 1.0))
-    s, is_cycle = motion.structure, isinstance(motion, LimitCycle)
-    if is_cycle and motion.result != Result.OK:
-        reason = Result(int(motion.result)).message
-        raise DefinitionError(f"a cycle that was not found cannot be animated ({reason}).")
-    added: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
-    for name, other in added.items():
-        if other is not None and not is_cycle:
-            raise DefinitionError(f"`{name}` is for a limit cycle: animate the cycle.")
-        if other is not None and other.structure.names != s.names:
-            raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
+    cycle = motion if isinstance(motion, LimitCycle) else None
+    _require(cycle, motion.structure, sections, perturbed)
+    s, unit = motion.structure, motion.system.time_unit
     everywhere, has_picture = s.states_everywhere(), drawing_of(s, 0) is not None
     plane = plane_of(s, x, y) if len(everywhere) > 1 or (x and y) else None
     default = (plane or everywhere)[:1] if has_picture else s.state_names()[:4]
     names = s.resolve_outputs(default if traces is None else traces).names
-    period = float(motion.period) if is_cycle else None
-    paths = {"cycle": motion.trajectory(1 + 1e-6) if is_cycle else motion}
-    paths |= {} if perturbed is None else {"perturbed": perturbed}
-    length = period or float(np.ptp(paths["cycle"].t))
-    if perturbed is not None and period:
-        length = period * max(1, np.ceil(np.ptp(perturbed.t) / period - 1e-6))
-    pace = _pace(length, s.system.time_unit, speed)
+    path = motion.trajectory(1 + 1e-6) if isinstance(motion, LimitCycle) else motion
+    period = None if cycle is None else float(cycle.period)
+    last = path if perturbed is None else perturbed
+    length = period if period and perturbed is None else float(np.ptp(last.t))
+    pace = _pace(length, unit, speed)
     times = np.linspace(0, length, max(12, round(length / pace * fps)), endpoint=False)
-    tracks = []
-    for title, path in paths.items():
-        repeats = period if path is paths["cycle"] else None
-        since = np.mod(times, repeats) if repeats else np.minimum(times, np.ptp(path.t))
-        at = np.minimum(path.t[0] + since, path.t[-1])
-        tracks.append(Track(title if perturbed else "", path, repeats, at, 0.2 * pace))
-    with style():
+    phase = last.t[0] + times - path.t[0]
+    at = path.t[0] + (np.mod(phase, period) if period else phase)
+    tracks = [Track("cycle" if perturbed else "", path, period, at, 0.2 * pace)]
+    if perturbed is not None:
+        tracks.append(Track("perturbed", perturbed, None, last.t[0] + times, 0.2 * pace))
+    with style(), matplotlib.rc_context(_SMALL):
         figure, grid = _sheet()
         draws: list[Draw] = []
         if has_picture:
-            cells = grid[0, 0].subgridspec(1, len(tracks))
-            shape = 1.5 / len(tracks)
+            cells, shape = grid[0, 0].subgridspec(1, len(tracks)), 1.5 / len(tracks)
             draws += [
                 _picture(figure.add_subplot(cells[i]), x, shape) for i, x in enumerate(tracks)
             ]
         cells = (grid[1, 0] if has_picture else grid[:, 0]).subgridspec(len(names), 1, hspace=0.05)
         axes = [figure.add_subplot(cells[i]) for i in range(len(names))]
         draws.append(_traces(axes, tracks, names, times))
-        axes[0].set_title(_label(pace, s.system.time_unit), fontsize=6, loc="right", pad=1)
-        has_circle = is_cycle and len(motion.multipliers) > 0
+        axes[0].set_title(_label(pace, unit), fontsize=6, loc="right")
+        has_circle = cycle is not None and len(cycle.multipliers) > 0
         if plane is not None:
             panel = figure.add_subplot(grid[0, 1] if has_circle else grid[:, 1])
-            draws.append(_orbit(panel, motion, tracks, plane, sections))
+            draws.append(_orbit(panel, cycle, tracks, plane, sections))
         if has_circle:
             panel = figure.add_subplot(grid[1, 1])
-            draw_multipliers(motion, zoom=False, ax=panel)
+            draw_multipliers(cycle, zoom=False, ax=panel)
             panel.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1])
-            _small(panel)
         draw: Draw = lambda k: [artist for part in draws for artist in part(k)]  # noqa: E731
         title = f"motion of {type(s.system).__name__}"
         return Motion(figure, draw, times, length / pace / len(times), title)
 
 
+def _require(cycle: LimitCycle | None, s: Structure, sections, perturbed) -> None:
+    """**Raises:** `DefinitionError`, as `animate`."""
+    if cycle is not None and cycle.result != Result.OK:
+        reason = Result(int(cycle.result)).message
+        raise DefinitionError(f"a cycle that was not found cannot be animated ({reason}).")
+    added = {"sections": sections and sections.cycle, "perturbed": perturbed}
+    for name, other in added.items():
+        if other is not None and cycle is None:
+            raise DefinitionError(f"`{name}` is for a limit cycle: animate the cycle.")
+        if other is not None and other.structure.names != s.names:
+            raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
+
+
 def _sheet() -> tuple[Figure, Any]:
-    """A figure, and its cells. (Its layout is fixed: labels find their places before it is drawn.)"""
+    """A figure and its cells, at fixed places, so that labels find theirs before it is drawn."""
     figure = pyplot.figure(figsize=(4.8, 3.1), dpi=100)
     borders: dict[str, float] = {"left": 0.1, "right": 0.98, "bottom": 0.11, "top": 0.96}
     ratios: Any = {"width_ratios": (1.15, 1), "height_ratios": (1.4, 1)}
@@ -225,14 +236,6 @@ def _label(pace: float, unit: str) -> str:
     return f"{real:.2g} x real speed" if real and abs(real - 1) > 1e-9 else ""
 
 
-def _small(ax: Axes) -> None:
-    """Small labels, close to a small panel."""
-    ax.tick_params(labelsize=6, length=2, pad=1)
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.label.set_size(7)
-        axis.labelpad = 1
-
-
 def _picture(ax: Axes, track: Track, shape: float) -> Draw:
     """The mechanism, in a picture of this width over height."""
     pictures = Pictures(track.trajectory, track.period)
@@ -242,7 +245,7 @@ def _picture(ax: Axes, track: Track, shape: float) -> Draw:
     x, y = np.outer(center, [1, 1]) + np.outer([shape, 1], [-height / 2, height / 2])
     ax.set(xlim=x, ylim=y, xticks=[], yticks=[], aspect="equal")
     ax.spines[:].set_visible(False)
-    ax.set_title(track.title, fontsize=7, pad=1)
+    ax.set_title(track.title)
     shapes: dict[str, Any] = {}
     lines = [name for name in scenes[0].lines if name != "ground"]
     colors = itertools.cycle(CYCLE[: 3 if len(lines) <= 3 else 1])
@@ -251,7 +254,7 @@ def _picture(ax: Axes, track: Track, shape: float) -> Draw:
         look = {"color": next(colors), "lw": 1.6, "zorder": 3} if name in lines else gray
         (shapes[name],) = ax.plot([], [], solid_joinstyle="round", **look)
     for name, (x, y, radius) in scenes[0].circles.items():
-        circle = Circle((x, y), radius, fc="#e3ebf3", ec="black", lw=0.8, zorder=4)
+        circle = Circle((x, y), radius, fc=BODY, ec="black", lw=0.8, zorder=4)
         shapes[name] = ax.add_patch(circle)
     (marks,), (dots,) = ax.plot([], [], **gray), ax.plot([], [], "ko", ms=2.5, zorder=5)
     stride = abs(float(pictures.stride[0]))
@@ -295,17 +298,16 @@ def _traces(axes: list[Axes], tracks: list[Track], names: Sequence[str], times) 
     for ax, name in zip(axes, names, strict=True):
         for track, color in zip(tracks, (CYCLE[0], COLORS["red"]), strict=False):
             t, values = track.trajectory(name)
-            once = t - t[0] < (track.period or np.inf)
-            for begin in np.arange(0, span * (1 - 1e-6), track.period or span):
-                ax.plot(begin + (t - t[0])[once], values[once], color=color, lw=0.9)
+            once, begin = t - t[0] < (track.period or np.inf), t[0] - track.times[0]
+            for shift in np.arange(begin, span, track.period or span):
+                ax.plot(shift + (t - t[0])[once], values[once], color=color, lw=0.9)
         ax.set(xlim=(0, span), ylabel=axis_of(name))
         ax.margins(y=0.1)
         ax.locator_params(axis="y", nbins=4)
         ax.tick_params(labelbottom=ax is axes[-1])
         cursors.append(ax.axvline(0, color="black", lw=0.8))
-        _small(ax)
     axes[-1].set_xlabel(f"time ({unit})" if unit else "time")
-    text = axes[0].set_title("", fontsize=7, loc="left", pad=1, color=COLORS["red"])
+    text = axes[0].set_title("", loc="left", color=COLORS["red"])
 
     def draw(k: int) -> list[Artist]:
         text.set_text(", ".join(dict.fromkeys(name for x in tracks for name in x.events(k))))
@@ -318,24 +320,20 @@ def _traces(axes: list[Axes], tracks: list[Track], names: Sequence[str], times) 
 
 def _orbit(
     ax: Axes,
-    motion: LimitCycle | Trajectory,
+    cycle: LimitCycle | None,
     tracks: list[Track],
     plane: tuple[str, str],
     sections: PlacedSections | None,
 ) -> Draw:
     """The orbit with its sections, dots that move along it, and rings at events."""
-    drawn = tracks
-    if isinstance(motion, LimitCycle):
-        draw_cycle(motion, *plane, sections=sections, ax=ax)
-        ax.get_legend().remove()
-        drawn = tracks[1:]
-    for track in drawn:
+    if cycle is not None:
+        draw_cycle(cycle, *plane, sections=sections, ax=ax)
+        ax.legend([], [])
+    for track in tracks if cycle is None else tracks[1:]:
         for _, x, y in pieces(track.trajectory, *plane):
             ax.plot(x, y, color=COLORS["red"] if track.title else CYCLE[0], lw=0.6, zorder=1)
     ax.set(xlabel=axis_of(plane[0]), ylabel=axis_of(plane[1]))
-    for text in ax.texts:
-        text.set_fontsize(6)
-    _small(ax)
+    ax.locator_params(nbins=5)
     places, dots, rings = [], [], []
     for track, color in zip(tracks, (CYCLE[0], COLORS["red"]), strict=False):
         path = track.trajectory
@@ -344,16 +342,17 @@ def _orbit(
         dots += ax.plot([], [], "o", ms=6, mfc=color, mec="white", zorder=8)
         rings += ax.plot([], [], "o", ms=13, mfc="none", mec=color, mew=1.5, zorder=7)
     (bar,) = ax.plot([], [], "o", ms=9, mfc="none", mec=COLORS["green"], mew=1.4, zorder=6)
-    passed = [] if sections is None else np.asarray(sections.observe(plane))
-    when = np.zeros(0) if sections is None else np.asarray(sections.lanes.t)
+    marks = np.zeros((0, 3))
+    if sections is not None:
+        marks = np.column_stack([sections.lanes.t, sections.observe(plane)])
 
     def draw(k: int) -> list[Artist]:
         for track, points, dot, ring in zip(tracks, places, dots, rings, strict=True):
             dot.set_data(*points[[k]].T)
             ring.set_data(*points[[k]].T if track.events(k) else ([], []))
-        if len(when):
-            now, period = tracks[0].times[k], tracks[0].period
-            bar.set_data(*passed[[np.argmin(np.mod(now - when, period))]].T)
+        if len(marks):
+            ago = np.mod(tracks[0].times[k] - marks[:, 0], tracks[0].period or np.inf)
+            bar.set_data(*marks[[int(np.argmin(ago))], 1:].T)
         return [bar, *rings, *dots]
 
     return draw
@@ -366,10 +365,11 @@ def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) ->
     plane = plane_of(cycles[0].structure, x, y)
     multipliers = branch.multipliers[rows]
     orbits = [cycle.trajectory()(*plane)[1:] for cycle in cycles]
-    with style():
+    with style(), matplotlib.rc_context(_SMALL):
         figure, grid = _sheet()
         left, above, below = (figure.add_subplot(x) for x in (grid[:, 0], grid[0, 1], grid[1, 1]))
         draw_branch(branch, output=plane[0], ax=left)
+        left.legend()
         cursor = left.axvline(values[0], color="black", lw=0.8)
         for row in orbits:
             above.plot(*row, color=COLORS["gray"], lw=0.3, alpha=0.3)
@@ -380,9 +380,7 @@ def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) ->
         below.set(xlim=(-far, far), ylim=(-far, far))
         below.lines[-1].remove()
         (points,) = below.plot([], [], "k+", ms=9, mew=1.2)
-        text = above.set_title("", fontsize=7, loc="left", pad=1)
-        for panel in (left, above, below):
-            _small(panel)
+        text = above.set_title("", loc="left")
 
         def draw(k: int) -> list[Artist]:
             orbit.set_data(*orbits[k])
@@ -393,4 +391,5 @@ def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) ->
             text.set_text(f"{branch.parameter} = {values[k]:.4g}{'' if stable else ', unstable'}")
             return [orbit, points, cursor, text]
 
+        interval = max(interval, 4 / len(values))
         return Motion(figure, draw, values, interval, f"branch along {branch.parameter}")

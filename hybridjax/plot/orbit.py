@@ -156,8 +156,8 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
             va="bottom" if y > 0.35 else "top" if y < -0.35 else "center",
         )
         box = note.get_window_extent()
-        outside = 4 - ax.bbox.count_contains(box.corners())  # a corner counts as five points
-        return 5 * outside + box.padded(4).count_contains(drawn)
+        outside = 4 - ax.bbox.count_contains(box.corners())  # a corner counts as 20 points
+        return 20 * outside + box.padded(4).count_contains(drawn)
 
     covered(min(_TURNS, key=covered))
     box = note.get_window_extent()

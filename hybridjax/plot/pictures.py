@@ -1,4 +1,4 @@
-"""Pictures of a trajectory: the shapes of `HybridSystem.draw`, in the places to which it has gone."""
+"""Pictures of a trajectory: the shapes of `HybridSystem.draw`, where the motion has taken them."""
 
 from typing import Any, NamedTuple
 
@@ -35,7 +35,8 @@ class Pictures:
         self.trajectory = trajectory
         t, chart, q = trajectory.dense(6)
         drawings = drawn(trajectory.structure, t, chart, q)
-        place, velocity = (np.array(x) for x in zip(*((d.place, d.velocity) for d in drawings)))
+        place = np.array([drawing.place for drawing in drawings])
+        velocity = np.array([drawing.velocity for drawing in drawings])
         # Over an event the body stays; between events the origin moves by its velocity.
         moves = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t)[:, None]
         jumps = np.where((np.diff(t) == 0)[:, None], place[:-1] - place[1:], 0.0)

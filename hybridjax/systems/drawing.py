@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..errors import DefinitionError
@@ -65,7 +66,7 @@ class Drawing(eqx.Module):
         return {**self.points, **self.circles}[self.body][:2]
 
     @staticmethod
-    def spring(start: Any, end: Any, width: float = 0.08) -> Float[Array, "15 2"]:
+    def spring(start: Any, end: Any, width: ArrayLike = 0.08) -> Float[Array, "15 2"]:
         """The points of a zigzag line of this half width, in meters. Default: 0.08."""
         a, b = jnp.asarray(start, float), jnp.asarray(end, float)
         along = b - a

@@ -306,7 +306,6 @@ class _Halves(Derived):
             outputs.append(Output(x.name, lifted, x.unit))
         return outputs
 
-
     def draw(self, chart, t, q):
         return self.system.draw(chart.removesuffix(SECOND), q.get("clock", t), q)
 
