@@ -48,7 +48,7 @@ def chain(
     return Mechanism(kinetic, lambda q: g * jnp.sum(masses * places(q)[1]), links)
 
 
-_GROUND = [(-1.0, 0.0), (1.0, 0.0)]
+_GROUND = np.array([(-1.0, 0.0), (1.0, 0.0)])
 
 
 def accelerations_under_feedback(

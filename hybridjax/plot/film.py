@@ -76,11 +76,11 @@ def _image(canvas: FigureCanvasAgg) -> Image.Image:
 def gif(images: Sequence[Image.Image], interval: float) -> bytes:
     """A GIF that repeats. Its times are whole hundredths of a second, which together last as long
     as the frames."""
-    first, *others = images
+    first, *following = images
     ends = np.round(100 * interval * np.arange(len(images) + 1))
     durations = [int(10 * max(2, x)) for x in np.diff(ends)]
     file, options = io.BytesIO(), {"duration": durations, "loop": 0, "disposal": 1}
-    first.save(file, "gif", save_all=True, append_images=others, **options)
+    first.save(file, "gif", save_all=True, append_images=following, **options)
     return file.getvalue()
 
 
@@ -96,13 +96,11 @@ def player(still: Image.Image, images: Sequence[Image.Image], interval: float, a
 
 
 _PNG = "data:image/png;base64,"
-_CLEAR = 255
-"""Index of no color in a palette."""
 
 
 def _encoded(image: Image.Image, clear: np.ndarray | bool = False) -> str:
-    seen = Image.fromarray(np.where(clear, _CLEAR, np.asarray(image)).astype(np.uint8), "P")
-    seen.putpalette(image.getpalette() or [])
+    picture = Image.fromarray(np.where(clear, 255, np.asarray(image)).astype(np.uint8), "P")
+    picture.putpalette(image.getpalette() or [])
     file = io.BytesIO()
-    seen.save(file, "png", optimize=True, **({} if clear is False else {"transparency": _CLEAR}))
+    picture.save(file, "png", optimize=True, **({} if clear is False else {"transparency": 255}))
     return base64.b64encode(file.getvalue()).decode()

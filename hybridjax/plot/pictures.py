@@ -25,7 +25,7 @@ class Picture(NamedTuple):
 
 
 class Pictures:
-    """The pictures of a trajectory, seen by a camera of constant velocity.
+    """The pictures of a trajectory, pictures by a camera of constant velocity.
 
     The camera moves as far in a `period` as the body of the system does (of a trajectory without a
     period: in all of its time), so that the last picture of a cycle is followed by the first.
@@ -47,8 +47,8 @@ class Pictures:
         else:
             after = t[0] + period - t[-1]
             self.period, self.stride = period, self._origin[-1] + velocity[-1] * after
-        seen = self._seen(t, self._origin, drawings)
-        corners = np.vstack([_corners(picture) for picture in seen])
+        pictures = self._seen(t, self._origin, drawings)
+        corners = np.vstack([_corners(picture) for picture in pictures])
         self.low, self.high = corners.min(axis=0), corners.max(axis=0)
 
     def at(self, t: Float[np.ndarray, " n"]) -> list[Picture]:
