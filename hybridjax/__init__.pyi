@@ -76,6 +76,7 @@ from .sections.linearize import linearize as linearize
 from .sections.place import place_sections as place_sections
 from .sections.section_map import section_map as section_map
 from .systems.chart import Chart as Chart
+from .systems.drawing import Drawing as Drawing
 from .systems.quotient import Quotient as Quotient
 from .systems.sliding import sliding as sliding
 from .systems.solver import Radau as Radau

@@ -111,21 +111,31 @@ class Trajectory(eqx.Module):
         keep[1:, 0] = self.event[1:-1] >= 0  # a step's start repeats the last end, but for resets
         return t[keep], chart[keep], q[keep]
 
+    def at(
+        self, t: Annotated[Numbers, Reals("p")]
+    ) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "p d"]]:
+        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. At an
+        event they are those after it.
+
+        **Raises:** `DefinitionError` for times before its begin or after its end.
+        """
+        t = np.asarray(t)
+        if len(t) and not self.t[0] <= t.min() <= t.max() <= self.t[-1]:
+            raise DefinitionError(f"times must lie between {self.t[0]:.9g} and {self.t[-1]:.9g}.")
+        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
+        h = np.diff(self.t)[k, None]
+        x = np.divide(t[:, None] - self.t[k, None], h, out=np.zeros_like(h), where=h > 0)
+        ends = self.after[k], self.before[k + 1], self.slope_after[k], self.slope_before[k + 1]
+        return self.chart[k], interpolate(x, h, *ends)
+
     def __call__(self, *names: str, per_step: Count = 32) -> tuple[np.ndarray, ...]:
         """Times and the named states or outputs (at zero input), dense enough to plot.
 
         Values are NaN in charts where they are not defined.
         """
         require_x64()
-        t, chart, q = self.dense(per_step)
-        s = self.structure
-        items = tuple(s.resolve_outputs(names).items)
-        values = np.full((len(names), t.shape[0]), np.nan)
-        for a in np.unique(chart):
-            at = chart == a
-            point = t[at], q[at, : s.dims[a]].T, np.zeros((s.nu, 1))
-            values[:, at] = kernels.outputs(s, int(a), items, *point)[:, 0]
-        return (t, *values)
+        point = self.dense(per_step)
+        return (point[0], *observed(self.structure, names, *point))
 
     def __repr__(self):
         s, system = self.structure, self.system
@@ -136,6 +146,23 @@ class Trajectory(eqx.Module):
             f"Trajectory({type(system).__name__}: {span}, {len(self.t) - 1} steps; {events}; "
             f"ends in {s.names[self.chart[-1]]}: {self.result.message})"
         )
+
+
+def observed(
+    s: Structure,
+    names: Sequence[str],
+    t: Float[np.ndarray, " p"],
+    chart: Int[np.ndarray, " p"],
+    q: Float[np.ndarray, "p d"],
+) -> Float[np.ndarray, "n p"]:
+    """States or outputs at zero input; NaN in charts where they are not defined."""
+    items = tuple(s.resolve_outputs(names).items)
+    values = np.full((len(names), len(t)), np.nan)
+    for a in np.unique(chart):
+        at = chart == a
+        point = t[at], q[at, : s.dims[a]].T, np.zeros((s.nu, 1))
+        values[:, at] = kernels.outputs(s, int(a), items, *point)[:, 0]
+    return values
 
 
 @checked

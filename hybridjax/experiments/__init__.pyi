@@ -1,4 +1,5 @@
 from .design.multisine import optimize_phases as optimize_phases
+from .motion import perturbed_trajectory as perturbed_trajectory
 from .noise import (
     ProcessNoise as ProcessNoise,
     add_noise as add_noise,

@@ -10,7 +10,7 @@ S. Sastry, A Mathematical Introduction to Robotic Manipulation, 1994, ch. 4 and 
 symbol is formed: h is one derivative along v of the momentum dT/dv, less one gradient.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -24,6 +24,7 @@ from .._core.boundary.checked import checked
 from .._core.executor import is_traced
 from .._core.vector_math.factorizations import solve_positive
 from ..errors import DefinitionError
+from ..systems.drawing import Drawing
 from ..systems.structure import as_vector
 
 
@@ -65,6 +66,8 @@ class Mechanism(eqx.Module):
     - `kinetic`: T(q, v) -> number, quadratic in v and positive; from a mass matrix,
         `lambda q, v: 0.5 * v @ M(q) @ v`.
     - `potential`: V(q) -> number. Default: 0.
+    - `links`: for pictures, a function of q that returns the points (k, 2) of each link by name, in
+        meters. Default: none.
 
     Methods take one state, in fields, guards, resets and outputs. They compile to plain arithmetic
     operations without LAPACK. If the mass matrix is singular or not positive, methods raise
@@ -74,6 +77,19 @@ class Mechanism(eqx.Module):
 
     kinetic: Callable[[Any, Any], Any]
     potential: Callable[[Any], Any] = _no_potential
+    links: Callable[[Any], Mapping[str, Any]] | None = None
+
+    def draw(self, q: Float[Array, " n"], ground: Any = None, body: str | None = None) -> Drawing:
+        """The links, with a point at the end of each that has its name (see `Drawing`).
+
+        **Raises:** `DefinitionError` for a mechanism without `links`.
+        """
+        if self.links is None:
+            raise DefinitionError("the mechanism has no `links` to draw: give them to Mechanism.")
+        lines = {name: jnp.asarray(link, float) for name, link in self.links(q).items()}
+        points = {name: link[-1] for name, link in lines.items()}
+        below = {} if ground is None else {"ground": ground}
+        return Drawing({**below, **lines}, points=points, body=body)
 
     def energy(self, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, ""]:
         """T + V."""
@@ -150,6 +166,7 @@ class Mechanism(eqx.Module):
         return Mechanism(
             lambda p, v: self.kinetic(*jax.jvp(place, (p,), (v,))),
             lambda p: self.potential(place(p)),
+            None if self.links is None else lambda p: self.links(place(p)),  # type: ignore[misc]
         )
 
 

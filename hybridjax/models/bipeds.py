@@ -1,6 +1,7 @@
 """Actuated bipeds: the three-link walker with a torso, and the five-link robot RABBIT."""
 
 import math
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -24,11 +25,18 @@ def tips(arms: Arms, q: Float[Array, " n"]) -> Float[Array, "2 k"]:
 
 
 def chain(
-    arms: Arms, masses: Float[Array, " k"], inertias: Float[Array, " n"] | float, g: Parameter
+    arms: Arms,
+    masses: Float[Array, " k"],
+    inertias: Float[Array, " n"] | float,
+    g: Parameter,
+    drawn: Mapping[str, Arms],
 ) -> Mechanism:
     """A chain of n links in a plane, by their angles and the place (x, y) of its foot, or by their
-    angles alone, with its foot at the origin."""
+    angles alone, with its foot at the origin; `drawn` as lines from point to point."""
     n = arms.shape[1]
+
+    def links(q):
+        return {name: tips(line, q[:n]).T for name, line in drawn.items()}
 
     def places(q):
         return tips(arms, q[:n]) + (q[n:, None] if len(q) > n else 0.0)
@@ -37,7 +45,10 @@ def chain(
         speeds = jax.jvp(places, (q,), (v,))[1]
         return 0.5 * jnp.sum(masses * speeds**2) + 0.5 * jnp.sum(inertias * v[:n] ** 2)
 
-    return Mechanism(kinetic, lambda q: g * jnp.sum(masses * places(q)[1]))
+    return Mechanism(kinetic, lambda q: g * jnp.sum(masses * places(q)[1]), links)
+
+
+_GROUND = np.array([(-1.0, 0.0), (1.0, 0.0)])
 
 
 def accelerations_under_feedback(
@@ -102,7 +113,10 @@ class TorsoWalker(HybridSystem):
         stance foot."""
         legs = self.r / 2 * np.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
         arms = legs + self.l * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
-        return chain(arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g)
+        ends = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, 0, 1]])
+        ends = ends * jnp.stack([self.r, self.r, self.l])
+        drawn = {"stance": ends[:2], "swing": ends[1:3], "torso": ends[np.array([1, 3])]}
+        return chain(arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g, drawn)
 
     def charts(self):
         states = ("th1", "th2", "th3", "w1", "w2", "w3")
@@ -129,6 +143,9 @@ class TorsoWalker(HybridSystem):
 
     def _swing_foot(self, q):
         return q[3:] + tips(self.r * np.array([[1.0, -1.0, 0.0]]), q[:3])[:, 0]
+
+    def draw(self, chart, t, q):
+        return self.mechanism().draw(jnp.stack(list(q.values())[:3]), _GROUND, "stance")
 
     def guess(self):
         start = -self.stride, self.stride, self.lean, 1.5, -1.5, 0.0
@@ -196,7 +213,13 @@ class FiveLinkBiped(HybridSystem):
             [[1, 0, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, -1, 0]]
         )
         arms = self.length * links + center[:, None] * np.diag([-1, -1, 1, -1, -1])
-        return chain(arms, m, about_joint - m * center**2, self.g)
+        hip = [1, 1, 0, 0, 0]
+        stance = np.array([[0, 0, 0, 0, 0], [1, 0, 0, 0, 0], hip])
+        swing = np.array([hip, [1, 1, 0, -1, 0], [1, 1, 0, -1, -1]])
+        torso = jnp.stack([0 * self.length, 2 * self.torso_center])[:, None] * np.eye(5)[2]
+        torso = torso + self.length * np.array(hip)
+        drawn = {"stance": self.length * stance, "swing": self.length * swing, "torso": torso}
+        return chain(arms, m, about_joint - m * center**2, self.g, drawn)
 
     def _swing_foot(self, q):
         """Position (x, y) of the swing foot relative to the stance foot."""
@@ -239,6 +262,9 @@ class FiveLinkBiped(HybridSystem):
         foot = lambda q: q[5:] + self._swing_foot(q[:5])  # noqa: E731
         after = self.mechanism().impact(q, v, foot).velocity
         return jnp.concatenate([q[4::-1], after[4::-1]])
+
+    def draw(self, chart, t, q):
+        return self.mechanism().draw(jnp.stack(list(q.values())[:5]), _GROUND, "stance")
 
     def guess(self):
         s, k = self.stride, self.knee / 2

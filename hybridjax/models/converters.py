@@ -1,11 +1,58 @@
 """DC-DC converters with a switch that a controller closes and opens."""
 
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..systems.chart import FieldChart
+from ..systems.drawing import Drawing
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Scheduled, Transition
+
+
+# Symbols of a circuit, as steps from their begin, in units of their length.
+_COIL = [(k / 48, 0.1 * math.sin(math.pi * (k % 12) / 12)) for k in range(49)]
+_LOAD = [
+    *(
+        (0.0, 0.0),
+        (0.2, 0.0),
+        (0.2, 0.12),
+        (0.8, 0.12),
+        (0.8, -0.12),
+        (0.2, -0.12),
+        (0.2, 0.12),
+        (0.8, 0.12),
+        (0.8, 0.0),
+        (1.0, 0.0),
+    )
+]
+_DIODE = [
+    *((0.0, 0.0), (0.35, 0.0), (0.35, 0.15), (0.65, 0.0), (0.35, -0.15), (0.35, 0.0), (0.65, 0.0)),
+    *((0.65, 0.15), (0.65, -0.15), (0.65, 0.0), (1.0, 0.0)),
+]
+_Way = Literal["right", "up", "down"]
+
+
+def _along(symbol: Sequence[tuple[Any, Any]], x: float, y: float, way: _Way = "right") -> list:
+    """A symbol of length 1 from (x, y) on."""
+    if way == "right":
+        return [(x + a, y + b) for a, b in symbol]
+    side = 1 if way == "up" else -1
+    return [(x + b, y + side * a) for a, b in symbol]
+
+
+def _capacitor(x: float, y: float, charge: ArrayLike, way: _Way = "down") -> dict[str, list]:
+    """Two plates, the distance of which shows the charge, from 0 to 1."""
+    gap = 0.05 + 0.1 * jnp.clip(charge, 0, 1)
+    first, second = 0.5 - gap, 0.5 + gap
+    return {
+        f"plate {x:g}": _along([(0, 0), (first, 0), (first, -0.25), (first, 0.25)], x, y, way),
+        f"plate {x:g}'": _along([(1, 0), (second, 0), (second, -0.25), (second, 0.25)], x, y, way),
+    }
 
 
 class BuckConverter(HybridSystem):
@@ -59,6 +106,21 @@ class BuckConverter(HybridSystem):
 
     def period(self):
         return self.T
+
+    def draw(self, chart, t, q):
+        """The circuit: supply, switch (or diode), coil, capacitor, load."""
+        blade = (0.9, 1.0) if chart == "closed" else (0.7, 1.4)
+        lines = {
+            "switch": [(0.0, 1.0), (0.2, 1.0), blade],
+            "contact": [(0.9, 1.0), (1.0, 1.0)],
+            "diode": _along(_DIODE, 1.0, 0.0, "up"),
+            "coil": _along(_COIL, 1.0, 1.0),
+            **_capacitor(2.0, 1.0, q["v"] / self.Vin),
+            "top": [(2.0, 1.0), (3.0, 1.0)],
+            "load": _along(_LOAD, 3.0, 1.0, "down"),
+            "bottom": [(0.0, 0.0), (3.0, 0.0)],
+        }
+        return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
     def guess(self):
         return Guess("open", (12.0, 0.6, self.lower))
@@ -114,6 +176,23 @@ class CukConverter(HybridSystem):
 
     def period(self):
         return self.T
+
+    def draw(self, chart, t, q):
+        """The circuit: supply, first coil, switch, capacitor, diode, second coil, load."""
+        foot = (1.0, 0.2) if chart == "closed" else (1.35, 0.3)
+        lines = {
+            "first coil": _along(_COIL, 0.0, 1.0),
+            "switch": [(1.0, 1.0), (1.0, 0.8), foot],
+            "below": [(1.0, 0.2), (1.0, 0.0)],
+            **_capacitor(1.0, 1.0, q["v1"] / (4 * self.E), "right"),
+            "diode": _along(_DIODE, 2.0, 1.0, "down"),
+            "second coil": _along(_COIL, 2.0, 1.0),
+            **_capacitor(3.0, 1.0, q["v2"] / (2 * self.E)),
+            "top": [(3.0, 1.0), (3.7, 1.0)],
+            "load": _along(_LOAD, 3.7, 1.0, "down"),
+            "bottom": [(0.0, 0.0), (3.7, 0.0)],
+        }
+        return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
     def guess(self):
         return Guess("open", (0.55, 25.0, 0.85, 10.0), 0.9 * self.T)

@@ -9,12 +9,20 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..systems.chart import Chart, FieldChart
+from ..systems.drawing import Drawing
 from ..systems.solver import Radau
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
 _MASSES = ("yM", "vM", "ym", "vm"), ("m", "m/s", "m", "m/s")
+
+
+def _hopper(i: int, yM: Array, ym: Array) -> tuple[dict, dict]:
+    """Lines and circles of hopper i. (Its foot has a radius of 0.1 m.)"""
+    x, tag = 1.5 * i, f" {i + 1}" if i else ""
+    circles = {f"body{tag}": (x, yM, 0.3), f"foot{tag}": (x, ym + 0.1, 0.1)}
+    return {f"leg{tag}": Drawing.spring((x, ym + 0.2), (x, yM - 0.3))}, circles
 
 
 class HopperStance(Chart):
@@ -86,6 +94,10 @@ class VerticalHopper(HybridSystem):
 
     def period(self):
         return 2 * jnp.pi / self.omega
+
+    def draw(self, chart, t, q):
+        lines, circles = _hopper(0, q["yM"], q["ym"])
+        return Drawing({"ground": [(-1.0, 0.0), (1.0, 0.0)], **lines}, circles=circles)
 
     def guess(self):
         return Guess("stance", (2.0, 1.9), 0.5)
@@ -205,6 +217,14 @@ class HopperPair(VerticalHopper):
 
         name = f"{'liftoff' if lifts else 'touchdown'} {i + 1} ({_PAIR_CHARTS[down]})"
         return Transition(name, _PAIR_CHARTS[down], _PAIR_CHARTS[after], guard, reset=reset)
+
+    def draw(self, chart, t, q):
+        (lines, circles), (second, more) = (
+            _hopper(i, q[f"yM{i + 1}"], q[f"ym{i + 1}"]) for i in (0, 1)
+        )
+        between = Drawing.spring((0.3, q["yM1"]), (1.2, q["yM2"]))
+        lines = {"ground": [(-1.0, 0.0), (2.5, 0.0)], **lines, **second, "coupling": between}
+        return Drawing(lines, circles={**circles, **more})
 
     def guess(self):
         """The states of two uncoupled hoppers: the first is about to lift off, the second is

@@ -1,11 +1,27 @@
 """Oscillators: clocked and autonomous, smooth and piecewise smooth."""
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ..systems.chart import FieldChart
+from ..systems.drawing import Drawing
 from ..systems.sliding import Sliding, sliding
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
+
+
+def _block(x: Array, reach: Parameter | float, speed: Parameter | float = 0.0) -> Drawing:
+    """A block at x on a spring, whose rest length is twice the `reach`, above a ground that moves
+    with this speed."""
+    half, wall = 0.25 * reach, -2 * reach
+    corners = (-1, 0), (-1, 2), (1, 2), (1, 0), (-1, 0)
+    lines = {
+        "ground": [(wall, 0.0), (-wall, 0.0)],
+        "block": [(x + a * half, b * half) for a, b in corners],
+        "wall": [(wall, 0.0), (wall, reach)],
+        "spring": Drawing.spring((wall, half), (x - half, half), 0.4 * half),
+    }
+    return Drawing(lines, velocity=(-speed, 0.0))
 
 
 class Duffing(HybridSystem):
@@ -37,6 +53,9 @@ class Duffing(HybridSystem):
 
     def period(self):
         return 2 * jnp.pi / self.rate
+
+    def draw(self, chart, t, q):
+        return _block(q["x"], self.amplitude)
 
     def guess(self):
         """The response of the linear oscillator, far from resonance."""
@@ -184,6 +203,9 @@ class BeltOscillator(HybridSystem):
             return q[1], (u[0] - self.k * q[0] - side * friction) / self.m
 
         return FieldChart(field, ("x", "v"), ("m", "m/s"))
+
+    def draw(self, chart, t, q):
+        return _block(q["x"], self.friction / self.k, self.belt)
 
     def guess(self):
         return Guess("sticks", jnp.stack([0.5 * self.friction / self.k, self.belt]))

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked_methods
 from ..systems.chart import FieldChart
+from ..systems.drawing import Drawing
 from ..systems.system import Guess, HybridSystem, Output, Parameter, parameter
 from ..systems.transition import Transition
 
@@ -109,6 +110,15 @@ class TwoLeggedBar(HybridSystem):
     def period(self):
         return self.T
 
+    def draw(self, chart, t, q):
+        """The table, the bar, and legs that have their rest length in the air."""
+        table = self.A * jnp.sin(2 * jnp.pi * t / self.T)
+        hips = [(self.hip(leg), q["y"] + self.hip(leg) * q["q"]) for leg in _LEGS]
+        lines: dict = {"ground": [(-1.0, table), (1.0, table)], "bar": hips}
+        for leg, (x, y) in zip(_LEGS, hips, strict=True):
+            lines[leg] = Drawing.spring((x, jnp.maximum(table, y - self.l0)), (x, y), 0.05)
+        return Drawing(lines, circles={"center": (0.0, q["y"], 0.08)})
+
     def guess(self):
         return Guess("both", (0.4, -0.9, 0.0, 0.5))
 
@@ -197,6 +207,15 @@ class SLIPRunner(HybridSystem):
             Transition("touchdown", "flight", "stance", height, reset=landed, enabled=down),
             Transition("liftoff", "stance", "flight", stretch, "rising", lifted),
         )
+
+    def draw(self, chart, t, q):
+        """In flight, the leg has the angle at which it will touch down."""
+        y, flies = q["y"], chart == "flight"
+        x = -self.l0 * jnp.cos(self.angle) if flies else q["x"]
+        foot = y - self.l0 * jnp.sin(self.angle) if flies else 0.0
+        speed = (q["vx"], 0.0) if flies else (0.0, 0.0)
+        lines = {"ground": [(-1.0, 0.0), (1.0, 0.0)], "leg": Drawing.spring((0.0, foot), (x, y))}
+        return Drawing(lines, circles={"mass": (x, y, 0.15)}, body="mass", velocity=speed)
 
     def guess(self):
         return Guess("flight", (0.95, 5.07, 0.0))

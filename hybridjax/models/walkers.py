@@ -3,10 +3,29 @@
 import math
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ..systems.chart import FieldChart
+from ..systems.drawing import Drawing
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
+
+
+def _slope(angle: Parameter, length: Parameter | float = 1.0) -> Array:
+    """The ground under a stance foot at the origin, which falls towards x > 0."""
+    way = length * jnp.stack([jnp.cos(angle), -jnp.sin(angle)])
+    return jnp.stack([-way, way])
+
+
+def _two_legs(slope: Parameter, length: Parameter | float, stance: Array, swing: Array) -> Drawing:
+    """Legs by their angles from the vertical, positive backward."""
+    way = lambda angle: length * jnp.stack([-jnp.sin(angle), jnp.cos(angle)])  # noqa: E731
+    hip = way(stance)
+    foot = hip - way(swing)
+    lines = {"ground": _slope(slope, length), "stance": [0 * hip, hip], "swing": [hip, foot]}
+    circles = {"hip": jnp.append(hip, 0.08 * length)}
+    return Drawing(lines, circles=circles, points={"stance foot": 0 * hip, "swing foot": foot},
+                   body="hip")  # fmt: skip
 
 
 class RimlessWheel(HybridSystem):
@@ -47,6 +66,15 @@ class RimlessWheel(HybridSystem):
         after = lambda t, q, u: (self.slope - self.alpha, jnp.cos(2 * self.alpha) * q[1])  # noqa: E731
         return (Transition("impact", "swing", "swing", angle, "rising", after),)
 
+    def draw(self, chart, t, q):
+        """With spokes of 1 m, of which up to 24 are drawn."""
+        angles = q["th"] + 2 * self.alpha * (jnp.arange(24) % self.spokes)
+        hub = jnp.stack([jnp.sin(q["th"]), jnp.cos(q["th"])])
+        tips = hub - jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1)
+        spokes = jnp.stack([jnp.broadcast_to(hub, tips.shape), tips], axis=1).reshape(-1, 2)
+        lines = {"ground": _slope(self.slope), "spokes": spokes}
+        return Drawing(lines, circles={"hub": jnp.append(hub, 0.08)}, body="hub")
+
     def guess(self):
         return Guess("swing", (0.0, 0.3 * jnp.sqrt(self.rate)))
 
@@ -78,6 +106,11 @@ class SimplestWalker(HybridSystem):
         foot = lambda t, q, u: q[1] - 2 * q[0]  # noqa: E731
         ahead = lambda t, q, u: q[0] < 0  # noqa: E731
         return (Transition("heelstrike", "step", "step", foot, "rising", _heelstrike, ahead),)
+
+    def draw(self, chart, t, q):
+        """With legs of 1 m."""
+        stance = q["th"] - self.slope
+        return _two_legs(self.slope, 1.0, stance, stance - q["phi"])
 
     def guess(self):
         """The long-period gait; `short_gait` is the other one."""
@@ -159,6 +192,9 @@ class CompassGait(HybridSystem):
         C, D = m * b**2, -m * b * length * c
         det = A * D - B * C
         return s, n, (D * whole - B * leg) / det, (A * leg - C * whole) / det
+
+    def draw(self, chart, t, q):
+        return _two_legs(self.slope, self.l, q["s"], q["n"])
 
     def guess(self):
         s = 0.22

@@ -9,6 +9,7 @@ from .data import (
 from .designs import spectrum as spectrum, strides as strides
 from .frequency import bode as bode, bodes as bodes, harmonics as harmonics, magnitude as magnitude
 from .look import COLORS as COLORS, PAGE as PAGE, save as save, style as style
+from .motion import Motion as Motion, animate as animate
 from .orbit import cycle as cycle
 from .over_parameters import branch as branch, sweep as sweep
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros

@@ -53,7 +53,7 @@ def cycle(
     **Raises:** `DefinitionError` for a name that does not exist, or sections of another system.
     """
     s = cycle.structure
-    x, y = _plane(s, x, y)
+    x, y = plane_of(s, x, y)
     added: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
     for name, other in added.items():
         if other is not None and other.structure.names != s.names:
@@ -62,12 +62,12 @@ def cycle(
     with panels(ax, height=3.0) as axes:
         panel = axes[0, 0]
         if perturbed is not None:
-            pieces = _pieces(perturbed, x, y)
-            for _, px, py in pieces:
+            parts = pieces(perturbed, x, y)
+            for _, px, py in parts:
                 panel.plot(px, py, color=COLORS["red"], lw=0.7, zorder=1)
-            panel.plot(pieces[0][1][0], pieces[0][2][0], "s", ms=3.5, color=COLORS["red"], zorder=5)
+            panel.plot(parts[0][1][0], parts[0][2][0], "s", ms=3.5, color=COLORS["red"], zorder=5)
         labeled = set()
-        for a, px, py in _pieces(orbit, x, y):
+        for a, px, py in pieces(orbit, x, y):
             label = None if a in labeled else s.names[a]
             labeled.add(a)
             color = _CHARTS[a % len(_CHARTS)]
@@ -87,7 +87,7 @@ def cycle(
     return Plot(axes)
 
 
-def _plane(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
+def plane_of(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
     everywhere = s.states_everywhere()
     if (x is None or y is None) and len(everywhere) < 2:
         raise DefinitionError("no two states are defined in every chart: give `x` and `y`.")
@@ -97,13 +97,13 @@ def _plane(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
     return x, y
 
 
-def _pieces(trajectory: Trajectory, x: str, y: str):
+def pieces(trajectory: Trajectory, x: str, y: str):
     """(chart, x, y) of each stay between two events."""
     t, chart, _ = trajectory.dense()
     _, px, py = trajectory(x, y)
     cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
-    pieces = zip(np.split(chart, cuts), np.split(px, cuts), np.split(py, cuts), strict=True)
-    return [(int(c[0]), x, y) for c, x, y in pieces if len(c) > 1 and np.any(np.isfinite(x + y))]
+    parts = zip(np.split(chart, cuts), np.split(px, cuts), np.split(py, cuts), strict=True)
+    return [(int(c[0]), x, y) for c, x, y in parts if len(c) > 1 and np.any(np.isfinite(x + y))]
 
 
 def _points(s: Structure, a: int, names, t, q) -> tuple[np.ndarray, np.ndarray]:
@@ -156,8 +156,8 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
             va="bottom" if y > 0.35 else "top" if y < -0.35 else "center",
         )
         box = note.get_window_extent()
-        outside = 4 - ax.bbox.count_contains(box.corners())  # a corner counts as five points
-        return 5 * outside + box.padded(4).count_contains(drawn)
+        outside = 4 - ax.bbox.count_contains(box.corners())  # a corner counts as 20 points
+        return 20 * outside + box.padded(4).count_contains(drawn)
 
     covered(min(_TURNS, key=covered))
     box = note.get_window_extent()

@@ -144,6 +144,17 @@ class Quotient(Derived):
             outputs.append(Output(x.name, kept, x.unit))
         return outputs
 
+    def draw(self, chart, t, q):
+        """The picture of the original system, which stands at the translation 0 and moves."""
+        whole, still = self.system.charts()[chart], dict.fromkeys(self.translation, 0.0)
+        state = jnp.stack([jnp.asarray((still | dict(q))[x], float) for x in whole.states])
+        drawing = self.system.draw(chart, t, {**q, **still})
+        if drawing is None or len(self.translation) != 1:
+            return drawing
+        rates = as_vector(whole.field(t, state, jnp.zeros(len(self.inputs))))
+        along = rates[whole.states.index(self.translation[0])]
+        return eqx.tree_at(lambda x: x.velocity, drawing, jnp.stack([along, 0 * along]))
+
     def check(self) -> None:
         """Raise an error for a function that does not have the symmetry."""
         if is_traced(self):
@@ -294,6 +305,9 @@ class _Halves(Derived):
             lifted = {name: charts[name].lifted(f) for name, f in given.items()}
             outputs.append(Output(x.name, lifted, x.unit))
         return outputs
+
+    def draw(self, chart, t, q):
+        return self.system.draw(chart.removesuffix(SECOND), q.get("clock", t), q)
 
 
 class _Half(DerivedChart):

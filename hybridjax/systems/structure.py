@@ -391,6 +391,12 @@ class Structure:
         """A state of chart a by names."""
         return ByName(zip(self.charts[a].states, q.tolist(), strict=False))
 
+    def drawing(self, a: int, t: Any, q: Any) -> Any:
+        """The drawing of a state of chart a, or `None`."""
+        values = {name: self.state_function(name, a) for name in self.state_names()}
+        named = {str(name): f(t, q, None) for name, f in values.items() if f is not None}
+        return self.system.draw(self.names[a], t, ByName(named))
+
     def resolve_outputs(self, outputs: Sequence[str | Output] | str | Output) -> "Outputs":
         """Outputs by name or by `Output`, checked and ready to evaluate in any chart."""
         if isinstance(outputs, str | Output):

@@ -21,6 +21,7 @@ from .._core.precision import real
 from .._core.text import columns, fields, value
 from ..errors import DefinitionError
 from .chart import Chart, attribute_of
+from .drawing import Drawing
 from .solver import ByChart, Method, Solver, solvers
 from .transition import Transition
 
@@ -159,7 +160,7 @@ class HybridSystem(Definition):
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
-        for name in ("charts", "transitions", "period", "outputs", "guess"):
+        for name in ("charts", "transitions", "period", "outputs", "guess", "draw"):
             if not callable(vars(cls).get(name, callable)):
                 raise DefinitionError(
                     f"{cls.__name__}: `{name}` must be a method, not a value or parameter: write "
@@ -192,6 +193,12 @@ class HybridSystem(Definition):
 
     def guess(self) -> Guess | None:
         """The default guess for the search of the limit cycle, or `None`."""
+        return None
+
+    def draw(self, chart: str, t: Any, q: Mapping[str, Any]) -> Drawing | None:
+        """What the system looks like in a chart, for `hj.plot.animate`: a `Drawing`, written for
+        one state as a vector field is. `q` holds the states of the chart and the values of those
+        that it lacks (`Chart.absent`) by name. `None`, the default: states are drawn over time."""
         return None
 
     def __repr__(self):
@@ -230,6 +237,9 @@ class Derived(HybridSystem):
 
     def outputs(self):
         return self.system.outputs()
+
+    def draw(self, chart, t, q):
+        return self.system.draw(chart, t, q)
 
 
 class Driven(Derived):

@@ -298,6 +298,8 @@ def plots(t):
     yield plot.spectrum, dict(plan=t.plan, model=t.model)
     yield plot.strides, dict(plan=t.plan, studies={"a": t.studied})
     yield plot.cycle, dict(cycle=t.cycle)
+    yield plot.animate, dict(motion=t.cycle)
+    yield hj.experiments.perturbed_trajectory, dict(placed=t.placed, inputs=t.data)
     yield positional(plot.branch), dict(values=t.branch)
     yield plot.experiment, dict(data=t.data)
     yield plot.multipliers, dict(true=np.array([0.5]))

@@ -1,0 +1,111 @@
+"""Pictures of a trajectory: the shapes of `HybridSystem.draw`, where the motion has taken them."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from .._core.lanes import by_lane
+from ..engine.trajectory import Trajectory
+from ..systems.check import evaluating
+from ..systems.drawing import Drawing
+from ..systems.structure import Structure
+
+
+class Picture(NamedTuple):
+    """Shapes by name, as those of a `Drawing`, as a camera sees them."""
+
+    lines: dict[str, Float[np.ndarray, "_ 2"]]
+    circles: dict[str, Float[np.ndarray, "3"]]
+    points: dict[str, Float[np.ndarray, "2"]]
+    ground: Float[np.ndarray, "2"]
+    """The position of a mark on the ground."""
+
+
+class Pictures:
+    """The pictures of a trajectory, pictures by a camera of constant velocity.
+
+    The camera moves as far in a `period` as the body of the system does (of a trajectory without a
+    period: in all of its time), so that the last picture of a cycle is followed by the first.
+    """
+
+    def __init__(self, trajectory: Trajectory, period: float | None = None):
+        self.trajectory = trajectory
+        t, chart, q = trajectory.dense(6)
+        drawings = drawn(trajectory.structure, t, chart, q)
+        place = np.array([drawing.place for drawing in drawings])
+        velocity = np.array([drawing.velocity for drawing in drawings])
+        # Over an event the body stays; between events the origin moves by its velocity.
+        moves = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t)[:, None]
+        jumps = np.where((np.diff(t) == 0)[:, None], place[:-1] - place[1:], 0.0)
+        self._origin = np.vstack([np.zeros(2), np.cumsum(moves + jumps, axis=0)])
+        self._t, self._velocity = t, velocity
+        if period is None:
+            self.period, self.stride = t[-1] - t[0], self._origin[-1] + place[-1] - place[0]
+        else:
+            after = t[0] + period - t[-1]
+            self.period, self.stride = period, self._origin[-1] + velocity[-1] * after
+        pictures = self._seen(t, self._origin, drawings)
+        corners = np.vstack([_corners(picture) for picture in pictures])
+        self.low, self.high = corners.min(axis=0), corners.max(axis=0)
+
+    def at(self, t: Float[np.ndarray, " n"]) -> list[Picture]:
+        """The pictures at times of the trajectory."""
+        drawings = drawn(self.trajectory.structure, t, *self.trajectory.at(t))
+        k = np.searchsorted(self._t, t, side="right") - 1
+        origin = self._origin[k] + self._velocity[k] * (t - self._t[k])[:, None]
+        return self._seen(t, origin, drawings)
+
+    def _seen(self, t, origin, drawings) -> list[Picture]:
+        cameras = (t - self._t[0])[:, None] / self.period * self.stride
+        return [
+            Picture(
+                {name: x + by for name, x in drawing.lines.items()},
+                {name: x + np.append(by, 0.0) for name, x in drawing.circles.items()},
+                {name: x + by for name, x in drawing.points.items()},
+                -camera,
+            )
+            for drawing, by, camera in zip(drawings, origin - cameras, cameras, strict=True)
+        ]
+
+
+def drawn(
+    s: Structure,
+    t: Float[np.ndarray, " n"],
+    chart: Int[np.ndarray, " n"],
+    q: Float[np.ndarray, "n d"],
+) -> list[Drawing]:
+    """The drawings of states, on the host."""
+    drawings: list[Any] = [None] * len(t)
+    for a in np.unique(chart).tolist():
+        rows = np.flatnonzero(chart == a)
+        leaves, form = jax.tree_util.tree_flatten(drawing_of(s, a))
+        values = s.kernel(_flat, by_lane, a, lanes=4)(t[rows], q[rows, : s.dims[a]].T)
+        parts = np.split(values.T, np.cumsum([x.size for x in leaves])[:-1], axis=1)
+        for k, row in enumerate(rows):
+            shapes = [part[k].reshape(x.shape) for part, x in zip(parts, leaves, strict=True)]
+            drawings[row] = jax.tree_util.tree_unflatten(form, shapes)
+    return drawings
+
+
+def drawing_of(s: Structure, a: int) -> Any:
+    """The shapes of the drawings in chart a, or `None` if the system has none.
+
+    **Raises:** `DefinitionError` if the system's `draw` raises an error.
+    """
+    point = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((s.dims[a],), float)
+    with evaluating(f"method `draw` of {type(s.system).__name__}"):
+        return jax.eval_shape(lambda t, q: s.drawing(a, t, q), *point)
+
+
+def _flat(a: int, s: Structure, t, q):
+    return jnp.concatenate([jnp.ravel(x) for x in jax.tree_util.tree_leaves(s.drawing(a, t, q))])
+
+
+def _corners(picture: Picture) -> Float[np.ndarray, "_ 2"]:
+    """Points between which a picture lies, without its ground."""
+    lines = [x for name, x in picture.lines.items() if name != "ground"]
+    circles = [x[:2] + side * x[2] for x in picture.circles.values() for side in (-1, 1)]
+    return np.vstack([*lines, *circles, *picture.points.values()])

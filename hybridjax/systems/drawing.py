@@ -1,0 +1,85 @@
+"""What a system looks like in one state, for animations: shapes by name, without matplotlib."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from ..errors import DefinitionError
+
+
+class Drawing(eqx.Module):
+    """A system seen from the side in one state, as `HybridSystem.draw` returns it.
+
+    ```python
+    def draw(self, chart, t, q):
+        leg = hj.Drawing.spring((0.0, q["foot"]), (0.0, q["body"]))
+        return hj.Drawing({"ground": [(-1.0, 0.0), (1.0, 0.0)], "leg": leg},
+                          circles={"body": (0.0, q["body"], 0.2)})
+    ```
+
+    **Fields**, in meters:
+
+    - `lines`: points (k, 2) that are joined, by name. The line `ground` is drawn to the borders of
+        the picture.
+    - `circles`: (x, y, radius) by name. `points`: (x, y) by name, drawn as dots.
+    - `body`: the name of a circle or a point that no event moves. After an event that gives the
+        origin another meaning (the other foot), the picture is moved until the body is where it
+        was. Default: the origin stays.
+    - `velocity`: that of the origin over the ground, (2,), in charts whose states hold no position
+        along the ground. Default: 0.
+
+    **Raises:** `DefinitionError` for other shapes, or a `body` that has no place.
+    """
+
+    lines: dict[str, Float[Array, "_ 2"]]
+    circles: dict[str, Float[Array, "3"]]
+    points: dict[str, Float[Array, "2"]]
+    body: str | None = eqx.field(static=True)
+    velocity: Float[Array, "2"]
+
+    def __init__(
+        self,
+        lines: Mapping[str, Any] | None = None,
+        *,
+        circles: Mapping[str, Any] | None = None,
+        points: Mapping[str, Any] | None = None,
+        body: str | None = None,
+        velocity: Any = (0.0, 0.0),
+    ):
+        self.lines, self.circles, self.points = (
+            {name: _array(name, x, shape) for name, x in (parts or {}).items()}
+            for parts, shape in ((lines, (None, 2)), (circles, (3,)), (points, (2,)))
+        )
+        self.velocity, self.body = _array("velocity", velocity, (2,)), body
+        if body is not None and body not in {**self.circles, **self.points}:
+            raise DefinitionError(f"Drawing: `body` must be a circle or a point, not '{body}'.")
+
+    @property
+    def place(self) -> Float[Array, "2"]:
+        """The position of the body; the origin without one."""
+        if self.body is None:
+            return 0 * self.velocity
+        return {**self.points, **self.circles}[self.body][:2]
+
+    @staticmethod
+    def spring(start: Any, end: Any, width: ArrayLike = 0.08) -> Float[Array, "15 2"]:
+        """The points of a zigzag line of this half width, in meters. Default: 0.08."""
+        a, b = jnp.asarray(start, float), jnp.asarray(end, float)
+        along = b - a
+        across = width * jnp.stack([-along[1], along[0]]) / jnp.maximum(jnp.hypot(*along), 1e-9)
+        part = jnp.concatenate([jnp.zeros(1), jnp.linspace(0.15, 0.85, 13), jnp.ones(1)])
+        side = jnp.array([0.0, 0.0, *[1.0, -1.0] * 5, 1.0, 0.0, 0.0])
+        return a + part[:, None] * along + side[:, None] * across
+
+
+def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
+    array = jnp.asarray(value, float)
+    fits = [n in (None, m) for n, m in zip(shape, array.shape, strict=False)]
+    if array.ndim != len(shape) or not all(fits):
+        text = str(shape).replace("None", "k")
+        raise DefinitionError(f"Drawing: '{name}' must have the shape {text}, not {array.shape}.")
+    return array

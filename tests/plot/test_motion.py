@@ -1,0 +1,59 @@
+"""Animations: frames on the trajectory, feet that stay, loops that close, files, refusals."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.plot.pictures import Pictures
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return hj.find_limit_cycle(hj.models.CompassGait(), section=hj.AtEvent("heelstrike"))
+
+
+def test_states_at_times_lie_on_the_trajectory(walk):
+    path = walk.trajectory()
+    t, chart, q = path.dense(7)
+    once = np.append(np.diff(t) > 0, False)  # at an event both sides have one time
+    found = path.at(t[once])
+    np.testing.assert_array_equal(found[0], chart[once])
+    np.testing.assert_allclose(found[1], q[once], rtol=0, atol=1e-12)
+    with pytest.raises(hj.DefinitionError, match="times must lie between"):
+        path.at([path.t[-1] + 1])
+
+
+def test_feet_do_not_slide_and_the_loop_closes(walk):
+    period = float(walk.period)
+    path = walk.trajectory(1 + 1e-6)
+    pictures = Pictures(path, period)
+    strike = path.t[path.event >= 0][-1]
+    before, after = pictures.at(np.array([strike - 1e-9, strike]))
+    for new, old in (("stance foot", "swing foot"), ("swing foot", "stance foot")):
+        np.testing.assert_allclose(after.points[new], before.points[old], atol=1e-7)
+    times = path.t[0] + np.linspace(0.01, 0.9, 20) * period
+    feet = [x.points["stance foot"] - x.ground for x in pictures.at(times)]
+    np.testing.assert_allclose(feet - feet[0], 0, atol=1e-12)
+    # A step has the length of the line between the feet.
+    step = before.points["swing foot"] - before.points["stance foot"]
+    np.testing.assert_allclose(pictures.stride, step, atol=1e-7)
+
+
+def test_files_and_refusals(walk, tmp_path):
+    motion = hj.plot.animate(walk)
+    assert abs(motion.interval * len(motion.times) - float(walk.period)) < 1e-9
+    assert motion.save(tmp_path / "walk.gif").read_bytes().startswith(b"GIF89a")
+    page = motion.save(tmp_path / "walk.html").read_text()
+    assert "<script>" in page and 'src="http' not in page
+    with pytest.raises(hj.DefinitionError, match="written as .gif, .html or .mp4"):
+        motion.save(tmp_path / "walk.avi")
+    with pytest.raises(hj.DefinitionError, match="animate the cycle"):
+        hj.plot.animate(walk.trajectory(), perturbed=walk.trajectory())
+
+
+def test_no_input_gives_the_cycle():
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    placed = hj.place_sections(cycle, hj.ClockPhase(4))
+    path = hj.experiments.perturbed_trajectory(placed, np.zeros((8, 1)))
+    end = path.at(path.t[-1:])[1] - path.at(path.t[:1])[1]
+    np.testing.assert_allclose(end, 0, atol=1e-9)
