@@ -154,7 +154,7 @@ def test_residuals_tell_of_the_loop(plant):
         (dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",)), False),
     ):
         fit, grid = hj.fit_series(record, 2, check=False), CycleGrid.from_records([record])
-        p = feedback_test(grid, grid.y - simulate(fit, grid, True), 0.01)
+        p = feedback_test(grid, grid.y - simulate(fit, grid, True))
         assert (p[0] < 1e-3) == answers
     unstable = hj.LDTP(1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1)))
     unstable = dataclasses.replace(unstable, inputs=("u",), outputs=early.outputs)
