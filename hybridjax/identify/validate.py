@@ -20,9 +20,9 @@ from .instrument import in_loop
 from .joint.fit import LDTPFit
 from .joint.model import PeriodicModel
 from .joint.prediction import Predictor
-from .residuals import FEWEST_SAMPLES, independence_test, whiteness_test
 from .series.fit import SeriesFit
 from .series.records import CycleGrid, drift_waves
+from .series.residuals import FEWEST_SAMPLES, independence_test, whiteness_test
 
 
 # Samples for each unknown of its initial condition and drift, which a record must exceed. Fewer:

@@ -16,10 +16,10 @@ from .._core.results import Result
 from .._core.text import p_value
 from ..errors import DefinitionError
 from ..identify.multiplier_estimate import compare_multipliers
-from ..identify.residuals import answering
 from ..identify.series.fit import SeriesFit, late_outputs, ordinary_least_squares, refuse_order
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
+from ..identify.series.residuals import answering
 from ..identify.validate import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import NAME_REFERENCE, Finding, print_findings, warn_of

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.identify.residuals import feedback_test
 from hybridjax.identify.series.records import CycleGrid
+from hybridjax.identify.series.residuals import feedback_test
 from hybridjax.identify.validate import simulate
 
 

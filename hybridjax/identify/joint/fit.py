@@ -26,8 +26,8 @@ from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
-from ..residuals import about_answering, answering
 from ..series.records import PreparedRecords
+from ..series.residuals import about_answering, answering
 from ..weights import SMALLEST_ERROR, are_alike, check_values, error_weights, neighbor_correlation
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates

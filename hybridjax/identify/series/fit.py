@@ -24,7 +24,6 @@ from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sa
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import refuse_invented
-from ..residuals import about_answering, answering
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
 from .linearization import Linearization, each_fit, linearize, measured_outputs, minimize, sum_up
@@ -37,6 +36,7 @@ from .records import (
     lagged_inputs,
     start_responses,
 )
+from .residuals import about_answering, answering
 
 
 _BIASED = "the fit is biased; name their `reference`"

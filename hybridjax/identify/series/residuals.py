@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special, stats
 
-from .series.output_error import RANK
-from .series.records import CycleGrid, lagged_inputs
+from .output_error import RANK
+from .records import CycleGrid, lagged_inputs
 
 
 # Samples of a section, below which its correlations are not tested. Fewer: their distribution is
