@@ -407,7 +407,7 @@ def require_order(
     refuse_invented(values / level, tails * deviation)
 
 
-def refuse_invented(values: Float[np.ndarray, " d1"], spread: float) -> None:
+def refuse_invented(values: Float[np.ndarray, " d1"], spread: float, cause: str = "") -> None:
     """Check the d + 1 ratios of a fit of order d, ascending: one is noise, that of chi itself.
 
     **Raises:** `DefinitionError` if more of them may be noise.
@@ -419,6 +419,6 @@ def refuse_invented(values: Float[np.ndarray, " d1"], spread: float) -> None:
         raise DefinitionError(
             f"the data support {carried} multipliers, not {order}: the weakest is "
             f"{np.sqrt(max(values[1], 0.0)):.3g} times the noise, which may be noise alone. Lower "
-            "`order` (`select_order` compares orders), measure longer, pass check=False, or, for "
-            "inputs that answer the outputs, name their `reference` (`fit_ldtp`, `estimate_htf`)."
+            "`order` (`select_order` compares orders), measure longer, or pass check=False. "
+            f"{cause and cause[0].upper() + cause[1:] + '.'}".rstrip()
         )

@@ -20,10 +20,9 @@ from .instrument import in_loop
 from .joint.fit import LDTPFit
 from .joint.model import PeriodicModel
 from .joint.prediction import Predictor
-from .residuals import FEWEST_SAMPLES, independence_test, whiteness_test
 from .series.fit import SeriesFit
-from .series.output_error import SectionRegression
-from .series.records import CycleGrid, divide_by_chi, drift_waves, lagged_inputs, start_responses
+from .series.records import CycleGrid, drift_waves
+from .series.residuals import FEWEST_SAMPLES, independence_test, whiteness_test
 
 
 # Samples for each unknown of its initial condition and drift, which a record must exceed. Fewer:
@@ -37,7 +36,7 @@ def can_be_compared(model: LDTP | SeriesFit | Predictor, record: Record, free_st
     unknown = N * ny * drift_waves(record).shape[1]
     if free_start:
         unknown += (
-            N * ny * _free_cycles(model)
+            N * ny * model.free_cycles
             if isinstance(model, SeriesFit)
             else int(model.dims[record.first_section])
         )
@@ -53,7 +52,7 @@ def simulate(
     that the records announce is estimated in either case.
     """
     if isinstance(model, SeriesFit):
-        return _simulate_fit(model, grid, free_start)
+        return model.simulate(grid, free_start)
     if isinstance(model, LDTP):
         # Outputs in units of their size, so that none is neglected.
         square = (grid.y**2).sum(axis=(0, 1, 2))
@@ -61,32 +60,6 @@ def simulate(
         plain = PeriodicModel.of(model, np.ones(len(S)))
         model = Predictor(plain, np.stack([S] * model.n_sections))
     return model.predict(grid, free_start)
-
-
-def _simulate_fit(
-    fit: SeriesFit, grid: CycleGrid, free_start: bool
-) -> Float[np.ndarray, "S T N ny"]:
-    N, R, ny, nu = fit.numerators.shape
-    v, T = divide_by_chi(fit.coefficients, grid.u), grid.u.shape[1]
-    # As in the fit, earlier inputs act on so many cycles without a model.
-    free = min(_free_cycles(fit), T) if free_start else 0
-    out = np.zeros(grid.y.shape)
-    for n, i in np.ndindex(N, ny):
-        forced = lagged_inputs(v, n, R, fit.lead) @ fit.numerators[n, :, i].reshape(R * nu, 1)
-        starts = start_responses(fit.coefficients, grid.first[:, n], T, free)
-        unknown, none = np.concatenate([starts, grid.drift], axis=2), grid.drift[:, :, :0]
-        regression = SectionRegression.make(forced, unknown, none, grid.sampled[:, :, n, i])
-        y, sampled = grid.y[:, :, n, i], grid.sampled[:, :, n, i]
-        error = regression.residual(np.ones(1), y).reshape(y.shape)
-        out[:, :, n, i] = np.where(sampled, y - error, regression.response(np.ones(1), y))
-    return out
-
-
-def _free_cycles(fit: SeriesFit) -> int:
-    """Return the cycles at the start of a record on which earlier inputs act without a model."""
-    N, R = fit.numerators.shape[:2]
-    d = len(fit.coefficients)
-    return d + -(-(R - 1 - fit.lead - d * N) // N)
 
 
 # Cycles that a notebook draws. More: they are harder to see.

@@ -16,11 +16,11 @@ from .._core.results import Result
 from .._core.text import p_value
 from ..errors import DefinitionError
 from ..identify.multiplier_estimate import compare_multipliers
-from ..identify.residuals import ANSWER, feedback_test
 from ..identify.series.fit import SeriesFit, late_outputs, ordinary_least_squares, refuse_order
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
-from ..identify.validate import Validation, simulate
+from ..identify.series.residuals import answering
+from ..identify.validate import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import NAME_REFERENCE, Finding, print_findings, warn_of
 
@@ -101,8 +101,11 @@ def advise(
         text = f"the data do not carry {d} multipliers: the weakest, and its region, may be noise."
         warnings.append(Finding("order", text))
     band = input_band(data)
-    error = np.where(grid.sampled, grid.y - simulate(fit, grid, True), 0.0)
-    warnings += _about_feedback(data, feedback_test(grid, error, _LEVEL))
+    error = np.where(grid.sampled, grid.y - fit.simulate(grid, True), 0.0)
+    for name, p in answering(grid, error, data.inputs).items():
+        text = f"{name} answers earlier residuals of the outputs ({p_value(p)}), as by a "
+        text += f"controller: fits are biased. {NAME_REFERENCE}"
+        warnings.append(Finding("feedback", text))
     warnings += [*_about_excitation(data, fit, band), *_about_outputs(grid, fit)]
     if bias > 2 * fit.standard_errors.max():
         values = ", ".join(f"{z:.4f}" for z in plain)
@@ -128,13 +131,6 @@ def advise(
         expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
     warn_of(warnings)
     return Advice(tuple(warnings), plain, tuple(band), strides, expected)
-
-
-def _about_feedback(data: SectionData, p: Float[np.ndarray, " nu"]) -> Iterator[Finding]:
-    for name, value in zip(data.inputs, p, strict=True):
-        if value < ANSWER:
-            text = f"{name} answers earlier residuals of the outputs ({p_value(value)}), as by a "
-            yield Finding("feedback", f"{text}controller: fits are biased. {NAME_REFERENCE}")
 
 
 def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.identify.residuals import feedback_test
 from hybridjax.identify.series.records import CycleGrid
+from hybridjax.identify.series.residuals import feedback_test
 from hybridjax.identify.validate import simulate
 
 
@@ -109,6 +109,24 @@ def test_regions_of_series_hold_in_the_loop(plant):
     assert sum(held) >= 16  # (of 20 with 95 %: less in one of 2500)
 
 
+def test_fits_without_a_reference_tell_of_the_controller(plant):
+    held = []
+    for seed in range(8):
+        data = series(plant, seed, noise=1.0)
+        data = hj.Record(data.u[:, :1], data.y, n_sections=N, inputs="u")
+        fit = hj.fit_ldtp(data, 2, noise="innovations")
+        assert not np.asarray(fit.model.D).any() or "D is free" in repr(fit)
+        held.append(fit.contains(plant.multipliers, 0.99)[0])
+        biased = hj.fit_series(data, 2, check=False)
+        assert biased.feedback == ("u",) and "name their `reference`" in repr(biased)
+    assert sum(held) >= 7
+    assert "biased" in hj.fit_ldtp(data, 2, check=False).feedback
+    data = series(plant, 0, noise=0.5)  # (r, and what it does)
+    data = hj.Record(data.u[:, 1:], data.y, n_sections=N, inputs="r")
+    assert not hj.fit_series(data, 2, check=False).feedback
+    assert not hj.fit_ldtp(data, 2, noise="innovations").feedback
+
+
 def test_whether_outputs_answer_at_once_is_found(plant):
     for waits, through in ((False, 0.0), (True, 0.0), (True, 1.0)):
         data = series(plant, 5, noise=0.0, waits=waits, through=through)
@@ -154,7 +172,7 @@ def test_residuals_tell_of_the_loop(plant):
         (dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",)), False),
     ):
         fit, grid = hj.fit_series(record, 2, check=False), CycleGrid.from_records([record])
-        p = feedback_test(grid, grid.y - simulate(fit, grid, True), 0.01)
+        p = feedback_test(grid, grid.y - simulate(fit, grid, True))
         assert (p[0] < 1e-3) == answers
     unstable = hj.LDTP(1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1)))
     unstable = dataclasses.replace(unstable, inputs=("u",), outputs=early.outputs)

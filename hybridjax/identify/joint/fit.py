@@ -1,5 +1,6 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
+import dataclasses
 from contextlib import suppress
 from functools import cached_property
 from typing import Annotated, Literal, cast
@@ -26,6 +27,7 @@ from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
+from ..series.residuals import about_answering, answering
 from ..weights import SMALLEST_ERROR, are_alike, check_values, error_weights, neighbor_correlation
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
@@ -50,6 +52,17 @@ _STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
 # errors are white and nothing answers). Smaller: multipliers of noise that is filtered by the
 # system, which looks like a response. Larger: weak responses are refused.
 _ANSWERED = 5.0
+# Advice where inputs answer residuals: for white noise, for innovations with D, and without.
+_REMEDIES = (
+    "the fit is biased; name their `reference`, or pass noise='innovations'",
+    "D is biased by a controller that answers at once; name their `reference`, or give a guess "
+    "with D = 0",
+    "D = 0 was taken; if outputs answer inputs at the same section, name their `reference`",
+)
+_UNSEEN = (
+    "outputs and inputs go together at the same section: D is free, and biased if a controller "
+    "makes inputs there (then name their `reference`, or give a guess with D = 0)"
+)
 
 
 class LDTPFit(MultiplierEstimate):
@@ -75,6 +88,8 @@ class LDTPFit(MultiplierEstimate):
     - `harmonics` (M,): harmonics that were fitted; for time series, all N.
     - `noise`: an `LDTP` whose response to independent white inputs of variance one is the noise of
       the outputs; None for HTFs.
+    - `feedback`: a sentence about inputs of time series that a controller makes, or may make; empty
+      if nothing speaks for a controller, or a `reference` was given.
     """
 
     model: LDTP
@@ -84,6 +99,7 @@ class LDTPFit(MultiplierEstimate):
     result: int = eqx.field(static=True)
     harmonics: tuple[int, ...] = eqx.field(static=True)
     noise: LDTP | None
+    feedback: str = eqx.field(static=True)
     _coordinates: LocalCoordinates
     _root: Float[np.ndarray, "P r"]
     _hidden: Float[np.ndarray, "P h"]
@@ -168,7 +184,8 @@ class LDTPFit(MultiplierEstimate):
         if self.noise is not None:
             size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
             about = f"errors one step ahead {signal_values(self.outputs, size)}"
-        return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
+        about = f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
+        return "; ".join(filter(None, [about, self.feedback]))
 
 
 @checked
@@ -229,7 +246,9 @@ def fit_ldtp(
       innovations, and of stable and unstable plants alike. It is consistent in the loop if D is
       zero wherever the controller answers at once; whether D is zero is found from the answer of
       the outputs to the reference. In a loop whose reference was not recorded, pass
-      noise="innovations" and an initial model with D = 0. Default: None.
+      noise="innovations". Then D is zero if outputs do not depend on inputs at the same section,
+      or if inputs answer earlier residuals; otherwise D is free, and `feedback` reports that a
+      controller could look the same. Default: None.
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data
@@ -242,9 +261,20 @@ def fit_ldtp(
             data, drive = in_loop(data, reference)
         innovations = noise == "innovations" or drive is not None
         records, direct = PreparedRecords(data), _is_direct(guess)
-        if drive is not None and not isinstance(guess, LDTP):
-            direct = answers_at_once(records, PreparedRecords(drive))
-        return _fit_to_series(records, guess, innovations, start == "free", check, direct)
+        if innovations and not isinstance(guess, LDTP):
+            outside = records if drive is None else PreparedRecords(drive)
+            direct = answers_at_once(records, outside)
+        how = (innovations, start == "free", check)
+        fit = _fit_to_series(records, guess, *how, direct)
+        if drive is not None:
+            return fit
+        feedback = _UNSEEN * (innovations and direct)
+        if answers := _answering(fit, records, start == "free"):
+            if innovations and direct and not isinstance(guess, LDTP):
+                fit, direct = _fit_to_series(records, guess, *how, False), False
+            remedy = _REMEDIES[innovations + (innovations and not direct)]
+            feedback = about_answering(answers, remedy)
+        return dataclasses.replace(fit, feedback=feedback)
     if reference is not None:
         raise DefinitionError(
             "`reference` is for time series: estimate the HTFs by "
@@ -255,6 +285,12 @@ def fit_ldtp(
     if start == "cycle":
         raise DefinitionError("HTFs are of periodic responses, without a start: leave `start` out.")
     return _fit_to_htf(data, guess, check)
+
+
+def _answering(fit: LDTPFit, records: PreparedRecords, free_start: bool) -> dict[str, float]:
+    grid, predictor = records.whole(), cast(Predictor, fit.predictor)
+    error = np.where(grid.sampled, grid.y - predictor.predict(grid, free_start), 0.0)
+    return answering(grid, error, records.inputs)
 
 
 def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
@@ -425,6 +461,7 @@ def _finished(
         result=Result.OK if converged else Result.NOT_CONVERGED,
         harmonics=harmonics,
         noise=noise,
+        feedback="",
         _coordinates=point.coordinates,
         _root=spread.root,
         _hidden=spread.hidden,

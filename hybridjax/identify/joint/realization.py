@@ -18,9 +18,9 @@ from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..denominator import SLOWEST
 from ..descent import ROUNDING
-from ..residuals import ANSWER
 from ..series.fit import SeriesFit
 from ..series.records import PreparedRecords
+from ..series.residuals import ANSWER
 from ..weights import SMALLEST_ERROR
 from .frequency import FrequencyProblem
 from .model import PeriodicModel

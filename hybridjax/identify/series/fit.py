@@ -1,5 +1,7 @@
 """Multipliers and transfer functions from recorded time series with any input: output error."""
 
+import dataclasses
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -26,7 +28,18 @@ from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
 from .linearization import Linearization, each_fit, linearize, measured_outputs, minimize, sum_up
 from .output_error import OutputErrorProblem, SectionRegression
-from .records import CycleGrid, PreparedRecords, delay_cycles, divide_by_chi, lagged_inputs
+from .records import (
+    CycleGrid,
+    PreparedRecords,
+    delay_cycles,
+    divide_by_chi,
+    lagged_inputs,
+    start_responses,
+)
+from .residuals import about_answering, answering
+
+
+_BIASED = "the fit is biased; name their `reference`"
 
 
 class SeriesFit(MultiplierEstimate):
@@ -50,6 +63,7 @@ class SeriesFit(MultiplierEstimate):
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
+    - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]
@@ -61,6 +75,7 @@ class SeriesFit(MultiplierEstimate):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
+    feedback: tuple[str, ...] = eqx.field(static=True, default=())
 
     @checked
     def impulse_response(self, n_lags: PeriodCount) -> Float[np.ndarray, "N lags ny nu"]:
@@ -108,7 +123,32 @@ class SeriesFit(MultiplierEstimate):
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         noise = signal_values(self.outputs, self.noise)
-        return f"noise {noise}; {self.n_sections} sections, {self.numerators.shape[1]} lags{state}"
+        about = f"noise {noise}; {self.n_sections} sections, {self.numerators.shape[1]} lags{state}"
+        return "; ".join(filter(None, [about, about_answering(self.feedback, _BIASED)]))
+
+    @property
+    def free_cycles(self) -> int:
+        """The cycles at the start of a record on which earlier inputs act without a model."""
+        N, R = self.numerators.shape[:2]
+        d = len(self.coefficients)
+        return d + -(-(R - 1 - self.lead - d * N) // N)
+
+    def simulate(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "S T N ny"]:
+        """Return the outputs from the inputs, and from the starts and drift that fit best."""
+        N, R, ny, nu = self.numerators.shape
+        v, T = divide_by_chi(self.coefficients, grid.u), grid.u.shape[1]
+        # As in the fit, earlier inputs act on so many cycles without a model.
+        free = min(self.free_cycles, T) if free_start else 0
+        out = np.zeros(grid.y.shape)
+        for n, i in np.ndindex(N, ny):
+            forced = lagged_inputs(v, n, R, self.lead) @ self.numerators[n, :, i].reshape(-1, 1)
+            starts = start_responses(self.coefficients, grid.first[:, n], T, free)
+            unknown, none = np.concatenate([starts, grid.drift], axis=2), grid.drift[:, :, :0]
+            regression = SectionRegression.make(forced, unknown, none, grid.sampled[:, :, n, i])
+            y, sampled = grid.y[:, :, n, i], grid.sampled[:, :, n, i]
+            error = regression.residual(np.ones(1), y).reshape(y.shape)
+            out[:, :, n, i] = np.where(sampled, y - error, regression.response(np.ones(1), y))
+        return out
 
 
 @checked
@@ -158,9 +198,15 @@ def fit_series(
     noise = _noise(solution)  # the weights that the residuals suggest
     problem = problem._replace(scale=problem.scale * noise)
     solution, converged = minimize(problem, solution.c)
+    fit = assemble(problem, solution, Covariance.unknown(order), converged)
+    grid = records.whole()
+    error = np.where(grid.sampled, grid.y - fit.simulate(grid, start == "free"), 0.0)
+    feedback = tuple(answering(grid, error, records.inputs))
     if check:
-        refuse_order(delayed, noise * _noise(solution))
-    return assemble(problem, solution, coefficient_covariance(problem, solution, errors), converged)
+        refuse_order(delayed, noise * _noise(solution), feedback)
+    covariance = coefficient_covariance(problem, solution, errors)
+    fit = assemble(problem, solution, covariance, converged)
+    return dataclasses.replace(fit, feedback=feedback)
 
 
 def assemble(
@@ -269,12 +315,15 @@ def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]
     return multipliers_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
 
 
-def refuse_order(delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"]) -> None:
+def refuse_order(
+    delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"], feedback: Sequence[str] = ()
+) -> None:
     """**Raises:** `DefinitionError` if the outputs, with noise of this standard deviation, do not
-    support so many multipliers."""
+    support so many multipliers; `feedback`, inputs that answer residuals, is named as the cause."""
     rows = max(delayed.freedom, 1)
     gram = (delayed.gram / noise[:, None, None] ** 2).sum(axis=0)
-    refuse_invented(np.linalg.eigvalsh(gram) / rows, np.sqrt(2 / rows))
+    cause = about_answering(feedback, _BIASED)
+    refuse_invented(np.linalg.eigvalsh(gram) / rows, np.sqrt(2 / rows), cause)
 
 
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered

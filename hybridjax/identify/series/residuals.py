@@ -1,11 +1,13 @@
 """Tests of residuals, section by section: their correlations in time and with inputs."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float
 from scipy import special, stats
 
-from .series.output_error import RANK
-from .series.records import CycleGrid, lagged_inputs
+from .output_error import RANK
+from .records import CycleGrid, lagged_inputs
 
 
 # Samples of a section, below which its correlations are not tested. Fewer: their distribution is
@@ -88,8 +90,22 @@ def independence_test(
     return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
 
 
+def answering(
+    grid: CycleGrid, error: Float[np.ndarray, "S T N ny"], inputs: tuple[str, ...]
+) -> dict[str, float]:
+    """Return the inputs that answer earlier residuals, as by a controller, with their p-values."""
+    p = feedback_test(grid, error)
+    return {name: float(x) for name, x in zip(inputs, p, strict=True) if x < ANSWER}
+
+
+def about_answering(inputs: Iterable[str], remedy: str) -> str:
+    """Return a sentence about inputs that answer earlier residuals; empty if there are none."""
+    names = ", ".join(inputs)
+    return names and f"inputs answer earlier residuals, as by a controller ({names}): {remedy}"
+
+
 def feedback_test(
-    grid: CycleGrid, error: Float[np.ndarray, "S T N ny"], level: float
+    grid: CycleGrid, error: Float[np.ndarray, "S T N ny"]
 ) -> Float[np.ndarray, " nu"]:
     """Test whether inputs answer residuals of a model of the outputs at earlier sections.
 
@@ -108,4 +124,4 @@ def feedback_test(
         rows = grid.inside[:, :, n] & start[:, :, n]
         past, u = lagged_inputs(grid.u, n, lags + 1, 0)[rows][:, nu:], grid.u[:, :, n][rows]
         new[:, :, n][rows] = u - past @ np.linalg.lstsq(past, u)[0]
-    return independence_test(late.reshape(error.shape), new, lags, level)[1]
+    return independence_test(late.reshape(error.shape), new, lags, ANSWER)[1]
