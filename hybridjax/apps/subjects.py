@@ -9,7 +9,7 @@ import itertools
 import json
 import multiprocessing
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from ..io import load
 from ..recordings.population.population import Population
 from ..recordings.population.tables import factors_of, table_of
 from ..recordings.read import read_recording
-from .identify import PAGE, figure_of, off_screen, page_of, report_folder, steps_of, write_results
+from .identify import PAGE, off_screen, page_of, report_folder, steps_of, with_png, write_results
 
 
 # Columns of the table of a study, and their names in the summaries.
@@ -60,40 +60,32 @@ class Study:
         return "\n".join([*lines, self.results.T.to_string(header=False)])
 
 
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """Identifies the trials of one subject in one condition, and writes the report."""
-
-    files: tuple[Path, ...]
-    folder: Path
-    identify: Callable[..., Any]
-    options: dict[str, Any]
-    formats: tuple[Format, ...]
-
-    def __call__(self) -> str:
-        """Return the cause of a failure, or "". Results of the same files and options are kept."""
-        stats = [(str(x), x.stat().st_size, x.stat().st_mtime_ns) for x in self.files if x.exists()]
-        what = digest_of(self.identify), self.options, self.formats
-        key, mark = json.dumps([__version__, stats, what]), self.folder / "job.json"
-        needed = [self.folder / name for name in (PAGE, "fit.npz", "summary.json", mark.name)]
-        if all(x.is_file() for x in needed) and mark.read_text() == key:
-            return ""
-        enable_x64()
-        result = self.identify(read_recording(*self.files, **self.options))
-        converged = result.fit.result == Result.OK
-        with report_folder(self.folder, result.data.inputs, self.formats) as new:
-            write_results(new, result, self.formats)
-            (new / mark.name).write_text(key if converged else "")
-        return "" if converged else "the fit did not converge."
-
-
-def _cause(call: Callable[[], str]) -> str:
+def _cause(write: Callable[..., str], *arguments: Any) -> str:
     """Return the cause of a failure, or "": files, functions of users and workers may all fail."""
     try:
-        return call()
+        return write(*arguments)
     except Exception as error:
         kind = "" if isinstance(error, HybridJaxError) else f"{type(error).__name__}: "
         return f"{kind}{error}"
+
+
+def _report(files: list[Path], folder: Path, identify: Callable, reading: dict, formats) -> str:
+    """Identify the trials of one subject in one condition, and write the report.
+
+    **Returns:** the cause of a failure, or "". Results of the same files and options are kept.
+    """
+    stats = [(str(x), x.stat().st_size, x.stat().st_mtime_ns) for x in files if x.exists()]
+    key = json.dumps([__version__, stats, digest_of(identify), reading, formats])
+    mark, *needed = (folder / name for name in ("job.json", PAGE, "fit.npz", "summary.json"))
+    if mark.is_file() and mark.read_text() == key and all(x.is_file() for x in needed):
+        return ""
+    enable_x64()
+    result = identify(read_recording(*files, **reading))
+    converged = result.fit.result == Result.OK
+    with report_folder(folder, result.data.inputs, formats) as new:
+        write_results(new, result, formats)
+        (new / mark.name).write_text(key if converged else "")
+    return "" if converged else "the fit did not converge."
 
 
 def run(options: Any) -> int:
@@ -155,10 +147,9 @@ def identify_subjects(
     for name, trials in rows.groupby("report", sort=False):
         if (trials[["subject", *factors_of(rows)]].nunique() > 1).any():
             raise DefinitionError(f"two subjects would have the report '{name}': rename one.")
-        files = tuple(Path(table).parent / file for file in trials["file"])
-        calls[name] = functools.partial(_cause, Job(files, root / name, identify, reading, formats))
-        if client is not None:
-            calls[name] = client.submit(calls[name]).result
+        files = [Path(table).parent / file for file in trials["file"]]
+        job = (_cause, _report, files, root / name, identify, reading, formats)
+        calls[name] = client.submit(*job).result if client else functools.partial(*job)
     causes = {name: _cause(calls[name]) for name in counted(list(calls), "subjects", len(calls))}
     failures = {name: text for name, text in causes.items() if text}
     frame = rows[~rows["report"].isin(failures)].drop_duplicates("report", ignore_index=True)
@@ -179,7 +170,7 @@ def identify_subjects(
             parts += [population.difference("modulus", a, b) for a, b in pairs]
     results = package("pandas").concat(parts, ignore_index=True)
     study = Study(population, fits, failures, results, root)
-    _write(study, dict.fromkeys(part.attrs["methods"] for part in parts[1:]))
+    _write(study, dict.fromkeys(part.attrs["methods"] for part in parts[1:]), formats)
     return study
 
 
@@ -201,24 +192,23 @@ def _rows(path: Path) -> Any:
     return rows
 
 
-def _write(study: Study, methods: dict[str, None]) -> None:
+def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) -> None:
     """Write the tables, and the report for all."""
-    population, figures = study.population, []
-    with off_screen(), contextlib.suppress(DefinitionError):  # for too few subjects
-        drawn = plot.forest(population, "modulus")
-        figures.append(figure_of(drawn, "Modulus of the leading multiplier"))
+    population, results = study.population, study.results
     links = (f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>' for n in population.table["report"])
+    errors = {f"{name}_error": error for name, error in population.errors.items()}
     parts = [
         *(f'<p class="warn">{escape(f"{n} failed: {x}")}</p>' for n, x in study.failures.items()),
         f"<ul>{''.join(links)}</ul>",
-        study.results.T.to_html(header=False, float_format="{:.4g}".format, na_rep=""),
-        *figures,
+        results.T.to_html(header=False, float_format="{:.4g}".format, na_rep=""),
         *(f"<p>{escape(x)}</p>" for x in methods),
     ]
-    errors = {f"{name}_error": error for name, error in population.errors.items()}
     with results_folder(study.folder, "population", _FILES) as new:
-        subjects = population.table.assign(**population.values, **errors)
-        subjects.to_csv(new / _FILES[0], index=False)
-        study.results.to_csv(new / _FILES[1], index=False)
+        with off_screen(), contextlib.suppress(DefinitionError):  # for too few subjects
+            drawn = plot.forest(population, "modulus")
+            plot.save(new / "forest", drawn, with_png(formats))
+            parts.append('<img alt="Modulus of the leading multiplier" src="forest.png">')
+        population.table.assign(**population.values, **errors).to_csv(new / _FILES[0], index=False)
+        results.to_csv(new / _FILES[1], index=False)
         page = page_of(f"{len(study.fits)} reports", parts)
         (new / _FILES[2]).write_text(page, encoding="utf-8")
