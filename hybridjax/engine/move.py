@@ -1,14 +1,17 @@
 """Flow of many lanes to targets, differentiable in forward and reverse mode, and its Jacobians."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float
 
-from .._core.executor import namespace, on_host
+from .._core.compilation import WORTH_COMPILING, whole
+from .._core.executor import namespace, on_host, scan
 from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
@@ -48,12 +51,63 @@ def move(
     if setout is None:
         setout = initial_step(s, lanes, u, target.limit - lanes.t, settings)
     if not isinstance(setout, Stride):
-        setout = Stride(setout, xp.zeros_like(setout), xp.ones_like(setout))
+        setout = stride(setout)
     if result is None:
         result = xp.full(lanes.t.shape, Result.OK, xp.int32)
+    if on_host(lanes.t) and len(lanes.t) == 1:
+        same = dict(index=target.index[:1], event=target.event[:1])
+        target, begin = dataclasses.replace(target, **same), (lanes, setout, result)
+        _, (_, *recorded) = through(s, begin, u, target, settings, options)
+        return Recorded(*jax.tree_util.tree_map(lambda x: x[0], recorded))
     if on_host(lanes.t):
         return search(s, lanes, u, target, setout, result, settings, options)
     return _move(s, lanes, u, target, fixed(setout), result, settings, options)
+
+
+def stride(h: Times) -> Stride:
+    """A first step of this length, on a way that is not known."""
+    return Stride(h, h * 0, h * 0 + 1)
+
+
+def through(
+    s: Structure,
+    begin: tuple[Lanes, Stride, Index],
+    u: Inputs,
+    targets: Target,
+    settings: Settings,
+    options: Options,
+    patience: float = np.inf,
+) -> tuple[tuple[Lanes, Stride, Index], tuple[Lanes, Moved, Tape | None]]:
+    """Flow a single lane to one of the `targets` after the other, waiting for each no longer than
+    `patience`. On the host these are many calls of small programs, until the whole is compiled.
+
+    **Arguments:** `begin`: the lane, its stride and its result.
+
+    **Returns:** the same at the end; by target (rows) the lane before, its end, and the tape.
+    """
+    ends, levels = (targets.time, targets.index, targets.event, targets.limit), targets.levels
+    static = options, targets.missed, targets.event_sequence
+    if not on_host(u):
+        return _pieces(static, s, levels, settings, ends, begin, u, patience, move)
+    static = (options._replace(tangents=bool(options.tangents)), *static[1:])
+    make = lambda: whole(_pieces, (static,), (s, levels, settings), WORTH_COMPILING / 3)  # noqa: E731
+    flow = s.once(("through", static), (levels, settings), make)
+    return flow(ends, begin, u, np.float64(patience))
+
+
+def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience, flow=search):
+    options, missed, sequence = static
+
+    def piece(carry, end):
+        lanes, stride, result = carry
+        time, index, event, limit = (x[None] for x in end)
+        limit = namespace(time).minimum(limit, lanes.t + patience)
+        target = Target(time, index, event, limit, sequence, levels, missed)
+        moved, tape = flow(s, lanes, u, target, stride, result, settings, options)
+        carry = moved.lanes, stride._replace(h=moved.h), moved.result
+        return carry, (lanes, moved, tape)
+
+    return scan(piece, begin, ends)
 
 
 @eqx.filter_jit

@@ -4,24 +4,19 @@ The search decides on step sizes, on the order of events, and on failures. It is
 its decisions are recorded in a `Tape`, which `replay` follows.
 """
 
-import functools as ft
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ..._core.compilation import WORTH_COMPILING, whole
-from ..._core.executor import cond, namespace, on_host, put, while_loop
+from ..._core.executor import cond, namespace, put, while_loop
 from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..arrays import Index, Inputs, Mask, Times
-from ..events import INSTANT, SAME_TIME, arm, next_schedule
-from ..lanes import IDLE, Lanes, Tape, blank_tape, for_each_chart, only, write_row
+from ..events import SAME_TIME, arm, next_schedule
+from ..lanes import Lanes, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
 from ..target import Target
 from ..watch import chart_field, watch
-from .accept import accurate, uneventful
+from .accept import uneventful
 from .attempt import attempt, deviation
 from .outcome import level_counts, with_events, without_events
 from .state import Aim, Approach, Attempt, Moved, Options, Recorded, State, Stride, Task
@@ -54,23 +49,6 @@ def search(
 
     Lanes whose `result` is not OK at the start stay there.
     """
-    if not on_host(lanes.t) or len(lanes.t) > 1:
-        return _search(s, lanes, u, target, stride, result, settings, options)
-    # Single lanes of the host are many calls of small programs, until the whole is compiled.
-    options = options._replace(tangents=bool(options.tangents))
-    static, trees = ((options, target.missed, target.event_sequence),), (target.levels, settings)
-    make = lambda: whole(_by_parts, static, (s, *trees), WORTH_COMPILING / 3)  # noqa: E731
-    ends = target.time, target.index, target.event, target.limit
-    return s.once(("search", static), trees, make)(ends, lanes, u, stride, result)
-
-
-def _by_parts(static: tuple, s, levels, settings: Settings, ends, lanes, u, stride, result):
-    options, missed, sequence = static
-    target = Target(*ends, sequence, levels, missed)
-    return _search(s, lanes, u, target, stride, result, settings, options)
-
-
-def _search(s, lanes, u, target, stride, result, settings, options) -> Recorded:
     task = Task(s, u, target, target.limit - lanes.t, stride, settings, options.tangents)
     begin = _begin(lanes, result, task, options.new_input)
     tape = blank_tape(settings.max_steps, lanes) if options.tape else None
