@@ -60,7 +60,7 @@ def move(
         _, (_, *recorded) = through(s, begin, u, target, settings, options)
         return Recorded(*jax.tree_util.tree_map(lambda x: x[0], recorded))
     if on_host(lanes.t):
-        return search(s, lanes, u, target, setout, result, settings, options)
+        return search(s, lanes, u, target, settings, setout, result, options)
     return _move(s, lanes, u, target, fixed(setout), result, settings, options)
 
 
@@ -103,7 +103,7 @@ def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience, flow=s
         time, index, event, limit = (x[None] for x in end)
         limit = namespace(time).minimum(limit, lanes.t + patience)
         target = Target(time, index, event, limit, sequence, levels, missed)
-        moved, tape = flow(s, lanes, u, target, stride, result, settings, options)
+        moved, tape = flow(s, lanes, u, target, settings, stride, result, options)
         carry = moved.lanes, stride._replace(h=moved.h), moved.result
         return carry, (lanes, moved, tape)
 
@@ -114,7 +114,7 @@ def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience, flow=s
 def _search(s, lanes, u, target, setout, result, settings, options: Options) -> Recorded:
     def run(s, target, common, by_lane):
         (settings, options), (lanes, u, setout, result) = common, by_lane
-        return search(s, lanes, u, target, setout, result, shared(settings), options)
+        return search(s, lanes, u, target, shared(settings), setout, result, options)
 
     return _over_lanes(run, s, target, (settings, options), (lanes, u, setout, result))
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.compilation import quick_jit
+from .._core.compilation import kind, quick_jit
 from .._core.executor import is_inside_program, on_cpu
 from .._core.host_derivatives import NotOnHostError, only_on_host
 from .._core.results import Result
@@ -167,6 +167,7 @@ def _with_jacobian(problem: FitProblem, x, guess):
 
 
 _compiled = quick_jit(_with_jacobian)
+_not_on_host: set[tuple] = set()
 
 
 def evaluate(
@@ -174,11 +175,13 @@ def evaluate(
 ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
     """Return residuals and Jacobian at x, from the host if it has these derivatives."""
     arguments = problem, jnp.asarray(x), guess
-    try:
-        with only_on_host():
-            return jax.device_get((_with_jacobian if on_cpu() else _compiled)(*arguments))
-    except NotOnHostError:
-        return jax.device_get(_compiled(*arguments))
+    if (key := kind(arguments)) not in _not_on_host and on_cpu():
+        try:
+            with only_on_host():
+                return jax.device_get(_with_jacobian(*arguments))
+        except NotOnHostError:
+            _not_on_host.add(key)
+    return jax.device_get(_compiled(*arguments))
 
 
 def descend(

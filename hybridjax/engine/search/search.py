@@ -40,9 +40,9 @@ def search(
     lanes: Lanes,
     u: Inputs,
     target: Target,
+    settings: Settings,
     stride: Stride,
     result: Index,
-    settings: Settings,
     options: Options,
 ) -> Recorded:
     """Flow every lane to its target, or to a result code for the reason of its failure.
