@@ -4,8 +4,8 @@
 - `host_first` runs a function on the host until compiling it is worth its time.
 - `TwoTiers` compiles the experiments twice: a quick executable for the first answer, and the fully
   optimized one in a thread beside it.
-- `kernel` compiles single functions of users for code that runs on the host, and `deferred` loops
-  of them.
+- `kernel` compiles single functions of users for code that runs on the host; `whole` and `deferred`
+  programs that do more at once, when the host has spent as much time.
 """
 
 import collections
@@ -383,9 +383,7 @@ def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=Non
     return np.concatenate(parts, axis=-1)[..., :L]
 
 
-def whole(
-    function: Callable, static: tuple[Hashable, ...], trees: Any, seconds: float
-) -> Callable[..., Any]:
+def whole(function: Callable, static: tuple, trees: Any, seconds: float) -> Callable[..., Any]:
     """`function(*static, *trees, *arguments)`, which runs on the host for so many seconds before it
     is compiled (see `deferred`); of any arguments and results, with arrays of NumPy."""
     compiled = ft.partial(_run_tree, *_bound(function, ft.partial, static, trees, 1))
@@ -412,12 +410,9 @@ def deferred(compiled: ft.partial, other: Callable, seconds: float) -> Callable:
         results = other(*arguments)
         after = _spent[program] = before + time.thread_time() - begin
         if before <= worth < after:
-            threading.Thread(target=compile_, args=arguments).start()
+            compile_ = lambda: (compiled(*arguments), _ready.add(program))  # noqa: E731
+            threading.Thread(target=compile_).start()
         return results
-
-    def compile_(*arguments):
-        compiled(*arguments)
-        _ready.add(program)
 
     return call
 

@@ -60,7 +60,7 @@ def linear_step(
 ) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
     states, inputs and length of the step. Those of explicit methods come `by_stages` until they
-    have been called for often."""
+    have taken a while."""
     compiled = s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=4 * _POINTS)
     if s.method(a).implicit or isinstance(s, Tangents):
         return compiled(t, q, u, h)

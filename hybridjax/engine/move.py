@@ -1,6 +1,5 @@
 """Flow of many lanes to targets, differentiable in forward and reverse mode, and its Jacobians."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -55,10 +54,8 @@ def move(
     if result is None:
         result = xp.full(lanes.t.shape, Result.OK, xp.int32)
     if on_host(lanes.t) and len(lanes.t) == 1:
-        same = dict(index=target.index[:1], event=target.event[:1])
-        target, begin = dataclasses.replace(target, **same), (lanes, setout, result)
-        _, (_, *recorded) = through(s, begin, u, target, settings, options)
-        return Recorded(*jax.tree_util.tree_map(lambda x: x[0], recorded))
+        _, (_, *row) = through(s, (lanes, setout, result), u, target, settings, options)
+        return Recorded(*jax.tree_util.tree_map(lambda x: x[0], row))
     if on_host(lanes.t):
         return search(s, lanes, u, target, settings, setout, result, options)
     return _move(s, lanes, u, target, fixed(setout), result, settings, options)
@@ -86,17 +83,17 @@ def through(
     **Returns:** the same at the end; by target (rows) the lane before, its end, and the tape.
     """
     ends, levels = (targets.time, targets.index, targets.event, targets.limit), targets.levels
-    static = options, targets.missed, targets.event_sequence
+    by = targets.missed, targets.event_sequence
     if not on_host(u):
-        return _pieces(static, s, levels, settings, ends, begin, u, patience, move)
-    static = (options._replace(tangents=bool(options.tangents)), *static[1:])
+        return _pieces((move, options, *by), s, levels, settings, ends, begin, u, patience)
+    static = search, options._replace(tangents=bool(options.tangents)), *by
     make = lambda: whole(_pieces, (static,), (s, levels, settings), WORTH_COMPILING / 3)  # noqa: E731
-    flow = s.once(("through", static), (levels, settings), make)
-    return flow(ends, begin, u, np.float64(patience))
+    arguments = ends, begin, u, np.float64(patience)
+    return s.once(("through", static), (levels, settings), make)(*arguments)
 
 
-def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience, flow=search):
-    options, missed, sequence = static
+def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
+    flow, options, missed, sequence = static
 
     def piece(carry, end):
         lanes, stride, result = carry

@@ -303,7 +303,9 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
     goal = target.time[moves.lane]
     h = np.where(on_time, goal - moves.t, moves.h)
-    q, dq, f = _step(s, a, moves.t, moves.q[:n], u, h)
+    point, by_stages = (moves.t, moves.q[:n], u, h), ft.partial(_by_stages, s, a)
+    expanded = np.array(np.moveaxis(kernels.linear_step(s, a, *point, by_stages), -1, 0))
+    q, dq, f = expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     t = np.where(on_time, goal, moves.t + h)
     # By (t, q, u), with the length of the step as the last; that to a known time shrinks with t.
     dt = np.zeros((M, 1, dq.shape[2]), dq.dtype)
@@ -356,14 +358,6 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
     end[:, 0] = t
     by[:, :1, columns] = dt
     return _Linear(end, by)
-
-
-def _step(s: Structure, a: int, t, q, u, h):
-    """States (n, M) at the end of Runge-Kutta steps, their derivatives (M, n, m) by (t, q, u, h) at
-    the start, and the field (n, M) at the end."""
-    by_stages = ft.partial(_by_stages, s, a)
-    expanded = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h, by_stages), -1, 0))
-    return expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
 
 
 def _by_stages(s: Structure, a: int, t, q, u, h):

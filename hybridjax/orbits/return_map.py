@@ -314,11 +314,8 @@ class ReturnMap(eqx.Module):
             moved, extra = flow(lanes, target, h, result, piece)
             return (moved.lanes, moved.h, moved.result), extra
 
-        lanes, h, result = (
-            self.departure(q),
-            (0.5 * self.expected / LEGS)[None],
-            xp.zeros(1, xp.int32),
-        )
+        lanes, result = self.departure(q), xp.zeros(1, xp.int32)
+        h = (0.5 * self.expected / LEGS)[None]
         if isinstance(flow, Options):
             u, begin = xp.zeros((self.structure.nu, 1)), (lanes, stride(h), result)
             (end, _, result), extra = through(self.structure, begin, u, ends, self.settings, flow)
