@@ -394,7 +394,7 @@ def _run_tree(program: Callable, arrays: list, *arguments):
     return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
 
 
-def deferred(compiled: ft.partial, other: Callable, seconds: float) -> Callable:
+def deferred(compiled: Any, other: Callable, seconds: float) -> Callable:
     """`other`, a function of the host, until it has taken so many seconds of this thread, about as
     many as compiling takes: then a thread compiles a kernel that has the same results.
 

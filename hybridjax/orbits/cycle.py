@@ -438,8 +438,8 @@ def orbit(map: ReturnMap, tapes: Tape | None = None) -> Trajectory:
     """One turn from the anchor, in the steps by which it is linearized, which its `tapes` may hold
     already, one for each piece."""
     map = to_host(map)
-    tapes = _turn(map, tangents=True)[1] if tapes is None else to_host(tapes)
-    pieces = [Tape(*x) for x in zip(*tapes, strict=True)]
+    rows = to_host(_turn(map, tangents=True)[1] if tapes is None else tapes)
+    pieces = [Tape(*x) for x in zip(*rows, strict=True)]
     begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
     return recorded(map.structure, begin, pieces, u, Result.OK)
 

@@ -297,10 +297,10 @@ class ReturnMap(eqx.Module):
         return by[:, 0], by[:, 2 : 2 + s.d]
 
     def travel(
-        self, q: Float[Array, " d"], flow: Callable | Options, record: Recorded | None = None
+        self, q: Float[Array, " d"], flow: Any, record: Recorded | None = None
     ) -> tuple[Return, Any]:
-        """One turn, piece by piece, each computed by `flow`, and the other results of `flow`; or
-        with these options, and the pieces (see `through`).
+        """One turn, piece by piece, each computed by the function `flow`, and its other results;
+        or if `flow` are `Options`, one turn with these, and its pieces (see `through`).
 
         The pieces end at K - 1 times, then on the section on which the turn began.
         """
