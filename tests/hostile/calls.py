@@ -299,6 +299,7 @@ def plots(t):
     yield plot.strides, dict(plan=t.plan, studies={"a": t.studied})
     yield plot.cycle, dict(cycle=t.cycle)
     yield plot.animate, dict(motion=t.cycle)
+    yield hj.explore, dict(system=t.cycle, ranges={"a": (-9.0, 9.0)})
     yield hj.experiments.perturbed_trajectory, dict(placed=t.placed, inputs=t.data)
     yield positional(plot.branch), dict(values=t.branch)
     yield plot.experiment, dict(data=t.data)
