@@ -44,8 +44,8 @@ class Study:
 
     **Fields:** `population` of the subjects that were identified; its table also has `report`,
     `strides`, `period` and `period_error` (s). `fits`, one for each row; `failures`: sentences by
-    name of the report; `results`: data frame of means, and differences of all pairs of groups and
-    conditions; `folder`.
+    name of the report, and of "population" if a mean has too few subjects; `results`: data frame of
+    means, and differences of all pairs of groups and conditions; `folder`.
     """
 
     population: Population
@@ -57,7 +57,8 @@ class Study:
     def __repr__(self) -> str:
         lines = [f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"]
         lines += [f"  {name} failed: {text}" for name, text in self.failures.items()]
-        return "\n".join([*lines, self.results.T.to_string(header=False)])
+        lines += [self.results.T.to_string(header=False)] * (len(self.results) > 0)
+        return "\n".join(lines)
 
 
 def _cause(write: Callable[..., str], *arguments: Any) -> str:
@@ -96,9 +97,12 @@ def run(options: Any) -> int:
     signals, identify = steps_of(options)
     reading: Any = {"time": options.time, "signals": signals, "formats": options.formats}
     spawn = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(options.workers, mp_context=spawn) as pool:
+    pool = concurrent.futures.ProcessPoolExecutor(options.workers, mp_context=spawn)
+    try:
         reading["client"] = pool if options.workers > 1 else None
         study = identify_subjects(options.table, options.out, identify, **reading)
+    finally:
+        pool.shutdown(cancel_futures=True)  # after an interruption
     print(study)
     print(Path(options.out) / _FILES[-1])
     return 1 if study.failures else 0
@@ -163,11 +167,13 @@ def identify_subjects(
         frame[name] = [float(json.loads(text)[key]) for text in texts]
     population = Population.from_fits(fits, frame.drop(columns=["file", "trial"], errors="ignore"))
     parts = [package("pandas").DataFrame()]
-    with contextlib.suppress(DefinitionError):  # for too few subjects
+    try:
         parts.append(population.mean("modulus"))
         for factor in factors_of(frame):
             pairs = itertools.combinations(frame[factor].unique()[::-1], 2)
             parts += [population.difference("modulus", a, b) for a, b in pairs]
+    except DefinitionError as error:  # for too few subjects
+        failures["population"] = str(error)
     results = package("pandas").concat(parts, ignore_index=True)
     study = Study(population, fits, failures, results, root)
     _write(study, dict.fromkeys(part.attrs["methods"] for part in parts[1:]), formats)
