@@ -1,6 +1,5 @@
 """Multipliers of a plant from returns of perturbed states."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +11,7 @@ from .._core.progress import counted, say
 from ..errors import ComputationError, DefinitionError
 from ..identify.multiplier_estimate import MultiplierEstimate
 from ..sections.families import ClockPhase
+from .drive import Stopped
 
 
 class Returns(MultiplierEstimate):
@@ -41,18 +41,19 @@ class Returns(MultiplierEstimate):
         return f"{hidden}from {len(self.coordinates)} coordinates, residual {self.residual:.1g}"
 
 
-class _Map:
-    """The return map of some coordinates of a plant."""
+class Map:
+    """The return map of some coordinates of a plant on section 0, and its fixed point.
 
-    def __init__(self, cycle: Any, names: Any):
-        plant, self.cycle, self.experiment = cycle.plant, cycle, cycle.experiment
-        try:
-            self.base = np.array(self.experiment.start.state, float)
-        except (TypeError, ValueError):
-            self.base = np.full(1, np.nan)
-        if not np.isfinite(self.base).all() or getattr(plant, "fixed_step", False):
-            text = "numbers that can be changed, and whose steps can end on a section"
-            raise DefinitionError(f"this needs a plant whose `get_state` returns {text}.")
+    **Fields:** `names`: of the coordinates. `x`: their values, first those of the settled state.
+    `size`: their ranges on the cycle. `noise`: of returns. `h`: steps of differences.
+    """
+
+    def __init__(self, cycle: Any, names: Any = None):
+        self.drive, plant = cycle.drive, cycle.plant
+        if not self.drive.sets or self.drive.fixed:
+            text = "whose state can be set, and whose steps can end on a section"
+            raise DefinitionError(f"perturbed returns need a plant {text}.")
+        self.base = np.array(cycle.state, float)
         states = tuple(getattr(plant, "states", [f"x{i}" for i in range(self.base.size)]))
         period = getattr(plant, "period", None)
         if names is None:
@@ -61,28 +62,30 @@ class _Map:
         require_among("coordinate", names, states, "perturbed_returns: ")
         self.names, self.columns = tuple(names), [states.index(x) for x in names]
         turn = 0.0 if period is None else round(cycle.period / period) * period
-        self.shift = np.array([turn if x == "time" else 0.0 for x in names])
-        rows = [self(self.base[self.columns], k) for k in range(cycle.sections.n_sections)]
-        largest, self.size = np.abs(rows).max(axis=0), np.ptp(rows, axis=0)
-        still = self.size <= 1e-9 * largest
-        self.size[still] = np.where(largest > 0, largest, 1.0)[still]
+        self.shift, self.n = turn * np.array([x == "time" for x in names]), 0
+        self.x, N = self.base[self.columns], cycle.sections.n_sections
+        rows = [self(self.x, k) for k in range(N)]
+        self.n, self.size = N, np.ptp(rows, axis=0)
+        still = self.size <= 1e-9 * np.abs(rows).max(axis=0)
+        self.size[still] = np.where(self.x, np.abs(self.x), 1.0)[still]
+        say("noise of returns")
+        self.noise = self._noise()
+        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
+        # derivatives; at most two percent of the range.
+        self.h = self.size * min((self.noise / self.size).max() ** 0.2 / 2, 0.02)
 
     def __call__(self, x: Float[np.ndarray, " d"], n: int | None = None) -> Any:
-        """Return coordinates (d,) after n sections. Default: after one cycle, at its beginning.
-
-        **Raises:** `ComputationError`.
-        """
-        state, cycle = self.base.copy(), self.cycle
+        """Return coordinates (d,) after n sections. Default: after one cycle, at its beginning."""
+        state, drive = self.base.copy(), self.drive
         state[self.columns] = x
-        u = [[0.0] * len(cycle.inputs)] * (1 + (cycle.sections.n_sections if n is None else n))
-        start = self.experiment.start._replace(state=state)
-        trial = dataclasses.replace(self.experiment, start=start).run(cycle.seed, u, repeats=True)
-        if trial.cause:
-            raise ComputationError(f"a perturbed state does not return: {trial.cause}.")
-        y = np.array(cycle.plant.get_state(), float)[self.columns]
+        drive.restore(drive.start._replace(state=state))
+        drive.phase.begin(drive.t, drive.z, on_section=True)
+        for k in range(1, 1 + (self.n if n is None else n)):
+            drive.advance(drive.zero, k)
+        y = np.array(drive.here().state, float)[self.columns]
         return y - self.shift if n is None else y
 
-    def noise(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+    def _noise(self) -> Float[np.ndarray, " d"]:
         """Return the standard deviation of returns from nearly equal states.
 
         Fourth differences along lines: their variance is 70 times that of the noise (Moré and Wild
@@ -90,71 +93,74 @@ class _Map:
         spacing the events that move through the time steps of a simulator.
         """
         rng = np.random.default_rng(0)
-        noise = np.finfo(float).eps * np.maximum(np.abs(x), self.size)
+        noise = np.finfo(float).eps * np.maximum(np.abs(self.x), self.size)
         for spacing in (1e-6, 1e-4, 1e-3):
-            along = spacing * self.size * rng.uniform(0.5, 1, len(x)) * rng.choice([-1, 1], len(x))
-            line = np.array([self(x + j * along) for j in range(-7, 8)])
+            along = rng.uniform(0.5, 1, len(self.x)) * rng.choice([-1, 1], len(self.x))
+            line = [self(self.x + j * spacing * self.size * along) for j in range(-7, 8)]
             squares = np.diff(line, 4, axis=0) ** 2 / 70
             noise = np.maximum(noise, np.sqrt(squares.mean(axis=0)))
         return noise
 
-    def slopes(self, x: Float[np.ndarray, " d"], h: Float[np.ndarray, " d"]) -> Any:
-        """Return central differences of second order with steps h."""
-        moves = counted(np.diag(h), "coordinates", len(x))
-        return np.array([(self(x + e) - self(x - e)) / (2 * e.sum()) for e in moves]).T
+    def slopes(self, steps: float) -> Any:
+        """Return central differences of second order with so many steps."""
+        moves = counted(np.diag(steps * self.h), "coordinates", len(self.x))
+        return np.array([(self(self.x + e) - self(self.x - e)) / (2 * e.sum()) for e in moves]).T
+
+    def solve(self) -> float:
+        """Move x to the fixed point by Newton's method, and return the largest residual, in units
+        of the sizes. The plant is then on section 0."""
+        for _ in range(8):
+            residual = (self(self.x) - self.x) / self.size
+            if (np.abs(residual) <= 3 * self.noise / self.size).all():
+                break
+            J = (self.slopes(1) - np.eye(len(self.x))) * self.size / self.size[:, None]
+            # (A multiplier of 1 leaves its direction as it is.)
+            self.x = self.x - self.size * np.linalg.lstsq(J, residual, rcond=1e-6)[0]
+        return float(np.abs(residual).max())
 
 
 def returns_of(cycle: Any, names: Any) -> Returns:
     """See `SettledCycle.perturbed_returns`."""
-    map = _Map(cycle, names)
-    x, size = map.base[map.columns], map.size
-    say("noise of returns")
-    noise = map.noise(x)
-    # Steps at which noise and the error of fourth order are nearly equal for a function of unit
-    # derivatives; at most two percent of the range.
-    h = size * min((noise / size).max() ** 0.2 / 2, 0.02)
-    J, y = map.slopes(x, h), map(x)
-    scale = size / size[:, None]  # (of derivatives)
-    for _ in range(5):
-        residual = (y - x) / size
-        if (np.abs(residual) <= 3 * noise / size).all():
-            break
-        x = x - size * np.linalg.lstsq((J - np.eye(len(x))) * scale, residual, rcond=1e-9)[0]
-        y = map(x)
-    fine, middle, wide = (map.slopes(x, k * h) for k in (1, 2, 4))
+    try:
+        map = Map(cycle, names)
+        residual = map.solve()
+        fine, middle, wide = (map.slopes(k) for k in (1, 2, 4))
+    except Stopped as stop:
+        raise ComputationError(f"a perturbed state does not return: {stop}.") from stop
     J, coarse = (4 * fine - middle) / 3, (4 * middle - wide) / 3
     # (Weights 8/12 and -1/12 of four returns, each with this noise.)
-    error = np.hypot(np.sqrt(2 * (8**2 + 1)) / 12 * noise[:, None] / h, (J - coarse) / 3)
+    error = np.hypot(np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / map.h, (J - coarse) / 3)
+    scale = map.size / map.size[:, None]
     values, covariance, bound = _resolved(J * scale, error * scale)
     return Returns(
-        multipliers=values, covariance=covariance, covariance_freedom=10.0,  # (eleven differences)
+        multipliers=values,
+        covariance=covariance,
+        covariance_freedom=10.0,  # (eleven differences)
         coefficients=np.poly(values).real[1:] if len(values) else np.zeros(0),
-        jacobian=J, state=x, noise=noise, coordinates=map.names,
-        residual=float(np.abs((y - x) / size).max()), bound=bound,
-    )  # fmt: skip
+        jacobian=J,
+        state=map.x,
+        noise=map.noise,
+        coordinates=map.names,
+        residual=residual,
+        bound=bound,
+    )
 
 
 def _resolved(J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]) -> Any:
     """Return the eigenvalues that differ from 0 by three standard errors, the covariance of their
-    polynomial's coefficients, and a bound of the others.
+    polynomial's coefficients, and a bound of the others, from draws within the errors."""
 
-    To first order, dλ = wᴴ dJ v / wᴴ v with left and right eigenvectors w and v.
-    """
-    values, V = np.linalg.eig(J)
-    # (Perturbed within the errors, so that a defective eigenvalue 0 has eigenvectors.)
-    values, V = values.astype(complex), V.astype(complex)
-    W = np.linalg.pinv(V, rcond=1e-14)
-    gradient = np.einsum("ia,bi->iab", W, V)
-    spread = np.sqrt(np.einsum("iab,ab->i", np.abs(gradient) ** 2, error**2))
-    order = np.argsort(-np.abs(values))
-    values, gradient, spread = values[order], gradient[order], spread[order]
-    sure = np.abs(values) > 3 * spread
-    count = int(np.argmin(sure)) if not sure.all() else len(sure)
-    if count and count < len(values) and np.isclose(values[count - 1], values[count].conj()):
-        count -= int(values[count].imag != 0)
-    kept, gradient = values[:count], gradient[:count]
-    slopes = [-np.poly(np.delete(kept, i)) for i in range(count)]  # of coefficients
-    change = np.einsum("ij,iab->jab", np.reshape(slopes, (count, count)), gradient).real
-    covariance = np.einsum("jab,kab,ab->jk", change, change, error**2)
+    def ordered(J: Any) -> Any:
+        values = np.linalg.eigvals(J).astype(complex)
+        return values[np.argsort(-np.abs(values))]
+
+    draws = J + error * np.random.default_rng(0).standard_normal((1000, *J.shape))
+    values, each = ordered(J), np.array([ordered(x) for x in draws])
+    spread = np.sqrt(((np.abs(each) - np.abs(values)) ** 2).mean(axis=0))
+    count = int(np.cumprod(np.abs(values) > 3 * spread).sum())
+    if 0 < count < len(values) and values[count - 1].imag > 0 > values[count].imag:
+        count -= 1
+    polynomials = [np.poly(x[:count]).real[1:] if count else np.zeros(0) for x in each]
+    covariance = np.reshape(np.cov(polynomials, rowvar=False) if count else [], (count, count))
     bound = float((np.abs(values) + 3 * spread)[count:].max(initial=0.0))
-    return kept, covariance, bound
+    return values[:count], covariance, bound
