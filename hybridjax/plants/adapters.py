@@ -47,8 +47,7 @@ class MuJoCoPlant(_Made):
     - `inputs`: names of actuators, or units by name. An input is added to what `control` returns.
     - `control`: function of (model, data) that returns the controls of all actuators in each time
         step. It may read `data.time` if `period` is given, and must keep nothing between calls.
-        Default: zero.
-    - `fallen`: function of data that returns True where an experiment ends. Default: never.
+        An error that it raises ends an experiment, for example after a fall. Default: zero.
     - `period`: period of the clock in seconds. Default: no clock.
     - `substeps`: number of time steps between two looks at the signals. Default: 1.
 
@@ -59,15 +58,13 @@ class MuJoCoPlant(_Made):
     inputs: NewOptionalNames
     _: dataclasses.KW_ONLY
     control: Callable[[Any, Any], Any] | None = None
-    fallen: Callable[[Any], Any] | None = None
     period: Positive | None = None
     substeps: Count = 1
 
     def __post_init__(self) -> None:
         mujoco, model = package("mujoco"), self.model
         if not isinstance(model, mujoco.MjModel):
-            text = "`mujoco.MjModel.from_xml_path(file)`"
-            raise DefinitionError(f"MuJoCoPlant: `model` must be a model of MuJoCo, {text}.")
+            raise DefinitionError("`model` must be a `mujoco.MjModel`: see `from_xml_path`.")
         actuators = [model.actuator(i).name for i in range(model.nu)]
         require_among("actuator", list(self.inputs), actuators, "MuJoCoPlant: ")
         self._actuators = [actuators.index(name) for name in self.inputs]
@@ -92,32 +89,26 @@ class MuJoCoPlant(_Made):
         self._mujoco.mj_resetData(self.model, self.data)
         if self.model.nkey:
             self._mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
-        self.data.time = 0.0
         self._mujoco.mj_step1(self.model, self.data)
         return self._observe()
 
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]:
         """Hold the inputs for some time."""
-        model, data, whole = self.model, self.data, self.model.opt.timestep
+        model, data, whole = self.model, self.data, self.dt / self.substeps
         steps = int(duration / whole + 1e-9)
         left = duration - steps * whole
-        try:
-            for h in [whole] * steps + [left] * (left > 1e-9 * whole):
-                model.opt.timestep = h
-                data.ctrl[:] = 0.0 if self.control is None else self.control(model, data)
-                data.ctrl[self._actuators] += u
-                self._integrate(model, data)
-                self._mujoco.mj_step1(model, data)
-        finally:
-            model.opt.timestep = whole
-        if self.fallen is not None and self.fallen(data):
-            raise ComputationError("the walker has fallen")
+        for h in [whole] * steps + [left] * (left > 1e-9 * whole):
+            model.opt.timestep = h
+            data.ctrl[:] = 0.0 if self.control is None else self.control(model, data)
+            data.ctrl[self._actuators] += u
+            self._integrate(model, data)
+            self._mujoco.mj_step1(model, data)
+        model.opt.timestep = whole
         return self._observe()
 
     def _observe(self) -> Mapping[str, float]:
-        data = self.data
-        values = np.concatenate([data.qpos, data.qvel, data.sensordata])
-        return dict(zip(self._names, values.tolist(), strict=True))
+        values = self.data.qpos, self.data.qvel, self.data.sensordata
+        return dict(zip(self._names, np.concatenate(values).tolist(), strict=True))
 
     def get_state(self) -> np.ndarray:
         """Return `states`, and then what the solver of contacts keeps."""
@@ -163,8 +154,7 @@ class FMUPlant(_Made):
         except Exception:  # (of many kinds)
             can = None
         if can is None:
-            text = "give a file of FMI 2.0 for co-simulation"
-            raise DefinitionError(f"'{self.file}' is not there, or no such FMU: {text}.")
+            raise DefinitionError(f"'{self.file}' is no FMU of FMI 2.0 for co-simulation.")
         groups = self.inputs, self.signals
         variables = {x.name: x for x in about.modelVariables if x.type == "Real"}
         require_among("real variable", [x for y in groups for x in y], variables, "FMUPlant: ")

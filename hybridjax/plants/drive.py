@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-from ..errors import DefinitionError
+from ..errors import ComputationError
 
 
 @runtime_checkable
@@ -57,10 +57,6 @@ class Plant(Protocol):
     def reset(self, seed: int) -> Mapping[str, float]: ...
 
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]: ...
-
-
-class Stopped(Exception):
-    """The end of an experiment, with its cause."""
 
 
 @dataclasses.dataclass
@@ -131,22 +127,25 @@ class Drive:
         self.sets = hasattr(plant, "get_state") and hasattr(plant, "set_state")
         self.zero = [0.0] * len(plant.inputs)
         self.t, self.warmup, self.longest = 0.0, 0.0, math.inf
-        self.names, self.columns, self.z = (), (), ()
-        self.phase = self.start = self.last = None
+        self.names, self.columns, self.z = tuple[str, ...](), tuple[int, ...](), tuple[float, ...]()
+        self.phase, self.start, self.last = Phase(1), At(0.0, ()), At(0.0, ())
 
     def _take(self, observation: Any, t: float) -> None:
         names, self.t = tuple(observation), t
         if self.names and names != self.names:
-            raise Stopped(f"signals changed from {self.names} to {names}")
+            raise ComputationError(f"signals changed from {self.names} to {names}")
         self.z, self.names = tuple(observation.values()), names
         for name, x in zip(names, self.z, strict=True):
             if not x - x == 0:
-                raise Stopped(f"{name} became {x}")
+                raise ComputationError(f"{name} became {x}")
 
     def reset(self, seed: int) -> None:
-        """Begin at time 0. **Raises:** `Stopped`, like all methods, for NaN and other signals."""
+        """Begin at time 0.
+
+        **Raises:** `ComputationError`, like all methods, for NaN and signals with other names.
+        """
         self._take(self.plant.reset(seed), 0.0)
-        self.last = None
+        self.last = At(0.0, ())
 
     def step(self, u: Sequence[float], h: float) -> None:
         """Hold the input for some time."""
@@ -159,7 +158,7 @@ class Drive:
     def restore(self, start: At) -> None:
         """Continue from a state that was kept."""
         self.plant.set_state(start.state)
-        self.t, self.z, self.last = start.t, start.z, None
+        self.t, self.z, self.last = start.t, tuple(start.z), At(0.0, ())
 
     def pass_time(self, duration: float) -> None:
         """Let the plant run without input."""
@@ -172,16 +171,16 @@ class Drive:
         phase, began = self.phase, self.t
         timed = phase.columns is None and not self.fixed
         lands = self.sets and not self.fixed and not timed
-        last = self.last or At(self.t, self.z)  # (one step may cross two sections)
+        last = self.last if self.last.z else At(self.t, self.z)  # (a step may cross two sections)
         x, y = phase.level(k, last.t, last.z), phase.level(k, self.t, self.z)
         while y > 1e-9 * self.dt * timed:
             if self.t - began > self.longest:
-                raise Stopped(f"a section was not reached within {self.longest:.4g}")
+                raise ComputationError(f"a section was not reached within {self.longest:.4g}")
             last, x = self.here() if lands else At(self.t, self.z), y
             self.step(u, min(y, self.dt) if timed else self.dt)
             y = phase.level(k, self.t, self.z)
         if lands and y < 0 < x:
-            from scipy.optimize import brentq
+            from scipy import optimize
 
             def level(h: float) -> float:
                 self.restore(last)
@@ -189,7 +188,8 @@ class Drive:
                     self.step(u, h)
                 return phase.level(k, self.t, self.z)
 
-            level(brentq(level, 0.0, self.t - last.t, xtol=1e-9 * self.dt))
+            find: Any = optimize.brentq
+            level(find(level, 0.0, self.t - last.t, xtol=1e-9 * self.dt))
             return At(self.t, self.z)
         self.last, share = last, x / (x - y) if x > y else 1.0
         at = last.t + share * (self.t - last.t)
@@ -202,7 +202,7 @@ class Drive:
         late: list[float] = []
         try:
             if self._beginning(seed) != self._beginning(seed):
-                raise Stopped("the plant is not deterministic after `reset(seed)`")
+                raise ComputationError("the plant is not deterministic after `reset(seed)`")
             self.reset(seed)
             at = self.begin()
             for k, held in enumerate(u, 1):
@@ -212,7 +212,9 @@ class Drive:
                     at = self.advance(held, k)
         except Exception as error:
             kind = (
-                "" if isinstance(error, Stopped) else f"the plant raised {type(error).__name__}: "
+                ""
+                if isinstance(error, ComputationError)
+                else f"the plant raised {type(error).__name__}: "
             )
             return y, late, f"{kind}{error} (t = {self.t:.6g})"
         return y, late, ""
@@ -225,7 +227,7 @@ class Drive:
 
     def begin(self) -> At:
         """Bring a plant to section 0."""
-        if self.sets and self.start is not None:
+        if self.sets:
             self.restore(self.start)
             self.phase.begin(self.t, self.z, on_section=True)
             return self.start
@@ -251,13 +253,15 @@ def run_all(
 ) -> Iterator[Trial]:
     """Run experiments (seed, inputs) in processes with a limit of time, and yield them in order.
     Processes that ended are replaced.
-
-    **Raises:** `DefinitionError` for a plant that cannot be pickled.
     """
     if not processes:
         yield from (drive.run(*item) for item in items)
         return
-    packed, local, begun = _pack(drive), threading.local(), []
+    try:  # (classes in notebooks and scripts)
+        from cloudpickle import dumps
+    except ImportError:
+        from pickle import dumps
+    packed, local, begun = dumps(drive), threading.local(), []
 
     def run(item: tuple[int, Any]) -> Trial:
         if getattr(local, "worker", None) is None:
@@ -290,45 +294,23 @@ def run_all(
 def resume(
     file: Any, about: str, count: int, run: Callable[[list[int]], Iterator[Trial]]
 ) -> list[Trial]:
-    """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends.
-
-    **Raises:** `DefinitionError` for a file of another kind.
-    """
-    try:
-        with contextlib.closing(sqlite3.connect(file or ":memory:", isolation_level=None)) as base:
-            base.execute("create table if not exists trials (about, s, trial, unique (about, s))")
-            kept = dict(base.execute("select s, trial from trials where about = ?", [about]))
-            missing = [s for s in range(count) if s not in kept]
-            for s, trial in zip(missing, run(missing), strict=True):
-                kept[s] = json.dumps(trial)
-                base.execute("replace into trials values (?, ?, ?)", (about, s, kept[s]))
-    except sqlite3.Error as error:
-        raise DefinitionError(f"'{file}' is no store of experiments ({error}).") from error
+    """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends."""
+    with contextlib.closing(sqlite3.connect(file or ":memory:", isolation_level=None)) as base:
+        base.execute("create table if not exists trials (about, s, trial, unique (about, s))")
+        kept = dict(base.execute("select s, trial from trials where about = ?", [about]))
+        missing = [s for s in range(count) if s not in kept]
+        for s, trial in zip(missing, run(missing), strict=True):
+            kept[s] = json.dumps(trial)
+            base.execute("replace into trials values (?, ?, ?)", (about, s, kept[s]))
     return [json.loads(kept[s]) for s in range(count)]
 
 
 def _start(packed: bytes) -> Any:
-    # (One thread of BLAS: the processes use all cores. Path: that of this process.)
-    threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    # (One thread of BLAS, because the processes use all cores.)
     path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), *sys.path]))
     command = [sys.executable, "-c", "from hybridjax.plants.drive import serve; serve()"]
-    pipe, environment = subprocess.PIPE, {**os.environ, **threads, "PYTHONPATH": path}
-    worker = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment)
+    changes = {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    pipe, environment = subprocess.PIPE, os.environ | changes
+    worker: Any = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment)
     pickle.dump(packed, worker.stdin)
     return worker
-
-
-def _pack(drive: Drive) -> bytes:
-    """Return a pickle; of classes in notebooks and scripts by cloudpickle, where it is installed.
-
-    **Raises:** `DefinitionError` for a plant that cannot be pickled.
-    """
-    try:
-        from cloudpickle import dumps
-    except ImportError:
-        from pickle import dumps
-    try:
-        return dumps(drive)
-    except Exception as error:
-        text = "give it `__getstate__`, or use `processes=0`"
-        raise DefinitionError(f"the plant cannot be pickled ({error}): {text}.") from error

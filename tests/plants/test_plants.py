@@ -27,7 +27,7 @@ def circle():
 
 
 def test_a_plant_in_closed_form(circle):
-    assert abs(circle.period - 2 * math.pi) < 1e-9 and circle.late < 1e-9
+    assert abs(circle.period - 2 * math.pi) < 1e-9
     angle = 2 * math.pi * np.arange(8) / 8
     assert np.abs(circle.cycle_outputs - np.c_[np.cos(angle), np.sin(angle)]).max() < 1e-9
     returns = circle.perturbed_returns()
@@ -100,10 +100,10 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
 
 def test_what_does_not_fit_is_refused(circle):
     for sections, message in (
-        (hj.ClockPhase(8), "set its `period`"),
+        (hj.ClockPhase(8), "with a `period`"),
         (hj.KinematicPhase(8, "x", "z"), "no signal 'z'"),
-        (hj.Crossing("x", "falling"), "no equations"),
-        (hj.KinematicPhase(8, "x", "y", anchor=hj.Crossing("x", "falling")), "no equations"),
+        (hj.Crossing("x", "falling"), "has no equations"),
+        (hj.KinematicPhase(8, "x", "y", anchor=hj.Crossing("x", "falling")), "has no equations"),
     ):
         with pytest.raises(hj.DefinitionError, match=message):
             hj.plants.settle(Circle(), sections, "x")
