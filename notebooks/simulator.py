@@ -47,7 +47,7 @@ def drive(model, data):
     return [20 * math.sin(2 * math.pi * data.time), 0.0]
 
 
-plant = hj.plants.from_mujoco(XML, {"push": "N"}, control=drive, period=1.0, substeps=20)
+plant = hj.plants.MuJoCoPlant(XML, {"push": "N"}, control=drive, period=1.0, substeps=20)
 
 # %% [markdown]
 # ## Its cycle

@@ -37,7 +37,7 @@ def test_every_public_name_is_in_the_reference_once():
 # Results of functions, and classes of errors.
 GIVEN = UNCHECKED["made by this package"] | {
     "ComputationError", "Design", "FileFormatError", "FindingWarning", "LDTP", "PrecisionError",
-    "SettledCycle", "StoredExperiments", "from_fmu",  # (an example would need an FMU)
+    "SettledCycle", "StoredExperiments", "FMUPlant",  # (an example would need an FMU)
 }  # fmt: skip
 
 
