@@ -1,6 +1,6 @@
 """Plants: accuracy, overhead, processes and memory, of the paper's hopper and of MuJoCo's.
 
-python -m benchmarks.plants [overhead] [accuracy] [mujoco]
+python -m benchmarks.plants [overhead] [accuracy] [mujoco] [stairs]
 """
 
 import math
@@ -137,8 +137,27 @@ def mujoco():
         print(f"  HTFs within the region of returns: {returns.contains(fit.multipliers)}")
 
 
+def stairs():
+    """Fixed time steps: returns and experiments by time step, integrator and amplitude."""
+    text = (pathlib.Path(__file__).parents[1] / "tests" / "plants" / "hopper.xml").read_text()
+    for step, integrator in ((2e-3, "Euler"), (5e-4, "Euler"), (5e-4, "implicit"), (1e-4, "Euler")):
+        change = f'timestep="{step}" integrator="{integrator}"'
+        model = mj.MjModel.from_xml_string(text.replace('timestep="0.0005"', change))
+        plant = hj.plants.MuJoCoPlant(
+            model, {"push": "N"}, control=drive, period=1.0, substeps=round(0.01 / step)
+        )
+        cycle = hj.plants.settle(plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"), cycles=40)
+        returns = cycle.perturbed_returns()
+        print(f"{step} {integrator}: returns {returns.multipliers[0]:.6f}, noise {returns.noise}")
+        for amplitude in (1e-4, 2e-2):
+            design = hj.multisine(n_sections=10, periods=8, amplitude=amplitude)
+            fit = hj.fit_multipliers(hj.estimate_htf(cycle.run_experiments(design)), order=2)
+            inside = fit.contains(returns.multipliers[:2])[0]
+            print(f"  {amplitude} N: {fit.multipliers[0]:.6f}, returns within the region: {inside}")
+
+
 if __name__ == "__main__":
     hj.enable_x64()
-    chosen = sys.argv[1:] or ["overhead", "accuracy", "mujoco"]
-    for name in chosen:
-        {"overhead": overhead, "accuracy": accuracy, "mujoco": mujoco}[name]()
+    subjects = {"overhead": overhead, "accuracy": accuracy, "mujoco": mujoco, "stairs": stairs}
+    for name in sys.argv[1:] or subjects:
+        subjects[name]()

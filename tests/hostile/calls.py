@@ -262,9 +262,9 @@ def plants(t):
     yield t.settled.run_experiments, dict(design=np.zeros((1, 88, 1)))
     yield t.settled.perturbed_returns, dict(coordinates=("x", "v"))
     names = dict(inputs=("u",), signals=("x",), dt=0.1)
-    yield hj.plants.MuJoCoPlant, dict(model="<mujoco/>", inputs=())
+    yield hj.plants.MuJoCoPlant, dict(model=None, inputs=())
     yield hj.plants.FMUPlant, dict(file="nope.fmu") | names
-    yield hj.plants.GymnasiumPlant, dict(environment="nope") | names
+    yield hj.plants.GymnasiumPlant, dict(environment=dict) | names
 
 
 def testing(t):
