@@ -57,7 +57,8 @@ class Study:
     def __repr__(self) -> str:
         lines = [f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"]
         lines += [f"  {name} failed: {text}" for name, text in self.failures.items()]
-        lines += [self.results.T.to_string(header=False)] * (len(self.results) > 0)
+        if len(self.results):
+            lines.append(self.results.T.to_string(header=False, float_format="{:.4g}".format))
         return "\n".join(lines)
 
 
@@ -146,14 +147,15 @@ def identify_subjects(
     groups, a folder that cannot be written, and if pandas is not installed; `ComputationError` if
     all subjects fail.
     """
-    rows, root, calls = _rows(Path(table)), Path(folder), {}
-    reading = {"time": time, "signals": tuple(signals) or None}
+    rows, root = _rows(Path(table)), Path(folder)
+    calls: dict[str, Any] = {}
+    reading: dict[str, Any] = {"time": time, "signals": tuple(signals) or None}
     for name, trials in rows.groupby("report", sort=False):
         if (trials[["subject", *factors_of(rows)]].nunique() > 1).any():
             raise DefinitionError(f"two subjects would have the report '{name}': rename one.")
         files = [Path(table).parent / file for file in trials["file"]]
-        job = (_cause, _report, files, root / name, identify, reading, formats)
-        calls[name] = client.submit(*job).result if client else functools.partial(*job)
+        job = functools.partial(_cause, _report, files, root / name, identify, reading, formats)
+        calls[name] = client.submit(job).result if client else job
     causes = {name: _cause(calls[name]) for name in counted(list(calls), "subjects", len(calls))}
     failures = {name: text for name, text in causes.items() if text}
     frame = rows[~rows["report"].isin(failures)].drop_duplicates("report", ignore_index=True)
