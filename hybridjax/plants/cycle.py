@@ -319,6 +319,8 @@ def settle(
     require_among("output", outputs, drive.names, "")
     drive.columns = tuple(map(drive.names.index, outputs))
     if guess is not None:
+        if not drive.sets or np.shape(drive.here().state) != np.shape(guess):
+            raise DefinitionError("`guess` must be a state as the plant's `get_state` returns it.")
         drive.restore(At(0.0, drive.z, state=np.asarray(guess)))
         drive.step(drive.zero, drive.dt)
     drive.phase = _bound(drive, family, cycles if guess is None else 0)

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-from ..errors import ComputationError
+from ..errors import ComputationError, DefinitionError
 
 
 @runtime_checkable
@@ -241,7 +241,11 @@ def serve() -> None:
     packed `Drive`, then the seed and inputs of each), standard output the answers."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a plant prints goes to standard error
-    drive = pickle.loads(pickle.load(sys.stdin.buffer))
+    try:
+        drive = pickle.loads(pickle.load(sys.stdin.buffer))
+    except Exception as error:
+        pickle.dump(f"{type(error).__name__}: {error}", answers)
+        return answers.close()
     with contextlib.suppress(EOFError):
         while True:
             pickle.dump(drive.run(*pickle.load(sys.stdin.buffer)), answers)
@@ -257,11 +261,7 @@ def run_all(
     if not processes:
         yield from (drive.run(*item) for item in items)
         return
-    try:  # (classes in notebooks and scripts)
-        from cloudpickle import dumps
-    except ImportError:
-        from pickle import dumps
-    packed, local, begun = dumps(drive), threading.local(), []
+    packed, local, begun = _pack(drive), threading.local(), []
 
     def run(item: tuple[int, Any]) -> Trial:
         if getattr(local, "worker", None) is None:
@@ -273,7 +273,7 @@ def run_all(
         try:
             pickle.dump(item, worker.stdin)
             worker.stdin.flush()
-            return pickle.load(worker.stdout)
+            answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
             local.worker, code = None, worker.wait()
             hung = time.monotonic() - began >= limit
@@ -281,6 +281,10 @@ def run_all(
             return [], [], f"no answer within the limit of {limit:g} s" if hung else ended
         finally:
             timer.cancel()
+        if isinstance(answer, str):
+            text = "define it in a module that can be imported, or use `processes=0`"
+            raise DefinitionError(f"another process cannot make the plant ({answer}): {text}.")
+        return answer
 
     with ThreadPoolExecutor(processes) as pool:
         try:
@@ -294,14 +298,20 @@ def run_all(
 def resume(
     file: Any, about: str, count: int, run: Callable[[list[int]], Iterator[Trial]]
 ) -> list[Trial]:
-    """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends."""
-    with contextlib.closing(sqlite3.connect(file or ":memory:", isolation_level=None)) as base:
-        base.execute("create table if not exists trials (about, s, trial, unique (about, s))")
-        kept = dict(base.execute("select s, trial from trials where about = ?", [about]))
-        missing = [s for s in range(count) if s not in kept]
-        for s, trial in zip(missing, run(missing), strict=True):
-            kept[s] = json.dumps(trial)
-            base.execute("replace into trials values (?, ?, ?)", (about, s, kept[s]))
+    """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends.
+
+    **Raises:** `DefinitionError` for a file of another kind, or in a folder that is not there.
+    """
+    try:
+        with contextlib.closing(sqlite3.connect(file or ":memory:", isolation_level=None)) as base:
+            base.execute("create table if not exists trials (about, s, trial, unique (about, s))")
+            kept = dict(base.execute("select s, trial from trials where about = ?", [about]))
+            missing = [s for s in range(count) if s not in kept]
+            for s, trial in zip(missing, run(missing), strict=True):
+                kept[s] = json.dumps(trial)
+                base.execute("replace into trials values (?, ?, ?)", (about, s, kept[s]))
+    except sqlite3.Error as error:
+        raise DefinitionError(f"'{file}' is no store of experiments ({error}).") from error
     return [json.loads(kept[s]) for s in range(count)]
 
 
@@ -314,3 +324,23 @@ def _start(packed: bytes) -> Any:
     worker: Any = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment)
     pickle.dump(packed, worker.stdin)
     return worker
+
+
+def _pack(drive: Drive) -> bytes:
+    """Return a pickle; of classes in notebooks and scripts by cloudpickle, where it is installed.
+
+    **Raises:** `DefinitionError` for a plant that cannot be pickled.
+    """
+    module = sys.modules.get(type(drive.plant).__module__)
+    try:
+        try:
+            import cloudpickle as packer
+        except ImportError:
+            packer = pickle
+        else:
+            if module is not None and module.__spec__ is None:  # (in no file)
+                packer.register_pickle_by_value(module)
+        return packer.dumps(drive)
+    except Exception as error:
+        text = "give it `__getstate__`, or use `processes=0`"
+        raise DefinitionError(f"the plant cannot be pickled ({error}): {text}.") from error

@@ -53,7 +53,8 @@ class Having(Kind):
     would do.)"""
 
     def __init__(self, protocol: type):
-        self.names = sorted(x for x in {**vars(protocol), **protocol.__annotations__} if x[0] != "_")
+        names = {**vars(protocol), **protocol.__annotations__}
+        self.names = sorted(x for x in names if x[0] != "_")
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
     def fits(self, value):
