@@ -12,6 +12,7 @@ from matplotlib import pyplot
 from PIL import Image
 
 import hybridjax as hj
+from hybridjax.plot import Motion
 from hybridjax.plot.look import Plot
 
 
@@ -38,6 +39,12 @@ def draw() -> dict[str, Plot]:
     }
 
 
+def walk() -> Motion:
+    """The animation below the first sentence."""
+    gait = hj.find_limit_cycle(hj.models.CompassGait(), section=hj.AtEvent("heelstrike"))
+    return hj.plot.animate(gait)
+
+
 def numbers(plot: Plot) -> list[list[float]]:
     """Sum and sum of squares of each curve's values."""
     curves = [line.get_ydata() for panel in plot.axes.flat for line in panel.get_lines()]
@@ -53,6 +60,7 @@ def drawn(name: str) -> list[list[float]]:
 if __name__ == "__main__":
     matplotlib.use("Agg")
     hj.enable_x64()
+    walk().save(IMAGES / "walk.gif")
     for name, plot in draw().items():
         about = {"Comment": json.dumps(numbers(plot)), "Software": None}
         plot.figure.savefig(IMAGES / f"{name}.png", metadata=about)
