@@ -18,6 +18,7 @@ from .._core.arguments import require_among, require_index
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers
 from .._core.boundary.values import Reals
+from .._core.compilation import at_ease
 from .._core.executor import Array, is_traced, namespace, on_host, stop_gradient, svdvals, to_host
 from .._core.results import Result
 from .._core.signal import unit_of
@@ -365,7 +366,8 @@ def asymptotic_phase(
     for _ in range(turns):
         target = toward(np.full(1, np.inf), -1, lanes.t + 3 * period)
         target = to_section(target, map.base, map.event)
-        moved = move(s, lanes, np.zeros((s.nu, 1)), target, map.settings).moved
+        with at_ease():
+            moved = move(s, lanes, np.zeros((s.nu, 1)), target, map.settings).moved
         lanes = moved.lanes
         if moved.result[0] != Result.OK:
             break
