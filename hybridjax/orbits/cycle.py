@@ -231,8 +231,8 @@ class LimitCycle(eqx.Module):
         """The phase, in cycles, of the state on the cycle that a state off it approaches. It flows
         until it meets the section near the anchor, where phases are linear.
 
-        **Arguments:** `chart`, `state`: as of `simulate`. `turns`: largest number of crossings of
-        the section. Default: 1000.
+        **Arguments:** `chart`, `state`: as of `simulate`; in a chart of sliding, on its surface.
+        `turns`: largest number of crossings of the section. Default: 1000.
 
         **Raises:** `DefinitionError` for a cycle that is driven by a clock; `ComputationError` for
         a state that does not reach the cycle.

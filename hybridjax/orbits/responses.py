@@ -39,10 +39,6 @@ from .return_map import SINGULAR, ReturnMap
 # divided by the multiplier, take the place of digits. Larger: slower modes are left out.
 _LEAST = 1e-6
 
-# Distance from the cycle, in sizes of the states, at which phases are linear in the state. Larger:
-# its square is an error of phases. Smaller: many turns near slow cycles.
-_NEAR = 1e-6
-
 Unit = Literal["time", "cycles", "radians"]
 Phases = Annotated[Numbers, Reals("p")]
 
@@ -361,6 +357,7 @@ def asymptotic_phase(
     if state.shape != (s.dims[a],):
         raise DefinitionError(f"`state` must give the {s.dims[a]} states of chart '{chart}'.")
     phase, size = to_host(responses(course, 0)._covector(None))[0, 0], map.sizes
+    near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase
     q = np.pad(state, (0, s.d - s.dims[a]))[:, None]
     lanes = begin = start_lanes(s, map.anchor.t, np.array([a], np.int32), q)
     for _ in range(turns):
@@ -372,7 +369,7 @@ def asymptotic_phase(
         if moved.result[0] != Result.OK:
             break
         off = (lanes.q - map.anchor.q)[:, 0]
-        if lanes.chart[0] == map.anchor.chart[0] and np.abs(off / size).max() < _NEAR:
+        if lanes.chart[0] == map.anchor.chart[0] and np.abs(off / size).max() < near:
             return float((phase @ off - (lanes.t - begin.t)[0]) / period % 1.0)
     raise ComputationError(
         f"the state did not come to the cycle within {turns} crossings of its section (at t = "
