@@ -57,6 +57,7 @@ from .orbits.crossing import AtEvent as AtEvent, Crossing as Crossing
 from .orbits.cycle import LimitCycle as LimitCycle
 from .orbits.find import find_limit_cycle as find_limit_cycle
 from .orbits.limit_cycles import find_limit_cycles as find_limit_cycles
+from .plot.explore import explore as explore
 from .recordings.identification import identify_recording as identify_recording
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording

@@ -10,6 +10,7 @@
 import math
 
 import matplotlib.pyplot as plt
+import mujoco
 import numpy as np
 
 import hybridjax as hj
@@ -47,7 +48,8 @@ def drive(model, data):
     return [20 * math.sin(2 * math.pi * data.time), 0.0]
 
 
-plant = hj.plants.from_mujoco(XML, {"push": "N"}, control=drive, period=1.0, substeps=20)
+model = mujoco.MjModel.from_xml_string(XML)
+plant = hj.plants.MuJoCoPlant(model, {"push": "N"}, control=drive, period=1.0, substeps=20)
 
 # %% [markdown]
 # ## Its cycle
@@ -60,7 +62,7 @@ cycle = hj.plants.settle(plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate")
 print(cycle)
 
 # %%
-plant.set_state(cycle.experiment.start.state)
+plant.set_state(cycle.state)
 frames = [plant.step([0.0], 0.1) for _ in range(10)]
 figure, ax = plt.subplots(figsize=(8, 3))
 for k, z in enumerate(frames):
@@ -121,7 +123,7 @@ plt.show()
 # 2 cm of its cycle after 20 periods.
 
 # %%
-start = cycle.experiment.start.state
+start = cycle.state
 names = plant.states
 
 

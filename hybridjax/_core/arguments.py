@@ -119,5 +119,5 @@ def package(name: str) -> ModuleType:
 
 # The extra of a library that is not called like it.
 _EXTRAS = {"distributed": "scale", "zarr": "scale", "ezc3d": "c3d", "h5py": "mat", "rosbags": "ros"}
-_EXTRAS |= {"fmpy": "fmu", "gymnasium": "gym"}
+_EXTRAS |= {"fmpy": "fmu", "gymnasium": "gym", "anywidget": "explore"}
 _EXTRAS |= dict.fromkeys(("pandas", "pyarrow", "openpyxl"), "tables")

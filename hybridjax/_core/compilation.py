@@ -4,8 +4,8 @@
 - `host_first` runs a function on the host until compiling it is worth its time.
 - `TwoTiers` compiles the experiments twice: a quick executable for the first answer, and the fully
   optimized one in a thread beside it.
-- `kernel` compiles single functions of users for code that runs on the host, and `deferred` loops
-  of them.
+- `kernel` compiles single functions of users for code that runs on the host; `whole` and `deferred`
+  programs that do more at once, when the host has spent as much time.
 """
 
 import collections
@@ -363,53 +363,63 @@ def kernel(
     (XLA runs the smallest programs, of a thousand operations, in the thread that calls them, and
     hands larger ones to another thread, which takes longer than they do.)
     """
-    program, arrays = _bound(function, form, static, trees, lanes)
-
-    def call(*arguments, some=None):
-        if some is not None:
-            values = call(*(x[..., some] if x.shape[-1] == len(some) else x for x in arguments))
-            return values[..., np.maximum(np.cumsum(some) - 1, 0)]
-        L = max(x.shape[-1] for x in arguments)
-        if L == lanes == 1:
-            return np.asarray(program(arrays, *arguments))
-        filled = -(-L // lanes) * lanes
-        arguments = [_fill(x, L, filled) for x in arguments]
-        if filled == lanes:
-            return np.asarray(program(arrays, *arguments))[..., :L]
-        blocks = [slice(k, k + lanes) for k in range(0, filled, lanes)]
-        parts = [program(arrays, *[x[..., block] for x in arguments]) for block in blocks]
-        return np.concatenate(parts, axis=-1)[..., :L]
-
-    return call
+    return ft.partial(_run_lanes, *_bound(function, form, static, trees, lanes), lanes)
 
 
-def deferred(function: Callable, form: Callable, static: tuple[Hashable, ...], trees) -> Callable:
-    """A `kernel` of any arguments and results, for which there is another way: it returns None
-    until it has been called so often that a thread compiles it, and has done so.
+def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=None) -> np.ndarray:
+    if some is not None:
+        arguments = [x[..., some] if x.shape[-1] == len(some) else x for x in arguments]
+        values = _run_lanes(program, arrays, lanes, *arguments)
+        return values[..., np.maximum(np.cumsum(some) - 1, 0)]
+    L = max(x.shape[-1] for x in arguments)
+    if L == lanes == 1:
+        return np.asarray(program(arrays, *arguments))
+    filled = -(-L // lanes) * lanes
+    arguments = [_fill(x, L, filled) for x in arguments]
+    if filled == lanes:
+        return np.asarray(program(arrays, *arguments))[..., :L]
+    blocks = [slice(k, k + lanes) for k in range(0, filled, lanes)]
+    parts = [program(arrays, *[x[..., block] for x in arguments]) for block in blocks]
+    return np.concatenate(parts, axis=-1)[..., :L]
 
-    That takes a tenth of the time of a whole program, and a call spares some ms of the other way.
+
+def whole(function: Callable, static: tuple, trees: Any, seconds: float) -> Callable[..., Any]:
+    """`function(*static, *trees, *arguments)`, which runs on the host for so many seconds before it
+    is compiled (see `deferred`); of any arguments and results, with arrays of NumPy."""
+    compiled = ft.partial(_run_tree, *_bound(function, ft.partial, static, trees, 1))
+    return deferred(compiled, ft.partial(function, *static, *trees), seconds)
+
+
+def _run_tree(program: Callable, arrays: list, *arguments):
+    return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
+
+
+def deferred(compiled: Any, other: Callable, seconds: float) -> Callable:
+    """`other`, a function of the host, until it has taken so many seconds of this thread, about as
+    many as compiling takes: then a thread compiles a kernel that has the same results.
+
     In interactive sessions there is time between calls: the thread starts earlier.
     """
-    program, arrays = _bound(function, form, static, trees, 1)
-    worth = WORTH_COMPILING * (16 if hasattr(sys, "ps1") else 128)
+    program = compiled.args[0]
+    worth = seconds / 3 if hasattr(sys, "ps1") else seconds
 
     def call(*arguments):
-        calls = _calls[program] = _calls.get(program, 0) + 1
-        if calls < 0:
-            return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
-        if calls - 1 < worth <= calls:
-            threading.Thread(target=compile_, args=arguments).start()
-        return None
-
-    def compile_(*arguments):
-        program(arrays, *arguments)
-        _calls[program] = -sys.maxsize  # (less than zero from now on)
+        if program in _ready:
+            return compiled(*arguments)
+        begin, before = time.thread_time(), _spent[program]
+        results = other(*arguments)
+        after = _spent[program] = before + time.thread_time() - begin
+        if before <= worth < after:
+            compile_ = lambda: (compiled(*arguments), _ready.add(program))  # noqa: E731
+            threading.Thread(target=compile_).start()
+        return results
 
     return call
 
 
-# Calls of each such program.
-_calls: dict[Callable, int] = {}
+# Seconds that the host has taken for each such program, and those that are compiled.
+_spent: dict[Callable, float] = collections.defaultdict(float)
+_ready: set[Callable] = set()
 
 
 def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:

@@ -33,9 +33,14 @@ def only_on_host() -> Iterator[None]:
         _only_on_host.reset(before)
 
 
+def must_be_on_host() -> bool:
+    """Return whether a derivative must come from the host."""
+    return _only_on_host.get() and not is_inside_program()
+
+
 def require_program() -> None:
     """**Raises:** `NotOnHostError` where a derivative must come from the host."""
-    if _only_on_host.get() and not is_inside_program():
+    if must_be_on_host():
         raise NotOnHostError
 
 

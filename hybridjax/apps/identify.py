@@ -7,7 +7,6 @@ import base64
 import contextlib
 import csv
 import functools
-import io
 import json
 import os
 import re
@@ -127,11 +126,11 @@ def report_folder(
     figures = ["phase", "sections", "multipliers", "impulse_responses", "validation"]
     for suffix in _suffixes(inputs):
         figures += [f"bode{suffix}", f"harmonics{suffix}"]
-    images = [f"figures/{name}.{format}" for name in figures for format in _with_png(formats)]
+    images = [f"figures/{name}.{format}" for name in figures for format in with_png(formats)]
     return results_folder(Path(folder), "report", [*files, *images])
 
 
-def _with_png(formats: Sequence[Format]) -> tuple[Format, ...]:
+def with_png(formats: Sequence[Format]) -> tuple[Format, ...]:
     """Return the formats with PNG, which the page shows, first."""
     return tuple(dict.fromkeys(("png", *formats)))
 
@@ -152,7 +151,7 @@ def write_results(folder: Path, found: Identification, formats: Sequence[Format]
     htf = found.fit.htf(np.linspace(0, edge, 241)[1:])
     images = {}
     for name, drawn in _figures(found, htf).items():
-        image, *_ = look.save(folder / "figures" / name, drawn, _with_png(formats))
+        image, *_ = look.save(folder / "figures" / name, drawn, with_png(formats))
         images[name] = base64.b64encode(image.read_bytes()).decode()
         pyplot.close(drawn.figure)
     save(folder / "htf.npz", htf)
@@ -179,23 +178,6 @@ def off_screen() -> contextlib.AbstractContextManager:
     import matplotlib
 
     return matplotlib.rc_context({"backend": "agg"})
-
-
-def figure_of(drawn: look.Plot, caption: str) -> str:
-    """Return a figure as HTML, and close it."""
-    from matplotlib import pyplot
-
-    file = io.BytesIO()
-    drawn.figure.savefig(file, format="png")
-    pyplot.close(drawn.figure)
-    return _figure(caption, base64.b64encode(file.getvalue()).decode(), caption)
-
-
-def _figure(name: str, image: str, caption: str) -> str:
-    return (
-        f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{image}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
 
 
 def page_of(title: str, parts: Iterable[str]) -> str:
@@ -295,7 +277,8 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         "nonlinearity, smoothing), not that the multipliers are wrong.</p>",
         found.held_out.validation._repr_html_(),
         *(
-            _figure(name, image, caption)
+            f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{image}">'
+            f"<figcaption>{escape(caption)}</figcaption></figure>"
             for name, image in images.items()
             for figure, caption in _CAPTIONS.items()
             if name.startswith(figure)

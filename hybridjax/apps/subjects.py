@@ -9,7 +9,7 @@ import itertools
 import json
 import multiprocessing
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from ..io import load
 from ..recordings.population.population import Population
 from ..recordings.population.tables import factors_of, table_of
 from ..recordings.read import read_recording
-from .identify import PAGE, figure_of, off_screen, page_of, report_folder, steps_of, write_results
+from .identify import PAGE, off_screen, page_of, report_folder, steps_of, with_png, write_results
 
 
 # Columns of the table of a study, and their names in the summaries.
@@ -44,8 +44,8 @@ class Study:
 
     **Fields:** `population` of the subjects that were identified; its table also has `report`,
     `strides`, `period` and `period_error` (s). `fits`, one for each row; `failures`: sentences by
-    name of the report; `results`: data frame of means, and differences of all pairs of groups and
-    conditions; `folder`.
+    name of the report, and of "population" if a mean has too few subjects; `results`: data frame of
+    means, and differences of all pairs of groups and conditions; `folder`.
     """
 
     population: Population
@@ -57,43 +57,37 @@ class Study:
     def __repr__(self) -> str:
         lines = [f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"]
         lines += [f"  {name} failed: {text}" for name, text in self.failures.items()]
-        return "\n".join([*lines, self.results.T.to_string(header=False)])
+        if len(self.results):
+            lines.append(self.results.T.to_string(header=False, float_format="{:.4g}".format))
+        return "\n".join(lines)
 
 
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """Identifies the trials of one subject in one condition, and writes the report."""
-
-    files: tuple[Path, ...]
-    folder: Path
-    identify: Callable[..., Any]
-    options: dict[str, Any]
-    formats: tuple[Format, ...]
-
-    def __call__(self) -> str:
-        """Return the cause of a failure, or "". Results of the same files and options are kept."""
-        stats = [(str(x), x.stat().st_size, x.stat().st_mtime_ns) for x in self.files if x.exists()]
-        what = digest_of(self.identify), self.options, self.formats
-        key, mark = json.dumps([__version__, stats, what]), self.folder / "job.json"
-        needed = [self.folder / name for name in (PAGE, "fit.npz", "summary.json", mark.name)]
-        if all(x.is_file() for x in needed) and mark.read_text() == key:
-            return ""
-        enable_x64()
-        result = self.identify(read_recording(*self.files, **self.options))
-        converged = result.fit.result == Result.OK
-        with report_folder(self.folder, result.data.inputs, self.formats) as new:
-            write_results(new, result, self.formats)
-            (new / mark.name).write_text(key if converged else "")
-        return "" if converged else "the fit did not converge."
-
-
-def _cause(call: Callable[[], str]) -> str:
+def _cause(write: Callable[..., str], *arguments: Any) -> str:
     """Return the cause of a failure, or "": files, functions of users and workers may all fail."""
     try:
-        return call()
+        return write(*arguments)
     except Exception as error:
         kind = "" if isinstance(error, HybridJaxError) else f"{type(error).__name__}: "
         return f"{kind}{error}"
+
+
+def _report(files: list[Path], folder: Path, identify: Callable, reading: dict, formats) -> str:
+    """Identify the trials of one subject in one condition, and write the report.
+
+    **Returns:** the cause of a failure, or "". Results of the same files and options are kept.
+    """
+    stats = [(str(x), x.stat().st_size, x.stat().st_mtime_ns) for x in files if x.exists()]
+    key = json.dumps([__version__, stats, digest_of(identify), reading, formats])
+    mark, *needed = (folder / name for name in ("job.json", PAGE, "fit.npz", "summary.json"))
+    if mark.is_file() and mark.read_text() == key and all(x.is_file() for x in needed):
+        return ""
+    enable_x64()
+    result = identify(read_recording(*files, **reading))
+    converged = result.fit.result == Result.OK
+    with report_folder(folder, result.data.inputs, formats) as new:
+        write_results(new, result, formats)
+        (new / mark.name).write_text(key if converged else "")
+    return "" if converged else "the fit did not converge."
 
 
 def run(options: Any) -> int:
@@ -104,9 +98,12 @@ def run(options: Any) -> int:
     signals, identify = steps_of(options)
     reading: Any = {"time": options.time, "signals": signals, "formats": options.formats}
     spawn = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(options.workers, mp_context=spawn) as pool:
+    pool = concurrent.futures.ProcessPoolExecutor(options.workers, mp_context=spawn)
+    try:
         reading["client"] = pool if options.workers > 1 else None
         study = identify_subjects(options.table, options.out, identify, **reading)
+    finally:
+        pool.shutdown(cancel_futures=True)  # after an interruption
     print(study)
     print(Path(options.out) / _FILES[-1])
     return 1 if study.failures else 0
@@ -150,15 +147,15 @@ def identify_subjects(
     groups, a folder that cannot be written, and if pandas is not installed; `ComputationError` if
     all subjects fail.
     """
-    rows, root, calls = _rows(Path(table)), Path(folder), {}
-    reading = {"time": time, "signals": tuple(signals) or None}
+    rows, root = _rows(Path(table)), Path(folder)
+    calls: dict[str, Any] = {}
+    reading: dict[str, Any] = {"time": time, "signals": tuple(signals) or None}
     for name, trials in rows.groupby("report", sort=False):
         if (trials[["subject", *factors_of(rows)]].nunique() > 1).any():
             raise DefinitionError(f"two subjects would have the report '{name}': rename one.")
-        files = tuple(Path(table).parent / file for file in trials["file"])
-        calls[name] = functools.partial(_cause, Job(files, root / name, identify, reading, formats))
-        if client is not None:
-            calls[name] = client.submit(calls[name]).result
+        files = [Path(table).parent / file for file in trials["file"]]
+        job = functools.partial(_cause, _report, files, root / name, identify, reading, formats)
+        calls[name] = client.submit(job).result if client else job
     causes = {name: _cause(calls[name]) for name in counted(list(calls), "subjects", len(calls))}
     failures = {name: text for name, text in causes.items() if text}
     frame = rows[~rows["report"].isin(failures)].drop_duplicates("report", ignore_index=True)
@@ -172,14 +169,16 @@ def identify_subjects(
         frame[name] = [float(json.loads(text)[key]) for text in texts]
     population = Population.from_fits(fits, frame.drop(columns=["file", "trial"], errors="ignore"))
     parts = [package("pandas").DataFrame()]
-    with contextlib.suppress(DefinitionError):  # for too few subjects
+    try:
         parts.append(population.mean("modulus"))
         for factor in factors_of(frame):
             pairs = itertools.combinations(frame[factor].unique()[::-1], 2)
             parts += [population.difference("modulus", a, b) for a, b in pairs]
+    except DefinitionError as error:  # for too few subjects
+        failures["population"] = str(error)
     results = package("pandas").concat(parts, ignore_index=True)
     study = Study(population, fits, failures, results, root)
-    _write(study, dict.fromkeys(part.attrs["methods"] for part in parts[1:]))
+    _write(study, dict.fromkeys(part.attrs["methods"] for part in parts[1:]), formats)
     return study
 
 
@@ -201,24 +200,23 @@ def _rows(path: Path) -> Any:
     return rows
 
 
-def _write(study: Study, methods: dict[str, None]) -> None:
+def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) -> None:
     """Write the tables, and the report for all."""
-    population, figures = study.population, []
-    with off_screen(), contextlib.suppress(DefinitionError):  # for too few subjects
-        drawn = plot.forest(population, "modulus")
-        figures.append(figure_of(drawn, "Modulus of the leading multiplier"))
+    population, results = study.population, study.results
     links = (f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>' for n in population.table["report"])
+    errors = {f"{name}_error": error for name, error in population.errors.items()}
     parts = [
         *(f'<p class="warn">{escape(f"{n} failed: {x}")}</p>' for n, x in study.failures.items()),
         f"<ul>{''.join(links)}</ul>",
-        study.results.T.to_html(header=False, float_format="{:.4g}".format, na_rep=""),
-        *figures,
+        results.T.to_html(header=False, float_format="{:.4g}".format, na_rep=""),
         *(f"<p>{escape(x)}</p>" for x in methods),
     ]
-    errors = {f"{name}_error": error for name, error in population.errors.items()}
     with results_folder(study.folder, "population", _FILES) as new:
-        subjects = population.table.assign(**population.values, **errors)
-        subjects.to_csv(new / _FILES[0], index=False)
-        study.results.to_csv(new / _FILES[1], index=False)
+        with off_screen(), contextlib.suppress(DefinitionError):  # for too few subjects
+            drawn = plot.forest(population, "modulus")
+            plot.save(new / "forest", drawn, with_png(formats))
+            parts.append('<img alt="Modulus of the leading multiplier" src="forest.png">')
+        population.table.assign(**population.values, **errors).to_csv(new / _FILES[0], index=False)
+        results.to_csv(new / _FILES[1], index=False)
         page = page_of(f"{len(study.fits)} reports", parts)
         (new / _FILES[2]).write_text(page, encoding="utf-8")

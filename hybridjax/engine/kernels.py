@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.compilation import kernel
+from .._core.compilation import WORTH_COMPILING, deferred, kernel
 from .._core.executor import on_host
 from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method, Radau, as_method
@@ -55,10 +55,16 @@ def step_along(
     return Step(*rows[:5]), rows[5], rows[6]
 
 
-def linear_step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Expanded:
+def linear_step(
+    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, by_stages: Callable
+) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
-    states, inputs and length of the step."""
-    return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=_POINTS)(t, q, u, h)
+    states, inputs and length of the step. Those of explicit methods come `by_stages` until they
+    have taken a while."""
+    compiled = s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=4 * _POINTS)
+    if s.method(a).implicit or isinstance(s, Tangents):
+        return compiled(t, q, u, h)
+    return deferred(compiled, by_stages, WORTH_COMPILING / 10)(t, q, u, h)
 
 
 def divergence(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Times:

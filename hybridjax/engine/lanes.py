@@ -89,6 +89,11 @@ def needed(mask: Mask, tree):
     return jax.tree_util.tree_map(cut, tree)
 
 
+def side_by_side(tree):
+    """An axis of pieces of the flow of a single lane, as one of lanes."""
+    return jax.tree_util.tree_map(lambda x: namespace(x).moveaxis(x[..., 0], 0, -1), tree)
+
+
 # Codes on a tape. Codes >= 0 are the transition that fires at the end of a move.
 IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = range(-4, 0)
 

@@ -6,9 +6,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float
 
-from .._core.executor import namespace, on_host
+from .._core.compilation import WORTH_COMPILING, whole
+from .._core.executor import namespace, on_host, scan
 from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
@@ -48,19 +50,68 @@ def move(
     if setout is None:
         setout = initial_step(s, lanes, u, target.limit - lanes.t, settings)
     if not isinstance(setout, Stride):
-        setout = Stride(setout, xp.zeros_like(setout), xp.ones_like(setout))
+        setout = stride(setout)
     if result is None:
         result = xp.full(lanes.t.shape, Result.OK, xp.int32)
+    if on_host(lanes.t) and len(lanes.t) == 1:
+        _, (_, *row) = through(s, (lanes, setout, result), u, target, settings, options)
+        return Recorded(*jax.tree_util.tree_map(lambda x: x[0], row))
     if on_host(lanes.t):
-        return search(s, lanes, u, target, setout, result, settings, options)
+        return search(s, lanes, u, target, settings, setout, result, options)
     return _move(s, lanes, u, target, fixed(setout), result, settings, options)
+
+
+def stride(h: Times) -> Stride:
+    """A first step of this length, on a way that is not known."""
+    return Stride(h, h * 0, h * 0 + 1)
+
+
+def through(
+    s: Structure,
+    begin: tuple[Lanes, Stride, Index],
+    u: Inputs,
+    targets: Target,
+    settings: Settings,
+    options: Options,
+    patience: float = np.inf,
+) -> tuple[tuple[Lanes, Stride, Index], tuple[Lanes, Moved, Tape | None]]:
+    """Flow a single lane to one of the `targets` after the other, waiting for each no longer than
+    `patience`. On the host these are many calls of small programs, until the whole is compiled.
+
+    **Arguments:** `begin`: the lane, its stride and its result.
+
+    **Returns:** the same at the end; by target (rows) the lane before, its end, and the tape.
+    """
+    ends, levels = (targets.time, targets.index, targets.event, targets.limit), targets.levels
+    by = targets.missed, targets.event_sequence
+    if not on_host(u):
+        return _pieces((move, options, *by), s, levels, settings, ends, begin, u, patience)
+    static = search, options._replace(tangents=bool(options.tangents)), *by
+    make = lambda: whole(_pieces, (static,), (s, levels, settings), WORTH_COMPILING / 3)  # noqa: E731
+    arguments = ends, begin, u, np.float64(patience)
+    return s.once(("through", static), (levels, settings), make)(*arguments)
+
+
+def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
+    flow, options, missed, sequence = static
+
+    def piece(carry, end):
+        lanes, stride, result = carry
+        time, index, event, limit = (x[None] for x in end)
+        limit = namespace(time).minimum(limit, lanes.t + patience)
+        target = Target(time, index, event, limit, sequence, levels, missed)
+        moved, tape = flow(s, lanes, u, target, settings, stride, result, options)
+        carry = moved.lanes, stride._replace(h=moved.h), moved.result
+        return carry, (lanes, moved, tape)
+
+    return scan(piece, begin, ends)
 
 
 @eqx.filter_jit
 def _search(s, lanes, u, target, setout, result, settings, options: Options) -> Recorded:
     def run(s, target, common, by_lane):
         (settings, options), (lanes, u, setout, result) = common, by_lane
-        return search(s, lanes, u, target, setout, result, shared(settings), options)
+        return search(s, lanes, u, target, shared(settings), setout, result, options)
 
     return _over_lanes(run, s, target, (settings, options), (lanes, u, setout, result))
 

@@ -303,7 +303,9 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
     goal = target.time[moves.lane]
     h = np.where(on_time, goal - moves.t, moves.h)
-    q, dq, f = _step(s, a, moves.t, moves.q[:n], u, h)
+    point, by_stages = (moves.t, moves.q[:n], u, h), ft.partial(_by_stages, s, a)
+    expanded = np.array(np.moveaxis(kernels.linear_step(s, a, *point, by_stages), -1, 0))
+    q, dq, f = expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     t = np.where(on_time, goal, moves.t + h)
     # By (t, q, u), with the length of the step as the last; that to a known time shrinks with t.
     dt = np.zeros((M, 1, dq.shape[2]), dq.dtype)
@@ -358,14 +360,10 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
     return _Linear(end, by)
 
 
-def _step(s: Structure, a: int, t, q, u, h):
-    """States (n, M) at the end of Runge-Kutta steps, their derivatives (M, n, m) by (t, q, u, h) at
-    the start, and the field (n, M) at the end."""
+def _by_stages(s: Structure, a: int, t, q, u, h):
+    """`kernels.linear_step` of an explicit method, by derivatives of the field at its stages."""
     n, M = q.shape
     m, method = 2 + n + s.nu, s.method(a)
-    if method.implicit or isinstance(s, kernels.Tangents):
-        expanded = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h), -1, 0))
-        return expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     stages = len(method.b) + 1
     K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
     straight = np.zeros((M, n, m))
@@ -383,7 +381,8 @@ def _step(s: Structure, a: int, t, q, u, h):
         dK[i, :, :, 1 + n : -1] += by_u
         dK[i, :, :, -1] += c * by_t[:, :, 0]
         K[i] = expanded[:, 0]
-    return state, dstate, K[-1]
+    values = np.stack([state.T, K[-1].T], axis=2)
+    return np.moveaxis(np.concatenate([values, dstate], axis=2), 0, -1)
 
 
 def _split(expanded, n: int):

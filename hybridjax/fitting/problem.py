@@ -1,8 +1,6 @@
 """Weighted residuals of data as a function of free parameters, and their minimization."""
 
-import collections
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -11,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core import compilation
 from .._core.compilation import kind, quick_jit
 from .._core.executor import is_inside_program, on_cpu
 from .._core.host_derivatives import NotOnHostError, only_on_host
@@ -170,24 +167,20 @@ def _with_jacobian(problem: FitProblem, x, guess):
 
 
 _compiled = quick_jit(_with_jacobian)
-_spent: dict[tuple, float] = collections.defaultdict(float)
+_not_on_host: set[tuple] = set()
 
 
 def evaluate(
     problem: FitProblem, x: Float[Array | np.ndarray, " p"], guess: LimitCycle
 ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
-    """Return residuals and Jacobian at x, from the host until compiling is worth its time."""
+    """Return residuals and Jacobian at x, from the host if it has these derivatives."""
     arguments = problem, jnp.asarray(x), guess
-    key, begin = kind(arguments), time.thread_time()
-    # (The whole program takes about eight times as long to compile as that of a cycle.)
-    if _spent[key] < 8 * compilation.WORTH_COMPILING and on_cpu():
+    if (key := kind(arguments)) not in _not_on_host and on_cpu():
         try:
             with only_on_host():
                 return jax.device_get(_with_jacobian(*arguments))
         except NotOnHostError:
-            _spent[key] = np.inf
-        finally:
-            _spent[key] += time.thread_time() - begin
+            _not_on_host.add(key)
     return jax.device_get(_compiled(*arguments))
 
 

@@ -1,13 +1,18 @@
 """The exact harmonic transfer functions of an LDTP system, for the host and for XLA."""
 
-from collections.abc import Iterable
+import functools as ft
+from collections.abc import Callable, Iterable
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import Scalar, Vector
 from .._core.compilation import host_first
 from .._core.executor import Array, namespace, scan
+from .._core.host_derivatives import must_be_on_host
 from ..errors import DefinitionError
 from .time_response import monodromy
 
@@ -47,7 +52,58 @@ def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, 
     return integers
 
 
-@host_first
+def _derived(compiled: Callable) -> Callable:
+    """`compiled`, whose derivatives in forward mode come from the host where they must."""
+    derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
+
+    @derived.def_jvp
+    def rule(arguments, tangents):
+        if not must_be_on_host():
+            return eqx.filter_jvp(compiled, arguments, tangents)
+        value, pairs = harmonic_transfer(*arguments), zip(arguments, tangents[:4], strict=False)
+        along = [jnp.zeros_like(x) if t is None else t for x, t in pairs]
+        shape, each = jax.ShapeDtypeStruct(value.shape, value.dtype), "broadcast_all"
+        return value, jax.pure_callback(_along, shape, *arguments, *along, vmap_method=each)
+
+    return derived
+
+
+def _along(*arrays: jax.Array) -> Complex[np.ndarray, "... N F ny nu"]:
+    """Derivatives of `harmonic_transfer` along (A, B, C, D) on the host, with any leading axes, on
+    which its arguments, which come first, do not depend."""
+    lead = np.shape(arrays[0])[:-3]
+    A, B, C, _, f = (np.asarray(x)[(0,) * len(lead)] for x in arrays[:5])
+    dA, dB, dC, dD = (np.asarray(x).reshape(-1, *x.shape[-3:])[:, :, None] for x in arrays[5:])
+    z, (P, N, _, d, _), nu = _unit_roots(A, f), dA.shape, B.shape[-1]
+    X = _states(A, z * B[:, None], f)
+    # (Directions are further columns.)
+    forcing = np.moveaxis(dA @ X + z * dB, 0, -2).reshape(N, f.size, d, P * nu)
+    dX = np.moveaxis(_states(A, forcing, f).reshape(N, f.size, d, P, nu), -2, 0)
+    G = (dC @ X + C[:, None] @ dX) / z + dD
+    return (np.fft.fft(G, axis=1) / N).reshape(*lead, N, f.size, len(C[0]), nu)
+
+
+def _unit_roots(A: Array, f: Array) -> Array:
+    """z^n (N, F, 1, 1) at each section."""
+    n = np.arange(len(A))[:, None, None, None] / len(A)
+    return namespace(A).exp(2j * np.pi * n * f[:, None, None])
+
+
+def _states(A: Array, forcing: Array, f: Array) -> Array:
+    """The response (N, F, d, m) of the states to a forcing that is z^N-periodic."""
+    xp = namespace(A)
+
+    def advance(X, section):
+        return section[0] @ X + section[1], X
+
+    start = xp.zeros(forcing.shape[1:], forcing.dtype)
+    forced, _ = scan(advance, start, (A, forcing))
+    z_N = xp.exp(2j * np.pi * f)[:, None, None]
+    start = xp.linalg.solve(z_N * np.eye(A.shape[-1]) - monodromy(A), forced)
+    return scan(advance, start, (A, forcing))[1]
+
+
+@ft.partial(host_first, derived=_derived)
 def harmonic_transfer(
     A: Float[Array, "N d d"],
     B: Float[Array, "N d nu"],
@@ -66,17 +122,6 @@ def harmonic_transfer(
 
     **Returns:** `H` with harmonic `m` at index `m mod N` (the order of the FFT).
     """
-    xp, (n_sections, d, _) = namespace(A), A.shape
-    z = xp.exp(2j * np.pi / n_sections * np.arange(n_sections)[:, None] * f)
-    z_N = xp.exp(2j * np.pi * f)
-
-    def advance(X, section):
-        A, B, z = section
-        return A @ X + z[:, None, None] * B, X
-
-    start = xp.zeros((f.size, d, B.shape[-1]), z.dtype)
-    forced, _ = scan(advance, start, (A, B, z))
-    start = xp.linalg.solve(z_N[:, None, None] * np.eye(d) - monodromy(A), forced)
-    _, X = scan(advance, start, (A, B, z))
-    G = C[:, None] @ X / z[:, :, None, None] + D[:, None]
-    return xp.fft.fft(G, axis=0) / n_sections
+    z = _unit_roots(A, f)
+    G = C[:, None] @ _states(A, z * B[:, None], f) / z + D[:, None]
+    return namespace(A).fft.fft(G, axis=0) / len(A)

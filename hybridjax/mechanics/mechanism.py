@@ -79,7 +79,9 @@ class Mechanism(eqx.Module):
     potential: Callable[[Any], Any] = _no_potential
     links: Callable[[Any], Mapping[str, Any]] | None = None
 
-    def draw(self, q: Float[Array, " n"], ground: Any = None, body: str | None = None) -> Drawing:
+    def draw(
+        self, q: Float[Array, " n"], ground: ArrayLike | None = None, body: str | None = None
+    ) -> Drawing:
         """The links, with a point at the end of each that has its name (see `Drawing`).
 
         **Raises:** `DefinitionError` for a mechanism without `links`.

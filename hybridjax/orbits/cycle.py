@@ -1,6 +1,6 @@
 """Limit cycles: fixed points of the return map, with their multipliers."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -20,8 +20,8 @@ from .._core.progress import whole_call
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
-from ..engine.lanes import Lanes, Tape
-from ..engine.move import Options, move
+from ..engine.lanes import Lanes, Tape, side_by_side
+from ..engine.move import Options
 from ..engine.replay import Link, divergence, links
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, recorded, simulate
@@ -420,7 +420,8 @@ def fine_factors(map: ReturnMap) -> list[Matrix]:
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
     map = to_host(map)
-    moves = [move for piece in _pieces(map, links, tangents=True) for move in piece]
+    lanes, tape = side_by_side(_turn(map, tangents=True))
+    moves = links(map.structure, lanes, map.ends(), tape)
     frames = [_frame(map, link) for link in moves]
     factors: list[Matrix] = []
     for k, link in enumerate(moves):
@@ -444,37 +445,26 @@ def log_determinant(map: ReturnMap) -> float:
 
     Steps of an implicit method lose a mode that decays within them; this gives its decay.
     """
-    each = _pieces(to_host(map), lambda s, lanes, _, tape: divergence(s, lanes, tape))
-    return float(np.sum(each))
+    map = to_host(map)
+    return float(divergence(map.structure, *side_by_side(_turn(map))))
 
 
 def orbit(map: ReturnMap, tapes: Tape | None = None) -> Trajectory:
     """One turn from the anchor, in the steps by which it is linearized, which its `tapes` may hold
     already, one for each piece."""
     map = to_host(map)
-    pieces = (
-        _pieces(map, lambda *x: x[3], tangents=True)
-        if tapes is None
-        else [Tape(*x) for x in zip(*to_host(tapes), strict=True)]
-    )
+    rows = to_host(_turn(map, tangents=True)[1] if tapes is None else tapes)
+    pieces = [Tape(*x) for x in zip(*rows, strict=True)]
     begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
     return recorded(map.structure, begin, pieces, u, Result.OK)
 
 
-def _pieces(map: ReturnMap, measure: Callable, tangents: bool = False) -> list:
-    """`measure(structure, lanes, target, tape)` of each piece of one turn."""
-    s, parts = map.structure, []
-
-    def flow(lanes, target, h, result, _):
-        u = np.zeros((s.nu, 1))
-        options = Options(tape=True, new_input=False, tangents=tangents)
-        moved, tape = move(s, lanes, u, target, map.settings, h, result, options)
-        parts.append(measure(s, lanes, target, tape))
-        return moved, None
-
+def _turn(map: ReturnMap, tangents: bool = False) -> tuple[Lanes, Tape]:
+    """The starts and tapes of the pieces of one turn."""
+    options = Options(tape=True, new_input=False, tangents=tangents)
     with at_ease():
-        map.travel(map.anchor.q[:, 0], flow)
-    return parts
+        _, (lanes, _, tapes) = map.travel(map.anchor.q[:, 0], options)
+    return lanes, tapes
 
 
 def _frame(map: ReturnMap, move: Link) -> tuple[Matrix, Matrix]:

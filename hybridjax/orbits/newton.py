@@ -20,7 +20,7 @@ from .._core.host_derivatives import NotOnHostError, by_columns
 from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.lanes import Lanes
+from ..engine.lanes import Lanes, side_by_side
 from ..engine.replay import Variation
 from ..engine.watch import slopes
 from .crossing import ListLevels
@@ -99,8 +99,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     longer = np.zeros(P) if by.expected is None else by.expected
     part = np.where(np.isfinite(ends.time), (ends.time - map.anchor.t) / map.expected, 0.0)
     times = begin[0][:, None] * np.isfinite(ends.time) + longer[:, None] * part
-    tapes = jax.tree_util.tree_map(lambda x: np.moveaxis(x[..., 0], 0, -1), turn.tapes)
-    orbit = Variation(s, turn.legs, ends, tapes, times)
+    orbit = Variation(s, turn.legs, ends, side_by_side(turn.tapes), times)
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
     moved = np.where(map.valid, orbit.tangents(begin)[-1, 1:].T, 0.0) / sizes
     jacobian = turn.jacobian * sizes / sizes[:, None]

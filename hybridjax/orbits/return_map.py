@@ -20,8 +20,8 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.events import arm
-from ..engine.lanes import Lanes, Tape, for_each_chart, only, start_lanes
-from ..engine.move import Options, flow_jacobian, follow, move, tape_jacobian
+from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
+from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
 from ..engine.replay import replay
 from ..engine.search.state import Recorded
 from ..engine.settings import Settings
@@ -183,12 +183,9 @@ class ReturnMap(eqx.Module):
         s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
 
         def flow(lanes, target, h, result, piece):
-            if piece is not None:
-                return follow(s, lanes, u, target, piece, False).moved, None
-            options = Options(new_input=False)
-            return move(s, lanes, u, target, self.settings, h, result, options).moved, None
+            return follow(s, lanes, u, target, piece, False).moved, None
 
-        return self.travel(q, flow, record)[0]
+        return self.travel(q, Options(new_input=False) if record is None else flow, record)[0]
 
     def turn_with_jacobian(
         self,
@@ -206,10 +203,6 @@ class ReturnMap(eqx.Module):
         s, xp, settings = self.structure, namespace(q), self.settings
 
         def flow(lanes, target, h, result, piece):
-            if on_host(q):  # (all pieces are linearized together)
-                u, options = np.zeros((s.nu, 1)), Options(True, new_input=False, tangents=wanted)
-                moved, tape = move(s, lanes, u, target, settings, h, result, options)
-                return moved, (lanes, None, None, tape, None)
             if piece is None:
                 jacobian, moved, tape = flow_jacobian(s, lanes, target, settings, h, result, wanted)
             else:
@@ -223,9 +216,12 @@ class ReturnMap(eqx.Module):
             steps = Tape(tape.h, tape.code, tape.t, None, None, None)
             return moved, (lanes, jacobian[0, 1:], moves, tape, Recorded(moved, steps))
 
-        end, (legs, factors, moves, tapes, recorded) = self.travel(q, flow, record)
-        as_lanes = lambda x: xp.moveaxis(x[..., 0], 0, -1)  # noqa: E731
-        legs, tape = jax.tree_util.tree_map(as_lanes, (legs, tapes))
+        if on_host(q):  # (all pieces are linearized together)
+            options = Options(True, new_input=False, tangents=wanted)
+            (end, (legs, _, tapes)), moves, recorded = self.travel(q, options), None, None
+        else:
+            end, (legs, factors, moves, tapes, recorded) = self.travel(q, flow, record)
+        legs, tape = side_by_side((legs, tapes))
         if on_host(q):
             factors = tape_jacobian(s, legs, self.ends(), tape, of_states=True)[0][:, 1:]
         codes, valid = tapes.code[..., 0], self.valid
@@ -301,9 +297,10 @@ class ReturnMap(eqx.Module):
         return by[:, 0], by[:, 2 : 2 + s.d]
 
     def travel(
-        self, q: Float[Array, " d"], flow: Callable, record: Recorded | None = None
+        self, q: Float[Array, " d"], flow: Any, record: Recorded | None = None
     ) -> tuple[Return, Any]:
-        """One turn, piece by piece, each computed by `flow`, and the other results of `flow`.
+        """One turn, piece by piece, each computed by the function `flow`, and its other results;
+        or if `flow` are `Options`, one turn with these, and its pieces (see `through`).
 
         The pieces end at K - 1 times, then on the section on which the turn began.
         """
@@ -317,9 +314,14 @@ class ReturnMap(eqx.Module):
             moved, extra = flow(lanes, target, h, result, piece)
             return (moved.lanes, moved.h, moved.result), extra
 
-        begin = self.departure(q), (0.5 * self.expected / LEGS)[None], xp.zeros(1, xp.int32)
-        each = ends.time, ends.index, ends.event, ends.limit, record
-        (end, _, result), extra = scan(leg, begin, each)
+        lanes, result = self.departure(q), xp.zeros(1, xp.int32)
+        h = (0.5 * self.expected / LEGS)[None]
+        if isinstance(flow, Options):
+            u, begin = xp.zeros((self.structure.nu, 1)), (lanes, stride(h), result)
+            (end, _, result), extra = through(self.structure, begin, u, ends, self.settings, flow)
+        else:
+            each = ends.time, ends.index, ends.event, ends.limit, record
+            (end, _, result), extra = scan(leg, (lanes, h, result), each)
         same = (result[0] == Result.OK) & (end.chart[0] == self.anchor.chart[0])
         residual = xp.where(self.valid, end.q[:, 0], 0.0) - q - self.held(q)[0]
         residual = xp.where(same, residual, np.nan)

@@ -1,7 +1,7 @@
 from .adapters import (
-    from_fmu as from_fmu,
-    from_gymnasium as from_gymnasium,
-    from_mujoco as from_mujoco,
+    FMUPlant as FMUPlant,
+    GymnasiumPlant as GymnasiumPlant,
+    MuJoCoPlant as MuJoCoPlant,
 )
 from .cycle import SettledCycle as SettledCycle, settle as settle
-from .plant import Plant as Plant
+from .drive import Plant as Plant

@@ -1,73 +1,97 @@
-"""A plant driven from section to section. Workers import this file, so it needs only Python."""
+"""A plant driven from section to section, in processes that may fail, hang or end without harm to
+the others. They import this file, so it needs only Python.
 
+The processes are not those of `multiprocessing`: these would run the main script again, and cannot
+be ended one by one.
+"""
+
+import contextlib
 import dataclasses
+import json
 import math
 import os
 import pickle
+import sqlite3
+import subprocess
 import sys
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from ..errors import ComputationError
 
 
-class Stopped(Exception):
-    """The end of an experiment, with its cause."""
+@runtime_checkable
+class Plant(Protocol):
+    """A simulator that can be reset and stepped. Nothing of JAX is needed.
+
+    **Fields:**
+
+    - `inputs`: names of the inputs, or units by name.
+    - `dt`: the longest time step. Sections are detected after each step.
+
+    **Methods:**
+
+    - `reset(seed)` begins at time 0 and returns an observation: the signals by name, always the
+      same names in the same order. The seed determines everything that is random.
+    - `step(u, duration)` holds the inputs `u` for a time and returns the observation at its end.
+
+    A step raises any exception to end an experiment, for example where a walker falls.
+
+    **Optional:**
+
+    - `get_state()` and `set_state(x)`: the state, from which the plant continues exactly. For
+      `perturbed_returns` it is an array of numbers, which can be changed by small amounts.
+    - `states`: names of these numbers. `time` is the clock's.
+    - `period`: period of the clock, on which the plant depends.
+    - `fixed_step`: True if a step always lasts `dt`. Otherwise steps end on clock sections, and on
+      others if the state can be set.
+    - `units`: units of signals by name.
+    """
+
+    inputs: Sequence[str] | Mapping[str, str]
+    dt: float
+
+    def reset(self, seed: int) -> Mapping[str, float]: ...
+
+    def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]: ...
 
 
 @dataclasses.dataclass
-class PhaseWatch:
+class Phase:
     """Sections at equal phases of a period (`columns` None), or of the angle of two signals.
 
-    **Fields:** `first`: time or angle of section 0. `scale`, `center`: of the two signals. `sense`:
-    +1 if the angle grows, otherwise -1.
+    **Fields:** `first`: time or angle of section 0. `center`, `scale`: of the two signals; the
+    second scale is negative if the angle decreases. `start`: turns at which sections are counted.
     """
 
     n: int
-    period: float
+    period: float = 1.0
     first: float = 0.0
     columns: tuple[int, int] | None = None
     center: Sequence[float] = (0.0, 0.0)
     scale: Sequence[float] = (1.0, 1.0)
-    sense: float = 1.0
-    phase: float = 0.0
+    turns: float = 0.0
     start: float = 0.0
-
-    def turns(self, t: float, z: Sequence[float]) -> float:
-        """Return the phase from section 0 in turns, for angles up to whole turns."""
-        if self.columns is None:
-            return (t - self.first) / self.period
-        (i, j), (a, b), (p, q) = self.columns, self.center, self.scale
-        angle = math.atan2((z[j] - b) / q, (z[i] - a) / p)
-        return self.sense * (angle - self.first) / (2 * math.pi)
 
     def begin(self, t: float, z: Sequence[float], on_section: bool = False) -> None:
         """Count sections from the next section 0 on, or from the one on which the plant is."""
-        self.phase = self.turns(t, z)
-        self.start = round(self.phase) if on_section else math.ceil(self.phase)
+        self.turns = 0.0
+        self.level(0, t, z)
+        self.start = round(self.turns) if on_section else math.ceil(self.turns)
 
     def level(self, k: int, t: float, z: Sequence[float]) -> float:
         """Return a number that falls through zero at section k, counted from `begin` on: the time
         until then, or an angle in turns, which is unwrapped."""
-        turns = self.turns(t, z)
-        if self.columns is not None:
-            turns += round(self.phase - turns)
-        self.phase = turns
-        return (self.start + k / self.n - turns) * self.period
-
-
-@dataclasses.dataclass
-class ListWatch:
-    """Sections one by one: for each its column, +1 if it is falling and -1 if rising, and the
-    value."""
-
-    items: tuple[tuple[int, float, float], ...]
-
-    def begin(self, t: float, z: Sequence[float], on_section: bool = False) -> None:
-        """Nothing is counted: each section is crossed in its turn."""
-
-    def level(self, k: int, t: float, z: Sequence[float]) -> float:
-        """Return a number that falls through zero at section k."""
-        column, sign, value = self.items[k % len(self.items)]
-        return sign * (z[column] - value)
+        if self.columns is None:
+            self.turns = (t - self.first) / self.period
+        else:
+            (i, j), (a, b), (p, q) = self.columns, self.center, self.scale
+            turns = (math.atan2((z[j] - b) / q, (z[i] - a) / p) - self.first) / (2 * math.pi)
+            self.turns = turns + round(self.turns - turns)
+        return (self.start + k / self.n - self.turns) * self.period
 
 
 class At(NamedTuple):
@@ -80,203 +104,213 @@ class At(NamedTuple):
     state: Any = None
 
 
-class Drive:
-    """A plant, its time since `reset`, and its signals.
+Trial = tuple[list[list[float]], list[float], str]
+"""One experiment: signals (n, ny) at the sections, lateness (n,), and the cause of its end, "" if
+it ran to its end."""
 
-    **Arguments:** `names`: the signals in order; empty: those of the first observation. `longest`:
-    time that one section may take.
+
+class Drive:
+    """A plant, and how it is taken from section to section.
+
+    **Fields:**
+
+    - `names`: signals in order; empty: those of the first observation. `columns`: of the outputs.
+    - `phase`: the sections. `longest`: time that one section may take.
+    - `start`: on section 0. `warmup`: time for which a plant whose state cannot be set runs after
+      `reset` instead.
+    - `t`, `z`: present time since `reset`, and signals. `last`: the point before, if known.
     """
 
-    def __init__(self, plant: Any, names: tuple[str, ...] = (), longest: float = math.inf):
-        self.plant, self.names, self.longest = plant, names, longest
-        self.dt, self.fixed = float(plant.dt), bool(getattr(plant, "fixed_step", False))
+    def __init__(self, plant: Any):
+        self.plant, self.dt = plant, float(plant.dt)
+        self.fixed = bool(getattr(plant, "fixed_step", False))
         self.sets = hasattr(plant, "get_state") and hasattr(plant, "set_state")
         self.zero = [0.0] * len(plant.inputs)
-        self.t = 0.0
-        self.z: Sequence[float] = ()
-        self.last: At | None = None
-        self.watch: Any = None
+        self.t, self.warmup, self.longest = 0.0, 0.0, math.inf
+        self.names, self.columns, self.z = tuple[str, ...](), tuple[int, ...](), tuple[float, ...]()
+        self.phase, self.start, self.last = Phase(1), At(0.0, ()), At(0.0, ())
+
+    def _take(self, observation: Any, t: float) -> None:
+        names, self.t = tuple(observation), t
+        if self.names and names != self.names:
+            raise ComputationError(f"signals changed from {self.names} to {names}")
+        self.z, self.names = tuple(observation.values()), names
+        for name, x in zip(names, self.z, strict=True):
+            if not x - x == 0:
+                raise ComputationError(f"{name} became {x}")
 
     def reset(self, seed: int) -> None:
-        """Begin at time 0. **Raises:** `Stopped`, like all methods, if the plant fails."""
-        self._observe("reset", 0.0, seed)
-        self.last = None
+        """Begin at time 0.
 
-    def restore(self, start: At) -> None:
-        """Continue from a state that was kept."""
-        self.plant.set_state(start.state)
-        self.t, self.z, self.last = start.t, start.z, None
+        **Raises:** `ComputationError`, like all methods, for NaN and signals with other names.
+        """
+        self._take(self.plant.reset(seed), 0.0)
+        self.last = At(0.0, ())
+
+    def step(self, u: Sequence[float], h: float) -> None:
+        """Hold the input for some time."""
+        self._take(self.plant.step(u, h), self.t + h)
 
     def here(self) -> At:
         """Return the present time, signals and state."""
         return At(self.t, self.z, 0.0, self.plant.get_state() if self.sets else None)
 
-    def step(self, u: Sequence[float], h: float) -> None:
-        """Hold the input for some time."""
-        self._observe("step", self.t + h, u, h)
+    def restore(self, start: At) -> None:
+        """Continue from a state that was kept."""
+        self.plant.set_state(start.state)
+        self.t, self.z, self.last = start.t, tuple(start.z), At(0.0, ())
 
-    def _observe(self, method: str, t: float, *arguments: Any) -> None:
-        try:
-            observation = getattr(self.plant, method)(*arguments)
-        except Exception as error:
-            text = f"`{method}` raised {type(error).__name__}: {error}"
-            raise Stopped(f"{text} (t = {self.t:.6g})") from error
-        names = tuple(observation)
-        if self.names and names != self.names:
-            raise Stopped(f"signals changed from {self.names} to {names} (t = {t:.6g})")
-        self.t, self.z, self.names = t, tuple(observation.values()), names
-        for name, x in zip(names, self.z, strict=True):
-            if not x - x == 0:
-                raise Stopped(f"{name} became {x} (t = {t:.6g})")
-
-    def run(self, duration: float) -> None:
+    def pass_time(self, duration: float) -> None:
         """Let the plant run without input."""
         for _ in range(round(duration / self.dt)):
             self.step(self.zero, self.dt)
 
-    def advance(self, u: Sequence[float], k: int, pause: float = 0.0) -> At:
+    def advance(self, u: Sequence[float], k: int) -> At:
         """Hold the input until section k. Steps end on it if its time is known, or if the state can
-        be set; steps of fixed length end after it.
+        be set; steps of fixed length end after it."""
+        phase, began = self.phase, self.t
+        timed = phase.columns is None and not self.fixed
+        lands = self.sets and not self.fixed and not timed
+        last = self.last if self.last.z else At(self.t, self.z)  # (a step may cross two sections)
+        x, y = phase.level(k, last.t, last.z), phase.level(k, self.t, self.z)
+        while y > 1e-9 * self.dt * timed:
+            if self.t - began > self.longest:
+                raise ComputationError(f"a section was not reached within {self.longest:.4g}")
+            last, x = self.here() if lands else At(self.t, self.z), y
+            self.step(u, min(y, self.dt) if timed else self.dt)
+            y = phase.level(k, self.t, self.z)
+        if lands and y < 0 < x:
+            from scipy import optimize
 
-        **Arguments:** `pause`: time in which a section is not crossed again (bounces, noise).
-        """
-        watch, began = self.watch, self.t
-        ordered = isinstance(watch, PhaseWatch)  # (sections cannot be crossed in another order)
-        x, last, armed = watch.level(k, self.t, self.z), self.last, ordered
-        if ordered and watch.columns is None and not self.fixed:
-            while x > 1e-9 * self.dt:
-                self.step(u, min(x, self.dt))
-                x = watch.level(k, self.t, self.z)
-            return At(self.t, self.z, max(0.0, -x))
-        if x <= 0 and armed and last is not None:  # two sections in one step
-            before = watch.level(k, last.t, last.z)
-            x = watch.level(k, self.t, self.z)
-            if before > 0:
-                return self._between(last, before, x)
-        while self.t - began <= self.longest:
-            lands = self.sets and not self.fixed and armed and x > 0
-            last = self.here() if lands else At(self.t, self.z)
-            self.step(u, self.dt)
-            self.last = last
-            y = watch.level(k, self.t, self.z)
-            if armed and y <= 0 and self.t - began > pause:
-                return self._land(u, k, last, x, y) if lands else self._between(last, x, y)
-            armed, x = ordered or y > 0, y
-        text = f"a section was not reached within {self.longest:.4g}"
-        raise Stopped(f"{text} (t = {self.t:.6g})")
+            def level(h: float) -> float:
+                self.restore(last)
+                if h > 0:
+                    self.step(u, h)
+                return phase.level(k, self.t, self.z)
 
-    def _between(self, last: At, x: float, y: float) -> At:
-        """Return the section between an earlier point and the present one."""
-        share = x / (x - y) if x > y else 1.0
+            find: Any = optimize.brentq
+            level(find(level, 0.0, self.t - last.t, xtol=1e-9 * self.dt))
+            return At(self.t, self.z)
+        self.last, share = last, x / (x - y) if x > y else 1.0
         at = last.t + share * (self.t - last.t)
         values = tuple(a + share * (b - a) for a, b in zip(last.z, self.z, strict=True))
         return At(at, values, self.t - at)
 
-    def _land(self, u: Sequence[float], k: int, before: At, x: float, y: float) -> At:
-        """Repeat a step that went beyond a section, so that it ends there (Illinois method)."""
-        low, high, side = 0.0, self.t - before.t, 0.0
-        for _ in range(40):
-            h = low + (high - low) * x / (x - y)
-            self.restore(before)
-            self.step(u, h)
-            level = self.watch.level(k, self.t, self.z)
-            late = -level * (high - low) / (x - y)
-            if abs(late) <= 1e-9 * self.dt or high - low <= 1e-9 * self.dt:
-                break
-            if level > 0:
-                low, x, y, side = h, level, y / 2 if side > 0 else y, 1.0
-            else:
-                high, y, x, side = h, level, x / 2 if side < 0 else x, -1.0
-        return At(self.t, self.z, late)
-
-
-class Trial(NamedTuple):
-    """One experiment: signals (n, ny) at the sections, lateness (n,), and the cause of its end, ""
-    if it ran to its end."""
-
-    y: list[list[float]]
-    late: list[float]
-    cause: str = ""
-
-
-@dataclasses.dataclass(frozen=True)
-class Experiment:
-    """How all experiments of a campaign are run.
-
-    **Fields:** `columns`: of the outputs. `start`: on section 0, with `names`, `watch`. `warmup`:
-    time for which a plant whose state cannot be set runs after `reset` instead. `longest`, `pause`:
-    as in `Drive`.
-    """
-
-    plant: Any
-    watch: Any
-    names: tuple[str, ...]
-    columns: tuple[int, ...]
-    start: At
-    warmup: float
-    longest: float
-    pause: float
-
-    def run(self, seed: int, u: Sequence[Sequence[float]], repeats: bool = False) -> Trial:
-        """Run one experiment with inputs u (n, nu), each held until the next section.
-
-        **Arguments:** `repeats`: whether the plant is known to repeat itself after `reset`.
-        """
-        drive = Drive(self.plant, self.names, self.longest)
+    def run(self, seed: int, u: Sequence[Sequence[float]]) -> Trial:
+        """Run one experiment with inputs u (n, nu), each held until the next section."""
         y: list[list[float]] = []
         late: list[float] = []
         try:
-            if not repeats:
-                self._require_repeatable(drive, seed)
-            at = self._begin(drive, seed)
+            if self._beginning(seed) != self._beginning(seed):
+                raise ComputationError("the plant is not deterministic after `reset(seed)`")
+            self.reset(seed)
+            at = self.begin()
             for k, held in enumerate(u, 1):
                 y.append([float(at.z[c]) for c in self.columns])
                 late.append(at.late)
                 if k < len(u):
-                    at = drive.advance(held, k, self.pause)
+                    at = self.advance(held, k)
         except Exception as error:
-            text = f"{type(error).__name__}: {error} (t = {drive.t:.6g})"
-            return Trial(y, late, str(error) if isinstance(error, Stopped) else text)
-        return Trial(y, late)
+            kind = (
+                ""
+                if isinstance(error, ComputationError)
+                else f"the plant raised {type(error).__name__}: "
+            )
+            return y, late, f"{kind}{error} (t = {self.t:.6g})"
+        return y, late, ""
 
-    def _require_repeatable(self, drive: Drive, seed: int) -> None:
-        """Compare the first steps after two equal resets."""
-        courses: list[list[Sequence[float]]] = [[], []]
-        for course in courses:
-            drive.reset(seed)
-            for _ in range(16):
-                course.append(drive.z)
-                drive.step(drive.zero, drive.dt)
-        if courses[0] != courses[1]:
-            raise Stopped("the plant is not deterministic after `reset(seed)`")
+    def _beginning(self, seed: int) -> Sequence[float]:
+        """Return the signals after the first steps."""
+        self.reset(seed)
+        self.pass_time(16 * self.dt)
+        return self.z
 
-    def _begin(self, drive: Drive, seed: int) -> At:
+    def begin(self) -> At:
         """Bring a plant to section 0."""
-        drive.reset(seed)
-        drive.watch = dataclasses.replace(self.watch)
-        if drive.sets:
-            drive.restore(self.start)
-            drive.watch.begin(drive.t, drive.z, on_section=True)
-            return At(drive.t, drive.z)
-        drive.run(self.warmup)
-        drive.watch.begin(drive.t, drive.z)
-        return drive.advance(drive.zero, 0)
+        if self.sets:
+            self.restore(self.start)
+            self.phase.begin(self.t, self.z, on_section=True)
+            return self.start
+        self.pass_time(self.warmup)
+        self.phase.begin(self.t, self.z)
+        return self.advance(self.zero, 0)
 
 
 def serve() -> None:
     """Run experiments in a worker: standard input holds pickles that only the parent writes (the
-    packed `Experiment`, then the seed and inputs of each), standard output the answers."""
+    packed `Drive`, then the seed and inputs of each), standard output the answers."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a plant prints goes to standard error
-    problem, packed = "", pickle.load(sys.stdin.buffer)
-    try:
-        experiment = pickle.loads(packed)
-    except Exception as error:
-        problem = f"{type(error).__name__}: {error}"
-    while True:
+    drive = pickle.loads(pickle.load(sys.stdin.buffer))
+    with contextlib.suppress(EOFError):
+        while True:
+            pickle.dump(drive.run(*pickle.load(sys.stdin.buffer)), answers)
+            answers.flush()
+
+
+def run_all(
+    drive: Drive, items: Iterable[tuple[int, Any]], processes: int, limit: float
+) -> Iterator[Trial]:
+    """Run experiments (seed, inputs) in processes with a limit of time, and yield them in order.
+    Processes that ended are replaced.
+    """
+    if not processes:
+        yield from (drive.run(*item) for item in items)
+        return
+    try:  # (classes in notebooks and scripts)
+        from cloudpickle import dumps
+    except ImportError:
+        from pickle import dumps
+    packed, local, begun = dumps(drive), threading.local(), []
+
+    def run(item: tuple[int, Any]) -> Trial:
+        if getattr(local, "worker", None) is None:
+            local.worker = _start(packed)
+            begun.append(local.worker)
+        worker, began = local.worker, time.monotonic()
+        timer = threading.Timer(limit, worker.kill)
+        timer.start()
         try:
-            item = pickle.load(sys.stdin.buffer)
-        except EOFError:
-            return
-        pickle.dump(problem or tuple(experiment.run(*item)), answers)
-        answers.flush()
+            pickle.dump(item, worker.stdin)
+            worker.stdin.flush()
+            return pickle.load(worker.stdout)
+        except (EOFError, pickle.UnpicklingError, OSError):
+            local.worker, code = None, worker.wait()
+            hung = time.monotonic() - began >= limit
+            ended = f"the process ended with code {code} (its error is on standard error)"
+            return [], [], f"no answer within the limit of {limit:g} s" if hung else ended
+        finally:
+            timer.cancel()
+
+    with ThreadPoolExecutor(processes) as pool:
+        try:
+            yield from pool.map(run, items)
+        finally:
+            for worker in begun:
+                worker.kill()
+                worker.communicate()
+
+
+def resume(
+    file: Any, about: str, count: int, run: Callable[[list[int]], Iterator[Trial]]
+) -> list[Trial]:
+    """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends."""
+    with contextlib.closing(sqlite3.connect(file or ":memory:", isolation_level=None)) as base:
+        base.execute("create table if not exists trials (about, s, trial, unique (about, s))")
+        kept = dict(base.execute("select s, trial from trials where about = ?", [about]))
+        missing = [s for s in range(count) if s not in kept]
+        for s, trial in zip(missing, run(missing), strict=True):
+            kept[s] = json.dumps(trial)
+            base.execute("replace into trials values (?, ?, ?)", (about, s, kept[s]))
+    return [json.loads(kept[s]) for s in range(count)]
+
+
+def _start(packed: bytes) -> Any:
+    # (One thread of BLAS, because the processes use all cores.)
+    path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), *sys.path]))
+    command = [sys.executable, "-c", "from hybridjax.plants.drive import serve; serve()"]
+    changes = {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    pipe, environment = subprocess.PIPE, os.environ | changes
+    worker: Any = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment)
+    pickle.dump(packed, worker.stdin)
+    return worker

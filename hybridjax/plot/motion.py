@@ -64,6 +64,7 @@ class Motion(FuncAnimation):
         if "inline" in matplotlib.get_backend().lower():
             pyplot.close(figure)  # a notebook shows the animation, and no still beside it
 
+    @checked
     def save(self, path: FilePath) -> Path:  # type: ignore[override]
         """Write a file: a `.gif`, a page that needs no other file (`.html`), or an `.mp4` where the
         program ffmpeg is.

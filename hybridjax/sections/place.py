@@ -19,8 +19,8 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.cubic import interpolate
-from ..engine.lanes import IDLE, Lanes, for_each_chart, only
-from ..engine.move import Options, move
+from ..engine.lanes import IDLE, Lanes, for_each_chart, only, side_by_side
+from ..engine.move import Options, stride, through
 from ..engine.replay import Variation
 from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
@@ -118,52 +118,53 @@ def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any,
     period, begin, xp = map.expected, map.anchor, namespace(map.expected)
     u = xp.zeros((s.nu, 1))
 
-    def go(carry, target):
-        lanes, h, result = carry
+    def go(carry, targets, patience=np.inf):
         options = Options(tape=True, tangents=True)
-        moved, tape = move(s, lanes, u, target, map.settings, h, result, options)
-        flows.append((lanes, target, tape))
-        return (moved.lanes, moved.h, moved.result), tape
+        carry, flow = through(s, carry, u, targets, map.settings, options, patience)
+        flows.append((flow[0], targets, flow[2]))
+        return carry, flow
 
-    def to_next(carry, k, bound):
-        i, lanes = k % N, carry[0]
+    def to(carry, k, bound):
+        i = k % N
         time, event = bound.time[i] + (k // N) * period, bound.event[i]
         if isinstance(bound.levels, _FromAnchor):  # at first to the anchor
             first = k == 0
             time, i = xp.where(first, np.inf, time), xp.where(first, N, i)
             event = xp.where(first, np.int32(-1), event)
-        ends, limit = (time[None], i[None], event[None]), lanes.t + 1.5 * period
-        target = Target(*ends, limit, None, bound.levels, Result.SECTION_MISSED)
-        carry, tape = go(carry, target)
-        return carry, (lanes, carry[0].t, carry[2], tape)
+        never = xp.full(k.shape, np.inf)
+        targets = Target(time, i, event, never, None, bound.levels, Result.SECTION_MISSED)
+        return go(carry, targets, 1.5 * period)
 
     def onwards(carry, k):
         carry, anchor = carry
         bound = _bind(s, map, family, anchor, go)
         assert isinstance(family.anchor, Crossing)
         levels = _FromAnchor(bound.levels, family.anchor, N)
-        carry, flow = to_next(carry, k, dataclasses.replace(bound, levels=levels))
+        carry, flow = to(carry, k[None], dataclasses.replace(bound, levels=levels))
         anchor = jax.tree_util.tree_map(lambda x, y: jnp.where(k == 0, x, y), carry[0], anchor)
         return (carry, anchor), flow
 
-    carry = begin, (0.1 * period / N)[None], xp.zeros(1, xp.int32)
+    carry = begin, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)
     if isinstance(family.anchor, Crossing) and family.points == 1 and not on_host(period):
         # (One loop to the anchor and on to all sections: a search of its own would take a third of
         # the time of compilation.)
-        (_, anchor), flows = scan(onwards, (carry, begin), xp.arange(N + 1))
-        bound, first = _bind(s, map, family, anchor, go), flows[2][0, 0]
-        flows = jax.tree_util.tree_map(lambda x: x[1:], flows)
+        (_, anchor), pieces = scan(onwards, (carry, begin), xp.arange(N + 1))
+        bound = _bind(s, map, family, anchor, go)
+        pieces = jax.tree_util.tree_map(lambda x: x[:, 0], pieces)
     else:
         if isinstance(family.anchor, Crossing):
             target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
-            carry, _ = go(carry, to_section(target, family.anchor))
+            carry, before = go(carry, to_section(target, family.anchor))
             bound = _bind(s, map, family, carry[0], go)
+            _, pieces = to(carry, xp.arange(1, N + 1), bound)
+            pieces = jax.tree_util.tree_map(lambda *x: xp.concatenate(x), before, pieces)
         else:
             bound = _bind(s, map, family, begin, go)
-            carry, _ = to_next(carry, xp.arange(1)[0], bound)
-        first = carry[2][0]
-        _, flows = scan(lambda carry, k: to_next(carry, k, bound), carry, xp.arange(1, N + 1))
-    lanes, end, result, tape = _side_by_side(flows)
+            _, pieces = to(carry, xp.arange(N + 1), bound)
+    first = pieces[1].result[0, 0]
+    pieces = jax.tree_util.tree_map(lambda x: x[1:], pieces)
+    lanes, moved, tape = side_by_side(pieces)
+    end, result = moved.lanes.t, moved.result
     normal = _normals(s, bound, lanes, xp.arange(N), u)
     f = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
     share = xp.abs(normal.T * xp.concatenate([xp.ones((1, N)), f]))
@@ -189,34 +190,32 @@ def place_along(
     x[0] = 0.0 if by_cycle.anchor.t is None else by_cycle.anchor.t[:, 0]
     x[1:] = 0.0 if by_cycle.anchor.q is None else by_cycle.anchor.q[..., 0].T
 
-    def follow(flows, by_levels, times):
-        levels = flows[0][1].levels
-        flows = [(lanes, dataclasses.replace(to, levels=None), tape) for lanes, to, tape in flows]
-        lanes, target, tape = _side_by_side(jax.tree_util.tree_map(lambda *x: np.stack(x), *flows))
-        target = dataclasses.replace(target, levels=levels)
+    def follow(flow, by_levels, times):
+        lanes, tape = side_by_side((flow[0], flow[2]))
+        target, levels = flow[1], flow[1].levels
         along = kernels.Tangents(s, by_cycle.structure, levels, by_levels, P)
         flow = Variation(along, lanes, target, tape, times)
         return flow, flow.tangents(x), along
 
     if isinstance(family.anchor, Crossing):
         levels = ListLevels((cast(Crossing, by_family.anchor),))
-        x = follow(flows[:1], levels, np.zeros((P, 1)))[1][-1]
-        flows = flows[1:]
-    start, points = flows[0][0], x[None]
+        x = follow(flows.pop(0), levels, np.zeros((P, 1)))[1][-1]
+    start, points = jax.tree_util.tree_map(lambda x: x[0], flows[0][0]), x[None]
     orbit = Orbit(cycle.period, start.t, start.chart, start.q.T)
     if M > 1:
         times = x[0][:, None] + longer[:, None] * np.arange(1, M + 1) / M
-        flow, points, _ = follow(flows[:M], None, times)
-        points, flows = points[flow.first], flows[M:]
+        flow, points, _ = follow(flows.pop(0), None, times)
+        points = points[flow.first]
         orbit = Orbit(cycle.period, flow.starts.t, flow.starts.chart, flow.starts.q.T)
     moving = longer, np.moveaxis(points[:, 0], 1, 0), np.moveaxis(points[:, 1:], 2, 0)
     raw, by_bound = to_host(_bind_along(s, family, orbit, (by_cycle.structure, by_family, moving)))
     clock = np.isfinite(bound.time)
     late = np.rint((bound.time[0] - raw.time[0]) / cycle.period) if clock[0] else 0.0
-    k = np.arange(N + 1)[-len(flows) :]
+    (flow,) = flows
+    k = np.arange(N + 1)[-len(flow[1].time) :]
     by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
     times = clock[k % N] * (by_time[:, k % N] + (late + k // N) * longer[:, None])
-    flow, tangents, along = follow(flows, by_bound.levels, times)
+    flow, tangents, along = follow(flow, by_bound.levels, times)
     t, chart, q, u = (y[..., -N * P :] for y in flow.points(tangents))
     many = lambda y: np.repeat(y, P)  # noqa: E731
     lanes = placed.lanes._replace(t=t, chart=chart, q=q)
@@ -258,11 +257,6 @@ class _FromAnchor(AbstractLevels):
         return jnp.where(i == N, first, later)
 
 
-def _side_by_side(tree):
-    """An axis of pieces of the flow of a single lane, as one of lanes."""
-    return jax.tree_util.tree_map(lambda x: namespace(x).moveaxis(x[..., 0], 0, -1), tree)
-
-
 def _bind(
     s: Structure, map: ReturnMap, family: AbstractSections, anchor: Lanes, go
 ) -> BoundSections:
@@ -270,14 +264,11 @@ def _bind(
     period, t, M = map.expected, anchor.t[0], family.points
     xp = namespace(period)
 
-    def later(carry, k):
-        target = toward(anchor.t + period * k / M, -1, anchor.t + 2 * period)
-        return go(carry, target)[0], carry[0]
-
     lanes = anchor
     if M > 1:
-        carry = anchor, (0.1 * period / M)[None], xp.zeros(1, xp.int32)
-        lanes = _side_by_side(scan(later, carry, xp.arange(1, M + 1))[1])
+        carry = anchor, stride((0.1 * period / M)[None]), xp.zeros(1, xp.int32)
+        times = anchor.t + period * xp.arange(1, M + 1) / M
+        lanes = side_by_side(go(carry, toward(times, -1, times))[1][0])
     orbit = Orbit(period, lanes.t, lanes.chart, lanes.q.T)
     bound = to_host(_bind_program(map, family, orbit)) if on_host(period) else family.bind(s, orbit)
     late = xp.ceil((t - bound.time[0]) / period - TOGETHER)

@@ -1,6 +1,6 @@
 """What a system looks like in one state, for animations: shapes by name, without matplotlib."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -48,7 +48,7 @@ class Drawing(eqx.Module):
         circles: Mapping[str, Any] | None = None,
         points: Mapping[str, Any] | None = None,
         body: str | None = None,
-        velocity: Any = (0.0, 0.0),
+        velocity: ArrayLike | Sequence[ArrayLike] = (0.0, 0.0),
     ):
         self.lines, self.circles, self.points = (
             {name: _array(name, x, shape) for name, x in (parts or {}).items()}
@@ -66,7 +66,11 @@ class Drawing(eqx.Module):
         return {**self.points, **self.circles}[self.body][:2]
 
     @staticmethod
-    def spring(start: Any, end: Any, width: ArrayLike = 0.08) -> Float[Array, "15 2"]:
+    def spring(
+        start: ArrayLike | Sequence[ArrayLike],
+        end: ArrayLike | Sequence[ArrayLike],
+        width: ArrayLike = 0.08,
+    ) -> Float[Array, "15 2"]:
         """The points of a zigzag line of this half width, in meters. Default: 0.08."""
         a, b = jnp.asarray(start, float), jnp.asarray(end, float)
         along = b - a

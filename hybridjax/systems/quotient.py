@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked
@@ -144,7 +145,7 @@ class Quotient(Derived):
             outputs.append(Output(x.name, kept, x.unit))
         return outputs
 
-    def draw(self, chart, t, q):
+    def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]):
         """The picture of the original system, which stands at the translation 0 and moves."""
         whole, still = self.system.charts()[chart], dict.fromkeys(self.translation, 0.0)
         state = jnp.stack([jnp.asarray((still | dict(q))[x], float) for x in whole.states])

@@ -195,7 +195,7 @@ class HybridSystem(Definition):
         """The default guess for the search of the limit cycle, or `None`."""
         return None
 
-    def draw(self, chart: str, t: Any, q: Mapping[str, Any]) -> Drawing | None:
+    def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]) -> Drawing | None:
         """What the system looks like in a chart, for `hj.plot.animate`: a `Drawing`, written for
         one state as a vector field is. `q` holds the states of the chart and the values of those
         that it lacks (`Chart.absent`) by name. `None`, the default: states are drawn over time."""

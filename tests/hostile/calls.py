@@ -262,9 +262,9 @@ def plants(t):
     yield t.settled.run_experiments, dict(design=np.zeros((1, 88, 1)))
     yield t.settled.perturbed_returns, dict(coordinates=("x", "v"))
     names = dict(inputs=("u",), signals=("x",), dt=0.1)
-    yield hj.plants.from_mujoco, dict(model="<mujoco/>", inputs=())
-    yield hj.plants.from_fmu, dict(file="nope.fmu") | names
-    yield hj.plants.from_gymnasium, dict(environment="nope") | names
+    yield hj.plants.MuJoCoPlant, dict(model=None, inputs=())
+    yield hj.plants.FMUPlant, dict(file="nope.fmu") | names
+    yield hj.plants.GymnasiumPlant, dict(environment=dict) | names
 
 
 def testing(t):
@@ -299,6 +299,7 @@ def plots(t):
     yield plot.strides, dict(plan=t.plan, studies={"a": t.studied})
     yield plot.cycle, dict(cycle=t.cycle)
     yield plot.animate, dict(motion=t.cycle)
+    yield hj.explore, dict(system=t.cycle, ranges={"a": (-9.0, 9.0)})
     yield hj.experiments.perturbed_trajectory, dict(placed=t.placed, inputs=t.data)
     yield positional(plot.branch), dict(values=t.branch)
     yield plot.experiment, dict(data=t.data)

@@ -16,7 +16,8 @@ CALLED_BY_THE_ENGINE = {
     "BuckConverter", "Chart", "ClockPhase", "CompliantHopper", "Crossing", "KinematicPhase",
     "Lanes", "Mechanism", "ObservedSeries", "PaddleJuggler", "PlacedSections", "Plan", "Plant",
     "Points", "ProcessNoise", "SLIPRunner", "Scheduled", "SectionList", "Settings", "TwoLeggedBar",
-    "VerticalHopper",
+    "VerticalHopper", "FMUPlant", "GymnasiumPlant", "MuJoCoPlant", "Drawing", "HybridSystem",
+    "Quotient",
 }  # fmt: skip
 SLOW_TO_MAKE = {"ModelFit", "StoredExperiments"}
 

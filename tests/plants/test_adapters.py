@@ -7,6 +7,7 @@ import zipfile
 
 import fmpy
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 
@@ -27,7 +28,7 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
   </ModelVariables>
   <ModelStructure/>
 </fmiModelDescription>"""
-SECTIONS = hj.KinematicPhase(8, "x", "v", anchor=hj.Crossing("v", "falling"))
+SECTIONS = hj.KinematicPhase(8, "x", "v")
 
 
 def drive(model, data):
@@ -63,24 +64,24 @@ def fmu(tmp_path_factory):
 
 
 def test_an_fmu_settles_where_the_equations_do_and_runs_in_processes(fmu):
-    plant = hj.plants.from_fmu(fmu, "u", ("x", "v"), dt=0.05)
-    cycle = hj.plants.settle(plant, SECTIONS, "x", cycles=20)
+    plant = hj.plants.FMUPlant(fmu, "u", ("x", "v"), dt=0.02)
+    cycle = hj.plants.settle(plant, SECTIONS, "x", cycles=8)
     exact = hj.find_limit_cycle(hj.models.VanDerPol(mu=2.0))
-    assert abs(cycle.period - exact.period) < 1e-8
-    u = 0.05 * np.random.default_rng(0).standard_normal((3, 80, 1))
+    assert abs(cycle.period - exact.period) < 0.2 * plant.dt**2  # (linear interpolation)
+    u = 0.05 * np.random.default_rng(0).standard_normal((2, 80, 1))
     data = cycle.run_experiments(u, discard=0, processes=0)
     again = cycle.run_experiments(u, discard=0, processes=1)
     assert np.array_equal(data.y, again.y) and data.ok.all() and np.abs(data.y).max() > 1e-3
-    with pytest.raises(hj.DefinitionError, match="numbers that can be changed"):
+    with pytest.raises(hj.DefinitionError, match="whose state can be set"):
         cycle.perturbed_returns()
     with pytest.raises(hj.DefinitionError, match="no real variable 'z'"):
-        hj.plants.from_fmu(fmu, "u", ("z",), dt=0.05)
+        hj.plants.FMUPlant(fmu, "u", ("z",), dt=0.05)
 
 
 def test_sections_are_interpolated_between_fixed_steps():
-    plant = hj.plants.from_gymnasium(Environment, "u", ("x", "y"), dt=0.02)
+    plant = hj.plants.GymnasiumPlant(Environment, "u", ("x", "y"), dt=0.02)
     cycle = hj.plants.settle(plant, hj.KinematicPhase(8, "x", "y"), "x", cycles=10)
-    assert abs(cycle.period - 2 * np.pi) < 1e-4 and 0.01 < cycle.late <= 0.02 * (1 + 1e-9)
+    assert abs(cycle.period - 2 * np.pi) < 1e-4
     u = 0.05 * np.random.default_rng(0).standard_normal((1, 80, 1))
     data = cycle.run_experiments(u, discard=0, processes=0)
     exact = hj.plants.settle(Circle(), hj.KinematicPhase(8, "x", "y"), "x", cycles=10)
@@ -93,8 +94,12 @@ def test_sections_are_interpolated_between_fixed_steps():
 
 @pytest.fixture(scope="module")
 def ground():
-    plant = hj.plants.from_mujoco(
-        HERE / "hopper.xml", {"push": "N"}, control=drive, period=1.0, substeps=20
+    plant = hj.plants.MuJoCoPlant(
+        mujoco.MjModel.from_xml_path(str(HERE / "hopper.xml")),
+        {"push": "N"},
+        control=drive,
+        period=1.0,
+        substeps=20,
     )
     sections = hj.ClockPhase(10, anchor=0.7)
     return hj.plants.settle(plant, sections, ("yM", "yM_rate"), cycles=32)
@@ -107,7 +112,7 @@ def test_mujoco_continues_from_its_state(ground):
     true = np.asarray(at.observe(("yM", "vM")))
     assert np.abs(ground.cycle_outputs - true).max() < 0.05
     plant = ground.plant
-    start = ground.experiment.start
+    start = ground.drive.start
     courses = []
     for _ in range(2):
         plant.set_state(start.state)

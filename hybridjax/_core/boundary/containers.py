@@ -53,7 +53,7 @@ class Having(Kind):
     would do.)"""
 
     def __init__(self, protocol: type):
-        self.names = sorted(name for name in vars(protocol) if not name.startswith("_"))
+        self.names = sorted(x for x in {**vars(protocol), **protocol.__annotations__} if x[0] != "_")
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
     def fits(self, value):

@@ -4,25 +4,19 @@ The search decides on step sizes, on the order of events, and on failures. It is
 its decisions are recorded in a `Tape`, which `replay` follows.
 """
 
-import functools as ft
-
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
-from ..._core.compilation import deferred
-from ..._core.executor import cond, namespace, on_host, put, while_loop
+from ..._core.executor import cond, namespace, put, while_loop
 from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..arrays import Index, Inputs, Mask, Times
-from ..events import INSTANT, SAME_TIME, arm, next_schedule
-from ..lanes import IDLE, Lanes, Tape, blank_tape, for_each_chart, only, write_row
+from ..events import SAME_TIME, arm, next_schedule
+from ..lanes import Lanes, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
 from ..target import Target
 from ..watch import chart_field, watch
-from .accept import accurate, uneventful
+from .accept import uneventful
 from .attempt import attempt, deviation
 from .outcome import level_counts, with_events, without_events
 from .state import Aim, Approach, Attempt, Moved, Options, Recorded, State, Stride, Task
@@ -46,9 +40,9 @@ def search(
     lanes: Lanes,
     u: Inputs,
     target: Target,
+    settings: Settings,
     stride: Stride,
     result: Index,
-    settings: Settings,
     options: Options,
 ) -> Recorded:
     """Flow every lane to its target, or to a result code for the reason of its failure.
@@ -66,10 +60,6 @@ def search(
 
         def iterate(carry):
             state, tape = carry
-            if on_host(state.h) and len(state.h) == 1 and not state.approach.on[0]:
-                state = _calm_steps(state, tape, task)
-                if not going((state, tape)):
-                    return state, tape
             aim = take_aim(state, task)
             step = state, aim, attempt(state, aim, task), task
             calm = uneventful(*step).all()
@@ -90,77 +80,6 @@ def search(
         return Recorded(Moved(end.lanes, end.h, end.error, end.result), written)
 
     return cond(arrives.all(), in_one_step, all_the_way)
-
-
-def _calm_steps(state: State, tape: Tape | None, task: Task) -> State:
-    """The state of a single lane of the host before its next event, if the loop of steps up to
-    there is compiled; else the state itself."""
-    s, target, a = task.s, task.target, int(state.lanes.chart[0])
-    trees, static = (target.levels, task.settings), ((a, bool(task.tangents), target.missed),)
-    make = lambda: deferred(_calm_loop, ft.partial, static, (s, *trees))  # noqa: E731
-    loop = s.once(("calm steps", static), trees, make)
-    taken = loop(state, task.u, (target.time, target.index, target.limit), (task.span, task.stride))
-    if taken is None:
-        return state
-    moving, count, rows = taken
-    if tape is not None and count > 0:
-        h, code, t, *q = rows[:count].T[..., None]
-        q = np.stack(q, axis=1)
-        write_row(tape, slice(state.i, state.i + count), Tape(h, code, t, q, q, state.lanes.chart))
-    return _with(state, moving)
-
-
-def _moving(state: State) -> tuple:
-    """Parts of a state that steps without events change."""
-    (t, _, q, _, _, pace), *_ = state
-    steps = state.h, state.along, state.error, state.result, state.arrived, state.i
-    return t, q, pace, state.watched, *steps
-
-
-def _with(state: State, moving: tuple) -> State:
-    """A state with other such parts."""
-    t, q, pace, watched, *steps = moving
-    lanes = state.lanes._replace(t=t, q=q, pace=pace)
-    return State(lanes, watched, state.aimed, state.approach, *steps)
-
-
-def _calm_loop(static: tuple, s, levels, settings: Settings, state: State, u, ends, way):
-    """Steps of a lane, accepted and rejected, up to the first that may have an event or fail: the
-    moving parts of its state, the number of steps, and rows of the tape."""
-    (a, tangents, missed), (time, index, limit), (span, stride) = static, ends, way
-    none, no = np.zeros(1, np.int32), np.zeros(1, bool)
-    target = Target(time, index, none - 1, limit, None, levels, missed)
-    task = Task(s, u, target, span, stride, settings, tangents)
-    # (Branches on constants are taken when the loop is traced.)
-    still = Approach(no, none - 1, 0.0 * none, 0.0 * none, 0.0 * none, none)
-    state = state._replace(lanes=state.lanes._replace(chart=none + a), approach=still)
-    begin, unravel = ravel_pytree(_moving(state))
-
-    def going(carry):
-        _, count, rows, on = carry
-        return on & (count < len(rows))
-
-    def body(carry):
-        x, count, rows, _ = carry
-        begin = _with(state, unravel(x))._replace(result=none, arrived=no)
-        aim = take_aim(begin, task)
-        new = attempt(begin, aim, task, in_step=True)
-        step, free = (begin, aim, new, task), aim.which[0] < 0
-        calm = free & uneventful(*step)[0]
-        end, row = without_events(*step)
-        shorter = free & ~accurate(new, task)[0] & (end.h >= INSTANT * task.span)[0]
-        code = jnp.where(calm, row.code, IDLE)
-        rows = rows.at[count].set(jnp.concatenate([row.h, code, row.t, row.before[:, 0]]))
-        again = begin._replace(h=end.h, i=end.i)
-        after, again = (ravel_pytree(_moving(state))[0] for state in (end, again))
-        on = ((calm & end.active[0]) | shorter) & (end.i < settings.max_steps)
-        x = jnp.where(calm, after, jnp.where(shorter, again, x))
-        return x, count + (calm | shorter), rows, on
-
-    rows = jnp.zeros((min(settings.max_steps, Settings().max_steps), 3 + s.d))
-    carry = begin, 0, rows, True
-    x, count, rows, _ = jax.lax.while_loop(going, body, carry)
-    return unravel(x), count, rows
 
 
 def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:

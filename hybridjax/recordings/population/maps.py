@@ -46,8 +46,8 @@ class MapResult:
 
     def __repr__(self) -> str:
         size, t = np.abs(self.values).max(), np.abs(self.t).max()
-        found = zip(self.axes.items(), np.nonzero(self.significant), strict=True)
-        spans = (f"{n} {x[i].min():.3g} to {x[i].max():.3g}" for (n, x), i in found if len(i))
+        inside = zip(self.axes.items(), np.nonzero(self.significant), strict=True)
+        spans = (f"{n} {x[i].min():.3g} to {x[i].max():.3g}" for (n, x), i in inside if len(i))
         where = ", ".join(spans) or "none"
         return (
             f"MapResult({' x '.join(self.axes)}: largest {size:.4g} {self.unit}".rstrip()

@@ -18,7 +18,7 @@ from .reml import Mixed, meta, mixed, moderated, spread_interval
 from .tables import Columns, cells_of, factors_of, require, rows_with, signed, table_of
 
 
-Numeric = Mapping[str, Annotated[Numbers, Reals("rows", missing=True, infinite=True)]]
+Numeric = Mapping[str, Annotated[Numbers, Reals("rows", missing=True)]]
 _SLOPE = "slope of "
 Freedom = Annotated[Numbers, Reals("rows", infinite=True, sign="positive")]
 
@@ -67,7 +67,7 @@ class Population:
         for name, error in self.errors.items():
             if not len(values[name]) == len(error) == rows:
                 raise DefinitionError(f"`values` and `errors` of '{name}' must have {rows} rows.")
-            wrong = np.isfinite(values[name]) & ~((0 < error) & (error < np.inf))
+            wrong = np.isfinite(values[name]) & ~(error > 0)
             for subject, number in zip(self.table["subject"][wrong], error[wrong], strict=True):
                 raise DefinitionError(
                     f"'{name}' of subject '{subject}' has the standard error {number:.3g}, not a "
@@ -102,12 +102,11 @@ class Population:
                     "leave the subject out."
                 )
             z, covariance = complex(fit.multipliers[0]), fit.multiplier_covariances[0]
-            radial = np.array([z.real, z.imag]) / abs(z)
-            angular = np.array([-z.imag, z.real]) / abs(z) ** 2
-            squares = [w @ covariance @ w for w in (radial, angular)]
-            errors = np.sqrt([*squares, *np.diag(fit.covariance)])
+            polar = np.array([[z.real, z.imag], [-z.imag / abs(z), z.real / abs(z)]]) / abs(z)
+            squares = *np.diag(polar @ covariance @ polar.T), *np.diag(fit.covariance)
             angle = abs(np.angle(z)) if z.imag else np.nan
-            numbers[:, : len(errors), row] = [abs(z), angle, *fit.coefficients], errors
+            values = abs(z), angle, *fit.coefficients
+            numbers[:, : len(values), row] = values, np.sqrt(squares)
         kinds = ["modulus", "angle", *(f"c{k}" for k in range(1, most + 1))]
         values, errors = (dict(zip(kinds, x, strict=True)) for x in numbers)
         return cls(frame, values, errors, {"angle": "rad"}, [x.covariance_freedom for x in fits])

@@ -71,7 +71,8 @@ def mixed(
 
     start = np.where(i == j, 0.7, 0.0)
     best = optimize.minimize(cost, start, jac=True, method="L-BFGS-B", options={"ftol": 1e-13})
-    lower, _, phi, wx, projection = fitted(best.x)
+    # A spread below 1e-5 of the scale is zero, up to the accuracy of the optimizer.
+    lower, _, phi, wx, projection = fitted(np.where(np.abs(best.x) < 1e-5, 0.0, best.x))
     # Derivatives of the covariance of all estimates by the elements of Psi, (k, N, N).
     both = np.einsum("nk,mk->knm", cell[:, i], cell[:, j])
     change = same * np.maximum(both, np.swapaxes(both, 1, 2))
@@ -93,10 +94,11 @@ def mixed(
 
 def meta(y: Reals, v: Reals, x: Design) -> Mixed:
     """Return the fit of single estimates of subjects, with the covariance of Hartung and Knapp
-    (2001; Knapp and Hartung 2003), scaled by the weighted residuals."""
+    (2001; Knapp and Hartung 2003), scaled by the weighted residuals, but not below one: estimates
+    that scatter less than their errors would have none."""
     fit = mixed(y, v, x, np.arange(len(y)), np.zeros(len(y), int))
     square = weighted_squares(y, v + fit.between[0, 0], x) / fit.most
-    return fit._replace(covariance=fit.plain * square, slopes=0 * fit.slopes)
+    return fit._replace(covariance=fit.plain * max(square, 1.0), slopes=0 * fit.slopes)
 
 
 def weighted_squares(y: Reals, v: Reals, x: Design) -> float:
