@@ -1,14 +1,15 @@
 """Limit cycles: fixed points of the return map, with their multipliers."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from .._core.boundary.checked import NeedsValues, checked_methods
-from .._core.boundary.kinds import Index, Positive, SignalNames
+from .._core.boundary.kinds import Count, Index, Numbers, Positive, SignalNames
+from .._core.boundary.values import Reals
 from .._core.compilation import at_ease
 from .._core.executor import is_traced, to_host
 from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, unit_circle
@@ -34,7 +35,7 @@ from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
 from .linear_flow import Course
-from .responses import Responses, responses
+from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
 from .sensitivity import Sensitivity, sensitivity
@@ -223,6 +224,20 @@ class LimitCycle(eqx.Module):
         for modes whose multipliers coincide; `DefinitionError` for more modes than have amplitudes.
         """
         return responses(self._course(), modes)
+
+    def asymptotic_phase(
+        self, chart: str, state: Annotated[Numbers, Reals("n")], turns: Count = 1000
+    ) -> float:
+        """The phase, in cycles, of the state on the cycle that a state off it approaches. It flows
+        until it meets the section near the anchor, where phases are linear.
+
+        **Arguments:** `chart`, `state`: as of `simulate`; in a chart of sliding, on its surface.
+        `turns`: largest number of crossings of the section. Default: 1000.
+
+        **Raises:** `DefinitionError` for a cycle that is driven by a clock; `ComputationError` for
+        a state that does not reach the cycle.
+        """
+        return asymptotic_phase(self._course(), chart, np.asarray(state), turns)
 
     def htf(
         self,

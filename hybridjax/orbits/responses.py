@@ -18,14 +18,19 @@ from .._core.arguments import require_among, require_index
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers
 from .._core.boundary.values import Reals
+from .._core.compilation import at_ease
 from .._core.executor import Array, is_traced, namespace, on_host, stop_gradient, svdvals, to_host
+from .._core.results import Result
 from .._core.signal import unit_of
 from .._core.text import number
 from ..engine import kernels
-from ..engine.lanes import for_each_chart, only
+from ..engine.lanes import for_each_chart, only, start_lanes
+from ..engine.move import move
+from ..engine.target import toward
 from ..errors import ComputationError, DefinitionError
 from ..systems.sliding import SlidingChart
 from ..systems.structure import Structure
+from .crossing import to_section
 from .linear_flow import Course, LinearFlow, by_name, polynomials, rule
 from .return_map import SINGULAR, ReturnMap
 
@@ -341,6 +346,36 @@ def responses(course: Course, modes: int | None) -> Responses:
         map.structure, flow, period, values, exponents, right, total - len(values),
         events, phase, amplitudes, off,
     )  # fmt: skip
+
+
+def asymptotic_phase(
+    course: Course, chart: str, state: Float[np.ndarray, " n"], turns: int
+) -> float:
+    """The asymptotic phase of a state (see `LimitCycle.asymptotic_phase`)."""
+    map, period = to_host(course.map), float(course.period)
+    s, a = map.structure, map.structure.chart_index(chart)
+    if state.shape != (s.dims[a],):
+        raise DefinitionError(f"`state` must give the {s.dims[a]} states of chart '{chart}'.")
+    phase, size = to_host(responses(course, 0)._covector(None))[0, 0], map.sizes
+    near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase
+    q = np.pad(state, (0, s.d - s.dims[a]))[:, None]
+    lanes = begin = start_lanes(s, map.anchor.t, np.array([a], np.int32), q)
+    for _ in range(turns):
+        target = toward(np.full(1, np.inf), -1, lanes.t + 3 * period)
+        target = to_section(target, map.base, map.event)
+        with at_ease():
+            moved = move(s, lanes, np.zeros((s.nu, 1)), target, map.settings).moved
+        lanes = moved.lanes
+        if moved.result[0] != Result.OK:
+            break
+        off = (lanes.q - map.anchor.q)[:, 0]
+        if lanes.chart[0] == map.anchor.chart[0] and np.abs(off / size).max() < near:
+            return float((phase @ off - (lanes.t - begin.t)[0]) / period % 1.0)
+    raise ComputationError(
+        f"the state did not come to the cycle within {turns} crossings of its section (at t = "
+        f"{lanes.t[0]:.6g}: {Result(int(moved.result[0])).message}): start nearer to a stable "
+        "cycle, or allow more `turns`."
+    )
 
 
 def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):

@@ -120,6 +120,11 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     np.testing.assert_allclose(amplitude["y"], np.sin(angle), rtol=0, atol=1e-12)
     np.testing.assert_allclose(responses.exponents, [-0.2], rtol=0, atol=1e-12)
     assert "exponent -0.2" in str(responses)
+    # Isochrons are logarithmic spirals: phase = angle + alpha log(r / sqrt(mu)).
+    cycle = hj.find_limit_cycle(system, guess, section=section)
+    phase = cycle.asymptotic_phase("plane", (0.3, 0.5))
+    exact = np.arctan2(0.5, 0.3) + 0.4 * np.log(np.hypot(0.3, 0.5) / np.sqrt(0.1))
+    np.testing.assert_allclose(phase, exact / (2 * np.pi), rtol=1e-9)
 
 
 def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
@@ -182,47 +187,36 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
     np.testing.assert_allclose(np.reshape(a.durations, (4, 2)).sum(1), a.period / 4, rtol=1e-9)
 
 
-def _pushed(cycle, phase, state, push, turns):
-    """Advance of the cycle after a push, by the flow of pushed states."""
-    s, period, settings = cycle.structure, float(cycle.period), cycle.settings
-    a = int(cycle.anchor.chart[0])
-    flow = lambda chart, q, time, t: hj.simulate(
-        cycle.system, chart, q, time, time=t, settings=settings
-    )
-    begin = float(cycle.anchor.t[0])
-    at = flow(s.names[a], cycle.anchor.q[: s.dims[a], 0], phase * period, begin)
-    chart = s.names[at.chart[-1]]
-    q, k = at.after[-1, : s.dims[at.chart[-1]]], s.charts[at.chart[-1]].states.index(state)
-    end = lambda push: flow(chart, q + push * np.eye(len(q))[k], turns * period, at.t[-1])
-    base = end(0.0)
-    f = base.slope_after[-1] / cycle.settings.scale[base.chart[-1]]
-
-    def advance(push):
-        moved = (end(push).after[-1] - base.after[-1]) / cycle.settings.scale[base.chart[-1]]
-        return moved @ f / (f @ f)
-
-    central = lambda h: (advance(h) - advance(-h)) / (2 * h)
-    return (4 * central(push / 2) - central(push)) / 3
+# All of `hj.models` without a clock, except a family of cycles (SLIPRunner).
+AUTONOMOUS = """
+    BeltOscillator ChuaCircuit CompassGait FitzHughNagumo FiveLinkBiped HopfOscillator RimlessWheel
+    SimplestWalker TorsoWalker VanDerPol
+""".split()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "system, state, phases, turns",
-    [
-        (hj.models.VanDerPol(), "x", (0.2, 0.6), 4),
-        (hj.models.FitzHughNagumo(), "w", (0.3, 0.83), 1),
-        (hj.models.BeltOscillator(), "x", (0.1, 0.4, 0.8), 1),
-        (hj.models.ChuaCircuit(), "y", (0.3, 0.7), 48),
-        (hj.models.RimlessWheel(), "w", (0.3, 0.8), 27),
-        (hj.models.SimplestWalker(), "th", (0.4,), 35),
-    ],
-    ids=lambda x: type(x).__name__ if isinstance(x, hj.HybridSystem) else "",
-)
-def test_phase_responses_are_those_of_pushed_flows(system, state, phases, turns):
-    cycle = hj.find_limit_cycle(system)
-    phase = cycle.responses(modes=0).phase(phases)[state]
-    pushed = [_pushed(cycle, x, state, 1e-4, turns) for x in phases]
-    np.testing.assert_allclose(phase, pushed, rtol=1e-6, atol=1e-6 * np.max(np.abs(phase)))
+@pytest.mark.parametrize("name", AUTONOMOUS)
+def test_phase_responses_are_differences_of_asymptotic_phases(name):
+    """Of flows from states that are pushed in a random direction, to both sides."""
+    cycle = hj.find_limit_cycle(getattr(hj.models, name)())
+    s, period, flow = cycle.structure, float(cycle.period), cycle._course().linear_flow()
+    phases = np.array([0.15, 0.4, 0.77])
+    response = cycle.responses(modes=0).phase(phases, "cycles")
+    charts, states = flow.at(phases, period, flow.q)
+    rng, exact, difference = np.random.default_rng(0), [], []
+    for k, a in enumerate(charts):
+        names, q = s.charts[a].states, states[k, : s.dims[a]]
+        push = 1e-4 * rng.normal(size=len(q)) * [cycle.scale[x] for x in names]
+        push *= [response[x][k] != 0 for x in names]  # sliding undoes the others
+
+        def central(h):
+            to = [cycle.asymptotic_phase(s.names[a], q + x * push) for x in (h, -h)]  # noqa: B023
+            return ((to[0] - to[1] + 0.5) % 1.0 - 0.5) / (2 * h)
+
+        difference.append((4 * central(0.5) - central(1.0)) / 3)
+        exact.append(sum(response[x][k] * p for x, p in zip(names, push, strict=True)))
+    size = max(np.abs(np.concatenate([*response.values()]))) * 1e-4
+    np.testing.assert_allclose(difference, exact, rtol=1e-6, atol=1e-6 * size)
 
 
 def test_pushes_off_a_surface_on_which_the_cycle_slides_are_lost():
@@ -334,6 +328,10 @@ def test_bad_questions_are_refused_in_one_sentence():
     hopper, wheel = (hj.find_limit_cycle(x()) for x in (hj.models.VerticalHopper, Neuron))
     with pytest.raises(hj.DefinitionError, match="has no phase response: its phase is that"):
         hopper.responses().phase([0.1])
+    with pytest.raises(hj.DefinitionError, match="has no phase response: its phase is that"):
+        hopper.asymptotic_phase("flight", [0.0] * hopper.structure.dims[0])
+    with pytest.raises(hj.DefinitionError, match="must give the 1 states of chart 'membrane'"):
+        wheel.asymptotic_phase("membrane", (0.3, 0.5))
     with pytest.raises(hj.DefinitionError, match="no mode with an amplitude 2: there are 2"):
         hopper.responses().amplitude(2, [0.1])
     with pytest.raises(hj.DefinitionError, match="3 modes were asked for; 2 have amplitudes"):
