@@ -358,6 +358,9 @@ def asymptotic_phase(
         raise DefinitionError(f"`state` must give the {s.dims[a]} states of chart '{chart}'.")
     phase, size = to_host(responses(course, 0)._covector(None))[0, 0], map.sizes
     near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase
+    surface = getattr(s.charts[a], "surface", None)
+    if surface is not None and abs(float(surface(map.anchor.t[0], state))) > near:
+        raise DefinitionError(f"`state` does not lie on the surface on which '{chart}' slides.")
     q = np.pad(state, (0, s.d - s.dims[a]))[:, None]
     lanes = begin = start_lanes(s, map.anchor.t, np.array([a], np.int32), q)
     for _ in range(turns):
