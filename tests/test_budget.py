@@ -28,17 +28,17 @@ PRONOUNS = set(
 # the responses of cycles with noise, coupling and symmetry in time, 770 populations of subjects,
 # 800 simulators of others; of the tests, 1530 are those of all four.
 LIMITS = {
-    "code": 28_340,
-    "files": 245,
+    "code": 28_400,
+    "files": 242,
     "longest": 500,
-    "public_names": 184,
+    "public_names": 185,
     "many_parameters": 8,
     "thresholds": 300,
     "structure": 12,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_320,
-    "doc_words": 38_330,
+    "test_lines": 17_460,
+    "doc_words": 39_150,
 }
 
 

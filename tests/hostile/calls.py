@@ -73,6 +73,7 @@ def cycles(t):
     yield t.cycles.__getitem__, dict(i=0)
     yield hj.continuation, dict(cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05)
     yield t.cycle.responses, dict(modes=0)
+    yield t.cycle.asymptotic_phase, dict(chart="plane", state=np.array([2.0, 0.1]), turns=9)
     yield t.cycle.htf, dict(f=np.array([0.3]), harmonics=0, outputs=STATES)
     yield t.cycle.sensitivity, dict(parameter="mu")
     yield t.cycle.fluctuations, dict(white={"v": 0.1}, guards={}, resets={})
