@@ -53,7 +53,7 @@ def to_pandas(thing: Tabular) -> Any:
             parts["standard_error"] = np.sqrt(rows["variance"].values)
         return rows[[]].assign(**parts)
     row = next(iter(dataset.data_vars.values())).dims[0]
-    table = {}
+    table: dict[str, Any] = {}
     for name, x in {**dataset.coords, **dataset.data_vars}.items():
         if x.dims[0] != row:
             continue

@@ -1,7 +1,7 @@
 """The whole motion of a single experiment, of which data have the sections only."""
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -79,7 +79,9 @@ def _joined(pieces: list[Trajectory]) -> Trajectory:
         inner = [x[cut] for x in parts]
         return np.concatenate([*inner, parts[-1][-1:]] if after else [parts[0][:1], *inner])
 
-    columns = {name: column(name, name in ("after", "slope_after", "chart")) for name in _COLUMNS}
+    columns: Any = {
+        name: column(name, name in ("after", "slope_after", "chart")) for name in _COLUMNS
+    }
     return dataclasses.replace(last, **columns)
 
 

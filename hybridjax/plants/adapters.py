@@ -79,9 +79,8 @@ class MuJoCoPlant(_Made):
         kept = "TIME", "QPOS", "QVEL", "ACT", "WARMSTART"
         self._kept = sum(int(getattr(mujoco.mjtState, f"mjSTATE_{x}")) for x in kept)
         # The positions of bodies, contacts and sensors belong to the present state after `mj_step1`
-        # but not after `mj_step`. (Runge-Kutta steps cannot be divided.)
-        whole = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        self._integrate = mujoco.mj_step if whole else mujoco.mj_step2
+        # but not after `mj_step`. (Those of 1, Runge-Kutta, cannot be divided.)
+        self._integrate = mujoco.mj_step if model.opt.integrator == 1 else mujoco.mj_step2
         self._mujoco = mujoco
 
     def reset(self, seed: int) -> Mapping[str, float]:
@@ -116,7 +115,7 @@ class MuJoCoPlant(_Made):
         self._mujoco.mj_getState(self.model, self.data, x, self._kept)
         return x
 
-    def set_state(self, x: Any) -> None:
+    def set_state(self, x: np.ndarray) -> None:
         """Continue from a state."""
         self._mujoco.mj_setState(self.model, self.data, x, self._kept)
         self._mujoco.mj_step1(self.model, self.data)
@@ -203,7 +202,6 @@ class GymnasiumPlant(_Made):
     - `dt`: time between two steps in seconds.
     - `policy`: function of the observation that returns the actions, without memory. Default:
         zero.
-    - `period`: period of the clock in seconds. Default: no clock.
     """
 
     fixed_step = True
@@ -212,7 +210,6 @@ class GymnasiumPlant(_Made):
     signals: SignalNames
     dt: Positive
     policy: Callable[[Any], Any] | None = None
-    period: Positive | None = None
 
     def __post_init__(self) -> None:
         self._made = self.environment()

@@ -50,9 +50,8 @@ class Returns(MultiplierEstimate):
     bound: float = eqx.field(static=True)
 
     def _about(self) -> str:
-        more = len(self.coordinates) - len(self.multipliers)
-        hidden = f"{more} more below {self.bound:.1g}; " if more else ""
-        return f"{hidden}from {len(self.coordinates)} coordinates, residual {self.residual:.1g}"
+        n, more = len(self.coordinates), len(self.coordinates) - len(self.multipliers)
+        return f"{more} more below {self.bound:.1g}; {n} coordinates, residual {self.residual:.1g}"
 
 
 class _Map:
@@ -65,8 +64,7 @@ class _Map:
     def __init__(self, cycle: Any, names: Any = None):
         self.drive, plant = cycle.drive, cycle.plant
         if not self.drive.sets or self.drive.fixed:
-            text = "whose state can be set, and whose steps can end on a section"
-            raise DefinitionError(f"perturbed returns need a plant {text}.")
+            raise DefinitionError("use a plant whose state can be set, with steps of any size.")
         self.base = np.array(cycle.state, float)
         states = tuple(getattr(plant, "states", [f"x{i}" for i in range(self.base.size)]))
         period = getattr(plant, "period", None)
@@ -224,8 +222,7 @@ class SettledCycle:
 
         with working("run_experiments"):
             # (A plant is described by the cycle that was measured.)
-            names = type(self.plant).__name__, self.outputs, inputs.periods
-            about = digest_of(names, self.cycle_outputs, self.sections, u, self.seed)
+            about = digest_of(self.outputs, self.cycle_outputs, self.sections, u, self.seed)
             trials = resume(store, about, len(u), run)
         # (Rows are as long as the inputs, and NaN from the end of an experiment on.)
         ends, ny = [len(late) for _, late, _ in trials], len(self.outputs)
@@ -319,8 +316,8 @@ def settle(
     require_among("output", outputs, drive.names, "")
     drive.columns = tuple(map(drive.names.index, outputs))
     if guess is not None:
-        if not drive.sets or np.shape(drive.here().state) != np.shape(guess):
-            raise DefinitionError("`guess` must be a state as the plant's `get_state` returns it.")
+        if not drive.sets or np.shape(guess) != np.shape(drive.here().state):
+            raise DefinitionError("`guess` must be a state, as `get_state` returns it.")
         drive.restore(At(0.0, drive.z, state=np.asarray(guess)))
         drive.step(drive.zero, drive.dt)
     drive.phase = _bound(drive, family, cycles if guess is None else 0)
@@ -352,15 +349,13 @@ def _measure(
     change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
     # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
     if cycles > 1 and (change > np.maximum(1e-4 * size, 1.6 * values.std(axis=0))).any():
-        text = f"outputs still change by up to {change.max():.1g}"
-        raise ComputationError(f"the plant has not settled: {text}; give more `cycles`, a `guess`.")
+        raise ComputationError("the plant has not settled: give more `cycles` or a `guess`.")
     drive.start, at = turns[-1]
     if drive.sets:
         drive.restore(drive.start)
         change = np.abs(np.array([x.z for x in turn()[1]]) - [x.z for x in at])
         if (change[:, list(drive.columns)] > 1e-6 * size).any():
-            text = "`get_state` must return all that its future depends on"
-            raise DefinitionError(f"`set_state` does not continue as before: {text}.")
+            raise DefinitionError("`set_state` does not continue as before: save more.")
     given, units = plant.inputs, getattr(plant, "units", {})
     of_inputs = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
     return SettledCycle(
@@ -384,8 +379,7 @@ def _bound(drive: Drive, family: Any, cycles: int) -> Phase:
     period: Any = getattr(drive.plant, "period", None)
     kinds = [families.KinematicPhase, *[families.ClockPhase] * (period is not None)]
     if kind not in kinds or isinstance(anchor, Crossing):
-        text = "ClockPhase of a plant with a `period`, or KinematicPhase, with a number as `anchor`"
-        raise DefinitionError(f"sections of a plant, which has no equations, are {text}.")
+        raise DefinitionError("use KinematicPhase, or ClockPhase and a `period`; no Crossing.")
     if kind is families.ClockPhase:
         drive.pass_time(cycles * period)
         return Phase(N, period, float(anchor) * period)
@@ -402,6 +396,5 @@ def _bound(drive: Drive, family: Any, cycles: int) -> Phase:
             raise ComputationError(f"{pair} do not circle around {center}")
         drive.step(drive.zero, drive.dt)
         phase.level(0, drive.t, drive.z)
-    sense = math.copysign(1, phase.turns - began)
-    first, scale = sense * float(anchor), (scale[0], sense * scale[1])
-    return dataclasses.replace(phase, first=first, scale=scale)
+    sign = math.copysign(1, phase.turns - began)
+    return dataclasses.replace(phase, first=sign * float(anchor), scale=(scale[0], sign * scale[1]))

@@ -104,7 +104,7 @@ class Explorer:
                 step /= 4
             else:
                 shown = ", ".join(f"{n} = {x:.4g}" for n, x in mixed.items())
-                self.message = f"The cycle is lost at {shown}: {Result(cycle.result).message}."
+                self.message = f"The cycle is lost at {shown}: {Result(int(cycle.result)).message}."
                 break
         self._draw()
 
@@ -149,7 +149,8 @@ class Explorer:
 
         **Raises:** `DefinitionError` where anywidget is not installed.
         """
-        anywidget, traitlets = package("anywidget"), package("traitlets")
+        anywidget: Any = package("anywidget")
+        traitlets = package("traitlets")
         sliders = [
             [name, _label(self.cycle, name), *map(float, limits)]
             for name, limits in self.ranges.items()

@@ -100,10 +100,10 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
 
 def test_what_does_not_fit_is_refused(circle):
     for sections, message in (
-        (hj.ClockPhase(8), "with a `period`"),
+        (hj.ClockPhase(8), "use KinematicPhase"),
         (hj.KinematicPhase(8, "x", "z"), "no signal 'z'"),
-        (hj.Crossing("x", "falling"), "has no equations"),
-        (hj.KinematicPhase(8, "x", "y", anchor=hj.Crossing("x", "falling")), "has no equations"),
+        (hj.Crossing("x", "falling"), "use KinematicPhase"),
+        (hj.KinematicPhase(8, "x", "y", anchor=hj.Crossing("x", "falling")), "use KinematicPhase"),
     ):
         with pytest.raises(hj.DefinitionError, match=message):
             hj.plants.settle(Circle(), sections, "x")
@@ -122,6 +122,8 @@ def test_what_does_not_fit_is_refused(circle):
 
     with pytest.raises(hj.DefinitionError, match="does not continue as before"):
         hj.plants.settle(Forgetful(), ANGLE, "x", cycles=20)
+    with pytest.raises(hj.DefinitionError, match="as `get_state` returns it"):
+        hj.plants.settle(Circle(), ANGLE, "x", guess=(1.0, 0.0, 0.0))
     with pytest.raises(hj.DefinitionError, match="no coordinate 'z'"):
         circle.perturbed_returns("z")
 
