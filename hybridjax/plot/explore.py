@@ -178,7 +178,10 @@ class Explorer:
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
         pyplot.close(self.figure)  # the widget shows it
-        self._widget = self.widget()
+        try:
+            self._widget = self.widget()
+        except DefinitionError as error:
+            return {"text/plain": f"Explorer without sliders: {error}"}
         return self._widget._repr_mimebundle_(**options)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
+from hybridjax.recordings.impulse import ImpulseResponses
 from hybridjax.recordings.sampling import without_drift
 
 from .conftest import MULTIPLIER
@@ -224,3 +225,16 @@ def test_signals_with_clocks_of_their_own(rhythm):
     together, apart = (hj.fit_series(d, order=1).multipliers for d in data)
     np.testing.assert_allclose(apart, together, rtol=0, atol=1e-5)
     np.testing.assert_allclose(apart, MULTIPLIER, rtol=0, atol=1e-3)
+
+
+def test_responses_of_a_model_are_by_the_section_of_the_push():
+    """One state: a push of area 1 at section m decays by A from section to section."""
+    N, a, b, c = 4, 0.8, np.array([1.0, 2.0, 3.0, 4.0]), np.array([5.0, 7.0, 11.0, 13.0])
+    model = hj.LDTP(
+        np.full((N, 1, 1), a), b[:, None, None], c[:, None, None], inputs="f", outputs="x"
+    )
+    zero, grid = np.zeros((N, 7, 1, 1)), (np.arange(N) / N, np.arange(7) / N)
+    found = ImpulseResponses(zero, zero, *grid, 0.0, 2.0, ("f",), ("x",))
+    m, r = np.arange(N)[:, None], np.arange(1, 7)
+    expected = b[m] * a ** (r - 1) * c[(m + r) % N] / (2.0 / N)
+    np.testing.assert_allclose(found.of_model(model)[:, 1:, 0, 0], expected, rtol=1e-13)
