@@ -28,7 +28,15 @@ from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
 from ..series.residuals import about_answering, answering
-from ..weights import SMALLEST_ERROR, are_alike, check_values, error_weights, neighbor_correlation
+from ..weights import (
+    SMALLEST_ERROR,
+    are_alike,
+    check_values,
+    error_weights,
+    estimated_noise,
+    largest_misfit,
+    neighbor_correlation,
+)
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
@@ -439,16 +447,19 @@ def _finished(
 ) -> LDTPFit:
     """Return the fit at a minimum, with the outputs in their own units, which are `scale`."""
     model, known, noise, correlation = point.coordinates.model, False, None, None
+    unit = point.cost / freedom
     harmonics = all_harmonics(data.n_sections)
     if isinstance(data, HTF):
         known, harmonics = data.variance is not None, data.harmonics
         problem = cast(FrequencyProblem, point.problem)
+        if known:
+            unit = estimated_noise(largest_misfit(data), unit)[1] ** 2
         size = problem.weight * problem.target
         correlation = neighbor_correlation(problem.errors(model), size, np.asarray(data.f))
     else:
         noise = noise_model(model, cast(SeriesProblem, point.problem).S, scale, data.outputs)
     c, slopes = characteristic_slopes(point.coordinates)
-    spread = point.equations.spread(1.0 if known else point.cost / freedom)
+    spread = point.equations.spread(unit)
     return LDTPFit(
         model=model.to_ldtp(scale, data.inputs, data.outputs),
         multipliers=multipliers_of(c),
