@@ -197,7 +197,7 @@ class Delayed(NamedTuple):
         lag = stop_gradient(jnp.floor(whole + TOGETHER))
         # (Sections that coincide are refused.)
         together = not is_traced(cycle, delay) and bool(whole - lag < 2 * TOGETHER)
-        family = _Departures(phase, delay, lag, 1 if together else 2)
+        family = _Departures(phase, delay, lag, 1 if together else 2)  # type: ignore[call-arg,arg-type]
         model = linearize(cycle, family, outputs, inputs)
         if together:
             return cls(model, lag, model.inputs)
