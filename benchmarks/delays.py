@@ -3,9 +3,9 @@
 The vertical hopper between `N` = 8 clock sections: its input acts 0.037 periods after it is given,
 and its outputs are measured 0.081 periods late. Experiments are those of the nonlinear hopper at
 1000 sections, with inputs that are held for 125 of them: a multisine of rms 0.001, four draws of
-its phases; noise 20 dB below the outputs. `fit_model` to HTFs with unknown stiffness, damping and both
-delays, from 11, 4.5 and twice 0.06. Printed, as `name value` lines, over `--draws` draws of the
-noise, for each of the four:
+its phases; noise 20 dB below the outputs. `fit_model` to HTFs with unknown stiffness, damping and
+both delays, from 11, 4.5 and twice 0.06. Printed, as `name value` lines, over `--draws` draws of
+the noise, for each of the four:
 
 - `bias`, `rms`: mean and rms error. `said`: rms of the standard errors. `largest`: largest error in
   standard errors.

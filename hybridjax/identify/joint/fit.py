@@ -444,9 +444,7 @@ def _finished(
     if isinstance(data, HTF):
         known, harmonics = data.variance is not None, data.harmonics
         problem = cast(FrequencyProblem, point.problem)
-        unit = (
-            weights.estimated_noise(weights.largest_misfit(data), unit)[1] ** 2 if known else unit
-        )
+        unit = weights.covariance_unit(data, unit)
         size = problem.weight * problem.target
         correlation = weights.neighbor_correlation(problem.errors(model), size, np.asarray(data.f))
     else:
