@@ -121,7 +121,7 @@ def largest_misfit(htf: HTF) -> float:
 
 
 def covariance_unit(htf: HTF, misfit: float) -> float:
-    """Return the factor of the covariances of a fit to HTFs: the misfit if these have no variances."""
+    """Return the factor of covariances of a fit to HTFs: the misfit, if they have no variances."""
     known = htf.variance is not None
     return estimated_noise(largest_misfit(htf), misfit)[1] ** 2 if known else misfit
 
