@@ -16,7 +16,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ.setdefault("HYBRIDJAX_CACHE", str(_programs))
     # Most of the time of a test is that of compiling what it runs once. (XLA ends the process where
     # it does not know an option, so other processes try them, once for each version.)
-    _answer = _programs.with_name(f"options-{importlib.metadata.version('jaxlib')}")
+    _answer = _programs.with_name(f"accepted-{importlib.metadata.version('jaxlib')}")
     if not _answer.exists():
         _try = [sys.executable, "-c", "import jax; jax.devices()"]
         _quick = "--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false"
