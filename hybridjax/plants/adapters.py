@@ -76,7 +76,7 @@ class MuJoCoPlant(_Made):
         self._names = [*q, *v, *_numbered(sensors, model.sensor_dim)]
         self.states = ("time", *q, *v, *(f"act{i}" for i in range(model.na)))
         # (The last part is where the solver of contacts begins.)
-        kept = "TIME", "QPOS", "QVEL", "ACT", "WARMSTART"
+        kept = "TIME", "QPOS", "QVEL", "ACT", "WARMSTART", "USERDATA"
         self._kept = sum(int(getattr(mujoco.mjtState, f"mjSTATE_{x}")) for x in kept)
         # The positions of bodies, contacts and sensors belong to the present state after `mj_step1`
         # but not after `mj_step`. (Those of 1, Runge-Kutta, cannot be divided.)

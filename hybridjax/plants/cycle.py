@@ -1,8 +1,9 @@
 """The limit cycle of a plant: the sections on it, outputs there, and experiments around it."""
 
+import copy
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from .._core.progress import counted, say, working
 from .._core.results import Result
 from .._core.signal import Signal, signals, unit_of
 from .._core.text import listed
+from ..engine.trajectory import Trajectory
 from ..errors import ComputationError, DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.design import DISCARD
@@ -26,6 +28,9 @@ from ..experiments.run import DesignLike, check_inputs
 from ..identify.multiplier_estimate import MultiplierEstimate
 from ..orbits.crossing import Crossing
 from ..sections import families
+from ..systems.chart import FieldChart
+from ..systems.structure import Structure
+from ..systems.system import HybridSystem
 from .drive import At, Drive, Phase, Plant, Trial, resume, run_all
 
 
@@ -54,6 +59,20 @@ class Returns(MultiplierEstimate):
         return f"{more} more below {self.bound:.1g}; {n} coordinates, residual {self.residual:.1g}"
 
 
+class Recorded(HybridSystem):
+    """The signals of a plant as the states of a system that is only looked at."""
+
+    states: tuple[str, ...] = eqx.field(static=True)
+    picture: Callable[[Any], Any] | None = eqx.field(static=True)
+    time_unit, inputs = "s", ()
+
+    def charts(self):
+        return {"plant": FieldChart(lambda t, q, u: 0 * q, self.states)}
+
+    def draw(self, chart, t, q):
+        return None if self.picture is None else self.picture(q)
+
+
 class _Map:
     """The return map of some coordinates of a plant on section 0, and its fixed point.
 
@@ -74,10 +93,13 @@ class _Map:
         require_among("coordinate", names, states, "perturbed_returns: ")
         self.names, self.columns = tuple(names), [states.index(x) for x in names]
         turn = 0.0 if period is None else round(cycle.period / period) * period
-        self.shift, self.n = turn * np.array([x == "time" for x in names]), 0
-        self.x, N = self.base[self.columns], cycle.sections.n_sections
-        rows = [self(self.x, k) for k in range(N)]
-        self.n, self.size = N, np.ptp(rows, axis=0)
+        self.shift = turn * np.array([x == "time" for x in names])
+        self.x, self.n = self.base[self.columns], cycle.sections.n_sections
+        # (A perturbed state before a crossing must not return to it at once.)
+        self.free = cycle.period / 2 if self.drive.phase.crossings else 0.0
+        self.drive.restore(self.drive.start)
+        rows = np.array([x.state for x in self.drive.course(cycle.period)])[:, self.columns]
+        self.size = np.ptp(rows, axis=0)
         still = self.size <= 1e-9 * np.abs(rows).max(axis=0)
         self.size[still] = np.where(self.x, np.abs(self.x), 1.0)[still]
         say("noise of returns")
@@ -86,16 +108,15 @@ class _Map:
         # derivatives; at most two percent of the range.
         self.h = self.size * min((self.noise / self.size).max() ** 0.2 / 2, 0.02)
 
-    def __call__(self, x: Float[np.ndarray, " d"], n: int | None = None) -> Any:
-        """Return coordinates (d,) after n sections. Default: after one cycle, at its beginning."""
+    def __call__(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+        """Return the coordinates after one cycle."""
         state, drive = self.base.copy(), self.drive
         state[self.columns] = x
         drive.restore(drive.start._replace(state=state))
         drive.phase.begin(drive.t, drive.z, on_section=True)
-        for k in range(1, 1 + (self.n if n is None else n)):
-            drive.advance(drive.zero, k)
-        y = np.array(drive.here().state, float)[self.columns]
-        return y - self.shift if n is None else y
+        drive.pass_time(self.free)
+        drive.advance(drive.zero, self.n)
+        return np.array(drive.here().state, float)[self.columns] - self.shift
 
     def _noise(self) -> Float[np.ndarray, " d"]:
         """Return the standard deviation of returns from nearly equal states.
@@ -144,12 +165,8 @@ def _resolved(J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]) -> A
         count -= 1
     coefficients = np.array([np.atleast_1d(np.poly(x[:count])).real[1:] for x in each])
     covariance = np.cov(coefficients[1:], rowvar=False).reshape(count, count)
-    return (
-        values[:count],
-        coefficients[0],
-        covariance,
-        (sizes[0] + 3 * spread)[count:].max(initial=0),
-    )
+    bound = float((sizes[0] + 3 * spread)[count:].max(initial=0))
+    return values[:count], coefficients[0], covariance, bound
 
 
 @checked_methods
@@ -248,8 +265,9 @@ class SettledCycle:
         """Estimate the multipliers from returns of perturbed states to section 0.
 
         Newton's method moves the state onto the cycle. Central differences of fourth order give the
-        Jacobian of the return map, with steps that the scatter of returns from nearly equal states
-        determines (measured by differences along lines: Moré and Wild 2011).
+        Jacobian of the return map. Their steps follow from the scatter of returns from nearly equal
+        states (measured by differences along lines: Moré and Wild 2011), or are a half or a quarter
+        of that if the error is then smaller.
 
         **Arguments:**
 
@@ -264,16 +282,61 @@ class SettledCycle:
         """
         map = _Map(self, coordinates)
         residual = map.solve()
-        fine, middle, wide = (map.slopes(k) for k in (1, 2, 4))
-        J, coarse = (4 * fine - middle) / 3, (4 * middle - wide) / 3
-        # (Weights 8/12 and -1/12 of four returns, each with this noise.)
-        noise = np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / map.h
-        scale = map.size / map.size[:, None]
-        error = np.hypot(noise, (J - coarse) / 3)
-        values, coefficients, covariance, bound = _resolved(J * scale, error * scale)
+        scale, slopes = map.size / map.size[:, None], [map.slopes(k) for k in (0.25, 0.5, 1, 2, 4)]
+        choices = []
+        for k in range(3):
+            fine, middle, wide = slopes[k : k + 3]
+            J, coarse = (4 * fine - middle) / 3, (4 * middle - wide) / 3
+            # (Weights 8/12 and -1/12 of four returns, each with this noise.)
+            noise = np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / (2.0 ** (k - 2) * map.h)
+            # (A jump of the second derivative leaves in J an error as large as this difference.)
+            choices.append((J * scale, np.hypot(noise, J - coarse) * scale))
+        best = min(choices, key=lambda x: float(np.linalg.norm(x[1])))
+        values, coefficients, covariance, bound = _resolved(*best)
         freedom = 10.0  # (eleven differences)
-        about = map.x, map.noise, map.names, residual, float(bound)
+        about = map.x, map.noise, map.names, residual, bound
         return Returns(values, coefficients, covariance, freedom, *about)
+
+    def trajectory(
+        self,
+        draw: Callable[[Any], Any] | None = None,
+        u: Annotated[Numbers, Reals("n inputs")] | None = None,
+    ) -> Trajectory:
+        """Record the signals after each step from section 0 on, for `hj.plot.animate`.
+
+        **Arguments:**
+
+        - `draw`: function of the signals by name that returns a `hj.Drawing`, written with JAX.
+          Default: none, the signals are drawn over time.
+        - `u` (n, nu): inputs, each held until the next section. Default: one cycle without inputs.
+
+        **Returns:** a `Trajectory` in the chart `plant`, from time 0 on. Where the plant raises an
+        error (a fall) it ends with `Result.PLANT_STOPPED`.
+        """
+        u = np.zeros((self.sections.n_sections, len(self.inputs))) if u is None else np.asarray(u)
+        drive, rows, result = copy.copy(self.drive), [], Result.OK
+        drive.phase = copy.copy(drive.phase)
+        drive.reset(self.seed)
+        drive.begin()
+
+        def step(held: Any, h: float) -> None:
+            Drive.step(drive, held, h)
+            rows.append((drive.t, *drive.z))
+
+        drive.step = step  # type: ignore[method-assign]
+        rows.append((drive.t, *drive.z))
+        try:
+            for k, held in enumerate(u.tolist(), 1):
+                drive.advance(held, k)
+        except Exception:
+            result = Result.PLANT_STOPPED
+        # (Where a step was repeated to end on a section, times went back.)
+        table = np.array(rows)
+        later = np.minimum.accumulate(table[::-1, 0])[::-1]
+        t, *z = table[table[:, 0] < np.append(later[1:], np.inf)].T
+        q, n, s = np.array(z).T, len(t), Structure(Recorded(drive.names, draw))
+        rates, events = np.gradient(q, t, axis=0) if n > 1 else 0 * q, np.full(n, -1)
+        return Trajectory(s, t - t[0], np.zeros(n, int), q, q, rates, rates, events, result)
 
     def __repr__(self) -> str:
         names = f"{listed(self.inputs)} -> {listed(self.outputs)}"
@@ -296,8 +359,9 @@ def settle(
 
     **Arguments:**
 
-    - `sections`: `ClockPhase` for a plant with a `period`, or `KinematicPhase` of two signals, with
-      numbers as `anchor`.
+    - `sections`: `ClockPhase` for a plant with a `period`; `KinematicPhase` of two signals, with
+      numbers as `anchor`; or one or several `Crossing` of signals by name, which lie more than a
+      step apart and are crossed once in each cycle.
     - `outputs`: names of signals.
     - `cycles`: number of cycles before the sections are located. A quarter as many are then
       recorded. Default: 100.
@@ -320,18 +384,18 @@ def settle(
             raise DefinitionError("`guess` must be a state, as `get_state` returns it.")
         drive.restore(At(0.0, drive.z, state=np.asarray(guess)))
         drive.step(drive.zero, drive.dt)
-    drive.phase = _bound(drive, family, cycles if guess is None else 0)
-    drive.warmup = drive.t
+    # (One turn shows the sense of an angle; that of a guess is seen near it.)
+    drive.phase = _bound(drive, family, 1.0 if guess is None else 0.01)
     drive.phase.begin(drive.t, drive.z)
-    drive.advance(drive.zero, 0)
+    for k in range(1 if guess is not None else cycles + 1):
+        drive.warmup = drive.t
+        drive.advance(drive.zero, k * family.n_sections)
     if guess is not None:
         _Map(_measure(drive, family, 1, seed)).solve()
     return _measure(drive, family, max(cycles // 4, 2) if guess is None else 2, seed)
 
 
-def _measure(
-    drive: Drive, family: families.AbstractSections, cycles: int, seed: int
-) -> SettledCycle:
+def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
     """Record cycles, and prepare experiments. The plant is on section 0."""
     N, plant = family.n_sections, drive.plant
 
@@ -345,12 +409,14 @@ def _measure(
     turns = [turn() for _ in range(cycles + 1)]
     values = np.array([[[x.z[c] for c in drive.columns] for x in at] for _, at in turns])
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
-    half, size = len(values) // 2, np.ptp(values, axis=(0, 1))
+    drive.start, at = turns[-1]
+    period = float(np.diff([x[-1].t for _, x in turns]).mean())
+    course = np.array([x.z for x in drive.course(period)])[:, drive.columns]
+    half, size = len(values) // 2, np.ptp(course, axis=0)
     change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
     # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
     if cycles > 1 and (change > np.maximum(1e-4 * size, 1.6 * values.std(axis=0))).any():
         raise ComputationError("the plant has not settled: give more `cycles` or a `guess`.")
-    drive.start, at = turns[-1]
     if drive.sets:
         drive.restore(drive.start)
         change = np.abs(np.array([x.z for x in turn()[1]]) - [x.z for x in at])
@@ -363,7 +429,7 @@ def _measure(
         sections=family,
         inputs=signals(of_inputs, of_inputs.values()),
         outputs=tuple(Signal(drive.names[c], units.get(drive.names[c], "")) for c in drive.columns),
-        period=float(np.diff([at[-1].t for _, at in turns]).mean()),
+        period=period,
         cycle_outputs=values.mean(axis=0),
         noise=values.std(axis=0),
         state=drive.start.state,
@@ -372,29 +438,34 @@ def _measure(
     )
 
 
-def _bound(drive: Drive, family: Any, cycles: int) -> Phase:
-    """Run the plant for some cycles, and return the sections with the numbers of its cycle."""
-    N, kind = family.n_sections, type(family)
-    anchor: Any = getattr(family, "anchor", None)
-    period: Any = getattr(drive.plant, "period", None)
+def _bound(drive: Drive, family: Any, turns: float) -> Phase:
+    """Return the sections as a plant is taken to them. An angle first makes so many turns."""
+    N, names, period = family.n_sections, drive.names, getattr(drive.plant, "period", None)
+    items: Any = getattr(family, "items", ())
+    if items and all(isinstance(getattr(x, "function", None), str) and not x.charts for x in items):
+        require_among("signal", [x.function for x in items], names, "Crossing: ")
+        signs = {"falling": 1.0, "rising": -1.0}
+        rows = [(names.index(x.function), signs[x.direction], float(x.value)) for x in items]
+        return Phase(N, crossings=rows)
     kinds = [families.KinematicPhase, *[families.ClockPhase] * (period is not None)]
-    if kind not in kinds or isinstance(anchor, Crossing):
-        raise DefinitionError("use KinematicPhase, or ClockPhase and a `period`; no Crossing.")
-    if kind is families.ClockPhase:
-        drive.pass_time(cycles * period)
-        return Phase(N, period, float(anchor) * period)
+    if type(family) not in kinds or isinstance(family.anchor, Crossing):
+        text = "use KinematicPhase, Crossings of signals by name, or ClockPhase and a `period`"
+        raise DefinitionError(f"{text}; an `anchor` must be a number.")
+    if isinstance(family, families.ClockPhase):
+        return Phase(N, period, float(family.anchor) * period)
     pair = family.position, family.velocity
-    require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
-    i, j = map(drive.names.index, pair)
+    require_among("signal", pair, names, "KinematicPhase(position, velocity): ")
     center = [0.0, 0.0] if family.center is None else np.asarray(family.center).tolist()
     scale = [1.0, 1.0] if family.scale is None else np.asarray(family.scale).tolist()
-    phase = Phase(N, 1.0, 0.0, (i, j), center, scale)
+    phase = Phase(N, 1.0, 0.0, (names.index(pair[0]), names.index(pair[1])), center, scale)
     phase.begin(drive.t, drive.z)
     began = phase.turns
-    while abs(phase.turns - began) < max(cycles, 0.01):  # (which shows the sense)
-        if drive.t > (1 + cycles) * 100_000 * drive.dt:
+    while abs(phase.turns - began) < turns:
+        if drive.t > drive.longest:
             raise ComputationError(f"{pair} do not circle around {center}")
         drive.step(drive.zero, drive.dt)
         phase.level(0, drive.t, drive.z)
     sign = math.copysign(1, phase.turns - began)
-    return dataclasses.replace(phase, first=sign * float(anchor), scale=(scale[0], sign * scale[1]))
+    return dataclasses.replace(
+        phase, first=sign * float(family.anchor), scale=(scale[0], sign * scale[1])
+    )

@@ -61,10 +61,12 @@ class Plant(Protocol):
 
 @dataclasses.dataclass
 class Phase:
-    """Sections at equal phases of a period (`columns` None), or of the angle of two signals.
+    """Sections at equal phases of a period (`columns` None), or of the angle of two signals, or
+    where signals cross levels.
 
     **Fields:** `first`: time or angle of section 0. `center`, `scale`: of the two signals; the
     second scale is negative if the angle decreases. `start`: turns at which sections are counted.
+    `crossings`: column, sign (1 if it falls) and level of each section.
     """
 
     n: int
@@ -75,6 +77,7 @@ class Phase:
     scale: Sequence[float] = (1.0, 1.0)
     turns: float = 0.0
     start: float = 0.0
+    crossings: Sequence[tuple[int, float, float]] = ()
 
     def begin(self, t: float, z: Sequence[float], on_section: bool = False) -> None:
         """Count sections from the next section 0 on, or from the one on which the plant is."""
@@ -84,7 +87,10 @@ class Phase:
 
     def level(self, k: int, t: float, z: Sequence[float]) -> float:
         """Return a number that falls through zero at section k, counted from `begin` on: the time
-        until then, or an angle in turns, which is unwrapped."""
+        until then, an angle in turns, which is unwrapped, or a signal above its level."""
+        if self.crossings:
+            c, sign, value = self.crossings[k % self.n]
+            return sign * (z[c] - value)
         if self.columns is None:
             self.turns = (t - self.first) / self.period
         else:
@@ -115,7 +121,7 @@ class Drive:
     **Fields:**
 
     - `names`: signals in order; empty: those of the first observation. `columns`: of the outputs.
-    - `phase`: the sections. `longest`: time that one section may take.
+    - `phase`: the sections. `longest`: time that one section may take, at first a million steps.
     - `start`: on section 0. `warmup`: time for which a plant whose state cannot be set runs after
       `reset` instead.
     - `t`, `z`: present time since `reset`, and signals. `last`: the point before, if known.
@@ -126,7 +132,7 @@ class Drive:
         self.fixed = bool(getattr(plant, "fixed_step", False))
         self.sets = hasattr(plant, "get_state") and hasattr(plant, "set_state")
         self.zero = [0.0] * len(plant.inputs)
-        self.t, self.warmup, self.longest = 0.0, 0.0, math.inf
+        self.t, self.warmup, self.longest = 0.0, 0.0, 1e6 * self.dt
         self.names, self.columns, self.z = tuple[str, ...](), tuple[int, ...](), tuple[float, ...]()
         self.phase, self.start, self.last = Phase(1), At(0.0, ()), At(0.0, ())
 
@@ -165,20 +171,30 @@ class Drive:
         for _ in range(round(duration / self.dt)):
             self.step(self.zero, self.dt)
 
+    def course(self, duration: float) -> list[At]:
+        """Return the points after each step, without input."""
+        points = []
+        for _ in range(round(duration / self.dt)):
+            self.step(self.zero, self.dt)
+            points.append(self.here())
+        return points
+
     def advance(self, u: Sequence[float], k: int) -> At:
         """Hold the input until section k. Steps end on it if its time is known, or if the state can
-        be set; steps of fixed length end after it."""
-        phase, began = self.phase, self.t
-        timed = phase.columns is None and not self.fixed
+        be set; steps of fixed length end after it. A crossing counts after a step that ends before
+        it, so that none is counted twice."""
+        phase, began, armed = self.phase, self.t, not self.phase.crossings
+        timed = phase.columns is None and armed and not self.fixed
         lands = self.sets and not self.fixed and not timed
         last = self.last if self.last.z else At(self.t, self.z)  # (a step may cross two sections)
         x, y = phase.level(k, last.t, last.z), phase.level(k, self.t, self.z)
-        while y > 1e-9 * self.dt * timed:
+        while y > 1e-9 * self.dt * timed or not armed:
             if self.t - began > self.longest:
                 raise ComputationError(f"a section was not reached within {self.longest:.4g}")
             last, x = self.here() if lands else At(self.t, self.z), y
             self.step(u, min(y, self.dt) if timed else self.dt)
             y = phase.level(k, self.t, self.z)
+            armed = armed or y > 0
         if lands and y < 0 < x:
             from scipy import optimize
 
@@ -211,11 +227,8 @@ class Drive:
                 if k < len(u):
                     at = self.advance(held, k)
         except Exception as error:
-            kind = (
-                ""
-                if isinstance(error, ComputationError)
-                else f"the plant raised {type(error).__name__}: "
-            )
+            told = isinstance(error, ComputationError)
+            kind = "" if told else f"the plant raised {type(error).__name__}: "
             return y, late, f"{kind}{error} (t = {self.t:.6g})"
         return y, late, ""
 
