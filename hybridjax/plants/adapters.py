@@ -149,17 +149,16 @@ class FMUPlant(_Made):
         fmpy, self.file = package("fmpy"), os.path.abspath(self.file)
         try:
             about = fmpy.read_model_description(self.file)
-            can = about.coSimulation if about.fmiVersion.startswith("2.") else None
-        except Exception:  # (of many kinds)
-            can = None
-        if can is None:
-            raise DefinitionError(f"'{self.file}' is no FMU of FMI 2.0 for co-simulation.")
+            can = {"2": about.coSimulation}[about.fmiVersion[0]]
+            self.fixed_step = not can.canHandleVariableCommunicationStepSize
+        except Exception as error:  # (of many kinds)
+            text = f"'{self.file}' is no FMU of FMI 2.0 for co-simulation."
+            raise DefinitionError(text) from error
         groups = self.inputs, self.signals
         variables = {x.name: x for x in about.modelVariables if x.type == "Real"}
         require_among("real variable", [x for y in groups for x in y], variables, "FMUPlant: ")
         self._at = [[variables[x].valueReference for x in group] for group in groups]
         self.units = {x: variables[x].unit for x in self.signals if variables[x].unit}
-        self.fixed_step = not can.canHandleVariableCommunicationStepSize
         folder = fmpy.extract(self.file)
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._slave, self._t = fmpy.instantiate_fmu(folder, about, "CoSimulation"), 0.0

@@ -1,6 +1,5 @@
 """The limit cycle of a plant: the sections on it, outputs there, and experiments around it."""
 
-import copy
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -16,7 +15,7 @@ from .._core.boundary.kinds import FilePath, Index, Positive, Seed, SignalNames
 from .._core.boundary.values import Reals, Whole
 from .._core.execution import core_count
 from .._core.pieces.description import digest_of
-from .._core.progress import counted, say, working
+from .._core.progress import counted, working
 from .._core.results import Result
 from .._core.signal import Signal, signals, unit_of
 from .._core.text import listed
@@ -87,9 +86,8 @@ class _Map:
         self.base = np.array(cycle.state, float)
         states = tuple(getattr(plant, "states", [f"x{i}" for i in range(self.base.size)]))
         period = getattr(plant, "period", None)
-        if names is None:
-            timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
-            names = [x for x in states if not (timeless and x == "time")]
+        timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
+        names = names or [x for x in states if not (timeless and x == "time")]
         require_among("coordinate", names, states, "perturbed_returns: ")
         self.names, self.columns = tuple(names), [states.index(x) for x in names]
         turn = 0.0 if period is None else round(cycle.period / period) * period
@@ -97,25 +95,25 @@ class _Map:
         self.x, self.n = self.base[self.columns], cycle.sections.n_sections
         # (A perturbed state before a crossing must not return to it at once.)
         self.free = cycle.period / 2 if self.drive.phase.crossings else 0.0
-        self.drive.restore(self.drive.start)
-        rows = np.array([x.state for x in self.drive.course(cycle.period)])[:, self.columns]
+        points: list[At] = []
+        self(self.x, points)
+        rows = np.array([x.state for x in points], float)[:, self.columns]
         self.size = np.ptp(rows, axis=0)
         still = self.size <= 1e-9 * np.abs(rows).max(axis=0)
         self.size[still] = np.where(self.x, np.abs(self.x), 1.0)[still]
-        say("noise of returns")
         self.noise = self._noise()
         # Steps at which noise and the error of fourth order are nearly equal for a function of unit
-        # derivatives; at most two percent of the range.
-        self.h = self.size * min((self.noise / self.size).max() ** 0.2 / 2, 0.02)
+        # derivatives; at most one percent of the range.
+        self.h = self.size * min((self.noise / self.size).max() ** 0.2 / 2, 0.01)
 
-    def __call__(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
-        """Return the coordinates after one cycle."""
+    def __call__(self, x: Float[np.ndarray, " d"], points: Any = None) -> Float[np.ndarray, " d"]:
+        """Return the coordinates after one cycle, and append the points of its steps."""
         state, drive = self.base.copy(), self.drive
         state[self.columns] = x
         drive.restore(drive.start._replace(state=state))
         drive.phase.begin(drive.t, drive.z, on_section=True)
-        drive.pass_time(self.free)
-        drive.advance(drive.zero, self.n)
+        drive.pass_time(self.free if points is None else 0.0)
+        drive.advance(drive.zero, self.n, points)
         return np.array(drive.here().state, float)[self.columns] - self.shift
 
     def _noise(self) -> Float[np.ndarray, " d"]:
@@ -265,9 +263,8 @@ class SettledCycle:
         """Estimate the multipliers from returns of perturbed states to section 0.
 
         Newton's method moves the state onto the cycle. Central differences of fourth order give the
-        Jacobian of the return map. Their steps follow from the scatter of returns from nearly equal
-        states (measured by differences along lines: Moré and Wild 2011), or are a half or a quarter
-        of that if the error is then smaller.
+        Jacobian of the return map, with steps that the scatter of returns from nearly equal states
+        determines (measured by differences along lines: Moré and Wild 2011).
 
         **Arguments:**
 
@@ -282,20 +279,15 @@ class SettledCycle:
         """
         map = _Map(self, coordinates)
         residual = map.solve()
-        scale, slopes = map.size / map.size[:, None], [map.slopes(k) for k in (0.25, 0.5, 1, 2, 4)]
-        choices = []
-        for k in range(3):
-            fine, middle, wide = slopes[k : k + 3]
-            J, coarse = (4 * fine - middle) / 3, (4 * middle - wide) / 3
-            # (Weights 8/12 and -1/12 of four returns, each with this noise.)
-            noise = np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / (2.0 ** (k - 2) * map.h)
-            # (A jump of the second derivative leaves in J an error as large as this difference.)
-            choices.append((J * scale, np.hypot(noise, J - coarse) * scale))
-        best = min(choices, key=lambda x: float(np.linalg.norm(x[1])))
-        values, coefficients, covariance, bound = _resolved(*best)
+        fine, middle, wide = (map.slopes(k) for k in (1, 2, 4))
+        J, coarse = (4 * fine - middle) / 3, (4 * middle - wide) / 3
+        # (Weights 8/12 and -1/12 of four returns, each with this noise.)
+        noise = np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / map.h
+        # (A jump of the second derivative leaves in J an error as large as this difference.)
+        error, scale = np.hypot(noise, J - coarse), map.size / map.size[:, None]
+        *estimate, bound = _resolved(J * scale, error * scale)
         freedom = 10.0  # (eleven differences)
-        about = map.x, map.noise, map.names, residual, bound
-        return Returns(values, coefficients, covariance, freedom, *about)
+        return Returns(*estimate, freedom, map.x, map.noise, map.names, residual, bound)
 
     def trajectory(
         self,
@@ -314,34 +306,24 @@ class SettledCycle:
         error (a fall) it ends with `Result.PLANT_STOPPED`.
         """
         u = np.zeros((self.sections.n_sections, len(self.inputs))) if u is None else np.asarray(u)
-        drive, rows, result = copy.copy(self.drive), [], Result.OK
-        drive.phase = copy.copy(drive.phase)
+        drive, points, result = self.drive, list[At](), Result.OK
         drive.reset(self.seed)
         drive.begin()
-
-        def step(held: Any, h: float) -> None:
-            Drive.step(drive, held, h)
-            rows.append((drive.t, *drive.z))
-
-        drive.step = step  # type: ignore[method-assign]
-        rows.append((drive.t, *drive.z))
         try:
             for k, held in enumerate(u.tolist(), 1):
-                drive.advance(held, k)
+                drive.advance(held, k, points)
+            points.append(drive.here())
         except Exception:
             result = Result.PLANT_STOPPED
-        # (Where a step was repeated to end on a section, times went back.)
-        table = np.array(rows)
-        later = np.minimum.accumulate(table[::-1, 0])[::-1]
-        t, *z = table[table[:, 0] < np.append(later[1:], np.inf)].T
-        q, n, s = np.array(z).T, len(t), Structure(Recorded(drive.names, draw))
+        q, t = np.array([x.z for x in points]), np.array([x.t for x in points])
+        n, s = len(t), Structure(Recorded(drive.names, draw))
         rates, events = np.gradient(q, t, axis=0) if n > 1 else 0 * q, np.full(n, -1)
         return Trajectory(s, t - t[0], np.zeros(n, int), q, q, rates, rates, events, result)
 
     def __repr__(self) -> str:
         names = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        about = f"{type(self.plant).__name__}: period {self.period:.9g}, {len(self.noise)} sections"
-        return f"SettledCycle({about}, {names})"
+        about = f"period {self.period:.9g}, {len(self.noise)} sections, {names}"
+        return f"SettledCycle({type(self.plant).__name__}: {about})"
 
 
 @checked
@@ -399,20 +381,19 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
     """Record cycles, and prepare experiments. The plant is on section 0."""
     N, plant = family.n_sections, drive.plant
 
-    def turn() -> tuple[At, list[At]]:
+    def turn(points: list[At] | None = None) -> tuple[At, list[At]]:
         start = drive.here()
         drive.phase.begin(drive.t, drive.z, on_section=True)
-        return start, [drive.advance(drive.zero, k) for k in range(1, N + 1)]
+        return start, [drive.advance(drive.zero, k, points) for k in range(1, N + 1)]
 
     start, at = turn()
     drive.longest = 2 * (at[-1].t - start.t)
-    turns = [turn() for _ in range(cycles + 1)]
+    points: list[At] = []
+    turns = [turn(points) for _ in range(cycles + 1)]
     values = np.array([[[x.z[c] for c in drive.columns] for x in at] for _, at in turns])
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
     drive.start, at = turns[-1]
-    period = float(np.diff([x[-1].t for _, x in turns]).mean())
-    course = np.array([x.z for x in drive.course(period)])[:, drive.columns]
-    half, size = len(values) // 2, np.ptp(course, axis=0)
+    half, size = len(values) // 2, np.ptp([x.z for x in points], axis=0)[list(drive.columns)]
     change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
     # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
     if cycles > 1 and (change > np.maximum(1e-4 * size, 1.6 * values.std(axis=0))).any():
@@ -423,19 +404,12 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
         if (change[:, list(drive.columns)] > 1e-6 * size).any():
             raise DefinitionError("`set_state` does not continue as before: save more.")
     given, units = plant.inputs, getattr(plant, "units", {})
-    of_inputs = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
-    return SettledCycle(
-        plant=plant,
-        sections=family,
-        inputs=signals(of_inputs, of_inputs.values()),
-        outputs=tuple(Signal(drive.names[c], units.get(drive.names[c], "")) for c in drive.columns),
-        period=period,
-        cycle_outputs=values.mean(axis=0),
-        noise=values.std(axis=0),
-        state=drive.start.state,
-        drive=drive,
-        seed=seed,
-    )
+    given = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
+    outputs = tuple(Signal(drive.names[c], units.get(drive.names[c], "")) for c in drive.columns)
+    about = plant, family, signals(given, given.values()), outputs
+    period = float(np.diff([at[-1].t for _, at in turns]).mean())
+    measured = period, values.mean(axis=0), values.std(axis=0), drive.start.state
+    return SettledCycle(*about, *measured, drive, seed)
 
 
 def _bound(drive: Drive, family: Any, turns: float) -> Phase:
@@ -457,7 +431,7 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     require_among("signal", pair, names, "KinematicPhase(position, velocity): ")
     center = [0.0, 0.0] if family.center is None else np.asarray(family.center).tolist()
     scale = [1.0, 1.0] if family.scale is None else np.asarray(family.scale).tolist()
-    phase = Phase(N, 1.0, 0.0, (names.index(pair[0]), names.index(pair[1])), center, scale)
+    phase = Phase(N, axes=[*zip(map(names.index, pair), center, scale, strict=True)])
     phase.begin(drive.t, drive.z)
     began = phase.turns
     while abs(phase.turns - began) < turns:
@@ -465,7 +439,6 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
             raise ComputationError(f"{pair} do not circle around {center}")
         drive.step(drive.zero, drive.dt)
         phase.level(0, drive.t, drive.z)
-    sign = math.copysign(1, phase.turns - began)
-    return dataclasses.replace(
-        phase, first=sign * float(family.anchor), scale=(scale[0], sign * scale[1])
-    )
+    phase.sense = math.copysign(1, phase.turns - began)
+    phase.first = float(family.anchor)
+    return phase

@@ -7,6 +7,7 @@ be ended one by one.
 
 import contextlib
 import dataclasses
+import importlib
 import json
 import math
 import os
@@ -61,20 +62,19 @@ class Plant(Protocol):
 
 @dataclasses.dataclass
 class Phase:
-    """Sections at equal phases of a period (`columns` None), or of the angle of two signals, or
-    where signals cross levels.
+    """Sections at equal phases of a period, of the angle of two signals, or where signals cross
+    levels.
 
-    **Fields:** `first`: time or angle of section 0. `center`, `scale`: of the two signals; the
-    second scale is negative if the angle decreases. `start`: turns at which sections are counted.
+    **Fields:** `first`: time or angle of section 0. `axes`: column, center and scale of the two
+    signals. `sense`: -1 if the angle decreases. `start`: turns at which sections are counted.
     `crossings`: column, sign (1 if it falls) and level of each section.
     """
 
     n: int
     period: float = 1.0
     first: float = 0.0
-    columns: tuple[int, int] | None = None
-    center: Sequence[float] = (0.0, 0.0)
-    scale: Sequence[float] = (1.0, 1.0)
+    axes: Sequence[tuple[int, float, float]] = ()
+    sense: float = 1.0
     turns: float = 0.0
     start: float = 0.0
     crossings: Sequence[tuple[int, float, float]] = ()
@@ -91,12 +91,12 @@ class Phase:
         if self.crossings:
             c, sign, value = self.crossings[k % self.n]
             return sign * (z[c] - value)
-        if self.columns is None:
-            self.turns = (t - self.first) / self.period
+        if self.axes:
+            (i, a, p), (j, b, q) = self.axes
+            angle = self.sense * (math.atan2((z[j] - b) / q, (z[i] - a) / p) - self.first)
+            self.turns = angle / (2 * math.pi) + round(self.turns - angle / (2 * math.pi))
         else:
-            (i, j), (a, b), (p, q) = self.columns, self.center, self.scale
-            turns = (math.atan2((z[j] - b) / q, (z[i] - a) / p) - self.first) / (2 * math.pi)
-            self.turns = turns + round(self.turns - turns)
+            self.turns = (t - self.first) / self.period
         return (self.start + k / self.n - self.turns) * self.period
 
 
@@ -171,27 +171,21 @@ class Drive:
         for _ in range(round(duration / self.dt)):
             self.step(self.zero, self.dt)
 
-    def course(self, duration: float) -> list[At]:
-        """Return the points after each step, without input."""
-        points = []
-        for _ in range(round(duration / self.dt)):
-            self.step(self.zero, self.dt)
-            points.append(self.here())
-        return points
-
-    def advance(self, u: Sequence[float], k: int) -> At:
-        """Hold the input until section k. Steps end on it if its time is known, or if the state can
-        be set; steps of fixed length end after it. A crossing counts after a step that ends before
-        it, so that none is counted twice."""
+    def advance(self, u: Sequence[float], k: int, points: list[At] | None = None) -> At:
+        """Hold the input until section k, and append the points before all steps. Steps end on the
+        section if its time is known, or if the state can be set; steps of fixed length end after
+        it. A crossing counts after a step that ends before it, so that none is counted twice."""
         phase, began, armed = self.phase, self.t, not self.phase.crossings
-        timed = phase.columns is None and armed and not self.fixed
+        timed = not phase.axes and armed and not self.fixed
         lands = self.sets and not self.fixed and not timed
         last = self.last if self.last.z else At(self.t, self.z)  # (a step may cross two sections)
         x, y = phase.level(k, last.t, last.z), phase.level(k, self.t, self.z)
         while y > 1e-9 * self.dt * timed or not armed:
             if self.t - began > self.longest:
                 raise ComputationError(f"a section was not reached within {self.longest:.4g}")
-            last, x = self.here() if lands else At(self.t, self.z), y
+            last, x = self.here() if lands or points is not None else At(self.t, self.z), y
+            if points is not None:
+                points.append(last)
             self.step(u, min(y, self.dt) if timed else self.dt)
             y = phase.level(k, self.t, self.z)
             armed = armed or y > 0
@@ -344,13 +338,10 @@ def _pack(drive: Drive) -> bytes:
 
     **Raises:** `DefinitionError` for a plant that cannot be pickled.
     """
-    module = sys.modules.get(type(drive.plant).__module__)
+    module, packer = sys.modules.get(type(drive.plant).__module__), pickle
     try:
-        try:
-            import cloudpickle as packer
-        except ImportError:
-            packer = pickle
-        else:
+        with contextlib.suppress(ImportError):
+            packer = importlib.import_module("cloudpickle")
             if module is not None and module.__spec__ is None:  # (in no file)
                 packer.register_pickle_by_value(module)
         return packer.dumps(drive)
