@@ -1,8 +1,8 @@
 """The limit cycle of a plant: the sections on it, outputs there, and experiments around it."""
 
 import dataclasses
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from itertools import starmap
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -11,13 +11,14 @@ from jaxtyping import Float
 
 from .._core.arguments import Numbers, require_among
 from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.containers import Names
 from .._core.boundary.kinds import FilePath, Index, Positive, Seed, SignalNames
 from .._core.boundary.values import Reals, Whole
 from .._core.execution import core_count
 from .._core.pieces.description import digest_of
 from .._core.progress import counted, working
 from .._core.results import Result
-from .._core.signal import Signal, signals, unit_of
+from .._core.signal import Signal, signals
 from .._core.text import listed
 from ..engine.trajectory import Trajectory
 from ..errors import ComputationError, DefinitionError
@@ -27,10 +28,12 @@ from ..experiments.run import DesignLike, check_inputs
 from ..identify.multiplier_estimate import MultiplierEstimate
 from ..orbits.crossing import Crossing
 from ..sections import families
-from ..systems.chart import FieldChart
-from ..systems.structure import Structure
-from ..systems.system import HybridSystem
+from ..systems import chart, structure, system
 from .drive import At, Drive, Phase, Plant, Trial, resume, run_all
+
+
+Draw = Callable[[Any], Any]
+Inputs = Annotated[Numbers, Reals("n inputs")]
 
 
 class Returns(MultiplierEstimate):
@@ -38,8 +41,7 @@ class Returns(MultiplierEstimate):
 
     **Fields** beside those of all estimates of multipliers:
 
-    - `coordinates`: names of the numbers that were perturbed. `state` (d,): their values on the
-      cycle, on section 0.
+    - `coordinates`: names of the numbers that were perturbed.
     - `noise` (d,): standard deviation of returns from nearly equal states.
     - `residual`: largest distance between state and return, in units of the range of the
       coordinate on the cycle.
@@ -47,18 +49,17 @@ class Returns(MultiplierEstimate):
       that they may have (0 if all are listed).
     """
 
-    state: Float[np.ndarray, " d"]
     noise: Float[np.ndarray, " d"]
     coordinates: tuple[str, ...] = eqx.field(static=True)
     residual: float = eqx.field(static=True)
     bound: float = eqx.field(static=True)
 
     def _about(self) -> str:
-        n, more = len(self.coordinates), len(self.coordinates) - len(self.multipliers)
-        return f"{more} more below {self.bound:.1g}; {n} coordinates, residual {self.residual:.1g}"
+        more = f"{len(self.coordinates) - len(self.multipliers)} more below {self.bound:.1g}"
+        return f"{more}; {len(self.coordinates)} coordinates, residual {self.residual:.1g}"
 
 
-class Recorded(HybridSystem):
+class Recorded(system.HybridSystem):
     """The signals of a plant as the states of a system that is only looked at."""
 
     states: tuple[str, ...] = eqx.field(static=True)
@@ -66,7 +67,7 @@ class Recorded(HybridSystem):
     time_unit, inputs = "s", ()
 
     def charts(self):
-        return {"plant": FieldChart(lambda t, q, u: 0 * q, self.states)}
+        return {"plant": chart.FieldChart(lambda t, q, u: 0 * q, self.states)}
 
     def draw(self, chart, t, q):
         return None if self.picture is None else self.picture(q)
@@ -95,12 +96,11 @@ class _Map:
         self.x, self.n = self.base[self.columns], cycle.sections.n_sections
         # (A perturbed state before a crossing must not return to it at once.)
         self.free = cycle.period / 2 if self.drive.phase.crossings else 0.0
-        points: list[At] = []
+        points = list[At]()
         self(self.x, points)
         rows = np.array([x.state for x in points], float)[:, self.columns]
-        self.size = np.ptp(rows, axis=0)
-        still = self.size <= 1e-9 * np.abs(rows).max(axis=0)
-        self.size[still] = np.where(self.x, np.abs(self.x), 1.0)[still]
+        size, top = np.ptp(rows, axis=0), np.abs(rows).max(axis=0)
+        self.size = np.where(size > 1e-9 * top, size, np.where(self.x, np.abs(self.x), 1.0))
         self.noise = self._noise()
         # Steps at which noise and the error of fourth order are nearly equal for a function of unit
         # derivatives; at most one percent of the range.
@@ -123,13 +123,11 @@ class _Map:
         2011, Estimating computational noise). Narrow spacing shows rounding and tolerances, wide
         spacing the events that move through the time steps of a simulator.
         """
-        rng = np.random.default_rng(0)
         noise = np.finfo(float).eps * np.maximum(np.abs(self.x), self.size)
-        for spacing in (1e-6, 1e-4, 1e-3):
-            along = rng.uniform(0.5, 1, len(self.x)) * rng.choice([-1, 1], len(self.x))
-            line = [self(self.x + j * spacing * self.size * along) for j in range(-7, 8)]
-            squares = np.diff(line, 4, axis=0) ** 2 / 70
-            noise = np.maximum(noise, np.sqrt(squares.mean(axis=0)))
+        signs = np.random.default_rng(0).choice([-1, 1], (3, len(self.x)))
+        for along in np.array([[1e-6], [1e-4], [1e-3]]) * self.size * signs:
+            line = [self(self.x + j * along) for j in range(-7, 8)]
+            noise = np.maximum(noise, np.sqrt((np.diff(line, 4, axis=0) ** 2 / 70).mean(axis=0)))
         return noise
 
     def slopes(self, steps: float) -> Any:
@@ -177,7 +175,6 @@ class SettledCycle:
     - `plant`, `sections`, `inputs`, `outputs`.
     - `period`: mean duration of a cycle.
     - `cycle_outputs` (N, ny): mean outputs at the sections.
-    - `noise` (N, ny): their standard deviations from cycle to cycle, without inputs.
     - `state`: that of the plant on section 0, if it can be set.
     """
 
@@ -187,7 +184,6 @@ class SettledCycle:
     outputs: tuple[Signal, ...]
     period: float
     cycle_outputs: Float[np.ndarray, "N ny"]
-    noise: Float[np.ndarray, "N ny"]
     state: Any
     drive: Drive = dataclasses.field(repr=False)
     seed: int = 0
@@ -233,31 +229,28 @@ class SettledCycle:
 
         def run(rows: list[int]) -> Iterator[Trial]:
             items = ((self.seed + 1 + s, u[s].tolist()) for s in rows)
-            yield from counted(run_all(self.drive, items, count, limit), "experiments", len(rows))
+            many = run_all(self.drive, items, count, limit) if count else None
+            yield from counted(many or starmap(self.drive.run, items), "experiments", len(rows))
 
         with working("run_experiments"):
             # (A plant is described by the cycle that was measured.)
             about = digest_of(self.outputs, self.cycle_outputs, self.sections, u, self.seed)
             trials = resume(store, about, len(u), run)
         # (Rows are as long as the inputs, and NaN from the end of an experiment on.)
-        ends, ny = [len(late) for _, late, _ in trials], len(self.outputs)
-        rows = np.full((*u.shape[:2], ny + 1), np.nan)
-        for s, (y, late, _) in enumerate(trials):
-            rows[s, : ends[s]] = np.c_[np.reshape(y, (-1, ny)), late]
-        causes = tuple(cause for _, _, cause in trials)
-        failed = np.array([x != "" for x in causes])
-        failed_at, label = np.where(failed, ends, -1), self.sections.label
-        return ExperimentData(
-            u,
-            rows[..., :ny] - np.tile(self.cycle_outputs, (u.shape[1] // N, 1)),
-            n_sections=N,
-            periods=inputs.periods,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            result=np.where(failed, Result.PLANT_STOPPED, Result.OK),
-            cycle_outputs=self.cycle_outputs,
-            simulated=Simulated(failed_at, None, label, rows[..., ny], causes),
+        rows = np.full((*u.shape[:2], len(self.outputs) + 1), np.nan)
+        for s, (values, _) in enumerate(trials):
+            rows[s, : len(values)] = np.reshape(values, (-1, rows.shape[2]))
+        causes = tuple(cause for _, cause in trials)
+        failed_at = np.array([len(values) if cause else -1 for values, cause in trials])
+        result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
+        simulated = Simulated(failed_at, None, self.sections.label, rows[..., -1], causes)
+        of_cycle = {"n_sections": N, "inputs": self.inputs, "outputs": self.outputs}
+        at, y = (
+            self.cycle_outputs,
+            rows[..., :-1] - np.tile(self.cycle_outputs, (len(u[0]) // N, 1)),
         )
+        given: Any = of_cycle | {"cycle_outputs": at, "periods": inputs.periods}
+        return ExperimentData(u, y, result=result, simulated=simulated, **given)
 
     def perturbed_returns(self, coordinates: SignalNames | None = None) -> Returns:
         """Estimate the multipliers from returns of perturbed states to section 0.
@@ -285,15 +278,11 @@ class SettledCycle:
         noise = np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / map.h
         # (A jump of the second derivative leaves in J an error as large as this difference.)
         error, scale = np.hypot(noise, J - coarse), map.size / map.size[:, None]
-        *estimate, bound = _resolved(J * scale, error * scale)
-        freedom = 10.0  # (eleven differences)
-        return Returns(*estimate, freedom, map.x, map.noise, map.names, residual, bound)
+        values, coefficients, spread, bound = _resolved(J * scale, error * scale)
+        # (10: eleven differences in each line.)
+        return Returns(values, coefficients, spread, 10.0, map.noise, map.names, residual, bound)
 
-    def trajectory(
-        self,
-        draw: Callable[[Any], Any] | None = None,
-        u: Annotated[Numbers, Reals("n inputs")] | None = None,
-    ) -> Trajectory:
+    def trajectory(self, draw: Draw | None = None, u: Inputs | None = None) -> Trajectory:
         """Record the signals after each step from section 0 on, for `hj.plot.animate`.
 
         **Arguments:**
@@ -307,8 +296,7 @@ class SettledCycle:
         """
         u = np.zeros((self.sections.n_sections, len(self.inputs))) if u is None else np.asarray(u)
         drive, points, result = self.drive, list[At](), Result.OK
-        drive.reset(self.seed)
-        drive.begin()
+        drive.begin(self.seed)
         try:
             for k, held in enumerate(u.tolist(), 1):
                 drive.advance(held, k, points)
@@ -316,13 +304,13 @@ class SettledCycle:
         except Exception:
             result = Result.PLANT_STOPPED
         q, t = np.array([x.z for x in points]), np.array([x.t for x in points])
-        n, s = len(t), Structure(Recorded(drive.names, draw))
+        n, s = len(t), structure.Structure(Recorded(drive.names, draw))
         rates, events = np.gradient(q, t, axis=0) if n > 1 else 0 * q, np.full(n, -1)
         return Trajectory(s, t - t[0], np.zeros(n, int), q, q, rates, rates, events, result)
 
     def __repr__(self) -> str:
         names = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        about = f"period {self.period:.9g}, {len(self.noise)} sections, {names}"
+        about = f"period {self.period:.9g}, {len(self.cycle_outputs)} sections, {names}"
         return f"SettledCycle({type(self.plant).__name__}: {about})"
 
 
@@ -379,17 +367,16 @@ def settle(
 
 def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
     """Record cycles, and prepare experiments. The plant is on section 0."""
-    N, plant = family.n_sections, drive.plant
+    N, plant, points = family.n_sections, drive.plant, list[At]()
 
-    def turn(points: list[At] | None = None) -> tuple[At, list[At]]:
+    def turn() -> tuple[At, list[At]]:
         start = drive.here()
         drive.phase.begin(drive.t, drive.z, on_section=True)
         return start, [drive.advance(drive.zero, k, points) for k in range(1, N + 1)]
 
     start, at = turn()
     drive.longest = 2 * (at[-1].t - start.t)
-    points: list[At] = []
-    turns = [turn(points) for _ in range(cycles + 1)]
+    turns = [turn() for _ in range(cycles + 1)]
     values = np.array([[[x.z[c] for c in drive.columns] for x in at] for _, at in turns])
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
     drive.start, at = turns[-1]
@@ -403,13 +390,11 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
         change = np.abs(np.array([x.z for x in turn()[1]]) - [x.z for x in at])
         if (change[:, list(drive.columns)] > 1e-6 * size).any():
             raise DefinitionError("`set_state` does not continue as before: save more.")
-    given, units = plant.inputs, getattr(plant, "units", {})
-    given = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
-    outputs = tuple(Signal(drive.names[c], units.get(drive.names[c], "")) for c in drive.columns)
-    about = plant, family, signals(given, given.values()), outputs
+    names, units = [drive.names[c] for c in drive.columns], getattr(plant, "units", {})
+    outputs = signals(names, [units.get(name, "") for name in names])
+    about = plant, family, Names(units=True, empty=True).take(plant.inputs), outputs
     period = float(np.diff([at[-1].t for _, at in turns]).mean())
-    measured = period, values.mean(axis=0), values.std(axis=0), drive.start.state
-    return SettledCycle(*about, *measured, drive, seed)
+    return SettledCycle(*about, period, values.mean(axis=0), drive.start.state, drive, seed)
 
 
 def _bound(drive: Drive, family: Any, turns: float) -> Phase:
@@ -425,7 +410,7 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     if type(family) not in kinds or isinstance(family.anchor, Crossing):
         text = "use KinematicPhase, Crossings of signals by name, or ClockPhase and a `period`"
         raise DefinitionError(f"{text}; an `anchor` must be a number.")
-    if isinstance(family, families.ClockPhase):
+    if period is not None and isinstance(family, families.ClockPhase):
         return Phase(N, period, float(family.anchor) * period)
     pair = family.position, family.velocity
     require_among("signal", pair, names, "KinematicPhase(position, velocity): ")
@@ -439,6 +424,6 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
             raise ComputationError(f"{pair} do not circle around {center}")
         drive.step(drive.zero, drive.dt)
         phase.level(0, drive.t, drive.z)
-    phase.sense = math.copysign(1, phase.turns - began)
+    phase.sense = float(np.sign(phase.turns - began))
     phase.first = float(family.anchor)
     return phase

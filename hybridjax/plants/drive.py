@@ -7,7 +7,6 @@ be ended one by one.
 
 import contextlib
 import dataclasses
-import importlib
 import json
 import math
 import os
@@ -16,7 +15,6 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -110,8 +108,8 @@ class At(NamedTuple):
     state: Any = None
 
 
-Trial = tuple[list[list[float]], list[float], str]
-"""One experiment: signals (n, ny) at the sections, lateness (n,), and the cause of its end, "" if
+Trial = tuple[list[list[float]], str]
+"""One experiment: signals at the sections and lateness (n, ny + 1), and the cause of its end, "" if
 it ran to its end."""
 
 
@@ -198,8 +196,7 @@ class Drive:
                     self.step(u, h)
                 return phase.level(k, self.t, self.z)
 
-            find: Any = optimize.brentq
-            level(find(level, 0.0, self.t - last.t, xtol=1e-9 * self.dt))
+            level(optimize.brentq(level, 0.0, self.t - last.t, xtol=1e-13 * self.dt))  # type: ignore
             return At(self.t, self.z)
         self.last, share = last, x / (x - y) if x > y else 1.0
         at = last.t + share * (self.t - last.t)
@@ -208,39 +205,34 @@ class Drive:
 
     def run(self, seed: int, u: Sequence[Sequence[float]]) -> Trial:
         """Run one experiment with inputs u (n, nu), each held until the next section."""
-        y: list[list[float]] = []
-        late: list[float] = []
+        rows, ended = list[At](), ""
         try:
-            if self._beginning(seed) != self._beginning(seed):
+            if self.begun(seed) != self.begun(seed):
                 raise ComputationError("the plant is not deterministic after `reset(seed)`")
-            self.reset(seed)
-            at = self.begin()
-            for k, held in enumerate(u, 1):
-                y.append([float(at.z[c]) for c in self.columns])
-                late.append(at.late)
-                if k < len(u):
-                    at = self.advance(held, k)
+            rows.append(self.begin(seed))
+            for k, held in enumerate(u[:-1], 1):
+                rows.append(self.advance(held, k))
         except Exception as error:
             told = isinstance(error, ComputationError)
             kind = "" if told else f"the plant raised {type(error).__name__}: "
-            return y, late, f"{kind}{error} (t = {self.t:.6g})"
-        return y, late, ""
+            ended = f"{kind}{error} (t = {self.t:.6g})"
+        return [[*(float(x.z[c]) for c in self.columns), x.late] for x in rows], ended
 
-    def _beginning(self, seed: int) -> Sequence[float]:
+    def begun(self, seed: int) -> Sequence[float]:
         """Return the signals after the first steps."""
         self.reset(seed)
         self.pass_time(16 * self.dt)
         return self.z
 
-    def begin(self) -> At:
+    def begin(self, seed: int) -> At:
         """Bring a plant to section 0."""
+        self.reset(seed)
         if self.sets:
             self.restore(self.start)
-            self.phase.begin(self.t, self.z, on_section=True)
-            return self.start
-        self.pass_time(self.warmup)
-        self.phase.begin(self.t, self.z)
-        return self.advance(self.zero, 0)
+        else:
+            self.pass_time(self.warmup)
+        self.phase.begin(self.t, self.z, on_section=self.sets)
+        return self.start if self.sets else self.advance(self.zero, 0)
 
 
 def serve() -> None:
@@ -259,33 +251,24 @@ def serve() -> None:
             answers.flush()
 
 
-def run_all(
-    drive: Drive, items: Iterable[tuple[int, Any]], processes: int, limit: float
-) -> Iterator[Trial]:
+def run_all(drive: Drive, items: Iterable[Any], processes: int, limit: float) -> Iterator[Trial]:
     """Run experiments (seed, inputs) in processes with a limit of time, and yield them in order.
     Processes that ended are replaced.
     """
-    if not processes:
-        yield from (drive.run(*item) for item in items)
-        return
-    packed, local, begun = _pack(drive), threading.local(), []
+    packed, local, begun = _pack(drive), threading.local(), list[Any]()
 
     def run(item: tuple[int, Any]) -> Trial:
-        if getattr(local, "worker", None) is None:
-            local.worker = _start(packed)
-            begun.append(local.worker)
-        worker, began = local.worker, time.monotonic()
-        timer = threading.Timer(limit, worker.kill)
+        local.worker = getattr(local, "worker", None) or _start(packed, begun)
+        worker, timer = local.worker, threading.Timer(limit, local.worker.kill)
         timer.start()
         try:
             pickle.dump(item, worker.stdin)
             worker.stdin.flush()
             answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
-            local.worker, code = None, worker.wait()
-            hung = time.monotonic() - began >= limit
+            local.worker, code, waits = None, worker.wait(), timer.is_alive()
             ended = f"the process ended with code {code} (its error is on standard error)"
-            return [], [], f"no answer within the limit of {limit:g} s" if hung else ended
+            return [], ended if waits else f"no answer within the limit of {limit:g} s"
         finally:
             timer.cancel()
         if isinstance(answer, str):
@@ -302,9 +285,7 @@ def run_all(
                 worker.communicate()
 
 
-def resume(
-    file: Any, about: str, count: int, run: Callable[[list[int]], Iterator[Trial]]
-) -> list[Trial]:
+def resume(file: Any, about: str, count: int, run: Callable[[list[int]], Any]) -> list[Trial]:
     """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends.
 
     **Raises:** `DefinitionError` for a file of another kind, or in a folder that is not there.
@@ -322,15 +303,15 @@ def resume(
     return [json.loads(kept[s]) for s in range(count)]
 
 
-def _start(packed: bytes) -> Any:
+def _start(packed: bytes, begun: list[Any]) -> Any:
     # (One thread of BLAS, because the processes use all cores.)
     path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), *sys.path]))
     command = [sys.executable, "-c", "from hybridjax.plants.drive import serve; serve()"]
     changes = {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     pipe, environment = subprocess.PIPE, os.environ | changes
-    worker: Any = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment)
-    pickle.dump(packed, worker.stdin)
-    return worker
+    begun.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment))
+    pickle.dump(packed, begun[-1].stdin)
+    return begun[-1]
 
 
 def _pack(drive: Drive) -> bytes:
@@ -341,9 +322,10 @@ def _pack(drive: Drive) -> bytes:
     module, packer = sys.modules.get(type(drive.plant).__module__), pickle
     try:
         with contextlib.suppress(ImportError):
-            packer = importlib.import_module("cloudpickle")
+            import cloudpickle as packer  # type: ignore
+
             if module is not None and module.__spec__ is None:  # (in no file)
-                packer.register_pickle_by_value(module)
+                packer.register_pickle_by_value(module)  # type: ignore
         return packer.dumps(drive)
     except Exception as error:
         text = "give it `__getstate__`, or use `processes=0`"
