@@ -196,7 +196,7 @@ class Drive:
                     self.step(u, h)
                 return phase.level(k, self.t, self.z)
 
-            level(optimize.brentq(level, 0.0, self.t - last.t, xtol=1e-13 * self.dt))  # type: ignore
+            level(optimize.brentq(level, 0.0, self.t - last.t, xtol=1e-11 * self.dt))  # type: ignore
             return At(self.t, self.z)
         self.last, share = last, x / (x - y) if x > y else 1.0
         at = last.t + share * (self.t - last.t)
