@@ -11,7 +11,6 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float
-from scipy.optimize import brentq
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Numbers, Share
@@ -300,6 +299,8 @@ class _Trace(NamedTuple):
 
         On the crossing of two branches itself no point can be computed, but beside it.
         """
+        from scipy.optimize import brentq  # (a third of a second)
+
         points, crossing = {0.0: a, 1.0: b}, False
 
         def test(where):

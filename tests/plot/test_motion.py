@@ -57,3 +57,8 @@ def test_no_input_gives_the_cycle():
     path = hj.experiments.perturbed_trajectory(placed, np.zeros((8, 1)))
     end = path.at(path.t[-1:])[1] - path.at(path.t[:1])[1]
     np.testing.assert_allclose(end, 0, atol=1e-9)
+    data = hj.ExperimentData(np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2)
+    motion = hj.plot.animate(cycle, sections=placed, perturbed=data)
+    assert abs(motion.interval * len(motion.times) - 2 * float(cycle.period)) < 1e-9
+    with pytest.raises(hj.DefinitionError, match="need their sections"):
+        hj.plot.animate(cycle, perturbed=data)
