@@ -51,7 +51,7 @@ class Easel:
     def image(self, moving: Sequence[Artist]) -> Image.Image:
         self._agg.restore_region(self._still)
         for artist in sorted(moving, key=lambda x: x.get_zorder()):
-            self._agg.figure.draw_artist(artist)
+            artist.draw(self._agg.get_renderer())  # (marimo gives the figure another canvas)
         return Image.fromarray(np.array(self._agg.buffer_rgba())[..., :3])
 
 
