@@ -21,7 +21,7 @@ from ..orbits.find import find_limit_cycle
 from ..systems.system import HybridSystem, unit_of_parameter
 from ..systems.varied import parameter_of, with_parameters
 from .film import Easel
-from .look import COLORS, CYCLE, style
+from .look import COLORS, CYCLE, close_in_notebook, style
 from .motion import portrait
 from .orbit import plane_of
 
@@ -94,7 +94,9 @@ class Explorer:
             gain.set(xlabel="input frequency (cycles/period)", ylabel=f"$|H_0|${pushed}")
             self._lost = self.figure.suptitle("", fontsize=8, color=COLORS["red"])
         self._easel: Easel | None = None
+        self._limits = np.zeros(0)
         self._draw()
+        close_in_notebook(self.figure)
 
     @checked
     def move(self, values: Mapping[str, float]) -> None:
@@ -145,7 +147,9 @@ class Explorer:
             if not all(ax.viewLim.contains(*corner) for corner in ax.dataLim.corners()):
                 ax.margins(0.2)
                 ax.autoscale_view()
-                self._easel = None
+        limits = np.stack([ax.viewLim.get_points() for ax in self._axes])
+        if not np.array_equal(limits, self._limits):
+            self._limits, self._easel = limits, None
 
     def show(self) -> None:
         """Open a window with the sliders (in scripts)."""
@@ -201,7 +205,6 @@ class Explorer:
         return {"picture": picture, "message": self.message, "gain": gain, "number": number}
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
-        pyplot.close(self.figure)  # the widget shows it
         try:
             self._widget = self.widget()
         except DefinitionError as error:

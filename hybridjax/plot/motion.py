@@ -28,7 +28,7 @@ from ..orbits.cycle import LimitCycle
 from ..sections.placed import PlacedSections
 from ..systems.structure import Structure
 from .film import BODY, frames, gif, player
-from .look import COLORS, CYCLE, axis_of, style
+from .look import COLORS, CYCLE, axis_of, close_in_notebook, style
 from .orbit import CHARTS, cycle as draw_cycle, pieces, plane_of
 from .over_parameters import branch as draw_branch
 from .pictures import Pictures, drawing_of
@@ -64,8 +64,7 @@ class Motion(FuncAnimation):
         options |= {"frames": len(times), "interval": 1000 * interval, "cache_frame_data": False}
         super().__init__(figure, draw, **options)
         self._draw_was_started = True  # else matplotlib warns of animations that are only saved
-        if "inline" in matplotlib.get_backend().lower():
-            pyplot.close(figure)  # a notebook shows the animation, and no still beside it
+        close_in_notebook(figure)
 
     @checked
     def save(self, path: FilePath) -> Path:  # type: ignore[override]
@@ -273,7 +272,7 @@ def _picture(ax: Axes, track: Track, shape: float) -> Draw:
         scene = scenes[k]
         for name, line in scene.lines.items():
             if name == "ground":
-                line = _to_borders(line, size)
+                line = to_borders(line, size)
                 marks.set_data(*_marks(line, scene.ground[0], spacing, size))
             shapes[name].set_data(*line.T)
         for name, (x, y, radius) in scene.circles.items():
@@ -285,7 +284,7 @@ def _picture(ax: Axes, track: Track, shape: float) -> Draw:
     return draw
 
 
-def _to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray, "k 2"]:
+def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray, "k 2"]:
     """A line with its ends beyond the borders of a picture of this size."""
     first, last = line[0] - line[1], line[-1] - line[-2]
     ends = [x + 5 * size * way / np.hypot(*way) for x, way in ((line[0], first), (line[-1], last))]
