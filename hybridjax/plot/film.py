@@ -103,8 +103,10 @@ _PNG = "data:image/png;base64,"
 
 
 def _encoded(image: Image.Image, clear: np.ndarray | bool = False) -> str:
-    picture = Image.fromarray(np.where(clear, 255, np.asarray(image)).astype(np.uint8), "P")
-    picture.putpalette(image.getpalette() or [])
+    # (The clear color is the last of the palette: browsers show one beyond its end as gray.)
+    last = len(_PALETTE)
+    picture = Image.fromarray(np.where(clear, last, np.asarray(image)).astype(np.uint8), "P")
+    picture.putpalette([*(image.getpalette() or [])[: 3 * last], 0, 0, 0])
     file = io.BytesIO()
-    picture.save(file, "png", optimize=True, **({} if clear is False else {"transparency": 255}))
+    picture.save(file, "png", optimize=True, **({} if clear is False else {"transparency": last}))
     return base64.b64encode(file.getvalue()).decode()
