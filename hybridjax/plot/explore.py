@@ -20,7 +20,7 @@ from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.system import HybridSystem, unit_of_parameter
 from ..systems.varied import parameter_of, with_parameters
-from .film import Easel
+from .film import PNG, Easel
 from .look import COLORS, CYCLE, close_in_notebook, style
 from .motion import portrait
 from .orbit import plane_of
@@ -201,7 +201,7 @@ class Explorer:
         self._easel = self._easel or Easel(self.figure, self._moving, 110)
         file = io.BytesIO()
         self._easel.image(self._moving).save(file, "png", compress_level=1)
-        picture = f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+        picture = PNG + base64.b64encode(file.getvalue()).decode()
         return {"picture": picture, "message": self.message, "gain": gain, "number": number}
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
@@ -209,7 +209,9 @@ class Explorer:
             self._widget = self.widget()
         except DefinitionError as error:
             return {"text/plain": f"Explorer without sliders: {error}"}
-        return self._widget._repr_mimebundle_(**options)
+        data, about = self._widget._repr_mimebundle_(**options)
+        still = self._widget.answer["picture"].removeprefix(PNG)  # where no kernel runs
+        return {**data, "text/plain": "Explorer", "image/png": still}, about
 
 
 @checked

@@ -94,12 +94,12 @@ def player(still: Image.Image, images: Sequence[Image.Image], interval: float, a
     frames = [_encoded(image, np.asarray(image) == np.asarray(still)) for image in images]
     return _PLAYER.format(
         id=f"motion-{uuid.uuid4().hex[:8]}", width=still.width * 2 // 3, alt=alt,
-        still=_PNG + _encoded(still), first=_PNG + frames[0], last=len(images) - 1,
+        still=PNG + _encoded(still), first=PNG + frames[0], last=len(images) - 1,
         frames=frames, milliseconds=round(1000 * interval),
     )  # fmt: skip
 
 
-_PNG = "data:image/png;base64,"
+PNG = "data:image/png;base64,"
 
 
 def _encoded(image: Image.Image, clear: np.ndarray | bool = False) -> str:
