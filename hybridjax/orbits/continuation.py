@@ -42,7 +42,7 @@ _ASIDE = (0.0, 1e-6, -1e-6, 1e-4, -1e-4, 1e-2, -1e-2)
 _SHORTEST = 1e-5
 
 Kind = Literal["fold", "branch point", "flip", "Neimark-Sacker"]
-KINDS = get_args(Kind)
+KINDS: tuple[str, ...] = get_args(Kind)
 
 
 class BranchPoint(NamedTuple):

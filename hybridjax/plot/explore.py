@@ -191,7 +191,7 @@ class Explorer:
             def _moved(self, change) -> None:
                 self.answer = explorer._answer(**change["new"])
 
-        first = {"values": self.values, "gain": True, "number": 0}
+        first: Any = {"values": self.values, "gain": True, "number": 0}
         return Sliders(sliders=sliders, asked=first, answer=self._answer(**first))
 
     def _answer(self, values: Mapping[str, float], gain: bool, number: int) -> dict[str, Any]:

@@ -164,9 +164,9 @@ def animate(
     if isinstance(motion, Branch):
         return _of_branch(motion, x, y, 1 / fps / (speed or 1.0))
     cycle = motion if isinstance(motion, LimitCycle) else None
-    if cycle is not None and isinstance(perturbed, ExperimentData):
-        if sections is None:
-            raise DefinitionError("data of experiments need their sections: give `sections`.")
+    if isinstance(perturbed, ExperimentData):
+        if cycle is None or sections is None:
+            raise DefinitionError("data of experiments need a limit cycle and their `sections`.")
         perturbed = perturbed_trajectory(sections, perturbed.u[0, : 4 * sections.n_sections])
     _require(cycle, motion.structure, sections, perturbed)
     s, unit = motion.structure, motion.system.time_unit

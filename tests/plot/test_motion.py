@@ -71,5 +71,5 @@ def test_no_input_gives_the_cycle():
     data = hj.ExperimentData(np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2)
     motion = hj.plot.animate(cycle, sections=placed, perturbed=data)
     assert abs(motion.interval * len(motion.times) - 2 * float(cycle.period)) < 1e-9
-    with pytest.raises(hj.DefinitionError, match="need their sections"):
+    with pytest.raises(hj.DefinitionError, match="and their `sections`"):
         hj.plot.animate(cycle, perturbed=data)
