@@ -56,7 +56,7 @@ def step_along(
 
 
 def linear_step(
-    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, by_stages: Callable
+    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, by_stages: Any = None
 ) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
     states, inputs and length of the step. Those of explicit methods come `by_stages` until they
@@ -118,6 +118,11 @@ def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Arr
     return of_lanes(t, q, u, g.place)
 
 
+def due(s: Structure, g: int, t: Times, u: Inputs) -> Times:
+    """The times of a scheduled transition that lie at t up to rounding."""
+    return s.kernel(_due, by_lane, g)(t, t[None], u)[0]
+
+
 def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) -> Expanded:
     """Outputs in chart a, and their derivatives."""
     return linear(s, _outputs, a, t, q, u, items)
@@ -167,6 +172,11 @@ def _enabled(kind: Kind, s: Structure, t, q, u, place):
 
 def _outputs(a: int, s: Structure, items: Items, t, q, u):
     return s.resolve_outputs(items)(a, t, q, u)
+
+
+def _due(g: int, s: Structure, t, q, u):
+    offset, period = s.transitions[g].guard.numbers(t)
+    return jnp.stack([offset + jax.lax.stop_gradient(jnp.round((t - offset) / period)) * period])
 
 
 def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q):

@@ -10,7 +10,6 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers, Positive, SignalNames
 from .._core.boundary.values import Reals
-from .._core.compilation import at_ease
 from .._core.executor import is_traced, to_host
 from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, unit_circle
 from .._core.meaning import code_digest
@@ -21,7 +20,6 @@ from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape, side_by_side
-from ..engine.move import Options
 from ..engine.replay import Link, divergence, links
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, recorded, simulate
@@ -305,8 +303,7 @@ class LimitCycle(eqx.Module):
     def _course(self) -> Course:
         require_x64()
         self.require_current()
-        map = self.return_map
-        return Course(self, map, self.legs, self.period, self.event_sequence, map.system)
+        return Course(self, self.return_map, self.period, self.event_sequence)
 
     def __repr__(self):
         if is_traced(self):
@@ -420,7 +417,7 @@ def fine_factors(map: ReturnMap) -> list[Matrix]:
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
     map = to_host(map)
-    lanes, tape = side_by_side(_turn(map, tangents=True))
+    lanes, tape = side_by_side(map.pieces(tangents=True))
     moves = links(map.structure, lanes, map.ends(), tape)
     frames = [_frame(map, link) for link in moves]
     factors: list[Matrix] = []
@@ -446,25 +443,17 @@ def log_determinant(map: ReturnMap) -> float:
     Steps of an implicit method lose a mode that decays within them; this gives its decay.
     """
     map = to_host(map)
-    return float(divergence(map.structure, *side_by_side(_turn(map))))
+    return float(divergence(map.structure, *side_by_side(map.pieces())))
 
 
 def orbit(map: ReturnMap, tapes: Tape | None = None) -> Trajectory:
     """One turn from the anchor, in the steps by which it is linearized, which its `tapes` may hold
     already, one for each piece."""
     map = to_host(map)
-    rows = to_host(_turn(map, tangents=True)[1] if tapes is None else tapes)
+    rows = to_host(map.pieces(tangents=True)[1] if tapes is None else tapes)
     pieces = [Tape(*x) for x in zip(*rows, strict=True)]
     begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
     return recorded(map.structure, begin, pieces, u, Result.OK)
-
-
-def _turn(map: ReturnMap, tangents: bool = False) -> tuple[Lanes, Tape]:
-    """The starts and tapes of the pieces of one turn."""
-    options = Options(tape=True, new_input=False, tangents=tangents)
-    with at_ease():
-        _, (lanes, _, tapes) = map.travel(map.anchor.q[:, 0], options)
-    return lanes, tapes
 
 
 def _frame(map: ReturnMap, move: Link) -> tuple[Matrix, Matrix]:

@@ -103,7 +103,7 @@ def fluctuations(
     s, flow = course.map.structure, course.linear_flow()
     levels, scatter = _at_events(s, guards, resets)
     course = to_host(course) if on_host(flow.q) else course
-    _, map, _, period, events, _ = course
+    _, map, period, events, _ = course
     xp, jumps = namespace(flow.q), flow.jumps
     (P, _, d), clocked, f = flow.q.shape, map.base is None, flow.field[0, 0]
     names = [s.transitions[g].name for g in events] or ([] if clocked else [str(map.base)])

@@ -313,7 +313,7 @@ def responses(course: Course, modes: int | None) -> Responses:
     """The responses of a cycle (see `LimitCycle.responses`)."""
     flow = course.linear_flow()
     host = on_host(flow.t)
-    _, map, _, period, events, _ = to_host(course) if host else course
+    _, map, period, events, _ = to_host(course) if host else course
     xp, clocked = namespace(flow.t), map.base is None
     free, _ = flow.forward()
     whole = flow.monodromy(free, map.valid)

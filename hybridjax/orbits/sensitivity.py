@@ -69,7 +69,7 @@ class Sensitivity(eqx.Module):
 def sensitivity(course: Course, parameter: str) -> Sensitivity:
     """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`)."""
     s, varied = course.map.structure, Varied(course.map.system, parameter)
-    course = course._replace(inputs=varied)
+    course = course._replace(parameter=parameter)
     flow = course.linear_flow()
     if on_host(flow.q):
         course = to_host(course)
