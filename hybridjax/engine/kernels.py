@@ -44,7 +44,9 @@ def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = Non
 
 def step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: Some = None) -> Step:
     """A step in chart a, without derivatives."""
-    return Step(*s.kernel(_field, _ByMethod(_step, s.method(a)), a)(t, q, u, h, some=some))
+    lanes = 1 if q.shape[-1] < 16 * _POINTS else 4 * _POINTS
+    of_lanes = s.kernel(_field, _ByMethod(_step, s.method(a)), a, lanes=lanes)
+    return Step(*of_lanes(t, q, u, h, some=some))
 
 
 def step_along(

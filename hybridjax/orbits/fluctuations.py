@@ -109,7 +109,7 @@ def fluctuations(
     names = [s.transitions[g].name for g in events] or ([] if clocked else [str(map.base)])
     n, E = d + 1 + len(names), len(names)
     # Noise in the states, collected over each piece.
-    B, (free, _), adjoint = _columns(s, flow, white), flow.forward(), flow.adjoint()
+    B, (free, _), adjoint = _columns(s, flow, white), flow.forward, flow.adjoint
     turned = xp.swapaxes(adjoint, -1, -2) @ B
     weight = (flow.length[:, None] * rule().weights)[..., None, None]
     collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Inexact, Int
 from .._core.boundary.checked import NeedsValues
 from .._core.executor import Array, is_inside_program, is_traced, namespace, scan, to_host
 from .._core.host_derivatives import by_columns
-from .._core.memo import Memory
+from .._core.memo import Memory, remembered
 from ..engine import kernels
 from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, Lanes, Tape, for_each_chart, side_by_side
 from ..engine.replay import Moves, Variation, recorded_moves
@@ -115,6 +115,7 @@ class LinearFlow(eqx.Module):
         shape = len(self.length), n * d, n * d
         return xp.linalg.inv(whole.reshape(shape)).reshape(-1, n, d, n, d)
 
+    @remembered
     def forward(self) -> tuple[Float[Array, "P K d d"], Float[Array, "P K d K d"]]:
         """Deviations at the nodes of each piece by that at its beginning, and by forces at the
         nodes (times the length of the piece)."""
@@ -124,6 +125,7 @@ class LinearFlow(eqx.Module):
         free = xp.concatenate([xp.broadcast_to(xp.eye(d), (len(free), 1, d, d)), free], axis=1)
         return free, xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
 
+    @remembered
     def adjoint(self) -> Float[Array, "P K d d"]:
         """Covectors at the nodes of each piece by that at its end."""
         xp, d = namespace(self.q), self.q.shape[2]

@@ -315,7 +315,7 @@ def responses(course: Course, modes: int | None) -> Responses:
     host = on_host(flow.t)
     _, map, period, events, _ = to_host(course) if host else course
     xp, clocked = namespace(flow.t), map.base is None
-    free, _ = flow.forward()
+    free, _ = flow.forward
     whole = flow.monodromy(free, map.valid)
     if not clocked:
         f = flow.field[0, 0]
@@ -326,7 +326,7 @@ def responses(course: Course, modes: int | None) -> Responses:
         raise DefinitionError("inside of jit and grad, `responses` needs the number of `modes`.")
     values, right, left = _modes(whole, map.sizes, modes)
     exponents = xp.log(values) / period
-    adjoint, to_go = flow.adjoint(), period - (flow.t - flow.t[0, 0])
+    adjoint, to_go = flow.adjoint, period - (flow.t - flow.t[0, 0])
 
     def nodes(ends):
         return xp.einsum("pkij,pjr->rpki", adjoint, flow.backward(adjoint, xp.stack(ends, axis=1)))

@@ -81,7 +81,7 @@ def _sensitivity(course: Course, flow: LinearFlow, s: Structure, varied: Varied)
     map, period, xp = course.map, course.period, namespace(flow.q)
     clocked, f0, jumps = map.base is None, flow.field[0, 0], flow.jumps
     due = _due(flow, course.events, varied)
-    free, forced = flow.forward()
+    free, forced = flow.forward
     force = flow.by_input[..., 0] * flow.length[:, None, None]
     pushed = xp.einsum("piakb,pkb->pia", forced, force)
     kick = jumps.by_input[..., 0] + jumps.slip * due[:, None]
