@@ -44,9 +44,7 @@ def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = Non
 
 def step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: Some = None) -> Step:
     """A step in chart a, without derivatives."""
-    lanes = 1 if q.shape[-1] < 16 * _POINTS else 4 * _POINTS
-    of_lanes = s.kernel(_field, _ByMethod(_step, s.method(a)), a, lanes=lanes)
-    return Step(*of_lanes(t, q, u, h, some=some))
+    return Step(*s.kernel(_field, _ByMethod(_step, s.method(a)), a)(t, q, u, h, some=some))
 
 
 def step_along(
@@ -136,7 +134,8 @@ def linear(
     """A vector function (chart, structure, *trees, t, q, u) of chart a, and its derivatives."""
     if not on_host(q):
         return s.by_lane(_columns(ft.partial(function, a), 1 + len(trees)), *trees)(t, q, u)
-    return s.kernel(function, _expanded, a, trees=trees, lanes=_POINTS)(t, q, u)
+    lanes = _POINTS if q.shape[-1] < 16 * _POINTS else 4 * _POINTS
+    return s.kernel(function, _expanded, a, trees=trees, lanes=lanes)(t, q, u)
 
 
 def levels(

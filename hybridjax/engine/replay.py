@@ -192,7 +192,9 @@ class Variation:
         along = along._replace(
             t=along.t + aside[0], q=along.q + aside[1:], lane=lane, h=along.h + 0j
         )
-        for g in np.intersect1d(moves.code, [g for a in range(len(s.charts)) for g in s.schedules(a)]):
+        for g in np.intersect1d(
+            moves.code, [g for a in range(len(s.charts)) for g in s.schedules(a)]
+        ):
             at = along.code == g
             end, u = along.t[at].real + along.h[at].real, kernels.unpushed(s, lane[at])
             along.h[at] = kernels.due(s, g, end, u) - along.t[at]

@@ -96,7 +96,9 @@ def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Float[np.nda
     k = np.arange(n)
     at = np.pi * (k + 0.5) / n
     series = np.cos(np.outer(np.arccos(np.clip((f - middle) / half, -1, 1)), k))
-    return middle + half * np.cos(at), series @ (np.cos(np.outer(k, at)) * (2 - (k == 0))[:, None] / n)
+    return middle + half * np.cos(at), series @ (
+        np.cos(np.outer(k, at)) * (2 - (k == 0))[:, None] / n
+    )
 
 
 def _transfer(
@@ -142,7 +144,9 @@ def _transfer(
     waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / period))
     weighted = waves * h[:, None] * rule().weights
     of_states = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ free).reshape(P, -1, K) @ back
-    of_states = xp.moveaxis(of_states.reshape(P, rows, d, -1), (3, 1), (0, 1)).reshape(-1, rows, P * d)
+    of_states = xp.moveaxis(of_states.reshape(P, rows, d, -1), (3, 1), (0, 1)).reshape(
+        -1, rows, P * d
+    )
     H = xp.moveaxis(of_states @ xp.moveaxis(x, 3, 0).reshape(-1, P * d, nu + d), 0, -1)
     of_push = (by_state @ push.reshape(P, K, d, -1)).reshape(P, -1, K) @ inside
     driven = of_push.reshape(P * K, -1, len(coarse)) * back.reshape(P * K, 1, -1)

@@ -27,7 +27,7 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled
 from ..systems.varied import Varied
-from .return_map import ReturnMap, with_derivatives
+from .return_map import ReturnMap, Turn, with_derivatives
 from .scale import has_implicit
 
 
@@ -171,7 +171,14 @@ class LinearFlow(eqx.Module):
         return xp.where(valid[:, None] & valid, whole, 0.0)
 
 
-_flows = Memory()
+_flows, _turns = Memory(), Memory()
+
+
+def keep_turn(cycle: Any, turn: Turn) -> None:
+    """Keep the steps of a cycle's last turn for its linearization."""
+    if turn.tapes is not None:
+        record = to_host((turn.legs, turn.tapes))
+        _turns.recall(cycle, None, lambda: (record[0], side_by_side(record[1])))
 
 
 class Course(NamedTuple):
@@ -219,7 +226,7 @@ def _linear_flow(cycle, parameter: str | None, longest: float, by: Any = None) -
     map, nodes, K = to_host(cycle.return_map), rule().nodes, NODES
     s, of = map.structure, _with_input(map.system, parameter)
     d, period, D, tiny = s.d, float(map.expected), 1, 1j * kernels.TINY
-    lanes, tape = side_by_side(map.pieces(tangents=True))
+    lanes, tape = _turns.recall(cycle, None, lambda: side_by_side(map.pieces(tangents=True)))
     moves = recorded_moves(lanes, tape)
     t, q = np.append(moves.t, map.anchor.t[0] + period)[:, None], moves.q.T[..., None]
     if by is not None:
@@ -321,7 +328,7 @@ def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:
     def work(a, here, out):
         n = s.dims[a]
         point = t[here], q[:n, here], u[:, here], h[here]
-        if isinstance(s, kernels.Tangents):
+        if s.method(a).implicit or isinstance(s, kernels.Tangents):  # (compiled already)
             out[:n, here] = kernels.linear_step(s, a, *point)[:, 0]
         else:
             out[:n, here] = kernels.step(s, a, *point).q
@@ -337,7 +344,11 @@ def _jumps(s: Structure, t, q, u, f, after, code, events) -> Jumps:
     out = Jumps(*(np.zeros(shape, f.dtype) for shape in shapes))
     out.by_state[:] = np.eye(d)
     for g in set(events):
-        now, tr, a = np.flatnonzero(code == g), s.transitions[g], s.chart_index(s.transitions[g].source)
+        now, tr, a = (
+            np.flatnonzero(code == g),
+            s.transitions[g],
+            s.chart_index(s.transitions[g].source),
+        )
         n, delay = s.dims[a], np.ones(len(now))
         point = t[now], q[now, :n].T, u[:, now]
         by = np.moveaxis(kernels.linear_reset(s, s.member(g), *point), -1, 0)
