@@ -1,4 +1,4 @@
-"""Periodic systems as time-invariant ones, whose samples are whole periods; python-control, scipy.
+"""Periodic systems as time-invariant ones: lifted, with samples of whole periods; harmonic.
 
 Lifting (Bittanti and Colaneri, *Periodic Systems*, 2009, sec. 6.2) stacks the inputs and outputs of
 all sections of a period.
@@ -12,12 +12,15 @@ import numpy as np
 
 from .._core.arguments import package
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Positive
+from .._core.boundary.kinds import Count, Positive, SignalNames
 from .._core.executor import is_traced
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
+from ..orbits.continuous_htf import HarmonicStateSpace, harmonic_state_space
+from ..orbits.cycle import LimitCycle
+from ..systems.system import OutputNames
 
 
 @checked
@@ -91,6 +94,32 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     frequencies = 2 * np.pi * np.asarray(thing.f) / period
     about = {"inputs": inputs, "outputs": outputs, "sysname": "HTF"}
     return package("control").FrequencyResponseData(H, frequencies, **about)
+
+
+@checked
+def to_harmonic_state_space(
+    cycle: LimitCycle,
+    order: Count | None = None,
+    *,
+    outputs: OutputNames | None = None,
+    inputs: SignalNames | None = None,
+    tolerance: Positive = 1e-6,
+) -> HarmonicStateSpace:
+    """Return the harmonic state space of a cycle: Toeplitz matrices of the Fourier coefficients of
+    its linearization in continuous time, truncated at an order (see `HarmonicStateSpace`).
+
+    `cycle.htf` gives the same responses without truncation.
+
+    **Arguments:**
+
+    - `order`: the largest harmonic. Default: the first of 2, 4, ..., 64 whose `error` beside
+        `cycle.htf` is below `tolerance` (Default: 1e-6).
+    - `outputs`, `inputs`: as of `LimitCycle.htf`.
+
+    **Raises:** `DefinitionError` for cycles with events at which deviations jump;
+    `ComputationError` if no order is large enough.
+    """
+    return harmonic_state_space(cycle._course(), order, tolerance, outputs, inputs)
 
 
 @checked

@@ -21,6 +21,7 @@ from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method, Radau, as_method
 from ..systems.structure import Kind, Member, Structure, stacked
 from ..systems.system import Output
+from ..systems.transition import Scheduled
 from .arrays import AnyInputs as Inputs, AnyTimes as Times, Array, States
 from .runge_kutta import Step, integrated_divergence, step_along as _along, take_step
 from .target import AbstractLevels
@@ -176,7 +177,9 @@ def _outputs(a: int, s: Structure, items: Items, t, q, u):
 
 
 def _due(g: int, s: Structure, t, q, u):
-    offset, period = s.transitions[g].guard.numbers(t)
+    guard = s.transitions[g].guard
+    assert isinstance(guard, Scheduled)
+    offset, period = guard.numbers(t)
     return jnp.stack([offset + jax.lax.stop_gradient(jnp.round((t - offset) / period)) * period])
 
 

@@ -189,15 +189,13 @@ class Variation:
         aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), len(moves.t))
         along = Moves(*map(many, moves))
         lane = along.lane * (n + P) + np.arange(len(along.t)) % (n + P)
-        along = along._replace(
-            t=along.t + aside[0], q=along.q + aside[1:], lane=lane, h=along.h + 0j
-        )
-        for g in np.intersect1d(
-            moves.code, [g for a in range(len(s.charts)) for g in s.schedules(a)]
-        ):
+        t, q, h = along.t + aside[0], along.q + aside[1:], along.h + 0j
+        for g, transition in enumerate(s.transitions):
             at = along.code == g
-            end, u = along.t[at].real + along.h[at].real, kernels.unpushed(s, lane[at])
-            along.h[at] = kernels.due(s, g, end, u) - along.t[at]
+            if isinstance(transition.guard, Scheduled) and at.any():
+                end, u = (t + h).real[at], kernels.unpushed(s, lane[at])
+                h[at] = kernels.due(s, g, end, u) - t[at]
+        along = along._replace(t=t, q=q, h=h, lane=lane)
         later = np.concatenate([np.zeros((n, len(lanes.t))), times]).T.ravel()
         target = dataclasses.replace(
             target, time=many(target.time) + 1j * kernels.TINY * later,

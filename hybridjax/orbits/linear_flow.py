@@ -105,6 +105,10 @@ class LinearFlow(eqx.Module):
         """Times of the beginnings of the pieces, from that of the turn."""
         return self.t[:, 0] - self.t[0, 0]
 
+    def after(self, map: ReturnMap) -> Float[Array, "P K"]:
+        """Times of the nodes: those of the clock, or since the anchor of an autonomous cycle."""
+        return self.t if map.base is None else self.t - self.t[0, 0]
+
     def _implicit(self, sign: float, rows: slice, matrix: Float[Array, "P K d d"]):
         """The inverse of (derivative + sign h matrix) on some of the nodes."""
         d, D = self.q.shape[2], rule().derivative[rows, rows]
@@ -215,7 +219,7 @@ def _with_input(system: HybridSystem, parameter: str | None) -> Structure:
 _STEPS = 4
 
 
-def _linear_flow(cycle, parameter: str | None, longest: float, by: Any = None) -> LinearFlow:
+def _linear_flow(cycle: Any, parameter: str | None, longest: float, by: Any = None) -> LinearFlow:
     """The flow linearized at nodes of pieces, whose states follow from the recorded steps; or its
     derivatives in the directions `by` of the cycle."""
     if is_traced(cycle) or is_inside_program():
@@ -231,10 +235,14 @@ def _linear_flow(cycle, parameter: str | None, longest: float, by: Any = None) -
     t, q = np.append(moves.t, map.anchor.t[0] + period)[:, None], moves.q.T[..., None]
     if by is not None:
         D = len(jax.tree_util.tree_leaves(by)[0])
-        tangents = _along(map, lanes, tape, by, D)
+        inputs = by.structure
+        if isinstance(of.system, Varied):
+            inputs = Structure(eqx.tree_at(lambda x: x.system, of.system, inputs.system))
+        s, of = (
+            kernels.Tangents(x, y, None, None, D) for x, y in ((s, by.structure), (of, inputs))
+        )
+        tangents = _along(s, map, lanes, tape, by)
         t, q = t + tiny * tangents[:, 0], q + tiny * tangents[:-1, 1:]
-        of = kernels.Tangents(of, _varied(of, by.structure), None, None, D)
-        s = kernels.Tangents(s, by.structure, None, None, D)
     # Pieces of several steps, each divided into some parts.
     first = _first(s, moves, np.diff(t.real[:, 0]), longest * period)
     last = np.append(first[1:], len(moves.t)) - 1
@@ -256,10 +264,9 @@ def _linear_flow(cycle, parameter: str | None, longest: float, by: Any = None) -
     with_field = with_derivatives(of, ft.partial(kernels.field, of), *at)
     lay = lambda x: np.moveaxis(x.reshape(*x.shape[:-1], P, K, D), (-1, -3, -2), (0, 1, 2))  # noqa: E731
     states, f = lay(states), lay(with_field[:, 0])
-    end = np.moveaxis(time[:, -1], -1, 0).ravel(), states[:, :, -1].reshape(-1, d)
-    fields = (x.reshape(-1, d) for x in (f[:, :, -1], np.roll(f[:, :, 0], -1, axis=1)))
     u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(D), P))
-    jumps = _jumps(of, *end, u, *fields, np.tile(code, D), cycle.event_sequence)
+    ends = (x.reshape(-1, d) for x in (states[:, :, -1], f[:, :, -1], np.roll(f[:, :, 0], -1, 1)))
+    jumps = _jumps(of, np.tile(code, D), time[:, -1].T.ravel(), u, *ends)
     jumps = Jumps(*(x.reshape(D, P, *x.shape[1:]) for x in jumps))
     arrays = LinearFlow(
         lay(time.ravel()), (h / parts).T, None, None, states, f,
@@ -271,28 +278,21 @@ def _linear_flow(cycle, parameter: str | None, longest: float, by: Any = None) -
     return dataclasses.replace(arrays, chart=moves.chart[first], event=code)
 
 
-def _along(map: ReturnMap, lanes: Lanes, tape: Tape, by: Any, D: int) -> Float[np.ndarray, "M n D"]:
+def _along(
+    s: kernels.Tangents, map: ReturnMap, lanes: Lanes, tape: Tape, by: Any
+) -> Float[np.ndarray, "M n D"]:
     """Tangents of times and states at the starts of recorded moves and at the end of the turn."""
-    ends, begin, longer = map.ends(), np.zeros((1 + map.structure.d, D)), np.zeros(D)
+    ends, begin = map.ends(), np.zeros((1 + s.d, s.directions))
     begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
     begin[1:] = 0.0 if by.anchor.q is None else by.anchor.q[..., 0].T
-    longer = np.zeros(D) if by.period is None else by.period
+    longer = 0.0 if by.period is None else by.period
     # A turn that ends on a section ends at a time, too.
     start, full = map.anchor.t[0], map.expected
-    ends = dataclasses.replace(
-        ends, time=np.where(np.isfinite(ends.time), ends.time, start + full), levels=None
-    )
+    time = np.where(np.isfinite(ends.time), ends.time, start + full)
     tape = tape._replace(code=np.where(tape.code == ARRIVE_LEVEL, ARRIVE_TIME, tape.code))
-    times = begin[0][:, None] + longer[:, None] * (ends.time - start) / full
-    s = kernels.Tangents(map.structure, by.structure, None, None, D)
+    times = begin[0][:, None] + np.outer(longer, (time - start) / full)
+    ends = dataclasses.replace(ends, time=time, levels=None)
     return Variation(s, lanes, ends, tape, times).tangents(begin)
-
-
-def _varied(of: Structure, by: Structure) -> Structure:
-    """Directions of the system with its inputs, from those of the system."""
-    if not isinstance(of.system, Varied):
-        return by
-    return Structure(eqx.tree_at(lambda x: x.system, of.system, by.system))
 
 
 def of_flow(tangents: Any) -> Any:
@@ -303,10 +303,14 @@ def of_flow(tangents: Any) -> Any:
     return dataclasses.replace(nothing, **moving)
 
 
+def _flow_along(arguments: tuple, by: tuple) -> tuple[LinearFlow, LinearFlow]:
+    cycle, parameter, longest = arguments
+    flow = _linear_flow(cycle, parameter, longest)
+    return flow, _linear_flow(cycle, parameter, longest, by[0])
+
+
 _of_cycle = by_columns(
-    _linear_flow,
-    lambda x, along: (_linear_flow(*x), _linear_flow(*x, along[0])),
-    lambda tangents: (of_flow(tangents[0]), *tangents[1:]),
+    _linear_flow, _flow_along, lambda tangents: (of_flow(tangents[0]), *tangents[1:])
 )
 
 
@@ -337,13 +341,13 @@ def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:
     return for_each_chart(s, chart, np.ones(len(t), bool), work, np.zeros_like(q))
 
 
-def _jumps(s: Structure, t, q, u, f, after, code, events) -> Jumps:
+def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
     """The events at the ends of pieces, with the fields f before and `after` them."""
     P, d = f.shape
     shapes = (P, d, d), (P, d, s.nu), (P, d), (P, s.nu), (P, d), (P,)
     out = Jumps(*(np.zeros(shape, f.dtype) for shape in shapes))
     out.by_state[:] = np.eye(d)
-    for g in set(events):
+    for g in np.unique(code[code >= 0]):
         now, tr, a = (
             np.flatnonzero(code == g),
             s.transitions[g],

@@ -106,16 +106,14 @@ def _sensitivity(course: Course, flow: LinearFlow, s: Structure, varied: Varied)
     change = xp.einsum("pkab,pb->pka", free, starts) + pushed
     late = xp.einsum("pa,pa->p", jumps.delay_by_state, change[:, -1])
     late = late + jumps.delay_by_input[:, 0] + due
-    time = flow.t
     if not clocked:  # phase 0 stays on the section
-        time = flow.t - flow.t[0, 0]
         if isinstance(map.base, AtEvent):
             ahead = late[-1] - longer
         else:
             by_state, by_parameter = to_section(course, f0)
             ahead = by_state @ begin + by_parameter
         change, late = change + ahead * flow.field, late - ahead
-    change = change + flow.field * (time / period * longer)[..., None]
+    change = change + flow.field * (flow.after(map) / period * longer)[..., None]
     place = xp.argsort(flow.event < 0, stable=True)[: len(course.events)]
     times = late[place]
     wrapped = xp.concatenate([times[1:], times[:1] + longer]) - times

@@ -352,12 +352,13 @@ class _Half(DerivedChart):
 
     def copied(self, x: Transition, when: str) -> Transition:
         """A transition of this half; the clock goes on."""
+        at, guard, kept = self.lifted, x.guard, slice(len(self.chart.states), None)
         if isinstance(tick := x.guard, Scheduled):
-            wave = lambda t, q, u: jnp.sin(2 * jnp.pi * (t - tick.offset) / tick.period)  # noqa: E731
-            x = dataclasses.replace(x, guard=wave, direction="rising")
-        at, kept = self.lifted, slice(len(self.chart.states), None)
+            guard = lambda t, q, u: jnp.sin(2 * jnp.pi * (t - tick.offset) / tick.period)  # noqa: E731
+            x = dataclasses.replace(x, direction="rising")
+        assert callable(guard)
         reset = lambda t, q, u: jnp.append(as_vector(at(x.reset)(t, q, u)), q[kept])  # noqa: E731
-        copy = dataclasses.replace(x, guard=at(x.guard), reset=reset)
+        copy = dataclasses.replace(x, guard=at(guard), reset=reset)
         copy = dataclasses.replace(copy, enabled=x.enabled and at(x.enabled))
         return dataclasses.replace(copy, source=x.source + when, target=x.target + when)
 

@@ -242,6 +242,18 @@ def test_mathieus_equation_has_the_published_continuous_htf():
         htf.predict(np.ones((32, 1)))
 
 
+def test_harmonic_state_spaces_converge_to_the_exact_htf():
+    cycle = hj.find_limit_cycle(hj.models.Mathieu())
+    space = hj.convert.to_harmonic_state_space(cycle, outputs="x", tolerance=1e-12)
+    H = space.transfer(0.25, float(cycle.period))[0, space.order - 1 : space.order + 2, 0, 0]
+    exact = cycle.htf(0.25, (-1, 0, 1), "x").H[:, 0, 0, 0]
+    np.testing.assert_allclose(H, exact, rtol=1e-11)
+    assert space.error < 1e-12 and space.order == 8
+    assert hj.convert.to_harmonic_state_space(cycle, 1).error > 1e-3
+    with pytest.raises(hj.DefinitionError, match="has events at which deviations jump"):
+        hj.convert.to_harmonic_state_space(hj.find_limit_cycle(Neuron()))
+
+
 def test_the_continuous_htf_of_a_speed_that_jumps_is_that_of_the_derivative_of_the_height():
     """With the impulses of the speed at impacts whose time moves."""
     cycle = hj.find_limit_cycle(Juggler(), hj.Guess("flight", (0.2, 4.5), time=0.1))

@@ -1,14 +1,12 @@
 """Cycles modulo a symmetry: the walker in full, with two legs that have names and a place."""
 
-import functools as ft
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.systems.chart import FieldChart
 from hybridjax.models.walkers import _heelstrike
+from hybridjax.systems.chart import FieldChart
 
 
 hj.enable_x64()
@@ -143,10 +141,9 @@ class Inverter(hj.HybridSystem):
     early: float = 0.125
 
     def charts(self):
-        field = lambda side, t, q, u: (side - q[0] - 0.3 * q[0] ** 3,)
         return {
-            name: FieldChart(ft.partial(field, side), ("i",))
-            for name, side in (("plus", 1.0), ("minus", -1.0))
+            name: FieldChart(lambda t, q, u, v=v: (v - q[0] - 0.3 * q[0] ** 3,), ("i",))
+            for name, v in (("plus", 1.0), ("minus", -1.0))
         }
 
     def transitions(self):
