@@ -4,6 +4,7 @@ A picture holds numbers that it draws, with which a test compares new ones.
 """
 
 import json
+import re
 from pathlib import Path
 
 import matplotlib
@@ -57,9 +58,18 @@ def drawn(name: str) -> list[list[float]]:
         return json.loads(picture.info["Comment"])
 
 
+def of_page() -> pyplot.Figure:
+    """The figure that the page on responses draws."""
+    text = (IMAGES.parent / "how-to" / "responses.md").read_text()
+    page: dict = {}
+    exec("".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), page)
+    return page["figure"]
+
+
 if __name__ == "__main__":
     matplotlib.use("Agg")
     hj.enable_x64()
+    of_page().savefig(IMAGES / "converter.png", metadata={"Software": None})
     walk().save(IMAGES / "walk.gif")
     for name, plot in draw().items():
         about = {"Comment": json.dumps(numbers(plot)), "Software": None}

@@ -311,7 +311,7 @@ def _flow_along(arguments: tuple, by: tuple) -> tuple[LinearFlow, LinearFlow]:
 
 
 _of_cycle = by_columns(
-    _linear_flow, _flow_along, lambda tangents: (of_flow(tangents[0]), *tangents[1:])
+    _linear_flow, _flow_along, lambda tangents: (of_flow(tangents[0]), *tangents[1:]), np.inf
 )
 
 
