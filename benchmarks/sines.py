@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.orbits.linear_flow import rule
+from hybridjax.orbits.linear_flow import linear_flow, rule
 from hybridjax.systems.chart import FieldChart
 from hybridjax.systems.system import Driven
 
@@ -101,7 +101,7 @@ def clocked(system, outputs, size):
 
     def mean(size, angle):
         push = Wave(*map(jnp.asarray, (size, angle, np.pi / 2 / period)))
-        flow = hj.find_limit_cycle(Pushed(system, push), begin)._course().linear_flow(1 / 64)
+        flow = linear_flow(hj.find_limit_cycle(Pushed(system, push), begin), 1 / 64)
         y = np.take_along_axis(flow.q, columns[flow.chart][:, None], axis=2)
         weight = flow.length[:, None] * rule().weights / (4 * period)
         return np.einsum("pk,pky->y", weight * np.exp(-2.5j * np.pi * flow.t / period), y)

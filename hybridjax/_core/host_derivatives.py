@@ -56,8 +56,8 @@ def by_columns(
     direction moves a single number of the arguments: `directions` is a tree of their form with
     arrays (P, ...), and `None` for what does not move; so is the second result. Values are
     concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
-    raises `NotOnHostError`, or more than `most` numbers move, derivatives are compiled, as inside of programs.
-    `relevant` replaces tangents that make no difference by `None`.
+    raises `NotOnHostError`, or more than `most` numbers move, derivatives are compiled, as inside
+    of programs. `relevant` replaces tangents that make no difference by `None`.
     """
     derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
 

@@ -6,7 +6,7 @@ turn; the Fourier integral is a sum over the same nodes, interrupted at events (
 N. M. Wereley, Analysis and control of linear periodically time varying systems, MIT 1991).
 """
 
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -15,14 +15,14 @@ from .._core.boundary.kinds import SignalNames
 from .._core.compilation import at_ease
 from .._core.executor import Array, namespace, on_host, scan, to_host
 from ..engine import kernels
-from ..errors import ComputationError, DefinitionError
+from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics, check_harmonics
 from ..linear.htf import HTF
 from ..systems.check import check_output
 from ..systems.structure import Outputs, Structure
 from ..systems.system import Output, OutputNames
-from .linear_flow import Course, LinearFlow, rule
-from .return_map import ReturnMap, with_derivatives
+from .linear_flow import LinearFlow, linear_flow, rule
+from .return_map import ReturnMap
 
 
 # Largest angle by which an input, or a harmonic of the output, turns within a piece. Larger:
@@ -34,10 +34,6 @@ _POLE = 1e-9
 # Chebyshev's frequencies beyond those that sines need, by the cube root of their angle. Fewer:
 # responses lose digits. More: calls take longer.
 _EXTRA = 12
-# The largest order of truncated series that is tried, and frequencies of the comparison, in cycles
-# per period. More: calls take longer. Fewer: an error between them is not seen.
-_MOST = 64
-_TRIED = np.array([0.13, 0.37, 0.5])
 # Pieces times frequencies of one call. More: gigabytes of memory. Fewer: calls are refused that a
 # machine can do.
 _LARGEST = 2**21
@@ -45,12 +41,9 @@ _LARGEST = 2**21
 
 def observed(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, Array, Array]:
     """Outputs at the nodes (P, K, ny), and their derivatives by states and inputs."""
-    xp, (P, K, d), ny = namespace(flow.q), flow.q.shape, len(z.names)
-    chart, t, q = xp.repeat(flow.chart, K), flow.t.ravel(), flow.q.reshape(P * K, d).T
     outputs = lambda a, *point: kernels.outputs(s, a, tuple(z.items), *point)  # noqa: E731
-    by = with_derivatives(s, outputs, chart, t, q, ny)
-    by = xp.moveaxis(by, -1, 0).reshape(P, K, ny, -1)
-    return by[..., 0], by[..., 2 : 2 + d], by[..., 2 + d :]
+    by = flow.evaluated(s, outputs, len(z.names))
+    return by[..., 0], by[..., 2 : 2 + s.d], by[..., 2 + s.d :]
 
 
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
@@ -66,19 +59,19 @@ def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> flo
     return longest
 
 
-def _asked(course: Course, outputs: OutputNames | None, inputs: SignalNames | None):
+def asked(cycle: Any, outputs: OutputNames | None, inputs: SignalNames | None):
     """Outputs that exist all along the cycle, and the names and indices of inputs."""
-    s = course.map.structure
+    s = cycle.structure
     z = s.resolve_outputs(s.states_everywhere() if outputs is None else outputs)
     for x in (x for x in z.items if isinstance(x, Output)):
         list(check_output(s, x))
-    for name in {s.transitions[g].source for g in course.events} or s.names:
+    for name in {s.transitions[g].source for g in cycle.event_sequence} or s.names:
         z.require(s.chart_index(name))
     return z, *s.inputs_among(inputs)
 
 
 def continuous_htf(
-    course: Course,
+    cycle: Any,
     f: Frequencies,
     harmonics: Harmonics,
     outputs: OutputNames | None,
@@ -86,78 +79,12 @@ def continuous_htf(
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
     harmonics, frequencies = check_harmonics(harmonics, 0), np.asarray(f, float).reshape(-1)
-    z, names, columns = _asked(course, outputs, inputs)
-    flow = course.linear_flow(longest_piece(frequencies, harmonics))
-    if on_host(flow.t):
-        course = to_host(course)
+    z, names, columns = asked(cycle, outputs, inputs)
+    flow = linear_flow(cycle, longest_piece(frequencies, harmonics))
+    map = (to_host(cycle) if on_host(flow.t) else cycle).return_map
     with at_ease():
-        H = _transfer(course.map, flow, course.period, z, frequencies, harmonics)
+        H = _transfer(map, flow, z, frequencies, harmonics)
     return HTF(frequencies, H[..., columns], harmonics, 0, names, z.names, "exact")
-
-
-class HarmonicStateSpace(NamedTuple):
-    """Constant matrices of the harmonics of states, inputs and outputs in dX/dt = A X + B U and
-    Y = C X + D U, harmonic -order first, to order. Block (m, n) of B is that from U_n to X_m."""
-
-    A: Complex[np.ndarray, "a a"]
-    B: Complex[np.ndarray, "a b"]
-    C: Complex[np.ndarray, "c a"]
-    D: Complex[np.ndarray, "c b"]
-    order: int
-    error: float
-    """The largest error of H_-1, H_0 and H_1, relative to the largest of them."""
-
-    def transfer(self, f: Frequencies, period: float) -> Complex[np.ndarray, "f M ny nu"]:
-        """Responses of all harmonics to inputs of frequencies in cycles per period."""
-        M = 2 * self.order + 1
-        B, D = (x.reshape(len(x), M, -1)[:, self.order] for x in (self.B, self.D))
-        rates = 2j * np.pi * np.asarray(f, float).reshape(-1, 1, 1) / period
-        H = self.C @ np.linalg.solve(rates * np.eye(len(self.A)) - self.A, B[None]) + D
-        return H.reshape(len(rates), M, -1, D.shape[-1])
-
-
-def harmonic_state_space(
-    course: Course,
-    order: int | None,
-    tolerance: float,
-    outputs: OutputNames | None,
-    inputs: SignalNames | None,
-) -> HarmonicStateSpace:
-    """See `convert.to_harmonic_state_space`."""
-    (z, _, columns), s, period = (
-        _asked(course, outputs, inputs),
-        course.map.structure,
-        course.period,
-    )
-    n, last = order or 2, order or _MOST
-    flow, exact = (
-        course.linear_flow(longest_piece(_TRIED, (2 * last,))),
-        course.cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs).H.swapaxes(0, 1),
-    )
-    if any(
-        np.abs(x - y).max() > _POLE for x, y in zip(flow.jumps[:2], (np.eye(s.d), 0), strict=True)
-    ):
-        raise DefinitionError(
-            f"{type(s.system).__name__} has events at which deviations jump, which no finite "
-            "number of harmonics represents: use `cycle.htf`, which is exact."
-        )
-    _, by_state, by_input = observed(to_host(course.map).structure, flow, z)
-    series = flow.by_state, flow.by_input[..., columns], by_state, by_input[..., columns]
-    while True:
-        m, k = np.arange(-n, n + 1), np.arange(-2 * n, 2 * n + 1)
-        waves = np.exp(-2j * np.pi * k[:, None, None] * flow.after(course.map) / period)
-        waves = waves * flow.length[:, None] * rule().weights / period
-        parts = [np.einsum("mpk,pkij->mij", waves, x)[m[:, None] - m + 2 * n] for x in series]
-        A, B, C, D = (x.swapaxes(1, 2).reshape(len(m) * x.shape[2], -1) for x in parts)
-        A = A - np.diag(np.repeat(2j * np.pi * m / period, s.d))
-        space = HarmonicStateSpace(A, B, C, D, n, 0.0)
-        off = np.abs(space.transfer(_TRIED, period)[:, n - 1 : n + 2] - exact).max()
-        space = space._replace(error=float(off / np.abs(exact).max()))
-        if order or space.error < tolerance:
-            return space
-        if n == last:
-            raise ComputationError(f"the error is {space.error:.1e} at order {n}: give an `order`.")
-        n *= 2
 
 
 def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Float[np.ndarray, "F n"]]:
@@ -179,12 +106,12 @@ def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Float[np.nda
 def _transfer(
     map: ReturnMap,
     flow: LinearFlow,
-    period: Float[Array, ""],
     z: Outputs,
     f: Float[np.ndarray, " F"],
     harmonics: tuple[int, ...],
 ) -> Complex[Array, "M F ny nu"]:
     s, xp, jumps, h = map.structure, namespace(flow.q), flow.jumps, flow.length
+    period = map.expected
     (values, by_state, by_input), (free, forced) = observed(s, flow, z), flow.forward
     (P, K, d), nu, size, rows = flow.q.shape, s.nu, map.sizes, len(harmonics) * len(z.names)
     whole = flow.monodromy(free, map.valid)

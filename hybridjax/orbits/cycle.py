@@ -32,7 +32,6 @@ from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
-from .linear_flow import Course
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
@@ -221,7 +220,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `ComputationError` for a double multiplier 1, where phase has no meaning, and
         for modes whose multipliers coincide; `DefinitionError` for more modes than have amplitudes.
         """
-        return responses(self._course(), modes)
+        return responses(self._checked(), modes)
 
     def asymptotic_phase(
         self, chart: str, state: Annotated[Numbers, Reals("n")], turns: Count = 1000
@@ -235,7 +234,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for a cycle that is driven by a clock; `ComputationError` for
         a state that does not reach the cycle.
         """
-        return asymptotic_phase(self._course(), chart, np.asarray(state), turns)
+        return asymptotic_phase(self._checked(), chart, np.asarray(state), turns)
 
     def htf(
         self,
@@ -264,7 +263,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for an output that a chart of the cycle does not define, an
         input that does not exist, and frequencies at a pole, as whole ones of autonomous cycles.
         """
-        return continuous_htf(self._course(), f, harmonics, outputs, inputs)
+        return continuous_htf(self._checked(), f, harmonics, outputs, inputs)
 
     def sensitivity(self, parameter: str) -> Sensitivity:
         """Derivatives of the period, of times of events and of the shape by a parameter.
@@ -278,7 +277,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for a parameter that does not exist; `ComputationError` for
         cycles that are not isolated.
         """
-        return sensitivity(self._course(), parameter)
+        return sensitivity(self._checked(), parameter)
 
     def fluctuations(
         self, white: Given = None, guards: Given = None, resets: GivenResets = None
@@ -298,12 +297,12 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for names that do not exist; `ComputationError` for cycles
         that are not stable.
         """
-        return fluctuations(self._course(), white or {}, guards or {}, resets or {})
+        return fluctuations(self._checked(), white or {}, guards or {}, resets or {})
 
-    def _course(self) -> Course:
+    def _checked(self) -> "LimitCycle":
         require_x64()
         self.require_current()
-        return Course(self, self.return_map, self.period, self.event_sequence)
+        return self
 
     def __repr__(self):
         if is_traced(self):

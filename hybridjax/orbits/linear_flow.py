@@ -8,6 +8,7 @@ saltation matrix.
 
 import dataclasses
 import functools as ft
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -106,6 +107,13 @@ class LinearFlow(eqx.Module):
         """Times of the beginnings of the pieces, from that of the turn."""
         return self.t[:, 0] - self.t[0, 0]
 
+    def evaluated(self, s: Structure, function: Callable, rows: int) -> Float[Array, "P K rows n"]:
+        """A function (see `with_derivatives`) at the nodes, and its derivatives."""
+        chart, (P, K, d) = namespace(self.q).repeat(self.chart, NODES), self.q.shape
+        at = chart, self.t.ravel(), self.q.reshape(P * K, d).T
+        by = with_derivatives(s, function, *at, rows)
+        return namespace(by).moveaxis(by, -1, 0).reshape(P, K, rows, -1)
+
     def after(self, map: ReturnMap) -> Float[Array, "P K"]:
         """Times of the nodes: those of the clock, or since the anchor of an autonomous cycle."""
         return self.t if map.base is None else self.t - self.t[0, 0]
@@ -186,33 +194,19 @@ def keep_turn(cycle: Any, turn: Turn) -> None:
         _turns.recall(cycle, None, lambda: (record[0], side_by_side(record[1])))
 
 
-class Course(NamedTuple):
-    """A cycle as its linearized flow takes it."""
+def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = None) -> LinearFlow:
+    """Linearize the flow along a cycle, in pieces no longer than this part of the period. Inputs
+    are those of the system, or a change of a parameter.
 
-    cycle: Any
-    map: ReturnMap
-    period: Float[Array, ""]
-    events: tuple[int, ...]
-    parameter: str | None = None
-    """A change of it is the only input. Default: the inputs are those of the system."""
-
-    @property
-    def linearized(self) -> Structure:
-        """The system, with the inputs by which its flow is linearized."""
-        return _with_input(self.map.system, self.parameter)
-
-    def linear_flow(self, longest: float = np.inf) -> LinearFlow:
-        """Linearize the flow along the cycle, in pieces no longer than this part of the period.
-
-        **Raises:** `NeedsValues` inside of `jit` and `vmap`.
-        """
-        if is_traced(self.cycle) or is_inside_program():
-            return _of_cycle(self.cycle, self.parameter, longest)
-        make = lambda: _linear_flow(self.cycle, self.parameter, longest)  # noqa: E731
-        return _flows.recall(self.cycle, (self.parameter, longest), make)
+    **Raises:** `NeedsValues` inside of `jit` and `vmap`.
+    """
+    if is_traced(cycle) or is_inside_program():
+        return _of_cycle(cycle, longest, parameter)
+    make = lambda: _linear_flow(cycle, longest, parameter)  # noqa: E731
+    return _flows.recall(cycle, (parameter, longest), make)
 
 
-def _with_input(system: HybridSystem, parameter: str | None) -> Structure:
+def with_inputs(system: HybridSystem, parameter: str | None) -> Structure:
     return Structure(system if parameter is None else Varied(system, parameter))
 
 
@@ -220,7 +214,7 @@ def _with_input(system: HybridSystem, parameter: str | None) -> Structure:
 _STEPS = 4
 
 
-def _linear_flow(cycle: Any, parameter: str | None, longest: float, by: Any = None) -> LinearFlow:
+def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = None) -> LinearFlow:
     """The flow linearized at nodes of pieces, whose states follow from the recorded steps; or its
     derivatives in the directions `by` of the cycle."""
     if is_traced(cycle) or is_inside_program():
@@ -229,7 +223,7 @@ def _linear_flow(cycle: Any, parameter: str | None, longest: float, by: Any = No
             "a cycle, which `jit` and `vmap` hide: call them outside (`grad` and `jvp` work there)."
         )
     map, nodes, K = to_host(cycle.return_map), rule().nodes, NODES
-    s, of = map.structure, _with_input(map.system, parameter)
+    s, of = map.structure, with_inputs(map.system, parameter)
     d, period, D, tiny = s.d, float(map.expected), 1, 1j * kernels.TINY
     lanes, tape = _turns.recall(cycle, None, lambda: side_by_side(map.pieces(tangents=True)))
     moves = recorded_moves(lanes, tape)
@@ -305,9 +299,9 @@ def of_flow(tangents: Any) -> Any:
 
 
 def _flow_along(arguments: tuple, by: tuple) -> tuple[LinearFlow, LinearFlow]:
-    cycle, parameter, longest = arguments
-    flow = _linear_flow(cycle, parameter, longest)
-    return flow, _linear_flow(cycle, parameter, longest, by[0])
+    cycle, longest, parameter = arguments
+    flow = _linear_flow(cycle, longest, parameter)
+    return flow, _linear_flow(cycle, longest, parameter, by[0])
 
 
 _of_cycle = by_columns(

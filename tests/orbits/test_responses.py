@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.orbits.linear_flow import linear_flow
 from hybridjax.systems.chart import FieldChart
 
 
@@ -199,7 +200,7 @@ AUTONOMOUS = """
 def test_phase_responses_are_differences_of_asymptotic_phases(name):
     """Of flows from states that are pushed in a random direction, to both sides."""
     cycle = hj.find_limit_cycle(getattr(hj.models, name)())
-    s, period, flow = cycle.structure, float(cycle.period), cycle._course().linear_flow()
+    s, period, flow = cycle.structure, float(cycle.period), linear_flow(cycle)
     phases = np.array([0.15, 0.4, 0.77])
     response = cycle.responses(modes=0).phase(phases, "cycles")
     charts, states = flow.at(phases, period, flow.q)
@@ -301,11 +302,7 @@ def test_sensitivities_are_differences_of_cycles(system, name):
     def numbers(step):
         other = _shifted(cycle, name, step)
         events = [x.time for x in other.trajectory().events]
-        _, states = (
-            other._course()
-            .linear_flow()
-            .at(PHASES[1:], other.period, other._course().linear_flow().q)
-        )
+        _, states = linear_flow(other).at(PHASES[1:], other.period, linear_flow(other).q)
         return np.concatenate(
             [[float(other.period)], np.array(events) - float(other.anchor.t[0]), states[:, 0]]
         )
