@@ -233,24 +233,6 @@ class Variation:
         return t + aside[0], chart, q + aside[1:], u
 
 
-class Link(NamedTuple):
-    """One move of a lane."""
-
-    chart: int
-    """The chart in which it starts."""
-    field: Float[np.ndarray, " d"]
-    """The field at its start."""
-    jacobian: Float[np.ndarray, "n n"]
-    """Derivative of (t, q) at its end by those at its start, padded."""
-
-
-def links(s: Structure, lanes: Lanes, target: Target, tape: Tape) -> list[Link]:
-    """The moves of one lane."""
-    moves = recorded_moves(lanes, tape)
-    by, f = _linear_moves(s, moves, target).by[:, :, : 1 + s.d], _fields(s, moves)
-    return [Link(*x) for x in zip(moves.chart.tolist(), f.T, by, strict=True)]
-
-
 def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
     """The divergence of the field, integrated over the moves of one lane, up to their ends."""
     moves, total = recorded_moves(lanes, tape), 0.0

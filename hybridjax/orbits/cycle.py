@@ -20,7 +20,7 @@ from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape, side_by_side
-from ..engine.replay import Link, divergence, links
+from ..engine.replay import divergence
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, recorded, simulate
 from ..errors import DefinitionError
@@ -32,6 +32,7 @@ from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
+from .linear_flow import linear_flow
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
@@ -154,7 +155,7 @@ class LimitCycle(eqx.Module):
         strong = np.isfinite(self.residual)
         strong = strong and min(weakest(block, weaker) for block in blocks) < WEAKEST
         if strong:
-            blocks = fine_factors(self.return_map)
+            blocks = fine_factors(self)
         values = product_eigenvalues(blocks, rtol=ROUNDING)
         if strong and has_implicit(self.structure):
             lost = np.abs(values) < _LEAST_OF_IMPLICIT
@@ -409,20 +410,24 @@ def orbit_picture(
     return picture(curves, *labels)
 
 
-def fine_factors(map: ReturnMap) -> list[Matrix]:
+def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     """Jacobians of one turn from the anchor over a few steps of the flow each, in sizes of the
     states; for an autonomous system on the states modulo the direction of the flow.
 
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
-    map = to_host(map)
-    lanes, tape = side_by_side(map.pieces(tangents=True))
-    moves = links(map.structure, lanes, map.ends(), tape)
-    frames = [_frame(map, link) for link in moves]
+    map, flow = to_host(cycle.return_map), linear_flow(cycle)
+    through, frames = flow.jumps.by_state @ flow.forward[0][:, -1], []
+    for chart, f in zip(flow.chart, flow.field[:, 0], strict=True):
+        n = map.structure.dims[chart]
+        basis, size = np.eye(n), np.asarray(map.scale)[chart, :n]
+        if map.base is not None:
+            basis = np.linalg.svd(f[None, :n] / size)[2][1:].T
+        frames.append((n, (basis / size[:, None]).T, basis * size[:, None]))
     factors: list[Matrix] = []
-    for k, link in enumerate(moves):
-        out, into = frames[(k + 1) % len(moves)], frames[k]
-        parts = out[0], link.jacobian, into[1]
+    for k, (n, _, into) in enumerate(frames):
+        m, out, _ = frames[(k + 1) % len(frames)]
+        parts = out, through[k, :m, :n], into
         factor = np.linalg.multi_dot(parts)
         # (A zero that comes out as rounding would be a multiplier.)
         least = np.finfo(float).eps * np.prod([np.linalg.norm(x) for x in parts])
@@ -453,19 +458,6 @@ def orbit(map: ReturnMap, tapes: Tape | None = None) -> Trajectory:
     pieces = [Tape(*x) for x in zip(*rows, strict=True)]
     begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
     return recorded(map.structure, begin, pieces, u, Result.OK)
-
-
-def _frame(map: ReturnMap, move: Link) -> tuple[Matrix, Matrix]:
-    """Matrices from (t, q), padded, at the start of a move to coordinates in sizes, and back."""
-    n, clocked = map.structure.dims[move.chart], map.base is None
-    size = np.append(map.expected, np.asarray(map.settings.scale)[move.chart, :n])
-    basis = np.eye(1 + n)
-    if not clocked:
-        f, basis = move.field[:n] / size[1:], np.zeros((1 + n, n - 1))
-        basis[1:] = np.linalg.svd(f[None])[2][1:].T
-    padding = [(0, map.structure.d - n), (0, 0)]
-    to, back = np.pad(basis / size[:, None], padding), np.pad(basis * size[:, None], padding)
-    return to.T, back
 
 
 def weakest(factor: Matrix, weaker: int = 0) -> float:
