@@ -232,7 +232,7 @@ def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = No
         D = len(jax.tree_util.tree_leaves(by)[0])
         inputs = by.structure
         if isinstance(of.system, Varied):
-            inputs = Structure(eqx.tree_at(lambda x: x.system, of.system, inputs.system))
+            inputs = eqx.tree_at(lambda x: x.system.system, of, inputs.system)
         s, of = (
             kernels.Tangents(x, y, None, None, D) for x, y in ((s, by.structure), (of, inputs))
         )

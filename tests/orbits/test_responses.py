@@ -316,21 +316,31 @@ def test_sensitivities_are_differences_of_cycles(system, name):
 
 
 @pytest.mark.slow
-def test_results_have_derivatives_in_forward_and_reverse_mode():
-    guess = hj.find_limit_cycle(Neuron())
+@pytest.mark.parametrize(
+    "system, name, output",
+    [(Neuron(), "current", "v"), (hj.models.VerticalHopper(), "k", "yM"),
+     (hj.models.BuckConverter(), "Vin", "v")],
+    ids=["a phase", "two charts", "a schedule"],
+)  # fmt: skip
+def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, output):
+    guess, begin = hj.find_limit_cycle(system), jnp.asarray(getattr(system, name), float)
 
-    def result(current):
-        cycle = hj.find_limit_cycle(Neuron(current=current), guess)
-        phase = cycle.responses(modes=0).phase(jnp.array([0.3]))["u"][0]
-        htf = jnp.abs(cycle.htf(0.3, 1, "v").H[0, 0, 0, 0])
-        return phase + htf + cycle.sensitivity("current").period
+    def result(value):
+        cycle = hj.find_limit_cycle(eqx.tree_at(lambda x: getattr(x, name), system, value), guess)
+        responses, at = cycle.responses(modes=2 * guess.clocked), jnp.array([0.3])
+        push = responses.amplitude(0, at) if guess.clocked else responses.phase(at)
+        htf = cycle.htf(0.3, 1, output).H[0, 0, 0, 0]
+        noisy = cycle.fluctuations({output: 0.1}).covariance(at)[0, 0, 0]
+        change = cycle.sensitivity(name)
+        shape = change.shape(at)[output][0] if guess.clocked else change.period
+        return jnp.real(jnp.stack([jnp.abs(push[output][0]), jnp.abs(htf), noisy, shape]))
 
-    begin, h = jnp.asarray(1.2), 1e-3
     forward = jax.jvp(result, (begin,), (jnp.ones(()),))[1]
-    central = lambda h: (result(1.2 + h) - result(1.2 - h)) / (2 * h)
+    central = lambda h: (result(begin + h) - result(begin - h)) / (2 * h)
+    h = 1e-3 * begin
     difference = (4 * central(h / 2) - central(h)) / 3
-    np.testing.assert_allclose(forward, difference, rtol=1e-7)
-    np.testing.assert_allclose(jax.grad(result)(begin), forward, rtol=1e-10)
+    np.testing.assert_allclose(forward, difference, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(jax.jacrev(result)(begin), forward, rtol=1e-9)
 
 
 def test_bad_questions_are_refused_in_one_sentence():
@@ -355,6 +365,8 @@ def test_bad_questions_are_refused_in_one_sentence():
         wheel.sensitivity("speed")
     with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
         wheel.responses().curve("force")
+    with pytest.raises(hj.DefinitionError, match="need the values of a cycle, which `jit`"):
+        eqx.filter_jit(lambda cycle: cycle.htf(0.3))(wheel)
     apex = hj.Crossing("vy", "falling")
     family = dict(section=apex, conserved={"energy": 1784.8})
     runner = hj.find_limit_cycle(hj.models.SLIPRunner(), **family)
