@@ -330,7 +330,8 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         responses, at = cycle.responses(modes=2 * guess.clocked), jnp.array([0.3])
         push = responses.amplitude(0, at) if guess.clocked else responses.phase(at)
         htf = cycle.htf(0.3, 1, output).H[0, 0, 0, 0]
-        noisy = cycle.fluctuations({output: 0.1}).covariance(at)[0, 0, 0]
+        noise = cycle.fluctuations({output: 0.1})
+        noisy = noise.covariance(at)[0, 0, 0] if guess.clocked else noise.diffusion
         change = cycle.sensitivity(name)
         shape = change.shape(at)[output][0] if guess.clocked else change.period
         return jnp.real(jnp.stack([jnp.abs(push[output][0]), jnp.abs(htf), noisy, shape]))
