@@ -13,7 +13,7 @@ from .._core.boundary.values import Reals
 from .._core.executor import is_traced, to_host
 from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, unit_circle
 from .._core.meaning import code_digest
-from .._core.memo import remembered
+from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
 from .._core.progress import whole_call
 from .._core.results import Result
@@ -40,6 +40,7 @@ from .sensitivity import Sensitivity, sensitivity
 
 
 Matrix = Float[np.ndarray, "_ _"]
+_trajectories = Memory()
 
 # A piece of a turn is computed in factors of its own steps if its weakest direction keeps less than
 # this, and these are multiplied as long as their product keeps as much. Larger: more factors, for
@@ -204,10 +205,9 @@ class LimitCycle(eqx.Module):
         self.require_current()
         s, anchor = self.structure, to_host(self.anchor)
         a = int(anchor.chart[0])
-        return simulate(
-            self.system, s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods,
-            time=float(anchor.t[0]), settings=self.settings,
-        )  # fmt: skip
+        begin = s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods
+        options: Any = dict(time=float(anchor.t[0]), settings=self.settings)
+        return _trajectories.recall(self, periods, lambda: simulate(self.system, *begin, **options))
 
     def responses(self, modes: Index | None = None) -> Responses:
         """Responses to brief pushes, at every phase: of the phase, and of the amplitudes of modes.
