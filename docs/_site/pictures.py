@@ -139,6 +139,14 @@ def drawn(name: str) -> list[list[float]]:
         return json.loads(picture.info["Comment"])
 
 
+def of_page() -> pyplot.Figure:
+    """The figure that the page on responses draws."""
+    text = (IMAGES.parent / "how-to" / "responses.md").read_text()
+    page: dict = {}
+    exec("".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), page)
+    return page["figure"]
+
+
 if __name__ == "__main__":
     matplotlib.use("Agg")
     hj.enable_x64()
@@ -146,6 +154,7 @@ if __name__ == "__main__":
         for name in sys.argv[2:] or codes():
             (IMAGES / f"gallery/{name}.svg").write_text(thumbnail(*run(name)))
         sys.exit()
+    of_page().savefig(IMAGES / "converter.png", metadata={"Software": None})
     walk().save(IMAGES / "walk.gif")
     for name, plot in draw().items():
         about = {"Comment": json.dumps(numbers(plot)), "Software": None}
