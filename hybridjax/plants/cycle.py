@@ -28,7 +28,8 @@ from ..experiments.run import DesignLike, check_inputs
 from ..identify.multiplier_estimate import MultiplierEstimate
 from ..orbits.crossing import Crossing
 from ..sections import families
-from ..systems import chart, structure, system
+from ..systems import chart, system
+from ..systems.structure import Structure
 from .drive import At, Drive, Phase, Plant, Trial, resume, run_all
 
 
@@ -304,7 +305,7 @@ class SettledCycle:
         except Exception:
             result = Result.PLANT_STOPPED
         q, t = np.array([x.z for x in points]), np.array([x.t for x in points])
-        n, s = len(t), structure.Structure(Recorded(drive.names, draw))
+        n, s = len(t), Structure(Recorded(drive.names, draw))
         rates, events = np.gradient(q, t, axis=0) if n > 1 else 0 * q, np.full(n, -1)
         return Trajectory(s, t - t[0], np.zeros(n, int), q, q, rates, rates, events, result)
 

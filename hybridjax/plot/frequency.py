@@ -132,14 +132,14 @@ def bode(
             for htf in _exact_first(htfs):
                 f, values, radius = _values(htf, harmonic, name, input)
                 size, line = np.abs(values), _line(htf, htfs, {"color": color}, label)
-                known = np.full(len(f), True) if radius is None else radius < size
-                phase = _phase(f, values, known, reference)
-                reference = f[known], phase[known]
+                is_certain = np.full(len(f), True) if radius is None else radius < size
+                phase = _phase(f, values, is_certain, reference)
+                reference = f[is_certain], phase[is_certain]
                 upper.plot(f, size, **line)
                 lower.plot(f, phase, **line)
                 _band(upper, f, size, radius, color, 0.3 * np.min(size))
                 if radius is not None:
-                    turn = np.degrees(np.arcsin(np.where(known, radius, np.nan) / size))
+                    turn = np.degrees(np.arcsin(np.where(is_certain, radius, np.nan) / size))
                     _band(lower, f, phase, turn, color)
             for fit in fits:
                 values = _evaluate(fit, f, harmonic, name, input)

@@ -261,6 +261,7 @@ def subjects(t):
 def plants(t):
     yield hj.plants.settle, dict(plant=t.plant, sections=hj.ClockPhase(4), outputs=("x", "v"))
     yield t.settled.run_experiments, dict(design=np.zeros((1, 88, 1)))
+    yield t.settled.trajectory, dict(u=np.zeros((4, 1)))
     yield t.settled.perturbed_returns, dict(coordinates=("x", "v"))
     names = dict(inputs=("u",), signals=("x",), dt=0.1)
     yield hj.plants.MuJoCoPlant, dict(model=None, inputs=())
@@ -285,6 +286,7 @@ def conversions(t):
     yield hj.convert.to_lti, dict(model=t.model)
     yield hj.convert.to_scipy, dict(model=t.model)
     yield hj.convert.to_control, dict(thing=t.model)
+    yield hj.convert.to_harmonic_state_space, dict(cycle=t.cycle)
     yield hj.convert.to_xarray, dict(thing=t.model)
     yield hj.convert.to_pandas, dict(thing=t.fit)
     yield hj.convert.from_xarray, dict(dataset=hj.convert.to_xarray(t.model))
