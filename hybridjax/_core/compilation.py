@@ -425,7 +425,7 @@ _ready: set[Callable] = set()
 def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:
     """The program of a kernel, and the arrays of its trees."""
     leaves, structure = jax.tree_util.tree_flatten(trees)
-    arrays = jax.device_put([x for x in leaves if _is_array(x)])
+    arrays = [x if isinstance(x, jax.Array) else jax.device_put(x) for x in leaves if _is_array(x)]
     # (1, 1.0 and True are equal, and not the same.)
     static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
     return _kernel_program(function, form, static, structure, static_leaves, lanes), arrays

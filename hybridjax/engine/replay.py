@@ -365,7 +365,7 @@ def _by_stages(s: Structure, a: int, t, q, u, h):
     n, M = q.shape
     m, method = 2 + n + s.nu, s.method(a)
     stages = len(method.b) + 1
-    K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
+    K, dK = np.zeros((stages, n, M), q.dtype), np.zeros((stages, M, n, m), q.dtype)
     straight = np.zeros((M, n, m))
     straight[:, :, 1 : 1 + n] = np.eye(n)
     rows = [*(row[:i] for i, row in enumerate(np.array(method.a))), np.array(method.b)]
