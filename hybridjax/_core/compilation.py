@@ -28,7 +28,7 @@ from jax.core import eval_context
 
 from ..errors import ComputationError
 from . import executor
-from .executor import from_host, is_inside_program, is_traced, on_cpu, to_host
+from .executor import from_host, is_inside_program, is_traced, on_cpu, on_the_cpu, to_host
 from .progress import say_compiling
 from .vector_math import rewrite
 
@@ -159,8 +159,7 @@ def host_first(function: Callable, derived: Callable = lambda compiled: compiled
     compiling takes: in a thread, or at once if a single call has taken so long. Both give the same
     result up to rounding.
 
-    Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`, or
-    that `derived`, as by `by_columns`.
+    Inside of a transformation of JAX this is `quick_jit`, or that `derived`, as by `by_columns`.
     """
     transformed = derived(compiled := quick_jit(function))
     spent: dict[tuple, float] = collections.defaultdict(float)
@@ -168,12 +167,17 @@ def host_first(function: Callable, derived: Callable = lambda compiled: compiled
 
     def compile_(key, arguments):
         # (It is not run: programs with factorizations may run in one thread only, see `in_turn`.)
-        programs[key] = getattr(compiled, "lower")(*arguments).compile()  # noqa: B009
+        with on_the_cpu():
+            programs[key] = getattr(compiled, "lower")(*arguments).compile()  # noqa: B009
 
     @ft.wraps(function)
     def call(*arguments):
-        if not on_cpu() or is_traced(arguments) or is_inside_program():
+        if is_traced(arguments) or is_inside_program():
             return transformed(*arguments)
+        with on_the_cpu():
+            return on_host(*arguments)
+
+    def on_host(*arguments):
         key, begin = kind(arguments), time.thread_time()
         before = spent[key]
         if key in programs:
@@ -425,7 +429,9 @@ _ready: set[Callable] = set()
 def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:
     """The program of a kernel, and the arrays of its trees."""
     leaves, structure = jax.tree_util.tree_flatten(trees)
-    arrays = [x if isinstance(x, jax.Array) else jax.device_put(x) for x in leaves if _is_array(x)]
+    # (Arrays of an accelerator are copied once, by way of NumPy, and not in each call.)
+    here = lambda x: isinstance(x, jax.Array) and x.device.platform == "cpu"  # noqa: E731
+    arrays = [x if here(x) else jax.device_put(np.asarray(x)) for x in leaves if _is_array(x)]
     # (1, 1.0 and True are equal, and not the same.)
     static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
     return _kernel_program(function, form, static, structure, static_leaves, lanes), arrays

@@ -176,3 +176,11 @@ def on_cpu() -> bool:
     """Return whether JAX computes on the CPU, by default or as `jax.default_device` says."""
     device = default_device()
     return (getattr(device, "platform", device) or jax.default_backend()) == "cpu"
+
+
+def on_the_cpu() -> contextlib.AbstractContextManager:
+    """A context in which JAX computes on the CPU. (A few lanes take longer on an accelerator, whose
+    programs call hundreds of small kernels one after the other.)"""
+    if on_cpu():
+        return contextlib.nullcontext()
+    return jax.default_device(jax.local_devices(backend="cpu")[0])

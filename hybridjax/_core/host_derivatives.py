@@ -12,7 +12,7 @@ from jax.core import eval_context
 from jax.flatten_util import ravel_pytree
 
 from .compilation import at_ease, uncollected
-from .executor import from_host, is_inside_program, is_traced, on_cpu, to_host
+from .executor import from_host, is_inside_program, is_traced, on_the_cpu, to_host
 from .lanes import JACOBIAN_COLUMNS
 
 
@@ -65,13 +65,13 @@ def by_columns(compiled: Callable, along: Callable, relevant: Callable = lambda 
         leaves, structure = jax.tree_util.tree_flatten(moving)
         ends = np.cumsum([x.size for x in leaves])
         is_small = len(leaves) and ends[-1] <= JACOBIAN_COLUMNS
-        if not on_cpu() or is_traced(arguments) or is_inside_program() or not is_small:
+        if is_traced(arguments) or is_inside_program() or not is_small:
             return eqx.filter_jvp(compiled, arguments, tangents)
         parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
         parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
         directions = jax.tree_util.tree_unflatten(structure, parts)
         try:
-            with eval_context(), uncollected(), at_ease():
+            with on_the_cpu(), eval_context(), uncollected(), at_ease():
                 result, columns = along(to_host(arguments), directions)
         except NotOnHostError:
             require_program()

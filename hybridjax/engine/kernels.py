@@ -218,11 +218,15 @@ class Tangents(Structure):
         return np.concatenate([np.zeros((self.nu, len(direction))), along])
 
     def kernel(self, function, form, *static, trees=(), lanes=1):
-        still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
-        along = [self._along[1] if x is self._levels else still(x) for x in trees]
-        every, along = (self._plain, *trees), (self._along[0], *along)
         moving = (0, 1, 3) if isinstance(form, _ByMethod) else (0, 1)
-        of_lanes = kernel(function, _Tangent(form, moving), static, (every, along), 4 * _POINTS)
+
+        def make():
+            still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
+            along = [self._along[1] if x is self._levels else still(x) for x in trees]
+            every, along = (self._plain, *trees), (self._along[0], *along)
+            return kernel(function, _Tangent(form, moving), static, (every, along), 4 * _POINTS)
+
+        of_lanes = self.once((function, form, static), trees, make)
 
         def call(*point, some=None):
             tangents = [point[k].imag / TINY for k in moving]

@@ -176,9 +176,10 @@ def _products(moves: "_Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.nda
 
 class Variation:
     """Recorded lanes that follow each other, each beginning where the last one ended, and their
-    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets."""
+    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets. If not
+    `twice`, their Jacobians have no derivatives."""
 
-    def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times):
+    def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times, twice):
         moves, n, P = _moves(lanes, tape), 1 + s.d, s.directions
         self._s, self._moves, self.first = s, moves, np.flatnonzero(moves.order == 0)
         due = [g for a in range(len(s.charts)) for g in s.schedules(a)]
@@ -191,15 +192,17 @@ class Variation:
         along = _Moves(*map(many, moves))
         lane = along.lane * (n + P) + np.arange(len(along.t)) % (n + P)
         along = along._replace(t=along.t + aside[0], q=along.q + aside[1:], lane=lane)
+        needed = twice | (lane % (n + P) >= n)
+        along = _Moves(*(x[..., needed] for x in along))
         later = np.concatenate([np.zeros((n, len(lanes.t))), times]).T.ravel()
         target = dataclasses.replace(
             target, time=many(target.time) + 1j * kernels.TINY * later,
             index=many(np.broadcast_to(target.index, target.time.shape)),
         )  # fmt: skip
         end, by = _linear_moves(s, along, target)
-        by, end = by.reshape(-1, n + P, *by.shape[1:]), end.reshape(-1, n + P, n)[:, n:]
+        by, end = by.reshape(len(moves.t), -1, *by.shape[1:]), end.reshape(len(moves.t), -1, n)
         self._by, self._change = np.real(by[:, 0]), np.imag(by) / kernels.TINY
-        self._kick = np.moveaxis(np.imag(end) / kernels.TINY, 1, 2)
+        self._kick = np.moveaxis(np.imag(end[:, -P:]) / kernels.TINY, 1, 2)
 
     def tangents(self, begin: Float[np.ndarray, "n P"]) -> Float[np.ndarray, "moves n P"]:
         """Tangents of (t, q) where moves start, and at the last end."""

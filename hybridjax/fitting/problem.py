@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.compilation import kind, quick_jit
-from .._core.executor import is_inside_program, on_cpu
+from .._core.executor import is_inside_program, on_the_cpu
 from .._core.host_derivatives import NotOnHostError, only_on_host
 from .._core.results import Result
 from ..errors import DefinitionError
@@ -124,7 +124,7 @@ def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
         q, turn, steps = root(map, False, NEWTON_STEPS)
         period, anchor = map.turn(q, turn.record).period, map.departure(q)
     else:
-        anchor, turn, steps, _ = solve(map, True)
+        anchor, turn, steps, _ = solve(map, True, False)
         period = turn.period
     period = map.expected if map.base is None else period
     code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)
@@ -174,14 +174,15 @@ def evaluate(
     problem: FitProblem, x: Float[Array | np.ndarray, " p"], guess: LimitCycle
 ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
     """Return residuals and Jacobian at x, from the host if it has these derivatives."""
-    arguments = problem, jnp.asarray(x), guess
-    if (key := kind(arguments)) not in _not_on_host and on_cpu():
-        try:
-            with only_on_host():
-                return jax.device_get(_with_jacobian(*arguments))
-        except NotOnHostError:
-            _not_on_host.add(key)
-    return jax.device_get(_compiled(*arguments))
+    with on_the_cpu():
+        arguments = problem, jnp.asarray(x), guess
+        if (key := kind(arguments)) not in _not_on_host:
+            try:
+                with only_on_host():
+                    return jax.device_get(_with_jacobian(*arguments))
+            except NotOnHostError:
+                _not_on_host.add(key)
+        return jax.device_get(_compiled(*arguments))
 
 
 def descend(

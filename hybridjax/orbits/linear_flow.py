@@ -49,7 +49,8 @@ class Rule(NamedTuple):
 @ft.lru_cache
 def rule() -> Rule:
     legendre, last = np.polynomial.legendre, np.eye(NODES)[-1]
-    x = np.r_[-1.0, np.sort(legendre.legroots(legendre.legder(last))), 1.0]
+    # (Roots are real here, and complex numbers since NumPy 2.5.)
+    x = np.r_[-1.0, np.sort(legendre.legroots(legendre.legder(last)).real), 1.0]
     x = (x - x[::-1]) / 2
     vander = legendre.legvander(x, NODES - 1)
     slopes = np.stack([legendre.legval(x, legendre.legder(e)) for e in np.eye(NODES)], axis=1)

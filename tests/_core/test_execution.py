@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from hybridjax._core import execution
+from hybridjax._core.compilation import host_first
 from hybridjax._core.execution import Execution, Library, on_all_cores, one_blas_thread
-from hybridjax._core.executor import on_cpu
+from hybridjax._core.executor import on_cpu, on_host
 
 
 def test_the_default_device_counts_more_than_the_backend(monkeypatch):
@@ -20,6 +21,13 @@ def test_the_default_device_counts_more_than_the_backend(monkeypatch):
     with jax.default_device("cpu"):
         assert on_cpu() and jnp.ones(1).devices() == {jax.devices("cpu")[0]}
     assert not on_cpu()
+
+
+def test_a_machine_with_a_gpu_computes_few_lanes_on_its_cpu(monkeypatch):
+    executors = []
+    function = host_first(lambda x: (executors.append(on_host(x)), 2 * x)[1])
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert function(jnp.ones(1)).devices() == {jax.devices("cpu")[0]} and executors == [True]
 
 
 @pytest.fixture
