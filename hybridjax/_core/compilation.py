@@ -38,9 +38,10 @@ from .vector_math import rewrite
 _QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 # XLA divides a program among its threads: dividing a small one takes a fifth longer.
 _UNDIVIDED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
-# Seconds of host time after which a function is compiled, which takes about as long. Less: programs
-# are compiled that are not used again. More: repeated calls stay slow for longer.
-WORTH_COMPILING = 3.0
+# Seconds of host time after which a function is compiled, which takes about as long (a single turn
+# of a cycle: a third of it). Less: programs are compiled that are not used again. More: repeated
+# calls stay slow for longer.
+WORTH_COMPILING = 6.0
 # Seconds in a quick executable after which a script compiles the optimized one, in about as much
 # time. Less: it waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
@@ -410,10 +411,11 @@ def deferred(compiled: Any, other: Callable, seconds: float) -> Callable:
     def call(*arguments):
         if program in _ready:
             return compiled(*arguments)
-        begin, before = time.thread_time(), _spent[program]
+        begin, before = time.thread_time(), _spent.get(program)
         results = other(*arguments)
-        after = _spent[program] = before + time.thread_time() - begin
-        if before <= worth < after:
+        # (The first call compiles kernels.)
+        after = _spent[program] = 0.0 if before is None else before + time.thread_time() - begin
+        if before is not None and before <= worth < after:
             compile_ = lambda: (compiled(*arguments), _ready.add(program))  # noqa: E731
             threading.Thread(target=compile_).start()
         return results
@@ -422,7 +424,7 @@ def deferred(compiled: Any, other: Callable, seconds: float) -> Callable:
 
 
 # Seconds that the host has taken for each such program, and those that are compiled.
-_spent: dict[Callable, float] = collections.defaultdict(float)
+_spent: dict[Callable, float] = {}
 _ready: set[Callable] = set()
 
 

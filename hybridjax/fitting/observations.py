@@ -118,8 +118,7 @@ class ObservedHTF(AbstractObservation):
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         model = linearize(cycle, self.sections, self.outputs, self.inputs)
-        error = (model.htf(self.f, self.harmonics).H - self.H) * self.weights
-        return jnp.concatenate([error.real.ravel(), error.imag.ravel()])
+        return _real(model.htf(self.f, self.harmonics).H, self.H, self.weights)
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
         cycle.structure.resolve_outputs(self.outputs)
@@ -279,6 +278,12 @@ class ObservedCycle(AbstractObservation):
     def prepare(self, cycle: LimitCycle) -> "ObservedCycle":
         place_sections(cycle, self.sections)
         return self
+
+
+@jax.jit
+def _real(H: Array, measured: Array, weights: Array) -> Float[Array, " r"]:
+    error = ((H - measured) * weights).ravel()
+    return jnp.concatenate([error.real, error.imag])
 
 
 def _times(placed: PlacedSections) -> Float[Array, " N"]:

@@ -62,10 +62,12 @@ class Parameters(eqx.Module):
         """Return the values of a system."""
         return jnp.stack([parameter_of(system, name) for name in self.names])
 
-    def insert(self, system: HybridSystem, values: Float[Array, " p"]) -> HybridSystem:
-        """Return the system with other values."""
-        return with_parameters(system, dict(zip(self.names, values, strict=True)))
+    @eqx.filter_jit
+    def insert(self, system: HybridSystem, x: Float[Array, " p"]) -> HybridSystem:
+        """Return the system with the values at coordinates x."""
+        return with_parameters(system, dict(zip(self.names, self.decode(x), strict=True)))
 
+    @eqx.filter_jit
     def encode(self, values: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
         """Return coordinates of values, NaN for those outside of their bounds."""
         low, high, cases = self._bounds()
@@ -73,6 +75,7 @@ class Parameters(eqx.Module):
         logarithms = [jnp.log(up / down), jnp.log(up), jnp.log(down)]
         return jnp.select(cases, logarithms, values / self.size)
 
+    @eqx.filter_jit
     def decode(self, x: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
         """Return values at coordinates x."""
         low, high, cases = self._bounds()
@@ -154,10 +157,15 @@ class FitProblem(eqx.Module):
 
     def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> Float[Array, " r"]:
         """Return the residuals, infinite where there is no limit cycle, or no observation on it."""
-        system = self.parameters.insert(guess.system, self.parameters.decode(x))
+        system = self.parameters.insert(guess.system, x)
         cycle = candidate_cycle(system, guess)
-        r = jnp.concatenate([observation.residuals(cycle) for observation in self.observations])
-        return jnp.where((cycle.result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
+        return _joined([x.residuals(cycle) for x in self.observations], cycle.result)
+
+
+@jax.jit
+def _joined(parts, result):
+    r = jnp.concatenate(parts)
+    return jnp.where((result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
 
 
 def _with_jacobian(problem: FitProblem, x, guess):
@@ -187,9 +195,9 @@ def evaluate(
 
 def descend(
     problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " r"], int, bool]:
-    """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals, number of
-    evaluations, and whether it has converged.
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " r"], Float[np.ndarray, "r p"], int, bool]:
+    """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals and their
+    Jacobian, number of evaluations, and whether it has converged.
 
     Steps are accepted and their damping changes as in `optimistix.LevenbergMarquardt`. Here the
     iteration runs on the host, so that only the model is compiled.
@@ -210,13 +218,13 @@ def descend(
             else:
                 damping *= _MORE
             if done:
-                return x, r, steps, True
+                return x, r, J, steps, True
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
             break
         damped = np.concatenate([J, np.sqrt(damping) * np.eye(len(x))])
         short = np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
         trial = x - short
-    return x, r, steps, False
+    return x, r, J, steps, False
 
 
 def _small(change: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"]) -> bool:
