@@ -15,16 +15,21 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     _programs = pathlib.Path(__file__).parents[1] / ".pytest_cache" / "programs"
     os.environ.setdefault("HYBRIDJAX_CACHE", str(_programs))
     # Most of the time of a test is that of compiling what it runs once. (XLA ends the process where
-    # it does not know an option, so another process tries them, once for each version.)
-    _quick = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-    _flags = {**os.environ, "XLA_FLAGS": f"{_quick} {os.environ.get('XLA_FLAGS', '')}"}
-    _try = [sys.executable, "-c", "import jax; jax.devices()"]
-    _answer = _programs.with_name(f"options-{importlib.metadata.version('jaxlib')}")
+    # it does not know an option, so other processes try them, once for each version.)
+    _answer = _programs.with_name(f"accepted-{importlib.metadata.version('jaxlib')}")
     if not _answer.exists():
+        _try = [sys.executable, "-c", "import jax; jax.devices()"]
+        _quick = "--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false"
+        _accepted = [
+            option
+            for option in _quick
+            if not subprocess.run(
+                _try, env={**os.environ, "XLA_FLAGS": option}, stderr=subprocess.DEVNULL
+            ).returncode
+        ]
         _answer.parent.mkdir(exist_ok=True)
-        _answer.write_text(str(subprocess.run(_try, env=_flags).returncode))
-    if _answer.read_text() == "0":
-        os.environ.update(_flags)
+        _answer.write_text(" ".join(_accepted))
+    os.environ["XLA_FLAGS"] = f"{_answer.read_text()} {os.environ.get('XLA_FLAGS', '')}"
 
 import hypothesis
 import jax

@@ -95,11 +95,17 @@ def _loops_are_kernels() -> bool:
 def compiler_options(small: bool = False) -> dict[str, Any]:
     """Return XLA's options for quick compilation, also of a `small` program."""
     options = _QUICK | _UNDIVIDED if small else _QUICK
+    return {name: value for name, value in options.items() if _is_known(name, value)}
+
+
+@ft.cache
+def _is_known(name: str, value: Any) -> bool:
+    """Return whether this version of XLA has an option."""
     try:
-        jax.jit(lambda: 0, compiler_options=options)()
-    except Exception:  # an XLA without one of them; the type depends on the version
-        return {}
-    return options
+        jax.jit(lambda: 0, compiler_options={name: value})()
+    except Exception:  # its type depends on the version
+        return False
+    return True
 
 
 @contextlib.contextmanager

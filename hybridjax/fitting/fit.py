@@ -65,7 +65,7 @@ def fit_model(
         subclass of `AbstractObservation` for data of another type.
     - `free`: names of parameters, which keep their signs, or `{name: (low, high)}` with bounds
         (infinite where there are none; `None` in place of both keeps the sign). Names may have
-        dots.
+        dots. "input_delay" and "output_delay" are those of all `ObservedHTF` with a delay.
     - `guess`: guess of the limit cycle of `system`, or the cycle of a similar system; see
         `find_limit_cycle`.
     - `guesses`: largest number of guesses of the parameters: those of `system`, then random ones
@@ -84,7 +84,7 @@ def fit_model(
     """
     problem, near = _prepare(system, data, free, guess)
     p = problem.parameters
-    x0 = np.asarray(p.encode(p.read(system)))
+    x0 = np.asarray(p.encode(p.read(system, problem.observations)))
     around = _SPREAD * np.random.default_rng(seed).uniform(-1, 1, (guesses - 1, len(x0)))
     ends: list[End] = []
     for start in counted(np.stack([x0, *(x0 + around)]), "guesses", guesses):
@@ -116,7 +116,7 @@ def identifiability(
     """
     problem, near = _prepare(system, data, free, guess)
     parameters, cycle = problem.parameters, find_limit_cycle(system, near)
-    x = parameters.encode(parameters.read(system))
+    x = parameters.encode(parameters.read(system, problem.observations))
     residuals, jacobian = evaluate(problem, x, cycle)
     if not np.isfinite(residuals).all():
         text = "predicts NaN or infinity for these data: change its parameters."
@@ -128,10 +128,10 @@ def _prepare(
     system: HybridSystem, data: Data, free: Free, guess: Guess | LimitCycle | None
 ) -> tuple[FitProblem, LimitCycle]:
     """Return the problem, and a limit cycle near which to search for others."""
-    parameters = free_parameters(system, free)
     observations = [data] if isinstance(data, AbstractObservation) else data
     if not observations:
         raise DefinitionError("`data` must be one observation or more, not an empty list.")
+    parameters = free_parameters(system, free, observations)
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
     near = _anchored(near)
     prepared = tuple(observation.prepare(near) for observation in observations)
@@ -196,7 +196,8 @@ def _cycle_at(
     problem: FitProblem, system: HybridSystem, x: Float[np.ndarray, " p"], near: LimitCycle
 ) -> LimitCycle:
     """Return the cycle with the parameters at x, converged or not."""
-    return find_limit_cycle(problem.parameters.insert(system, jnp.asarray(x)), near, throw=False)
+    p = problem.parameters
+    return find_limit_cycle(p.insert(system, p.decode(jnp.asarray(x))), near, throw=False)
 
 
 def _descend(
@@ -214,7 +215,7 @@ def _descend(
 
 
 def _summary(problem: FitProblem, system: HybridSystem, ends: list[End], best: End) -> ModelFit:
-    parameters, weighted = problem.parameters, problem.weighted
+    parameters = problem.parameters
     decode = lambda x: np.asarray(parameters.decode(jnp.asarray(x)))  # noqa: E731
     guesses = tuple(
         ParameterGuess(decode(e.start), decode(e.x), e.cost, e.steps, e.result) for e in ends
@@ -227,7 +228,7 @@ def _summary(problem: FitProblem, system: HybridSystem, ends: list[End], best: E
     identified = diagnose(parameters.names, sensitivity)
     rank = identified.rank
     freedom = len(residuals) - rank
-    unit = 1.0 if weighted else max(best.cost / max(freedom, 1), np.finfo(float).tiny)
+    unit = problem.unit(best.cost / max(freedom, 1))
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
     root = left[:, :rank] / singular[:rank] * size[:, None]
     return ModelFit(

@@ -19,7 +19,7 @@ from .._core.results import Result
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..systems.system import HybridSystem, unit_of_parameter
-from .problem import FitProblem, evaluate
+from .problem import DELAYS, FitProblem, evaluate
 
 
 # Singular values of the sensitivities below this part of the largest one are zero. Larger: badly
@@ -191,22 +191,23 @@ class ModelFit(eqx.Module):
         For the true values it has a chi square distribution with `identifiability.rank` degrees of
         freedom (Wilks 1938). Unlike $e^T J^T J e$ with the errors e of the values, it does not
         depend on the parametrization, and follows curved regions. Where the data have no standard
-        deviations it is in units of the variance estimated from the residuals.
+        deviations, or estimated ones, it is in units that the residuals show.
 
         **Arguments:** `true`: a system, or values by name.
 
         **Raises:** `DefinitionError` if a value is missing.
         """
         if isinstance(true, HybridSystem):
-            true = {name: operator.attrgetter(name)(true) for name in self.names}
+            named = [name for name in self.names if name not in DELAYS]
+            true = {name: operator.attrgetter(name)(true) for name in named}
         missing = [name for name in self.names if name not in true]
         if missing:
             raise DefinitionError(f"`true` must have a value of '{missing[0]}', which was fitted.")
         values = jnp.array([float(true[name]) for name in self.names])
         x = self.problem.parameters.encode(values)
         r, _ = evaluate(self.problem, x, self.cycle)
-        more = float(r @ r) - self.cost
-        return more if self.weighted else more / (self.cost / self.freedom)
+        misfit = self.cost / max(self.freedom, 1)
+        return (float(r @ r) - self.cost) / self.problem.unit(misfit)
 
     @checked
     def contains(self, true: HybridSystem | Mapping[str, float], level: Probability = 0.95) -> bool:
@@ -239,7 +240,9 @@ class ModelFit(eqx.Module):
         rows = []
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
             shown = f"{error:.2g}" if np.isfinite(error) else "not seen by itself"
-            rows.append((name, f"{value:.9g}", shown, unit_of_parameter(self.system, name)))
+            system = self.system
+            unit = system.time_unit if name in DELAYS else unit_of_parameter(system, name)
+            rows.append((name, f"{value:.9g}", shown, unit))
         parameters = table(("parameter", "value", "± standard error", "unit"), rows)
         unseen = [f"not seen: {x}" for x in self.identifiability.descriptions()]
         of = f"of {type(self.system).__name__}: {Result(self.result).message}"

@@ -21,11 +21,11 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.plan import Plan
 from ..experiments.response import course, flow_batch, response_function
-from ..identify.weights import check_values, error_weights
+from ..identify.weights import check_values, error_weights, largest_misfit
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections, FamilyLike, as_family
-from ..sections.linearize import linearize
+from ..sections.linearize import Delayed, Delays, linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
 
@@ -93,6 +93,9 @@ class ObservedHTF(AbstractObservation):
     deviations $\sqrt{v/2}$ where the HTFs have variances v, otherwise relative to the rms of each
     output's HTFs over all inputs. In the second case, choose units in which the inputs have effects
     of similar magnitude.
+
+    With `delay` inputs act later, and outputs are measured later; `fit_model` fits those of its
+    two entries that `free` names, "input_delay" and "output_delay".
     """
 
     f: Float[Array, " F"]
@@ -103,27 +106,40 @@ class ObservedHTF(AbstractObservation):
     sections: AbstractSections
     weights: Float[Array, "M F ny nu"]
     weighted: Bool[Array, ""]
+    most: Float[Array, ""]
+    """Largest mean square of the residuals that estimated variances explain."""
+    delay: Float[Array, "2"] | None
 
-    def __init__(self, htf: HTF, sections: FamilyLike):
+    def __init__(self, htf: HTF, sections: FamilyLike, delay: Delays | None = None):
         """**Arguments:** `htf`: of outputs and inputs of the system, by name. `sections`: the
-        family of sections at which it was measured.
+        family of sections at which it was measured. `delay`: as for `linearize`; the first guess
+        of what is free. Default: none.
 
         **Raises:** `DefinitionError` for NaN, bad variances, or another number of sections.
         """
+        self.delay = None if delay is None else jnp.asarray(delay, float)
         self.f, self.H, self.sections = htf.f, htf.H, as_family(sections)
         self.harmonics, self.inputs, self.outputs = htf.harmonics, htf.inputs, htf.outputs
         require_same("HTFs and `sections`", htf, self.sections, ("n_sections",))
         self.weights = jnp.asarray(error_weights(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
+        self.most = jnp.asarray(largest_misfit(htf))
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
-        model = linearize(cycle, self.sections, self.outputs, self.inputs)
-        return _real(model.htf(self.f, self.harmonics).H, self.H, self.weights)
+        where = cycle, self.sections, self.outputs, self.inputs
+        if self.delay is None:
+            H = linearize(*where).htf(self.f, self.harmonics).H
+        else:
+            H = Delayed.of(*where, self.delay).htf(self.f, self.harmonics)
+        return _real(H, self.H, self.weights)
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
         cycle.structure.resolve_outputs(self.outputs)
         cycle.structure.inputs_among(self.inputs)
-        place_sections(cycle, self.sections)
+        if self.delay is None:
+            place_sections(cycle, self.sections)
+        else:
+            Delayed.of(cycle, self.sections, self.outputs, self.inputs, self.delay)
         return self
 
 

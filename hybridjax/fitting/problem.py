@@ -14,11 +14,12 @@ from .._core.executor import is_inside_program, on_the_cpu
 from .._core.host_derivatives import NotOnHostError, only_on_host
 from .._core.results import Result
 from ..errors import DefinitionError
+from ..identify.weights import estimated_noise
 from ..orbits.cycle import LimitCycle
 from ..orbits.newton import MAX_STEPS as NEWTON_STEPS, root, solve
 from ..systems.system import HybridSystem
 from ..systems.varied import parameter_of, with_parameters
-from .observations import AbstractObservation
+from .observations import AbstractObservation, ObservedHTF
 
 
 # The iteration ends when a step changes no coordinate and no residual by more than this, in sum and
@@ -38,6 +39,10 @@ _ACCEPTED, _GOOD = 0.01, 0.99
 # Farther: it swings between too much and too little.
 _LESS, _MORE = 3.5, 4.0
 
+# Names of the entries of `ObservedHTF.delay` among the free parameters.
+DELAYS = "input_delay", "output_delay"
+
+Observations = Sequence[AbstractObservation]
 Bounds = tuple[float | int, float | int]
 Free = str | Sequence[str] | Mapping[str, Bounds | None]
 
@@ -58,14 +63,29 @@ class Parameters(eqx.Module):
     high: Float[Array, " p"]
     size: Float[Array, " p"]
 
-    def read(self, system: HybridSystem) -> Float[Array, " p"]:
-        """Return the values of a system."""
-        return jnp.stack([parameter_of(system, name) for name in self.names])
+    def read(self, system: HybridSystem, observations: Observations) -> Float[Array, " p"]:
+        """Return the values of a system, and the delays of its observations."""
+        return jnp.stack([_value(system, observations, name) for name in self.names])
 
     @eqx.filter_jit
-    def insert(self, system: HybridSystem, x: Float[Array, " p"]) -> HybridSystem:
-        """Return the system with the values at coordinates x."""
-        return with_parameters(system, dict(zip(self.names, self.decode(x), strict=True)))
+    def insert(self, system: HybridSystem, values: Float[Array, " p"]) -> HybridSystem:
+        """Return the system with other values."""
+        named = zip(self.names, values, strict=True)
+        return with_parameters(system, {name: x for name, x in named if name not in DELAYS})
+
+    def observed(
+        self, observations: Observations, values: Float[Array, " p"]
+    ) -> list[AbstractObservation]:
+        """Return the observations with other delays."""
+        named = {name: values[k] for k, name in enumerate(self.names) if name in DELAYS}
+
+        def changed(o):
+            if not named or getattr(o, "delay", None) is None:
+                return o
+            both = [named.get(name, x) for name, x in zip(DELAYS, o.delay, strict=True)]
+            return eqx.tree_at(lambda o: o.delay, o, jnp.stack(both))
+
+        return [changed(o) for o in observations]
 
     @eqx.filter_jit
     def encode(self, values: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
@@ -89,7 +109,20 @@ class Parameters(eqx.Module):
         return *finite, [low & high, low, high]
 
 
-def free_parameters(system: HybridSystem, free: Free) -> Parameters:
+def _value(system: HybridSystem, observations: Observations, name: str) -> Array:
+    if name not in DELAYS:
+        return parameter_of(system, name)
+    delays = [o.delay for o in observations if isinstance(o, ObservedHTF) and o.delay is not None]
+    if not delays:
+        raise DefinitionError(
+            f"'{name}' is free, but no data have a delay: pass `ObservedHTF(..., delay=)`."
+        )
+    return delays[0][DELAYS.index(name)]
+
+
+def free_parameters(
+    system: HybridSystem, free: Free, observations: Observations = ()
+) -> Parameters:
     """Return the free parameters of a system, given as in `fit_model`.
 
     **Raises:** `DefinitionError` for names that are no numbers of the system, or bounds that do not
@@ -101,7 +134,7 @@ def free_parameters(system: HybridSystem, free: Free) -> Parameters:
         raise DefinitionError(f"`free` must name one parameter or more, each once, not {names}.")
     low, high, size = [], [], []
     for name in names:
-        value = float(parameter_of(system, name))
+        value = float(_value(system, observations, name))
         bounds = free[name] if isinstance(free, Mapping) else None
         if bounds is None:  # it keeps its sign
             bounds = (0.0 if value > 0 else -jnp.inf, 0.0 if value < 0 else jnp.inf)
@@ -155,11 +188,20 @@ class FitProblem(eqx.Module):
         """True if all data have standard deviations."""
         return all(bool(observation.weighted) for observation in self.observations)
 
+    def unit(self, misfit: float) -> float:
+        """Return the factor of covariances for a misfit, the cost relative to its expected value:
+        that of variances that are estimated, or the misfit where there are none."""
+        if not self.weighted:
+            return max(misfit, np.finfo(float).tiny)
+        htfs = [x for x in self.observations if isinstance(x, ObservedHTF)]
+        return estimated_noise(max((float(x.most) for x in htfs), default=1.0), misfit)[1] ** 2
+
     def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> Float[Array, " r"]:
         """Return the residuals, infinite where there is no limit cycle, or no observation on it."""
-        system = self.parameters.insert(guess.system, x)
-        cycle = candidate_cycle(system, guess)
-        return _joined([x.residuals(cycle) for x in self.observations], cycle.result)
+        values = self.parameters.decode(x)
+        cycle = candidate_cycle(self.parameters.insert(guess.system, values), guess)
+        observations = self.parameters.observed(self.observations, values)
+        return _joined([observation.residuals(cycle) for observation in observations], cycle.result)
 
 
 @jax.jit

@@ -27,6 +27,8 @@ from .weights import (
     are_alike,
     check_values,
     error_weights,
+    estimated_noise,
+    largest_misfit,
     line_variances,
     neighbor_correlation,
     weights_of,
@@ -328,7 +330,7 @@ def select_order(
         costs.append(sum(float((misfit_of(g, c).residual ** 2).sum()) for g in groups))
         freedoms.append(sum(g.freedom * g.size for g in groups) - d)
     cost, freedom, data = np.array(costs), np.array(freedoms), 2 * htf.H.size
-    level, tails = _estimated_noise(htf, cost[-1] / freedom[-1])
+    level, tails = estimated_noise(largest_misfit(htf), cost[-1] / freedom[-1])
     likelihood = data * np.log(np.maximum(cost, 1e-300)) if htf.variance is None else cost / level
     left = values[::-1] / level
     return OrderSelection(
@@ -360,25 +362,6 @@ def _noise_ratios(
     return values, float(np.sqrt(2 / sum(group.freedom * group.size for group in groups)))
 
 
-def _estimated_noise(htf: HTF, misfit: float) -> tuple[float, float]:
-    r"""Return the mean square of the noise in units of `htf.variance`, and how wide it scatters.
-
-    Both are 1 for variances that are known. With $\nu$ complex degrees of freedom
-    $|\varepsilon|^2 / v$ has Fisher's distribution with 2 and $2 \nu$: its mean is
-    $L = \nu / (\nu - 1)$, its standard deviation $L \sqrt{L / (2 - L)}$.
-    Weights that are pooled have more degrees of freedom than each variance, so that L is taken
-    from the misfit of a fit, as far as $\nu$ allows.
-
-    **Arguments:** `misfit`: cost of the fit relative to its expected value.
-    """
-    if htf.scatter is None:
-        return 1.0, 1.0
-    freedom = float(np.median(htf.scatter.freedom))
-    most = freedom / (freedom - 1) if freedom > 1 else np.inf
-    level = float(np.clip(misfit, 1.0, most))
-    return level, float(np.sqrt(level / (2 - level))) if level < 2 else np.inf
-
-
 @functools.lru_cache
 def _largest_of_noise(size: int) -> float:
     """Return the value that the largest of `size` ratios of noise exceeds in 1 % of cases.
@@ -401,7 +384,7 @@ def require_order(
 
     **Raises:** `DefinitionError` if noise alone could account for one of the multipliers.
     """
-    level, tails = _estimated_noise(htf, misfit)
+    level, tails = estimated_noise(largest_misfit(htf), misfit)
     noise = residual if htf.variance is None else np.ones(len(residual))
     values, deviation = _noise_ratios(groups, order, noise)
     refuse_invented(values / level, tails * deviation)

@@ -93,6 +93,39 @@ def _product_of_factors(
     return size[same] * by_line
 
 
+def estimated_noise(most: float, misfit: float) -> tuple[float, float]:
+    r"""Return the mean square of the noise in units of `htf.variance`, and its standard deviation.
+
+    Both are 1 for variances that are known. With $\nu$ complex degrees of freedom
+    $|\varepsilon|^2 / v$ has Fisher's distribution with 2 and $2 \nu$: its mean is
+    $L = \nu / (\nu - 1)$, its standard deviation $L \sqrt{L / (2 - L)}$. The errors of a fit with
+    such weights have $L / (2 - L)$ times the covariance that the weights suggest, in the limit of
+    many lines. Weights that are pooled have more degrees of freedom than each variance, so that L
+    is taken from the misfit of a fit, as far as $\nu$ allows.
+
+    **Arguments:** `most`: `largest_misfit` of the HTFs. `misfit`: cost of the fit relative to its
+    expected value.
+
+    **Returns:** L, and the deviation in units of L.
+    """
+    level = float(np.clip(misfit, 1.0, most))
+    return level, float(np.sqrt(level / (2 - level))) if level < 2 else np.inf
+
+
+def largest_misfit(htf: HTF) -> float:
+    """Return the misfit that the scatter of variances explains."""
+    if htf.scatter is None:
+        return 1.0
+    freedom = float(np.median(htf.scatter.freedom))
+    return freedom / (freedom - 1) if freedom > 1 else np.inf
+
+
+def covariance_unit(htf: HTF, misfit: float) -> float:
+    """Return the factor of covariances of a fit to HTFs: the misfit, if they have no variances."""
+    known = htf.variance is not None
+    return estimated_noise(largest_misfit(htf), misfit)[1] ** 2 if known else misfit
+
+
 def neighbor_correlation(
     error: Complex[np.ndarray, "M F ny nu"],
     values: Complex[np.ndarray, "M F ny nu"],

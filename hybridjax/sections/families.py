@@ -70,6 +70,8 @@ class AbstractSections(Definition):
     - `anchor`: the position of section 0. A `Crossing`: the point where the cycle crosses it, which
       is the first point of the `orbit`. Values of other types are interpreted by `bind`.
     - `points`: the number M of points of the orbit that `bind` needs, a class variable. Default: 1.
+    - `at_anchor`: whether section 0 lies at an anchor that is a `Crossing`, a class variable.
+      Default: True.
 
     **Methods of a subclass:**
 
@@ -82,6 +84,7 @@ class AbstractSections(Definition):
 
     label: eqx.AbstractClassVar[str]
     points: ClassVar[int] = 1
+    at_anchor: ClassVar[bool] = True
     n_sections: eqx.AbstractVar[int]
     anchor: eqx.AbstractVar[Crossing | Float[Array, ""] | None]
 

@@ -1,27 +1,36 @@
 """From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
 
 import dataclasses
-from typing import Any
+from typing import Annotated, Any, ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import SignalNames
+from .._core.boundary.kinds import Numbers, SignalNames
+from .._core.boundary.values import Reals
 from .._core.compilation import host_first
-from .._core.executor import Array, is_traced, namespace
+from .._core.executor import Array, is_traced, namespace, stop_gradient
 from .._core.host_derivatives import by_columns
 from .._core.progress import working
 from ..engine import kernels
+from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.checks import check_outputs
+from ..orbits.coincidence import TOGETHER
 from ..orbits.cycle import LimitCycle
 from ..orbits.return_map import with_derivatives
+from ..systems.structure import Structure
 from ..systems.system import Output, OutputNames
-from .families import AbstractSections, as_family
+from .families import AbstractSections, BoundSections, ClockPhase, Orbit, as_family
 from .place import as_placed, place_along, place_sections
 from .placed import PlacedSections, SectionsLike
+
+
+Delays = Annotated[Numbers, Reals("2", sign="nonnegative")]
 
 
 @checked
@@ -31,6 +40,7 @@ def linearize(
     sections: SectionsLike,
     outputs: OutputNames | None = None,
     inputs: SignalNames | None = None,
+    delay: Delays | None = None,
 ) -> LDTP:
     """Linearize the flow between consecutive sections, eqs. (5) and (6).
 
@@ -49,11 +59,17 @@ def linearize(
     - `sections`: a family or `PlacedSections`.
     - `outputs`: names or `Output`s. Default: all states that every chart defines.
     - `inputs`: names. Default: all.
+    - `delay`: (of the inputs, of the outputs), in the unit of time, for `ClockPhase` sections: the
+      input of section n acts from so much later on, and the outputs at section n are those that the
+      system had so much earlier. The coordinates are those at that earlier time, then the inputs
+      that still act or wait. Default: none.
 
     **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
-    lies, or uses the time without having the period of a clock, or an input that does not exist;
-    `ComputationError` as `place_sections`.
+    lies, or uses the time without having the period of a clock, or an input that does not exist,
+    or for `delay` with other sections; `ComputationError` as `place_sections`.
     """
+    if delay is not None:
+        return Delayed.of(cycle, sections, outputs, inputs, delay).to_ldtp()
     s, traced = cycle.structure, is_traced(cycle, sections)
     of_family = traced and not isinstance(sections, PlacedSections)
     placed: Any = sections if of_family else as_placed(cycle, sections)
@@ -123,3 +139,100 @@ def _output_jacobians(
     by = with_derivatives(s, values, lanes.chart, lanes.t, lanes.q, len(items))
     J, n = namespace(by).moveaxis(by[:, 1:], -1, 0), 1 + s.d
     return J[:, :, :n] @ placed.frames()[0], J[:, :, n:]
+
+
+class _Departures(AbstractSections):
+    """The times at which the outputs of a `ClockPhase` leave the system; with two `parts`, each is
+    followed by the time at which the next input begins to act."""
+
+    label: ClassVar[str] = "isochron"
+    at_anchor: ClassVar[bool] = False
+    phase: ClockPhase
+    delay: Float[Array, "2"]
+    lag: Array
+    """Whole sections in the sum of both delays."""
+    parts: int = eqx.field(static=True)
+
+    n_sections = property(lambda self: self.parts * self.phase.n_sections)  # type: ignore[assignment]
+    anchor = property(lambda self: self.phase.anchor)  # type: ignore[assignment]
+
+    def check(self, s: Structure) -> None:
+        self.phase.check(s)
+
+    def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
+        leave, step = self.phase.bind(s, orbit).time - self.delay[1], orbit.period
+        change = leave + self.delay.sum() - self.lag * step / self.phase.n_sections
+        return BoundSections.at_times(jnp.stack([leave, change][: self.parts], axis=1).ravel())
+
+    def describe(self, i: int) -> str:
+        when = ("when outputs leave", "when the next input acts")[i % self.parts]
+        return f"section {i // self.parts}, {when}"
+
+
+class Delayed(NamedTuple):
+    """A system with delays: its response at section n to the inputs `lag` sections earlier and,
+    unless these act right then, to those before them as more inputs."""
+
+    model: LDTP
+    lag: Array
+    inputs: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        cycle: LimitCycle,
+        sections: SectionsLike,
+        outputs: OutputNames | None,
+        inputs: SignalNames | None,
+        delay: Numbers,
+    ) -> "Delayed":
+        """**Raises:** `DefinitionError` for sections other than a `ClockPhase`."""
+        phase = sections.family if isinstance(sections, PlacedSections) else sections
+        if not isinstance(phase, ClockPhase):
+            raise DefinitionError(
+                f"`delay` needs sections at equal times, `ClockPhase`, not {type(phase).__name__}."
+            )
+        delay = jnp.asarray(delay, float)
+        whole = delay.sum() * phase.n_sections / cycle.period
+        lag = stop_gradient(jnp.floor(whole + TOGETHER))
+        # (Sections that coincide are refused.)
+        together = not is_traced(cycle, delay) and bool(whole - lag < 2 * TOGETHER)
+        family = _Departures(phase, delay, lag, 1 if together else 2)  # type: ignore[call-arg,arg-type]
+        model = linearize(cycle, family, outputs, inputs)
+        if together:
+            return cls(model, lag, model.inputs)
+        A, B, C, D, dims = model.matrices
+        B = jnp.concatenate([B[1::2], A[1::2] @ B[::2]], axis=2)
+        D = jnp.concatenate([0 * D[::2], D[::2]], axis=2)
+        names = *model.inputs, *(f"{x} before" for x in model.inputs)
+        model = LDTP(A[1::2] @ A[::2], B, C[::2], D, dims[::2], names, model.outputs)
+        return cls(model, lag, names[: len(names) // 2])
+
+    def htf(self, f: Float[Array, " F"], harmonics: tuple[int, ...]) -> Complex[Array, "M F ny nu"]:
+        """Return the HTFs, also for a traced lag."""
+        H = self.model.htf(f, harmonics).H
+        turn = -2j * jnp.pi * f[:, None, None] / self.model.n_sections
+        halves = jnp.split(H, H.shape[3] // len(self.inputs), axis=3)
+        return sum(jnp.exp((self.lag + k) * turn) * x for k, x in enumerate(halves))
+
+    def to_ldtp(self) -> LDTP:
+        """Return the system with past inputs as states.
+
+        **Raises:** `DefinitionError` for a traced lag.
+        """
+        if is_traced(self.lag):
+            raise DefinitionError(
+                "the delays decide on the number of states: they cannot be traced. To fit delays, "
+                "give them to `ObservedHTF`."
+            )
+        nu, wide = len(self.inputs), len(self.model.inputs)
+        first = int(self.lag) * nu
+        past = first + wide - nu
+        if not past:
+            return self.model
+        rows = np.tile(np.eye(past + nu), (self.model.n_sections, 1, 1))
+        (B, A), (D, C) = (
+            np.split(rows[:, part], [nu], axis=2)
+            for part in (slice(past), slice(first, first + wide))
+        )
+        return self.model @ LDTP(A, B, C, D, inputs=self.inputs, outputs=self.model.inputs)

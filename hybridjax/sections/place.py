@@ -145,7 +145,8 @@ def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any,
         return (carry, anchor), flow
 
     carry = begin, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)
-    if isinstance(family.anchor, Crossing) and family.points == 1 and not on_host(period):
+    at_anchor = isinstance(family.anchor, Crossing) and family.at_anchor
+    if at_anchor and family.points == 1 and not on_host(period):
         # (One loop to the anchor and on to all sections: a search of its own would take a third of
         # the time of compilation.)
         (_, anchor), pieces = scan(onwards, (carry, begin), xp.arange(N + 1))
@@ -156,8 +157,9 @@ def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any,
             target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
             carry, before = go(carry, to_section(target, family.anchor))
             bound = _bind(s, map, family, carry[0], go)
-            _, pieces = to(carry, xp.arange(1, N + 1), bound)
-            pieces = jax.tree_util.tree_map(lambda *x: xp.concatenate(x), before, pieces)
+            _, pieces = to(carry, xp.arange(int(at_anchor), N + 1), bound)
+            if at_anchor:
+                pieces = jax.tree_util.tree_map(lambda *x: xp.concatenate(x), before, pieces)
         else:
             bound = _bind(s, map, family, begin, go)
             _, pieces = to(carry, xp.arange(N + 1), bound)

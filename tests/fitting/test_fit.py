@@ -113,3 +113,17 @@ def test_the_hopper_comes_back_from_experiments(hopper_cycle):
     for name in HOPPER:
         found, true = (float(getattr(s, name)) for s in (fit.system, hopper_cycle.system))
         assert found == pytest.approx(true, rel=1e-6), name
+
+
+def test_both_delays_come_back(hopper_cycle):
+    lines = np.arange(1, 33) / 16 + 0.01
+    htf = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS, delay=(0.037, 0.081)).htf(lines)
+    free = "k", "input_delay", "output_delay"
+    data = hj.ObservedHTF(htf, SECTIONS, delay=(0.0625, 0.0625))  # (together a whole section)
+    fit = hj.fit_model(hj.models.VerticalHopper(k=11.0), data, free, guess=hopper_cycle)
+    np.testing.assert_allclose(fit.values, (10.0, 0.037, 0.081), rtol=1e-8)
+    assert fit.contains({"k": 10.0, "input_delay": 0.037, "output_delay": 0.081})
+    with pytest.raises(hj.DefinitionError, match="must have a value of 'input_delay'"):
+        fit.contains(hopper_cycle.system)
+    with pytest.raises(hj.DefinitionError, match="no data have a delay"):
+        hj.fit_model(hopper_cycle.system, hj.ObservedHTF(htf, SECTIONS), free)

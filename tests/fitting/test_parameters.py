@@ -20,7 +20,7 @@ COORDINATES = st.floats(-8.0, 8.0)
 @given(VALUES, BOUNDS, COORDINATES)
 def test_values_come_back_and_keep_to_their_bounds(value, bounds, x):
     parameters = free_parameters(HOPPER(k=value), {"k": bounds})
-    values = parameters.read(HOPPER(k=value))
+    values = parameters.read(HOPPER(k=value), ())
     np.testing.assert_allclose(parameters.decode(parameters.encode(values)), values, rtol=1e-12)
     low, high = (0.0, np.inf) if bounds is None else bounds
     assert low <= parameters.decode(jnp.array([x]))[0] <= high

@@ -6,6 +6,7 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.htf_estimate import roundness
+from hybridjax.identify.weights import estimated_noise
 
 
 N, P = 4, 16
@@ -158,3 +159,36 @@ def test_repeated_phases_show_no_distortion(model):
     twice = [np.concatenate([x, x + 1e-3 * k]) for k, x in ((0, data.u), (1, data.y))]
     with pytest.raises(hj.DefinitionError, match="repeat the same phases"):
         hj.estimate_htf(hj.ExperimentData(*twice, n_sections=N, periods=P), variance="total")
+
+
+@pytest.mark.parametrize("freedom", [3, 8])
+def test_weights_from_estimated_variances_widen_the_errors_of_fits(freedom):
+    """One unknown, 300 lines: the misfit shows the factor of the variance of its estimate."""
+    rng = np.random.default_rng(0)
+    weight = freedom / rng.gamma(freedom, size=(4000, 300))
+    error = rng.normal(size=weight.shape)
+    estimate = (weight * error).sum(axis=1) / weight.sum(axis=1)
+    misfit = np.mean(weight * (error - estimate[:, None]) ** 2) * 300 / 299
+    _, deviation = estimated_noise(freedom / (freedom - 1), misfit)
+    actual = np.mean(estimate**2) / np.mean(1 / weight.sum(axis=1))
+    assert actual == pytest.approx(deviation**2, rel=0.12)  # (freedom / (freedom - 2) at most)
+
+
+def test_fits_know_of_estimated_variances(model):
+    exact = model.htf(np.arange(1, 32) / 16)
+    H = np.asarray(exact.H)
+    drawn = np.random.default_rng(0).normal(size=(2, *H.shape))
+    variance = 0.1 * np.random.default_rng(1).gamma(4, size=H.shape)
+    fits = [
+        hj.fit_ldtp(
+            hj.HTF(
+                exact.f, H + np.sqrt(0.2) * (drawn[0] + 1j * drawn[1]), exact.harmonics, N,
+                exact.inputs, exact.outputs, "estimate", variance=variance, scatter=scatter,
+            ), 2,
+        )
+        for scatter in (hj.Scatter(np.full(31, x)) for x in (4.0, 1e9))
+    ]  # fmt: skip
+    level = fits[0].cost / fits[0].freedom
+    ratio = fits[0].covariance / fits[1].covariance
+    np.testing.assert_allclose(ratio, level / (2 - level), rtol=1e-6)
+    assert level > 1.02

@@ -7,7 +7,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..conftest import ISOCHRONS, KINEMATIC, OUTPUTS
+from ..conftest import APEX, ISOCHRONS, KINEMATIC, OUTPUTS
 from ..orbits import hopper_scipy
 
 
@@ -135,3 +135,23 @@ def test_a_cycle_that_is_rest():
     cycle = hj.find_limit_cycle(hj.models.Mathieu(delta=1.0, epsilon=0.4))
     found = hj.linearize(cycle, hj.ClockPhase(4)).multipliers
     np.testing.assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)
+
+
+@pytest.mark.parametrize("late", [(7, 16), (40, 9), (0, 16), (10, 15), (0, 0)])
+def test_delays_agree_with_finer_sections(hopper_cycle, late):
+    """100 sections, whose inputs change at every 25th: delays of so many of them."""
+    M = 25
+    fine = hj.linearize(hopper_cycle, hj.ClockPhase(4 * M, anchor=APEX), OUTPUTS)
+    delay = np.array(late) * float(hopper_cycle.period) / (4 * M)
+    model = hj.linearize(hopper_cycle, hj.ClockPhase(4, anchor=APEX), OUTPUTS, delay=delay)
+    u = np.random.default_rng(0).normal(size=(24, 1))
+    held = np.concatenate([np.zeros((4 * M + late[0], 1)), np.repeat(u, M, axis=0)])
+    y = np.asarray(fine.simulate(held))[4 * M - late[1] :: M][: len(u)]
+    np.testing.assert_allclose(model.simulate(u), y, atol=1e-11 * np.abs(y).max())
+    np.testing.assert_allclose(model.multipliers, hopper_cycle.multipliers, atol=1e-9)
+    assert max(model.dims) == max(fine.dims) + -(-sum(late) // M)
+
+
+def test_delays_at_sections_of_the_state_are_refused(hopper_cycle):
+    with pytest.raises(hj.DefinitionError, match="needs sections at equal times"):
+        hj.linearize(hopper_cycle, KINEMATIC, OUTPUTS, delay=(0.1, 0.0))

@@ -21,6 +21,7 @@ from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, all_harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
+from .. import weights
 from ..denominator import multipliers_of
 from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
 from ..instrument import in_loop
@@ -28,7 +29,6 @@ from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
 from ..series.residuals import about_answering, answering
-from ..weights import SMALLEST_ERROR, are_alike, check_values, error_weights, neighbor_correlation
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
@@ -176,7 +176,7 @@ class LDTPFit(MultiplierEstimate):
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         about = f"misfit {self.cost:.6g}, expected {self.freedom}"
-        if self.cost > 2 * self.freedom or are_alike(self.correlation or 0.0, self.freedom):
+        if self.cost > 2 * self.freedom or weights.are_alike(self.correlation or 0.0, self.freedom):
             about += (
                 " (errors are larger than their variances, or alike at neighboring frequencies: "
                 "too few dimensions, or a local minimum that another guess avoids)"
@@ -294,11 +294,11 @@ def _answering(fit: LDTPFit, records: PreparedRecords, free_start: bool) -> dict
 
 
 def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
-    scale, direct = check_values(htf), _is_direct(guess)
+    scale, direct = weights.check_values(htf), _is_direct(guess)
     if not isinstance(guess, LDTP):
         guess = realize(htf, np.array(given_dims(guess, htf.n_sections, "guess")))
     require_same("guess and data", guess, htf)
-    problem = FrequencyProblem.of(htf, error_weights(htf, scale), scale)
+    problem = FrequencyProblem.of(htf, weights.error_weights(htf, scale), scale)
     model = PeriodicModel.of(guess, scale)
     unknowns = local_coordinates(model, direct).size
     freedom = problem.residuals - unknowns
@@ -311,7 +311,7 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
         square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
-        weight = problem.weight / np.maximum(np.sqrt(square / 2), SMALLEST_ERROR)[:, None]
+        weight = problem.weight / np.maximum(np.sqrt(square / 2), weights.SMALLEST_ERROR)[:, None]
         problem = problem._replace(weight=weight)
         point, converged = descend(ModelPoint(problem, point.model, direct), FIRST_DAMPING)
     if check:
@@ -438,17 +438,19 @@ def _finished(
     freedom: int,
 ) -> LDTPFit:
     """Return the fit at a minimum, with the outputs in their own units, which are `scale`."""
-    model, known, noise, correlation = point.coordinates.model, False, None, None
+    model, unit, known = point.coordinates.model, point.cost / freedom, False
+    noise = correlation = None
     harmonics = all_harmonics(data.n_sections)
     if isinstance(data, HTF):
         known, harmonics = data.variance is not None, data.harmonics
         problem = cast(FrequencyProblem, point.problem)
+        unit = weights.covariance_unit(data, unit)
         size = problem.weight * problem.target
-        correlation = neighbor_correlation(problem.errors(model), size, np.asarray(data.f))
+        correlation = weights.neighbor_correlation(problem.errors(model), size, np.asarray(data.f))
     else:
         noise = noise_model(model, cast(SeriesProblem, point.problem).S, scale, data.outputs)
     c, slopes = characteristic_slopes(point.coordinates)
-    spread = point.equations.spread(1.0 if known else point.cost / freedom)
+    spread = point.equations.spread(unit)
     return LDTPFit(
         model=model.to_ldtp(scale, data.inputs, data.outputs),
         multipliers=multipliers_of(c),
@@ -490,8 +492,8 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     exact = exact_htf(model, htf)
     lags = 2 * default_horizon(model.n_sections) + 1
     minimal = realize(np.asarray(model.impulse_response(lags)))
-    scale = check_values(exact)
-    problem = FrequencyProblem.of(exact, error_weights(exact, scale), scale)
+    scale = weights.check_values(exact)
+    problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
     coordinates = local_coordinates(PeriodicModel.of(minimal, scale), _is_direct(model))
     c, slopes = characteristic_slopes(coordinates)
     spread = problem.linearize(coordinates).spread()

@@ -252,7 +252,11 @@ def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> No
     if (solution.freedom > order).all():
         return
     n, i = np.argwhere(solution.freedom <= order)[0]
-    missing = order + 1 - int(solution.freedom[n, i])
+    left = int(solution.freedom[n, i])
+    if not left:  # more lags than samples would use up more of them
+        starts = (len(g.y) * (problem.free + g.drift.shape[-1]) for g in problem.records.grids)
+        left = int(problem.records.sampled[n, i]) - problem.lags * problem.shape[1] - sum(starts)
+    missing = order + 1 - left
     raise DefinitionError(
         f"section {n} was sampled {problem.records.sampled[n, i]} times, too few for numerators of "
         f"{problem.lags} lags and {problem.free} unknown cycles at the start of each record: "
