@@ -4,8 +4,8 @@
 - `host_first` runs a function on the host until compiling it is worth its time.
 - `TwoTiers` compiles the experiments twice: a quick executable for the first answer, and the fully
   optimized one in a thread beside it.
-- `kernel` compiles single functions of users for code that runs on the host; `whole` and `deferred`
-  programs that do more at once, when the host has spent as much time.
+- `kernel` compiles single functions of users for code that runs on the host; `whole` programs that
+  do more at once, when the host has spent as much time.
 """
 
 import collections
@@ -394,33 +394,26 @@ def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=Non
     return np.concatenate(parts, axis=-1)[..., :L]
 
 
-def whole(function: Callable, static: tuple, trees: Any, seconds: float) -> Callable[..., Any]:
-    """`function(*static, *trees, *arguments)`, which runs on the host for so many seconds before it
-    is compiled (see `deferred`); of any arguments and results, with arrays of NumPy."""
-    compiled = ft.partial(_run_tree, *_bound(function, ft.partial, static, trees, 1))
-    return deferred(compiled, ft.partial(function, *static, *trees), seconds)
-
-
-def _run_tree(program: Callable, arrays: list, *arguments):
-    return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
-
-
-def deferred(compiled: Any, other: Callable, seconds: float) -> Callable:
-    """`other`, a function of the host, until it has taken so many seconds of this thread, about as
-    many as compiling takes: then a thread compiles a kernel that has the same results.
+def whole(function: Callable, static: tuple, trees: Any) -> Callable[..., Any]:
+    """`function(*static, *trees, *arguments)` of any arguments and results, with arrays of NumPy:
+    on the host, until it has taken as many seconds of this thread as compiling takes (a third of
+    `WORTH_COMPILING`). Then a thread compiles it.
 
     In interactive sessions there is time between calls: the thread starts earlier.
     """
-    program = compiled.args[0]
-    worth = seconds / 3 if hasattr(sys, "ps1") else seconds
+    program, arrays = _bound(function, ft.partial, static, trees, 1)
+
+    def compiled(*arguments):
+        return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
 
     def call(*arguments):
         if program in _ready:
             return compiled(*arguments)
         begin, before = time.thread_time(), _spent.get(program)
-        results = other(*arguments)
+        results = function(*static, *trees, *arguments)
         # (The first call compiles kernels.)
         after = _spent[program] = 0.0 if before is None else before + time.thread_time() - begin
+        worth = WORTH_COMPILING / (9 if hasattr(sys, "ps1") else 3)
         if before is not None and before <= worth < after:
             compile_ = lambda: (compiled(*arguments), _ready.add(program))  # noqa: E731
             threading.Thread(target=compile_).start()
