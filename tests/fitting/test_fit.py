@@ -141,7 +141,8 @@ def test_both_delays_come_back(hopper_cycle):
     data = hj.ObservedHTF(htf, SECTIONS, delay=(0.0625, 0.0625))  # (together a whole section)
     fit = hj.fit_model(hj.models.VerticalHopper(k=11.0), data, free, guess=hopper_cycle)
     np.testing.assert_allclose(fit.values, (10.0, 0.037, 0.081), rtol=1e-8)
-    assert fit.contains({"k": 10.0, "input_delay": 0.037, "output_delay": 0.081})
+    # (Without noise, a region is as small as rounding errors, which are not independent.)
+    assert not fit.contains({"k": 10.0, "input_delay": 0.037, "output_delay": 0.082})
     with pytest.raises(hj.DefinitionError, match="must have a value of 'input_delay'"):
         fit.contains(hopper_cycle.system)
     with pytest.raises(hj.DefinitionError, match="no data have a delay"):
