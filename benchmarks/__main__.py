@@ -27,6 +27,7 @@ CASES = {
     "second-order": ("second_order.py", 2, "second-order products on lines, and draws without"),
     "jumps": ("jumps.py --draws 200", 6, "random systems with jumps and pulses, right or refused"),
     "scale": ("scale.py", 30, "sweeps and experiments on several processes"),
+    "motion": ("motion.py", 1, "moves of sliders, first pictures of animations"),
     "boundary": ("boundary.py", 1, "the cost of checking arguments"),
     "truth-chain": ("chain_truth.py", 1, "ground truth, independent of the package"),
     "truth-circuits": ("circuits_truth.py", 1, "ground truth"),

@@ -5,9 +5,11 @@ dB in the usual design), and multipliers by `fit_multipliers`. "Saved" is the ra
 rms errors at equal numbers of strides (and equal rms of the input). Printed, as `name value` lines:
 
 - `bound`: Cramer-Rao bounds of the usual design (620 lines, 20 experiments) and of the optimal one,
-  input or output limited, what is saved, the certificate, and seconds of the process to find it.
+  input or output limited, what is saved, the certificate, and seconds of the process to find it;
+  `slow`: what is saved, input limited, over equal amplitudes up to f = 2 only.
 - `known`: rms errors of draws with new noise, four draws of the phases; the model is known. The
-  input's rms is 0.001, on odd lines (P = 128), so that distortion is below noise.
+  input's rms is 0.001, on odd lines (P = 128), so that distortion is below noise. `strong`: the
+  same for a rms of 0.02 and 0.1.
 - `nothing`: from nothing, by `hj.designs.Study`, which is asked for a standard error of 5e-5: 640
   strides of equal amplitudes, then designs made from what was measured, until it stops. The noise
   is not known either. All strides are counted, and compared with those of equal amplitudes whose
@@ -100,10 +102,20 @@ def bounds(family: Family, draws: int) -> None:
         for name in OUTPUTS:
             family.show(f"bound.{limit}.deviation.{name}", plan.rms[name] / plan.usual_rms[name])
         family.show(f"bound.{limit}.cpu_seconds", seconds)
+    noise = {"yM": 6e-6, "vM": 1.2e-5}
+    usual = (hj.multisine().scaled(RMS), hj.multisine(band=(0, 2)).scaled(RMS))
+    plan, slow = (hj.optimal_design(family.model, x, noise=noise) for x in usual)
+    as_much = slow.usual_criterion * usual[1].cycles(0)
+    family.show("bound.slow.saved", as_much / (plan.criterion * plan.design.cycles(0)))
 
 
-def known(family: Family, draws: int) -> None:
-    usual = hj.multisine(periods=128, lines="odd").scaled(RMS)
+def strong(family: Family, draws: int) -> None:
+    for rms in (0.02, 0.1):
+        known(family, draws, rms, f"strong.{rms}")
+
+
+def known(family: Family, draws: int, rms: float = RMS, row: str = "known") -> None:
+    usual = hj.multisine(periods=128, lines="odd").scaled(rms)
     before = family.recorded(usual)
     noise = family.noise(before[0])
     plan = hj.optimal_design(family.model, usual, noise=noise)
@@ -118,10 +130,10 @@ def known(family: Family, draws: int) -> None:
             return hj.fit_multipliers(htf, 2)
 
         found.append(rms_error(family, fit, draws, seed=3))
-        family.show(f"known.{name}.rms_error", found[-1])
-    family.show("known.usual.bound", np.linalg.norm(plan.usual_standard_errors))
-    family.show("known.optimal.bound", np.linalg.norm(plan.standard_errors))
-    family.show("known.saved", (found[0] / found[1]) ** 2)
+        family.show(f"{row}.{name}.rms_error", found[-1])
+    family.show(f"{row}.usual.bound", np.linalg.norm(plan.usual_standard_errors))
+    family.show(f"{row}.optimal.bound", np.linalg.norm(plan.standard_errors))
+    family.show(f"{row}.saved", (found[0] / found[1]) ** 2)
 
 
 def study(family: Family, rng, first, begun, noise: dict[str, float]) -> hj.designs.Study:
@@ -184,6 +196,7 @@ def stopping(family: Family, draws: int) -> None:
 STEPS = {
     "bound": bounds,
     "known": known,
+    "strong": strong,
     "nothing": nothing,
     "stopping": stopping,
     "goals": goals,

@@ -76,7 +76,7 @@ CASES: dict[str, Callable[[], Case]] = {
         5e-4, _pair(-0.248983334735609 + 0.699333251798004j), _MPMATH, ("yM", "vM"),
     ),
     "lossy hopper": lambda: Case(
-        "the same, retention 0.8", m.VerticalHopper(retention=0.8),
+        "vertical hopper, retention 0.8", m.VerticalHopper(retention=0.8),
         hj.ClockPhase(32, anchor=_APEX), "yM", "force", 5e-4,
         _pair(-0.317897006349938 + 0.694628822735891j), _MPMATH, ("yM", "vM"),
     ),

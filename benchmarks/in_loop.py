@@ -186,7 +186,7 @@ def random_loops(count: int) -> dict[str, int]:
             counts["reported"] += 1
             continue
         right = fit.contains(model.multipliers, 0.9999).all()
-        name = "right" if right else "wrong" if fit.result == hj.Result.OK else "reported"
+        name = "reported" if fit.result != hj.Result.OK else "right" if right else "wrong"
         counts[name] += 1
         print(
             f"in_loop.random.{k} {name}: {fit.compare(model.multipliers).max_error:.2g}", flush=True

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.orbits.linear_flow import rule
+from hybridjax.orbits.linear_flow import linear_flow, rule
 from hybridjax.systems.chart import FieldChart
 from hybridjax.systems.system import Driven
 
@@ -55,6 +55,33 @@ class PushedWheel(hj.models.RimlessWheel):
         return [dataclasses.replace(x, reset=lambda t, q, u: (*x.reset(t, q, u), *q[2:]))]
 
 
+class Circuit(hj.Chart):
+    """A boost converter whose duty cycle is its input, as on the page on responses."""
+
+    states = ("i", "v", "ramp")
+    opened: float
+
+    def field(self, t, q, u):
+        charge = (self.opened * q[0] - q[1] / 5.0) * 1e4
+        return (12.0 - self.opened * q[1]) * 1e4, charge, 1e5
+
+
+class Boost(hj.HybridSystem):
+    def charts(self):
+        return {"closed": Circuit(0.0), "open": Circuit(1.0)}
+
+    def transitions(self):
+        yield hj.Transition("opens", "closed", "open", lambda t, q, u: 0.4 + u[0] - q[2])
+        anew = lambda t, q, u: (q[0], q[1], 0.0)  # noqa: E731
+        yield hj.Transition("closes", "open", "closed", hj.Scheduled(1e-5), reset=anew)
+
+    def period(self):
+        return 1e-5
+
+    def guess(self):
+        return hj.Guess("closed", (6.0, 20.0, 0.1), 1e-6)
+
+
 def slope(mean, size):
     """The response to a complex wave, by differences of responses to real ones of some sizes."""
 
@@ -74,7 +101,7 @@ def clocked(system, outputs, size):
 
     def mean(size, angle):
         push = Wave(*map(jnp.asarray, (size, angle, np.pi / 2 / period)))
-        flow = hj.find_limit_cycle(Pushed(system, push), begin)._course().linear_flow(1 / 64)
+        flow = linear_flow(hj.find_limit_cycle(Pushed(system, push), begin), 1 / 64)
         y = np.take_along_axis(flow.q, columns[flow.chart][:, None], axis=2)
         weight = flow.length[:, None] * rule().weights / (4 * period)
         return np.einsum("pk,pky->y", weight * np.exp(-2.5j * np.pi * flow.t / period), y)
@@ -107,6 +134,7 @@ if __name__ == "__main__":
         (hj.models.VerticalHopper(), ("yM", "vM"), 1e-2),
         (hj.models.BuckConverter(), ("v", "i"), 1e-3),
         (hj.models.CukConverter(), ("v2", "i1"), 1e-3),
+        (Boost(), ("v", "i"), 1e-4),
     ]
     for system, outputs, size in cases:
         H, response = clocked(system, outputs, size)

@@ -70,6 +70,24 @@ def test_the_pictures_of_the_home_page_are_those_that_are_drawn_now(monkeypatch)
     pyplot.close("all")
 
 
+@pytest.mark.slow
+def test_thumbnails_are_those_of_the_code_on_their_pages(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs/_site")
+    pictures = importlib.import_module("pictures")
+    values = lambda text: np.array(re.findall(r"-?\d+(?:\.\d+)?", text), float)  # noqa: E731
+    for name in ("compass-gait", "slip", "van-der-pol"):
+        file = values((pictures.IMAGES / f"gallery/{name}.svg").read_text())
+        np.testing.assert_allclose(values(pictures.thumbnail(*pictures.run(name))), file, atol=1.01)
+
+
+def test_the_gallery_has_a_page_with_code_for_each_thumbnail(site):
+    pages = re.findall(
+        r'<a href="(gallery/[\w-]+\.html)"><svg', (site / "gallery.html").read_text()
+    )
+    assert len(set(pages)) == 29
+    assert all("find_limit_cycle" in (site / page).read_text() for page in pages)
+
+
 def test_nothing_is_fetched_from_another_host(site):
     fetched = re.compile(r"<(?!a\s)[^>]*\s(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
     for page in site.rglob("*.html"):

@@ -51,7 +51,8 @@ def _pages(path: Path) -> dict[str, str | bytes]:
             elif "image/png" in data:
                 name = f"{path.stem}-{len(pictures) + 1}.png"
                 pictures[name] = base64.b64decode(data["image/png"])
-                parts.append(f"![]({name})")
+                code = re.sub(r"[\[\]`\n]", " ", source.strip().rsplit("\n", 1)[-1])
+                parts.append(f"![Figure that the code above draws: {code}]({name})")
             elif "text/plain" in data:  # (what a long call said of itself is empty in the end)
                 parts.append(f"```text\n{''.join(data['text/plain'])}\n```")
     return {f"{path.stem}.md": "\n\n".join(parts)} | pictures

@@ -9,6 +9,9 @@ import griffe
 
 # Functions that are named as the makers of a result. Doubled: longer lists.
 _MAKERS = 4
+# A list of arguments, and the names and the text of an item.
+_ARGUMENTS = re.compile(r"(?<=\*\*Arguments:\*\*\n\n)(?:- .*\n?(?:(?: +\S.*| *)(?:\n|$))*)+")
+_ITEM = re.compile(r"((?:`[^`]+`(?:, (?:and )?)?)+)[:,]?\s*(.*)", re.DOTALL)
 
 
 class Members(griffe.Extension):
@@ -25,6 +28,10 @@ class Members(griffe.Extension):
                 given = ", ".join(f"`hj.{x}`" for x in own[:_MAKERS])
                 thing.docstring.value += f"\n\n*Given by* {given}."
 
+    def on_object(self, *, obj: griffe.Object, **_) -> None:
+        if obj.docstring:
+            obj.docstring.value = _ARGUMENTS.sub(_table, obj.docstring.value)
+
     def on_function(self, *, func: griffe.Function, **_) -> None:
         if any(decorator.callable_path.endswith("remembered") for decorator in func.decorators):
             value = griffe.Attribute(
@@ -38,6 +45,16 @@ class Members(griffe.Extension):
         lines = [_parameter(x) for x in cls.attributes.values() if str(x.annotation) == "Parameter"]
         if lines and cls.docstring:
             cls.docstring.value += "\n\n**Parameters:**\n\n" + "\n".join(lines)
+
+
+def _table(arguments: re.Match) -> str:
+    """A list of arguments as a table."""
+    items = re.split(r"^- ", arguments[0], flags=re.MULTILINE)[1:]
+    rows = [_ITEM.fullmatch(" ".join(item.split())) for item in items]
+    if not all(rows) or any("|" in re.sub("`[^`]*`", "", item) for item in items):
+        return arguments[0]
+    lines = [f"| {row[1]} | {row[2][:1].upper()}{row[2][1:]} |" for row in rows]
+    return "\n".join(["| argument | meaning |", "|---|---|", *lines]) + "\n\n"
 
 
 def _public(pkg: griffe.Module) -> Iterator[tuple[str, griffe.Object]]:

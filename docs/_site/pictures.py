@@ -1,23 +1,32 @@
-"""Pictures of the home page: `python docs/_site/pictures.py` draws them anew.
+"""Pictures of the home page: `python docs/_site/pictures.py` draws them anew; with the argument
+`gallery`, it runs the code of the gallery's pages and draws their thumbnails (two minutes).
 
 A picture holds numbers that it draws, with which a test compares new ones.
 """
 
+import itertools
 import json
+import re
+import sys
 from pathlib import Path
 
 import matplotlib
 import numpy as np
+from gallery import codes
 from matplotlib import pyplot
 from PIL import Image
 
 import hybridjax as hj
+from hybridjax.engine.trajectory import observed
 from hybridjax.plot import Motion
-from hybridjax.plot.look import Plot
+from hybridjax.plot.look import CYCLE, Plot
+from hybridjax.plot.motion import to_borders
+from hybridjax.plot.pictures import Pictures, drawing_of
 
 
 IMAGES = Path(__file__).parents[1] / "images"
 APEX = hj.Crossing("vM", "falling")
+FRAMES = 24  # of a thumbnail
 
 
 def draw() -> dict[str, Plot]:
@@ -45,6 +54,79 @@ def walk() -> Motion:
     return hj.plot.animate(gait)
 
 
+def thumbnail(cycle: hj.LimitCycle, plane: list[str]) -> str:
+    """An SVG of 160 x 120 in which the mechanism moves; or, of systems without a picture and of
+    circuits, the orbit with a dot that moves along it."""
+    motion = hj.plot.animate(cycle)
+    pyplot.close(motion.figure)
+    path, period = cycle.trajectory(1 + 1e-6), float(cycle.period)
+    times = path.t[0] + np.linspace(0, period, FRAMES, endpoint=False)
+    about = f'dur="{max(motion.interval * len(motion.times), 1.0):.3g}s"'
+    is_circuit = isinstance(cycle.system, hj.models.BuckConverter | hj.models.CukConverter)
+    if is_circuit or drawing_of(cycle.structure, 0) is None:
+        names = plane or cycle.structure.states_everywhere()[:2]
+        points = np.array(path(*names, per_step=4)[1:]).T
+        now = observed(cycle.structure, names, times, *path.at(times)).T
+        size = np.maximum(np.ptp(points, axis=0), 1e-9 * (1 + np.abs(points).max(axis=0)))
+        to = lambda x: 20 + (x - points.min(axis=0)) / size * (120, 80)  # noqa: E731
+        shapes = [
+            _line("orbit", [to(points)], CYCLE[0]),
+            _circle([(*x, 5) for x in to(now)], about),
+        ]
+        return _svg(shapes)
+    pictures = Pictures(path, period)
+    scenes, extent = pictures.at(times), np.maximum(pictures.high - pictures.low, 1e-9)
+    center, scale = (pictures.low + pictures.high) / 2, min(140 / extent[0], 100 / extent[1])
+    to = lambda x: (80, 60) + (x - center) * scale  # noqa: E731
+    colors = itertools.cycle(CYCLE[:3])
+    shapes = []
+    for name in scenes[0].lines:
+        lines = [x.lines[name] for x in scenes]
+        is_ground = name == "ground"
+        if is_ground:
+            lines = [to_borders(x, float(extent.max())) for x in lines]
+        color = "currentColor" if is_ground else next(colors)
+        shapes.append(_line(name, [to(x) for x in lines], color, about))
+    for name in scenes[0].circles:
+        rows = [x.circles[name] for x in scenes]
+        shapes.append(_circle([(*to(x[:2]), x[2] * scale) for x in rows], about))
+    return _svg(shapes)
+
+
+def _svg(shapes: list[str]) -> str:
+    size = 'viewBox="0 0 160 120" xmlns="http://www.w3.org/2000/svg"'
+    return f'<svg {size}><g transform="matrix(1 0 0 -1 0 120)">{"".join(shapes)}</g></svg>\n'
+
+
+def _line(name: str, frames: list, color: str, about: str = "") -> str:
+    paths = ["M" + " ".join(f"{x:.0f},{y:.0f}" for x, y in z) for z in frames]
+    moves = _animated("d", paths, about)
+    return f'<path d="{paths[0]}" fill="none" stroke="{color}" stroke-width="2">{moves}</path>'
+
+
+def _circle(frames: list, about: str) -> str:
+    values = [[f"{x:.1f}" for x in column] for column in zip(*frames, strict=True)]
+    names = dict(zip(("cx", "cy", "r"), values, strict=True))
+    first = " ".join(f'{name}="{column[0]}"' for name, column in names.items())
+    moves = "".join(_animated(name, column, about) for name, column in names.items())
+    return f'<circle {first} fill="#e3ebf3" stroke="currentColor">{moves}</circle>'
+
+
+def _animated(name: str, values: list[str], about: str) -> str:
+    if len(set(values)) == 1:
+        return ""
+    how = f'{about} begin="0s" calcMode="discrete" repeatCount="indefinite"'
+    return f'<animate attributeName="{name}" values="{";".join(values)}" {how}/>'
+
+
+def run(name: str) -> tuple[hj.LimitCycle, list[str]]:
+    """The cycle and the plane that the code of a page of the gallery gives."""
+    *lines, last = codes()[name][1].splitlines()
+    scope: dict = {}
+    exec("\n".join(lines), scope)
+    return scope["cycle"], re.findall(r', "(\w+)"', last)
+
+
 def numbers(plot: Plot) -> list[list[float]]:
     """Sum and sum of squares of each curve's values."""
     curves = [line.get_ydata() for panel in plot.axes.flat for line in panel.get_lines()]
@@ -57,9 +139,22 @@ def drawn(name: str) -> list[list[float]]:
         return json.loads(picture.info["Comment"])
 
 
+def of_page() -> pyplot.Figure:
+    """The figure that the page on responses draws."""
+    text = (IMAGES.parent / "how-to" / "responses.md").read_text()
+    page: dict = {}
+    exec("".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), page)
+    return page["figure"]
+
+
 if __name__ == "__main__":
     matplotlib.use("Agg")
     hj.enable_x64()
+    if "gallery" in sys.argv:
+        for name in sys.argv[2:] or codes():
+            (IMAGES / f"gallery/{name}.svg").write_text(thumbnail(*run(name)))
+        sys.exit()
+    of_page().savefig(IMAGES / "converter.png", metadata={"Software": None})
     walk().save(IMAGES / "walk.gif")
     for name, plot in draw().items():
         about = {"Comment": json.dumps(numbers(plot)), "Software": None}

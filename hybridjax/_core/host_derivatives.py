@@ -44,15 +44,20 @@ def require_program() -> None:
         raise NotOnHostError
 
 
-def by_columns(compiled: Callable, along: Callable, relevant: Callable = lambda t: t) -> Callable:
+def by_columns(
+    compiled: Callable,
+    along: Callable,
+    relevant: Callable = lambda t: t,
+    most: float = JACOBIAN_COLUMNS,
+) -> Callable:
     """`compiled`, whose derivatives outside of programs come from the host.
 
     `along(arguments, directions)` returns the result and its derivatives in P directions. A
     direction moves a single number of the arguments: `directions` is a tree of their form with
     arrays (P, ...), and `None` for what does not move; so is the second result. Values are
     concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
-    raises `NotOnHostError`, or many numbers move, derivatives are compiled, as inside of programs.
-    `relevant` replaces tangents that make no difference by `None`.
+    raises `NotOnHostError`, or more than `most` numbers move, derivatives are compiled, as inside
+    of programs. `relevant` replaces tangents that make no difference by `None`.
     """
     derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
 
@@ -64,7 +69,7 @@ def by_columns(compiled: Callable, along: Callable, relevant: Callable = lambda 
         )  # fmt: skip
         leaves, structure = jax.tree_util.tree_flatten(moving)
         ends = np.cumsum([x.size for x in leaves])
-        is_small = len(leaves) and ends[-1] <= JACOBIAN_COLUMNS
+        is_small = len(leaves) and ends[-1] <= most
         if is_traced(arguments) or is_inside_program() or not is_small:
             return eqx.filter_jvp(compiled, arguments, tangents)
         parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)

@@ -1,3 +1,8 @@
-from .lti import to_control as to_control, to_lti as to_lti, to_scipy as to_scipy
+from .lti import (
+    to_control as to_control,
+    to_harmonic_state_space as to_harmonic_state_space,
+    to_lti as to_lti,
+    to_scipy as to_scipy,
+)
 from .tables import to_pandas as to_pandas
 from .xarray_datasets import from_xarray as from_xarray, to_xarray as to_xarray

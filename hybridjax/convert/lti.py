@@ -1,23 +1,30 @@
-"""Periodic systems as time-invariant ones, whose samples are whole periods; python-control, scipy.
+"""Periodic systems as time-invariant ones: lifted, with samples of whole periods; harmonic.
 
 Lifting (Bittanti and Colaneri, *Periodic Systems*, 2009, sec. 6.2) stacks the inputs and outputs of
 all sections of a period.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Complex
 
 from .._core.arguments import package
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Positive
-from .._core.executor import is_traced
+from .._core.boundary.kinds import Count, Positive, SignalNames
+from .._core.executor import is_traced, to_host
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
+from ..errors import ComputationError, DefinitionError
+from ..linear.frequency_response import Frequencies
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
+from ..orbits.continuous_htf import asked, observed
+from ..orbits.cycle import LimitCycle
+from ..orbits.linear_flow import linear_flow, rule
+from ..systems.system import OutputNames
 
 
 @checked
@@ -91,6 +98,84 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     frequencies = 2 * np.pi * np.asarray(thing.f) / period
     about = {"inputs": inputs, "outputs": outputs, "sysname": "HTF"}
     return package("control").FrequencyResponseData(H, frequencies, **about)
+
+
+class HarmonicStateSpace(NamedTuple):
+    """Constant matrices of the harmonics of states, inputs and outputs in dX/dt = A X + B U and
+    Y = C X + D U, harmonic -order first, to order. Block (m, n) of B is that from U_n to X_m."""
+
+    A: Complex[np.ndarray, "a a"]
+    B: Complex[np.ndarray, "a b"]
+    C: Complex[np.ndarray, "c a"]
+    D: Complex[np.ndarray, "c b"]
+    order: int
+    error: float
+    """The largest error of H_-1, H_0 and H_1, relative to the largest of them."""
+
+    def transfer(self, f: Frequencies, period: float) -> Complex[np.ndarray, "f M ny nu"]:
+        """Responses of all harmonics to inputs of frequencies in cycles per period."""
+        M = 2 * self.order + 1
+        B, D = (x.reshape(len(x), M, -1)[:, self.order] for x in (self.B, self.D))
+        rates = 2j * np.pi * np.asarray(f, float).reshape(-1, 1, 1) / period
+        H = self.C @ np.linalg.solve(rates * np.eye(len(self.A)) - self.A, B[None]) + D
+        return H.reshape(len(rates), M, -1, D.shape[-1])
+
+
+# The largest order that is tried, and frequencies of the comparison, in cycles per period. More:
+# calls take longer. Fewer: an error between them is not seen.
+_MOST = 64
+_TRIED = np.array([0.13, 0.37, 0.5])
+
+
+@checked
+def to_harmonic_state_space(
+    cycle: LimitCycle,
+    order: Count | None = None,
+    *,
+    outputs: OutputNames | None = None,
+    inputs: SignalNames | None = None,
+    tolerance: Positive = 1e-6,
+) -> HarmonicStateSpace:
+    """Return the harmonic state space of a cycle: Toeplitz matrices of the Fourier coefficients of
+    its linearization in continuous time, truncated at an order (see `HarmonicStateSpace`).
+
+    `cycle.htf` gives the same responses without truncation.
+
+    **Arguments:**
+
+    - `order`: the largest harmonic. Default: the first of 2, 4, ..., 64 whose `error` beside
+        `cycle.htf` is below `tolerance` (Default: 1e-6).
+    - `outputs`, `inputs`: as of `LimitCycle.htf`.
+
+    **Raises:** `DefinitionError` for cycles with events at which deviations jump;
+    `ComputationError` if no order is large enough.
+    """
+    exact = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs).H.swapaxes(0, 1)
+    (z, _, columns), map, n = asked(cycle, outputs, inputs), to_host(cycle.return_map), order or 2
+    flow, s, period = linear_flow(cycle, 0.25 / (order or _MOST)), map.structure, map.expected
+    jumps = flow.jumps.by_state - np.eye(s.d), flow.jumps.by_input
+    if any(np.abs(x).max() > 1e-9 for x in jumps):
+        raise DefinitionError(
+            f"{type(s.system).__name__} has events at which deviations jump, which no finite "
+            "number of harmonics represents: use `cycle.htf`, which is exact."
+        )
+    _, by_state, by_input = observed(s, flow, z)
+    series = flow.by_state, flow.by_input[..., columns], by_state, by_input[..., columns]
+    while True:
+        m, k = np.arange(-n, n + 1), np.arange(-2 * n, 2 * n + 1)
+        waves = np.exp(-2j * np.pi * k[:, None, None] * flow.after(map) / period)
+        waves = waves * flow.length[:, None] * rule().weights / period
+        parts = [np.einsum("mpk,pkij->mij", waves, x)[m[:, None] - m + 2 * n] for x in series]
+        A, B, C, D = (x.swapaxes(1, 2).reshape(len(m) * x.shape[2], -1) for x in parts)
+        A = A - np.diag(np.repeat(2j * np.pi * m / period, s.d))
+        space = HarmonicStateSpace(A, B, C, D, n, 0.0)
+        off = np.abs(space.transfer(_TRIED, period)[:, n - 1 : n + 2] - exact).max()
+        space = space._replace(error=float(off / np.abs(exact).max()))
+        if order or space.error < tolerance:
+            return space
+        if n == _MOST:
+            raise ComputationError(f"the error is {space.error:.1e} at order {n}: give an `order`.")
+        n *= 2
 
 
 @checked

@@ -18,6 +18,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
 from ..identify.multipliers import StructuredFit
+from ..identify.weights import are_alike
 from .candidates import Candidates
 from .goals import Multipliers
 from .limits import Limit, as_limits
@@ -181,9 +182,10 @@ class Study(eqx.Module):
         recordings: `section_data(...).experiments(periods)`). `repeats`: number of last windows
         that are averaged. Default: 1.
 
-        **Raises:** `DefinitionError` for data of other inputs, outputs or sections, and if the
-        initial transient, relative to the response, exceeds `standard_error` (tested if there are
-        cycles before the window); as `estimate_htf`, `fit_multipliers` and `optimal_design`.
+        **Raises:** `DefinitionError` for data of other inputs, outputs or sections, if the data
+        show more than `order` multipliers, and if the initial transient, relative to the response,
+        exceeds `standard_error` (tested if there are cycles before the window); as `estimate_htf`,
+        `fit_multipliers` and `optimal_design`.
         """
         require_equal("data and study", "n_sections", data.n_sections, self.first.n_sections)
         require_equal("data and study", "numbers of inputs", len(data.inputs), 1)
@@ -192,6 +194,11 @@ class Study(eqx.Module):
             require_same("blocks of one study", earlier.htf, block.htf, ("inputs", "outputs"))
         blocks = (*self._history.blocks, block)
         best = estimate(blocks, self.order, self.goal)
+        if are_alike(best.fit.correlation, best.fit.freedom):
+            raise DefinitionError(
+                f"the data show more than {self.order} multipliers (misfits are alike at nearby "
+                "frequencies): add the blocks to a study with a larger `order`."
+            )
         errors = _standard_errors(best.fit, self.goal)
         if best.objection:
             errors = np.full_like(errors, np.nan)

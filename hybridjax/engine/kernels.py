@@ -21,6 +21,7 @@ from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method, Radau, as_method
 from ..systems.structure import Kind, Member, Structure, stacked
 from ..systems.system import Output
+from ..systems.transition import Scheduled
 from .arrays import AnyInputs as Inputs, AnyTimes as Times, Array, States
 from .runge_kutta import Step, integrated_divergence, step_along as _along, take_step
 from .target import AbstractLevels
@@ -56,7 +57,7 @@ def step_along(
 
 
 def linear_step(
-    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, by_stages: Callable
+    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, by_stages: Any = None
 ) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
     states, inputs and length of the step. Those of explicit methods come `by_stages`."""
@@ -116,6 +117,11 @@ def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Arr
     return of_lanes(t, q, u, g.place)
 
 
+def due(s: Structure, g: int, t: Times, u: Inputs) -> Times:
+    """The times of a scheduled transition that lie at t up to rounding."""
+    return s.kernel(_due, by_lane, g)(t, t[None], u)[0]
+
+
 def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) -> Expanded:
     """Outputs in chart a, and their derivatives."""
     return linear(s, _outputs, a, t, q, u, items)
@@ -127,7 +133,8 @@ def linear(
     """A vector function (chart, structure, *trees, t, q, u) of chart a, and its derivatives."""
     if not on_host(q):
         return s.by_lane(_columns(ft.partial(function, a), 1 + len(trees)), *trees)(t, q, u)
-    return s.kernel(function, _expanded, a, trees=trees, lanes=_POINTS)(t, q, u)
+    lanes = _POINTS if q.shape[-1] < 16 * _POINTS else 4 * _POINTS
+    return s.kernel(function, _expanded, a, trees=trees, lanes=lanes)(t, q, u)
 
 
 def levels(
@@ -165,6 +172,13 @@ def _enabled(kind: Kind, s: Structure, t, q, u, place):
 
 def _outputs(a: int, s: Structure, items: Items, t, q, u):
     return s.resolve_outputs(items)(a, t, q, u)
+
+
+def _due(g: int, s: Structure, t, q, u):
+    guard = s.transitions[g].guard
+    assert isinstance(guard, Scheduled)
+    offset, period = guard.numbers(t)
+    return jnp.stack([offset + jax.lax.stop_gradient(jnp.round((t - offset) / period)) * period])
 
 
 def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q):

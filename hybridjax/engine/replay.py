@@ -118,7 +118,7 @@ def _advance(
     return for_each_chart(s, chart, moving, work, (t, q))
 
 
-class _Moves(NamedTuple):
+class Moves(NamedTuple):
     """Moves of any lanes, on the last axis."""
 
     t: Float[np.ndarray, " M"]
@@ -153,7 +153,7 @@ def chain(
     direction of the flow has no meaning: it is projected out of every move, so that it does not
     drown the other directions, however strongly the flow contracts.
     """
-    n, moves = 1 + s.d, _moves(lanes, tape)
+    n, moves = 1 + s.d, recorded_moves(lanes, tape)
     end, by = _linear_moves(s, moves, target)
     if across is not None:
         by[:, :, 1:n] = by[:, :, 1:n] @ _across(s, moves, across)
@@ -162,7 +162,7 @@ def chain(
     return columns[:, :, 1:n] if of_states else columns, ends
 
 
-def _products(moves: "_Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndarray:
+def _products(moves: "Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndarray:
     """Derivatives of (t, q) at the ends of lanes by (t, q, u) at their starts."""
     n, m = by.shape[1:]
     columns = np.tile(np.eye(n, m, dtype=by.dtype), (L, 1, 1))
@@ -180,20 +180,25 @@ class Variation:
     `twice`, their Jacobians have no derivatives."""
 
     def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times, twice):
-        moves, n, P = _moves(lanes, tape), 1 + s.d, s.directions
+        moves, n, P = recorded_moves(lanes, tape), 1 + s.d, s.directions
         self._s, self._moves, self.first = s, moves, np.flatnonzero(moves.order == 0)
-        due = [g for a in range(len(s.charts)) for g in s.schedules(a)]
-        if np.isin(moves.code, due).any() or len(self.first) < len(lanes.t):
+        if len(self.first) < len(lanes.t):
             raise NotOnHostError
-        self.starts = _Moves(*(x[..., self.first] for x in moves))
+        self.starts = Moves(*(x[..., self.first] for x in moves))
         # Every move in all directions: of its start, and the P ones.
         many = lambda x: np.repeat(x, n + P, axis=-1)  # noqa: E731
         aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), len(moves.t))
-        along = _Moves(*map(many, moves))
+        along = Moves(*map(many, moves))
         lane = along.lane * (n + P) + np.arange(len(along.t)) % (n + P)
-        along = along._replace(t=along.t + aside[0], q=along.q + aside[1:], lane=lane)
+        t, q, h = along.t + aside[0], along.q + aside[1:], along.h + 0j
+        for g, transition in enumerate(s.transitions):
+            at = along.code == g
+            if isinstance(transition.guard, Scheduled) and at.any():
+                end, u = (t + h).real[at], kernels.unpushed(s, lane[at])
+                h[at] = kernels.due(s, g, end, u) - t[at]
+        along = along._replace(t=t, q=q, h=h, lane=lane)
         needed = twice | (lane % (n + P) >= n)
-        along = _Moves(*(x[..., needed] for x in along))
+        along = Moves(*(x[..., needed] for x in along))
         later = np.concatenate([np.zeros((n, len(lanes.t))), times]).T.ravel()
         target = dataclasses.replace(
             target, time=many(target.time) + 1j * kernels.TINY * later,
@@ -231,27 +236,9 @@ class Variation:
         return t + aside[0], chart, q + aside[1:], u
 
 
-class Link(NamedTuple):
-    """One move of a lane."""
-
-    chart: int
-    """The chart in which it starts."""
-    field: Float[np.ndarray, " d"]
-    """The field at its start."""
-    jacobian: Float[np.ndarray, "n n"]
-    """Derivative of (t, q) at its end by those at its start, padded."""
-
-
-def links(s: Structure, lanes: Lanes, target: Target, tape: Tape) -> list[Link]:
-    """The moves of one lane."""
-    moves = _moves(lanes, tape)
-    by, f = _linear_moves(s, moves, target).by[:, :, : 1 + s.d], _fields(s, moves)
-    return [Link(*x) for x in zip(moves.chart.tolist(), f.T, by, strict=True)]
-
-
 def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
     """The divergence of the field, integrated over the moves of one lane, up to their ends."""
-    moves, total = _moves(lanes, tape), 0.0
+    moves, total = recorded_moves(lanes, tape), 0.0
     for a in np.unique(moves.chart):
         in_chart = moves.chart == a
         t, q, h = moves.t[in_chart], moves.q[: s.dims[a], in_chart], moves.h[in_chart]
@@ -259,23 +246,23 @@ def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
     return total
 
 
-def _linear_moves(s: Structure, moves: _Moves, target: Target) -> _Linear:
+def _linear_moves(s: Structure, moves: Moves, target: Target) -> _Linear:
     n, M = 1 + s.d, len(moves.t)
     number = target.time.dtype
     linear = _Linear(np.zeros((M, n), number), np.zeros((M, n, n + s.nu), number))
     for a in np.unique(moves.chart):
         in_chart = np.flatnonzero(moves.chart == a)
-        of_chart = _linear(s, int(a), _Moves(*(x[..., in_chart] for x in moves)), target)
+        of_chart = _linear(s, int(a), Moves(*(x[..., in_chart] for x in moves)), target)
         linear.end[in_chart], linear.by[in_chart] = of_chart
     return linear
 
 
-def _fields(s: Structure, moves: _Moves) -> Float[np.ndarray, "d M"]:
+def _fields(s: Structure, moves: Moves) -> Float[np.ndarray, "d M"]:
     """The field where moves start."""
     return slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1)))
 
 
-def _across(s: Structure, moves: _Moves, sizes) -> Float[np.ndarray, "M d d"]:
+def _across(s: Structure, moves: Moves, sizes) -> Float[np.ndarray, "M d d"]:
     """Projections of states along the flow where moves start, orthogonal in sizes."""
     size = sizes[moves.chart]
     f = _fields(s, moves).T / size
@@ -283,14 +270,14 @@ def _across(s: Structure, moves: _Moves, sizes) -> Float[np.ndarray, "M d d"]:
     return np.eye(s.d) - (size * f)[:, :, None] * (f / size)[:, None, :]
 
 
-def _moves(lanes: Lanes, tape: Tape) -> _Moves:
+def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
     """The moves of a tape, lane by lane."""
     lane, row = np.nonzero(tape.code.T != IDLE)
     first = np.diff(lane, prepend=-1) > 0
     last = np.roll(row, 1)  # the move before, but for the first of a lane
     begins = np.flatnonzero(first)
     order = np.arange(len(lane)) - np.repeat(begins, np.diff(begins, append=len(lane)))
-    return _Moves(
+    return Moves(
         np.where(first, lanes.t[lane], tape.t[last, lane]),
         np.where(first, lanes.chart[lane], tape.chart[last, lane]),
         np.where(first, lanes.q[:, lane], tape.after[last, :, lane].T),
@@ -298,7 +285,7 @@ def _moves(lanes: Lanes, tape: Tape) -> _Moves:
     )  # fmt: skip
 
 
-def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
+def _linear(s: Structure, a: int, moves: Moves, target: Target) -> _Linear:
     """Moves that start in chart a."""
     n, M, code = s.dims[a], len(moves.t), moves.code
     u = kernels.unpushed(s, moves.lane)

@@ -1,14 +1,13 @@
 """Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
 from .._core.compilation import is_left_to_lapack, one_tier, uncollected
 from .._core.execution import in_threads
@@ -173,7 +172,7 @@ class Tiles(NamedTuple):
                 call.done = done
                 more = slice(done, max(2 * done, self.size))
                 rows = order[more]
-                rows = rows[KDTree(parameters[rows]).indices]  # systems of one call are neighbors
+                rows = rows[_tree(parameters[rows]).indices]  # systems of one call are neighbors
                 order[more] = rows
                 anchor, period, jacobian = neighbors(rows, out)
                 anchor, period = self._first_step(rows, anchor, period, jacobian)
@@ -217,7 +216,7 @@ class Tiles(NamedTuple):
             return *self._given(len(wanted)), blank
         parameters = parameters[ok]
         terms = _powers(parameters[:1]).shape[1]
-        _, near = KDTree(parameters).query(wanted, min(2 * terms + 3, len(ok)))
+        _, near = _tree(parameters).query(wanted, min(2 * terms + 3, len(ok)))
         near = near.reshape(len(wanted), -1)
         first = near[:, 0]
         anchor, period, jacobian = _pick((cycles.anchor, cycles.period, cycles.jacobian), ok)
@@ -311,6 +310,12 @@ def _numbers(systems: HybridSystem | None) -> Float[np.ndarray, "S p"]:
     """The numbers of systems, one row for each."""
     arrays = jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_inexact_array))
     return np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)
+
+
+def _tree(points: Float[np.ndarray, "S p"]) -> Any:
+    from scipy.spatial import KDTree  # (a third of a second)
+
+    return KDTree(points)
 
 
 def _powers(x: Float[np.ndarray, "*S p"]) -> Float[np.ndarray, "*S r"]:

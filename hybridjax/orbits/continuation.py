@@ -11,7 +11,6 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float
-from scipy.optimize import brentq
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Numbers, Share
@@ -43,7 +42,7 @@ _ASIDE = (0.0, 1e-6, -1e-6, 1e-4, -1e-4, 1e-2, -1e-2)
 _SHORTEST = 1e-5
 
 Kind = Literal["fold", "branch point", "flip", "Neimark-Sacker"]
-KINDS = get_args(Kind)
+KINDS: tuple[str, ...] = get_args(Kind)
 
 
 class BranchPoint(NamedTuple):
@@ -300,6 +299,8 @@ class _Trace(NamedTuple):
 
         On the crossing of two branches itself no point can be computed, but beside it.
         """
+        from scipy.optimize import brentq  # (a third of a second)
+
         points, crossing = {0.0: a, 1.0: b}, False
 
         def test(where):

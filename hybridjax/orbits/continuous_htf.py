@@ -6,6 +6,8 @@ turn; the Fourier integral is a sum over the same nodes, interrupted at events (
 N. M. Wereley, Analysis and control of linear periodically time varying systems, MIT 1991).
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -19,8 +21,8 @@ from ..linear.htf import HTF
 from ..systems.check import check_output
 from ..systems.structure import Outputs, Structure
 from ..systems.system import Output, OutputNames
-from .linear_flow import Course, LinearFlow, rule
-from .return_map import ReturnMap, with_derivatives
+from .linear_flow import LinearFlow, linear_flow, rule
+from .return_map import ReturnMap
 
 
 # Largest angle by which an input, or a harmonic of the output, turns within a piece. Larger:
@@ -29,6 +31,9 @@ _TURNS = 4.0
 # Distance in cycles per period from a pole on the unit circle at which a frequency lies on it.
 # Smaller: responses are rounding errors. Larger: frequencies beside it are rejected.
 _POLE = 1e-9
+# Chebyshev's frequencies beyond those that sines need, by the cube root of their angle. Fewer:
+# responses lose digits. More: calls take longer.
+_EXTRA = 12
 # Pieces times frequencies of one call. More: gigabytes of memory. Fewer: calls are refused that a
 # machine can do.
 _LARGEST = 2**21
@@ -36,12 +41,9 @@ _LARGEST = 2**21
 
 def observed(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, Array, Array]:
     """Outputs at the nodes (P, K, ny), and their derivatives by states and inputs."""
-    xp, (P, K, d), ny = namespace(flow.q), flow.q.shape, len(z.names)
-    chart, t, q = xp.repeat(flow.chart, K), flow.t.ravel(), flow.q.reshape(P * K, d).T
     outputs = lambda a, *point: kernels.outputs(s, a, tuple(z.items), *point)  # noqa: E731
-    by = with_derivatives(s, outputs, chart, t, q, ny)
-    by = xp.moveaxis(by, -1, 0).reshape(P, K, ny, -1)
-    return by[..., 0], by[..., 2 : 2 + d], by[..., 2 + d :]
+    by = flow.evaluated(s, outputs, len(z.names))
+    return by[..., 0], by[..., 2 : 2 + s.d], by[..., 2 + s.d :]
 
 
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
@@ -57,93 +59,112 @@ def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> flo
     return longest
 
 
+def asked(cycle: Any, outputs: OutputNames | None, inputs: SignalNames | None):
+    """Outputs that exist all along the cycle, and the names and indices of inputs."""
+    s = cycle.structure
+    z = s.resolve_outputs(s.states_everywhere() if outputs is None else outputs)
+    for x in (x for x in z.items if isinstance(x, Output)):
+        list(check_output(s, x))
+    for name in {s.transitions[g].source for g in cycle.event_sequence} or s.names:
+        z.require(s.chart_index(name))
+    return z, *s.inputs_among(inputs)
+
+
 def continuous_htf(
-    course: Course,
+    cycle: Any,
     f: Frequencies,
     harmonics: Harmonics,
     outputs: OutputNames | None,
     inputs: SignalNames | None,
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
-    s, harmonics = course.map.structure, check_harmonics(harmonics, 0)
-    frequencies = np.asarray(f, float).reshape(-1)
-    visited = {s.transitions[g].source for g in course.events}
-    z = s.resolve_outputs(s.states_everywhere() if outputs is None else outputs)
-    for x in (x for x in z.items if isinstance(x, Output)):
-        list(check_output(s, x))
-    for name in visited or s.names:
-        z.require(s.chart_index(name))
-    names, columns = s.inputs_among(inputs)
-    flow = course.linear_flow(longest_piece(frequencies, harmonics))
-    if on_host(flow.t):
-        course = to_host(course)
+    harmonics, frequencies = check_harmonics(harmonics, 0), np.asarray(f, float).reshape(-1)
+    z, names, columns = asked(cycle, outputs, inputs)
+    flow = linear_flow(cycle, longest_piece(frequencies, harmonics))
+    map = (to_host(cycle) if on_host(flow.t) else cycle).return_map
     with at_ease():
-        H = _transfer(course.map, flow, course.period, z, frequencies, harmonics)
+        H = _transfer(map, flow, z, frequencies, harmonics)
     return HTF(frequencies, H[..., columns], harmonics, 0, names, z.names, "exact")
+
+
+def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Float[np.ndarray, "F n"]]:
+    """Frequencies, and the matrix from values there to those at f of functions that turn by one
+    turn per cycle: Chebyshev's, where these are fewer than f."""
+    middle, half = (np.max(f) + np.min(f)) / 2, np.ptp(f) / 2
+    angle = 2 * np.pi * half
+    n = int(angle + _EXTRA * np.cbrt(1 + angle))
+    if n >= len(f):
+        return f, np.eye(len(f))
+    k = np.arange(n)
+    at = np.pi * (k + 0.5) / n
+    series = np.cos(np.outer(np.arccos(np.clip((f - middle) / half, -1, 1)), k))
+    return middle + half * np.cos(at), series @ (
+        np.cos(np.outer(k, at)) * (2 - (k == 0))[:, None] / n
+    )
 
 
 def _transfer(
     map: ReturnMap,
     flow: LinearFlow,
-    period: Float[Array, ""],
     z: Outputs,
     f: Float[np.ndarray, " F"],
     harmonics: tuple[int, ...],
 ) -> Complex[Array, "M F ny nu"]:
-    s, xp, w = map.structure, namespace(flow.q), rule().weights
-    clocked, jumps, h = map.base is None, flow.jumps, flow.length
-    (values, by_state, by_input), T = observed(s, flow, z), period
-    (P, K, d), F, nu = flow.q.shape, len(f), flow.by_input.shape[-1]
-    free, forced = flow.forward()
-    # Time 0 is that of the clock, or the anchor of an autonomous cycle. Frequencies come last, so
-    # that all products are those of matrices.
-    t = flow.t if clocked else flow.t - flow.t[0, 0]
-    rate = 2j * np.pi * f / T
-    begin = xp.exp(t[:, :1] * rate)[:, None, None]  # (P, 1, 1, F)
-    inside = xp.exp((h[:, None] * rule().nodes)[..., None] * rate)  # (P, K, F)
-    at_end = begin * inside[:, -1:, None]
-    push = forced * h[:, None, None, None, None]
-    push = xp.einsum("piakb,pkbu->piauk", push, flow.by_input)  # nodes by inputs at nodes
-    # From piece to piece.
-    arrived = (push[:, -1].reshape(P, d * nu, K) @ inside).reshape(P, d, nu, F)
-    driven = jumps.by_state @ (arrived * begin).reshape(P, d, nu * F)
-    driven = driven + (jumps.by_input[..., None] * at_end).reshape(P, d, nu * F)
-    through = jumps.by_state @ free[:, -1]
-    advance = lambda x, piece: (piece[0] @ x + piece[1], x)  # noqa: E731
-    total, _ = scan(advance, xp.zeros(driven.shape[1:], driven.dtype), (through + 0j, driven))
-    # Deviations at the beginning: X(T) = exp(i w T) X(0).
-    size = map.sizes
-    whole = flow.monodromy(free, map.valid) * size / size[:, None]
+    s, xp, jumps, h = map.structure, namespace(flow.q), flow.jumps, flow.length
+    period = map.expected
+    (values, by_state, by_input), (free, forced) = observed(s, flow, z), flow.forward
+    (P, K, d), nu, size, rows = flow.q.shape, s.nu, map.sizes, len(harmonics) * len(z.names)
+    whole = flow.monodromy(free, map.valid)
     if on_host(whole):
         apart = np.abs(np.exp(2j * np.pi * f)[:, None] - np.linalg.eigvals(whole)).min(axis=1)
         if (apart < _POLE).any():
-            where = "every whole number" if not clocked else "its multipliers of modulus 1"
+            where = "every whole number" if map.base else "its multipliers of modulus 1"
             raise DefinitionError(
                 f"`f` = {f[apart.argmin()]:.10g} cycles per period is a pole of the cycle, which "
                 f"lie at {where}: leave it out."
             )
-    turned = xp.exp(rate * T)[:, None, None] * xp.eye(d)
-    total = xp.moveaxis(total.reshape(d, nu, F), -1, 0) / size[:, None]
-    start = xp.moveaxis(xp.linalg.solve(turned - whole, total) * size[:, None], 0, -1)
-    _, x = scan(advance, start.reshape(d, nu * F), (through + 0j, driven))
-    # Fourier integrals, with exp(-i w t) of the piece and of the node apart.
-    weight = (h[:, None] * w)[..., None, None]
-    C = by_state * weight
-    before = (x.reshape(P, d, nu, F) / begin).reshape(P, d, nu * F)
-    of_push = C @ push.reshape(P, K, d, nu * K)
-    shape = P, K, len(z.names), nu, F
-    response = ((C @ free).reshape(P, -1, d) @ before).reshape(shape)
-    response += (of_push.reshape(P, -1, K) @ inside).reshape(shape)
-    back = xp.conj(inside)[:, :, None, None]
-    response *= back
+    # Responses to inputs, and to states at phase 0, are columns. They turn with the input, and
+    # frequencies come last, so that all products are those of matrices.
+    coarse, fine = _interpolation(f)
+    inside = xp.exp((h[:, None] * rule().nodes / period)[..., None] * (2j * np.pi * coarse))
+    back, shape = xp.conj(inside), (P, d, nu, len(coarse))
+    more = lambda x: xp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, d), (0, 0)])  # noqa: E731
+    push = xp.einsum("piakb,pkbu->piauk", forced * h[:, None, None, None, None], flow.by_input)
+    arrived = push[:, -1].reshape(P, d * nu, K) @ inside
+    kick = (jumps.by_state @ arrived.reshape(P, d, -1)).reshape(shape)
+    kick = more(kick + jumps.by_input[..., None] * inside[:, -1, None, None])
+
+    def advance(x, piece):
+        through, kick, back = piece
+        return ((through @ x.reshape(d, -1)).reshape(x.shape) + kick) * back, x
+
+    begin = xp.concatenate([xp.zeros((d, nu)), xp.eye(d)], axis=1)[..., None] + 0 * kick[0]
+    pieces = jumps.by_state @ free[:, -1] + 0j, kick, back[:, -1]
+    end, x = scan(advance, begin, pieces)
+    # Fourier integrals.
+    t = flow.after(map)
+    waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / period))
+    weighted = waves * h[:, None] * rule().weights
+    of_states = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ free).reshape(P, -1, K) @ back
+    of_states = xp.moveaxis(of_states.reshape(P, rows, d, -1), (3, 1), (0, 1)).reshape(
+        -1, rows, P * d
+    )
+    H = xp.moveaxis(of_states @ xp.moveaxis(x, 3, 0).reshape(-1, P * d, nu + d), 0, -1)
+    of_push = (by_state @ push.reshape(P, K, d, -1)).reshape(P, -1, K) @ inside
+    driven = of_push.reshape(P * K, -1, len(coarse)) * back.reshape(P * K, 1, -1)
+    driven = driven.reshape(P * K, -1, nu, len(coarse)) + by_input.reshape(P * K, -1, nu, 1)
+    driven = weighted.reshape(-1, P * K) @ driven.reshape(P * K, -1)
+    H = H + more(driven.reshape(rows, nu, -1))
     # Events whose time moves: the jump of the output at the moment of the event.
-    last = (free[:, -1] @ before).reshape(arrived.shape) + arrived
-    delay = xp.einsum("pa,pauf->puf", jumps.delay_by_state, last) * back[:, -1, 0]
+    last = (free[:, -1] @ x.reshape(P, d, -1)).reshape(x.shape) + more(arrived.reshape(shape))
+    delay = xp.einsum("pa,pacf->pcf", jumps.delay_by_state, last) * back[:, -1, None]
+    delay = delay + more(jumps.delay_by_input[..., None])
     step = values[:, -1] - xp.roll(values[:, 0], -1, axis=0)
-    impulse = step[..., None, None] * (delay + jumps.delay_by_input[..., None])[:, None]
-    waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / T))
-    entries = len(z.names) * nu * F
-    H = waves.reshape(len(waves), P * K) @ response.reshape(P * K, entries)
-    H = (H + waves[:, :, -1] @ impulse.reshape(P, entries)).reshape(len(waves), *shape[2:])
-    H = H + xp.einsum("mpk,pkyu->myu", waves, by_input * weight)[..., None]
-    return xp.moveaxis(H, -1, 1) / T
+    impulse = step[..., None, None] * delay[:, None]
+    H = H + (waves[:, :, -1] @ impulse.reshape(P, -1)).reshape(H.shape)
+    # The deviation at phase 0 is that one period later.
+    H, end = xp.moveaxis(H @ fine.T, -1, 0), xp.moveaxis(end[:, :nu] @ fine.T, -1, 0)
+    turned = xp.eye(d) - xp.exp(-2j * np.pi * f)[:, None, None] * (whole * size / size[:, None])
+    start = xp.linalg.solve(turned, end / size[:, None]) * size[:, None]
+    H = (H[..., :nu] + H[..., nu:] @ start).reshape(-1, len(harmonics), len(z.names), nu)
+    return xp.moveaxis(H, 0, 1) / period

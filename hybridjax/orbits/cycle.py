@@ -10,19 +10,17 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers, Positive, SignalNames
 from .._core.boundary.values import Reals
-from .._core.compilation import at_ease
 from .._core.executor import is_traced, to_host
 from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, unit_circle
 from .._core.meaning import code_digest
-from .._core.memo import remembered
+from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
 from .._core.progress import whole_call
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape, side_by_side
-from ..engine.move import Options
-from ..engine.replay import Link, divergence, links
+from ..engine.replay import divergence
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, recorded, simulate
 from ..errors import DefinitionError
@@ -34,7 +32,7 @@ from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
-from .linear_flow import Course
+from .linear_flow import linear_flow
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
@@ -42,6 +40,7 @@ from .sensitivity import Sensitivity, sensitivity
 
 
 Matrix = Float[np.ndarray, "_ _"]
+_trajectories = Memory()
 
 # A piece of a turn is computed in factors of its own steps if its weakest direction keeps less than
 # this, and these are multiplied as long as their product keeps as much. Larger: more factors, for
@@ -157,7 +156,7 @@ class LimitCycle(eqx.Module):
         strong = np.isfinite(self.residual)
         strong = strong and min(weakest(block, weaker) for block in blocks) < WEAKEST
         if strong:
-            blocks = fine_factors(self.return_map)
+            blocks = fine_factors(self)
         values = product_eigenvalues(blocks, rtol=ROUNDING)
         if strong and has_implicit(self.structure):
             lost = np.abs(values) < _LEAST_OF_IMPLICIT
@@ -206,10 +205,9 @@ class LimitCycle(eqx.Module):
         self.require_current()
         s, anchor = self.structure, to_host(self.anchor)
         a = int(anchor.chart[0])
-        return simulate(
-            self.system, s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods,
-            time=float(anchor.t[0]), settings=self.settings,
-        )  # fmt: skip
+        begin = s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods
+        options: Any = dict(time=float(anchor.t[0]), settings=self.settings)
+        return _trajectories.recall(self, periods, lambda: simulate(self.system, *begin, **options))
 
     def responses(self, modes: Index | None = None) -> Responses:
         """Responses to brief pushes, at every phase: of the phase, and of the amplitudes of modes.
@@ -223,7 +221,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `ComputationError` for a double multiplier 1, where phase has no meaning, and
         for modes whose multipliers coincide; `DefinitionError` for more modes than have amplitudes.
         """
-        return responses(self._course(), modes)
+        return responses(self._checked(), modes)
 
     def asymptotic_phase(
         self, chart: str, state: Annotated[Numbers, Reals("n")], turns: Count = 1000
@@ -237,7 +235,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for a cycle that is driven by a clock; `ComputationError` for
         a state that does not reach the cycle.
         """
-        return asymptotic_phase(self._course(), chart, np.asarray(state), turns)
+        return asymptotic_phase(self._checked(), chart, np.asarray(state), turns)
 
     def htf(
         self,
@@ -266,7 +264,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for an output that a chart of the cycle does not define, an
         input that does not exist, and frequencies at a pole, as whole ones of autonomous cycles.
         """
-        return continuous_htf(self._course(), f, harmonics, outputs, inputs)
+        return continuous_htf(self._checked(), f, harmonics, outputs, inputs)
 
     def sensitivity(self, parameter: str) -> Sensitivity:
         """Derivatives of the period, of times of events and of the shape by a parameter.
@@ -280,7 +278,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for a parameter that does not exist; `ComputationError` for
         cycles that are not isolated.
         """
-        return sensitivity(self._course(), parameter)
+        return sensitivity(self._checked(), parameter)
 
     def fluctuations(
         self, white: Given = None, guards: Given = None, resets: GivenResets = None
@@ -300,13 +298,12 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for names that do not exist; `ComputationError` for cycles
         that are not stable.
         """
-        return fluctuations(self._course(), white or {}, guards or {}, resets or {})
+        return fluctuations(self._checked(), white or {}, guards or {}, resets or {})
 
-    def _course(self) -> Course:
+    def _checked(self) -> "LimitCycle":
         require_x64()
         self.require_current()
-        map = self.return_map
-        return Course(self, map, self.legs, self.period, self.event_sequence, map.system)
+        return self
 
     def __repr__(self):
         if is_traced(self):
@@ -413,20 +410,24 @@ def orbit_picture(
     return picture(curves, *labels)
 
 
-def fine_factors(map: ReturnMap) -> list[Matrix]:
+def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     """Jacobians of one turn from the anchor over a few steps of the flow each, in sizes of the
     states; for an autonomous system on the states modulo the direction of the flow.
 
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
-    map = to_host(map)
-    lanes, tape = side_by_side(_turn(map, tangents=True))
-    moves = links(map.structure, lanes, map.ends(), tape)
-    frames = [_frame(map, link) for link in moves]
+    map, flow = to_host(cycle.return_map), linear_flow(cycle)
+    through, frames = flow.jumps.by_state @ flow.forward[0][:, -1], []
+    for chart, f in zip(flow.chart, flow.field[:, 0], strict=True):
+        n = map.structure.dims[chart]
+        basis, size = np.eye(n), np.asarray(map.scale)[chart, :n]
+        if map.base is not None:
+            basis = np.linalg.svd(f[None, :n] / size)[2][1:].T
+        frames.append((n, (basis / size[:, None]).T, basis * size[:, None]))
     factors: list[Matrix] = []
-    for k, link in enumerate(moves):
-        out, into = frames[(k + 1) % len(moves)], frames[k]
-        parts = out[0], link.jacobian, into[1]
+    for k, (n, _, into) in enumerate(frames):
+        m, out, _ = frames[(k + 1) % len(frames)]
+        parts = out, through[k, :m, :n], into
         factor = np.linalg.multi_dot(parts)
         # (A zero that comes out as rounding would be a multiplier.)
         least = np.finfo(float).eps * np.prod([np.linalg.norm(x) for x in parts])
@@ -446,38 +447,17 @@ def log_determinant(map: ReturnMap) -> float:
     Steps of an implicit method lose a mode that decays within them; this gives its decay.
     """
     map = to_host(map)
-    return float(divergence(map.structure, *side_by_side(_turn(map))))
+    return float(divergence(map.structure, *side_by_side(map.pieces())))
 
 
 def orbit(map: ReturnMap, tapes: Tape | None = None) -> Trajectory:
     """One turn from the anchor, in the steps by which it is linearized, which its `tapes` may hold
     already, one for each piece."""
     map = to_host(map)
-    rows = to_host(_turn(map, tangents=True)[1] if tapes is None else tapes)
+    rows = to_host(map.pieces(tangents=True)[1] if tapes is None else tapes)
     pieces = [Tape(*x) for x in zip(*rows, strict=True)]
     begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
     return recorded(map.structure, begin, pieces, u, Result.OK)
-
-
-def _turn(map: ReturnMap, tangents: bool = False) -> tuple[Lanes, Tape]:
-    """The starts and tapes of the pieces of one turn."""
-    options = Options(tape=True, new_input=False, tangents=tangents)
-    with at_ease():
-        _, (lanes, _, tapes) = map.travel(map.anchor.q[:, 0], options)
-    return lanes, tapes
-
-
-def _frame(map: ReturnMap, move: Link) -> tuple[Matrix, Matrix]:
-    """Matrices from (t, q), padded, at the start of a move to coordinates in sizes, and back."""
-    n, clocked = map.structure.dims[move.chart], map.base is None
-    size = np.append(map.expected, np.asarray(map.settings.scale)[move.chart, :n])
-    basis = np.eye(1 + n)
-    if not clocked:
-        f, basis = move.field[:n] / size[1:], np.zeros((1 + n, n - 1))
-        basis[1:] = np.linalg.svd(f[None])[2][1:].T
-    padding = [(0, map.structure.d - n), (0, 0)]
-    to, back = np.pad(basis / size[:, None], padding), np.pad(basis * size[:, None], padding)
-    return to.T, back
 
 
 def weakest(factor: Matrix, weaker: int = 0) -> float:

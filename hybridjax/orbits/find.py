@@ -27,6 +27,7 @@ from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
 from .guess import return_map_near
+from .linear_flow import keep_turn
 from .newton import Solution, search, solve
 from .return_map import PATIENCE, ReturnMap
 from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_on, stiff_charts
@@ -170,6 +171,7 @@ def find_limit_cycle(
             failure = Result.COINCIDENCE
     if failure is not None:
         cycle = dataclasses.replace(cycle, result=jax.device_put(np.int32(failure)))
+    keep_turn(cycle, solution.turn)
     code, legs = Result(int(cycle.result)), to_host(cycle.legs)
     checks.check_times(s, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):

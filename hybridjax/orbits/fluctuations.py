@@ -7,6 +7,7 @@ phase Z . x diffuses and is taken out: the deviations are those across the cycle
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -19,7 +20,7 @@ from .._core.executor import Array, is_traced, namespace, on_host, scan, to_host
 from .._core.text import number
 from ..errors import ComputationError
 from ..systems.structure import Structure
-from .linear_flow import Course, LinearFlow, rule
+from .linear_flow import LinearFlow, linear_flow, rule
 from .responses import Phases, loop, surface
 from .return_map import SINGULAR
 from .sensitivity import to_section
@@ -96,20 +97,18 @@ class Fluctuations(eqx.Module):
         return f"Fluctuations({name})" + "".join(f"\n  {x}" for x in rows)
 
 
-def fluctuations(
-    course: Course, white: Strengths, guards: Strengths, resets: Resets
-) -> Fluctuations:
+def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets) -> Fluctuations:
     """Deviations from a cycle under noise (see `LimitCycle.fluctuations`)."""
-    s, flow = course.map.structure, course.linear_flow()
+    flow, events = linear_flow(cycle), cycle.event_sequence
+    map = (to_host(cycle) if on_host(flow.q) else cycle).return_map
+    s, period = map.structure, map.expected
     levels, scatter = _at_events(s, guards, resets)
-    course = to_host(course) if on_host(flow.q) else course
-    _, map, _, period, events, _ = course
     xp, jumps = namespace(flow.q), flow.jumps
     (P, _, d), clocked, f = flow.q.shape, map.base is None, flow.field[0, 0]
     names = [s.transitions[g].name for g in events] or ([] if clocked else [str(map.base)])
     n, E = d + 1 + len(names), len(names)
     # Noise in the states, collected over each piece.
-    B, (free, _), adjoint = _columns(s, flow, white), flow.forward(), flow.adjoint()
+    B, (free, _), adjoint = _columns(s, flow, white), flow.forward, flow.adjoint
     turned = xp.swapaxes(adjoint, -1, -2) @ B
     weight = (flow.length[:, None] * rule().weights)[..., None, None]
     collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
@@ -138,7 +137,7 @@ def fluctuations(
         closed, along = loop(map, M[:d, :d], f)
         Z = xp.linalg.solve(closed.T, along)
         if not events:
-            delay = to_section(course, f)[0][None]
+            delay = to_section(map, f)[0][None]
             last = _timing(np.eye(d)[None], delay, np.ones(1, bool), np.ones((1, 1), bool))[0]
         diffusion = Z @ Q[:d, :d] @ Z / period
         # (A state ahead of the cycle meets the next events earlier.)

@@ -6,7 +6,9 @@ follow from linear collocation equations, without further integration. At events
 saltation matrix.
 """
 
+import dataclasses
 import functools as ft
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,18 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
-from .._core.compilation import at_ease
-from .._core.executor import Array, is_inside_program, is_traced, namespace, on_host, scan, to_host
-from .._core.memo import Memory
+from .._core.boundary.checked import NeedsValues
+from .._core.executor import Array, is_inside_program, is_traced, namespace, scan, to_host
+from .._core.host_derivatives import by_columns
+from .._core.memo import Memory, remembered
 from ..engine import kernels
-from ..engine.lanes import IDLE, Lanes, Tape, for_each_chart, only
-from ..engine.move import Options, move
-from ..engine.replay import replay
-from ..engine.target import Target, toward, until
+from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, Lanes, Tape, for_each_chart, side_by_side
+from ..engine.replay import Moves, Variation, recorded_moves
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled
-from .return_map import ReturnMap, with_derivatives
+from ..systems.varied import Varied
+from .return_map import ReturnMap, Turn, with_derivatives
 from .scale import has_implicit
 
 
@@ -105,6 +107,17 @@ class LinearFlow(eqx.Module):
         """Times of the beginnings of the pieces, from that of the turn."""
         return self.t[:, 0] - self.t[0, 0]
 
+    def evaluated(self, s: Structure, function: Callable, rows: int) -> Float[Array, "P K rows n"]:
+        """A function (see `with_derivatives`) at the nodes, and its derivatives."""
+        chart, (P, K, d) = namespace(self.q).repeat(self.chart, NODES), self.q.shape
+        at = chart, self.t.ravel(), self.q.reshape(P * K, d).T
+        by = with_derivatives(s, function, *at, rows)
+        return namespace(by).moveaxis(by, -1, 0).reshape(P, K, rows, -1)
+
+    def after(self, map: ReturnMap) -> Float[Array, "P K"]:
+        """Times of the nodes: those of the clock, or since the anchor of an autonomous cycle."""
+        return self.t if map.base is None else self.t - self.t[0, 0]
+
     def _implicit(self, sign: float, rows: slice, matrix: Float[Array, "P K d d"]):
         """The inverse of (derivative + sign h matrix) on some of the nodes."""
         d, D = self.q.shape[2], rule().derivative[rows, rows]
@@ -115,6 +128,7 @@ class LinearFlow(eqx.Module):
         shape = len(self.length), n * d, n * d
         return xp.linalg.inv(whole.reshape(shape)).reshape(-1, n, d, n, d)
 
+    @remembered
     def forward(self) -> tuple[Float[Array, "P K d d"], Float[Array, "P K d K d"]]:
         """Deviations at the nodes of each piece by that at its beginning, and by forces at the
         nodes (times the length of the piece)."""
@@ -124,6 +138,7 @@ class LinearFlow(eqx.Module):
         free = xp.concatenate([xp.broadcast_to(xp.eye(d), (len(free), 1, d, d)), free], axis=1)
         return free, xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
 
+    @remembered
     def adjoint(self) -> Float[Array, "P K d d"]:
         """Covectors at the nodes of each piece by that at its end."""
         xp, d = namespace(self.q), self.q.shape[2]
@@ -169,216 +184,185 @@ class LinearFlow(eqx.Module):
         return xp.where(valid[:, None] & valid, whole, 0.0)
 
 
-_flows = Memory()
+_flows, _turns = Memory(), Memory()
 
 
-class Course(NamedTuple):
-    """A cycle as its linearized flow takes it."""
-
-    owner: Any
-    """The cycle, for which linearized flows are kept."""
-    map: ReturnMap
-    legs: Lanes
-    """States at the beginnings of the pieces of one turn."""
-    period: Float[Array, ""]
-    events: tuple[int, ...]
-    inputs: HybridSystem
-    """The system, or the same one with other inputs, by which the flow is linearized."""
-
-    @property
-    def linearized(self) -> Structure:
-        return Structure(self.inputs)
-
-    def linear_flow(self, longest: float = np.inf) -> LinearFlow:
-        """Linearize the flow along the cycle, in pieces no longer than this part of the period.
-
-        (If they are traced, their lengths are not known, and all are divided as the longest
-        possible would be.)
-        """
-        if is_traced(self) or is_inside_program():
-            return _linear_flow(self, longest)
-        name = type(self.inputs), getattr(self.inputs, "parameter", ""), longest
-        make = lambda: _linear_flow(to_host(self), longest)  # noqa: E731
-        return _flows.recall(self.owner, name, make)
+def keep_turn(cycle: Any, turn: Turn) -> None:
+    """Keep the steps of a cycle's last turn for its linearization."""
+    if turn.tapes is not None:
+        record = to_host((turn.legs, turn.tapes))
+        _turns.recall(cycle, None, lambda: (record[0], side_by_side(record[1])))
 
 
-def _linear_flow(course: Course, longest: float) -> LinearFlow:
-    _, map, legs, period, events, _ = course
-    s, xp = map.structure, namespace(period)
-    L = legs.t.shape[0]
-    ends = xp.concatenate([legs.t[1:], (map.anchor.t[0] + period)[None]])
-    last = np.arange(L) == L - 1
-    target = toward(xp.where(last & (map.event >= 0), xp.inf, ends), -1, ends + 0.5 * period)
-    event = xp.asarray(np.where(last, map.event, -1).astype(np.int32))
-    target = eqx.tree_at(lambda x: x.event, target, event)
-    u = xp.zeros((s.nu, L))
-    options = Options(tape=True, new_input=False, tangents=True)
-    first = xp.full(L, 1.0) * (0.5 * period / L)
-    with at_ease():
-        tape = move(s, legs, u, target, map.settings, first, options=options).tape
-        assert tape is not None
-        pieces = _pieces(map, legs, target, tape, ends[-1:])
-        if on_host(pieces.t):
-            first, joined = _joined(s, pieces, longest * period)
-            divide = np.maximum(np.ceil(joined.h / (longest * period) - 1e-9), 1).astype(int)
-        else:
-            first, joined = np.arange(len(pieces.t)), pieces
-            divide = np.full(len(first), max(int(np.ceil(_LONGEST / longest)), 1))
-        return _linearized(course, pieces, first, joined, divide)
+def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = None) -> LinearFlow:
+    """Linearize the flow along a cycle, in pieces no longer than this part of the period. Inputs
+    are those of the system, or a change of a parameter.
+
+    **Raises:** `NeedsValues` inside of `jit` and `vmap`.
+    """
+    if is_traced(cycle) or is_inside_program():
+        return _of_cycle(cycle, longest, parameter)
+    make = lambda: _linear_flow(cycle, longest, parameter)  # noqa: E731
+    return _flows.recall(cycle, (parameter, longest), make)
 
 
-# Bound on the steps of a turn that is traced, whose number is not known. Fewer: results for long
-# turns are NaN. More: programs take longer.
-_MOST = 256
+def with_inputs(system: HybridSystem, parameter: str | None) -> Structure:
+    return Structure(system if parameter is None else Varied(system, parameter))
+
+
 # Explicit steps of a piece. More: its polynomials lose digits. Fewer: more pieces than needed.
 _STEPS = 4
-# The longest step that a turn can have, in parts of the period (see `ReturnMap.travel`).
-_LONGEST = 0.5
 
 
-class _Pieces(NamedTuple):
-    """Recorded moves, leg by leg."""
+def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = None) -> LinearFlow:
+    """The flow linearized at nodes of pieces, whose states follow from the recorded steps; or its
+    derivatives in the directions `by` of the cycle."""
+    if is_traced(cycle) or is_inside_program():
+        raise NeedsValues(
+            "responses, sensitivities, fluctuations and HTFs in continuous time need the values of "
+            "a cycle, which `jit` and `vmap` hide: call them outside (`grad` and `jvp` work there)."
+        )
+    map, nodes, K = to_host(cycle.return_map), rule().nodes, NODES
+    s, of = map.structure, with_inputs(map.system, parameter)
+    d, period, D, tiny = s.d, float(map.expected), 1, 1j * kernels.TINY
+    lanes, tape = _turns.recall(cycle, None, lambda: side_by_side(map.pieces(tangents=True)))
+    moves = recorded_moves(lanes, tape)
+    t, q = np.append(moves.t, map.anchor.t[0] + period)[:, None], moves.q.T[..., None]
+    if by is not None:
+        D = len(jax.tree_util.tree_leaves(by)[0])
+        inputs = by.structure
+        if isinstance(of.system, Varied):
+            inputs = eqx.tree_at(lambda x: x.system.system, of, inputs.system)
+        s, of = (
+            kernels.Tangents(x, y, None, None, D) for x, y in ((s, by.structure), (of, inputs))
+        )
+        tangents = _along(s, map, lanes, tape, by)
+        t, q = t + tiny * tangents[:, 0], q + tiny * tangents[:-1, 1:]
+    # Pieces of several steps, each divided into some parts.
+    first = _first(s, moves, np.diff(t.real[:, 0]), longest * period)
+    last = np.append(first[1:], len(moves.t)) - 1
+    h, code = t[last + 1] - t[first], np.maximum(moves.code[last], -1)
+    parts = np.maximum(np.ceil(h[:, 0].real / (longest * period) - 1e-9), 1).astype(int)
+    whole = np.repeat(np.arange(len(first)), parts)
+    part = np.arange(len(whole)) - np.repeat(np.cumsum(parts) - parts, parts)
+    first, last, h, parts = first[whole], last[whole], h[whole], parts[whole, None]
+    P, code = len(whole), np.where(part == parts[:, 0] - 1, code[whole], -1)
+    time = t[first][:, None] + ((part[:, None] + nodes) / parts)[..., None] * h[:, None]
+    step = np.searchsorted(t.real[:-1, 0], time.real[..., 0], "right") - 1
+    step = np.clip(step, first[:, None], last[:, None])
+    # Directions are lanes of their own, and come last.
+    each = 1 + d + np.arange(P * K * D) % D
+    charts, u = np.repeat(moves.chart[first], K * D), kernels.unpushed(s, each)
+    begin = t[step].ravel(), charts, np.moveaxis(q[step], 2, 0).reshape(d, -1)
+    states = _ahead(s, *begin, u, (time - t[step]).ravel())
+    at = charts, time.ravel(), states, d, kernels.unpushed(of, each)
+    with_field = with_derivatives(of, ft.partial(kernels.field, of), *at)
+    lay = lambda x: np.moveaxis(x.reshape(*x.shape[:-1], P, K, D), (-1, -3, -2), (0, 1, 2))  # noqa: E731
+    states, f = lay(states), lay(with_field[:, 0])
+    u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(D), P))
+    ends = (x.reshape(-1, d) for x in (states[:, :, -1], f[:, :, -1], np.roll(f[:, :, 0], -1, 1)))
+    jumps = _jumps(of, np.tile(code, D), time[:, -1].T.ravel(), u, *ends)
+    jumps = Jumps(*(x.reshape(D, P, *x.shape[1:]) for x in jumps))
+    arrays = LinearFlow(
+        lay(time.ravel()), (h / parts).T, None, None, states, f,
+        lay(with_field[:, 2 : 2 + d]), lay(with_field[:, 2 + d :]), jumps,
+    )  # fmt: skip
+    if by is not None:
+        return jax.tree_util.tree_map(lambda x: x.imag / kernels.TINY, arrays)
+    arrays = jax.tree_util.tree_map(lambda x: x[0], arrays)
+    return dataclasses.replace(arrays, chart=moves.chart[first], event=code)
 
-    t: Float[Array, " P"]
-    chart: Int[Array, " P"]
-    q: Float[Array, "d P"]
-    h: Float[Array, " P"]
-    code: Int[Array, " P"]
+
+def _along(
+    s: kernels.Tangents, map: ReturnMap, lanes: Lanes, tape: Tape, by: Any
+) -> Float[np.ndarray, "M n D"]:
+    """Tangents of times and states at the starts of recorded moves and at the end of the turn."""
+    ends, begin = map.ends(), np.zeros((1 + s.d, s.directions))
+    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
+    begin[1:] = 0.0 if by.anchor.q is None else by.anchor.q[..., 0].T
+    longer = 0.0 if by.period is None else by.period
+    # A turn that ends on a section ends at a time, too.
+    start, full = map.anchor.t[0], map.expected
+    time = np.where(np.isfinite(ends.time), ends.time, start + full)
+    tape = tape._replace(code=np.where(tape.code == ARRIVE_LEVEL, ARRIVE_TIME, tape.code))
+    times = begin[0][:, None] + np.outer(longer, (time - start) / full)
+    ends = dataclasses.replace(ends, time=time, levels=None)
+    return Variation(s, lanes, ends, tape, times).tangents(begin)
 
 
-def _pieces(map: ReturnMap, legs: Lanes, target: Target, tape: Tape, end: Array) -> _Pieces:
-    xp, s = namespace(legs.t), map.structure
-
-    def row(lanes, row):
-        begin = lanes.t, lanes.chart, lanes.q
-        moving = row.code != IDLE
-        if on_host(lanes.t):
-            t, q = row.t, row.after
-        else:
-            single = jax.tree_util.tree_map(lambda x: x[None], row)
-            t, q = replay(s, lanes, jnp.zeros((s.nu, len(lanes.t))), target, single)
-        t, q = xp.where(moving, t, lanes.t), xp.where(moving, q, lanes.q)
-        chart = xp.where(moving, row.chart, lanes.chart)
-        return lanes._replace(t=t, q=q, chart=chart), _Pieces(*begin, t - begin[0], row.code)
-
-    _, rows = scan(row, legs, tape)  # rows by legs
-    # Rows of legs, one leg after the other.
-    join = lambda x: xp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], -1)  # noqa: E731
-    pieces = _Pieces(*(join(x) for x in rows))
-    if on_host(legs.t):
-        return _Pieces(*(x[..., pieces.code != IDLE] for x in pieces))
-    idle = pieces.code == IDLE
-    used = xp.argsort(idle, stable=True)[:_MOST]
-    lost = (~idle).sum() > _MOST
-    # Those that are not used stand at the end of the turn.
-    finish = _Pieces(end[:1], map.anchor.chart, map.anchor.q, xp.zeros(1), pieces.code[:1])
-    either = (xp.where(idle, y, x) for x, y in zip(pieces, finish, strict=True))
-    pieces = _Pieces(*(x[..., used] for x in either))
-    pieces = pieces._replace(code=xp.where(idle[used], IDLE, pieces.code))
-    return pieces._replace(h=xp.where(lost, xp.nan, pieces.h))
+def of_flow(tangents: Any) -> Any:
+    """The tangents of a cycle on which its flow depends, others replaced by `None`."""
+    nothing, anchor = jax.tree_util.tree_map(lambda _: None, tangents), tangents.anchor
+    anchor = nothing.anchor._replace(t=anchor.t, q=anchor.q)
+    moving = dict(system=tangents.system, period=tangents.period, anchor=anchor)
+    return dataclasses.replace(nothing, **moving)
 
 
-def _joined(s: Structure, steps: _Pieces, longest: Array) -> tuple[np.ndarray, _Pieces]:
-    """Pieces of several steps between events, because a step of an explicit method is short for
-    the polynomials of a piece, and the indices of their first steps."""
+def _flow_along(arguments: tuple, by: tuple) -> tuple[LinearFlow, LinearFlow]:
+    cycle, longest, parameter = arguments
+    flow = _linear_flow(cycle, longest, parameter)
+    return flow, _linear_flow(cycle, longest, parameter, by[0])
+
+
+_of_cycle = by_columns(
+    _linear_flow, _flow_along, lambda tangents: (of_flow(tangents[0]), *tangents[1:]), np.inf
+)
+
+
+def _first(s: Structure, moves: Moves, h: Float[np.ndarray, " M"], longest: float) -> np.ndarray:
+    """First moves of pieces: of several steps between events, because a step of an explicit method
+    is short for the polynomials of a piece."""
     first, length, most = [0], 0.0, 1 if has_implicit(s) else _STEPS
-    for k, h in enumerate(steps.h[1:], 1):
-        length += steps.h[k - 1]
-        if steps.code[k - 1] >= 0 or k - first[-1] == most or length + h > longest:
+    for k in range(1, len(h)):
+        length += h[k - 1]
+        if moves.code[k - 1] >= 0 or k - first[-1] == most or length + h[k] > longest:
             first.append(k)
             length = 0.0
-    h, code = np.add.reduceat(steps.h, first), steps.code[np.append(first[1:], len(steps.h)) - 1]
-    return np.array(first), _Pieces(*(x[..., first] for x in steps))._replace(h=h, code=code)
+    return np.array(first)
 
 
-def _linearized(
-    course: Course, steps: _Pieces, first: np.ndarray, pieces: _Pieces, divide: np.ndarray
-) -> LinearFlow:
-    """The flow linearized at nodes of pieces, each divided into some parts, whose states follow
-    from the recorded steps."""
-    s, of, events = course.map.structure, course.linearized, course.events
-    xp, K, nodes = namespace(steps.t), NODES, rule().nodes
-    whole = np.repeat(np.arange(len(divide)), divide)
-    part = np.arange(len(whole)) - np.repeat(np.cumsum(divide) - divide, divide)
-    of_piece = (part[:, None] + nodes) / divide[whole, None]
-    t, chart, _, h, code = (x[..., whole] for x in pieces)
-    P = len(whole)
-    time, charts = (t[:, None] + h[:, None] * of_piece).ravel(), xp.repeat(chart, K)
-    step = np.repeat(first[whole], K)
-    if len(first) < len(steps.t):
-        last = np.append(first[1:], len(steps.t))[whole] - 1
-        step = np.clip(np.searchsorted(steps.t, time, "right") - 1, step, np.repeat(last, K))
-    states = _ahead(s, steps.t[step], charts, steps.q[:, step], time - steps.t[step])
-    code = xp.where(part == divide[whole] - 1, xp.maximum(code, -1), -1)
-    by = with_derivatives(of, ft.partial(kernels.field, of), charts, time, states, s.d)
-    d = s.d
-    field, by_state, by_input = (
-        x.reshape(*x.shape[:-1], P, K) for x in (by[:, 0], by[:, 2 : 2 + d], by[:, 2 + d :])
-    )
-    field = xp.moveaxis(field, 0, -1)
-    by_state, by_input = (xp.moveaxis(x, (2, 3), (0, 1)) for x in (by_state, by_input))
-    states = xp.moveaxis(states.reshape(d, P, K), 0, -1)
-    time = time.reshape(P, K)
-    end = time[:, -1], states[:, -1].T, field[:, -1]
-    jumps = _jumps(of, end, xp.roll(field[:, 0], -1, axis=0), code, events)
-    lengths = h / divide[whole]
-    return LinearFlow(time, lengths, chart, code, states, field, by_state, by_input, jumps)
-
-
-def _ahead(s: Structure, t, chart, q, h) -> Float[Array, "d L"]:
+def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:
     """States after a step from each lane."""
-    xp, L = namespace(t), len(t)
-    if not on_host(t):
-        code = jnp.full((1, L), IDLE + 1)  # a move
-        tape = Tape(h[None], code, None, None, None, None)
-        lanes = Lanes(t, chart, q, None, None, None)
-        return replay(s, lanes, jnp.zeros((s.nu, L)), until(t + h), tape)[1]
 
     def work(a, here, out):
         n = s.dims[a]
-        out[:n, here] = kernels.step(s, a, t[here], q[:n, here], np.zeros((s.nu, 1)), h[here]).q
+        point = t[here], q[:n, here], u[:, here], h[here]
+        if s.method(a).implicit or isinstance(s, kernels.Tangents):  # (compiled already)
+            out[:n, here] = kernels.linear_step(s, a, *point)[:, 0]
+        else:
+            out[:n, here] = kernels.step(s, a, *point).q
         return out
 
-    return for_each_chart(s, chart, xp.ones(L, bool), work, xp.zeros_like(q))
+    return for_each_chart(s, chart, np.ones(len(t), bool), work, np.zeros_like(q))
 
 
-def _jumps(s: Structure, end, after, code, events) -> Jumps:
-    """The events at the `end` (times, states and fields) of pieces; `after`: fields after them."""
-    t, q, f = end
-    xp, (P, d) = namespace(t), f.shape
-    out = Jumps(
-        xp.broadcast_to(xp.eye(d), (P, d, d)), xp.zeros((P, d, s.nu)),
-        xp.zeros((P, d)), xp.zeros((P, s.nu)), xp.zeros((P, d)), xp.zeros(P),
-    )  # fmt: skip
-    for g in sorted(set(events)):
-        fired = code == g
-        if on_host(fired) and not fired.any():
-            continue
-        tr = s.transitions[g]
-        a = s.chart_index(tr.source)
-        n, u = s.dims[a], xp.zeros((s.nu, 1))
-        point = only(fired, t), only(fired, q[:n]), u
-        by = xp.moveaxis(kernels.linear_reset(s, s.member(g), *point), -1, 0)
-        m, n_u = by.shape[1], 2 + n
-        by_t, by_q, by_u = by[:, :, 1], by[:, :, 2:n_u], by[:, :, n_u:]
-        moves, pushed, delay = xp.zeros((P, n)), xp.zeros((P, s.nu)), xp.ones(P)
+def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
+    """The events at the ends of pieces, with the fields f before and `after` them."""
+    P, d = f.shape
+    shapes = (P, d, d), (P, d, s.nu), (P, d), (P, s.nu), (P, d), (P,)
+    out = Jumps(*(np.zeros(shape, f.dtype) for shape in shapes))
+    out.by_state[:] = np.eye(d)
+    for g in np.unique(code[code >= 0]):
+        now, tr, a = (
+            np.flatnonzero(code == g),
+            s.transitions[g],
+            s.chart_index(s.transitions[g].source),
+        )
+        n, delay = s.dims[a], np.ones(len(now))
+        point = t[now], q[now, :n].T, u[:, now]
+        by = np.moveaxis(kernels.linear_reset(s, s.member(g), *point), -1, 0)
+        m, by_t, by_q, by_u = by.shape[1], by[:, :, 1], by[:, :, 2 : 2 + n], by[:, :, 2 + n :]
         if not isinstance(tr.guard, Scheduled):
-            index = np.zeros(1, np.int32)
-            guard = kernels.watched(s, a, None, *point, xp.asarray(index))[s.guards(a).index(g)]
-            guard = xp.moveaxis(guard, -1, 0)
-            rate = guard[:, 1] + xp.sum(guard[:, 2:n_u] * f[:, :n], axis=1)
-            delay = -1 / xp.where(fired, rate, 1.0)
-            moves, pushed = guard[:, 2:n_u] * delay[:, None], guard[:, n_u:] * delay[:, None]
-        slip = by_t + xp.einsum("pij,pj->pi", by_q, f[:, :n]) - after[:, :m]
-        salted = by_q + slip[:, :, None] * moves[:, None, :]
-        driven = by_u + slip[:, :, None] * pushed[:, None, :]
-        new = Jumps(
-            xp.pad(salted, [(0, 0), (0, d - m), (0, d - n)]),
-            xp.pad(driven, [(0, 0), (0, d - m), (0, 0)]),
-            xp.pad(moves, [(0, 0), (0, d - n)]), pushed, xp.pad(slip, [(0, 0), (0, d - m)]), delay,
-        )  # fmt: skip
-        choose = lambda x, y, fired=fired: xp.where(fired.reshape(-1, *[1] * (x.ndim - 1)), x, y)  # noqa: E731
-        out = Jumps(*(choose(x, y) for x, y in zip(new, out, strict=True)))
+            row, index = s.guards(a).index(g), np.zeros(1, np.int32)
+            guard = kernels.watched(s, a, None, *point, index)[row].T
+            delay = -1 / (guard[:, 1] + np.sum(guard[:, 2 : 2 + n] * f[now, :n], axis=1))
+            out.delay_by_state[now, :n] = guard[:, 2 : 2 + n] * delay[:, None]
+            out.delay_by_input[now] = guard[:, 2 + n :] * delay[:, None]
+        slip = by_t + (by_q @ f[now, :n, None])[..., 0] - after[now, :m]
+        out.by_state[now] = 0.0
+        out.by_state[now, :m, :n] = by_q + slip[..., None] * out.delay_by_state[now, None, :n]
+        out.by_input[now, :m] = by_u + slip[..., None] * out.delay_by_input[now, None]
+        out.slip[now, :m], out.delay_by_level[now] = slip, delay
     return out
 
 

@@ -7,10 +7,12 @@ the mode v (G. B. Ermentrout, D. H. Terman, Mathematical foundations of neurosci
 Ch. 8; D. Wilson, J. Moehlis, Phys. Rev. E 94, 2016).
 """
 
+import functools as ft
 from collections.abc import Callable
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
@@ -24,14 +26,14 @@ from .._core.results import Result
 from .._core.signal import unit_of
 from .._core.text import number
 from ..engine import kernels
-from ..engine.lanes import for_each_chart, only, start_lanes
+from ..engine.lanes import start_lanes
 from ..engine.move import move
 from ..engine.target import toward
 from ..errors import ComputationError, DefinitionError
 from ..systems.sliding import SlidingChart
 from ..systems.structure import Structure
 from .crossing import to_section
-from .linear_flow import Course, LinearFlow, by_name, polynomials, rule
+from .linear_flow import LinearFlow, by_name, linear_flow, polynomials, rule
 from .return_map import SINGULAR, ReturnMap
 
 
@@ -309,13 +311,13 @@ class Responses(eqx.Module):
         return {name: value * scale for name, value in named.items()}
 
 
-def responses(course: Course, modes: int | None) -> Responses:
+def responses(cycle: Any, modes: int | None) -> Responses:
     """The responses of a cycle (see `LimitCycle.responses`)."""
-    flow = course.linear_flow()
-    host = on_host(flow.t)
-    _, map, _, period, events, _ = to_host(course) if host else course
-    xp, clocked = namespace(flow.t), map.base is None
-    free, _ = flow.forward()
+    flow = linear_flow(cycle)
+    host, xp = on_host(flow.t), namespace(flow.t)
+    map = (to_host(cycle) if host else cycle).return_map
+    period, clocked = map.expected, map.base is None
+    free, _ = flow.forward
     whole = flow.monodromy(free, map.valid)
     if not clocked:
         f = flow.field[0, 0]
@@ -326,7 +328,7 @@ def responses(course: Course, modes: int | None) -> Responses:
         raise DefinitionError("inside of jit and grad, `responses` needs the number of `modes`.")
     values, right, left = _modes(whole, map.sizes, modes)
     exponents = xp.log(values) / period
-    adjoint, to_go = flow.adjoint(), period - (flow.t - flow.t[0, 0])
+    adjoint, to_go = flow.adjoint, period - (flow.t - flow.t[0, 0])
 
     def nodes(ends):
         return xp.einsum("pkij,pjr->rpki", adjoint, flow.backward(adjoint, xp.stack(ends, axis=1)))
@@ -344,19 +346,17 @@ def responses(course: Course, modes: int | None) -> Responses:
     off = surface(map.structure, flow)
     return Responses(
         map.structure, flow, period, values, exponents, right, total - len(values),
-        events, phase, amplitudes, off,
+        cycle.event_sequence, phase, amplitudes, off,
     )  # fmt: skip
 
 
-def asymptotic_phase(
-    course: Course, chart: str, state: Float[np.ndarray, " n"], turns: int
-) -> float:
+def asymptotic_phase(cycle: Any, chart: str, state: Float[np.ndarray, " n"], turns: int) -> float:
     """The asymptotic phase of a state (see `LimitCycle.asymptotic_phase`)."""
-    map, period = to_host(course.map), float(course.period)
+    map, period = to_host(cycle.return_map), float(cycle.period)
     s, a = map.structure, map.structure.chart_index(chart)
     if state.shape != (s.dims[a],):
         raise DefinitionError(f"`state` must give the {s.dims[a]} states of chart '{chart}'.")
-    phase, size = to_host(responses(course, 0)._covector(None))[0, 0], map.sizes
+    phase, size = to_host(responses(cycle, 0)._covector(None))[0, 0], map.sizes
     near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase
     surface = getattr(s.charts[a], "surface", None)
     if surface is not None and abs(float(surface(map.anchor.t[0], state))) > near:
@@ -454,27 +454,14 @@ def _eigenpairs(M: Float[Array, "d d"], value, right):
 
 def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
     """The effect of pushes in charts of sliding; identity in others."""
-    sliding = [a for a, chart in enumerate(s.charts) if isinstance(chart, SlidingChart)]
-    if not sliding:
+    if not any(isinstance(chart, SlidingChart) for chart in s.charts):
         return None
-    xp, (P, K, d) = namespace(flow.q), flow.q.shape
-    chart, t, q = xp.repeat(flow.chart, K), flow.t.ravel(), flow.q.reshape(P * K, d).T
-
-    def work(a, here, out):
-        if a not in sliding:
-            return out
-        n = s.dims[a]
-        point = only(here, t), only(here, q[:n]), xp.zeros((s.nu, 1))
-        by = kernels.linear(s, _returned, a, *point)[:, 0].reshape(n, n, -1)
-        by = xp.pad(by, [(0, d - n), (0, d - n), (0, 0)])
-        return xp.where(here, by, out)
-
-    begin = xp.broadcast_to(xp.eye(d)[..., None], (d, d, P * K))
-    by = for_each_chart(s, chart, xp.ones(P * K, bool), work, begin)
-    return xp.moveaxis(by, -1, 0).reshape(P, K, d, d)
+    effect = flow.evaluated(s, ft.partial(kernels.linear, s, _returned), s.d**2)
+    return effect[..., 0].reshape(flow.by_state.shape)
 
 
 def _returned(a: int, s: Structure, t, q, u):
-    chart = s.charts[a]
-    assert isinstance(chart, SlidingChart)
-    return chart.returned(t, q, s.chart_input(a, t, u)).ravel()
+    chart, effect = s.charts[a], jnp.eye(len(q))
+    if isinstance(chart, SlidingChart):
+        effect = chart.returned(t, q, s.chart_input(a, t, u))
+    return jnp.pad(effect, (0, s.d - len(q))).ravel()

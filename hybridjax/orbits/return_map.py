@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._core.compilation import at_ease
 from .._core.executor import Array, namespace, on_host, put, scan, stop_gradient, svdvals
 from .._core.memo import remembered
 from .._core.results import Result
@@ -326,6 +327,13 @@ class ReturnMap(eqx.Module):
         residual = xp.where(self.valid, end.q[:, 0], 0.0) - q - self.held(q)[0]
         residual = xp.where(same, residual, np.nan)
         return Return(residual, end.t[0] - self.anchor.t[0], result[0]), extra
+
+    def pieces(self, tangents: bool = False) -> tuple[Lanes, Tape]:
+        """The starts and tapes of the pieces of one turn."""
+        options = Options(tape=True, new_input=False, tangents=tangents)
+        with at_ease():
+            _, (lanes, _, tapes) = self.travel(self.anchor.q[:, 0], options)
+        return lanes, tapes
 
     def ends(self) -> Target:
         """The ends of the pieces, as lanes."""

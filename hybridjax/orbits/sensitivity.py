@@ -5,6 +5,8 @@ shape response curve, and the changes of the times between events are local timi
 Wang, J. P. Gill, H. J. Chiel, P. J. Thomas, SIAM J. Appl. Dyn. Syst. 20, 2021).
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -15,15 +17,14 @@ from .._core.compilation import at_ease
 from .._core.executor import Array, is_traced, namespace, on_host, scan, to_host
 from .._core.text import number
 from ..engine import kernels
-from ..engine.lanes import for_each_chart
 from ..errors import ComputationError
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from ..systems.varied import Varied
 from .crossing import AtEvent, ListLevels
-from .linear_flow import Course, LinearFlow, by_name
+from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
 from .responses import Phases, loop
-from .return_map import SINGULAR, derivative_at_zero
+from .return_map import SINGULAR, ReturnMap, derivative_at_zero, with_derivatives
 
 
 @checked_methods
@@ -66,22 +67,20 @@ class Sensitivity(eqx.Module):
         return head + f"{number(self.period, 9)})" + "".join(rows)
 
 
-def sensitivity(course: Course, parameter: str) -> Sensitivity:
+def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
     """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`)."""
-    s, varied = course.map.structure, Varied(course.map.system, parameter)
-    course = course._replace(inputs=varied)
-    flow = course.linear_flow()
-    if on_host(flow.q):
-        course = to_host(course)
+    varied = Varied(cycle.system, parameter)
+    flow = linear_flow(cycle, parameter=parameter)
+    cycle = to_host(cycle) if on_host(flow.q) else cycle
     with at_ease():
-        return _sensitivity(course, flow, s, varied)
+        return _sensitivity(cycle, flow, varied)
 
 
-def _sensitivity(course: Course, flow: LinearFlow, s: Structure, varied: Varied) -> Sensitivity:
-    map, period, xp = course.map, course.period, namespace(flow.q)
-    clocked, f0, jumps = map.base is None, flow.field[0, 0], flow.jumps
-    due = _due(flow, course.events, varied)
-    free, forced = flow.forward()
+def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
+    map, period, events = cycle.return_map, cycle.period, cycle.event_sequence
+    s, xp, jumps, f0 = map.structure, namespace(flow.q), flow.jumps, flow.field[0, 0]
+    clocked, due = map.base is None, _due(flow, events, varied)
+    free, forced = flow.forward
     force = flow.by_input[..., 0] * flow.length[:, None, None]
     pushed = xp.einsum("piakb,pkb->pia", forced, force)
     kick = jumps.by_input[..., 0] + jumps.slip * due[:, None]
@@ -106,20 +105,18 @@ def _sensitivity(course: Course, flow: LinearFlow, s: Structure, varied: Varied)
     change = xp.einsum("pkab,pb->pka", free, starts) + pushed
     late = xp.einsum("pa,pa->p", jumps.delay_by_state, change[:, -1])
     late = late + jumps.delay_by_input[:, 0] + due
-    time = flow.t
     if not clocked:  # phase 0 stays on the section
-        time = flow.t - flow.t[0, 0]
         if isinstance(map.base, AtEvent):
             ahead = late[-1] - longer
         else:
-            by_state, by_parameter = to_section(course, f0)
+            by_state, by_parameter = to_section(map, f0, parameter=varied.parameter)
             ahead = by_state @ begin + by_parameter
         change, late = change + ahead * flow.field, late - ahead
-    change = change + flow.field * (time / period * longer)[..., None]
-    place = xp.argsort(flow.event < 0, stable=True)[: len(course.events)]
+    change = change + flow.field * (flow.after(map) / period * longer)[..., None]
+    place = xp.argsort(flow.event < 0, stable=True)[: len(events)]
     times = late[place]
     wrapped = xp.concatenate([times[1:], times[:1] + longer]) - times
-    names = tuple(s.transitions[g].name for g in course.events)
+    names = tuple(s.transitions[g].name for g in events)
     return Sensitivity(varied.parameter, longer, names, times, wrapped, s, flow, period, change)
 
 
@@ -143,21 +140,17 @@ def _due(flow: LinearFlow, events: tuple[int, ...], varied: Varied) -> Float[Arr
     return out
 
 
-def to_section(course: Course, f: Float[Array, " d"]) -> tuple[Float[Array, " d"], Array]:
+def to_section(
+    map: ReturnMap, f: Float[Array, " d"], parameter: str | None = None
+) -> tuple[Float[Array, " d"], Array]:
     """The time by which a changed state at phase 0 comes later to the section, per change of the
     state and of the first input."""
-    map, xp = course.map, namespace(f)
     assert map.base is not None
-    levels, (t, chart, q, *_) = ListLevels((map.base,)), map.anchor
-
-    def work(a, here, out):
-        n, u = map.structure.dims[a], xp.zeros((course.linearized.nu, 1))
-        by = kernels.linear(course.linearized, _level, a, t, q[:n], u, levels)[0, :, 0]
-        rate = by[2 : 2 + n] @ f[:n]
-        return out + xp.append(xp.pad(by[2 : 2 + n], (0, len(f) - n)), by[2 + n]) / -rate
-
-    out = for_each_chart(map.structure, chart, xp.ones(1, bool), work, xp.zeros(len(f) + 1))
-    return out[:-1], out[-1]
+    levels = ListLevels((map.base,))
+    of, (t, chart, q, *_) = with_inputs(map.system, parameter), map.anchor
+    level = lambda a, *at: kernels.linear(of, _level, a, *at, levels)  # noqa: E731
+    by = with_derivatives(of, level, chart, t, q, 1)[0, 2 : 3 + len(f), 0]
+    return by[:-1] / -(by[:-1] @ f), by[-1] / -(by[:-1] @ f)
 
 
 def _level(a: int, s: Structure, levels: ListLevels, t, q, u):

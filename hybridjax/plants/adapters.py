@@ -46,8 +46,8 @@ class MuJoCoPlant(_Made):
     - `model`: a `mujoco.MjModel`.
     - `inputs`: names of actuators, or units by name. An input is added to what `control` returns.
     - `control`: function of (model, data) that returns the controls of all actuators in each time
-        step. It may read `data.time` if `period` is given, and must keep nothing between calls.
-        An error that it raises ends an experiment, for example after a fall. Default: zero.
+        step. It may read `data.time` if `period` is given, and keeps memory in
+        `data.userdata` only. An error that it raises (a fall) ends an experiment. Default: zero.
     - `period`: period of the clock in seconds. Default: no clock.
     - `substeps`: number of time steps between two looks at the signals. Default: 1.
 
@@ -75,9 +75,8 @@ class MuJoCoPlant(_Made):
         v = _numbered([f"{x}_rate" for x in joints], np.diff([*model.jnt_dofadr, model.nv]))
         self._names = [*q, *v, *_numbered(sensors, model.sensor_dim)]
         self.states = ("time", *q, *v, *(f"act{i}" for i in range(model.na)))
-        # (The last part is where the solver of contacts begins.)
-        kept = "TIME", "QPOS", "QVEL", "ACT", "WARMSTART"
-        self._kept = sum(int(getattr(mujoco.mjtState, f"mjSTATE_{x}")) for x in kept)
+        # (With the memory of controllers, and where the solver of contacts begins.)
+        self._kept = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         # The positions of bodies, contacts and sensors belong to the present state after `mj_step1`
         # but not after `mj_step`. (Those of 1, Runge-Kutta, cannot be divided.)
         self._integrate = mujoco.mj_step if model.opt.integrator == 1 else mujoco.mj_step2
@@ -85,9 +84,7 @@ class MuJoCoPlant(_Made):
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin at the first keyframe."""
-        self._mujoco.mj_resetData(self.model, self.data)
-        if self.model.nkey:
-            self._mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        self._mujoco.mj_resetDataKeyframe(self.model, self.data, 0)  # (or `qpos0` if there is none)
         self._mujoco.mj_step1(self.model, self.data)
         return self._observe()
 
@@ -95,8 +92,7 @@ class MuJoCoPlant(_Made):
         """Hold the inputs for some time."""
         model, data, whole = self.model, self.data, self.dt / self.substeps
         steps = int(duration / whole + 1e-9)
-        left = duration - steps * whole
-        for h in [whole] * steps + [left] * (left > 1e-9 * whole):
+        for h in [whole] * steps + [duration - steps * whole] * (duration > (steps + 1e-9) * whole):
             model.opt.timestep = h
             data.ctrl[:] = 0.0 if self.control is None else self.control(model, data)
             data.ctrl[self._actuators] += u
@@ -110,7 +106,7 @@ class MuJoCoPlant(_Made):
         return dict(zip(self._names, np.concatenate(values).tolist(), strict=True))
 
     def get_state(self) -> np.ndarray:
-        """Return `states`, and then what the solver of contacts keeps."""
+        """Return `states`, and then all else that MuJoCo continues from."""
         x = np.empty(self._mujoco.mj_stateSize(self.model, self._kept))
         self._mujoco.mj_getState(self.model, self.data, x, self._kept)
         return x
@@ -149,17 +145,15 @@ class FMUPlant(_Made):
         fmpy, self.file = package("fmpy"), os.path.abspath(self.file)
         try:
             about = fmpy.read_model_description(self.file)
-            can = about.coSimulation if about.fmiVersion.startswith("2.") else None
-        except Exception:  # (of many kinds)
-            can = None
-        if can is None:
-            raise DefinitionError(f"'{self.file}' is no FMU of FMI 2.0 for co-simulation.")
-        groups = self.inputs, self.signals
-        variables = {x.name: x for x in about.modelVariables if x.type == "Real"}
-        require_among("real variable", [x for y in groups for x in y], variables, "FMUPlant: ")
-        self._at = [[variables[x].valueReference for x in group] for group in groups]
-        self.units = {x: variables[x].unit for x in self.signals if variables[x].unit}
-        self.fixed_step = not can.canHandleVariableCommunicationStepSize
+            can = {"2": about.coSimulation}[about.fmiVersion[0]]
+            self.fixed_step = not can.canHandleVariableCommunicationStepSize
+        except Exception as error:  # (of many kinds)
+            text = f"'{self.file}' is no FMU of FMI 2.0 for co-simulation."
+            raise DefinitionError(text) from error
+        real, names = {x.name: x for x in about.modelVariables if x.type == "Real"}, self.signals
+        require_among("real variable", [*self.inputs, *names], real, "FMUPlant: ")
+        self._at = [[real[x].valueReference for x in group] for group in (self.inputs, names)]
+        self.units = {x: real[x].unit for x in names if real[x].unit}
         folder = fmpy.extract(self.file)
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._slave, self._t = fmpy.instantiate_fmu(folder, about, "CoSimulation"), 0.0

@@ -1,8 +1,8 @@
 """The limit cycle of a plant: the sections on it, outputs there, and experiments around it."""
 
 import dataclasses
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
+from itertools import starmap
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -11,14 +11,16 @@ from jaxtyping import Float
 
 from .._core.arguments import Numbers, require_among
 from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.containers import Names
 from .._core.boundary.kinds import FilePath, Index, Positive, Seed, SignalNames
 from .._core.boundary.values import Reals, Whole
 from .._core.execution import core_count
 from .._core.pieces.description import digest_of
-from .._core.progress import counted, say, working
+from .._core.progress import counted, working
 from .._core.results import Result
-from .._core.signal import Signal, signals, unit_of
+from .._core.signal import Signal, signals
 from .._core.text import listed
+from ..engine.trajectory import Trajectory
 from ..errors import ComputationError, DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.design import DISCARD
@@ -26,7 +28,12 @@ from ..experiments.run import DesignLike, check_inputs
 from ..identify.multiplier_estimate import MultiplierEstimate
 from ..orbits.crossing import Crossing
 from ..sections import families
+from ..systems import chart, structure, system
 from .drive import At, Drive, Phase, Plant, Trial, resume, run_all
+
+
+Draw = Callable[[Any], Any]
+Inputs = Annotated[Numbers, Reals("n inputs")]
 
 
 class Returns(MultiplierEstimate):
@@ -34,8 +41,7 @@ class Returns(MultiplierEstimate):
 
     **Fields** beside those of all estimates of multipliers:
 
-    - `coordinates`: names of the numbers that were perturbed. `state` (d,): their values on the
-      cycle, on section 0.
+    - `coordinates`: names of the numbers that were perturbed.
     - `noise` (d,): standard deviation of returns from nearly equal states.
     - `residual`: largest distance between state and return, in units of the range of the
       coordinate on the cycle.
@@ -43,15 +49,28 @@ class Returns(MultiplierEstimate):
       that they may have (0 if all are listed).
     """
 
-    state: Float[np.ndarray, " d"]
     noise: Float[np.ndarray, " d"]
     coordinates: tuple[str, ...] = eqx.field(static=True)
     residual: float = eqx.field(static=True)
     bound: float = eqx.field(static=True)
 
     def _about(self) -> str:
-        n, more = len(self.coordinates), len(self.coordinates) - len(self.multipliers)
-        return f"{more} more below {self.bound:.1g}; {n} coordinates, residual {self.residual:.1g}"
+        more = f"{len(self.coordinates) - len(self.multipliers)} more below {self.bound:.1g}"
+        return f"{more}; {len(self.coordinates)} coordinates, residual {self.residual:.1g}"
+
+
+class Recorded(system.HybridSystem):
+    """The signals of a plant as the states of a system that is only looked at."""
+
+    states: tuple[str, ...] = eqx.field(static=True)
+    picture: Callable[[Any], Any] | None = eqx.field(static=True)
+    time_unit, inputs = "s", ()
+
+    def charts(self):
+        return {"plant": chart.FieldChart(lambda t, q, u: 0 * q, self.states)}
+
+    def draw(self, chart, t, q):
+        return None if self.picture is None else self.picture(q)
 
 
 class _Map:
@@ -68,34 +87,34 @@ class _Map:
         self.base = np.array(cycle.state, float)
         states = tuple(getattr(plant, "states", [f"x{i}" for i in range(self.base.size)]))
         period = getattr(plant, "period", None)
-        if names is None:
-            timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
-            names = [x for x in states if not (timeless and x == "time")]
+        timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
+        names = names or [x for x in states if not (timeless and x == "time")]
         require_among("coordinate", names, states, "perturbed_returns: ")
         self.names, self.columns = tuple(names), [states.index(x) for x in names]
         turn = 0.0 if period is None else round(cycle.period / period) * period
-        self.shift, self.n = turn * np.array([x == "time" for x in names]), 0
-        self.x, N = self.base[self.columns], cycle.sections.n_sections
-        rows = [self(self.x, k) for k in range(N)]
-        self.n, self.size = N, np.ptp(rows, axis=0)
-        still = self.size <= 1e-9 * np.abs(rows).max(axis=0)
-        self.size[still] = np.where(self.x, np.abs(self.x), 1.0)[still]
-        say("noise of returns")
+        self.shift = turn * np.array([x == "time" for x in names])
+        self.x, self.n = self.base[self.columns], cycle.sections.n_sections
+        # (A perturbed state before a crossing must not return to it at once.)
+        self.free = cycle.period / 2 if self.drive.phase.crossings else 0.0
+        points = list[At]()
+        self(self.x, points)
+        rows = np.array([x.state for x in points], float)[:, self.columns]
+        size, top = np.ptp(rows, axis=0), np.abs(rows).max(axis=0)
+        self.size = np.where(size > 1e-9 * top, size, np.where(self.x, np.abs(self.x), 1.0))
         self.noise = self._noise()
         # Steps at which noise and the error of fourth order are nearly equal for a function of unit
-        # derivatives; at most two percent of the range.
-        self.h = self.size * min((self.noise / self.size).max() ** 0.2 / 2, 0.02)
+        # derivatives; at most one percent of the range.
+        self.h = self.size * min((self.noise / self.size).max() ** 0.2 / 2, 0.01)
 
-    def __call__(self, x: Float[np.ndarray, " d"], n: int | None = None) -> Any:
-        """Return coordinates (d,) after n sections. Default: after one cycle, at its beginning."""
+    def __call__(self, x: Float[np.ndarray, " d"], points: Any = None) -> Float[np.ndarray, " d"]:
+        """Return the coordinates after one cycle, and append the points of its steps."""
         state, drive = self.base.copy(), self.drive
         state[self.columns] = x
         drive.restore(drive.start._replace(state=state))
         drive.phase.begin(drive.t, drive.z, on_section=True)
-        for k in range(1, 1 + (self.n if n is None else n)):
-            drive.advance(drive.zero, k)
-        y = np.array(drive.here().state, float)[self.columns]
-        return y - self.shift if n is None else y
+        drive.pass_time(self.free if points is None else 0.0)
+        drive.advance(drive.zero, self.n, points)
+        return np.array(drive.here().state, float)[self.columns] - self.shift
 
     def _noise(self) -> Float[np.ndarray, " d"]:
         """Return the standard deviation of returns from nearly equal states.
@@ -104,13 +123,11 @@ class _Map:
         2011, Estimating computational noise). Narrow spacing shows rounding and tolerances, wide
         spacing the events that move through the time steps of a simulator.
         """
-        rng = np.random.default_rng(0)
         noise = np.finfo(float).eps * np.maximum(np.abs(self.x), self.size)
-        for spacing in (1e-6, 1e-4, 1e-3):
-            along = rng.uniform(0.5, 1, len(self.x)) * rng.choice([-1, 1], len(self.x))
-            line = [self(self.x + j * spacing * self.size * along) for j in range(-7, 8)]
-            squares = np.diff(line, 4, axis=0) ** 2 / 70
-            noise = np.maximum(noise, np.sqrt(squares.mean(axis=0)))
+        signs = np.random.default_rng(0).choice([-1, 1], (3, len(self.x)))
+        for along in np.array([[1e-6], [1e-4], [1e-3]]) * self.size * signs:
+            line = [self(self.x + j * along) for j in range(-7, 8)]
+            noise = np.maximum(noise, np.sqrt((np.diff(line, 4, axis=0) ** 2 / 70).mean(axis=0)))
         return noise
 
     def slopes(self, steps: float) -> Any:
@@ -144,12 +161,8 @@ def _resolved(J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]) -> A
         count -= 1
     coefficients = np.array([np.atleast_1d(np.poly(x[:count])).real[1:] for x in each])
     covariance = np.cov(coefficients[1:], rowvar=False).reshape(count, count)
-    return (
-        values[:count],
-        coefficients[0],
-        covariance,
-        (sizes[0] + 3 * spread)[count:].max(initial=0),
-    )
+    bound = float((sizes[0] + 3 * spread)[count:].max(initial=0))
+    return values[:count], coefficients[0], covariance, bound
 
 
 @checked_methods
@@ -162,7 +175,6 @@ class SettledCycle:
     - `plant`, `sections`, `inputs`, `outputs`.
     - `period`: mean duration of a cycle.
     - `cycle_outputs` (N, ny): mean outputs at the sections.
-    - `noise` (N, ny): their standard deviations from cycle to cycle, without inputs.
     - `state`: that of the plant on section 0, if it can be set.
     """
 
@@ -172,7 +184,6 @@ class SettledCycle:
     outputs: tuple[Signal, ...]
     period: float
     cycle_outputs: Float[np.ndarray, "N ny"]
-    noise: Float[np.ndarray, "N ny"]
     state: Any
     drive: Drive = dataclasses.field(repr=False)
     seed: int = 0
@@ -218,31 +229,28 @@ class SettledCycle:
 
         def run(rows: list[int]) -> Iterator[Trial]:
             items = ((self.seed + 1 + s, u[s].tolist()) for s in rows)
-            yield from counted(run_all(self.drive, items, count, limit), "experiments", len(rows))
+            many = run_all(self.drive, items, count, limit) if count else None
+            yield from counted(many or starmap(self.drive.run, items), "experiments", len(rows))
 
         with working("run_experiments"):
             # (A plant is described by the cycle that was measured.)
             about = digest_of(self.outputs, self.cycle_outputs, self.sections, u, self.seed)
             trials = resume(store, about, len(u), run)
         # (Rows are as long as the inputs, and NaN from the end of an experiment on.)
-        ends, ny = [len(late) for _, late, _ in trials], len(self.outputs)
-        rows = np.full((*u.shape[:2], ny + 1), np.nan)
-        for s, (y, late, _) in enumerate(trials):
-            rows[s, : ends[s]] = np.c_[np.reshape(y, (-1, ny)), late]
-        causes = tuple(cause for _, _, cause in trials)
-        failed = np.array([x != "" for x in causes])
-        failed_at, label = np.where(failed, ends, -1), self.sections.label
-        return ExperimentData(
-            u,
-            rows[..., :ny] - np.tile(self.cycle_outputs, (u.shape[1] // N, 1)),
-            n_sections=N,
-            periods=inputs.periods,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            result=np.where(failed, Result.PLANT_STOPPED, Result.OK),
-            cycle_outputs=self.cycle_outputs,
-            simulated=Simulated(failed_at, None, label, rows[..., ny], causes),
+        rows = np.full((*u.shape[:2], len(self.outputs) + 1), np.nan)
+        for s, (values, _) in enumerate(trials):
+            rows[s, : len(values)] = np.reshape(values, (-1, rows.shape[2]))
+        causes = tuple(cause for _, cause in trials)
+        failed_at = np.array([len(values) if cause else -1 for values, cause in trials])
+        result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
+        simulated = Simulated(failed_at, None, self.sections.label, rows[..., -1], causes)
+        of_cycle = {"n_sections": N, "inputs": self.inputs, "outputs": self.outputs}
+        at, y = (
+            self.cycle_outputs,
+            rows[..., :-1] - np.tile(self.cycle_outputs, (len(u[0]) // N, 1)),
         )
+        given: Any = of_cycle | {"cycle_outputs": at, "periods": inputs.periods}
+        return ExperimentData(u, y, result=result, simulated=simulated, **given)
 
     def perturbed_returns(self, coordinates: SignalNames | None = None) -> Returns:
         """Estimate the multipliers from returns of perturbed states to section 0.
@@ -268,17 +276,42 @@ class SettledCycle:
         J, coarse = (4 * fine - middle) / 3, (4 * middle - wide) / 3
         # (Weights 8/12 and -1/12 of four returns, each with this noise.)
         noise = np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / map.h
-        scale = map.size / map.size[:, None]
-        error = np.hypot(noise, (J - coarse) / 3)
-        values, coefficients, covariance, bound = _resolved(J * scale, error * scale)
-        freedom = 10.0  # (eleven differences)
-        about = map.x, map.noise, map.names, residual, float(bound)
-        return Returns(values, coefficients, covariance, freedom, *about)
+        # (A jump of the second derivative leaves in J an error as large as this difference.)
+        error, scale = np.hypot(noise, J - coarse), map.size / map.size[:, None]
+        values, coefficients, spread, bound = _resolved(J * scale, error * scale)
+        # (10: eleven differences in each line.)
+        return Returns(values, coefficients, spread, 10.0, map.noise, map.names, residual, bound)
+
+    def trajectory(self, draw: Draw | None = None, u: Inputs | None = None) -> Trajectory:
+        """Record the signals after each step from section 0 on, for `hj.plot.animate`.
+
+        **Arguments:**
+
+        - `draw`: function of the signals by name that returns a `hj.Drawing`, written with JAX.
+          Default: none, the signals are drawn over time.
+        - `u` (n, nu): inputs, each held until the next section. Default: one cycle without inputs.
+
+        **Returns:** a `Trajectory` in the chart `plant`, from time 0 on. Where the plant raises an
+        error (a fall) it ends with `Result.PLANT_STOPPED`.
+        """
+        u = np.zeros((self.sections.n_sections, len(self.inputs))) if u is None else np.asarray(u)
+        drive, points, result = self.drive, list[At](), Result.OK
+        drive.begin(self.seed)
+        try:
+            for k, held in enumerate(u.tolist(), 1):
+                drive.advance(held, k, points)
+            points.append(drive.here())
+        except Exception:
+            result = Result.PLANT_STOPPED
+        q, t = np.array([x.z for x in points]), np.array([x.t for x in points])
+        n, s = len(t), structure.Structure(Recorded(drive.names, draw))
+        rates, events = np.gradient(q, t, axis=0) if n > 1 else 0 * q, np.full(n, -1)
+        return Trajectory(s, t - t[0], np.zeros(n, int), q, q, rates, rates, events, result)
 
     def __repr__(self) -> str:
         names = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        about = f"{type(self.plant).__name__}: period {self.period:.9g}, {len(self.noise)} sections"
-        return f"SettledCycle({about}, {names})"
+        about = f"period {self.period:.9g}, {len(self.cycle_outputs)} sections, {names}"
+        return f"SettledCycle({type(self.plant).__name__}: {about})"
 
 
 @checked
@@ -296,8 +329,9 @@ def settle(
 
     **Arguments:**
 
-    - `sections`: `ClockPhase` for a plant with a `period`, or `KinematicPhase` of two signals, with
-      numbers as `anchor`.
+    - `sections`: `ClockPhase` for a plant with a `period`; `KinematicPhase` of two signals, with
+      numbers as `anchor`; or one or several `Crossing` of signals by name, which lie more than a
+      step apart and are crossed once in each cycle.
     - `outputs`: names of signals.
     - `cycles`: number of cycles before the sections are located. A quarter as many are then
       recorded. Default: 100.
@@ -320,81 +354,76 @@ def settle(
             raise DefinitionError("`guess` must be a state, as `get_state` returns it.")
         drive.restore(At(0.0, drive.z, state=np.asarray(guess)))
         drive.step(drive.zero, drive.dt)
-    drive.phase = _bound(drive, family, cycles if guess is None else 0)
-    drive.warmup = drive.t
+    # (One turn shows the sense of an angle; that of a guess is seen near it.)
+    drive.phase = _bound(drive, family, 1.0 if guess is None else 0.01)
     drive.phase.begin(drive.t, drive.z)
-    drive.advance(drive.zero, 0)
+    for k in range(1 if guess is not None else cycles + 1):
+        drive.warmup = drive.t
+        drive.advance(drive.zero, k * family.n_sections)
     if guess is not None:
         _Map(_measure(drive, family, 1, seed)).solve()
     return _measure(drive, family, max(cycles // 4, 2) if guess is None else 2, seed)
 
 
-def _measure(
-    drive: Drive, family: families.AbstractSections, cycles: int, seed: int
-) -> SettledCycle:
+def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
     """Record cycles, and prepare experiments. The plant is on section 0."""
-    N, plant = family.n_sections, drive.plant
+    N, plant, points = family.n_sections, drive.plant, list[At]()
 
     def turn() -> tuple[At, list[At]]:
         start = drive.here()
         drive.phase.begin(drive.t, drive.z, on_section=True)
-        return start, [drive.advance(drive.zero, k) for k in range(1, N + 1)]
+        return start, [drive.advance(drive.zero, k, points) for k in range(1, N + 1)]
 
     start, at = turn()
     drive.longest = 2 * (at[-1].t - start.t)
     turns = [turn() for _ in range(cycles + 1)]
     values = np.array([[[x.z[c] for c in drive.columns] for x in at] for _, at in turns])
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
-    half, size = len(values) // 2, np.ptp(values, axis=(0, 1))
+    drive.start, at = turns[-1]
+    half, size = len(values) // 2, np.ptp([x.z for x in points], axis=0)[list(drive.columns)]
     change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
     # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
     if cycles > 1 and (change > np.maximum(1e-4 * size, 1.6 * values.std(axis=0))).any():
         raise ComputationError("the plant has not settled: give more `cycles` or a `guess`.")
-    drive.start, at = turns[-1]
     if drive.sets:
         drive.restore(drive.start)
         change = np.abs(np.array([x.z for x in turn()[1]]) - [x.z for x in at])
         if (change[:, list(drive.columns)] > 1e-6 * size).any():
             raise DefinitionError("`set_state` does not continue as before: save more.")
-    given, units = plant.inputs, getattr(plant, "units", {})
-    of_inputs = dict(given) if isinstance(given, Mapping) else {x: unit_of(x) for x in given}
-    return SettledCycle(
-        plant=plant,
-        sections=family,
-        inputs=signals(of_inputs, of_inputs.values()),
-        outputs=tuple(Signal(drive.names[c], units.get(drive.names[c], "")) for c in drive.columns),
-        period=float(np.diff([at[-1].t for _, at in turns]).mean()),
-        cycle_outputs=values.mean(axis=0),
-        noise=values.std(axis=0),
-        state=drive.start.state,
-        drive=drive,
-        seed=seed,
-    )
+    names, units = [drive.names[c] for c in drive.columns], getattr(plant, "units", {})
+    outputs = signals(names, [units.get(name, "") for name in names])
+    about = plant, family, Names(units=True, empty=True).take(plant.inputs), outputs
+    period = float(np.diff([at[-1].t for _, at in turns]).mean())
+    return SettledCycle(*about, period, values.mean(axis=0), drive.start.state, drive, seed)
 
 
-def _bound(drive: Drive, family: Any, cycles: int) -> Phase:
-    """Run the plant for some cycles, and return the sections with the numbers of its cycle."""
-    N, kind = family.n_sections, type(family)
-    anchor: Any = getattr(family, "anchor", None)
-    period: Any = getattr(drive.plant, "period", None)
+def _bound(drive: Drive, family: Any, turns: float) -> Phase:
+    """Return the sections as a plant is taken to them. An angle first makes so many turns."""
+    N, names, period = family.n_sections, drive.names, getattr(drive.plant, "period", None)
+    items: Any = getattr(family, "items", ())
+    if items and all(isinstance(getattr(x, "function", None), str) and not x.charts for x in items):
+        require_among("signal", [x.function for x in items], names, "Crossing: ")
+        signs = {"falling": 1.0, "rising": -1.0}
+        rows = [(names.index(x.function), signs[x.direction], float(x.value)) for x in items]
+        return Phase(N, crossings=rows)
     kinds = [families.KinematicPhase, *[families.ClockPhase] * (period is not None)]
-    if kind not in kinds or isinstance(anchor, Crossing):
-        raise DefinitionError("use KinematicPhase, or ClockPhase and a `period`; no Crossing.")
-    if kind is families.ClockPhase:
-        drive.pass_time(cycles * period)
-        return Phase(N, period, float(anchor) * period)
+    if type(family) not in kinds or isinstance(family.anchor, Crossing):
+        text = "use KinematicPhase, Crossings of signals by name, or ClockPhase and a `period`"
+        raise DefinitionError(f"{text}; an `anchor` must be a number.")
+    if period is not None and isinstance(family, families.ClockPhase):
+        return Phase(N, period, float(family.anchor) * period)
     pair = family.position, family.velocity
-    require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
-    i, j = map(drive.names.index, pair)
+    require_among("signal", pair, names, "KinematicPhase(position, velocity): ")
     center = [0.0, 0.0] if family.center is None else np.asarray(family.center).tolist()
     scale = [1.0, 1.0] if family.scale is None else np.asarray(family.scale).tolist()
-    phase = Phase(N, 1.0, 0.0, (i, j), center, scale)
+    phase = Phase(N, axes=[*zip(map(names.index, pair), center, scale, strict=True)])
     phase.begin(drive.t, drive.z)
     began = phase.turns
-    while abs(phase.turns - began) < max(cycles, 0.01):  # (which shows the sense)
-        if drive.t > (1 + cycles) * 100_000 * drive.dt:
+    while abs(phase.turns - began) < turns:
+        if drive.t > drive.longest:
             raise ComputationError(f"{pair} do not circle around {center}")
         drive.step(drive.zero, drive.dt)
         phase.level(0, drive.t, drive.z)
-    sign = math.copysign(1, phase.turns - began)
-    return dataclasses.replace(phase, first=sign * float(anchor), scale=(scale[0], sign * scale[1]))
+    phase.sense = float(np.sign(phase.turns - began))
+    phase.first = float(family.anchor)
+    return phase

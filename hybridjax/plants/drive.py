@@ -15,7 +15,6 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -61,20 +60,22 @@ class Plant(Protocol):
 
 @dataclasses.dataclass
 class Phase:
-    """Sections at equal phases of a period (`columns` None), or of the angle of two signals.
+    """Sections at equal phases of a period, of the angle of two signals, or where signals cross
+    levels.
 
-    **Fields:** `first`: time or angle of section 0. `center`, `scale`: of the two signals; the
-    second scale is negative if the angle decreases. `start`: turns at which sections are counted.
+    **Fields:** `first`: time or angle of section 0. `axes`: column, center and scale of the two
+    signals. `sense`: -1 if the angle decreases. `start`: turns at which sections are counted.
+    `crossings`: column, sign (1 if it falls) and level of each section.
     """
 
     n: int
     period: float = 1.0
     first: float = 0.0
-    columns: tuple[int, int] | None = None
-    center: Sequence[float] = (0.0, 0.0)
-    scale: Sequence[float] = (1.0, 1.0)
+    axes: Sequence[tuple[int, float, float]] = ()
+    sense: float = 1.0
     turns: float = 0.0
     start: float = 0.0
+    crossings: Sequence[tuple[int, float, float]] = ()
 
     def begin(self, t: float, z: Sequence[float], on_section: bool = False) -> None:
         """Count sections from the next section 0 on, or from the one on which the plant is."""
@@ -84,13 +85,16 @@ class Phase:
 
     def level(self, k: int, t: float, z: Sequence[float]) -> float:
         """Return a number that falls through zero at section k, counted from `begin` on: the time
-        until then, or an angle in turns, which is unwrapped."""
-        if self.columns is None:
-            self.turns = (t - self.first) / self.period
+        until then, an angle in turns, which is unwrapped, or a signal above its level."""
+        if self.crossings:
+            c, sign, value = self.crossings[k % self.n]
+            return sign * (z[c] - value)
+        if self.axes:
+            (i, a, p), (j, b, q) = self.axes
+            angle = self.sense * (math.atan2((z[j] - b) / q, (z[i] - a) / p) - self.first)
+            self.turns = angle / (2 * math.pi) + round(self.turns - angle / (2 * math.pi))
         else:
-            (i, j), (a, b), (p, q) = self.columns, self.center, self.scale
-            turns = (math.atan2((z[j] - b) / q, (z[i] - a) / p) - self.first) / (2 * math.pi)
-            self.turns = turns + round(self.turns - turns)
+            self.turns = (t - self.first) / self.period
         return (self.start + k / self.n - self.turns) * self.period
 
 
@@ -104,8 +108,8 @@ class At(NamedTuple):
     state: Any = None
 
 
-Trial = tuple[list[list[float]], list[float], str]
-"""One experiment: signals (n, ny) at the sections, lateness (n,), and the cause of its end, "" if
+Trial = tuple[list[list[float]], str]
+"""One experiment: signals at the sections and lateness (n, ny + 1), and the cause of its end, "" if
 it ran to its end."""
 
 
@@ -115,7 +119,7 @@ class Drive:
     **Fields:**
 
     - `names`: signals in order; empty: those of the first observation. `columns`: of the outputs.
-    - `phase`: the sections. `longest`: time that one section may take.
+    - `phase`: the sections. `longest`: time that one section may take, at first a million steps.
     - `start`: on section 0. `warmup`: time for which a plant whose state cannot be set runs after
       `reset` instead.
     - `t`, `z`: present time since `reset`, and signals. `last`: the point before, if known.
@@ -126,7 +130,7 @@ class Drive:
         self.fixed = bool(getattr(plant, "fixed_step", False))
         self.sets = hasattr(plant, "get_state") and hasattr(plant, "set_state")
         self.zero = [0.0] * len(plant.inputs)
-        self.t, self.warmup, self.longest = 0.0, 0.0, math.inf
+        self.t, self.warmup, self.longest = 0.0, 0.0, 1e6 * self.dt
         self.names, self.columns, self.z = tuple[str, ...](), tuple[int, ...](), tuple[float, ...]()
         self.phase, self.start, self.last = Phase(1), At(0.0, ()), At(0.0, ())
 
@@ -165,20 +169,24 @@ class Drive:
         for _ in range(round(duration / self.dt)):
             self.step(self.zero, self.dt)
 
-    def advance(self, u: Sequence[float], k: int) -> At:
-        """Hold the input until section k. Steps end on it if its time is known, or if the state can
-        be set; steps of fixed length end after it."""
-        phase, began = self.phase, self.t
-        timed = phase.columns is None and not self.fixed
+    def advance(self, u: Sequence[float], k: int, points: list[At] | None = None) -> At:
+        """Hold the input until section k, and append the points before all steps. Steps end on the
+        section if its time is known, or if the state can be set; steps of fixed length end after
+        it. A crossing counts after a step that ends before it, so that none is counted twice."""
+        phase, began, armed = self.phase, self.t, not self.phase.crossings
+        timed = not phase.axes and armed and not self.fixed
         lands = self.sets and not self.fixed and not timed
         last = self.last if self.last.z else At(self.t, self.z)  # (a step may cross two sections)
         x, y = phase.level(k, last.t, last.z), phase.level(k, self.t, self.z)
-        while y > 1e-9 * self.dt * timed:
+        while y > 1e-9 * self.dt * timed or not armed:
             if self.t - began > self.longest:
                 raise ComputationError(f"a section was not reached within {self.longest:.4g}")
-            last, x = self.here() if lands else At(self.t, self.z), y
+            last, x = self.here() if lands or points is not None else At(self.t, self.z), y
+            if points is not None:
+                points.append(last)
             self.step(u, min(y, self.dt) if timed else self.dt)
             y = phase.level(k, self.t, self.z)
+            armed = armed or y > 0
         if lands and y < 0 < x:
             from scipy import optimize
 
@@ -188,8 +196,7 @@ class Drive:
                     self.step(u, h)
                 return phase.level(k, self.t, self.z)
 
-            find: Any = optimize.brentq
-            level(find(level, 0.0, self.t - last.t, xtol=1e-9 * self.dt))
+            level(optimize.brentq(level, 0.0, self.t - last.t, xtol=1e-11 * self.dt))  # type: ignore
             return At(self.t, self.z)
         self.last, share = last, x / (x - y) if x > y else 1.0
         at = last.t + share * (self.t - last.t)
@@ -198,42 +205,34 @@ class Drive:
 
     def run(self, seed: int, u: Sequence[Sequence[float]]) -> Trial:
         """Run one experiment with inputs u (n, nu), each held until the next section."""
-        y: list[list[float]] = []
-        late: list[float] = []
+        rows, ended = list[At](), ""
         try:
-            if self._beginning(seed) != self._beginning(seed):
+            if self.begun(seed) != self.begun(seed):
                 raise ComputationError("the plant is not deterministic after `reset(seed)`")
-            self.reset(seed)
-            at = self.begin()
-            for k, held in enumerate(u, 1):
-                y.append([float(at.z[c]) for c in self.columns])
-                late.append(at.late)
-                if k < len(u):
-                    at = self.advance(held, k)
+            rows.append(self.begin(seed))
+            for k, held in enumerate(u[:-1], 1):
+                rows.append(self.advance(held, k))
         except Exception as error:
-            kind = (
-                ""
-                if isinstance(error, ComputationError)
-                else f"the plant raised {type(error).__name__}: "
-            )
-            return y, late, f"{kind}{error} (t = {self.t:.6g})"
-        return y, late, ""
+            told = isinstance(error, ComputationError)
+            kind = "" if told else f"the plant raised {type(error).__name__}: "
+            ended = f"{kind}{error} (t = {self.t:.6g})"
+        return [[*(float(x.z[c]) for c in self.columns), x.late] for x in rows], ended
 
-    def _beginning(self, seed: int) -> Sequence[float]:
+    def begun(self, seed: int) -> Sequence[float]:
         """Return the signals after the first steps."""
         self.reset(seed)
         self.pass_time(16 * self.dt)
         return self.z
 
-    def begin(self) -> At:
+    def begin(self, seed: int) -> At:
         """Bring a plant to section 0."""
+        self.reset(seed)
         if self.sets:
             self.restore(self.start)
-            self.phase.begin(self.t, self.z, on_section=True)
-            return self.start
-        self.pass_time(self.warmup)
-        self.phase.begin(self.t, self.z)
-        return self.advance(self.zero, 0)
+        else:
+            self.pass_time(self.warmup)
+        self.phase.begin(self.t, self.z, on_section=self.sets)
+        return self.start if self.sets else self.advance(self.zero, 0)
 
 
 def serve() -> None:
@@ -252,33 +251,24 @@ def serve() -> None:
             answers.flush()
 
 
-def run_all(
-    drive: Drive, items: Iterable[tuple[int, Any]], processes: int, limit: float
-) -> Iterator[Trial]:
+def run_all(drive: Drive, items: Iterable[Any], processes: int, limit: float) -> Iterator[Trial]:
     """Run experiments (seed, inputs) in processes with a limit of time, and yield them in order.
     Processes that ended are replaced.
     """
-    if not processes:
-        yield from (drive.run(*item) for item in items)
-        return
-    packed, local, begun = _pack(drive), threading.local(), []
+    packed, local, begun = _pack(drive), threading.local(), list[Any]()
 
     def run(item: tuple[int, Any]) -> Trial:
-        if getattr(local, "worker", None) is None:
-            local.worker = _start(packed)
-            begun.append(local.worker)
-        worker, began = local.worker, time.monotonic()
-        timer = threading.Timer(limit, worker.kill)
+        local.worker = getattr(local, "worker", None) or _start(packed, begun)
+        worker, timer = local.worker, threading.Timer(limit, local.worker.kill)
         timer.start()
         try:
             pickle.dump(item, worker.stdin)
             worker.stdin.flush()
             answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
-            local.worker, code = None, worker.wait()
-            hung = time.monotonic() - began >= limit
+            local.worker, code, waits = None, worker.wait(), timer.is_alive()
             ended = f"the process ended with code {code} (its error is on standard error)"
-            return [], [], f"no answer within the limit of {limit:g} s" if hung else ended
+            return [], ended if waits else f"no answer within the limit of {limit:g} s"
         finally:
             timer.cancel()
         if isinstance(answer, str):
@@ -295,9 +285,7 @@ def run_all(
                 worker.communicate()
 
 
-def resume(
-    file: Any, about: str, count: int, run: Callable[[list[int]], Iterator[Trial]]
-) -> list[Trial]:
+def resume(file: Any, about: str, count: int, run: Callable[[list[int]], Any]) -> list[Trial]:
     """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends.
 
     **Raises:** `DefinitionError` for a file of another kind, or in a folder that is not there.
@@ -315,15 +303,15 @@ def resume(
     return [json.loads(kept[s]) for s in range(count)]
 
 
-def _start(packed: bytes) -> Any:
+def _start(packed: bytes, begun: list[Any]) -> Any:
     # (One thread of BLAS, because the processes use all cores.)
     path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), *sys.path]))
     command = [sys.executable, "-c", "from hybridjax.plants.drive import serve; serve()"]
     changes = {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     pipe, environment = subprocess.PIPE, os.environ | changes
-    worker: Any = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment)
-    pickle.dump(packed, worker.stdin)
-    return worker
+    begun.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment))
+    pickle.dump(packed, begun[-1].stdin)
+    return begun[-1]
 
 
 def _pack(drive: Drive) -> bytes:
@@ -331,15 +319,13 @@ def _pack(drive: Drive) -> bytes:
 
     **Raises:** `DefinitionError` for a plant that cannot be pickled.
     """
-    module = sys.modules.get(type(drive.plant).__module__)
+    module, packer = sys.modules.get(type(drive.plant).__module__), pickle
     try:
-        try:
-            import cloudpickle as packer
-        except ImportError:
-            packer = pickle
-        else:
+        with contextlib.suppress(ImportError):
+            import cloudpickle as packer  # type: ignore
+
             if module is not None and module.__spec__ is None:  # (in no file)
-                packer.register_pickle_by_value(module)
+                packer.register_pickle_by_value(module)  # type: ignore
         return packer.dumps(drive)
     except Exception as error:
         text = "give it `__getstate__`, or use `processes=0`"

@@ -20,28 +20,37 @@ from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.system import HybridSystem, unit_of_parameter
 from ..systems.varied import parameter_of, with_parameters
-from .look import COLORS, style
-from .orbit import cycle as draw_cycle, plane_of
-from .plane import multipliers as draw_multipliers
+from .film import PNG, Easel
+from .look import COLORS, CYCLE, close_in_notebook, style
+from .motion import portrait
+from .orbit import plane_of
 
 
 Ranges = Mapping[str, Annotated[Numbers, Reals("2")]]
 # Input frequencies of the gain, in cycles per period. Fewer: resonances have corners. More: slow.
 _FREQUENCIES = np.linspace(0.02, 1.98, 50)
-# A slider, and what happens where it is moved; the picture comes from Python.
+# Sliders, and the picture that comes from Python. While one is on its way, only the last place of
+# the sliders is kept; once they rest, the gain is asked for.
 _PAGE = """
 function render({ model, el }) {
   const note = document.createElement("div"), picture = document.createElement("img");
+  const values = { ...model.get("asked").values };
+  let moved = false, waiting = false, number = 0;
+  const ask = (gain) => {
+    [moved, waiting] = [false, true];
+    model.set("asked", { values: { ...values }, gain, number: ++number });
+    model.save_changes();
+  };
   for (const [name, label, low, high] of model.get("sliders")) {
     const row = document.createElement("label"), text = document.createElement("span");
     const about = { type: "range", min: low, max: high, step: (high - low) / 100 };
     const slider = Object.assign(document.createElement("input"), about);
     const show = () => { text.textContent = ` ${label} = ${(+slider.value).toPrecision(4)}`; };
-    slider.value = model.get("values")[name];
+    slider.value = values[name];
     slider.oninput = () => {
       show();
-      model.set("values", { ...model.get("values"), [name]: +slider.value });
-      model.save_changes();
+      [values[name], moved] = [+slider.value, true];
+      if (!waiting) ask(false);
     };
     row.style.display = "block";
     row.append(slider, text);
@@ -49,11 +58,12 @@ function render({ model, el }) {
     show();
   }
   const update = () => {
-    picture.src = model.get("picture");
-    note.textContent = model.get("message");
+    const answer = model.get("answer");
+    [picture.src, note.textContent, waiting] = [answer.picture, answer.message, false];
+    if (moved || !answer.gain) ask(!moved);
   };
   picture.style.maxWidth = "100%";
-  model.on("change:picture", update);
+  model.on("change:answer", update);
   update();
   el.append(note, picture);
 }
@@ -71,11 +81,22 @@ class Explorer:
     def __init__(self, cycle: LimitCycle, ranges: dict[str, np.ndarray], plane: tuple[str, str]):
         self.cycle, self.message, self.ranges, self._plane = cycle, "", ranges, plane
         self.values = {name: float(parameter_of(cycle.system, name)) for name in ranges}
+        s, places = cycle.structure, {"left": 0.07, "right": 0.99, "bottom": 0.14, "top": 0.86}
         with style():
             # (A layout that is computed for each picture takes longer than the cycle.)
-            places: Any = {"left": 0.07, "right": 0.99, "bottom": 0.14, "top": 0.86, "wspace": 0.3}
-            self.figure, self._axes = pyplot.subplots(1, 3, figsize=(9.0, 3.2), gridspec_kw=places)
+            self.figure, self._axes = pyplot.subplots(1, 3, figsize=(9.0, 3.2))
+            self.figure.subplots_adjust(**places, wspace=0.3)
+            orbit, circle, gain = self._axes
+            self._portrait = portrait(orbit, circle, s, plane)
+            orbit.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4)
+            (self._gain,) = gain.semilogy([], [], color=CYCLE[0])
+            pushed = f", {s.inputs[0]} to {plane[0]}" if s.nu else ""
+            gain.set(xlabel="input frequency (cycles/period)", ylabel=f"$|H_0|${pushed}")
+            self._lost = self.figure.suptitle("", fontsize=8, color=COLORS["red"])
+        self._easel: Easel | None = None
+        self._limits = np.zeros(0)
         self._draw()
+        close_in_notebook(self.figure)
 
     @checked
     def move(self, values: Mapping[str, float]) -> None:
@@ -90,6 +111,10 @@ class Explorer:
         for name in values:
             if name not in self.ranges:
                 raise DefinitionError(f"'{name}' has no slider; {', '.join(self.ranges)} have one.")
+        self._follow(values)
+        self._draw()
+
+    def _follow(self, values: Mapping[str, float]) -> None:
         self.values |= {name: float(x) for name, x in values.items()}
         begin = {name: float(parameter_of(self.cycle.system, name)) for name in self.values}
         share, step, self.message = 0.0, 1.0, ""
@@ -106,26 +131,25 @@ class Explorer:
                 shown = ", ".join(f"{n} = {x:.4g}" for n, x in mixed.items())
                 self.message = f"The cycle is lost at {shown}: {Result(int(cycle.result)).message}."
                 break
-        self._draw()
 
-    def _draw(self) -> None:
-        orbit, circle, gain = self._axes
-        for panel in self._axes:
-            panel.clear()
-        cycle, structure = self.cycle, self.cycle.structure
-        draw_cycle(cycle, *self._plane, ax=orbit)
-        if len(cycle.multipliers):
-            draw_multipliers(cycle, zoom=False, ax=circle)
-        if structure.nu:
+    def _draw(self, gain: bool = True) -> None:
+        """Draw the cycle, and the gain, which takes as long to compute."""
+        cycle, s = self.cycle, self.cycle.structure
+        if gain and s.nu:
             f = _FREQUENCIES[(_FREQUENCIES % 1 > 0.01) | cycle.clocked]
-            htf = cycle.htf(f, outputs=self._plane[0], inputs=structure.inputs[0])
-            gain.semilogy(f, np.abs(htf[0][:, 0, 0]))
-            pushed = f"{structure.inputs[0]} to {self._plane[0]}"
-            gain.set(xlabel="input frequency (cycles/period)", ylabel=f"$|H_0|$, {pushed}")
-        color = COLORS["red"] if self.message else "black"
-        self.figure.suptitle(
-            "the last cycle that was found" if self.message else "", fontsize=8, color=color
-        )
+            htf = cycle.htf(f, outputs=self._plane[0], inputs=s.inputs[0])
+            self._gain.set_data(f, np.abs(htf[0][:, 0, 0]))
+        self._gain.set_alpha(1.0 if gain else 0.3)
+        self._lost.set_text("the last cycle that was found" if self.message else "")
+        self._moving = [*self._portrait(cycle), self._gain, self._lost]
+        for ax in self._axes[::2]:  # wider axes where the curves leave them
+            ax.relim(visible_only=True)
+            if not all(ax.viewLim.contains(*corner) for corner in ax.dataLim.corners()):
+                ax.margins(0.2)
+                ax.autoscale_view()
+        limits = np.stack([ax.viewLim.get_points() for ax in self._axes])
+        if not np.array_equal(limits, self._limits):
+            self._limits, self._easel = limits, None
 
     def show(self) -> None:
         """Open a window with the sliders (in scripts)."""
@@ -160,29 +184,34 @@ class Explorer:
         class Sliders(anywidget.AnyWidget):
             _esm = _PAGE
             sliders = traitlets.List().tag(sync=True)
-            values = traitlets.Dict().tag(sync=True)
-            message = traitlets.Unicode().tag(sync=True)
-            picture = traitlets.Unicode().tag(sync=True)
+            asked = traitlets.Dict().tag(sync=True)
+            answer = traitlets.Dict().tag(sync=True)
 
-            @traitlets.observe("values")
+            @traitlets.observe("asked")
             def _moved(self, change) -> None:
-                explorer.move(change["new"])
-                self.message, self.picture = explorer.message, explorer._picture()
+                self.answer = explorer._answer(**change["new"])
 
-        return Sliders(sliders=sliders, values=self.values)
+        first: Any = {"values": self.values, "gain": True, "number": 0}
+        return Sliders(sliders=sliders, asked=first, answer=self._answer(**first))
 
-    def _picture(self) -> str:
-        image = io.BytesIO()
-        self.figure.savefig(image, format="png", dpi=110)
-        return f"data:image/png;base64,{base64.b64encode(image.getvalue()).decode()}"
+    def _answer(self, values: Mapping[str, float], gain: bool, number: int) -> dict[str, Any]:
+        if values != self.values:
+            self._follow(values)
+        self._draw(gain)
+        self._easel = self._easel or Easel(self.figure, self._moving, 110)
+        file = io.BytesIO()
+        self._easel.image(self._moving).save(file, "png", compress_level=1)
+        picture = PNG + base64.b64encode(file.getvalue()).decode()
+        return {"picture": picture, "message": self.message, "gain": gain, "number": number}
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
-        pyplot.close(self.figure)  # the widget shows it
         try:
             self._widget = self.widget()
         except DefinitionError as error:
             return {"text/plain": f"Explorer without sliders: {error}"}
-        return self._widget._repr_mimebundle_(**options)
+        data, about = self._widget._repr_mimebundle_(**options)
+        still = self._widget.answer["picture"].removeprefix(PNG)  # where no kernel runs
+        return {**data, "text/plain": "Explorer", "image/png": still}, about
 
 
 @checked

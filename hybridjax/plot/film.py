@@ -37,24 +37,32 @@ const timer = setInterval(() => {{
 }})();</script></div>"""
 
 
+class Easel:
+    """A figure of which only the artists that move are drawn anew for each image."""
+
+    def __init__(self, figure: Figure, moving: Sequence[Artist], dpi: float):
+        figure.set_dpi(dpi)
+        self._agg = FigureCanvasAgg(figure)
+        for artist in moving:
+            artist.set_animated(True)
+        self._agg.draw()
+        self._still = self._agg.copy_from_bbox(figure.bbox)
+
+    def image(self, moving: Sequence[Artist]) -> Image.Image:
+        self._agg.restore_region(self._still)
+        for artist in sorted(moving, key=lambda x: x.get_zorder()):
+            artist.draw(self._agg.get_renderer())  # (marimo gives the figure another canvas)
+        return Image.fromarray(np.array(self._agg.buffer_rgba())[..., :3])
+
+
 def frames(
     figure: Figure, draw: Callable[[int], Sequence[Artist]], count: int, dpi: float
 ) -> list[Image.Image]:
-    """What stands still, and the frames, as images with one palette. Only what moves is drawn anew
-    in each frame."""
+    """What stands still, and the frames, as images with one palette."""
     canvas, before = figure.canvas, figure.dpi
     try:
-        figure.set_dpi(dpi)
-        agg = FigureCanvasAgg(figure)
-        for artist in draw(0):
-            artist.set_animated(True)
-        agg.draw()
-        background, images = agg.copy_from_bbox(figure.bbox), [_image(agg)]
-        for k in range(count):
-            agg.restore_region(background)
-            for artist in sorted(draw(k), key=lambda x: x.get_zorder()):
-                figure.draw_artist(artist)
-            images.append(_image(agg))
+        easel = Easel(figure, draw(0), dpi)
+        images = [easel.image([]), *(easel.image(draw(k)) for k in range(count))]
     finally:
         figure.set_dpi(before)
         figure.set_canvas(canvas)
@@ -67,10 +75,6 @@ def frames(
 _INKS = np.array([to_rgb(color) for color in COLORS.values()])
 _SHADES = (1 + np.arange(1, 5)[:, None, None] / 4 * (_INKS - 1)).reshape(-1, 3)
 _PALETTE = 255 * np.vstack([np.ones(3), to_rgb(BODY), _SHADES])
-
-
-def _image(canvas: FigureCanvasAgg) -> Image.Image:
-    return Image.fromarray(np.array(canvas.buffer_rgba())[..., :3])
 
 
 def gif(images: Sequence[Image.Image], interval: float) -> bytes:
@@ -90,17 +94,19 @@ def player(still: Image.Image, images: Sequence[Image.Image], interval: float, a
     frames = [_encoded(image, np.asarray(image) == np.asarray(still)) for image in images]
     return _PLAYER.format(
         id=f"motion-{uuid.uuid4().hex[:8]}", width=still.width * 2 // 3, alt=alt,
-        still=_PNG + _encoded(still), first=_PNG + frames[0], last=len(images) - 1,
+        still=PNG + _encoded(still), first=PNG + frames[0], last=len(images) - 1,
         frames=frames, milliseconds=round(1000 * interval),
     )  # fmt: skip
 
 
-_PNG = "data:image/png;base64,"
+PNG = "data:image/png;base64,"
 
 
 def _encoded(image: Image.Image, clear: np.ndarray | bool = False) -> str:
-    picture = Image.fromarray(np.where(clear, 255, np.asarray(image)).astype(np.uint8), "P")
-    picture.putpalette(image.getpalette() or [])
+    # (The clear color is the last of the palette: browsers show one beyond its end as gray.)
+    last = len(_PALETTE)
+    picture = Image.fromarray(np.where(clear, last, np.asarray(image)).astype(np.uint8), "P")
+    picture.putpalette([*(image.getpalette() or [])[: 3 * last], 0, 0, 0])
     file = io.BytesIO()
-    picture.save(file, "png", optimize=True, **({} if clear is False else {"transparency": 255}))
+    picture.save(file, "png", optimize=True, **({} if clear is False else {"transparency": last}))
     return base64.b64encode(file.getvalue()).decode()

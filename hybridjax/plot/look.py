@@ -77,6 +77,12 @@ def style() -> contextlib.AbstractContextManager:
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
 
 
+def close_in_notebook(figure: Figure) -> None:
+    """Notebooks show what the figure belongs to, and no still beside it."""
+    if "inline" in matplotlib.get_backend().lower():
+        pyplot.close(figure)
+
+
 AxesLike = Axes | np.ndarray | Sequence
 """Axes to draw on: one, or a grid of them."""
 

@@ -21,13 +21,15 @@ from .._core.results import Result
 from .._core.writing import replacing
 from ..engine.trajectory import Trajectory, observed
 from ..errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..experiments.motion import perturbed_trajectory
 from ..orbits.continuation import Branch
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import PlacedSections
 from ..systems.structure import Structure
 from .film import BODY, frames, gif, player
-from .look import COLORS, CYCLE, axis_of, style
-from .orbit import cycle as draw_cycle, pieces, plane_of
+from .look import COLORS, CYCLE, axis_of, close_in_notebook, style
+from .orbit import CHARTS, cycle as draw_cycle, pieces, plane_of
 from .over_parameters import branch as draw_branch
 from .pictures import Pictures, drawing_of
 from .plane import multipliers as draw_multipliers
@@ -43,6 +45,7 @@ _SMALL: dict[Any, Any] = {
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 Draw = Callable[[int], Sequence[Artist]]
 """A function that draws frame k, and returns what it has moved."""
+Portrait = Callable[[LimitCycle], list[Artist]]
 
 
 class Motion(FuncAnimation):
@@ -56,13 +59,12 @@ class Motion(FuncAnimation):
         self.figure, self.times, self.interval = figure, times, interval
         self._draw, self._title = draw, title
         draw(0)
-        super().__init__(
-            figure, draw, frames=len(times), interval=1000 * interval, blit=True,
-            cache_frame_data=False,
-        )  # fmt: skip
+        # (What windows do by `blit` is one more drawing for files and notebooks.)
+        options: Any = {"blit": figure.canvas.required_interactive_framework is not None}
+        options |= {"frames": len(times), "interval": 1000 * interval, "cache_frame_data": False}
+        super().__init__(figure, draw, **options)
         self._draw_was_started = True  # else matplotlib warns of animations that are only saved
-        if "inline" in matplotlib.get_backend().lower():
-            pyplot.close(figure)  # a notebook shows the animation, and no still beside it
+        close_in_notebook(figure)
 
     @checked
     def save(self, path: FilePath) -> Path:  # type: ignore[override]
@@ -126,7 +128,7 @@ def animate(
     y: str | None = None,
     *,
     sections: PlacedSections | None = None,
-    perturbed: Trajectory | None = None,
+    perturbed: Trajectory | ExperimentData | None = None,
     traces: SignalNames | None = None,
     speed: Positive | None = None,
     fps: Count = 25,
@@ -144,8 +146,9 @@ def animate(
         value of the parameter.
     - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
     - `sections`: from `place_sections`, on this cycle.
-    - `perturbed`: a trajectory beside the cycle, from `hj.experiments.perturbed_trajectory` or
-        `simulate`.
+    - `perturbed`: a motion beside the cycle: a trajectory, from `simulate` or
+        `hj.experiments.perturbed_trajectory`; or data of experiments at `sections`, of which the
+        inputs of the first are applied, to the cycle, for four periods.
     - `traces`: names of states or outputs that are drawn over time. Default: `x` if the system has
         a picture, else up to four states.
     - `speed`: multiple of real speed. Default: 1. A motion of less than 0.25 s or more than 20 s,
@@ -161,6 +164,10 @@ def animate(
     if isinstance(motion, Branch):
         return _of_branch(motion, x, y, 1 / fps / (speed or 1.0))
     cycle = motion if isinstance(motion, LimitCycle) else None
+    if isinstance(perturbed, ExperimentData):
+        if cycle is None or sections is None:
+            raise DefinitionError("data of experiments need a limit cycle and their `sections`.")
+        perturbed = perturbed_trajectory(sections, perturbed.u[0, : 4 * sections.n_sections])
     _require(cycle, motion.structure, sections, perturbed)
     s, unit = motion.structure, motion.system.time_unit
     everywhere, has_picture = s.states_everywhere(), drawing_of(s, 0) is not None
@@ -265,7 +272,7 @@ def _picture(ax: Axes, track: Track, shape: float) -> Draw:
         scene = scenes[k]
         for name, line in scene.lines.items():
             if name == "ground":
-                line = _to_borders(line, size)
+                line = to_borders(line, size)
                 marks.set_data(*_marks(line, scene.ground[0], spacing, size))
             shapes[name].set_data(*line.T)
         for name, (x, y, radius) in scene.circles.items():
@@ -277,7 +284,7 @@ def _picture(ax: Axes, track: Track, shape: float) -> Draw:
     return draw
 
 
-def _to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray, "k 2"]:
+def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray, "k 2"]:
     """A line with its ends beyond the borders of a picture of this size."""
     first, last = line[0] - line[1], line[-1] - line[-2]
     ends = [x + 5 * size * way / np.hypot(*way) for x, way in ((line[0], first), (line[-1], last))]
@@ -359,38 +366,65 @@ def _orbit(
     return draw
 
 
+def portrait(above: Axes, below: Axes, s: Structure, plane: tuple[str, str]) -> Portrait:
+    """A function that draws a cycle anew in the same Axes: its orbit, colored by chart, dashed if
+    it is unstable, its events, and its multipliers."""
+    colors = zip(itertools.cycle(CHARTS), s.names, strict=False)
+    orbits = [above.plot([], [], color=color, lw=1.8, label=name)[0] for color, name in colors]
+    (marks,) = above.plot([], [], "ko", ms=4, zorder=5)
+    about: Any = {"xytext": (4, 5), "textcoords": "offset points", "zorder": 6}
+    notes = [above.annotate(x.name, (np.nan, np.nan), **about) for x in s.transitions]
+    above.set(xlabel=axis_of(plane[0]), ylabel=axis_of(plane[1]))
+    draw_multipliers(np.zeros(1), zoom=False, ax=below)
+    points = below.lines[-1]
+
+    def draw(cycle: LimitCycle) -> list[Artist]:
+        path = cycle.trajectory(1 + 1e-6)  # with an event at the very end of a period
+        parts, gap = pieces(path, *plane), np.full((2, 1), np.nan)
+        for a, line in enumerate(orbits):
+            line.set_data(np.hstack([gap, *(x for b, *xy in parts if b == a for x in (xy, gap))]))
+            line.set_linestyle("-" if cycle.stable else "--")
+        rows = np.flatnonzero(path.event >= 0)
+        ends = observed(s, plane, path.t[rows], path.chart[rows - 1], path.before[rows])
+        marks.set_data(ends)
+        for note in notes:
+            note.set_visible(False)
+        for g, end in zip(path.event[rows], ends.T, strict=True):
+            notes[g].set_visible(True)
+            notes[g].xy = end
+        points.set_data(cycle.multipliers.real, cycle.multipliers.imag)
+        far = 1.1 * float(np.abs(cycle.multipliers).max(initial=1.0))
+        if far > below.get_xlim()[1]:
+            below.set(xlim=(-far, far), ylim=(-far, far))
+        return [*orbits, marks, *notes, points]
+
+    return draw
+
+
 def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) -> Motion:
     """At most 100 cycles of a branch, one after the other."""
     rows = np.unique(np.linspace(0, len(branch) - 1, 100).round().astype(int))
     cycles, values = [branch[int(k)] for k in rows], branch.values[rows]
     plane = plane_of(cycles[0].structure, x, y)
-    multipliers = branch.multipliers[rows]
-    orbits = [cycle.trajectory()(*plane)[1:] for cycle in cycles]
     with style(), matplotlib.rc_context(_SMALL):
         figure, grid = _sheet()
         left, above, below = (figure.add_subplot(x) for x in (grid[:, 0], grid[0, 1], grid[1, 1]))
         draw_branch(branch, output=plane[0], ax=left)
         left.legend()
         cursor = left.axvline(values[0], color="black", lw=0.8)
-        for row in orbits:
-            above.plot(*row, color=COLORS["gray"], lw=0.3, alpha=0.3)
-        (orbit,) = above.plot([], [], color=CYCLE[0], lw=1.5)
-        above.set(xlabel=axis_of(plane[0]), ylabel=axis_of(plane[1]))
-        draw_multipliers(multipliers[0], zoom=False, ax=below)
-        far = min(max(1.1, 1.1 * float(np.abs(multipliers).max())), 3.0)
-        below.set(xlim=(-far, far), ylim=(-far, far))
-        below.lines[-1].remove()
-        (points,) = below.plot([], [], "k+", ms=9, mew=1.2)
+        draw_cycle = portrait(above, below, cycles[0].structure, plane)
+        for cycle in cycles:
+            above.plot(
+                *cycle.trajectory(1 + 1e-6)(*plane)[1:], color=COLORS["gray"], lw=0.3, alpha=0.3
+            )
+            draw_cycle(cycle)
         text = above.set_title("", loc="left")
 
         def draw(k: int) -> list[Artist]:
-            orbit.set_data(*orbits[k])
-            stable = np.all(np.abs(multipliers[k]) < 1)
-            orbit.set_linestyle("-" if stable else "--")
-            points.set_data(multipliers[k].real, multipliers[k].imag)
             cursor.set_xdata([values[k], values[k]])
-            text.set_text(f"{branch.parameter} = {values[k]:.4g}{'' if stable else ', unstable'}")
-            return [orbit, points, cursor, text]
+            unstable = "" if cycles[k].stable else ", unstable"
+            text.set_text(f"{branch.parameter} = {values[k]:.4g}{unstable}")
+            return [*draw_cycle(cycles[k]), cursor, text]
 
         interval = max(interval, 4 / len(values))
         return Motion(figure, draw, values, interval, f"branch along {branch.parameter}")

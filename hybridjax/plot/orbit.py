@@ -17,7 +17,8 @@ from ..systems.structure import Structure
 from .look import COLORS, AxesLike, Plot, axis_of, panels
 
 
-_CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
+CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
+"""Colors of the charts of a system."""
 # Half of a section's bar, and the distance from its end to its number, in widths of the picture.
 _BAR = 0.035
 _TURNS = np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
@@ -70,7 +71,7 @@ def cycle(
         for a, px, py in pieces(orbit, x, y):
             label = None if a in labeled else s.names[a]
             labeled.add(a)
-            color = _CHARTS[a % len(_CHARTS)]
+            color = CHARTS[a % len(CHARTS)]
             panel.plot(px, py, color=color, lw=1.8, label=label, zorder=3, solid_capstyle="butt")
         _, px, py = orbit(x, y)
         center = np.array([(np.nanmin(v) + np.nanmax(v)) / 2 for v in (px, py)])

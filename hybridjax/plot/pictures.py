@@ -97,7 +97,8 @@ def drawing_of(s: Structure, a: int) -> Any:
     """
     point = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((s.dims[a],), float)
     with evaluating(f"method `draw` of {type(s.system).__name__}"):
-        return jax.eval_shape(lambda t, q: s.drawing(a, t, q), *point)
+        shapes = lambda: jax.eval_shape(lambda t, q: s.drawing(a, t, q), *point)  # noqa: E731
+        return s.once(("drawing", a), (), shapes)
 
 
 def _flat(a: int, s: Structure, t, q):

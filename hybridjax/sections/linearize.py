@@ -1,6 +1,5 @@
 """From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
 
-import dataclasses
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -22,6 +21,7 @@ from ..linear.ldtp import LDTP
 from ..orbits.checks import check_outputs
 from ..orbits.coincidence import TOGETHER
 from ..orbits.cycle import LimitCycle
+from ..orbits.linear_flow import of_flow
 from ..orbits.return_map import with_derivatives
 from ..systems.structure import Structure
 from ..systems.system import Output, OutputNames
@@ -117,16 +117,9 @@ def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     return _matrices_of(placed, outputs), (*columns, None)
 
 
-def _relevant(tangents: tuple) -> tuple:
-    """Tangents of what the matrices depend on."""
-    cycle, *definitions = tangents
-    nothing, anchor = jax.tree_util.tree_map(lambda _: None, cycle), cycle.anchor
-    anchor = nothing.anchor._replace(t=anchor.t, q=anchor.q)
-    moving = dict(system=cycle.system, period=cycle.period, anchor=anchor)
-    return dataclasses.replace(nothing, **moving), *definitions
-
-
-_of_family = by_columns(_matrices, _matrices_along, _relevant)
+_of_family = by_columns(
+    _matrices, _matrices_along, lambda tangents: (of_flow(tangents[0]), *tangents[1:])
+)
 
 
 @host_first

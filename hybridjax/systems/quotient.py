@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools as ft
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -51,7 +52,8 @@ class Quotient(Derived):
     - `half_period`: for cycles with x(t + T/2) = S x(t), with S from the arguments above. True if a
         clock drives the system; otherwise the name of a state, or a function of (t, q), that S
         multiplies by -1 and that rises through zero once in half a period. There, or after half a
-        period of the clock, the transition "half period" puts the mirror image of the state. The
+        period of the clock, the transition "half period" (with several charts, "half period
+        (chart)") puts the mirror image of the state. The
         multipliers are those of this half map, whose squares are those of the cycle. All charts are
         kept; if one is its own mirror image, its last transition is the image of its first. The
         state `clock`, the time since that transition, makes a system with a clock autonomous.
@@ -247,6 +249,9 @@ class Quotient(Derived):
 
 
 SECOND = " (second half)"
+# Distance from the begin of a half, in periods, at which a scheduled transition coincides with it.
+# Smaller: it is missed. Larger: ones that are distinct are refused.
+SAME_TIME = 1e-9
 
 
 class _Halves(Derived):
@@ -259,8 +264,13 @@ class _Halves(Derived):
         if (self.system.period() is not None) != (self.half_period is True):
             sentence = "True if a clock drives the system, else a state or a function of (t, q)"
             raise DefinitionError(f"Quotient: `half_period` must be {sentence}.")
-        if any(isinstance(x.guard, Scheduled) for x in self.system.transitions()):
-            raise DefinitionError("Quotient: `half_period` does not cover scheduled transitions.")
+        for x in self.system.transitions():
+            if isinstance(x.guard, Scheduled) and not is_traced(x.guard):
+                if abs(math.remainder(x.guard.offset / x.guard.period, 1.0)) < SAME_TIME:
+                    raise DefinitionError(
+                        f"Quotient: with `half_period`, '{x.name}' must not be scheduled at t = 0, "
+                        "where halves begin: let the clock begin earlier."
+                    )
         for name, chart in self.system.charts().items():
             named = [self.half_period] if isinstance(self.half_period, str) else []
             require_among("state", named, chart.states, f"Quotient: in '{name}' ")
@@ -282,7 +292,8 @@ class _Halves(Derived):
                 copies = [chart.copied(x, when) for x in events if x.source == name]
                 guard, places = ft.partial(self._switch, chart, sign), (name + when, name + other)
                 made += copies[::-1] if when and name == image else copies
-                made += [Transition("half period", *places, guard, "rising", chart.anew)]
+                title = "half period" + f" ({name})" * (len(self.images) > 1)
+                made += [Transition(title, *places, guard, "rising", chart.anew)]
         return made
 
     def _switch(self, chart: "_Half", sign: int, t, q, u):
@@ -341,10 +352,13 @@ class _Half(DerivedChart):
 
     def copied(self, x: Transition, when: str) -> Transition:
         """A transition of this half; the clock goes on."""
-        assert not isinstance(x.guard, Scheduled)
-        at, kept = self.lifted, slice(len(self.chart.states), None)
+        at, guard, kept = self.lifted, x.guard, slice(len(self.chart.states), None)
+        if isinstance(tick := x.guard, Scheduled):
+            guard = lambda t, q, u: jnp.sin(2 * jnp.pi * (t - tick.offset) / tick.period)  # noqa: E731
+            x = dataclasses.replace(x, direction="rising")
+        assert callable(guard)
         reset = lambda t, q, u: jnp.append(as_vector(at(x.reset)(t, q, u)), q[kept])  # noqa: E731
-        copy = dataclasses.replace(x, guard=at(x.guard), reset=reset)
+        copy = dataclasses.replace(x, guard=at(guard), reset=reset)
         copy = dataclasses.replace(copy, enabled=x.enabled and at(x.enabled))
         return dataclasses.replace(copy, source=x.source + when, target=x.target + when)
 

@@ -95,6 +95,13 @@ def test_repeated_windows_count(model, first):
     assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
 
 
+def test_an_order_that_is_too_low_is_named(model, first):
+    study = hj.designs.Study(first, 1, 1e-5)
+    with pytest.raises(hj.DefinitionError, match="show more than 1 multipliers"):
+        for k in range(4):
+            study = study.add(measured(model, study.design, seed=k))
+
+
 def test_bad_data(model, first):
     with pytest.raises(hj.DefinitionError, match="`limit` has 'nope', but the signals are u"):
         hj.designs.Study(first, 2, 1e-4, limit={"nope": 1.0})

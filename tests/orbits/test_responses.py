@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.orbits.linear_flow import linear_flow
 from hybridjax.systems.chart import FieldChart
 
 
@@ -199,7 +200,7 @@ AUTONOMOUS = """
 def test_phase_responses_are_differences_of_asymptotic_phases(name):
     """Of flows from states that are pushed in a random direction, to both sides."""
     cycle = hj.find_limit_cycle(getattr(hj.models, name)())
-    s, period, flow = cycle.structure, float(cycle.period), cycle._course().linear_flow()
+    s, period, flow = cycle.structure, float(cycle.period), linear_flow(cycle)
     phases = np.array([0.15, 0.4, 0.77])
     response = cycle.responses(modes=0).phase(phases, "cycles")
     charts, states = flow.at(phases, period, flow.q)
@@ -240,6 +241,18 @@ def test_mathieus_equation_has_the_published_continuous_htf():
     assert "continuous time" in str(htf) and htf[1].shape == (1, 1, 1)
     with pytest.raises(hj.DefinitionError, match="takes HTFs between sections"):
         htf.predict(np.ones((32, 1)))
+
+
+def test_harmonic_state_spaces_converge_to_the_exact_htf():
+    cycle = hj.find_limit_cycle(hj.models.Mathieu())
+    space = hj.convert.to_harmonic_state_space(cycle, outputs="x", tolerance=1e-12)
+    H = space.transfer(0.25, float(cycle.period))[0, space.order - 1 : space.order + 2, 0, 0]
+    exact = cycle.htf(0.25, (-1, 0, 1), "x").H[:, 0, 0, 0]
+    np.testing.assert_allclose(H, exact, rtol=1e-11)
+    assert space.error < 1e-12 and space.order == 8
+    assert hj.convert.to_harmonic_state_space(cycle, 1).error > 1e-3
+    with pytest.raises(hj.DefinitionError, match="has events at which deviations jump"):
+        hj.convert.to_harmonic_state_space(hj.find_limit_cycle(Neuron()))
 
 
 def test_the_continuous_htf_of_a_speed_that_jumps_is_that_of_the_derivative_of_the_height():
@@ -289,11 +302,7 @@ def test_sensitivities_are_differences_of_cycles(system, name):
     def numbers(step):
         other = _shifted(cycle, name, step)
         events = [x.time for x in other.trajectory().events]
-        _, states = (
-            other._course()
-            .linear_flow()
-            .at(PHASES[1:], other.period, other._course().linear_flow().q)
-        )
+        _, states = linear_flow(other).at(PHASES[1:], other.period, linear_flow(other).q)
         return np.concatenate(
             [[float(other.period)], np.array(events) - float(other.anchor.t[0]), states[:, 0]]
         )
@@ -307,21 +316,32 @@ def test_sensitivities_are_differences_of_cycles(system, name):
 
 
 @pytest.mark.slow
-def test_results_have_derivatives_in_forward_and_reverse_mode():
-    guess = hj.find_limit_cycle(Neuron())
+@pytest.mark.parametrize(
+    "system, name, output",
+    [(Neuron(), "current", "v"), (hj.models.VerticalHopper(), "k", "yM"),
+     (hj.models.BuckConverter(), "Vin", "v")],
+    ids=["a phase", "two charts", "a schedule"],
+)  # fmt: skip
+def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, output):
+    guess, begin = hj.find_limit_cycle(system), jnp.asarray(getattr(system, name), float)
 
-    def result(current):
-        cycle = hj.find_limit_cycle(Neuron(current=current), guess)
-        phase = cycle.responses(modes=0).phase(jnp.array([0.3]))["u"][0]
-        htf = jnp.abs(cycle.htf(0.3, 1, "v").H[0, 0, 0, 0])
-        return phase + htf + cycle.sensitivity("current").period
+    def result(value):
+        cycle = hj.find_limit_cycle(eqx.tree_at(lambda x: getattr(x, name), system, value), guess)
+        responses, at = cycle.responses(modes=2 * guess.clocked), jnp.array([0.3])
+        push = responses.amplitude(0, at) if guess.clocked else responses.phase(at)
+        htf = cycle.htf(0.3, 1, output).H[0, 0, 0, 0]
+        noise = cycle.fluctuations({output: 0.1})
+        noisy = noise.covariance(at)[0, 0, 0] if guess.clocked else noise.diffusion
+        change = cycle.sensitivity(name)
+        shape = change.shape(at)[output][0] if guess.clocked else change.period
+        return jnp.real(jnp.stack([jnp.abs(push[output][0]), jnp.abs(htf), noisy, shape]))
 
-    begin, h = jnp.asarray(1.2), 1e-3
     forward = jax.jvp(result, (begin,), (jnp.ones(()),))[1]
-    central = lambda h: (result(1.2 + h) - result(1.2 - h)) / (2 * h)
+    central = lambda h: (result(begin + h) - result(begin - h)) / (2 * h)
+    h = 1e-3 * begin
     difference = (4 * central(h / 2) - central(h)) / 3
-    np.testing.assert_allclose(forward, difference, rtol=1e-7)
-    np.testing.assert_allclose(jax.grad(result)(begin), forward, rtol=1e-10)
+    np.testing.assert_allclose(forward, difference, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(jax.jacrev(result)(begin), forward, rtol=1e-9)
 
 
 def test_bad_questions_are_refused_in_one_sentence():
@@ -346,6 +366,8 @@ def test_bad_questions_are_refused_in_one_sentence():
         wheel.sensitivity("speed")
     with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
         wheel.responses().curve("force")
+    with pytest.raises(hj.DefinitionError, match="call (it|them) outside"):
+        eqx.filter_jit(lambda cycle: cycle.htf(0.3))(wheel)
     apex = hj.Crossing("vy", "falling")
     family = dict(section=apex, conserved={"energy": 1784.8})
     runner = hj.find_limit_cycle(hj.models.SLIPRunner(), **family)

@@ -14,6 +14,7 @@ import pytest
 import hybridjax as hj
 
 from .toys import Circle
+from .walker import coordinates, walker
 
 
 HERE = pathlib.Path(__file__).parent
@@ -88,6 +89,10 @@ def test_sections_are_interpolated_between_fixed_steps():
     true = exact.run_experiments(u, discard=0, processes=0)
     assert np.abs(data.y - true.y).max() < 0.05 * np.abs(true.y).max() and data.ok.all()
     assert 0.01 < data.simulated.late.max() <= 0.02 * (1 + 1e-9)
+    event = hj.plants.settle(plant, hj.Crossing("y", "rising"), ("x", "y"), cycles=10)
+    assert abs(event.period - 2 * np.pi) < 1e-4 and abs(event.cycle_outputs[0, 1]) < 1e-9
+    late = event.run_experiments(0.1 * u[:, :8], discard=0, processes=0).simulated.late
+    assert (0 <= late).all() and 0.01 < late.max() <= 0.02
     fallen = cycle.run_experiments(np.full((1, 80, 1), 4.0), discard=0, processes=0)
     assert "terminated" in fallen.summary()
 
@@ -119,6 +124,43 @@ def test_mujoco_continues_from_its_state(ground):
         courses.append([plant.step([0.1], h) for h in (0.02, 0.0123, 0.5)])
     assert courses[0] == courses[1]
     assert courses[0][-1].keys() == {"yM", "ym", "yM_rate", "ym_rate"}
+
+
+def test_a_controller_may_keep_memory_in_userdata():
+    xml = (
+        (HERE / "hopper.xml").read_text().replace("<worldbody>", '<size nuserdata="1"/><worldbody>')
+    )
+
+    def remember(model, data):
+        data.userdata[0] += 1
+        return [data.userdata[0] % 7, 0.0]
+
+    plant = hj.plants.MuJoCoPlant(mujoco.MjModel.from_xml_string(xml), "push", control=remember)
+    plant.reset(0)
+    plant.step([0.0], 0.0015)
+    state = plant.get_state()
+    first = plant.step([0.0], 0.01)
+    plant.set_state(state)
+    assert plant.step([0.0], 0.01) == first and plant.data.userdata[0] == 23
+
+
+@pytest.mark.slow
+def test_a_walker_in_mujoco():
+    """Perturbed returns at clock sections and at the touchdown agree with experiments."""
+    plant = walker()
+    cycle = hj.plants.settle(plant, hj.ClockPhase(8), ("x_rate", "pitch"), cycles=40)
+    returns = cycle.perturbed_returns(coordinates(plant))
+    design = hj.multisine(n_sections=8, periods=16, amplitude=0.1, lines="odd")
+    data = cycle.run_experiments(design, discard=24)
+    fit = hj.fit_multipliers(hj.estimate_htf(data), order=2)
+    assert fit.contains(returns.multipliers[:2]).all() and (fit.standard_errors < 1e-3).all()
+    assert returns.contains(fit.multipliers).all()
+    touchdown = hj.Crossing("left_foot[2]", "falling")
+    events = hj.plants.settle(plant, touchdown, ("x_rate", "pitch"), cycles=40)
+    there = events.perturbed_returns([*coordinates(plant), "time"]).multipliers[:2]
+    assert np.abs(there - returns.multipliers[:2]).max() < 2e-3
+    falls = cycle.trajectory(u=[[0.0], [0.0], [0.0], [-200.0], *[[0.0]] * 40])
+    assert falls.result == hj.Result.PLANT_STOPPED and 1 < falls.t[-1] < 3
 
 
 @pytest.mark.slow

@@ -45,6 +45,46 @@ def test_a_plant_in_closed_form(circle):
     assert len(circle.perturbed_returns("x").coordinates) == 1
 
 
+def test_sections_at_events():
+    """Crossings of signals, at angles 0.2 and pi - 0.2: exact places, and the multiplier."""
+    level = math.sin(0.2)
+    items = [hj.Crossing("y", "rising", level), hj.Crossing("y", "falling", level)]
+    cycle = hj.plants.settle(Circle(), items, ("x", "y"), cycles=20)
+    true = [[math.cos(0.2), level], [-math.cos(0.2), level]]
+    assert (
+        abs(cycle.period - 2 * math.pi) < 1e-9 and np.abs(cycle.cycle_outputs - true).max() < 1e-8
+    )
+    returns = cycle.perturbed_returns()
+    assert abs(returns.multipliers[0] - math.exp(-0.4 * math.pi)) < 1e-6
+    assert len(returns.multipliers) == 1
+    single = hj.plants.settle(Circle(), items[0], "x", cycles=20)
+    assert single.perturbed_returns().contains(math.exp(-0.4 * math.pi)).all()
+    data = single.run_experiments(np.full((1, 8, 1), 0.01), discard=0, processes=0)
+    # The radius returns to 1.05 by the multiplier; a push that lasts for one turn is a new cycle.
+    radius = np.hypot(math.sqrt(1 - level**2) + data.y[0, :, 0], level)
+    decay = math.exp(-0.4 * math.pi) ** np.arange(8)
+    assert data.ok.all() and np.abs(radius - 1.05 + 0.05 * decay).max() < 2e-3
+
+
+def test_a_motion_is_recorded_up_to_a_fall(circle):
+    picture = lambda z: hj.Drawing(circles={"point": (z["x"], z["y"], 0.1)})  # noqa: E731
+    motion = circle.trajectory(picture)
+    t, x = motion("x")
+    assert abs(motion.t[-1] - 2 * math.pi) < 1e-8 and np.abs(x - np.cos(t)).max() < 1e-3
+    assert np.abs(motion.after[:, 0] - np.cos(motion.t)).max() < 1e-9
+    assert len(hj.plot.animate(motion, "x", "y", fps=4).times) > 4
+
+    class Falls(Circle):
+        def step(self, u, duration):
+            if u[0] > 1:
+                raise RuntimeError("fell")
+            return super().step(u, duration)
+
+    cycle = hj.plants.settle(Falls(), ANGLE, "x", cycles=20)
+    fall = cycle.trajectory(picture, [[0.0], [0.0], [2.0], [0.0]])
+    assert fall.result == hj.Result.PLANT_STOPPED and abs(fall.t[-1] - math.pi / 2) < 1e-8
+
+
 def test_an_unstable_cycle_is_found_from_a_guess():
     class Unstable(Circle):
         rate = -0.2
@@ -102,7 +142,8 @@ def test_what_does_not_fit_is_refused(circle):
     for sections, message in (
         (hj.ClockPhase(8), "use KinematicPhase"),
         (hj.KinematicPhase(8, "x", "z"), "no signal 'z'"),
-        (hj.Crossing("x", "falling"), "use KinematicPhase"),
+        (hj.Crossing("z", "falling"), "no signal 'z'"),
+        (hj.Crossing(lambda t, q: q[0], "falling"), "Crossings of signals by name"),
         (hj.KinematicPhase(8, "x", "y", anchor=hj.Crossing("x", "falling")), "use KinematicPhase"),
     ):
         with pytest.raises(hj.DefinitionError, match=message):

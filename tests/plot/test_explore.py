@@ -1,8 +1,13 @@
 """Sliders: the cycle follows them, is lost with a reason, and is found again."""
 
+import base64
+import io
+
 import numpy as np
 import pytest
 from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image
 
 import hybridjax as hj
 
@@ -25,10 +30,18 @@ def test_the_widget_sends_pictures():
     pytest.importorskip("anywidget", reason="pip install 'hybridjax[explore]' installs it")
     explorer = hj.explore(hj.models.VanDerPol(), "mu")
     widget = explorer.widget()
-    before = widget.picture
-    widget.values = {"mu": 1.2}
+    before = widget.answer
+    widget.asked = {"values": {"mu": 1.2}, "gain": False, "number": 1}
     assert float(explorer.cycle.system.mu) == 1.2
-    assert widget.picture.startswith("data:image/png;base64,") and widget.picture != before
+    assert widget.answer["number"] == 1 and widget.answer["picture"] != before["picture"]
+    # Only what moves is drawn anew, and the picture is that of the whole figure.
+    with io.BytesIO(base64.b64decode(widget.answer["picture"].split(",")[1])) as file:
+        sent = np.asarray(Image.open(file).convert("RGB")).astype(int)
+    canvas = FigureCanvasAgg(explorer.figure)
+    for artist in explorer.figure.findobj():
+        artist.set_animated(False)
+    canvas.draw()
+    assert np.mean(np.abs(sent - np.asarray(canvas.buffer_rgba())[..., :3]) > 64) < 1e-3
     pyplot.close("all")
 
 

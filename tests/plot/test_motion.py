@@ -1,7 +1,12 @@
 """Animations: frames on the trajectory, feet that stay, loops that close, files, refusals."""
 
+import base64
+import io
+import re
+
 import numpy as np
 import pytest
+from PIL import Image
 
 import hybridjax as hj
 from hybridjax.plot.pictures import Pictures
@@ -45,6 +50,12 @@ def test_files_and_refusals(walk, tmp_path):
     assert motion.save(tmp_path / "walk.gif").read_bytes().startswith(b"GIF89a")
     page = motion.save(tmp_path / "walk.html").read_text()
     assert "<script>" in page and 'src="http' not in page
+    still, first, *_ = (
+        Image.open(io.BytesIO(base64.b64decode(x))).convert("RGBA")
+        for x in re.findall(r'base64,([\w+/=]+)"', page)
+    )
+    frame = next(iter(motion._frames(150)[1:])).convert("RGBA")  # on top of what stands still
+    assert Image.alpha_composite(still, first).tobytes() == frame.tobytes()
     with pytest.raises(hj.DefinitionError, match="written as .gif, .html or .mp4"):
         motion.save(tmp_path / "walk.avi")
     with pytest.raises(hj.DefinitionError, match="animate the cycle"):
@@ -57,3 +68,8 @@ def test_no_input_gives_the_cycle():
     path = hj.experiments.perturbed_trajectory(placed, np.zeros((8, 1)))
     end = path.at(path.t[-1:])[1] - path.at(path.t[:1])[1]
     np.testing.assert_allclose(end, 0, atol=1e-9)
+    data = hj.ExperimentData(np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2)
+    motion = hj.plot.animate(cycle, sections=placed, perturbed=data)
+    assert abs(motion.interval * len(motion.times) - 2 * float(cycle.period)) < 1e-9
+    with pytest.raises(hj.DefinitionError, match="and their `sections`"):
+        hj.plot.animate(cycle, perturbed=data)

@@ -6,6 +6,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.models.walkers import _heelstrike
+from hybridjax.systems.chart import FieldChart
 
 
 hj.enable_x64()
@@ -132,3 +133,38 @@ def test_odd_oscillators_close_after_half_a_period():
         hj.find_limit_cycle(hj.Quotient(duffing, flipped="x", half_period=True), section=at)
     with pytest.raises(hj.DefinitionError, match="must be True if a clock drives the system"):
         hj.Quotient(duffing, flipped=("x", "v"), half_period="x")
+
+
+class Inverter(hj.HybridSystem):
+    """A coil between the poles of a supply, which two switches exchange."""
+
+    early: float = 0.125
+
+    def charts(self):
+        return {
+            name: FieldChart(lambda t, q, u, v=v: (v - q[0] - 0.3 * q[0] ** 3,), ("i",))
+            for name, v in (("plus", 1.0), ("minus", -1.0))
+        }
+
+    def transitions(self):
+        yield hj.Transition("down", "plus", "minus", hj.Scheduled(2.0, self.early))
+        yield hj.Transition("up", "minus", "plus", hj.Scheduled(2.0, 1 + self.early))
+
+    def period(self):
+        return 2.0
+
+    def guess(self):
+        return hj.Guess("plus", (0.1,))
+
+
+def test_scheduled_switches_close_after_half_a_period():
+    symmetry = dict(swap={"plus": "minus"}, flipped="i", half_period=True)
+    half = hj.Quotient(Inverter(), **symmetry)
+    half = hj.find_limit_cycle(half, section=hj.AtEvent("half period (minus)"))
+    whole = hj.find_limit_cycle(Inverter())
+    np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-12)
+    np.testing.assert_allclose(half.state["i"], whole.state["i"], rtol=1e-11)
+    np.testing.assert_allclose(half.multipliers[0] ** 2, whole.multipliers[0], rtol=1e-10)
+    assert [half.structure.transitions[g].name for g in half.event_sequence][0] == "down"
+    with pytest.raises(hj.DefinitionError, match="'down' must not be scheduled at t = 0"):
+        hj.Quotient(Inverter(early=0.0), **symmetry)
