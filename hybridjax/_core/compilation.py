@@ -4,8 +4,8 @@
 - `host_first` runs a function on the host until compiling it is worth its time.
 - `TwoTiers` compiles the experiments twice: a quick executable for the first answer, and the fully
   optimized one in a thread beside it.
-- `kernel` compiles single functions of users for code that runs on the host; `whole` and `deferred`
-  programs that do more at once, when the host has spent as much time.
+- `kernel` compiles single functions of users for code that runs on the host; `whole` programs that
+  do more at once, when the host has spent as much time.
 """
 
 import collections
@@ -38,9 +38,10 @@ from .vector_math import rewrite
 _QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 # XLA divides a program among its threads: dividing a small one takes a fifth longer.
 _UNDIVIDED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
-# Seconds of host time after which a function is compiled, which takes about as long. Less: programs
-# are compiled that are not used again. More: repeated calls stay slow for longer.
-WORTH_COMPILING = 3.0
+# Seconds of host time after which a function is compiled, which takes about as long (a single turn
+# of a cycle: a third of it). Less: programs are compiled that are not used again. More: repeated
+# calls stay slow for longer.
+WORTH_COMPILING = 6.0
 # Seconds in a quick executable after which a script compiles the optimized one, in about as much
 # time. Less: it waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
@@ -393,33 +394,27 @@ def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=Non
     return np.concatenate(parts, axis=-1)[..., :L]
 
 
-def whole(function: Callable, static: tuple, trees: Any, seconds: float) -> Callable[..., Any]:
-    """`function(*static, *trees, *arguments)`, which runs on the host for so many seconds before it
-    is compiled (see `deferred`); of any arguments and results, with arrays of NumPy."""
-    compiled = ft.partial(_run_tree, *_bound(function, ft.partial, static, trees, 1))
-    return deferred(compiled, ft.partial(function, *static, *trees), seconds)
-
-
-def _run_tree(program: Callable, arrays: list, *arguments):
-    return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
-
-
-def deferred(compiled: Any, other: Callable, seconds: float) -> Callable:
-    """`other`, a function of the host, until it has taken so many seconds of this thread, about as
-    many as compiling takes: then a thread compiles a kernel that has the same results.
+def whole(function: Callable, static: tuple, trees: Any) -> Callable[..., Any]:
+    """`function(*static, *trees, *arguments)` of any arguments and results, with arrays of NumPy:
+    on the host, until it has taken as many seconds of this thread as compiling takes (a third of
+    `WORTH_COMPILING`). Then a thread compiles it.
 
     In interactive sessions there is time between calls: the thread starts earlier.
     """
-    program = compiled.args[0]
-    worth = seconds / 3 if hasattr(sys, "ps1") else seconds
+    program, arrays = _bound(function, ft.partial, static, trees, 1)
+
+    def compiled(*arguments):
+        return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
 
     def call(*arguments):
         if program in _ready:
             return compiled(*arguments)
-        begin, before = time.thread_time(), _spent[program]
-        results = other(*arguments)
-        after = _spent[program] = before + time.thread_time() - begin
-        if before <= worth < after:
+        begin, before = time.thread_time(), _spent.get(program)
+        results = function(*static, *trees, *arguments)
+        # (The first call compiles kernels.)
+        after = _spent[program] = 0.0 if before is None else before + time.thread_time() - begin
+        worth = WORTH_COMPILING / (9 if hasattr(sys, "ps1") else 3)
+        if before is not None and before <= worth < after:
             compile_ = lambda: (compiled(*arguments), _ready.add(program))  # noqa: E731
             threading.Thread(target=compile_).start()
         return results
@@ -428,15 +423,16 @@ def deferred(compiled: Any, other: Callable, seconds: float) -> Callable:
 
 
 # Seconds that the host has taken for each such program, and those that are compiled.
-_spent: dict[Callable, float] = collections.defaultdict(float)
+_spent: dict[Callable, float] = {}
 _ready: set[Callable] = set()
 
 
 def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:
     """The program of a kernel, and the arrays of its trees."""
     leaves, structure = jax.tree_util.tree_flatten(trees)
-    # (By way of NumPy, so that arrays of an accelerator are copied once, and not in each call.)
-    arrays = jax.device_put([np.asarray(x) for x in leaves if _is_array(x)])
+    # (Arrays of an accelerator are copied once, by way of NumPy, and not in each call.)
+    here = lambda x: isinstance(x, jax.Array) and getattr(x.device, "platform", "") == "cpu"  # noqa: E731
+    arrays = [x if here(x) else jax.device_put(np.asarray(x)) for x in leaves if _is_array(x)]
     # (1, 1.0 and True are equal, and not the same.)
     static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
     return _kernel_program(function, form, static, structure, static_leaves, lanes), arrays

@@ -55,11 +55,12 @@ def one_lane(tree: Any) -> Any:
     return eqx.combine(jax.tree_util.tree_unflatten(structure, shapes), static)
 
 
-def by_lane(function: Callable, *trees: Any) -> Callable:
+def by_lane(function: Callable, *trees: Any, quick: bool = False) -> Callable:
     """Vectorize `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 
     Of a tree that is a `PerLane`, each lane gets its own part. An argument with a single lane where
     others have more is the same for all of them, and what depends on nothing else is computed once.
+    `quick`: to compile, instead of to run: without trigonometric functions of many lanes.
     """
     arrays, static = eqx.partition([shared(x) for x in trees], eqx.is_array)
     axes = [x.axes() if isinstance(x, PerLane) else None for x in trees]
@@ -78,7 +79,7 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
         lanes = max(x.shape[-1] for x in arguments)
         common = tuple(x.shape[-1] < lanes for x in arguments)
         arguments = [x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)]
-        return program(common, lanes >= _VECTOR_LANES)(arrays, *arguments)
+        return program(common, lanes >= _VECTOR_LANES and not quick)(arrays, *arguments)
 
     return call
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.compilation import WORTH_COMPILING, deferred, kernel
+from .._core.compilation import kernel
 from .._core.executor import on_host
 from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method, Radau, as_method
@@ -33,7 +33,7 @@ Items = tuple[str | Output, ...]
 
 # Lanes of programs that are called for many points at once. Higher: single points wait for lanes
 # that nobody needs. Lower: many points take more calls.
-_POINTS = 4
+_POINTS = 16
 
 
 def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
@@ -60,12 +60,10 @@ def linear_step(
     s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, by_stages: Any = None
 ) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
-    states, inputs and length of the step. Those of explicit methods come `by_stages` until they
-    have taken a while."""
-    compiled = s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=4 * _POINTS)
-    if s.method(a).implicit or isinstance(s, Tangents):
-        return compiled(t, q, u, h)
-    return deferred(compiled, by_stages, WORTH_COMPILING / 10)(t, q, u, h)
+    states, inputs and length of the step. Those of explicit methods come `by_stages`."""
+    if not s.method(a).implicit:
+        return by_stages(t, q, u, h)
+    return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=_POINTS)(t, q, u, h)
 
 
 def divergence(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Times:
@@ -89,8 +87,8 @@ def watched(
     static = a, s.guard_kinds(a)
     if not on_host(q):
         return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(t, q, u, index)
-    # (A program for many points is worth its compilation from sixteen calls on.)
-    lanes = 1 if q.shape[-1] < 16 * _POINTS else _POINTS
+    # (A program for many points is worth its compilation from so many calls on.)
+    lanes = 1 if q.shape[-1] < 4 * _POINTS else _POINTS
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
@@ -197,7 +195,7 @@ def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q)
 
 def _expanded(function: Callable, *trees: Any) -> Callable:
     """Lanes of a vector function of (t, q, u) and its derivatives, as columns of one array."""
-    return by_lane(_columns(function, len(trees)), *trees)
+    return by_lane(_columns(function, len(trees)), *trees, quick=True)
 
 
 def _columns(function: Callable, trees: int = 2) -> Callable:
@@ -234,11 +232,15 @@ class Tangents(Structure):
         return np.concatenate([np.zeros((self.nu, len(direction))), along])
 
     def kernel(self, function, form, *static, trees=(), lanes=1):
-        still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
-        along = [self._along[1] if x is self._levels else still(x) for x in trees]
-        every, along = (self._plain, *trees), (self._along[0], *along)
         moving = (0, 1, 3) if isinstance(form, _ByMethod) else (0, 1)
-        of_lanes = kernel(function, _Tangent(form, moving), static, (every, along), 16 * _POINTS)
+
+        def make():
+            still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
+            along = [self._along[1] if x is self._levels else still(x) for x in trees]
+            every, along = (self._plain, *trees), (self._along[0], *along)
+            return kernel(function, _Tangent(form, moving), static, (every, along), 4 * _POINTS)
+
+        of_lanes = self.once((function, form, static), trees, make)
 
         def call(*point, some=None):
             tangents = [point[k].imag / TINY for k in moving]
@@ -296,7 +298,7 @@ class _ByMethod(NamedTuple):
     method: Method
 
     def __call__(self, function: Callable, *trees: Any) -> Callable:
-        field = by_lane(function, *trees)
+        field = by_lane(function, *trees, quick=True)
         return lambda t, q, u, h, *others: self.compute(self.method, field, t, q, u, h, *others)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._core.compilation import WORTH_COMPILING, whole
+from .._core.compilation import whole
 from .._core.executor import namespace, on_host, scan
 from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
@@ -87,7 +87,7 @@ def through(
     if not on_host(u):
         return _pieces((move, options, *by), s, levels, settings, ends, begin, u, patience)
     static = search, options._replace(tangents=bool(options.tangents)), *by
-    make = lambda: whole(_pieces, (static,), (s, levels, settings), WORTH_COMPILING / 3)  # noqa: E731
+    make = lambda: whole(_pieces, (static,), (s, levels, settings))  # noqa: E731
     arguments = ends, begin, u, np.float64(patience)
     return s.once(("through", static), (levels, settings), make)(*arguments)
 

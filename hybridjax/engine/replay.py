@@ -176,9 +176,10 @@ def _products(moves: "Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndar
 
 class Variation:
     """Recorded lanes that follow each other, each beginning where the last one ended, and their
-    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets."""
+    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets. If not
+    `twice`, their Jacobians have no derivatives."""
 
-    def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times):
+    def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times, twice):
         moves, n, P = recorded_moves(lanes, tape), 1 + s.d, s.directions
         self._s, self._moves, self.first = s, moves, np.flatnonzero(moves.order == 0)
         if len(self.first) < len(lanes.t):
@@ -196,15 +197,17 @@ class Variation:
                 end, u = (t + h).real[at], kernels.unpushed(s, lane[at])
                 h[at] = kernels.due(s, g, end, u) - t[at]
         along = along._replace(t=t, q=q, h=h, lane=lane)
+        needed = twice | (lane % (n + P) >= n)
+        along = Moves(*(x[..., needed] for x in along))
         later = np.concatenate([np.zeros((n, len(lanes.t))), times]).T.ravel()
         target = dataclasses.replace(
             target, time=many(target.time) + 1j * kernels.TINY * later,
             index=many(np.broadcast_to(target.index, target.time.shape)),
         )  # fmt: skip
         end, by = _linear_moves(s, along, target)
-        by, end = by.reshape(-1, n + P, *by.shape[1:]), end.reshape(-1, n + P, n)[:, n:]
+        by, end = by.reshape(len(moves.t), -1, *by.shape[1:]), end.reshape(len(moves.t), -1, n)
         self._by, self._change = np.real(by[:, 0]), np.imag(by) / kernels.TINY
-        self._kick = np.moveaxis(np.imag(end) / kernels.TINY, 1, 2)
+        self._kick = np.moveaxis(np.imag(end[:, -P:]) / kernels.TINY, 1, 2)
 
     def tangents(self, begin: Float[np.ndarray, "n P"]) -> Float[np.ndarray, "moves n P"]:
         """Tangents of (t, q) where moves start, and at the last end."""
@@ -352,7 +355,7 @@ def _by_stages(s: Structure, a: int, t, q, u, h):
     n, M = q.shape
     m, method = 2 + n + s.nu, s.method(a)
     stages = len(method.b) + 1
-    K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
+    K, dK = np.zeros((stages, n, M), q.dtype), np.zeros((stages, M, n, m), q.dtype)
     straight = np.zeros((M, n, m))
     straight[:, :, 1 : 1 + n] = np.eye(n)
     rows = [*(row[:i] for i, row in enumerate(np.array(method.a))), np.array(method.b)]

@@ -91,14 +91,14 @@ def fit_model(
         ends.append(_descend(problem, system, start, near))
         if ends[-1].explains(problem.weighted):
             break
-    best = min(ends, key=lambda end: (end.cost, -end.residuals))
+    best = min(ends, key=lambda end: (end.cost, -len(end.residuals)))
     if best.cost == np.inf:
-        why = "its residuals are not finite" if best.residuals else Result(best.result).message
+        why = "its residuals are not finite" if len(best.residuals) else Result(best.result).message
         raise ComputationError(
             f"none of {guesses} guesses has a limit cycle on which the data can be observed "
             f"({why}): give another system, or more `guesses`."
         )
-    return _summary(problem, system, near, ends, best)
+    return _summary(problem, system, ends, best)
 
 
 @checked
@@ -176,16 +176,19 @@ class End(NamedTuple):
     """and of the fit."""
     cost: float
     """Infinite where there is no limit cycle, or no observation on it."""
-    residuals: int
-    """Number of residuals."""
+    residuals: Float[np.ndarray, " r"]
+    jacobian: Float[np.ndarray, "r p"]
+    """Their derivatives by the coordinates."""
+    cycle: LimitCycle
+    """The cycle of the guess."""
     steps: int
     result: int
 
     def explains(self, weighted: bool) -> bool:
         """Test whether the fit has converged to a cost that the data explain."""
-        freedom = max(self.residuals - len(self.x), 1)
+        freedom = max(len(self.residuals) - len(self.x), 1)
         likely = freedom + _LIKELY * np.sqrt(2 * freedom)
-        goal = likely if weighted else _PERFECT * self.residuals
+        goal = likely if weighted else _PERFECT * len(self.residuals)
         return bool(self.result == Result.OK and self.cost <= goal)
 
 
@@ -202,28 +205,26 @@ def _descend(
 ) -> End:
     cycle = _cycle_at(problem, system, start, near)
     if cycle.result != Result.OK:
-        return End(start, start, np.inf, 0, 0, int(cycle.result))
-    x, r, steps, converged = descend(problem, start, cycle)
+        none = np.zeros(0), np.zeros((0, len(start)))
+        return End(start, start, np.inf, *none, cycle, 0, int(cycle.result))
+    x, r, J, steps, converged = descend(problem, start, cycle)
     if not np.isfinite(r).all():  # there is a cycle, but no observation on it
-        return End(start, start, np.inf, len(r), steps, int(Result.NOT_CONVERGED))
+        return End(start, start, np.inf, r, J, cycle, steps, int(Result.NOT_CONVERGED))
     result = Result.OK if converged else Result.NOT_CONVERGED
-    return End(start, x, float(r @ r), len(r), steps, int(result))
+    return End(start, x, float(r @ r), r, J, cycle, steps, int(result))
 
 
-def _summary(
-    problem: FitProblem, system: HybridSystem, near: LimitCycle, ends: list[End], best: End
-) -> ModelFit:
+def _summary(problem: FitProblem, system: HybridSystem, ends: list[End], best: End) -> ModelFit:
     parameters = problem.parameters
     decode = lambda x: np.asarray(parameters.decode(jnp.asarray(x)))  # noqa: E731
     guesses = tuple(
         ParameterGuess(decode(e.start), decode(e.x), e.cost, e.steps, e.result) for e in ends
     )
-    x = jnp.asarray(best.x)
     # The cycle of the guess is nearer than the first one, which may be too far away.
-    cycle = _cycle_at(problem, system, best.x, _cycle_at(problem, system, best.start, near))
-    (residuals, jacobian), values = evaluate(problem, x, cycle), decode(x)
+    cycle = _cycle_at(problem, system, best.x, best.cycle)
+    values, residuals = decode(best.x), best.residuals
     size = np.asarray(_sizes(jnp.asarray(values)))
-    sensitivity = _relative(parameters, x, jacobian)
+    sensitivity = _relative(parameters, jnp.asarray(best.x), best.jacobian)
     identified = diagnose(parameters.names, sensitivity)
     rank = identified.rank
     freedom = len(residuals) - rank

@@ -131,8 +131,7 @@ class ObservedHTF(AbstractObservation):
             H = linearize(*where).htf(self.f, self.harmonics).H
         else:
             H = Delayed.of(*where, self.delay).htf(self.f, self.harmonics)
-        error = (H - self.H) * self.weights
-        return jnp.concatenate([error.real.ravel(), error.imag.ravel()])
+        return _real(H, self.H, self.weights)
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
         cycle.structure.resolve_outputs(self.outputs)
@@ -295,6 +294,12 @@ class ObservedCycle(AbstractObservation):
     def prepare(self, cycle: LimitCycle) -> "ObservedCycle":
         place_sections(cycle, self.sections)
         return self
+
+
+@jax.jit
+def _real(H: Array, measured: Array, weights: Array) -> Float[Array, " r"]:
+    error = ((H - measured) * weights).ravel()
+    return jnp.concatenate([error.real, error.imag])
 
 
 def _times(placed: PlacedSections) -> Float[Array, " N"]:

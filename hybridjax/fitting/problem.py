@@ -67,6 +67,7 @@ class Parameters(eqx.Module):
         """Return the values of a system, and the delays of its observations."""
         return jnp.stack([_value(system, observations, name) for name in self.names])
 
+    @eqx.filter_jit
     def insert(self, system: HybridSystem, values: Float[Array, " p"]) -> HybridSystem:
         """Return the system with other values."""
         named = zip(self.names, values, strict=True)
@@ -76,7 +77,7 @@ class Parameters(eqx.Module):
         self, observations: Observations, values: Float[Array, " p"]
     ) -> list[AbstractObservation]:
         """Return the observations with other delays."""
-        named = {name: x for name, x in zip(self.names, values, strict=True) if name in DELAYS}
+        named = {name: values[k] for k, name in enumerate(self.names) if name in DELAYS}
 
         def changed(o):
             if not named or getattr(o, "delay", None) is None:
@@ -86,6 +87,7 @@ class Parameters(eqx.Module):
 
         return [changed(o) for o in observations]
 
+    @eqx.filter_jit
     def encode(self, values: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
         """Return coordinates of values, NaN for those outside of their bounds."""
         low, high, cases = self._bounds()
@@ -93,6 +95,7 @@ class Parameters(eqx.Module):
         logarithms = [jnp.log(up / down), jnp.log(up), jnp.log(down)]
         return jnp.select(cases, logarithms, values / self.size)
 
+    @eqx.filter_jit
     def decode(self, x: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
         """Return values at coordinates x."""
         low, high, cases = self._bounds()
@@ -157,7 +160,7 @@ def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
         q, turn, steps = root(map, False, NEWTON_STEPS)
         period, anchor = map.turn(q, turn.record).period, map.departure(q)
     else:
-        anchor, turn, steps, _ = solve(map, True)
+        anchor, turn, steps, _ = solve(map, True, False)
         period = turn.period
     period = map.expected if map.base is None else period
     code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)
@@ -198,8 +201,13 @@ class FitProblem(eqx.Module):
         values = self.parameters.decode(x)
         cycle = candidate_cycle(self.parameters.insert(guess.system, values), guess)
         observations = self.parameters.observed(self.observations, values)
-        r = jnp.concatenate([observation.residuals(cycle) for observation in observations])
-        return jnp.where((cycle.result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
+        return _joined([observation.residuals(cycle) for observation in observations], cycle.result)
+
+
+@jax.jit
+def _joined(parts, result):
+    r = jnp.concatenate(parts)
+    return jnp.where((result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
 
 
 def _with_jacobian(problem: FitProblem, x, guess):
@@ -229,9 +237,9 @@ def evaluate(
 
 def descend(
     problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " r"], int, bool]:
-    """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals, number of
-    evaluations, and whether it has converged.
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " r"], Float[np.ndarray, "r p"], int, bool]:
+    """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals and their
+    Jacobian, number of evaluations, and whether it has converged.
 
     Steps are accepted and their damping changes as in `optimistix.LevenbergMarquardt`. Here the
     iteration runs on the host, so that only the model is compiled.
@@ -252,13 +260,13 @@ def descend(
             else:
                 damping *= _MORE
             if done:
-                return x, r, steps, True
+                return x, r, J, steps, True
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
             break
         damped = np.concatenate([J, np.sqrt(damping) * np.eye(len(x))])
         short = np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
         trial = x - short
-    return x, r, steps, False
+    return x, r, J, steps, False
 
 
 def _small(change: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"]) -> bool:

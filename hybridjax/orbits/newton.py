@@ -77,7 +77,7 @@ def search(map: ReturnMap, patient: bool = False) -> Solution:
     return solution
 
 
-def _solve(map: ReturnMap, once_more: bool = False) -> Solution:
+def _solve(map: ReturnMap, once_more: bool = False, factors: bool = True) -> Solution:
     q, turn, steps = root(map, False, MAX_STEPS)
     if once_more and not on_host(q):  # (where the host's last turn begins, a step is rounding)
         turn = map.turn_with_jacobian(q, record=turn.record)
@@ -87,7 +87,7 @@ def _solve(map: ReturnMap, once_more: bool = False) -> Solution:
 def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solution]:
     """`solve` on the host, and its derivatives: implicit ones of the state, then those of the
     recorded turn."""
-    (map, _), (by, _), solution = arguments, directions, _solve(*arguments)
+    (map, *_, factors), (by, *_), solution = arguments, directions, _solve(*arguments)
     turn, ends, sizes = solution.turn, map.ends(), map.sizes
     if map.conserved or not solution.is_fixed_point:
         raise NotOnHostError
@@ -99,34 +99,35 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     longer = np.zeros(P) if by.expected is None else by.expected
     part = np.where(np.isfinite(ends.time), (ends.time - map.anchor.t) / map.expected, 0.0)
     times = begin[0][:, None] * np.isfinite(ends.time) + longer[:, None] * part
-    orbit = Variation(s, turn.legs, ends, side_by_side(turn.tapes), times)
+    orbit = Variation(s, turn.legs, ends, side_by_side(turn.tapes), times, factors)
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
     moved = np.where(map.valid, orbit.tangents(begin)[-1, 1:].T, 0.0) / sizes
     jacobian = turn.jacobian * sizes / sizes[:, None]
     begin[1:] = (newton_steps(np.tile(jacobian, (P, 1, 1)), moved) * sizes).T
     tangents = orbit.tangents(begin)
-    t_legs = np.moveaxis(tangents[orbit.first], 0, -1)
-    legs, factors = turn.legs, orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)]
-    if map.base is not None:
-        f = slopes(s, *orbit.points(tangents)).T.reshape(*factors.shape[:3])
-        factors = across(f, map.scale[legs.chart][:, None], factors)
     nothing = jax.tree_util.tree_map(lambda _: None, solution)
-    moving = nothing.turn._replace(
-        legs=nothing.turn.legs._replace(t=t_legs[0], q=np.moveaxis(t_legs[1:], 1, 0)),
-        factors=np.moveaxis(factors.imag / kernels.TINY, 1, 0),
-        period=tangents[-1, 0] - begin[0],
-    )
+    moving = nothing.turn._replace(period=tangents[-1, 0] - begin[0])
+    if factors:
+        legs, by_factor = turn.legs, orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)]
+        if map.base is not None:
+            f = slopes(s, *orbit.points(tangents)).T.reshape(*by_factor.shape[:3])
+            by_factor = across(f, map.scale[legs.chart][:, None], by_factor)
+        t_legs = np.moveaxis(tangents[orbit.first], 0, -1)
+        moving = moving._replace(
+            legs=moving.legs._replace(t=t_legs[0], q=np.moveaxis(t_legs[1:], 1, 0)),
+            factors=np.moveaxis(by_factor.imag / kernels.TINY, 1, 0),
+        )
     t_anchor = None if by.anchor.t is None else begin[0][:, None]
     anchor = nothing.anchor._replace(t=t_anchor, q=begin[1:].T[..., None])
     return solution, nothing._replace(anchor=anchor, turn=moving)
 
 
 @ft.partial(host_first, derived=ft.partial(by_columns, along=_solve_along))
-def solve(map: ReturnMap, once_more: bool = False) -> Solution:
+def solve(map: ReturnMap, once_more: bool = False, factors: bool = True) -> Solution:
     """Newton's method from the anchor's state.
 
     **Arguments:** `once_more`: whether to compute one more turn on the cycle, so that the result
-    has the derivatives of the cycle.
+    has the derivatives of the cycle. `factors`: whether its pieces have them, too.
     """
     return _solve(map, once_more)
 

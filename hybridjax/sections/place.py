@@ -192,11 +192,11 @@ def place_along(
     x[0] = 0.0 if by_cycle.anchor.t is None else by_cycle.anchor.t[:, 0]
     x[1:] = 0.0 if by_cycle.anchor.q is None else by_cycle.anchor.q[..., 0].T
 
-    def follow(flow, by_levels, times):
+    def follow(flow, by_levels, times, twice=False):
         lanes, tape = side_by_side((flow[0], flow[2]))
         target, levels = flow[1], flow[1].levels
         along = kernels.Tangents(s, by_cycle.structure, levels, by_levels, P)
-        flow = Variation(along, lanes, target, tape, times)
+        flow = Variation(along, lanes, target, tape, times, twice)
         return flow, flow.tangents(x), along
 
     if isinstance(family.anchor, Crossing):
@@ -217,7 +217,7 @@ def place_along(
     k = np.arange(N + 1)[-len(flow[1].time) :]
     by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
     times = clock[k % N] * (by_time[:, k % N] + (late + k // N) * longer[:, None])
-    flow, tangents, along = follow(flow, by_bound.levels, times)
+    flow, tangents, along = follow(flow, by_bound.levels, times, True)
     t, chart, q, u = (y[..., -N * P :] for y in flow.points(tangents))
     many = lambda y: np.repeat(y, P)  # noqa: E731
     lanes = placed.lanes._replace(t=t, chart=chart, q=q)
