@@ -24,21 +24,22 @@ PRONOUNS = set(
     "found own known one seen here some there these those it them others rest thing things".split()
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
-# a change that needs less lowers it. Of the code, 670 lines are the algebra of HTFs and loops, 1220
-# the responses of cycles with noise, coupling and symmetry in time, 770 populations of subjects,
-# 620 simulators of others; of the tests, 1530 are those of all four.
+# a change that needs less lowers it. Of the code, 890 lines are the algebra of HTFs, loops and
+# delays, 1310 the responses of cycles with noise, coupling and symmetry in time, 770 populations of
+# subjects, 1040 motion and sliders, 600 simulators of others; of the tests, 1860 are those of all.
+# (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 28_400,
+    "code": 28_650,
     "files": 242,
     "longest": 500,
-    "public_names": 185,
+    "public_names": 186,
     "many_parameters": 8,
-    "thresholds": 300,
-    "structure": 12,
+    "thresholds": 301,
+    "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_480,
-    "doc_words": 39_250,
+    "test_lines": 17_820,
+    "doc_words": 40_400,
 }
 
 

@@ -287,7 +287,7 @@ def _along(
     tape = tape._replace(code=np.where(tape.code == ARRIVE_LEVEL, ARRIVE_TIME, tape.code))
     times = begin[0][:, None] + np.outer(longer, (time - start) / full)
     ends = dataclasses.replace(ends, time=time, levels=None)
-    return Variation(s, lanes, ends, tape, times).tangents(begin)
+    return Variation(s, lanes, ends, tape, times, twice=False).tangents(begin)
 
 
 def of_flow(tangents: Any) -> Any:
