@@ -60,8 +60,9 @@ def linear_step(
     s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, by_stages: Any = None
 ) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
-    states, inputs and length of the step. Those of explicit methods come `by_stages`."""
-    if not s.method(a).implicit:
+    states, inputs and length of the step. Those of explicit methods come `by_stages`, if that is
+    given, and need no program."""
+    if by_stages is not None and not s.method(a).implicit:
         return by_stages(t, q, u, h)
     return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=_POINTS)(t, q, u, h)
 
