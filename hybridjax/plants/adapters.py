@@ -145,11 +145,12 @@ class FMUPlant(_Made):
         fmpy, self.file = package("fmpy"), os.path.abspath(self.file)
         try:
             about = fmpy.read_model_description(self.file)
-            can = {"2": about.coSimulation}[about.fmiVersion[0]]
-            self.fixed_step = not can.canHandleVariableCommunicationStepSize
-        except Exception as error:  # (of many kinds)
-            text = f"'{self.file}' is no FMU of FMI 2.0 for co-simulation."
-            raise DefinitionError(text) from error
+            can = about.coSimulation if about.fmiVersion.startswith("2.") else None
+        except Exception:  # (of many kinds)
+            can = None
+        if can is None:
+            raise DefinitionError(f"'{self.file}' is no FMU of FMI 2.0 for co-simulation.")
+        self.fixed_step = not can.canHandleVariableCommunicationStepSize
         real, names = {x.name: x for x in about.modelVariables if x.type == "Real"}, self.signals
         require_among("real variable", [*self.inputs, *names], real, "FMUPlant: ")
         self._at = [[real[x].valueReference for x in group] for group in (self.inputs, names)]

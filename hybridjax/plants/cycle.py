@@ -245,13 +245,17 @@ class SettledCycle:
         failed_at = np.array([len(values) if cause else -1 for values, cause in trials])
         result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
         simulated = Simulated(failed_at, None, self.sections.label, rows[..., -1], causes)
-        of_cycle = {"n_sections": N, "inputs": self.inputs, "outputs": self.outputs}
-        at, y = (
-            self.cycle_outputs,
-            rows[..., :-1] - np.tile(self.cycle_outputs, (len(u[0]) // N, 1)),
+        return ExperimentData(
+            u,
+            rows[..., :-1] - np.tile(self.cycle_outputs, (u.shape[1] // N, 1)),
+            n_sections=N,
+            periods=inputs.periods,
+            inputs=self.inputs,
+            outputs=self.outputs,
+            result=result,
+            cycle_outputs=self.cycle_outputs,
+            simulated=simulated,
         )
-        given: Any = of_cycle | {"cycle_outputs": at, "periods": inputs.periods}
-        return ExperimentData(u, y, result=result, simulated=simulated, **given)
 
     def perturbed_returns(self, coordinates: SignalNames | None = None) -> Returns:
         """Estimate the multipliers from returns of perturbed states to section 0.
