@@ -315,11 +315,11 @@ def test_sensitivities_are_differences_of_cycles(system, name):
     np.testing.assert_allclose(np.concatenate(exact), difference, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "system, name, output",
-    [(Neuron(), "current", "v"), (hj.models.VerticalHopper(), "k", "yM"),
-     (hj.models.BuckConverter(), "Vin", "v")],
+    [(Neuron(), "current", "v"),
+     pytest.param(hj.models.VerticalHopper(), "k", "yM", marks=pytest.mark.slow),
+     pytest.param(hj.models.BuckConverter(), "Vin", "v", marks=pytest.mark.slow)],
     ids=["a phase", "two charts", "a schedule"],
 )  # fmt: skip
 def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, output):
