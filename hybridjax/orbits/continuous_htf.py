@@ -88,12 +88,12 @@ def continuous_htf(
 
 
 def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Float[np.ndarray, "F n"]]:
-    """Frequencies, and the matrix from values there to those at f of functions that turn by one
-    turn per cycle: Chebyshev's, where these are fewer than f."""
+    """Chebyshev's frequencies where these are fewer than f, else f, and the matrix from values there
+    to values at f, for functions of the frequency that are sums of exp(2 pi i f s), |s| <= 1."""
     middle, half = (np.max(f) + np.min(f)) / 2, np.ptp(f) / 2
     angle = 2 * np.pi * half
     n = int(angle + _EXTRA * np.cbrt(1 + angle))
-    if n >= len(f):
+    if n >= len(f) or not half:
         return f, np.eye(len(f))
     k = np.arange(n)
     at = np.pi * (k + 0.5) / n

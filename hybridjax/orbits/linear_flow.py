@@ -343,11 +343,8 @@ def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
     out = Jumps(*(np.zeros(shape, f.dtype) for shape in shapes))
     out.by_state[:] = np.eye(d)
     for g in np.unique(code[code >= 0]):
-        now, tr, a = (
-            np.flatnonzero(code == g),
-            s.transitions[g],
-            s.chart_index(s.transitions[g].source),
-        )
+        now, tr = np.flatnonzero(code == g), s.transitions[g]
+        a = s.chart_index(tr.source)
         n, delay = s.dims[a], np.ones(len(now))
         point = t[now], q[now, :n].T, u[:, now]
         by = np.moveaxis(kernels.linear_reset(s, s.member(g), *point), -1, 0)

@@ -243,6 +243,13 @@ def test_mathieus_equation_has_the_published_continuous_htf():
         htf.predict(np.ones((32, 1)))
 
 
+def test_htfs_at_many_frequencies_come_from_fewer():
+    cycle, f = hj.find_limit_cycle(hj.models.BuckConverter()), np.linspace(0.013, 9.987, 620)
+    some = [0, 7, 311, 619]
+    many, few = cycle.htf(f, (-1, 0, 1)).H, cycle.htf(f[some], (-1, 0, 1)).H
+    np.testing.assert_allclose(many[:, some], few, rtol=0, atol=1e-12 * np.abs(few).max())
+
+
 def test_harmonic_state_spaces_converge_to_the_exact_htf():
     cycle = hj.find_limit_cycle(hj.models.Mathieu())
     space = hj.convert.to_harmonic_state_space(cycle, outputs="x", tolerance=1e-12)
