@@ -88,8 +88,9 @@ def continuous_htf(
 
 
 def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Float[np.ndarray, "F n"]]:
-    """Chebyshev's frequencies where these are fewer than f, else f, and the matrix from values there
-    to values at f, for functions of the frequency that are sums of exp(2 pi i f s), |s| <= 1."""
+    """Chebyshev's frequencies where these are fewer than f, else f, and the matrix from values
+    there to values at f, of functions of the frequency that are sums of exp(2 pi i f s), |s| <= 1.
+    """
     middle, half = (np.max(f) + np.min(f)) / 2, np.ptp(f) / 2
     angle = 2 * np.pi * half
     n = int(angle + _EXTRA * np.cbrt(1 + angle))

@@ -212,14 +212,15 @@ class LimitCycle(eqx.Module):
     def responses(self, modes: Index | None = None) -> Responses:
         """Responses to brief pushes, at every phase: of the phase, and of the amplitudes of modes.
 
-        They come from one more turn on the cycle, whose steps are linearized, and are exact through
+        They come from the steps of the last turn, which are linearized, and are exact through
         events; inputs that resets and guards use act at events (`Responses.impulses`).
 
         **Arguments:** `modes`: number of modes, those with the largest multipliers. Default: all
-        with multipliers above 1e-6; inside of JAX transformations it must be given.
+        with multipliers above 1e-6; inside of `grad` and `jvp` it must be given.
 
         **Raises:** `ComputationError` for a double multiplier 1, where phase has no meaning, and
-        for modes whose multipliers coincide; `DefinitionError` for more modes than have amplitudes.
+        for modes whose multipliers coincide; `DefinitionError` for more modes than have amplitudes,
+        and inside of `jit` and `vmap`.
         """
         return responses(self._checked(), modes)
 

@@ -325,7 +325,9 @@ def responses(cycle: Any, modes: int | None) -> Responses:
         Z = xp.linalg.solve(closed.T, along)
         whole = whole - f[:, None] * Z
     if modes is None and not host:
-        raise DefinitionError("inside of jit and grad, `responses` needs the number of `modes`.")
+        raise DefinitionError(
+            "inside of `grad` and `jvp`, `responses` needs the number of `modes`."
+        )
     values, right, left = _modes(whole, map.sizes, modes)
     exponents = xp.log(values) / period
     adjoint, to_go = flow.adjoint, period - (flow.t - flow.t[0, 0])

@@ -128,6 +128,20 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     np.testing.assert_allclose(phase, exact / (2 * np.pi), rtol=1e-9)
 
 
+def test_the_closed_form_of_a_response_has_its_derivative_in_both_modes():
+    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
+    near = hj.find_limit_cycle(StuartLandau(), guess, section=section)
+
+    def response(mu):
+        cycle = hj.find_limit_cycle(StuartLandau(mu=mu), near)
+        return cycle.responses(modes=0).phase(jnp.asarray(PHASES), "radians")["x"]
+
+    angle, mu = 2 * np.pi * PHASES, jnp.asarray(0.1)
+    exact = (np.sin(angle) - 0.4 * np.cos(angle)) / (2 * 0.1**1.5)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(response)(mu), exact, rtol=0, atol=1e-9)
+
+
 def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
     section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
     responses = hj.find_limit_cycle(StuartLandau(), guess, section=section).responses()
@@ -322,11 +336,11 @@ def test_sensitivities_are_differences_of_cycles(system, name):
     np.testing.assert_allclose(np.concatenate(exact), difference, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "system, name, output",
-    [(Neuron(), "current", "v"),
-     pytest.param(hj.models.VerticalHopper(), "k", "yM", marks=pytest.mark.slow),
-     pytest.param(hj.models.BuckConverter(), "Vin", "v", marks=pytest.mark.slow)],
+    [(Neuron(), "current", "v"), (hj.models.VerticalHopper(), "k", "yM"),
+     (hj.models.BuckConverter(), "Vin", "v")],
     ids=["a phase", "two charts", "a schedule"],
 )  # fmt: skip
 def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, output):
