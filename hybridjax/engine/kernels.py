@@ -22,6 +22,7 @@ from ..systems.solver import Method, Radau, as_method
 from ..systems.structure import Kind, Member, Structure, stacked
 from ..systems.system import Output
 from ..systems.transition import Scheduled
+from ..systems.varied import under
 from .arrays import AnyInputs as Inputs, AnyTimes as Times, Array, States
 from .runge_kutta import Step, integrated_divergence, step_along as _along, take_step
 from .target import AbstractLevels
@@ -56,14 +57,9 @@ def step_along(
     return Step(*rows[:5]), rows[5], rows[6]
 
 
-def linear_step(
-    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, by_stages: Any = None
-) -> Expanded:
+def linear_step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
-    states, inputs and length of the step. Those of explicit methods come `by_stages`, if that is
-    given, and need no program."""
-    if by_stages is not None and not s.method(a).implicit:
-        return by_stages(t, q, u, h)
+    states, inputs and length of the step."""
     return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=_POINTS)(t, q, u, h)
 
 
@@ -118,9 +114,9 @@ def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Arr
     return of_lanes(t, q, u, g.place)
 
 
-def due(s: Structure, g: int, t: Times, u: Inputs) -> Times:
-    """The times of a scheduled transition that lie at t up to rounding."""
-    return s.kernel(_due, by_lane, g)(t, t[None], u)[0]
+def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
+    """The time from t to that of a scheduled transition up to rounding, and its derivatives."""
+    return s.kernel(_due, _expanded, g)(t, q, u)
 
 
 def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) -> Expanded:
@@ -176,10 +172,11 @@ def _outputs(a: int, s: Structure, items: Items, t, q, u):
 
 
 def _due(g: int, s: Structure, t, q, u):
-    guard = s.transitions[g].guard
+    guard = under(s, u).transitions[g].guard
     assert isinstance(guard, Scheduled)
     offset, period = guard.numbers(t)
-    return jnp.stack([offset + jax.lax.stop_gradient(jnp.round((t - offset) / period)) * period])
+    tick = offset + jax.lax.stop_gradient(jnp.round((t - offset) / period)) * period
+    return jnp.stack([tick - t])
 
 
 def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q):
@@ -303,8 +300,8 @@ class _ByMethod(NamedTuple):
         return lambda t, q, u, h, *others: self.compute(self.method, field, t, q, u, h, *others)
 
 
-def _step(method: Method, field: Callable, t, q, u, h):
-    return jnp.stack(take_step(method, lambda t, q: field(t, q, u, h), t, q, h))
+def _step(method: Method, field: Callable, t, q, u, h, *x):
+    return jnp.stack(take_step(method, lambda t, q: field(t, q, u, h, *x), t, q, h))
 
 
 def _step_along(method: Method, field: Callable, t, q, u, h, along):

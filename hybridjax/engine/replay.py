@@ -194,8 +194,8 @@ class Variation:
         for g, transition in enumerate(s.transitions):
             at = along.code == g
             if isinstance(transition.guard, Scheduled) and at.any():
-                end, u = (t + h).real[at], kernels.unpushed(s, lane[at])
-                h[at] = kernels.due(s, g, end, u) - t[at]
+                end, u = (t + h).real[at] + 0j, kernels.unpushed(s, lane[at])
+                h[at] = end + kernels.due(s, g, end, q[:, at], u)[0, 0] - t[at]
         along = along._replace(t=t, q=q, h=h, lane=lane)
         needed = twice | (lane % (n + P) >= n)
         along = Moves(*(x[..., needed] for x in along))
@@ -293,8 +293,7 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> _Linear:
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
     goal = target.time[moves.lane]
     h = np.where(on_time, goal - moves.t, moves.h)
-    point, by_stages = (moves.t, moves.q[:n], u, h), ft.partial(_by_stages, s, a)
-    expanded = np.array(np.moveaxis(kernels.linear_step(s, a, *point, by_stages), -1, 0))
+    expanded = np.array(np.moveaxis(_linear_step(s, a, moves.t, moves.q[:n], u, h), -1, 0))
     q, dq, f = expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     t = np.where(on_time, goal, moves.t + h)
     # By (t, q, u), with the length of the step as the last; that to a known time shrinks with t.
@@ -350,10 +349,13 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> _Linear:
     return _Linear(end, by)
 
 
-def _by_stages(s: Structure, a: int, t, q, u, h):
-    """`kernels.linear_step` of an explicit method, by derivatives of the field at its stages."""
-    n, M = q.shape
-    m, method = 2 + n + s.nu, s.method(a)
+def _linear_step(s: Structure, a: int, t, q, u, h):
+    """`kernels.linear_step`; of an explicit method, by derivatives of the field at its stages,
+    which needs no program."""
+    (n, M), method = q.shape, s.method(a)
+    if method.implicit:
+        return kernels.linear_step(s, a, t, q, u, h)
+    m = 2 + n + s.nu
     stages = len(method.b) + 1
     K, dK = np.zeros((stages, n, M), q.dtype), np.zeros((stages, M, n, m), q.dtype)
     straight = np.zeros((M, n, m))

@@ -317,12 +317,10 @@ def responses(cycle: Any, modes: int | None) -> Responses:
     host, xp = on_host(flow.t), namespace(flow.t)
     map = (to_host(cycle) if host else cycle).return_map
     period, clocked = map.expected, map.base is None
-    free, _ = flow.forward
-    whole = flow.monodromy(free, map.valid)
+    whole = flow.monodromy(map.valid)
     if not clocked:
         f = flow.field[0, 0]
-        closed, along = loop(map, whole, f)
-        Z = xp.linalg.solve(closed.T, along)
+        _, Z = loop(map, whole, f)
         whole = whole - f[:, None] * Z
     if modes is None and not host:
         raise DefinitionError(
@@ -384,7 +382,8 @@ def asymptotic_phase(cycle: Any, chart: str, state: Float[np.ndarray, " n"], tur
 
 
 def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
-    """M - I + f w^T, which is regular if the multiplier 1 is simple, and w, with w . f = 1.
+    """M - I + f w^T with w . f = 1, which is regular if the multiplier 1 is simple, and the phase
+    response at the beginning.
 
     **Raises:** `ComputationError` if it is not simple.
     """
@@ -399,7 +398,7 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
                 "the cycle has no phase of its own: its multiplier 1 is double, as in a family of "
                 "cycles with a conserved quantity, where pushes change the period."
             )
-    return closed, along
+    return closed, xp.linalg.solve(closed.T, along)
 
 
 def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from .._core.arguments import require_among
 from .._core.executor import Array
 from .chart import DerivedChart
+from .structure import Structure
 from .system import Derived, HybridSystem, parameters_of, unit_of_parameter
 from .transition import Scheduled
 
@@ -74,6 +75,11 @@ class Varied(Derived):
     def _size(self, chart: str) -> int:
         inputs = self.system.charts()[chart].inputs
         return len(self.system.inputs if inputs is None else inputs)
+
+
+def under(s: Structure, u: Array) -> Structure:
+    """The structure of a system at the parameter to which its input is added, if it is `Varied`."""
+    return Structure(s.system.at(u[0])) if isinstance(s.system, Varied) else s
 
 
 class _Varied(DerivedChart):
