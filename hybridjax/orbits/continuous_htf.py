@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import SignalNames
 from .._core.compilation import at_ease
-from .._core.executor import Array, namespace, on_host, to_host
+from .._core.executor import Array, namespace, on_host
 from ..engine import kernels
 from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics, check_harmonics
@@ -59,13 +59,15 @@ def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> flo
     return longest
 
 
-def asked(cycle: Any, outputs: OutputNames | None, inputs: SignalNames | None):
-    """Outputs that exist all along the cycle, and the names and indices of inputs."""
-    s = cycle.structure
+def asked(
+    s: Structure, events: tuple[int, ...], outputs: OutputNames | None, inputs: SignalNames | None
+):
+    """Outputs that exist all along a cycle with these events, and the names and indices of
+    inputs."""
     z = s.resolve_outputs(s.states_everywhere() if outputs is None else outputs)
     for x in (x for x in z.items if isinstance(x, Output)):
         list(check_output(s, x))
-    for name in {s.transitions[g].source for g in cycle.event_sequence} or s.names:
+    for name in {s.transitions[g].source for g in events} or s.names:
         z.require(s.chart_index(name))
     return z, *s.inputs_among(inputs)
 
@@ -79,9 +81,9 @@ def continuous_htf(
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
     harmonics, frequencies = check_harmonics(harmonics, 0), np.asarray(f, float).reshape(-1)
-    z, names, columns = asked(cycle, outputs, inputs)
+    map = cycle.return_map
+    z, names, columns = asked(map.structure, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, longest_piece(frequencies, harmonics))
-    map = (to_host(cycle) if on_host(flow.t) else cycle).return_map
     with at_ease():
         H = _transfer(map, flow, z, frequencies, harmonics)
     return HTF(frequencies, H[..., columns], harmonics, 0, names, z.names, "exact")
@@ -96,12 +98,10 @@ def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Float[np.nda
     n = int(angle + _EXTRA * np.cbrt(1 + angle))
     if n >= len(f) or not half:
         return f, np.eye(len(f))
-    k = np.arange(n)
-    at = np.pi * (k + 0.5) / n
-    series = np.cos(np.outer(np.arccos(np.clip((f - middle) / half, -1, 1)), k))
-    return middle + half * np.cos(at), series @ (
-        np.cos(np.outer(k, at)) * (2 - (k == 0))[:, None] / n
-    )
+    k, chebyshev = np.arange(n), np.polynomial.chebyshev
+    x = np.cos(np.pi * (k + 0.5) / n)
+    values = chebyshev.chebvander(x, n - 1).T * (2 - (k == 0))[:, None] / n
+    return middle + half * x, chebyshev.chebvander((f - middle) / half, n - 1) @ values
 
 
 def _transfer(

@@ -32,7 +32,7 @@ from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
-from .linear_flow import linear_flow
+from .linear_flow import hosted, linear_flow
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
@@ -304,7 +304,7 @@ class LimitCycle(eqx.Module):
     def _checked(self) -> "LimitCycle":
         require_x64()
         self.require_current()
-        return self
+        return hosted(self)
 
     def __repr__(self):
         if is_traced(self):
@@ -417,7 +417,7 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
 
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
-    map, flow = to_host(cycle.return_map), linear_flow(cycle)
+    map, flow = hosted(cycle).return_map, linear_flow(cycle)
     through, frames = flow.jumps.by_state @ flow.forward[0][:, -1], []
     for chart, f in zip(flow.chart, flow.field[:, 0], strict=True):
         n = map.structure.dims[chart]

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, NonNegative
-from .._core.executor import Array, is_traced, namespace, on_host, scan, to_host
+from .._core.executor import Array, is_traced, namespace, on_host, scan
 from .._core.text import number
 from ..errors import ComputationError
 from ..systems.structure import Structure
@@ -100,7 +100,7 @@ class Fluctuations(eqx.Module):
 def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets) -> Fluctuations:
     """Deviations from a cycle under noise (see `LimitCycle.fluctuations`)."""
     flow, events = linear_flow(cycle), cycle.event_sequence
-    map = (to_host(cycle) if on_host(flow.q) else cycle).return_map
+    map = cycle.return_map
     s, period = map.structure, map.expected
     levels, scatter = _at_events(s, guards, resets)
     xp, jumps = namespace(flow.q), flow.jumps

@@ -18,7 +18,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
 from .._core.boundary.checked import NeedsValues
-from .._core.executor import Array, is_inside_program, is_traced, namespace, scan, to_host
+from .._core.executor import (
+    Array,
+    is_inside_program,
+    is_traced,
+    namespace,
+    on_host,
+    scan,
+    to_host,
+)
 from .._core.host_derivatives import by_columns
 from .._core.memo import Memory, remembered
 from ..engine import kernels
@@ -198,7 +206,7 @@ class LinearFlow(eqx.Module):
             return ((through @ x.reshape(d, -1)).reshape(x.shape) + kick) * back, x
 
         begin = xp.pad(xp.eye(d), [(0, 0), (self.by_input.shape[3], 0)])[..., None] + 0 * kick[0]
-        free, back = self.forward[0][:, -1], 1 / last[:, 0]
+        free, back = xp.asarray(self.forward[0][:, -1], dtype=waves.dtype), 1 / last[:, 0]
         end, x = scan(advance, begin, (jumps.by_state @ free, kick, back))
         ends = (free @ x.reshape(P, d, -1)).reshape(x.shape) + wide(arrived.reshape(shape))
         delay = xp.einsum("pa,pacf->pcf", jumps.delay_by_state, ends)
@@ -214,14 +222,21 @@ class LinearFlow(eqx.Module):
         return xp.where(valid[:, None] & valid, whole, 0.0)
 
 
-_flows, _turns = Memory(), Memory()
+_hosted, _flows, _turns = Memory(), Memory(), Memory()
 
 
 def keep_turn(cycle: Any, turn: Turn) -> None:
     """Keep the steps of a cycle's last turn for its linearization."""
     if turn.tapes is not None:
         record = to_host((turn.legs, turn.tapes))
-        _turns.recall(cycle, None, lambda: (record[0], side_by_side(record[1])))
+        _turns.recall(hosted(cycle), None, lambda: (record[0], side_by_side(record[1])))
+
+
+def hosted(cycle: Any) -> Any:
+    """The cycle with its arrays on the host, the same at each call; itself if JAX traces it."""
+    if is_traced(cycle) or is_inside_program() or on_host(cycle.period):
+        return cycle
+    return _hosted.recall(cycle, None, lambda: to_host(cycle))
 
 
 def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = None) -> LinearFlow:
@@ -230,7 +245,8 @@ def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = Non
 
     **Raises:** `NeedsValues` inside of `jit` and `vmap`.
     """
-    if is_traced(cycle) or is_inside_program():
+    cycle = hosted(cycle)
+    if not on_host(cycle.period):
         return _of_cycle(cycle, longest, parameter)
     make = lambda: _linear_flow(cycle, longest, parameter)  # noqa: E731
     return _flows.recall(cycle, (parameter, longest), make)

@@ -314,8 +314,7 @@ class Responses(eqx.Module):
 def responses(cycle: Any, modes: int | None) -> Responses:
     """The responses of a cycle (see `LimitCycle.responses`)."""
     flow = linear_flow(cycle)
-    host, xp = on_host(flow.t), namespace(flow.t)
-    map = (to_host(cycle) if host else cycle).return_map
+    host, xp, map = on_host(flow.t), namespace(flow.t), cycle.return_map
     period, clocked = map.expected, map.base is None
     whole = flow.monodromy(map.valid)
     if not clocked:
@@ -352,7 +351,7 @@ def responses(cycle: Any, modes: int | None) -> Responses:
 
 def asymptotic_phase(cycle: Any, chart: str, state: Float[np.ndarray, " n"], turns: int) -> float:
     """The asymptotic phase of a state (see `LimitCycle.asymptotic_phase`)."""
-    map, period = to_host(cycle.return_map), float(cycle.period)
+    map, period = cycle.return_map, float(cycle.period)
     s, a = map.structure, map.structure.chart_index(chart)
     if state.shape != (s.dims[a],):
         raise DefinitionError(f"`state` must give the {s.dims[a]} states of chart '{chart}'.")

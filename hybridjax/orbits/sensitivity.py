@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked_methods
 from .._core.compilation import at_ease
-from .._core.executor import Array, is_traced, namespace, on_host, to_host
+from .._core.executor import Array, is_traced, namespace, on_host
 from .._core.text import number
 from ..engine import kernels
 from ..errors import ComputationError
@@ -70,7 +70,6 @@ def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
     """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`)."""
     varied = Varied(cycle.system, parameter)
     flow = linear_flow(cycle, parameter=parameter)
-    cycle = to_host(cycle) if on_host(flow.q) else cycle
     with at_ease():
         return _sensitivity(cycle, flow, varied)
 
