@@ -208,9 +208,10 @@ class LinearFlow(eqx.Module):
         begin = xp.pad(xp.eye(d), [(0, 0), (self.by_input.shape[3], 0)])[..., None] + 0 * kick[0]
         free, back = xp.asarray(self.forward[0][:, -1], dtype=waves.dtype), 1 / last[:, 0]
         end, x = scan(advance, begin, (jumps.by_state @ free, kick, back))
-        ends = (free @ x.reshape(P, d, -1)).reshape(x.shape) + wide(arrived.reshape(shape))
-        delay = xp.einsum("pa,pacf->pcf", jumps.delay_by_state, ends)
-        return x, (delay + wide(jumps.delay_by_input[..., None] * last)) / last, end
+        by_begin = (jumps.delay_by_state[:, None] @ free)[:, 0]
+        by_input = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived.reshape(shape))
+        by_input = wide(by_input + jumps.delay_by_input[..., None] * last)
+        return x, (xp.einsum("pa,pacf->pcf", by_begin, x) + by_input) / last, end
 
     def monodromy(self, valid: Bool[Array, " d"]) -> Float[Array, "d d"]:
         """Derivative of the state at the end of the turn by that at its beginning, at fixed times;
