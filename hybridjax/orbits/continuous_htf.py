@@ -47,10 +47,10 @@ def observed(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, Array, 
 
 
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
-    """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of 2, so
-    that calls with similar frequencies share a linearization."""
+    """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of the
+    root of 2, so that calls with similar frequencies share a linearization."""
     fastest = max(1.25 * np.max(np.abs(f), initial=0.0), np.max(np.abs(harmonics)), 0.1)
-    longest = float(2.0 ** np.floor(np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))))
+    longest = float(2.0 ** (np.floor(2 * np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))) / 2))
     if max(len(f), 64) / longest > _LARGEST:
         raise DefinitionError(
             f"{len(f)} frequencies up to {np.abs(f).max():.3g} per period and harmonics up to "
