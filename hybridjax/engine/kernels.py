@@ -1,9 +1,9 @@
 """Users' functions for code that runs on the host, each with its first derivatives.
 
-`watched`, `reset` and `enabled` also take and return arrays of JAX, the others NumPy's. A column of
-values stands before those of derivatives, by the time, the n states and the inputs: (rows, 2 + n +
-nu, L). Where only `some` lanes are needed, the others are copies of one of these; one lane may
-stand for all.
+`watched`, `reset`, `enabled` and `linear` also take and return arrays of JAX, the others NumPy's. A
+column of values stands before those of derivatives, by the time, the n states and the inputs:
+(rows, 2 + n + nu, L). Where only `some` lanes are needed, the others are copies of one of these;
+one lane may stand for all.
 """
 
 import functools as ft
@@ -18,13 +18,13 @@ from jaxtyping import Bool, Float, Int
 from .._core.compilation import kernel
 from .._core.executor import on_host
 from .._core.lanes import PerLane, by_lane
-from ..systems.solver import Method, Radau, as_method
+from ..systems.solver import Method
 from ..systems.structure import Kind, Member, Structure, stacked
 from ..systems.system import Output
 from ..systems.transition import Scheduled
 from ..systems.varied import under
 from .arrays import AnyInputs as Inputs, AnyTimes as Times, Array, States
-from .runge_kutta import Step, integrated_divergence, step_along as _along, take_step
+from .runge_kutta import Step, step_along as _along, take_step
 from .target import AbstractLevels
 
 
@@ -38,9 +38,7 @@ _POINTS = 16
 
 
 def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
-    """The field of chart a, and its derivatives."""
-    if not on_host(q):
-        return linear(s, _field, a, t, q, u)
+    """The field of chart a, and its derivatives (on the host)."""
     return s.kernel(_field, _expanded, a, lanes=_POINTS)(t, q, u, some=some)
 
 
@@ -61,13 +59,6 @@ def linear_step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) 
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
     states, inputs and length of the step."""
     return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=_POINTS)(t, q, u, h)
-
-
-def divergence(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Times:
-    """The divergence of the field of chart a, integrated over steps."""
-    method = s.method(a)
-    form = _ByMethod(_divergence, method if method.implicit else as_method(Radau()))
-    return s.kernel(_field, form, a, lanes=_POINTS)(t, q, u, h)
 
 
 def watched(
@@ -95,13 +86,6 @@ def reset(s: Structure, g: Member, t: Times, q: States, u: Inputs, some: Some = 
     if on_host(q):
         return s.kernel(_reset, _expanded, g.kind)(t, q, u, g.place, some=some)
     return s.by_lane(ft.partial(_reset, g.kind))(t, q, u, g.place)[:, None]
-
-
-def linear_reset(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Expanded:
-    """The state after transitions of one kind, and its derivatives."""
-    if on_host(q):
-        return reset(s, g, t, q, u)
-    return s.by_lane(_columns(ft.partial(_reset, g.kind), 1))(t, q, u, g.place)
 
 
 def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Array, " L"]:
@@ -307,10 +291,6 @@ def _step(method: Method, field: Callable, t, q, u, h, *x):
 def _step_along(method: Method, field: Callable, t, q, u, h, along):
     step, *tangent = _along(method, lambda t, q: field(t, q, u, h, along), t, q, h, along)
     return jnp.stack([*step, *tangent])
-
-
-def _divergence(method: Method, field: Callable, t, q, u, h):
-    return integrated_divergence(method, lambda t, q: field(t, q, u, h), t, q, h)
 
 
 def _linear_step(method: Method, field: Callable, t, q, u, h, *x):

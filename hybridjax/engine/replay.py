@@ -236,16 +236,6 @@ class Variation:
         return t + aside[0], chart, q + aside[1:], u
 
 
-def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
-    """The divergence of the field, integrated over the moves of one lane, up to their ends."""
-    moves, total = recorded_moves(lanes, tape), 0.0
-    for a in np.unique(moves.chart):
-        in_chart = moves.chart == a
-        t, q, h = moves.t[in_chart], moves.q[: s.dims[a], in_chart], moves.h[in_chart]
-        total += kernels.divergence(s, int(a), t, q, np.zeros((s.nu, 1)), h).sum()
-    return total
-
-
 def _linear_moves(s: Structure, moves: Moves, target: Target) -> _Linear:
     n, M = 1 + s.d, len(moves.t)
     number = target.time.dtype

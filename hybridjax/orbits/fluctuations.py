@@ -108,8 +108,8 @@ def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets
     names = [s.transitions[g].name for g in events] or ([] if clocked else [str(map.base)])
     n, E = d + 1 + len(names), len(names)
     # Noise in the states, collected over each piece.
-    B, (free, _), adjoint = _columns(s, flow, white), flow.forward, flow.adjoint
-    turned = xp.swapaxes(adjoint, -1, -2) @ B
+    B, (free, _) = _columns(s, flow, white), flow.forward
+    turned = xp.swapaxes(flow.adjoint, -1, -2) @ B
     weight = (flow.length[:, None] * rule().weights)[..., None, None]
     collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
     # Noise of events, and what each makes of the states before, of the delay of the last event,
@@ -131,7 +131,7 @@ def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets
     pieces = forward, _pad(collected, n), jump, added
     (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
     M, last = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0), xp.eye(n)
-    diffusion, to_end = xp.zeros(()), adjoint @ flow.backward(adjoint, xp.eye(d))[:, None]
+    diffusion, to_end = xp.zeros(()), flow.covectors(xp.eye(d))
     across = np.eye(d)
     if not clocked:
         _, Z = loop(map, M[:d, :d], f)

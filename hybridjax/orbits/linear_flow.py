@@ -32,6 +32,7 @@ from .._core.memo import Memory, remembered
 from ..engine import kernels
 from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, Lanes, Tape, for_each_chart, side_by_side
 from ..engine.replay import Variation, recorded_moves
+from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled
@@ -154,17 +155,16 @@ class LinearFlow(eqx.Module):
         free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[:-1, -1])
         return xp.concatenate([free, xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))], axis=1)
 
-    def backward(
-        self, adjoint: Float[Array, "P K d d"], end: Float[Array, "d r"]
-    ) -> Float[Array, "P d r"]:
-        """Covectors at the ends of pieces, before their events, by those at the end of the turn."""
+    def covectors(self, end: Inexact[Array, "d r"]) -> Inexact[Array, "P K d r"]:
+        """Covectors at the nodes by those at the end of the turn."""
 
         def back(after, piece):
             jump, free = piece
             before = jump.T @ after
             return free @ before, before
 
-        return scan(back, end, (self.jumps.by_state[::-1], adjoint[::-1, 0]))[1][::-1]
+        _, ends = scan(back, end, (self.jumps.by_state[::-1], self.adjoint[::-1, 0]))
+        return self.adjoint @ ends[::-1, None]
 
     def at(
         self, phase: Array, period: Array, *values: Inexact[Array, "P K ..."]
@@ -206,21 +206,22 @@ class LinearFlow(eqx.Module):
             return ((through @ x.reshape(d, -1)).reshape(x.shape) + kick) * back, x
 
         begin = xp.pad(xp.eye(d), [(0, 0), (self.by_input.shape[3], 0)])[..., None] + 0 * kick[0]
-        free, back = xp.asarray(self.forward[0][:, -1], dtype=waves.dtype), 1 / last[:, 0]
-        end, x = scan(advance, begin, (jumps.by_state @ free, kick, back))
-        by_begin = (jumps.delay_by_state[:, None] @ free)[:, 0]
+        through, back = xp.asarray(self.through, dtype=waves.dtype), 1 / last[:, 0]
+        end, x = scan(advance, begin, (through, kick, back))
+        by_begin = (jumps.delay_by_state[:, None] @ self.forward[0][:, -1])[:, 0]
         by_input = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived.reshape(shape))
         by_input = wide(by_input + jumps.delay_by_input[..., None] * last)
         return x, (xp.einsum("pa,pacf->pcf", by_begin, x) + by_input) / last, end
 
+    @remembered
+    def through(self) -> Float[Array, "P d d"]:
+        """Deviations at the beginnings of pieces to those at the beginnings of the next."""
+        return self.jumps.by_state @ self.forward[0][:, -1]
+
     def monodromy(self, valid: Bool[Array, " d"]) -> Float[Array, "d d"]:
         """Derivative of the state at the end of the turn by that at its beginning, at fixed times;
         zero outside of the `valid` rows and columns."""
-        xp = namespace(self.q)
-        step = lambda product, through: (through @ product, None)  # noqa: E731
-        through = self.jumps.by_state @ self.forward[0][:, -1]
-        whole, _ = scan(step, xp.eye(self.q.shape[2]), through)
-        return xp.where(valid[:, None] & valid, whole, 0.0)
+        return namespace(self.q).where(valid[:, None] & valid, monodromy(self.through), 0.0)
 
 
 _hosted, _flows, _turns = Memory(), Memory(), Memory()
@@ -384,7 +385,7 @@ def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
         now, tr = np.flatnonzero(code == g), s.transitions[g]
         a = s.chart_index(tr.source)
         n, point = s.dims[a], (t[now], q[now, : s.dims[a]].T, u[:, now])
-        by = np.moveaxis(kernels.linear_reset(s, s.member(g), *point), -1, 0)
+        by = np.moveaxis(kernels.reset(s, s.member(g), *point), -1, 0)
         m, by_t, by_q, by_u = by.shape[1], by[:, :, 1], by[:, :, 2 : 2 + n], by[:, :, 2 + n :]
         if isinstance(tr.guard, Scheduled):
             guard = kernels.due(s, g, *point)[0].T

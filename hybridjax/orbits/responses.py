@@ -33,7 +33,7 @@ from ..errors import ComputationError, DefinitionError
 from ..systems.sliding import SlidingChart
 from ..systems.structure import Structure
 from .crossing import to_section
-from .linear_flow import LinearFlow, by_name, linear_flow, polynomials, rule
+from .linear_flow import NODES, LinearFlow, by_name, linear_flow
 from .return_map import SINGULAR, ReturnMap
 
 
@@ -240,28 +240,25 @@ class Responses(eqx.Module):
         **Raises:** `DefinitionError` for names that do not exist, too few harmonics, and a cycle
         that is driven by a clock.
         """
-        flow, xp = self.flow, namespace(self.flow.q)
+        flow, xp, period = self.flow, namespace(self.flow.q), self.period
         signal, column = self._input(input)
         # Nodes within parts of pieces that resolve the fastest wave.
-        parts = 1 + harmonics // 2
-        x = ((np.arange(parts)[:, None] + rule().nodes) / parts).ravel()
-        mix = polynomials(x) @ rule().coefficients
-        turn, period = flow.length[:, None] / self.period, self.period
-        phase = flow.turn[:, None] / period + turn * x
-        Z = xp.einsum("pki,pki->pk", self._covector(None), flow.by_input[..., column]) @ mix.T
+        parts, (x, weight) = 1 + harmonics // 2, np.polynomial.legendre.leggauss(NODES)
+        x = ((np.arange(parts)[:, None] + (x + 1) / 2) / parts).ravel()
+        phase = ((flow.turn[:, None] + flow.length[:, None] * x) / period).ravel()
+        weight = (flow.length[:, None] / period * np.tile(weight / 2 / parts, parts)).ravel()
+        pushed = xp.einsum("pki,pki->pk", self._covector(None), flow.by_input[..., column])
+        chart, Z, states = flow.at(phase, period, pushed, flow.q)
         if isinstance(push, str):
             require_among("state", [push], self.structure.state_names(), "`push`: ")
-            chart, states = xp.repeat(flow.chart, len(x)), mix @ flow.q
-            wave = by_name(self.structure, chart, states.reshape(len(chart), -1))[push]
+            wave = by_name(self.structure, chart, states)[push]
         else:
-            wave = xp.asarray(push(phase.ravel()), float)
-        n = np.arange(harmonics + 1)[:, None, None]
-        weight = turn * np.tile(rule().weights / parts, parts)
-        weight = xp.exp(-2j * np.pi * n * phase) * weight
-        wave = xp.sum(weight * wave.reshape(phase.shape), axis=(1, 2))
-        response = xp.sum(weight * Z, axis=(1, 2))
+            wave = xp.asarray(push(phase), float)
+        n = np.arange(harmonics + 1)
+        weight = xp.exp(-2j * np.pi * n[:, None] * phase) * weight
+        wave, response = weight @ wave, weight @ Z
         for x in self.impulses():
-            response += xp.exp(-2j * np.pi * n[:, 0, 0] * x.phase) * x.weight[signal] / period
+            response += xp.exp(-2j * np.pi * n * x.phase) * x.weight[signal] / period
         c = xp.conj(response) * wave / period
         if on_host(c) and np.abs(c[len(c) * 3 // 4 :]).max() > 1e-3 * np.abs(c).max():
             raise DefinitionError(f"`harmonics` = {harmonics} does not resolve jumps of the push.")
@@ -327,18 +324,14 @@ def responses(cycle: Any, modes: int | None) -> Responses:
         )
     values, right, left = _modes(whole, map.sizes, modes)
     exponents = xp.log(values) / period
-    adjoint, to_go = flow.adjoint, period - (flow.t - flow.t[0, 0])
-
-    def nodes(ends):
-        return xp.einsum("pkij,pjr->rpki", adjoint, flow.backward(adjoint, xp.stack(ends, axis=1)))
-
-    phase = nodes([Z])[0] if not clocked else None
-    amplitudes = xp.zeros((0, *flow.q.shape), complex)
-    if len(left):  # they grow by their exponents; rounding adds responses of the phase
-        amplitudes = nodes(left) * xp.exp(-exponents[:, None, None] * to_go)[..., None]
-        if phase is not None:
-            slip = xp.einsum("rpki,pki->rpk", amplitudes, flow.field)
-            amplitudes = amplitudes - slip[..., None] * phase
+    phase = None if clocked else flow.covectors(Z[:, None])[..., 0]
+    # Amplitudes grow by their exponents; rounding adds responses of the phase.
+    to_go = period - (flow.t - flow.t[0, 0])[..., None]
+    amplitudes = xp.moveaxis(flow.covectors(left.T), -1, 0)
+    amplitudes = amplitudes * xp.exp(-exponents[:, None, None, None] * to_go)
+    if phase is not None:
+        slip = xp.einsum("rpki,pki->rpk", amplitudes, flow.field)
+        amplitudes = amplitudes - slip[..., None] * phase
     if host and not np.any(np.iscomplex(exponents)):
         amplitudes, right = np.real(amplitudes), np.real(right)
     total = int(np.sum(map.valid)) - (not clocked) if host else len(values)
@@ -413,33 +406,22 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
         count = kept if count is None else count
         if count > kept:
             raise DefinitionError(f"{count} modes were asked for; {kept} have amplitudes.")
-    values, right = values[order][:count], right[:, order][:, :count]
-    out = [_eigenpairs(scaled, values[k], right[:, k]) for k in range(len(values))]
-    values = xp.asarray([x for x, *_ in out]) if out else values[:0]
-    rights, lefts = [], []
-    for _, r, l in out:
-        r, l = r * size, l / size
-        largest = xp.argmax(xp.abs(l) * size)
-        l = l * xp.conj(l[largest]) / xp.abs(l[largest]) / xp.sqrt(xp.sum(xp.abs(l) ** 2))
-        rights.append(r / (l @ r))
-        lefts.append(l)
-        if on_host(M):
-            apart = np.abs(l @ r) * np.sqrt(np.sum(np.abs(r / size) ** 2))
-            if not apart > SINGULAR * np.linalg.norm(l * size) * np.sum(np.abs(r / size) ** 2):
-                raise ComputationError(
-                    "two multipliers coincide, and their modes have no amplitudes of their own: "
-                    "ask for the phase alone by `modes=0`, or change a parameter."
-                )
-    return values, xp.stack(rights) if rights else right.T[:0], lefts
+    modes = [_mode(scaled, size, values[k], right[:, k]) for k in order[:count]]
+    if not modes:
+        return values[:0], right[:0], right[:0]
+    return tuple(xp.stack(x) for x in zip(*modes, strict=True))
 
 
-def _eigenpairs(M: Float[Array, "d d"], value, right):
-    """An eigenvalue with its right and left eigenvectors near an approximation, by one Newton step,
-    which also carries derivatives."""
+def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
+    """An eigenvalue of M with its right and left eigenvectors, in units of the states, near an
+    approximation, by one Newton step, which also carries derivatives.
+
+    **Raises:** `ComputationError` for one that coincides with another.
+    """
     xp, n = namespace(M), len(M)
     still = stop_gradient(M)
 
-    def pair(M, still, x, value):
+    def pair(M, still, x):
         matrix = xp.concatenate([still - value * np.eye(n), xp.conj(x)[None]])
         column = xp.append(-x, 0.0)[:, None]
         off = xp.append(M @ x - value * x, 0.0)
@@ -447,9 +429,17 @@ def _eigenpairs(M: Float[Array, "d d"], value, right):
         return x - step[:n], value - step[n]
 
     *_, rows = xp.linalg.svd(still.T - value * np.eye(n))  # the last is contracted most
-    right, root = pair(M, still, right, value)
-    left, _ = pair(M.T, still.T, xp.conj(rows[-1]), value)
-    return root, right, left
+    (right, root), (left, _) = pair(M, still, right), pair(M.T, still.T, xp.conj(rows[-1]))
+    if on_host(M):
+        apart = np.abs(left @ right) / (np.linalg.norm(left) * np.linalg.norm(right))
+        if not apart > SINGULAR:
+            raise ComputationError(
+                "two multipliers coincide, and their modes have no amplitudes of their own: "
+                "ask for the phase alone by `modes=0`, or change a parameter."
+            )
+    largest, left = left[xp.argmax(xp.abs(left))], left / size
+    left = left * xp.conj(largest) / xp.abs(largest) / xp.sqrt(xp.sum(xp.abs(left) ** 2))
+    return root, right * size / (left @ (right * size)), left
 
 
 def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
