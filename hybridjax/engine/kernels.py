@@ -158,9 +158,7 @@ def _outputs(a: int, s: Structure, items: Items, t, q, u):
 def _due(g: int, s: Structure, t, q, u):
     guard = under(s, u).transitions[g].guard
     assert isinstance(guard, Scheduled)
-    offset, period = guard.numbers(t)
-    tick = offset + jax.lax.stop_gradient(jnp.round((t - offset) / period)) * period
-    return jnp.stack([tick - t])
+    return jnp.stack([guard.nearest(t) - t])
 
 
 def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q):

@@ -19,11 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Inexact, Int
 
+from .._core.executor import namespace
 from .._core.host_derivatives import NotOnHostError
 from ..systems.structure import Member, Structure
 from ..systems.transition import Scheduled
 from . import kernels
-from .arrays import Index, Inputs, Mask, Padded, Times
+from .arrays import Array, Index, Inputs, Mask, Padded, Times
 from .events import apply_resets, scheduled_time
 from .lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Lanes, Tape, fixed, for_each_chart, needed, only
 from .runge_kutta import Step, take_step
@@ -156,7 +157,8 @@ def chain(
     n, moves = 1 + s.d, recorded_moves(lanes, tape)
     end, by = _linear_moves(s, moves, target)
     if across is not None:
-        by[:, :, 1:n] = by[:, :, 1:n] @ _across(s, moves, across)
+        f = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
+        by[:, :, 1:n] = by[:, :, 1:n] @ projections(f, np.asarray(across)[moves.chart])
     columns, ends = _products(moves, by, len(lanes.t)), np.concatenate([lanes.t[None], lanes.q])
     ends[:, moves.lane] = end.T  # (the last move of a lane comes last)
     return columns[:, :, 1:n] if of_states else columns, ends
@@ -247,17 +249,12 @@ def _linear_moves(s: Structure, moves: Moves, target: Target) -> _Linear:
     return linear
 
 
-def _fields(s: Structure, moves: Moves) -> Float[np.ndarray, "d M"]:
-    """The field where moves start."""
-    return slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1)))
-
-
-def _across(s: Structure, moves: Moves, sizes) -> Float[np.ndarray, "M d d"]:
-    """Projections of states along the flow where moves start, orthogonal in sizes."""
-    size = sizes[moves.chart]
-    f = _fields(s, moves).T / size
-    f = f / np.linalg.norm(f, axis=1, keepdims=True)
-    return np.eye(s.d) - (size * f)[:, :, None] * (f / size)[:, None, :]
+def projections(f: Float[Array, "*K d"], sizes: Float[Array, "*K d"]) -> Float[Array, "*K d d"]:
+    """Projections of states along the flow f, orthogonal in sizes."""
+    xp, f = namespace(f), f / sizes
+    f = f / xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
+    project = np.eye(f.shape[-1]) - f[..., :, None] * f[..., None, :]
+    return project * sizes[..., :, None] / sizes[..., None, :]
 
 
 def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:

@@ -192,9 +192,7 @@ def _columns(s: Structure, flow: LinearFlow, white: Strengths) -> Float[Array, "
     require_among("state or input", white, [*s.state_names(), *s.inputs], "`white`: ")
     names = [(*chart.states, *[""] * s.d)[: s.d] for chart in s.charts]
     of_states = xp.asarray([[white.get(x, 0.0) for x in states] for states in names])
-    direct = of_states[flow.chart][:, None, :, None] * np.eye(s.d)
-    pushed = surface(s, flow)
-    direct = xp.broadcast_to(direct, flow.by_state.shape) if pushed is None else pushed @ direct
+    direct = surface(s, flow) @ (of_states[flow.chart][:, None, :, None] * np.eye(s.d))
     driven = flow.by_input * np.array([white.get(x, 0.0) for x in s.inputs])
     return xp.concatenate([direct, driven], axis=-1)
 

@@ -26,7 +26,7 @@ from .._core.results import Result
 from .._core.signal import unit_of
 from .._core.text import number
 from ..engine import kernels
-from ..engine.lanes import start_lanes
+from ..engine.lanes import lane_at
 from ..engine.move import move
 from ..engine.target import toward
 from ..errors import ComputationError, DefinitionError
@@ -166,8 +166,8 @@ class Responses(eqx.Module):
     of_phase: Float[Array, "P K d"] | None
     """The phase response in time; `None` if clocked."""
     of_amplitudes: Inexact[Array, "r P K d"]
-    surface: Float[Array, "P K d d"] | None
-    """The effect of a push, less what sliding undoes; `None` without sliding."""
+    surface: Float[Array, "P K d d"]
+    """The effect of a push, less what sliding undoes."""
 
     def phase(self, phase: Phases, unit: Unit = "time") -> dict[str, Float[Array, " p"]]:
         """Change of the phase after a brief push at some phases, by names of states and inputs.
@@ -272,11 +272,10 @@ class Responses(eqx.Module):
         kinds += [f"amplitude {k}: exponent {number(x)}" for k, x in enumerate(self.exponents)]
         if self.left_out:
             kinds.append(f"{self.left_out} faster modes left out")
-        has_any = self.of_phase is not None or len(self.exponents)
-        impulses = self.impulses(0 if self.of_phase is None else None) if has_any else ()
-        acting = [x.event for x in impulses if any(x.weight.values())]
-        if acting:
-            kinds.append(f"inputs act at {', '.join(dict.fromkeys(acting))}: see `impulses()`")
+        acting = self.flow.event[np.any(self.flow.jumps.by_input, axis=(1, 2))]
+        if len(acting):
+            names = dict.fromkeys(self.structure.transitions[g].name for g in acting)
+            kinds.append(f"inputs act at {', '.join(names)}: see `impulses()`")
         period = number(self.period, 9, self.structure.system.time_unit)
         return f"Responses({name}: period {period})" + "".join(f"\n  {x}" for x in kinds)
 
@@ -301,8 +300,7 @@ class Responses(eqx.Module):
         flow, s = self.flow, self.structure
         xp = namespace(flow.q)
         pushed = xp.einsum("pki,pkiu->pku", covector, flow.by_input)
-        if self.surface is not None:
-            covector = xp.einsum("pki,pkij->pkj", covector, self.surface)
+        covector = xp.einsum("pki,pkij->pkj", covector, self.surface)
         chart, states, inputs = flow.at(phase, self.period, covector, pushed)
         named = by_name(s, chart, states) | dict(zip(s.inputs, inputs.T, strict=True))
         return {name: value * scale for name, value in named.items()}
@@ -346,15 +344,12 @@ def asymptotic_phase(cycle: Any, chart: str, state: Float[np.ndarray, " n"], tur
     """The asymptotic phase of a state (see `LimitCycle.asymptotic_phase`)."""
     map, period = cycle.return_map, float(cycle.period)
     s, a = map.structure, map.structure.chart_index(chart)
-    if state.shape != (s.dims[a],):
-        raise DefinitionError(f"`state` must give the {s.dims[a]} states of chart '{chart}'.")
-    phase, size = to_host(responses(cycle, 0)._covector(None))[0, 0], map.sizes
+    lanes = begin = lane_at(s, chart, state, map.anchor.t[0], "`state`")
+    phase, size = responses(cycle, 0)._covector(None)[0, 0], map.sizes
     near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase
     surface = getattr(s.charts[a], "surface", None)
     if surface is not None and abs(float(surface(map.anchor.t[0], state))) > near:
         raise DefinitionError(f"`state` does not lie on the surface on which '{chart}' slides.")
-    q = np.pad(state, (0, s.d - s.dims[a]))[:, None]
-    lanes = begin = start_lanes(s, map.anchor.t, np.array([a], np.int32), q)
     for _ in range(turns):
         target = toward(np.full(1, np.inf), -1, lanes.t + 3 * period)
         target = to_section(target, map.base, map.event)
@@ -442,10 +437,10 @@ def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
     return root, right * size / (left @ (right * size)), left
 
 
-def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
+def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"]:
     """The effect of pushes in charts of sliding; identity in others."""
     if not any(isinstance(chart, SlidingChart) for chart in s.charts):
-        return None
+        return namespace(flow.q).broadcast_to(np.eye(s.d), flow.by_state.shape)
     effect = flow.evaluated(s, ft.partial(kernels.linear, s, _returned), s.d**2)
     return effect[..., 0].reshape(flow.by_state.shape)
 
