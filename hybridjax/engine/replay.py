@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Inexact, Int
+from jaxtyping import Float, Int
 
 from .._core.executor import namespace
 from .._core.host_derivatives import NotOnHostError
@@ -132,13 +132,6 @@ class Moves(NamedTuple):
     """Number of moves of the same lane before this one."""
 
 
-class _Linear(NamedTuple):
-    """(t, q) after some moves, and its derivatives by (t, q, u) before them: moves come first."""
-
-    end: Inexact[np.ndarray, "M n"]
-    by: Inexact[np.ndarray, "M n m"]
-
-
 def chain(
     s: Structure,
     lanes: Lanes,
@@ -238,15 +231,15 @@ class Variation:
         return t + aside[0], chart, q + aside[1:], u
 
 
-def _linear_moves(s: Structure, moves: Moves, target: Target) -> _Linear:
+def _linear_moves(s: Structure, moves: Moves, target: Target) -> tuple[np.ndarray, np.ndarray]:
+    """(t, q) after some moves (M, n), and its derivatives by (t, q, u) before them (M, n, m)."""
     n, M = 1 + s.d, len(moves.t)
-    number = target.time.dtype
-    linear = _Linear(np.zeros((M, n), number), np.zeros((M, n, n + s.nu), number))
+    end, by = (np.zeros((M, *x), target.time.dtype) for x in ((n,), (n, n + s.nu)))
     for a in np.unique(moves.chart):
         in_chart = np.flatnonzero(moves.chart == a)
-        of_chart = _linear(s, int(a), Moves(*(x[..., in_chart] for x in moves)), target)
-        linear.end[in_chart], linear.by[in_chart] = of_chart
-    return linear
+        of_chart = Moves(*(x[..., in_chart] for x in moves))
+        end[in_chart], by[in_chart] = _linear(s, int(a), of_chart, target)
+    return end, by
 
 
 def projections(f: Float[Array, "*K d"], sizes: Float[Array, "*K d"]) -> Float[Array, "*K d d"]:
@@ -272,7 +265,7 @@ def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
     )  # fmt: skip
 
 
-def _linear(s: Structure, a: int, moves: Moves, target: Target) -> _Linear:
+def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndarray, np.ndarray]:
     """Moves that start in chart a."""
     n, M, code = s.dims[a], len(moves.t), moves.code
     u = kernels.unpushed(s, moves.lane)
@@ -333,7 +326,7 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> _Linear:
         by[np.ix_(now, np.arange(1, 1 + m), columns)] = dnew
     end[:, 0] = t
     by[:, :1, columns] = dt
-    return _Linear(end, by)
+    return end, by
 
 
 def _linear_step(s: Structure, a: int, t, q, u, h):

@@ -131,18 +131,15 @@ def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets
     pieces = forward, _pad(collected, n), jump, added
     (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
     M, last = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0), xp.eye(n)
-    diffusion, to_end = xp.zeros(()), flow.covectors(xp.eye(d))
-    across = np.eye(d)
-    if not clocked:
-        _, Z = loop(map, M[:d, :d], f)
-        if not events:
-            delay = to_section(map, f)[0][None]
-            last = _timing(np.eye(d)[None], delay, np.ones(1, bool), np.ones((1, 1), bool))[0]
-        diffusion = Z @ Q[:d, :d] @ Z / period
-        # (A state ahead of the cycle meets the next events earlier.)
-        ahead = xp.concatenate([-f, xp.ones(1), xp.zeros(E)])
-        last = last + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
-        across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
+    _, Z = loop(map, M[:d, :d], f)
+    if not (clocked or events):
+        delay = to_section(map, f)[0][None]
+        last = _timing(np.eye(d)[None], delay, np.ones(1, bool), np.ones((1, 1), bool))[0]
+    diffusion, to_end = Z @ Q[:d, :d] @ Z / period, flow.covectors(xp.eye(d))
+    # (A state ahead of the cycle meets the next events earlier.)
+    ahead = xp.concatenate([-f, xp.ones(1), xp.zeros(E)])
+    last = last + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
+    across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
     step, Q = last @ M, last @ Q @ last.T
     joint = _pad(_stationary(step[:d, :d], Q[:d, :d]), n)
     for _ in range(2):  # durations follow from the states of this turn and from the last

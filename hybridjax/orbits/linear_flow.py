@@ -18,15 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
 from .._core.boundary.checked import NeedsValues
-from .._core.executor import (
-    Array,
-    is_inside_program,
-    is_traced,
-    namespace,
-    on_host,
-    scan,
-    to_host,
-)
+from .._core.executor import Array, is_hidden, namespace, on_host, scan, to_host
 from .._core.host_derivatives import by_columns
 from .._core.memo import Memory, remembered
 from ..engine import kernels
@@ -236,7 +228,7 @@ def keep_turn(cycle: Any, turn: Turn) -> None:
 
 def hosted(cycle: Any) -> Any:
     """The cycle with its arrays on the host, the same at each call; itself if JAX traces it."""
-    if is_traced(cycle) or is_inside_program() or on_host(cycle.period):
+    if is_hidden(cycle) or on_host(cycle.period):
         return cycle
     return _hosted.recall(cycle, None, lambda: to_host(cycle))
 
@@ -265,7 +257,7 @@ _STEPS = 4
 def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = None) -> LinearFlow:
     """The flow linearized at nodes of pieces, whose states follow from the recorded steps; or its
     derivatives in the directions `by` of the cycle."""
-    if is_traced(cycle) or is_inside_program():
+    if not on_host(cycle.period):
         raise NeedsValues(
             "responses, sensitivities, fluctuations and HTFs in continuous time need the values of "
             "a cycle, which `jit` and `vmap` hide: call them outside (`grad` and `jvp` work there)."

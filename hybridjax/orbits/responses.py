@@ -95,14 +95,15 @@ class Coupling(eqx.Module):
     coefficients: Complex[Array, " n"]
 
     def __call__(self, lead: Phases) -> Float[Array, " p"]:
-        return _series(self.coefficients, lead)
+        xp, n = namespace(self.coefficients), np.arange(len(self.coefficients))
+        waves = xp.exp(2j * np.pi * xp.asarray(lead)[..., None] * n)
+        return xp.real(waves @ (self.coefficients * np.where(n == 0, 1, 2)))
 
     @property
     def locking(self) -> tuple[float, float]:
         """The least and the largest frequency of a push that the cycle follows, less that of the
         cycle, per strength of the push: the Arnold tongue, to first order."""
-        c = to_host(self.coefficients)
-        values = _series(c, [x.lead for x in _zeros(2j * np.pi * np.arange(len(c)) * c)] or [0.0])
+        values = self([x.lead for x in self._slope._zeros()] or [0.0])
         return float(values.min()), float(values.max())
 
     def locked(self, detuning: float = 0.0, mutual: bool = False) -> tuple[Locked, ...]:
@@ -116,26 +117,26 @@ class Coupling(eqx.Module):
         """
         c = to_host(self.coefficients)
         c = np.conj(c) - c if mutual else -c
-        return _zeros(c + detuning * (np.arange(len(c)) == 0))
+        return Coupling(c + detuning * (np.arange(len(c)) == 0))._zeros()
 
+    @property
+    def _slope(self) -> "Coupling":
+        c = to_host(self.coefficients)
+        return Coupling(2j * np.pi * np.arange(len(c)) * c)
 
-def _series(c: Complex[Array, " n"], lead: Phases) -> Float[Array, " p"]:
-    xp, n = namespace(c), np.arange(len(c))
-    waves = xp.exp(2j * np.pi * xp.asarray(lead)[..., None] * n)
-    return xp.real(waves @ (c * np.where(n == 0, 1, 2)))
+    def _zeros(self) -> tuple[Locked, ...]:
+        """Zeros in one cycle, with the slopes there."""
+        from scipy import optimize  # (a third of a second)
 
-
-def _zeros(c: Complex[np.ndarray, " n"]) -> tuple[Locked, ...]:
-    """Zeros of a series in one cycle, and its slopes there."""
-    grid = (np.arange(16 * len(c) + 1) - 0.5) / (16 * len(c))
-    sign = np.sign(_series(c, grid))
-    crossed = zip(grid[:-1], grid[1:], sign[:-1] * sign[1:] < 0, strict=True)
-    value = lambda x: float(_series(c, x))  # noqa: E731
-    from scipy import optimize  # (a third of a second)
-
-    zeros = [optimize.root_scalar(value, bracket=(a, b)).root for a, b, turns in crossed if turns]
-    slopes = _series(2j * np.pi * np.arange(len(c)) * c, zeros)
-    return tuple(Locked(x % 1.0, float(rate)) for x, rate in zip(zeros, slopes, strict=True))
+        steps = 16 * len(self.coefficients)
+        grid = (np.arange(steps + 1) - 0.5) / steps
+        sign = np.sign(self(grid))
+        crossed = zip(grid[:-1], grid[1:], sign[:-1] * sign[1:] < 0, strict=True)
+        value = lambda x: float(self([x])[0])  # noqa: E731
+        roots = [
+            optimize.root_scalar(value, bracket=(a, b)).root for a, b, turns in crossed if turns
+        ]
+        return tuple(Locked(x % 1.0, float(self._slope([x])[0])) for x in roots)
 
 
 @checked_methods
@@ -312,10 +313,8 @@ def responses(cycle: Any, modes: int | None) -> Responses:
     host, xp, map = on_host(flow.t), namespace(flow.t), cycle.return_map
     period, clocked = map.expected, map.base is None
     whole = flow.monodromy(map.valid)
-    if not clocked:
-        f = flow.field[0, 0]
-        _, Z = loop(map, whole, f)
-        whole = whole - f[:, None] * Z
+    _, Z = loop(map, whole, flow.field[0, 0])
+    whole = whole - flow.field[0, 0, :, None] * Z
     if modes is None and not host:
         raise DefinitionError(
             "inside of `grad` and `jvp`, `responses` needs the number of `modes`."
@@ -370,11 +369,13 @@ def asymptotic_phase(cycle: Any, chart: str, state: Float[np.ndarray, " n"], tur
 
 def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
     """M - I + f w^T with w . f = 1, which is regular if the multiplier 1 is simple, and the phase
-    response at the beginning.
+    response at the beginning; M - I and zeros for a clock.
 
     **Raises:** `ComputationError` if it is not simple.
     """
     xp, size = namespace(f), map.sizes
+    if map.base is None:
+        return monodromy - xp.eye(len(f)), xp.zeros_like(f)
     along = f / size**2
     along = along / (along @ f)
     closed = monodromy - xp.eye(len(f)) + f[:, None] * along

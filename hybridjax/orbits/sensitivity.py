@@ -80,18 +80,16 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     # The parameter is an input of frequency 0; the other columns are those of the state at phase 0.
     starts, late, total = (x[..., 0] for x in flow.driven(xp.ones((*flow.t.shape, 1))))
     whole = xp.where(map.valid[:, None] & map.valid, total[:, 1:], 0.0)
+    closed, Z = loop(map, whole, f0)
+    longer = -(Z @ total[:, 0])
     if clocked:
         period_at = lambda k: jnp.asarray(varied.at(k).period(), float)  # noqa: E731
         longer = map.multiplicity * derivative_at_zero(period_at)
-        closed = whole - xp.eye(len(f0))
         if on_host(whole) and np.linalg.svd(closed, compute_uv=False)[-1] < SINGULAR:
             raise ComputationError(
                 "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
                 "branch by `continuation`."
             )
-    else:
-        closed, Z = loop(map, whole, f0)
-        longer = -(Z @ total[:, 0])
     begin = xp.linalg.solve(closed, -(total[:, 0] + f0 * longer))
     starts, late = starts[..., 0] + starts[..., 1:] @ begin, late[:, 0] + late[:, 1:] @ begin
     change = xp.einsum("pkab,pb->pka", flow.forward[0], starts)
