@@ -297,8 +297,9 @@ class SettledCycle:
         - `u` (n, nu): inputs, each held until the next section. Default: one cycle without inputs.
 
         **Returns:** a `Trajectory` in the chart `plant`, from time 0 on. Where the plant raises a
-        `hj.ComputationError` (a fall) it ends with `Result.PLANT_STOPPED`; other errors of the plant
-        are raised.
+        `hj.ComputationError` (a fall) it ends with `Result.PLANT_STOPPED`.
+
+        **Raises:** any other error of the plant.
         """
         u = np.zeros((self.sections.n_sections, len(self.inputs))) if u is None else np.asarray(u)
         drive, points, result = self.drive, list[At](), Result.OK
