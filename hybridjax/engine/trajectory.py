@@ -240,17 +240,20 @@ def simulate(
 def recorded(
     s: Structure, begin: Lanes, tapes: Sequence[Tape], u: np.ndarray, result: Result
 ) -> Trajectory:
-    """The trajectory of one lane, from the tapes of its pieces, under a constant input (nu, 1)."""
+    """The trajectory of one lane, from the tapes of its pieces, under a constant input (nu, 1), or
+    under another one in each piece (nu, pieces)."""
     rows = [(begin.t, begin.q.T, begin.q.T, begin.chart, np.full(1, -1))]
     for tape in tapes:
         tape = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
         columns = tape.t, tape.before, tape.after, tape.chart, tape.code
         rows.append(tuple(x[tape.code != IDLE] for x in columns))
     t, before, after, chart, event = (np.concatenate(x) for x in zip(*rows, strict=True))
-
-    source = np.concatenate([chart[:1], chart[:-1]])
+    source, until = np.append(chart[:1], chart[:-1]), u
+    if u.shape[1] > 1:
+        u = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
+        until, u = np.hstack([u[:, :1], u]), np.hstack([u, u[:, -1:]])
     with at_ease():
-        left, right = slopes(s, t, source, before.T, u).T, slopes(s, t, chart, after.T, u).T
+        left, right = slopes(s, t, source, before.T, until).T, slopes(s, t, chart, after.T, u).T
     return Trajectory(s, t, chart, before, after, left, right, event, result)
 
 

@@ -55,10 +55,7 @@ def cycle(
     """
     s = cycle.structure
     x, y = plane_of(s, x, y)
-    added: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
-    for name, other in added.items():
-        if other is not None and other.structure.names != s.names:
-            raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
+    require_same_system(s, sections, perturbed)
     orbit = cycle.trajectory(1 + 1e-6)  # with an event at the very end of a period
     with panels(ax, height=3.0) as axes:
         panel = axes[0, 0]
@@ -96,6 +93,16 @@ def plane_of(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
     y = next(n for n in everywhere if n != x) if y is None else y
     x, y = s.resolve_outputs((x, y)).names
     return x, y
+
+
+def require_same_system(
+    s: Structure, sections: PlacedSections | None, perturbed: Trajectory | None
+) -> None:
+    """**Raises:** `DefinitionError` if something is not of the system of a cycle."""
+    added: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
+    for name, other in added.items():
+        if other is not None and other.structure.names != s.names:
+            raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
 
 
 def pieces(trajectory: Trajectory, x: str, y: str):
