@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Index, Numbers
+from .._core.boundary.kinds import Numbers
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease
 from .._core.executor import to_host
@@ -15,17 +15,15 @@ from .._core.results import Result
 from ..engine.lanes import Tape
 from ..engine.move import Options, move
 from ..engine.trajectory import Trajectory, recorded
-from ..errors import ComputationError, DefinitionError
+from ..errors import ComputationError
 from ..sections.placed import PlacedSections
-from .data import ExperimentData
 from .response import require_shape
 
 
 @checked
 def perturbed_trajectory(
     placed: PlacedSections,
-    inputs: ExperimentData | Annotated[Numbers, Reals("samples inputs")],
-    experiment: Index = 0,
+    inputs: Annotated[Numbers, Reals("samples inputs")],
 ) -> Trajectory:
     """Return the motion from section 0 of the cycle under inputs that are held from section to
     section, for `hj.plot.animate` and `hj.plot.cycle`.
@@ -33,18 +31,13 @@ def perturbed_trajectory(
     **Arguments:**
 
     - `placed`: the sections of the experiments.
-    - `inputs`: data of experiments, or the inputs (n, nu) of a single one, in whole periods.
-    - `experiment`: index in the data. (One that did not start on the cycle differs until its
-        transient has decayed.) Default: 0.
+    - `inputs` (n, nu), in whole periods, such as `data.u[0]`. (An experiment that did not start on
+        the cycle differs until its transient has decayed.)
 
-    **Raises:** `DefinitionError` for an experiment that is not in the data, or inputs of another
-    shape; `ComputationError` if a section is not reached.
+    **Raises:** `DefinitionError` for inputs of another shape; `ComputationError` if a section is
+    not reached.
     """
     require_x64()
-    if isinstance(inputs, ExperimentData):
-        if experiment >= len(inputs.u):
-            raise DefinitionError(f"the data hold {len(inputs.u)} experiments, none {experiment}.")
-        inputs = inputs.u[experiment]
     held: np.ndarray = np.asarray(inputs)
     s, placed, N = placed.structure(), to_host(placed), placed.n_sections
     require_shape((1, *held.shape), N, s.nu)

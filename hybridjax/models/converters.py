@@ -16,10 +16,6 @@ from ..systems.transition import Scheduled, Transition
 
 # Symbols of a circuit, as steps from their begin, in units of their length.
 _COIL = [(k / 48, 0.1 * math.sin(math.pi * (k % 12) / 12)) for k in range(49)]
-_LOAD = [
-    *((0.0, 0.0), (0.2, 0.0), (0.2, 0.12), (0.8, 0.12), (0.8, -0.12), (0.2, -0.12), (0.2, 0.12)),
-    *((0.8, 0.12), (0.8, 0.0), (1.0, 0.0)),
-]
 _DIODE = [
     *((0.0, 0.0), (0.35, 0.0), (0.35, 0.15), (0.65, 0.0), (0.35, -0.15), (0.35, 0.0), (0.65, 0.0)),
     *((0.65, 0.15), (0.65, -0.15), (0.65, 0.0), (1.0, 0.0)),
@@ -37,8 +33,14 @@ def _along(
 
 def _plates(charge: ArrayLike) -> list[list]:
     """Both halves of a capacitor, the gap of which shows the charge, from 0 to 1."""
-    edges = zip((0, 1), (0.45, 0.55) + jnp.clip(charge, 0, 1) * jnp.array([-0.1, 0.1]), strict=True)
-    return [[(end, 0), (x, 0), (x, -0.25), (x, 0.25)] for end, x in edges]
+    gap = 0.05 + 0.1 * jnp.clip(charge, 0, 1)
+    ends = (0, 0.5 - gap), (1, 0.5 + gap)
+    return [[(end, 0), (x, 0), (x, -0.25), (x, 0.25)] for end, x in ends]
+
+
+def _load(begin: float, x: float) -> list:
+    """A resistor at x, and its wires from the capacitor to the supply."""
+    return [(begin, 1.0), *Drawing.spring((x, 1.0), (x, 0.0)), (0.0, 0.0)]
 
 
 class BuckConverter(HybridSystem):
@@ -102,7 +104,7 @@ class BuckConverter(HybridSystem):
             "coil": [(0.9, 1.0), *_along(_COIL, 1.0, 1.0)],
             "diode": _along(_DIODE, 1.0, 0.0, _UP),
             "upper plate": _along(above, 2.0, 1.0, _DOWN),
-            "load": [(2.0, 1.0), *_along(_LOAD, 3.0, 1.0, _DOWN), (0.0, 0.0)],
+            "load": _load(2.0, 3.0),
             "lower plate": _along(below, 2.0, 1.0, _DOWN),
         }
         return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
@@ -177,7 +179,7 @@ class CukConverter(HybridSystem):
             "second coil": _along(_COIL, 2.0, 1.0),
             "upper plate": _along(above, 3.0, 1.0, _DOWN),
             "lower plate": _along(below, 3.0, 1.0, _DOWN),
-            "load": [(3.0, 1.0), *_along(_LOAD, 3.7, 1.0, _DOWN), (0.0, 0.0)],
+            "load": _load(3.0, 3.7),
         }
         return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 

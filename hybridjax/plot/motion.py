@@ -18,6 +18,7 @@ from matplotlib.patches import Circle
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, FilePath, Positive, SignalNames
+from .._core.executor import to_host
 from .._core.results import Result
 from .._core.writing import replacing
 from ..engine.trajectory import Trajectory, observed
@@ -26,11 +27,14 @@ from ..experiments.data import ExperimentData
 from ..experiments.motion import perturbed_trajectory
 from ..orbits.continuation import Branch
 from ..orbits.cycle import LimitCycle
+from ..orbits.find import find_limit_cycle
 from ..sections.placed import PlacedSections
+from ..systems.quotient import Quotient
 from ..systems.structure import Structure
+from ..systems.system import Guess
 from .film import BODY, frames, gif, player
 from .look import COLORS, CYCLE, axis_of, close_in_notebook, style
-from .orbit import CHARTS, cycle as draw_cycle, pieces, plane_of, require_same_system
+from .orbit import CHARTS, by_chart, cycle as draw_cycle, plane_of, require_same_system
 from .over_parameters import branch as draw_branch
 from .pictures import Pictures, drawing_of
 from .plane import multipliers as draw_multipliers
@@ -159,7 +163,8 @@ def animate(
     **Arguments:**
 
     - `motion`: a limit cycle, a trajectory, or a branch, of which each frame is a cycle at another
-        value of the parameter.
+        value of the parameter. Where `hj.Quotient(half_period=)` halves a cycle, both halves are
+        drawn, with the multipliers of the whole (not beside `sections` or `perturbed`).
     - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
     - `sections`: from `place_sections`, on this cycle.
     - `perturbed`: a motion beside the cycle: a trajectory, from `simulate` or
@@ -187,6 +192,8 @@ def animate(
         if cycle is None or sections is None:
             raise DefinitionError("data of experiments need a limit cycle and their `sections`.")
         perturbed = perturbed_trajectory(sections, perturbed.u[0, : 4 * sections.n_sections])
+    if cycle is not None and sections is perturbed is None:
+        motion = cycle = _both_halves(cycle)
     s, unit = motion.structure, motion.system.time_unit
     if cycle is None and not sections is perturbed is None:
         raise DefinitionError("`sections` and `perturbed` are for limit cycles: animate the cycle.")
@@ -231,6 +238,15 @@ def animate(
         return Motion(figure, parts, times, length / pace / len(times), title)
 
 
+def _both_halves(cycle: LimitCycle) -> LimitCycle:
+    """The cycle of the system itself, where a `Quotient` with `half_period` has a half of it."""
+    s, anchor = cycle.structure, to_host(cycle.anchor)
+    a = int(anchor.chart[0])
+    at = Guess(s.names[a], anchor.q[: s.dims[a], 0], anchor.t[0])
+    whole = cycle.system.whole(at) if isinstance(cycle.system, Quotient) else None
+    return cycle if whole is None else find_limit_cycle(*whole)
+
+
 def _sheet() -> tuple[Figure, Any]:
     """A figure and its cells, at fixed places, so that labels find theirs before it is drawn."""
     figure = pyplot.figure(figsize=(4.8, 3.1), dpi=100)
@@ -268,7 +284,7 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
         lines, look = [x.lines.get(name, nowhere[None, :2]) for x in scenes], _GROUND
         if name == "ground":
             lines = [to_borders(line, size) for line in lines]
-            (marks,) = ax.plot([], [], **_GROUND)
+            (marks,) = ax.plot([], [], ls="", marker=[(0, 0), (-3, -4)], ms=8, **_GROUND)
             parts.append((marks, marks.set_data, _marks(lines, pictures, at, size)))
         else:
             look = {"color": next(colors), "lw": 1.6, "zorder": 3, "solid_joinstyle": "round"}
@@ -289,16 +305,14 @@ def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray,
 
 
 def _marks(lines, pictures: Pictures, at, size: float) -> list[Float[np.ndarray, "2 n"]]:
-    """Short strokes below the ground, at equal distances from one that moves with it."""
+    """Places on the ground, at equal distances from one that moves with it."""
     stride = abs(float(pictures.stride[0]))
     spacing = stride / max(1, round(stride / (0.1 * size))) or 0.1 * size
-    strokes = []
+    marks = []
     for line, begin in zip(lines, -pictures.camera(at)[:, 0], strict=True):
         x = begin % spacing + spacing * np.arange(*np.round(line[[0, -1], 0] / spacing))
-        y, gap = np.interp(x, *line.T), np.full_like(x, np.nan)
-        rows = (x, x - 0.03 * size, gap), (y, y - 0.04 * size, gap)
-        strokes.append(np.array([np.stack(row, axis=1).ravel() for row in rows]))
-    return strokes
+        marks.append(np.stack([x, np.interp(x, *line.T)]))
+    return marks
 
 
 def _traces(axes: list[Axes], tracks: list[Track], names: Sequence[str], events) -> list[Part]:
@@ -329,8 +343,8 @@ def _dots(ax: Axes, tracks: list[Track], plane, events, sections) -> list[Part]:
     marks, ring = list[tuple](), {"mfc": "none", "mew": 1.5, "zorder": 7}
     for track, names in zip(tracks, events, strict=True):
         if np.isinf(track.period) and len(tracks) == 1:
-            for _, x, y in pieces(track.trajectory, *plane):
-                ax.plot(x, y, color=track.color, lw=0.6, zorder=1)
+            for line in by_chart(track.trajectory, *plane).values():
+                ax.plot(*line, color=track.color, lw=0.6, zorder=1)
         points = track.observed(plane, track.times).T
         marks.append((points, {"ms": 6, "mfc": track.color, "mec": "white", "zorder": 8}))
         rings = np.where([[bool(x)] for x in names], points, np.nan)
@@ -357,9 +371,9 @@ def portrait(above: Axes, below: Axes, s: Structure, plane: tuple[str, str]) -> 
 
     def draw(cycle: LimitCycle) -> list[Artist]:
         path = cycle.trajectory(1 + 1e-6)  # with an event at the very end of a period
-        parts, gap = pieces(path, *plane), np.full((2, 1), np.nan)
+        curves = by_chart(path, *plane)
         for a, line in enumerate(orbits):
-            line.set_data(np.hstack([gap, *(x for b, *xy in parts if b == a for x in (xy, gap))]))
+            line.set_data(curves.get(a, ([], [])))
             line.set_linestyle("-" if cycle.stable else "--")
         rows = np.flatnonzero(path.event >= 0)
         ends = observed(s, plane, path.t[rows], path.chart[rows - 1], path.before[rows])

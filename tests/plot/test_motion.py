@@ -62,6 +62,14 @@ def test_files_and_refusals(walk, tmp_path):
         hj.plot.animate(walk.trajectory(), perturbed=walk.trajectory())
 
 
+def test_both_halves_of_a_cycle_are_drawn():
+    duffing = hj.models.Duffing()
+    half = hj.find_limit_cycle(hj.Quotient(duffing, flipped=("x", "v"), half_period=True))
+    motion = hj.plot.animate(half)
+    span = len(motion.times) * motion.times[1]
+    np.testing.assert_allclose([span, 2 * half.period], float(duffing.period()), rtol=1e-9)
+
+
 def test_no_input_gives_the_cycle():
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     placed = hj.place_sections(cycle, hj.ClockPhase(4))
