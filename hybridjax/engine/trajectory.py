@@ -109,7 +109,9 @@ class Trajectory(eqx.Module):
         chart = np.broadcast_to(self.chart[:-1, None], t.shape)
         keep = np.ones(t.shape, bool)
         keep[1:, 0] = self.event[1:-1] >= 0  # a step's start repeats the last end, but for resets
-        return t[keep], chart[keep], q[keep]
+        last = np.flatnonzero(self.event[-1:] >= 0) - 1
+        t, chart = np.append(t[keep], self.t[last]), np.append(chart[keep], self.chart[last])
+        return t, chart, np.vstack([q[keep], self.after[last]])
 
     def at(
         self, t: Annotated[Numbers, Reals("p")]
@@ -122,10 +124,11 @@ class Trajectory(eqx.Module):
         t = np.asarray(t)
         if len(t) and not self.t[0] <= t.min() <= t.max() <= self.t[-1]:
             raise DefinitionError(f"times must lie between {self.t[0]:.9g} and {self.t[-1]:.9g}.")
-        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
-        h = np.diff(self.t)[k, None]
+        k = np.searchsorted(self.t, t, side="right") - 1
+        j = np.minimum(k + 1, len(self.t) - 1)
+        h = (self.t[j] - self.t[k])[:, None]
         x = np.divide(t[:, None] - self.t[k, None], h, out=np.zeros_like(h), where=h > 0)
-        ends = self.after[k], self.before[k + 1], self.slope_after[k], self.slope_before[k + 1]
+        ends = self.after[k], self.before[j], self.slope_after[k], self.slope_before[j]
         return self.chart[k], interpolate(x, h, *ends)
 
     def __call__(self, *names: str, per_step: Count = 32) -> tuple[np.ndarray, ...]:

@@ -125,8 +125,8 @@ class Track(NamedTuple):
 
     def wrapped(self, t: Any) -> Any:
         """Times of the trajectory."""
-        first = self.trajectory.t[0]
-        return first + np.mod(t - first, self.period)
+        first, last = self.trajectory.t[[0, -1]]
+        return np.minimum(first + np.mod(t - first, self.period), last)
 
     def observed(self, names: Sequence[str], t: Float[np.ndarray, " p"]):
         """States or outputs (n, p) at times."""
@@ -202,7 +202,7 @@ def animate(
     plane = plane_of(s, x, y) if len(everywhere) > 1 or (x and y) else None
     default = (plane or everywhere)[:1] if has_picture else s.state_names()[:4]
     names = s.resolve_outputs(default if traces is None else traces).names
-    path = motion.trajectory(1 + 1e-6) if isinstance(motion, LimitCycle) else motion
+    path = motion.trajectory() if isinstance(motion, LimitCycle) else motion
     period = math.inf if cycle is None else float(cycle.period)
     last = perturbed or path
     length = period if cycle is not None and perturbed is None else float(np.ptp(last.t))
@@ -370,7 +370,7 @@ def portrait(above: Axes, below: Axes, s: Structure, plane: tuple[str, str]) -> 
     points = below.lines[-1]
 
     def draw(cycle: LimitCycle) -> list[Artist]:
-        path = cycle.trajectory(1 + 1e-6)  # with an event at the very end of a period
+        path = cycle.trajectory()
         curves = by_chart(path, *plane)
         for a, line in enumerate(orbits):
             line.set_data(curves.get(a, ([], [])))
@@ -411,9 +411,7 @@ def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) ->
         cursor = left.axvline(values[0], color="black", lw=0.8)
         draw_cycle = portrait(above, below, cycles[0].structure, plane)
         for cycle in cycles:
-            above.plot(
-                *cycle.trajectory(1 + 1e-6)(*plane)[1:], color=COLORS["gray"], lw=0.3, alpha=0.3
-            )
+            above.plot(*cycle.trajectory()(*plane)[1:], color=COLORS["gray"], lw=0.3, alpha=0.3)
             moved = draw_cycle(cycle)
             widened(below)
         text = above.set_title("", loc="left")

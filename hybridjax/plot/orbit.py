@@ -57,7 +57,7 @@ def cycle(
     s = cycle.structure
     x, y = plane_of(s, x, y)
     require_same_system(s, sections, perturbed)
-    orbit = cycle.trajectory(1 + 1e-6)  # with an event at the very end of a period
+    orbit = cycle.trajectory()
     with panels(ax, height=3.0) as axes:
         panel = axes[0, 0]
         if perturbed is not None:

@@ -30,7 +30,7 @@ def test_states_at_times_lie_on_the_trajectory(walk):
 
 def test_feet_do_not_slide_and_the_loop_closes(walk):
     period = float(walk.period)
-    path = walk.trajectory(1 + 1e-6)
+    path = walk.trajectory()
     pictures = Pictures(path, period)
     strike = path.t[path.event >= 0][-1]
     before, after = pictures.at(np.array([strike - 1e-9, strike]))
