@@ -128,7 +128,7 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     np.testing.assert_allclose(phase, exact / (2 * np.pi), rtol=1e-9)
 
 
-def test_the_closed_form_of_a_response_has_its_derivative_in_both_modes():
+def test_the_closed_form_of_a_response_has_its_derivative():
     section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
     near = hj.find_limit_cycle(StuartLandau(), guess, section=section)
 
@@ -136,10 +136,10 @@ def test_the_closed_form_of_a_response_has_its_derivative_in_both_modes():
         cycle = hj.find_limit_cycle(StuartLandau(mu=mu), near)
         return cycle.responses(modes=0).phase(jnp.asarray(PHASES), "radians")["x"]
 
-    angle, mu = 2 * np.pi * PHASES, jnp.asarray(0.1)
+    angle = 2 * np.pi * PHASES
     exact = (np.sin(angle) - 0.4 * np.cos(angle)) / (2 * 0.1**1.5)
-    for derivative in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(derivative(response)(mu), exact, rtol=0, atol=1e-9)
+    tangent = jax.jvp(response, (0.1,), (1.0,))[1]  # (in reverse mode: the slow test)
+    np.testing.assert_allclose(tangent, exact, rtol=0, atol=1e-9)
 
 
 def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
