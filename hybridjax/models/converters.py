@@ -20,14 +20,12 @@ _DIODE = [
     *((0.0, 0.0), (0.35, 0.0), (0.35, 0.15), (0.65, 0.0), (0.35, -0.15), (0.35, 0.0), (0.65, 0.0)),
     *((0.65, 0.15), (0.65, -0.15), (0.65, 0.0), (1.0, 0.0)),
 ]
-_DOWN, _UP = (0, -1), (0, 1)
+_WAYS = {"right": (1, 0), "up": (0, 1), "down": (0, -1)}
 
 
-def _along(
-    symbol: Sequence[tuple[Any, Any]], x: float, y: float, way: tuple[int, int] = (1, 0)
-) -> list:
+def _along(symbol: Sequence[tuple[Any, Any]], x: float, y: float, way: str = "right") -> list:
     """A symbol of length 1 from (x, y) on."""
-    c, s = way
+    c, s = _WAYS[way]
     return [(x + c * a - s * b, y + s * a + c * b) for a, b in symbol]
 
 
@@ -102,10 +100,10 @@ class BuckConverter(HybridSystem):
         lines = {
             "switch": [(0.0, 1.0), (0.2, 1.0), blade],
             "coil": [(0.9, 1.0), *_along(_COIL, 1.0, 1.0)],
-            "diode": _along(_DIODE, 1.0, 0.0, _UP),
-            "upper plate": _along(above, 2.0, 1.0, _DOWN),
+            "diode": _along(_DIODE, 1.0, 0.0, "up"),
+            "upper plate": _along(above, 2.0, 1.0, "down"),
             "load": _load(2.0, 3.0),
-            "lower plate": _along(below, 2.0, 1.0, _DOWN),
+            "lower plate": _along(below, 2.0, 1.0, "down"),
         }
         return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
@@ -175,10 +173,10 @@ class CukConverter(HybridSystem):
             "contact": [(1.0, 0.2), (1.0, 0.0)],
             "left plate": _along(left, 1.0, 1.0),
             "right plate": _along(right, 1.0, 1.0),
-            "diode": _along(_DIODE, 2.0, 1.0, _DOWN),
+            "diode": _along(_DIODE, 2.0, 1.0, "down"),
             "second coil": _along(_COIL, 2.0, 1.0),
-            "upper plate": _along(above, 3.0, 1.0, _DOWN),
-            "lower plate": _along(below, 3.0, 1.0, _DOWN),
+            "upper plate": _along(above, 3.0, 1.0, "down"),
+            "lower plate": _along(below, 3.0, 1.0, "down"),
             "load": _load(3.0, 3.7),
         }
         return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
