@@ -80,7 +80,7 @@ class Explorer:
             (self._gain,) = gain.semilogy([], [], color=CYCLE[0])
             pushed = f", {s.inputs[0]} to {plane[0]}" if s.nu else ""
             gain.set(xlabel="input frequency (cycles/period)", ylabel=f"$|H_0|${pushed}")
-            self._lost = self.figure.suptitle("", fontsize=8, color=COLORS["red"])
+            self._lost = self.figure.suptitle("", fontsize=8, color=COLORS["red"], wrap=True)
         self._easel: Easel | None = None
         self._draw()
         close_in_notebook(self.figure)
@@ -138,7 +138,8 @@ class Explorer:
         for k, (name, label, low, high) in enumerate(self._sliders, 1):
             ax = window.add_axes((0.25, 1 - k / (len(self._sliders) + 1), 0.55, 0.05))
             self._widgets.append(Slider(ax, label, low, high, valinit=self.values[name]))
-            self._widgets[-1].on_changed(lambda value, name=name: self.move({name: value}))
+            move = lambda value, name=name: self.move({name: value})  # type: ignore[misc]  # noqa: E731
+            self._widgets[-1].on_changed(move)
         pyplot.show()
 
     def widget(self) -> Any:

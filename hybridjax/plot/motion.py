@@ -61,7 +61,9 @@ class Motion(FuncAnimation):
     (of a branch, values of the parameter); `interval`, seconds from one frame to the next.
     """
 
-    def __init__(self, figure: Figure, parts: Sequence[Part], times, interval: float, title: str):
+    def __init__(
+        self, figure: Figure, parts: Sequence[Part], times: np.ndarray, interval: float, title: str
+    ):
         self.figure, self.times, self.interval = figure, times, interval
         self._parts, self._title = parts, title
         self._draw(0)

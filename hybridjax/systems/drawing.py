@@ -1,6 +1,6 @@
 """What a system looks like in one state, for animations: shapes by name, without matplotlib."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -22,8 +22,15 @@ def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
 
 def _shapes(*shape: int | None, **options: Any) -> Any:
     """A field of shapes by name."""
-    arrays = lambda shapes: {name: _array(name, x, shape) for name, x in shapes.items()}  # noqa: E731
+
+    def arrays(shapes: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: _array(name, x, shape) for name, x in shapes.items()}
+
     return eqx.field(converter=arrays, default_factory=dict, **options)
+
+
+def _velocity(value: ArrayLike | Sequence[ArrayLike]) -> Any:
+    return _array("velocity", value, (2,))
 
 
 class Drawing(eqx.Module):
@@ -50,13 +57,11 @@ class Drawing(eqx.Module):
     **Raises:** `DefinitionError` for other shapes, or a `body` that has no place.
     """
 
-    lines: dict[str, Float[Array, "_ 2"]] = _shapes(None, 2)
-    circles: dict[str, Float[Array, "3"]] = _shapes(3, kw_only=True)
-    points: dict[str, Float[Array, "2"]] = _shapes(2, kw_only=True)
+    lines: Mapping[str, Any] = _shapes(None, 2)
+    circles: Mapping[str, Any] = _shapes(3, kw_only=True)
+    points: Mapping[str, Any] = _shapes(2, kw_only=True)
     body: str | None = eqx.field(static=True, default=None, kw_only=True)
-    velocity: Float[Array, "2"] = eqx.field(
-        converter=lambda x: _array("velocity", x, (2,)), default=(0.0, 0.0), kw_only=True
-    )
+    velocity: Any = eqx.field(converter=_velocity, default=(0.0, 0.0), kw_only=True)
 
     def __check_init__(self):
         if self.body is not None and self.body not in {**self.circles, **self.points}:
