@@ -19,10 +19,9 @@ from .._core.progress import whole_call
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
-from ..engine.lanes import Lanes, Tape, side_by_side
-from ..engine.replay import divergence
+from ..engine.lanes import Lanes, Tape
 from ..engine.settings import Settings
-from ..engine.trajectory import Trajectory, recorded, simulate
+from ..engine.trajectory import Trajectory, observed, recorded, simulate
 from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics
 from ..linear.htf import HTF
@@ -32,7 +31,7 @@ from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
-from .linear_flow import last_turn, linear_flow
+from .linear_flow import hosted, last_turn, linear_flow, rule
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
@@ -163,7 +162,7 @@ class LimitCycle(eqx.Module):
             values = np.where(lost, 0.0, values)
             if lost.sum() == 1 and not self.event_sequence:  # it follows from the product of all
                 resolved = np.prod(values[~lost]).real
-                values[lost] = np.exp(log_determinant(self.return_map)) / resolved
+                values[lost] = np.exp(log_determinant(self)) / resolved
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
         values = values[np.argsort(-np.abs(values), kind="stable")]
         values.flags.writeable = False  # they are kept
@@ -179,7 +178,7 @@ class LimitCycle(eqx.Module):
         with np.errstate(divide="ignore"):
             logs = np.log(np.abs(self.multipliers))
         if not self.event_sequence and np.sum(np.isneginf(logs)) == 1:
-            logs[-1] = log_determinant(self.return_map) - np.sum(logs[:-1])
+            logs[-1] = log_determinant(self) - np.sum(logs[:-1])
         return logs
 
     @property
@@ -306,7 +305,7 @@ class LimitCycle(eqx.Module):
     def _checked(self) -> "LimitCycle":
         require_x64()
         self.require_current()
-        return self
+        return hosted(self)
 
     def __repr__(self):
         if is_traced(self):
@@ -393,12 +392,7 @@ def orbit_picture(
     names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
     if not names:
         return ""
-
-    def axes(t, chart, q):
-        columns = [np.array([s.charts[a].states.index(x) for a in chart]) for x in names]
-        values = [np.take_along_axis(q, c[:, None], axis=1)[:, 0] for c in columns]
-        return values if len(names) == 2 else [t, *values]
-
+    axes = lambda t, *point: [t, *observed(s, names, t, *point)][-2:]  # noqa: E731
     chart, (x, y) = turn[1], axes(*turn)
     curves = []
     for a in np.unique(chart):
@@ -407,10 +401,8 @@ def orbit_picture(
     if sections is not None:
         x, y = axes(*sections)
         curves.append(Curve(x, y, color="currentColor", points=True))
-    labels = [with_unit(x, unit_of(x)) for x in names]
-    if len(names) == 1:
-        labels.insert(0, with_unit("t", orbit.system.time_unit))
-    return picture(curves, *labels)
+    units = ("t", orbit.system.time_unit), *((x, unit_of(x)) for x in names)
+    return picture(curves, *(with_unit(*x) for x in units[-2:]))
 
 
 def fine_factors(cycle: LimitCycle) -> list[Matrix]:
@@ -419,8 +411,8 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
 
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
-    map, flow = to_host(cycle.return_map), linear_flow(cycle)
-    through, frames = flow.jumps.by_state @ flow.forward[0][:, -1], []
+    map, flow = hosted(cycle).return_map, linear_flow(cycle)
+    frames: list[tuple[int, Matrix, Matrix]] = []
     for chart, f in zip(flow.chart, flow.field[:, 0], strict=True):
         n = map.structure.dims[chart]
         basis, size = np.eye(n), np.asarray(map.scale)[chart, :n]
@@ -430,7 +422,7 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     factors: list[Matrix] = []
     for k, (n, _, into) in enumerate(frames):
         m, out, _ = frames[(k + 1) % len(frames)]
-        parts = out, through[k, :m, :n], into
+        parts = out, flow.through[k, :m, :n], into
         factor = np.linalg.multi_dot(parts)
         # (A zero that comes out as rounding would be a multiplier.)
         least = np.finfo(float).eps * np.prod([np.linalg.norm(x) for x in parts])
@@ -443,14 +435,14 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     return factors
 
 
-def log_determinant(map: ReturnMap) -> float:
+def log_determinant(cycle: LimitCycle) -> float:
     """The logarithm of the determinant of the monodromy of a cycle without events: the divergence
     of the field, integrated over one turn.
 
     Steps of an implicit method lose a mode that decays within them; this gives its decay.
     """
-    map = to_host(map)
-    return float(divergence(map.structure, *side_by_side(map.pieces())))
+    flow = linear_flow(cycle)
+    return float(flow.length @ np.trace(flow.by_state, axis1=2, axis2=3) @ rule().weights)
 
 
 def orbit(cycle: LimitCycle) -> Trajectory:
