@@ -315,7 +315,8 @@ class ReturnMap(eqx.Module):
             moved, extra = flow(lanes, target, h, result, piece)
             return (moved.lanes, moved.h, moved.result), extra
 
-        lanes, result = self.departure(q), xp.zeros(1, xp.int32)
+        lanes = self.departure(q)
+        result = lanes.events  # (none is `Result.OK`)
         h = (0.5 * self.expected / LEGS)[None]
         if isinstance(flow, Options):
             u, begin = xp.zeros((self.structure.nu, 1)), (lanes, stride(h), result)
