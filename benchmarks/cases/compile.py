@@ -12,7 +12,8 @@ the hopper's).
 
 `derivatives`: the gradient of a coefficient of the characteristic polynomial by the hopper's nine
 parameters, in reverse mode and outside of `jit`, and a fit of two parameters to HTFs; `again`: the
-second of each.
+second of each. `responses`: the first `cycle.responses()` of the hopper and of a neuron, and the
+hopper's `cycle.htf` at 620 frequencies again.
 
 The same in seconds of the processor (`cpu`), and as multiples of a yardstick that is measured
 beside them, `diffeqsolve.cpu`: the first call, in a fresh process, of `diffrax.diffeqsolve` for the
@@ -53,9 +54,10 @@ def run(show, options) -> None:
                 hopper = seconds[label.removeprefix("bar."), state, what]
                 show(f"{label}.{state}.{what}.times_hopper", value / hopper)
 
-    for name, value in call("compile", "derivatives").items():
-        show(f"derivatives.{name}.cpu", value)
-        show(f"derivatives.{name}.times_diffeqsolve", value / yardstick)
+    for job in ("derivatives", "responses"):
+        for name, value in call("compile", job).items():
+            show(f"{job}.{name}.cpu", value)
+            show(f"{job}.{name}.times_diffeqsolve", value / yardstick)
     for _, family in HOPPER[:1] if options.quick else HOPPER:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "cached", "later"):
@@ -142,6 +144,25 @@ def derivatives() -> dict[str, float]:
     return seconds
 
 
+def responses() -> dict[str, float]:
+    """CPU seconds of first responses, after the cycle was found, and of HTFs again."""
+    import numpy as np
+
+    import hybridjax as hj
+
+    hj.enable_x64()
+    hopper, seconds = hj.find_limit_cycle(hj.models.VerticalHopper()), {}
+    neuron, f = hj.find_limit_cycle(hj.models.FitzHughNagumo()), np.linspace(0.013, 9.987, 620)
+    htf = lambda: hopper.htf(f, range(-2, 3), ("yM", "vM"))  # noqa: E731
+    jobs = {"hopper": hopper.responses, "neuron": neuron.responses, "htf_first": htf}
+    for name, job in (jobs | {f"htf_again_{k}": htf for k in range(30)}).items():
+        begin = time.process_time()
+        job()
+        seconds[name] = time.process_time() - begin
+    again = [seconds.pop(f"htf_again_{k}") for k in range(30)]
+    return seconds | {"htf_again": min(again)}
+
+
 def diffeqsolve() -> float:
     """CPU seconds of the yardstick."""
     import diffrax
@@ -218,9 +239,8 @@ def main(model: str, family: str, folder: str | None) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "diffeqsolve":
-        print(json.dumps(diffeqsolve()))
-    elif sys.argv[1] == "derivatives":
-        print(json.dumps(derivatives()))
+    jobs = {x.__name__: x for x in (diffeqsolve, derivatives, responses)}
+    if sys.argv[1] in jobs:
+        print(json.dumps(jobs[sys.argv[1]]()))
     else:
         main(*sys.argv[1:3], sys.argv[3] if len(sys.argv) > 3 else None)

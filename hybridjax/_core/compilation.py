@@ -28,7 +28,7 @@ from jax.core import eval_context
 
 from ..errors import ComputationError
 from . import executor
-from .executor import from_host, is_inside_program, is_traced, on_cpu, on_the_cpu, to_host
+from .executor import from_host, is_hidden, on_cpu, on_the_cpu, to_host
 from .progress import say_compiling
 from .vector_math import rewrite
 
@@ -149,7 +149,7 @@ def quick_jit(function: Callable) -> Callable:
         with uncollected():
             # JAX allows options of the compiler at the top level only, and refuses them elsewhere
             # after it has traced the function.
-            if not on_cpu() or is_traced(arguments) or is_inside_program():
+            if not on_cpu() or is_hidden(arguments):
                 return plain(*arguments)
             result = quick()(*arguments)
             say_compiling(False)
@@ -179,7 +179,7 @@ def host_first(function: Callable, derived: Callable = lambda compiled: compiled
 
     @ft.wraps(function)
     def call(*arguments):
-        if is_traced(arguments) or is_inside_program():
+        if is_hidden(arguments):
             return transformed(*arguments)
         with on_the_cpu():
             return on_host(*arguments)
@@ -230,7 +230,7 @@ class TwoTiers:
         self._chosen: dict[tuple, tuple[_Program, jax.stages.Compiled]] = {}
 
     def __call__(self, *arguments: Any) -> Any:
-        if not _is_simple() or is_traced(arguments) or is_inside_program():
+        if not _is_simple() or is_hidden(arguments):
             return one_tier(self._function, self.large)(*arguments)
         key = self._function, _settings(), kind(arguments)
         arrays, static = eqx.partition(arguments, _is_array)

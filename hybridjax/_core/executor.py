@@ -162,6 +162,12 @@ def is_inside_program() -> bool:
     return is_traced(_constant())
 
 
+def is_hidden(*trees: Any) -> bool:
+    """Return whether a transformation of JAX hides the values of `trees`, or of all that is
+    computed."""
+    return is_traced(*trees) or is_inside_program()
+
+
 @jax.jit
 def _constant():
     return 0.0

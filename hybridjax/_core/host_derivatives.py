@@ -12,7 +12,7 @@ from jax.core import eval_context
 from jax.flatten_util import ravel_pytree
 
 from .compilation import at_ease, uncollected
-from .executor import from_host, is_inside_program, is_traced, on_the_cpu, to_host
+from .executor import from_host, is_hidden, is_inside_program, on_the_cpu, to_host
 from .lanes import JACOBIAN_COLUMNS
 
 
@@ -70,7 +70,7 @@ def by_columns(
         leaves, structure = jax.tree_util.tree_flatten(moving)
         ends = np.cumsum([x.size for x in leaves])
         is_small = len(leaves) and ends[-1] <= most
-        if is_traced(arguments) or is_inside_program() or not is_small:
+        if is_hidden(arguments) or not is_small:
             return eqx.filter_jvp(compiled, arguments, tangents)
         parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
         parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]

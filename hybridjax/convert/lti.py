@@ -14,7 +14,7 @@ from jaxtyping import Complex
 from .._core.arguments import package
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive, SignalNames
-from .._core.executor import is_traced, to_host
+from .._core.executor import is_traced
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
 from ..errors import ComputationError, DefinitionError
@@ -23,7 +23,7 @@ from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from ..orbits.continuous_htf import asked, observed
 from ..orbits.cycle import LimitCycle
-from ..orbits.linear_flow import linear_flow, rule
+from ..orbits.linear_flow import hosted, linear_flow, rule
 from ..systems.system import OutputNames
 
 
@@ -151,8 +151,10 @@ def to_harmonic_state_space(
     `ComputationError` if no order is large enough.
     """
     exact = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs).H.swapaxes(0, 1)
-    (z, _, columns), map, n = asked(cycle, outputs, inputs), to_host(cycle.return_map), order or 2
-    flow, s, period = linear_flow(cycle, 0.25 / (order or _MOST)), map.structure, map.expected
+    map, n = hosted(cycle).return_map, order or 2
+    s, period = map.structure, map.expected
+    z, _, columns = asked(s, cycle.event_sequence, outputs, inputs)
+    flow = linear_flow(cycle, 0.25 / (order or _MOST))
     jumps = flow.jumps.by_state - np.eye(s.d), flow.jumps.by_input
     if any(np.abs(x).max() > 1e-9 for x in jumps):
         raise DefinitionError(

@@ -6,7 +6,7 @@ Derivatives across an event (saltation) come from `watch.ChartFlow.locate` and `
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.executor import cond, namespace, put, stop_gradient
+from .._core.executor import cond, namespace, put
 from .._core.lanes import put_rows
 from ..systems.structure import Kind, Member, Structure
 from ..systems.transition import Scheduled
@@ -176,9 +176,7 @@ def scheduled_time(s: Structure, fired: Index, t: Times) -> Times:
     xp, time = namespace(t), t
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
-            offset, period = transition.guard.numbers(t)
-            k = stop_gradient(xp.round((t - offset) / period))
-            time = xp.where(fired == g, offset + k * period, time)
+            time = xp.where(fired == g, transition.guard.nearest(t), time)
     return time
 
 

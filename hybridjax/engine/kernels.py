@@ -1,9 +1,9 @@
 """Users' functions for code that runs on the host, each with its first derivatives.
 
-`watched`, `reset` and `enabled` also take and return arrays of JAX, the others NumPy's. A column of
-values stands before those of derivatives, by the time, the n states and the inputs: (rows, 2 + n +
-nu, L). Where only `some` lanes are needed, the others are copies of one of these; one lane may
-stand for all.
+`watched`, `reset`, `enabled` and `linear` also take and return arrays of JAX, the others NumPy's. A
+column of values stands before those of derivatives, by the time, the n states and the inputs:
+(rows, 2 + n + nu, L). Where only `some` lanes are needed, the others are copies of one of these;
+one lane may stand for all.
 """
 
 import functools as ft
@@ -18,12 +18,13 @@ from jaxtyping import Bool, Float, Int
 from .._core.compilation import kernel
 from .._core.executor import on_host
 from .._core.lanes import PerLane, by_lane
-from ..systems.solver import Method, Radau, as_method
+from ..systems.solver import Method
 from ..systems.structure import Kind, Member, Structure, stacked
 from ..systems.system import Output
 from ..systems.transition import Scheduled
+from ..systems.varied import under
 from .arrays import AnyInputs as Inputs, AnyTimes as Times, Array, States
-from .runge_kutta import Step, integrated_divergence, step_along as _along, take_step
+from .runge_kutta import Step, step_along as _along, take_step
 from .target import AbstractLevels
 
 
@@ -37,9 +38,7 @@ _POINTS = 16
 
 
 def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
-    """The field of chart a, and its derivatives."""
-    if not on_host(q):
-        return linear(s, _field, a, t, q, u)
+    """The field of chart a, and its derivatives (on the host)."""
     return s.kernel(_field, _expanded, a, lanes=_POINTS)(t, q, u, some=some)
 
 
@@ -56,22 +55,10 @@ def step_along(
     return Step(*rows[:5]), rows[5], rows[6]
 
 
-def linear_step(
-    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, by_stages: Any = None
-) -> Expanded:
+def linear_step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
-    states, inputs and length of the step. Those of explicit methods come `by_stages`, if that is
-    given, and need no program."""
-    if by_stages is not None and not s.method(a).implicit:
-        return by_stages(t, q, u, h)
+    states, inputs and length of the step."""
     return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=_POINTS)(t, q, u, h)
-
-
-def divergence(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Times:
-    """The divergence of the field of chart a, integrated over steps."""
-    method = s.method(a)
-    form = _ByMethod(_divergence, method if method.implicit else as_method(Radau()))
-    return s.kernel(_field, form, a, lanes=_POINTS)(t, q, u, h)
 
 
 def watched(
@@ -101,13 +88,6 @@ def reset(s: Structure, g: Member, t: Times, q: States, u: Inputs, some: Some = 
     return s.by_lane(ft.partial(_reset, g.kind))(t, q, u, g.place)[:, None]
 
 
-def linear_reset(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Expanded:
-    """The state after transitions of one kind, and its derivatives."""
-    if on_host(q):
-        return reset(s, g, t, q, u)
-    return s.by_lane(_columns(ft.partial(_reset, g.kind), 1))(t, q, u, g.place)
-
-
 def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Array, " L"]:
     """Test whether the predicates of transitions of one kind hold."""
     of_lanes = (
@@ -118,9 +98,9 @@ def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Arr
     return of_lanes(t, q, u, g.place)
 
 
-def due(s: Structure, g: int, t: Times, u: Inputs) -> Times:
-    """The times of a scheduled transition that lie at t up to rounding."""
-    return s.kernel(_due, by_lane, g)(t, t[None], u)[0]
+def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
+    """The time from t to that of a scheduled transition up to rounding, and its derivatives."""
+    return s.kernel(_due, _expanded, g)(t, q, u)
 
 
 def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) -> Expanded:
@@ -176,10 +156,9 @@ def _outputs(a: int, s: Structure, items: Items, t, q, u):
 
 
 def _due(g: int, s: Structure, t, q, u):
-    guard = s.transitions[g].guard
+    guard = under(s, u).transitions[g].guard
     assert isinstance(guard, Scheduled)
-    offset, period = guard.numbers(t)
-    return jnp.stack([offset + jax.lax.stop_gradient(jnp.round((t - offset) / period)) * period])
+    return jnp.stack([guard.nearest(t) - t])
 
 
 def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q):
@@ -303,17 +282,13 @@ class _ByMethod(NamedTuple):
         return lambda t, q, u, h, *others: self.compute(self.method, field, t, q, u, h, *others)
 
 
-def _step(method: Method, field: Callable, t, q, u, h):
-    return jnp.stack(take_step(method, lambda t, q: field(t, q, u, h), t, q, h))
+def _step(method: Method, field: Callable, t, q, u, h, *x):
+    return jnp.stack(take_step(method, lambda t, q: field(t, q, u, h, *x), t, q, h))
 
 
 def _step_along(method: Method, field: Callable, t, q, u, h, along):
     step, *tangent = _along(method, lambda t, q: field(t, q, u, h, along), t, q, h, along)
     return jnp.stack([*step, *tangent])
-
-
-def _divergence(method: Method, field: Callable, t, q, u, h):
-    return integrated_divergence(method, lambda t, q: field(t, q, u, h), t, q, h)
 
 
 def _linear_step(method: Method, field: Callable, t, q, u, h, *x):

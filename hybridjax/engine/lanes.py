@@ -7,9 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
 from .._core.executor import cond, lane, namespace, on_host, put
+from ..errors import DefinitionError
 from ..systems.structure import Structure
 from .arrays import Array, Index, Mask, Padded, Times
 
@@ -35,6 +37,21 @@ def start_lanes(s: Structure, t: Times, chart: Index, q: Padded) -> Lanes:
     zero, armed = chart * 0, np.zeros((len(s.transitions), t.shape[0]), bool)
     pace = np.array([[0.0], [np.inf], [0.0], [0.0]]) + zero
     return Lanes(t, chart, q, namespace(t).asarray(armed), zero, pace)
+
+
+def lane_at(s: Structure, chart: str, state: Array, t: ArrayLike, name: str) -> Lanes:
+    """The lane of the host at a state that users give by this name.
+
+    **Raises:** `DefinitionError` for another number of states.
+    """
+    a, q = s.chart_index(chart), np.asarray(state)
+    if q.shape != (s.dims[a],):
+        raise DefinitionError(
+            f"{name} must give values for the {s.dims[a]} states {', '.join(s.charts[a].states)} "
+            f"of chart '{chart}'; got {q}."
+        )
+    q = np.pad(q, (0, s.d - len(q)))[:, None]
+    return start_lanes(s, np.array([t], float), np.array([a], np.int32), q)
 
 
 def for_each_chart(s: Structure, chart: Index, mask: Mask, work: Callable, out):

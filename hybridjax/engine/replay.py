@@ -17,13 +17,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Inexact, Int
+from jaxtyping import Float, Int
 
+from .._core.executor import namespace
 from .._core.host_derivatives import NotOnHostError
 from ..systems.structure import Member, Structure
 from ..systems.transition import Scheduled
 from . import kernels
-from .arrays import Index, Inputs, Mask, Padded, Times
+from .arrays import Array, Index, Inputs, Mask, Padded, Times
 from .events import apply_resets, scheduled_time
 from .lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Lanes, Tape, fixed, for_each_chart, needed, only
 from .runge_kutta import Step, take_step
@@ -131,13 +132,6 @@ class Moves(NamedTuple):
     """Number of moves of the same lane before this one."""
 
 
-class _Linear(NamedTuple):
-    """(t, q) after some moves, and its derivatives by (t, q, u) before them: moves come first."""
-
-    end: Inexact[np.ndarray, "M n"]
-    by: Inexact[np.ndarray, "M n m"]
-
-
 def chain(
     s: Structure,
     lanes: Lanes,
@@ -156,7 +150,8 @@ def chain(
     n, moves = 1 + s.d, recorded_moves(lanes, tape)
     end, by = _linear_moves(s, moves, target)
     if across is not None:
-        by[:, :, 1:n] = by[:, :, 1:n] @ _across(s, moves, across)
+        f = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
+        by[:, :, 1:n] = by[:, :, 1:n] @ projections(f, np.asarray(across)[moves.chart])
     columns, ends = _products(moves, by, len(lanes.t)), np.concatenate([lanes.t[None], lanes.q])
     ends[:, moves.lane] = end.T  # (the last move of a lane comes last)
     return columns[:, :, 1:n] if of_states else columns, ends
@@ -194,8 +189,8 @@ class Variation:
         for g, transition in enumerate(s.transitions):
             at = along.code == g
             if isinstance(transition.guard, Scheduled) and at.any():
-                end, u = (t + h).real[at], kernels.unpushed(s, lane[at])
-                h[at] = kernels.due(s, g, end, u) - t[at]
+                end, u = (t + h).real[at] + 0j, kernels.unpushed(s, lane[at])
+                h[at] = end + kernels.due(s, g, end, q[:, at], u)[0, 0] - t[at]
         along = along._replace(t=t, q=q, h=h, lane=lane)
         needed = twice | (lane % (n + P) >= n)
         along = Moves(*(x[..., needed] for x in along))
@@ -236,38 +231,23 @@ class Variation:
         return t + aside[0], chart, q + aside[1:], u
 
 
-def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
-    """The divergence of the field, integrated over the moves of one lane, up to their ends."""
-    moves, total = recorded_moves(lanes, tape), 0.0
-    for a in np.unique(moves.chart):
-        in_chart = moves.chart == a
-        t, q, h = moves.t[in_chart], moves.q[: s.dims[a], in_chart], moves.h[in_chart]
-        total += kernels.divergence(s, int(a), t, q, np.zeros((s.nu, 1)), h).sum()
-    return total
-
-
-def _linear_moves(s: Structure, moves: Moves, target: Target) -> _Linear:
+def _linear_moves(s: Structure, moves: Moves, target: Target) -> tuple[np.ndarray, np.ndarray]:
+    """(t, q) after some moves (M, n), and its derivatives by (t, q, u) before them (M, n, m)."""
     n, M = 1 + s.d, len(moves.t)
-    number = target.time.dtype
-    linear = _Linear(np.zeros((M, n), number), np.zeros((M, n, n + s.nu), number))
+    end, by = (np.zeros((M, *x), target.time.dtype) for x in ((n,), (n, n + s.nu)))
     for a in np.unique(moves.chart):
         in_chart = np.flatnonzero(moves.chart == a)
-        of_chart = _linear(s, int(a), Moves(*(x[..., in_chart] for x in moves)), target)
-        linear.end[in_chart], linear.by[in_chart] = of_chart
-    return linear
+        of_chart = Moves(*(x[..., in_chart] for x in moves))
+        end[in_chart], by[in_chart] = _linear(s, int(a), of_chart, target)
+    return end, by
 
 
-def _fields(s: Structure, moves: Moves) -> Float[np.ndarray, "d M"]:
-    """The field where moves start."""
-    return slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1)))
-
-
-def _across(s: Structure, moves: Moves, sizes) -> Float[np.ndarray, "M d d"]:
-    """Projections of states along the flow where moves start, orthogonal in sizes."""
-    size = sizes[moves.chart]
-    f = _fields(s, moves).T / size
-    f = f / np.linalg.norm(f, axis=1, keepdims=True)
-    return np.eye(s.d) - (size * f)[:, :, None] * (f / size)[:, None, :]
+def projections(f: Float[Array, "*K d"], sizes: Float[Array, "*K d"]) -> Float[Array, "*K d d"]:
+    """Projections of states along the flow f, orthogonal in sizes."""
+    xp, f = namespace(f), f / sizes
+    f = f / xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
+    project = np.eye(f.shape[-1]) - f[..., :, None] * f[..., None, :]
+    return project * sizes[..., :, None] / sizes[..., None, :]
 
 
 def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
@@ -285,7 +265,7 @@ def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
     )  # fmt: skip
 
 
-def _linear(s: Structure, a: int, moves: Moves, target: Target) -> _Linear:
+def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndarray, np.ndarray]:
     """Moves that start in chart a."""
     n, M, code = s.dims[a], len(moves.t), moves.code
     u = kernels.unpushed(s, moves.lane)
@@ -293,8 +273,7 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> _Linear:
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
     goal = target.time[moves.lane]
     h = np.where(on_time, goal - moves.t, moves.h)
-    point, by_stages = (moves.t, moves.q[:n], u, h), ft.partial(_by_stages, s, a)
-    expanded = np.array(np.moveaxis(kernels.linear_step(s, a, *point, by_stages), -1, 0))
+    expanded = np.array(np.moveaxis(_linear_step(s, a, moves.t, moves.q[:n], u, h), -1, 0))
     q, dq, f = expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     t = np.where(on_time, goal, moves.t + h)
     # By (t, q, u), with the length of the step as the last; that to a known time shrinks with t.
@@ -347,13 +326,16 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> _Linear:
         by[np.ix_(now, np.arange(1, 1 + m), columns)] = dnew
     end[:, 0] = t
     by[:, :1, columns] = dt
-    return _Linear(end, by)
+    return end, by
 
 
-def _by_stages(s: Structure, a: int, t, q, u, h):
-    """`kernels.linear_step` of an explicit method, by derivatives of the field at its stages."""
-    n, M = q.shape
-    m, method = 2 + n + s.nu, s.method(a)
+def _linear_step(s: Structure, a: int, t, q, u, h):
+    """`kernels.linear_step`; of an explicit method, by derivatives of the field at its stages,
+    which needs no program."""
+    (n, M), method = q.shape, s.method(a)
+    if method.implicit:
+        return kernels.linear_step(s, a, t, q, u, h)
+    m = 2 + n + s.nu
     stages = len(method.b) + 1
     K, dK = np.zeros((stages, n, M), q.dtype), np.zeros((stages, M, n, m), q.dtype)
     straight = np.zeros((M, n, m))

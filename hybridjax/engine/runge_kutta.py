@@ -186,14 +186,6 @@ def step_along(
     return value, tangent.q, tangent.estimate
 
 
-def integrated_divergence(method: Method, field: LaneField, t, q, h) -> Times:
-    """The divergence of the field, integrated over a step by the quadrature of the method."""
-    w = _increments(method, field, t, q, h)[0]
-    stages = q + jnp.tensordot(np.array(method.a), w, 1)
-    J = jax.vmap(lambda t, q: _jacobian(field, t, q))(t + np.array(method.c)[:, None] * h, stages)
-    return h * jnp.tensordot(np.array(method.b), jnp.trace(J, axis1=1, axis2=2), 1)
-
-
 def _increments(method, field, t, q, h):
     """Increments (s, n, L) by Newton's method, their last change (n, L), and the Jacobian (n, n, L)
     at the start."""

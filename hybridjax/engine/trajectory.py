@@ -23,7 +23,7 @@ from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
 from .cubic import interpolate
-from .lanes import IDLE, Lanes, Tape, start_lanes
+from .lanes import IDLE, Lanes, Tape, lane_at
 from .move import Options, move
 from .settings import SIMULATION, Settings
 from .target import until
@@ -204,17 +204,9 @@ def simulate(
     check_system(system)
     constant = _constant_input(system, input)
     s = Structure(current(Driven(system, input)) if callable(input) else system)
-    a, start = s.chart_index(chart), Guess(chart, state, time)
-    if start.state.shape != (s.dims[a],):
-        raise DefinitionError(
-            f"chart '{chart}' has the states {', '.join(s.charts[a].states)}, so the start needs "
-            f"shape ({s.dims[a]},); it has {start.state.shape}."
-        )
-    settings = settings.filled(SIMULATION)
-    u, end = constant[:, None], np.asarray(start.time) + np.array([duration], float)
-    q = np.zeros((s.d, 1))
-    q[: s.dims[a], 0] = start.state
-    lanes = begin = start_lanes(s, np.array([start.time]), np.full(1, a, np.int32), q)
+    start = Guess(chart, state, time)
+    lanes = begin = lane_at(s, chart, start.state, start.time, "`state`")
+    settings, u, end = settings.filled(SIMULATION), constant[:, None], lanes.t + float(duration)
     tapes, steps, h = [], 0, None
     while True:
         moved, tape = _piece(s, lanes, u, end, settings, h)

@@ -26,8 +26,7 @@ from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections, FamilyLike, as_family
 from ..sections.linearize import Delayed, Delays, linearize
-from ..sections.place import place_sections
-from ..sections.placed import PlacedSections
+from ..sections.place import observed_at, place_sections
 
 
 AnyNames = Annotated[str | Sequence[str], Names(empty=True)]
@@ -272,17 +271,18 @@ class ObservedCycle(AbstractObservation):
         placed = place_sections(cycle, sections)
         outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         values = placed.observe(outputs) if outputs else None
-        times = _times(placed) if np.any(_times(placed)) else None
+        times = _times(cycle, placed.lanes.t)
+        times = times if np.any(times) else None
         return cls(placed.family, outputs, values, times=times, period=cycle.period)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
-        placed = place_sections(cycle, self.sections)
+        t, y = observed_at(cycle, self.sections, self.outputs)
         parts = []
         for name, measured, scale in zip(self.which, self.measured, self.scales, strict=True):
             if name == "values":
-                error = placed.observe(self.outputs) - measured
+                error = y - measured
             elif name == "times":
-                error = _times(placed) - measured
+                error = _times(cycle, t) - measured
                 if cycle.clocked:
                     turns = jnp.round(error / cycle.period)
                     error = error - jax.lax.stop_gradient(turns) * cycle.period
@@ -302,9 +302,8 @@ def _real(H: Array, measured: Array, weights: Array) -> Float[Array, " r"]:
     return jnp.concatenate([error.real, error.imag])
 
 
-def _times(placed: PlacedSections) -> Float[Array, " N"]:
-    t = placed.lanes.t
-    return t if placed.cycle.clocked else t - t[0]
+def _times(cycle: LimitCycle, t: Float[Array, " N"]) -> Float[Array, " N"]:
+    return t if cycle.clocked else t - t[0]
 
 
 def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:

@@ -149,8 +149,7 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
 def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
     """True if scheduled event g happens at t."""
     schedule = cast(Scheduled, s.transitions[g].guard)
-    turns = (t - float(schedule.offset)) / float(schedule.period)
-    return abs(turns - round(turns)) * float(schedule.period) <= within
+    return abs(float(schedule.nearest(np.asarray(t))) - t) <= within
 
 
 def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> bool:

@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import SignalNames
 from .._core.compilation import at_ease
-from .._core.executor import Array, namespace, on_host, scan, to_host
+from .._core.executor import Array, namespace, on_host
 from ..engine import kernels
 from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics, check_harmonics
@@ -47,10 +47,10 @@ def observed(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, Array, 
 
 
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
-    """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of 2, so
-    that calls with similar frequencies share a linearization."""
+    """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of the
+    root of 2, so that calls with similar frequencies share a linearization."""
     fastest = max(1.25 * np.max(np.abs(f), initial=0.0), np.max(np.abs(harmonics)), 0.1)
-    longest = float(2.0 ** np.floor(np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))))
+    longest = float(2.0 ** (np.floor(2 * np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))) / 2))
     if max(len(f), 64) / longest > _LARGEST:
         raise DefinitionError(
             f"{len(f)} frequencies up to {np.abs(f).max():.3g} per period and harmonics up to "
@@ -59,13 +59,15 @@ def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> flo
     return longest
 
 
-def asked(cycle: Any, outputs: OutputNames | None, inputs: SignalNames | None):
-    """Outputs that exist all along the cycle, and the names and indices of inputs."""
-    s = cycle.structure
+def asked(
+    s: Structure, events: tuple[int, ...], outputs: OutputNames | None, inputs: SignalNames | None
+):
+    """Outputs that exist all along a cycle with these events, and the names and indices of
+    inputs."""
     z = s.resolve_outputs(s.states_everywhere() if outputs is None else outputs)
     for x in (x for x in z.items if isinstance(x, Output)):
         list(check_output(s, x))
-    for name in {s.transitions[g].source for g in cycle.event_sequence} or s.names:
+    for name in {s.transitions[g].source for g in events} or s.names:
         z.require(s.chart_index(name))
     return z, *s.inputs_among(inputs)
 
@@ -79,9 +81,9 @@ def continuous_htf(
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
     harmonics, frequencies = check_harmonics(harmonics, 0), np.asarray(f, float).reshape(-1)
-    z, names, columns = asked(cycle, outputs, inputs)
+    map = cycle.return_map
+    z, names, columns = asked(map.structure, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, longest_piece(frequencies, harmonics))
-    map = (to_host(cycle) if on_host(flow.t) else cycle).return_map
     with at_ease():
         H = _transfer(map, flow, z, frequencies, harmonics)
     return HTF(frequencies, H[..., columns], harmonics, 0, names, z.names, "exact")
@@ -96,12 +98,10 @@ def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Float[np.nda
     n = int(angle + _EXTRA * np.cbrt(1 + angle))
     if n >= len(f) or not half:
         return f, np.eye(len(f))
-    k = np.arange(n)
-    at = np.pi * (k + 0.5) / n
-    series = np.cos(np.outer(np.arccos(np.clip((f - middle) / half, -1, 1)), k))
-    return middle + half * np.cos(at), series @ (
-        np.cos(np.outer(k, at)) * (2 - (k == 0))[:, None] / n
-    )
+    k, chebyshev = np.arange(n), np.polynomial.chebyshev
+    x = np.cos(np.pi * (k + 0.5) / n)
+    values = chebyshev.chebvander(x, n - 1).T * (2 - (k == 0))[:, None] / n
+    return middle + half * x, chebyshev.chebvander((f - middle) / half, n - 1) @ values
 
 
 def _transfer(
@@ -111,11 +111,10 @@ def _transfer(
     f: Float[np.ndarray, " F"],
     harmonics: tuple[int, ...],
 ) -> Complex[Array, "M F ny nu"]:
-    s, xp, jumps, h = map.structure, namespace(flow.q), flow.jumps, flow.length
-    period = map.expected
-    (values, by_state, by_input), (free, forced) = observed(s, flow, z), flow.forward
+    s, xp, h, period = map.structure, namespace(flow.q), flow.length, map.expected
+    values, by_state, by_input = observed(s, flow, z)
     (P, K, d), nu, size, rows = flow.q.shape, s.nu, map.sizes, len(harmonics) * len(z.names)
-    whole = flow.monodromy(free, map.valid)
+    whole = flow.monodromy(map.valid)
     if on_host(whole):
         apart = np.abs(np.exp(2j * np.pi * f)[:, None] - np.linalg.eigvals(whole)).min(axis=1)
         if (apart < _POLE).any():
@@ -124,45 +123,24 @@ def _transfer(
                 f"`f` = {f[apart.argmin()]:.10g} cycles per period is a pole of the cycle, which "
                 f"lie at {where}: leave it out."
             )
-    # Responses to inputs, and to states at phase 0, are columns. They turn with the input, and
-    # frequencies come last, so that all products are those of matrices.
+    # Responses to inputs, and to states at phase 0, are columns, and frequencies come last.
     coarse, fine = _interpolation(f)
     inside = xp.exp((h[:, None] * rule().nodes / period)[..., None] * (2j * np.pi * coarse))
-    back, shape = xp.conj(inside), (P, d, nu, len(coarse))
-    more = lambda x: xp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, d), (0, 0)])  # noqa: E731
-    push = xp.einsum("piakb,pkbu->piauk", forced * h[:, None, None, None, None], flow.by_input)
-    arrived = push[:, -1].reshape(P, d * nu, K) @ inside
-    kick = (jumps.by_state @ arrived.reshape(P, d, -1)).reshape(shape)
-    kick = more(kick + jumps.by_input[..., None] * inside[:, -1, None, None])
-
-    def advance(x, piece):
-        through, kick, back = piece
-        return ((through @ x.reshape(d, -1)).reshape(x.shape) + kick) * back, x
-
-    begin = xp.concatenate([xp.zeros((d, nu)), xp.eye(d)], axis=1)[..., None] + 0 * kick[0]
-    pieces = jumps.by_state @ free[:, -1] + 0j, kick, back[:, -1]
-    end, x = scan(advance, begin, pieces)
+    back, (begin, delay, end) = xp.conj(inside), flow.driven(inside)
     # Fourier integrals.
-    t = flow.after(map)
-    waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * (t / period))
+    waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * flow.after(map) / period)
     weighted = waves * h[:, None] * rule().weights
-    of_states = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ free).reshape(P, -1, K) @ back
-    of_states = xp.moveaxis(of_states.reshape(P, rows, d, -1), (3, 1), (0, 1)).reshape(
-        -1, rows, P * d
-    )
-    H = xp.moveaxis(of_states @ xp.moveaxis(x, 3, 0).reshape(-1, P * d, nu + d), 0, -1)
-    of_push = (by_state @ push.reshape(P, K, d, -1)).reshape(P, -1, K) @ inside
-    driven = of_push.reshape(P * K, -1, len(coarse)) * back.reshape(P * K, 1, -1)
-    driven = driven.reshape(P * K, -1, nu, len(coarse)) + by_input.reshape(P * K, -1, nu, 1)
-    driven = weighted.reshape(-1, P * K) @ driven.reshape(P * K, -1)
-    H = H + more(driven.reshape(rows, nu, -1))
+    of_begin = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ flow.forward[0])
+    of_begin = (of_begin.reshape(P, -1, K) @ back).reshape(P, rows, d, -1)
+    H = xp.einsum("praf,pacf->rcf", of_begin, begin)
+    pushed = (by_state @ flow.pushed.reshape(P, K, d, -1)).reshape(P, -1, K) @ inside
+    pushed = pushed.reshape(P, K, -1, len(coarse)) * back[:, :, None]
+    pushed = (pushed + by_input.reshape(P, K, -1, 1)).reshape(P * K, -1)
+    pushed = (weighted.reshape(-1, P * K) @ pushed).reshape(rows, nu, -1)
+    H = H + xp.pad(pushed, [(0, 0), (0, d), (0, 0)])
     # Events whose time moves: the jump of the output at the moment of the event.
-    last = (free[:, -1] @ x.reshape(P, d, -1)).reshape(x.shape) + more(arrived.reshape(shape))
-    delay = xp.einsum("pa,pacf->pcf", jumps.delay_by_state, last) * back[:, -1, None]
-    delay = delay + more(jumps.delay_by_input[..., None])
-    step = values[:, -1] - xp.roll(values[:, 0], -1, axis=0)
-    impulse = step[..., None, None] * delay[:, None]
-    H = H + (waves[:, :, -1] @ impulse.reshape(P, -1)).reshape(H.shape)
+    jump = values[:, -1] - xp.roll(values[:, 0], -1, axis=0)
+    H = H + xp.einsum("mp,py,pcf->mycf", waves[:, :, -1], jump, delay).reshape(H.shape)
     # The deviation at phase 0 is that one period later.
     H, end = xp.moveaxis(H @ fine.T, -1, 0), xp.moveaxis(end[:, :nu] @ fine.T, -1, 0)
     turned = xp.eye(d) - xp.exp(-2j * np.pi * f)[:, None, None] * (whole * size / size[:, None])

@@ -19,8 +19,7 @@ from .._core.progress import whole_call
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
-from ..engine.lanes import Lanes, Tape, side_by_side
-from ..engine.replay import divergence
+from ..engine.lanes import Lanes, Tape
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, recorded, simulate
 from ..errors import DefinitionError
@@ -32,7 +31,7 @@ from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
-from .linear_flow import linear_flow
+from .linear_flow import hosted, linear_flow, rule
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
@@ -163,7 +162,7 @@ class LimitCycle(eqx.Module):
             values = np.where(lost, 0.0, values)
             if lost.sum() == 1 and not self.event_sequence:  # it follows from the product of all
                 resolved = np.prod(values[~lost]).real
-                values[lost] = np.exp(log_determinant(self.return_map)) / resolved
+                values[lost] = np.exp(log_determinant(self)) / resolved
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
         values = values[np.argsort(-np.abs(values), kind="stable")]
         values.flags.writeable = False  # they are kept
@@ -179,7 +178,7 @@ class LimitCycle(eqx.Module):
         with np.errstate(divide="ignore"):
             logs = np.log(np.abs(self.multipliers))
         if not self.event_sequence and np.sum(np.isneginf(logs)) == 1:
-            logs[-1] = log_determinant(self.return_map) - np.sum(logs[:-1])
+            logs[-1] = log_determinant(self) - np.sum(logs[:-1])
         return logs
 
     @property
@@ -304,7 +303,7 @@ class LimitCycle(eqx.Module):
     def _checked(self) -> "LimitCycle":
         require_x64()
         self.require_current()
-        return self
+        return hosted(self)
 
     def __repr__(self):
         if is_traced(self):
@@ -417,8 +416,8 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
 
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
-    map, flow = to_host(cycle.return_map), linear_flow(cycle)
-    through, frames = flow.jumps.by_state @ flow.forward[0][:, -1], []
+    map, flow = hosted(cycle).return_map, linear_flow(cycle)
+    frames: list[tuple[int, Matrix, Matrix]] = []
     for chart, f in zip(flow.chart, flow.field[:, 0], strict=True):
         n = map.structure.dims[chart]
         basis, size = np.eye(n), np.asarray(map.scale)[chart, :n]
@@ -428,7 +427,7 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     factors: list[Matrix] = []
     for k, (n, _, into) in enumerate(frames):
         m, out, _ = frames[(k + 1) % len(frames)]
-        parts = out, through[k, :m, :n], into
+        parts = out, flow.through[k, :m, :n], into
         factor = np.linalg.multi_dot(parts)
         # (A zero that comes out as rounding would be a multiplier.)
         least = np.finfo(float).eps * np.prod([np.linalg.norm(x) for x in parts])
@@ -441,14 +440,14 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     return factors
 
 
-def log_determinant(map: ReturnMap) -> float:
+def log_determinant(cycle: LimitCycle) -> float:
     """The logarithm of the determinant of the monodromy of a cycle without events: the divergence
     of the field, integrated over one turn.
 
     Steps of an implicit method lose a mode that decays within them; this gives its decay.
     """
-    map = to_host(map)
-    return float(divergence(map.structure, *side_by_side(map.pieces())))
+    flow = linear_flow(cycle)
+    return float(flow.length @ np.trace(flow.by_state, axis1=2, axis2=3) @ rule().weights)
 
 
 def orbit(map: ReturnMap, tapes: Tape | None = None) -> Trajectory:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, NonNegative
-from .._core.executor import Array, is_traced, namespace, on_host, scan, to_host
+from .._core.executor import Array, is_traced, namespace, on_host, scan
 from .._core.text import number
 from ..errors import ComputationError
 from ..systems.structure import Structure
@@ -100,7 +100,7 @@ class Fluctuations(eqx.Module):
 def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets) -> Fluctuations:
     """Deviations from a cycle under noise (see `LimitCycle.fluctuations`)."""
     flow, events = linear_flow(cycle), cycle.event_sequence
-    map = (to_host(cycle) if on_host(flow.q) else cycle).return_map
+    map = cycle.return_map
     s, period = map.structure, map.expected
     levels, scatter = _at_events(s, guards, resets)
     xp, jumps = namespace(flow.q), flow.jumps
@@ -108,8 +108,8 @@ def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets
     names = [s.transitions[g].name for g in events] or ([] if clocked else [str(map.base)])
     n, E = d + 1 + len(names), len(names)
     # Noise in the states, collected over each piece.
-    B, (free, _), adjoint = _columns(s, flow, white), flow.forward, flow.adjoint
-    turned = xp.swapaxes(adjoint, -1, -2) @ B
+    B, (free, _) = _columns(s, flow, white), flow.forward
+    turned = xp.swapaxes(flow.adjoint, -1, -2) @ B
     weight = (flow.length[:, None] * rule().weights)[..., None, None]
     collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
     # Noise of events, and what each makes of the states before, of the delay of the last event,
@@ -131,19 +131,15 @@ def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets
     pieces = forward, _pad(collected, n), jump, added
     (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
     M, last = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0), xp.eye(n)
-    diffusion, to_end = xp.zeros(()), adjoint @ flow.backward(adjoint, xp.eye(d))[:, None]
-    across = np.eye(d)
-    if not clocked:
-        closed, along = loop(map, M[:d, :d], f)
-        Z = xp.linalg.solve(closed.T, along)
-        if not events:
-            delay = to_section(map, f)[0][None]
-            last = _timing(np.eye(d)[None], delay, np.ones(1, bool), np.ones((1, 1), bool))[0]
-        diffusion = Z @ Q[:d, :d] @ Z / period
-        # (A state ahead of the cycle meets the next events earlier.)
-        ahead = xp.concatenate([-f, xp.ones(1), xp.zeros(E)])
-        last = last + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
-        across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
+    _, Z = loop(map, M[:d, :d], f)
+    if not (clocked or events):
+        delay = to_section(map, f)[0][None]
+        last = _timing(np.eye(d)[None], delay, np.ones(1, bool), np.ones((1, 1), bool))[0]
+    diffusion, to_end = Z @ Q[:d, :d] @ Z / period, flow.covectors(xp.eye(d))
+    # (A state ahead of the cycle meets the next events earlier.)
+    ahead = xp.concatenate([-f, xp.ones(1), xp.zeros(E)])
+    last = last + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
+    across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
     step, Q = last @ M, last @ Q @ last.T
     joint = _pad(_stationary(step[:d, :d], Q[:d, :d]), n)
     for _ in range(2):  # durations follow from the states of this turn and from the last
@@ -193,9 +189,7 @@ def _columns(s: Structure, flow: LinearFlow, white: Strengths) -> Float[Array, "
     require_among("state or input", white, [*s.state_names(), *s.inputs], "`white`: ")
     names = [(*chart.states, *[""] * s.d)[: s.d] for chart in s.charts]
     of_states = xp.asarray([[white.get(x, 0.0) for x in states] for states in names])
-    direct = of_states[flow.chart][:, None, :, None] * np.eye(s.d)
-    pushed = surface(s, flow)
-    direct = xp.broadcast_to(direct, flow.by_state.shape) if pushed is None else pushed @ direct
+    direct = surface(s, flow) @ (of_states[flow.chart][:, None, :, None] * np.eye(s.d))
     driven = flow.by_input * np.array([white.get(x, 0.0) for x in s.inputs])
     return xp.concatenate([direct, driven], axis=-1)
 

@@ -14,7 +14,7 @@ from .._core.precision import real
 from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.lanes import Lanes, start_lanes
+from ..engine.lanes import Lanes, lane_at
 from ..engine.move import move
 from ..engine.search.state import Moved
 from ..engine.settings import Settings
@@ -63,12 +63,7 @@ def return_map_near(
     guess = system.guess() if guess is None else guess
     if guess is None:
         raise DefinitionError(f"{type(system).__name__} has no guess: pass `Guess(chart, state)`.")
-    a, time = s.chart_index(guess.chart), np.array([guess.time])
-    if guess.state.shape != (s.dims[a],):
-        raise DefinitionError(
-            f"the guess must give values for the {s.dims[a]} states "
-            f"{', '.join(s.charts[a].states)} of chart '{guess.chart}'; got {guess.state}."
-        )
+    time, (a,), q, *_ = lanes = lane_at(s, guess.chart, guess.state, guess.time, "the guess")
     if guess.after is not None:
         event = s.transitions[s.transition_index(guess.after)]
         if event.target != guess.chart:
@@ -76,7 +71,6 @@ def return_map_near(
                 f"the guess is in chart '{guess.chart}', but the event '{event.name}', after which "
                 f"it is said to be, leads to chart '{event.target}'."
             )
-    q = np.pad(np.asarray(guess.state), (0, s.d - s.dims[a]))[:, None]
     rate = kernels.field(s, a, time, q[: s.dims[a]], np.zeros((s.nu, 1)))[:, 0, 0]
     if not np.isfinite(rate).all():
         raise DefinitionError(
@@ -84,7 +78,7 @@ def return_map_near(
             "elsewhere, or look for a division by zero or a mass matrix that is singular or not "
             "positive."
         )
-    lanes = from_host(start_lanes(s, time, np.array([a], np.int32), q))
+    lanes = from_host(lanes)
     near = sizes_near(s, a, time[0], q[:, 0], None if period is None else float(period))
     settings = dataclasses.replace(settings, scale=scale_of(s, near.sizes | given))
     charts = np.arange(len(s.charts))

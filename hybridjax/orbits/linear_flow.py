@@ -18,12 +18,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
 from .._core.boundary.checked import NeedsValues
-from .._core.executor import Array, is_inside_program, is_traced, namespace, scan, to_host
+from .._core.executor import Array, is_hidden, namespace, on_host, scan, to_host
 from .._core.host_derivatives import by_columns
 from .._core.memo import Memory, remembered
 from ..engine import kernels
 from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, Lanes, Tape, for_each_chart, side_by_side
-from ..engine.replay import Moves, Variation, recorded_moves
+from ..engine.replay import Variation, recorded_moves
+from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled
@@ -146,17 +147,16 @@ class LinearFlow(eqx.Module):
         free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[:-1, -1])
         return xp.concatenate([free, xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))], axis=1)
 
-    def backward(
-        self, adjoint: Float[Array, "P K d d"], end: Float[Array, "d r"]
-    ) -> Float[Array, "P d r"]:
-        """Covectors at the ends of pieces, before their events, by those at the end of the turn."""
+    def covectors(self, end: Inexact[Array, "d r"]) -> Inexact[Array, "P K d r"]:
+        """Covectors at the nodes by those at the end of the turn."""
 
         def back(after, piece):
             jump, free = piece
             before = jump.T @ after
             return free @ before, before
 
-        return scan(back, end, (self.jumps.by_state[::-1], adjoint[::-1, 0]))[1][::-1]
+        _, ends = scan(back, end, (self.jumps.by_state[::-1], self.adjoint[::-1, 0]))
+        return self.adjoint @ ends[::-1, None]
 
     def at(
         self, phase: Array, period: Array, *values: Inexact[Array, "P K ..."]
@@ -173,25 +173,64 @@ class LinearFlow(eqx.Module):
         mixed = (xp.einsum("pk,pk...->p...", mix, xp.asarray(y)[k]) for y in values)
         return xp.asarray(self.chart)[k], *mixed
 
-    def monodromy(
-        self, free: Float[Array, "P K d d"], valid: Bool[Array, " d"]
-    ) -> Float[Array, "d d"]:
+    @remembered
+    def pushed(self) -> Float[Array, "P K d nu K"]:
+        """Deviations at the nodes of each piece by inputs at the nodes."""
+        force = self.by_input * self.length[:, None, None, None]
+        return namespace(force).einsum("piakb,pkbu->piauk", self.forward[1], force)
+
+    def driven(self, waves: Inexact[Array, "P K f"]) -> tuple[Array, Array, Array]:
+        """Deviations by inputs that are `waves`, divided by the wave at the beginning of each
+        piece; and by those at the beginning of the turn, as further d columns.
+
+        **Returns:** those where pieces begin (P, d, nu + d, f), the delays of the events at their
+        ends (P, nu + d, f), and those at the end of the turn (d, nu + d, f).
+        """
+        (xp, jumps), (P, K, d) = (namespace(self.q), self.jumps), self.q.shape
+        shape, last = (P, d, -1, waves.shape[2]), waves[:, -1, None]
+        wide = lambda x: xp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, d), (0, 0)])  # noqa: E731
+        arrived = self.pushed[:, -1].reshape(P, -1, K) @ waves
+        kick = (jumps.by_state @ arrived.reshape(P, d, -1)).reshape(shape)
+        kick = wide(kick + jumps.by_input[..., None] * last[:, None])
+
+        def advance(x, piece):
+            through, kick, back = piece
+            return ((through @ x.reshape(d, -1)).reshape(x.shape) + kick) * back, x
+
+        begin = xp.pad(xp.eye(d), [(0, 0), (self.by_input.shape[3], 0)])[..., None] + 0 * kick[0]
+        through, back = xp.asarray(self.through, dtype=waves.dtype), 1 / last[:, 0]
+        end, x = scan(advance, begin, (through, kick, back))
+        by_begin = (jumps.delay_by_state[:, None] @ self.forward[0][:, -1])[:, 0]
+        by_input = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived.reshape(shape))
+        by_input = wide(by_input + jumps.delay_by_input[..., None] * last)
+        return x, (xp.einsum("pa,pacf->pcf", by_begin, x) + by_input) / last, end
+
+    @remembered
+    def through(self) -> Float[Array, "P d d"]:
+        """Deviations at the beginnings of pieces to those at the beginnings of the next."""
+        return self.jumps.by_state @ self.forward[0][:, -1]
+
+    def monodromy(self, valid: Bool[Array, " d"]) -> Float[Array, "d d"]:
         """Derivative of the state at the end of the turn by that at its beginning, at fixed times;
         zero outside of the `valid` rows and columns."""
-        xp = namespace(self.q)
-        step = lambda product, piece: (piece[0] @ (piece[1] @ product), None)  # noqa: E731
-        whole, _ = scan(step, xp.eye(self.q.shape[2]), (self.jumps.by_state, free[:, -1]))
-        return xp.where(valid[:, None] & valid, whole, 0.0)
+        return namespace(self.q).where(valid[:, None] & valid, monodromy(self.through), 0.0)
 
 
-_flows, _turns = Memory(), Memory()
+_hosted, _flows, _turns = Memory(), Memory(), Memory()
 
 
 def keep_turn(cycle: Any, turn: Turn) -> None:
     """Keep the steps of a cycle's last turn for its linearization."""
     if turn.tapes is not None:
         record = to_host((turn.legs, turn.tapes))
-        _turns.recall(cycle, None, lambda: (record[0], side_by_side(record[1])))
+        _turns.recall(hosted(cycle), None, lambda: (record[0], side_by_side(record[1])))
+
+
+def hosted(cycle: Any) -> Any:
+    """The cycle with its arrays on the host, the same at each call; itself if JAX traces it."""
+    if is_hidden(cycle) or on_host(cycle.period):
+        return cycle
+    return _hosted.recall(cycle, None, lambda: to_host(cycle))
 
 
 def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = None) -> LinearFlow:
@@ -200,7 +239,8 @@ def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = Non
 
     **Raises:** `NeedsValues` inside of `jit` and `vmap`.
     """
-    if is_traced(cycle) or is_inside_program():
+    cycle = hosted(cycle)
+    if not on_host(cycle.period):
         return _of_cycle(cycle, longest, parameter)
     make = lambda: _linear_flow(cycle, longest, parameter)  # noqa: E731
     return _flows.recall(cycle, (parameter, longest), make)
@@ -217,7 +257,7 @@ _STEPS = 4
 def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = None) -> LinearFlow:
     """The flow linearized at nodes of pieces, whose states follow from the recorded steps; or its
     derivatives in the directions `by` of the cycle."""
-    if is_traced(cycle) or is_inside_program():
+    if not on_host(cycle.period):
         raise NeedsValues(
             "responses, sensitivities, fluctuations and HTFs in continuous time need the values of "
             "a cycle, which `jit` and `vmap` hide: call them outside (`grad` and `jvp` work there)."
@@ -238,9 +278,12 @@ def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = No
         )
         tangents = _along(s, map, lanes, tape, by)
         t, q = t + tiny * tangents[:, 0], q + tiny * tangents[:-1, 1:]
-    # Pieces of several steps, each divided into some parts.
-    first = _first(s, moves, np.diff(t.real[:, 0]), longest * period)
-    last = np.append(first[1:], len(moves.t)) - 1
+    # Pieces of several steps between events, because a step of an explicit method is short for the
+    # polynomials of a piece; each divided into some parts.
+    k, most = np.arange(len(moves.t)), 1 if has_implicit(s) else _STEPS
+    begins = np.maximum.accumulate(np.where(np.roll(moves.code, 1) >= 0, k, 0))
+    first = np.flatnonzero((k - begins) % most == 0)
+    last = np.append(first[1:], len(k)) - 1
     h, code = t[last + 1] - t[first], np.maximum(moves.code[last], -1)
     parts = np.maximum(np.ceil(h[:, 0].real / (longest * period) - 1e-9), 1).astype(int)
     whole = np.repeat(np.arange(len(first)), parts)
@@ -309,25 +352,13 @@ _of_cycle = by_columns(
 )
 
 
-def _first(s: Structure, moves: Moves, h: Float[np.ndarray, " M"], longest: float) -> np.ndarray:
-    """First moves of pieces: of several steps between events, because a step of an explicit method
-    is short for the polynomials of a piece."""
-    first, length, most = [0], 0.0, 1 if has_implicit(s) else _STEPS
-    for k in range(1, len(h)):
-        length += h[k - 1]
-        if moves.code[k - 1] >= 0 or k - first[-1] == most or length + h[k] > longest:
-            first.append(k)
-            length = 0.0
-    return np.array(first)
-
-
 def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:
     """States after a step from each lane."""
 
     def work(a, here, out):
         n = s.dims[a]
         point = t[here], q[:n, here], u[:, here], h[here]
-        if s.method(a).implicit or isinstance(s, kernels.Tangents):  # (compiled already)
+        if s.method(a).implicit:
             out[:n, here] = kernels.linear_step(s, a, *point)[:, 0]
         else:
             out[:n, here] = kernels.step(s, a, *point).q
@@ -345,16 +376,17 @@ def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
     for g in np.unique(code[code >= 0]):
         now, tr = np.flatnonzero(code == g), s.transitions[g]
         a = s.chart_index(tr.source)
-        n, delay = s.dims[a], np.ones(len(now))
-        point = t[now], q[now, :n].T, u[:, now]
-        by = np.moveaxis(kernels.linear_reset(s, s.member(g), *point), -1, 0)
+        n, point = s.dims[a], (t[now], q[now, : s.dims[a]].T, u[:, now])
+        by = np.moveaxis(kernels.reset(s, s.member(g), *point), -1, 0)
         m, by_t, by_q, by_u = by.shape[1], by[:, :, 1], by[:, :, 2 : 2 + n], by[:, :, 2 + n :]
-        if not isinstance(tr.guard, Scheduled):
+        if isinstance(tr.guard, Scheduled):
+            guard = kernels.due(s, g, *point)[0].T
+        else:
             row, index = s.guards(a).index(g), np.zeros(1, np.int32)
             guard = kernels.watched(s, a, None, *point, index)[row].T
-            delay = -1 / (guard[:, 1] + np.sum(guard[:, 2 : 2 + n] * f[now, :n], axis=1))
-            out.delay_by_state[now, :n] = guard[:, 2 : 2 + n] * delay[:, None]
-            out.delay_by_input[now] = guard[:, 2 + n :] * delay[:, None]
+        delay = -1 / (guard[:, 1] + np.sum(guard[:, 2 : 2 + n] * f[now, :n], axis=1))
+        out.delay_by_state[now, :n] = guard[:, 2 : 2 + n] * delay[:, None]
+        out.delay_by_input[now] = guard[:, 2 + n :] * delay[:, None]
         slip = by_t + (by_q @ f[now, :n, None])[..., 0] - after[now, :m]
         out.by_state[now] = 0.0
         out.by_state[now, :m, :n] = by_q + slip[..., None] * out.delay_by_state[now, None, :n]

@@ -26,14 +26,14 @@ from .._core.results import Result
 from .._core.signal import unit_of
 from .._core.text import number
 from ..engine import kernels
-from ..engine.lanes import start_lanes
+from ..engine.lanes import lane_at
 from ..engine.move import move
 from ..engine.target import toward
 from ..errors import ComputationError, DefinitionError
 from ..systems.sliding import SlidingChart
 from ..systems.structure import Structure
 from .crossing import to_section
-from .linear_flow import LinearFlow, by_name, linear_flow, polynomials, rule
+from .linear_flow import NODES, LinearFlow, by_name, linear_flow
 from .return_map import SINGULAR, ReturnMap
 
 
@@ -95,14 +95,15 @@ class Coupling(eqx.Module):
     coefficients: Complex[Array, " n"]
 
     def __call__(self, lead: Phases) -> Float[Array, " p"]:
-        return _series(self.coefficients, lead)
+        xp, n = namespace(self.coefficients), np.arange(len(self.coefficients))
+        waves = xp.exp(2j * np.pi * xp.asarray(lead)[..., None] * n)
+        return xp.real(waves @ (self.coefficients * np.where(n == 0, 1, 2)))
 
     @property
     def locking(self) -> tuple[float, float]:
         """The least and the largest frequency of a push that the cycle follows, less that of the
         cycle, per strength of the push: the Arnold tongue, to first order."""
-        c = to_host(self.coefficients)
-        values = _series(c, [x.lead for x in _zeros(2j * np.pi * np.arange(len(c)) * c)] or [0.0])
+        values = self([x.lead for x in self._slope._zeros()] or [0.0])
         return float(values.min()), float(values.max())
 
     def locked(self, detuning: float = 0.0, mutual: bool = False) -> tuple[Locked, ...]:
@@ -116,26 +117,26 @@ class Coupling(eqx.Module):
         """
         c = to_host(self.coefficients)
         c = np.conj(c) - c if mutual else -c
-        return _zeros(c + detuning * (np.arange(len(c)) == 0))
+        return Coupling(c + detuning * (np.arange(len(c)) == 0))._zeros()
 
+    @property
+    def _slope(self) -> "Coupling":
+        c = to_host(self.coefficients)
+        return Coupling(2j * np.pi * np.arange(len(c)) * c)
 
-def _series(c: Complex[Array, " n"], lead: Phases) -> Float[Array, " p"]:
-    xp, n = namespace(c), np.arange(len(c))
-    waves = xp.exp(2j * np.pi * xp.asarray(lead)[..., None] * n)
-    return xp.real(waves @ (c * np.where(n == 0, 1, 2)))
+    def _zeros(self) -> tuple[Locked, ...]:
+        """Zeros in one cycle, with the slopes there."""
+        from scipy import optimize  # (a third of a second)
 
-
-def _zeros(c: Complex[np.ndarray, " n"]) -> tuple[Locked, ...]:
-    """Zeros of a series in one cycle, and its slopes there."""
-    grid = (np.arange(16 * len(c) + 1) - 0.5) / (16 * len(c))
-    sign = np.sign(_series(c, grid))
-    crossed = zip(grid[:-1], grid[1:], sign[:-1] * sign[1:] < 0, strict=True)
-    value = lambda x: float(_series(c, x))  # noqa: E731
-    from scipy import optimize  # (a third of a second)
-
-    zeros = [optimize.root_scalar(value, bracket=(a, b)).root for a, b, turns in crossed if turns]
-    slopes = _series(2j * np.pi * np.arange(len(c)) * c, zeros)
-    return tuple(Locked(x % 1.0, float(rate)) for x, rate in zip(zeros, slopes, strict=True))
+        steps = 16 * len(self.coefficients)
+        grid = (np.arange(steps + 1) - 0.5) / steps
+        sign = np.sign(self(grid))
+        crossed = zip(grid[:-1], grid[1:], sign[:-1] * sign[1:] < 0, strict=True)
+        value = lambda x: float(self([x])[0])  # noqa: E731
+        roots = [
+            optimize.root_scalar(value, bracket=(a, b)).root for a, b, turns in crossed if turns
+        ]
+        return tuple(Locked(x % 1.0, float(self._slope([x])[0])) for x in roots)
 
 
 @checked_methods
@@ -166,8 +167,8 @@ class Responses(eqx.Module):
     of_phase: Float[Array, "P K d"] | None
     """The phase response in time; `None` if clocked."""
     of_amplitudes: Inexact[Array, "r P K d"]
-    surface: Float[Array, "P K d d"] | None
-    """The effect of a push, less what sliding undoes; `None` without sliding."""
+    surface: Float[Array, "P K d d"]
+    """The effect of a push, less what sliding undoes."""
 
     def phase(self, phase: Phases, unit: Unit = "time") -> dict[str, Float[Array, " p"]]:
         """Change of the phase after a brief push at some phases, by names of states and inputs.
@@ -240,28 +241,25 @@ class Responses(eqx.Module):
         **Raises:** `DefinitionError` for names that do not exist, too few harmonics, and a cycle
         that is driven by a clock.
         """
-        flow, xp = self.flow, namespace(self.flow.q)
+        flow, xp, period = self.flow, namespace(self.flow.q), self.period
         signal, column = self._input(input)
         # Nodes within parts of pieces that resolve the fastest wave.
-        parts = 1 + harmonics // 2
-        x = ((np.arange(parts)[:, None] + rule().nodes) / parts).ravel()
-        mix = polynomials(x) @ rule().coefficients
-        turn, period = flow.length[:, None] / self.period, self.period
-        phase = flow.turn[:, None] / period + turn * x
-        Z = xp.einsum("pki,pki->pk", self._covector(None), flow.by_input[..., column]) @ mix.T
+        parts, (x, weight) = 1 + harmonics // 2, np.polynomial.legendre.leggauss(NODES)
+        x = ((np.arange(parts)[:, None] + (x + 1) / 2) / parts).ravel()
+        phase = ((flow.turn[:, None] + flow.length[:, None] * x) / period).ravel()
+        weight = (flow.length[:, None] / period * np.tile(weight / 2 / parts, parts)).ravel()
+        pushed = xp.einsum("pki,pki->pk", self._covector(None), flow.by_input[..., column])
+        chart, Z, states = flow.at(phase, period, pushed, flow.q)
         if isinstance(push, str):
             require_among("state", [push], self.structure.state_names(), "`push`: ")
-            chart, states = xp.repeat(flow.chart, len(x)), mix @ flow.q
-            wave = by_name(self.structure, chart, states.reshape(len(chart), -1))[push]
+            wave = by_name(self.structure, chart, states)[push]
         else:
-            wave = xp.asarray(push(phase.ravel()), float)
-        n = np.arange(harmonics + 1)[:, None, None]
-        weight = turn * np.tile(rule().weights / parts, parts)
-        weight = xp.exp(-2j * np.pi * n * phase) * weight
-        wave = xp.sum(weight * wave.reshape(phase.shape), axis=(1, 2))
-        response = xp.sum(weight * Z, axis=(1, 2))
+            wave = xp.asarray(push(phase), float)
+        n = np.arange(harmonics + 1)
+        weight = xp.exp(-2j * np.pi * n[:, None] * phase) * weight
+        wave, response = weight @ wave, weight @ Z
         for x in self.impulses():
-            response += xp.exp(-2j * np.pi * n[:, 0, 0] * x.phase) * x.weight[signal] / period
+            response += xp.exp(-2j * np.pi * n * x.phase) * x.weight[signal] / period
         c = xp.conj(response) * wave / period
         if on_host(c) and np.abs(c[len(c) * 3 // 4 :]).max() > 1e-3 * np.abs(c).max():
             raise DefinitionError(f"`harmonics` = {harmonics} does not resolve jumps of the push.")
@@ -275,11 +273,10 @@ class Responses(eqx.Module):
         kinds += [f"amplitude {k}: exponent {number(x)}" for k, x in enumerate(self.exponents)]
         if self.left_out:
             kinds.append(f"{self.left_out} faster modes left out")
-        has_any = self.of_phase is not None or len(self.exponents)
-        impulses = self.impulses(0 if self.of_phase is None else None) if has_any else ()
-        acting = [x.event for x in impulses if any(x.weight.values())]
-        if acting:
-            kinds.append(f"inputs act at {', '.join(dict.fromkeys(acting))}: see `impulses()`")
+        acting = self.flow.event[np.any(self.flow.jumps.by_input, axis=(1, 2))]
+        if len(acting):
+            names = dict.fromkeys(self.structure.transitions[g].name for g in acting)
+            kinds.append(f"inputs act at {', '.join(names)}: see `impulses()`")
         period = number(self.period, 9, self.structure.system.time_unit)
         return f"Responses({name}: period {period})" + "".join(f"\n  {x}" for x in kinds)
 
@@ -304,8 +301,7 @@ class Responses(eqx.Module):
         flow, s = self.flow, self.structure
         xp = namespace(flow.q)
         pushed = xp.einsum("pki,pkiu->pku", covector, flow.by_input)
-        if self.surface is not None:
-            covector = xp.einsum("pki,pkij->pkj", covector, self.surface)
+        covector = xp.einsum("pki,pkij->pkj", covector, self.surface)
         chart, states, inputs = flow.at(phase, self.period, covector, pushed)
         named = by_name(s, chart, states) | dict(zip(s.inputs, inputs.T, strict=True))
         return {name: value * scale for name, value in named.items()}
@@ -314,34 +310,25 @@ class Responses(eqx.Module):
 def responses(cycle: Any, modes: int | None) -> Responses:
     """The responses of a cycle (see `LimitCycle.responses`)."""
     flow = linear_flow(cycle)
-    host, xp = on_host(flow.t), namespace(flow.t)
-    map = (to_host(cycle) if host else cycle).return_map
+    host, xp, map = on_host(flow.t), namespace(flow.t), cycle.return_map
     period, clocked = map.expected, map.base is None
-    free, _ = flow.forward
-    whole = flow.monodromy(free, map.valid)
-    if not clocked:
-        f = flow.field[0, 0]
-        closed, along = loop(map, whole, f)
-        Z = xp.linalg.solve(closed.T, along)
-        whole = whole - f[:, None] * Z
+    whole = flow.monodromy(map.valid)
+    _, Z = loop(map, whole, flow.field[0, 0])
+    whole = whole - flow.field[0, 0, :, None] * Z
     if modes is None and not host:
         raise DefinitionError(
             "inside of `grad` and `jvp`, `responses` needs the number of `modes`."
         )
     values, right, left = _modes(whole, map.sizes, modes)
     exponents = xp.log(values) / period
-    adjoint, to_go = flow.adjoint, period - (flow.t - flow.t[0, 0])
-
-    def nodes(ends):
-        return xp.einsum("pkij,pjr->rpki", adjoint, flow.backward(adjoint, xp.stack(ends, axis=1)))
-
-    phase = nodes([Z])[0] if not clocked else None
-    amplitudes = xp.zeros((0, *flow.q.shape), complex)
-    if len(left):  # they grow by their exponents; rounding adds responses of the phase
-        amplitudes = nodes(left) * xp.exp(-exponents[:, None, None] * to_go)[..., None]
-        if phase is not None:
-            slip = xp.einsum("rpki,pki->rpk", amplitudes, flow.field)
-            amplitudes = amplitudes - slip[..., None] * phase
+    phase = None if clocked else flow.covectors(Z[:, None])[..., 0]
+    # Amplitudes grow by their exponents; rounding adds responses of the phase.
+    to_go = period - (flow.t - flow.t[0, 0])[..., None]
+    amplitudes = xp.moveaxis(flow.covectors(left.T), -1, 0)
+    amplitudes = amplitudes * xp.exp(-exponents[:, None, None, None] * to_go)
+    if phase is not None:
+        slip = xp.einsum("rpki,pki->rpk", amplitudes, flow.field)
+        amplitudes = amplitudes - slip[..., None] * phase
     if host and not np.any(np.iscomplex(exponents)):
         amplitudes, right = np.real(amplitudes), np.real(right)
     total = int(np.sum(map.valid)) - (not clocked) if host else len(values)
@@ -354,17 +341,14 @@ def responses(cycle: Any, modes: int | None) -> Responses:
 
 def asymptotic_phase(cycle: Any, chart: str, state: Float[np.ndarray, " n"], turns: int) -> float:
     """The asymptotic phase of a state (see `LimitCycle.asymptotic_phase`)."""
-    map, period = to_host(cycle.return_map), float(cycle.period)
+    map, period = cycle.return_map, float(cycle.period)
     s, a = map.structure, map.structure.chart_index(chart)
-    if state.shape != (s.dims[a],):
-        raise DefinitionError(f"`state` must give the {s.dims[a]} states of chart '{chart}'.")
-    phase, size = to_host(responses(cycle, 0)._covector(None))[0, 0], map.sizes
+    lanes = begin = lane_at(s, chart, state, map.anchor.t[0], "`state`")
+    phase, size = responses(cycle, 0)._covector(None)[0, 0], map.sizes
     near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase
     surface = getattr(s.charts[a], "surface", None)
     if surface is not None and abs(float(surface(map.anchor.t[0], state))) > near:
         raise DefinitionError(f"`state` does not lie on the surface on which '{chart}' slides.")
-    q = np.pad(state, (0, s.d - s.dims[a]))[:, None]
-    lanes = begin = start_lanes(s, map.anchor.t, np.array([a], np.int32), q)
     for _ in range(turns):
         target = toward(np.full(1, np.inf), -1, lanes.t + 3 * period)
         target = to_section(target, map.base, map.event)
@@ -384,11 +368,14 @@ def asymptotic_phase(cycle: Any, chart: str, state: Float[np.ndarray, " n"], tur
 
 
 def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
-    """M - I + f w^T, which is regular if the multiplier 1 is simple, and w, with w . f = 1.
+    """M - I + f w^T with w . f = 1, which is regular if the multiplier 1 is simple, and the phase
+    response at the beginning; M - I and zeros for a clock.
 
     **Raises:** `ComputationError` if it is not simple.
     """
     xp, size = namespace(f), map.sizes
+    if map.base is None:
+        return monodromy - xp.eye(len(f)), xp.zeros_like(f)
     along = f / size**2
     along = along / (along @ f)
     closed = monodromy - xp.eye(len(f)) + f[:, None] * along
@@ -399,7 +386,7 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
                 "the cycle has no phase of its own: its multiplier 1 is double, as in a family of "
                 "cycles with a conserved quantity, where pushes change the period."
             )
-    return closed, along
+    return closed, xp.linalg.solve(closed.T, along)
 
 
 def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
@@ -415,33 +402,22 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
         count = kept if count is None else count
         if count > kept:
             raise DefinitionError(f"{count} modes were asked for; {kept} have amplitudes.")
-    values, right = values[order][:count], right[:, order][:, :count]
-    out = [_eigenpairs(scaled, values[k], right[:, k]) for k in range(len(values))]
-    values = xp.asarray([x for x, *_ in out]) if out else values[:0]
-    rights, lefts = [], []
-    for _, r, l in out:
-        r, l = r * size, l / size
-        largest = xp.argmax(xp.abs(l) * size)
-        l = l * xp.conj(l[largest]) / xp.abs(l[largest]) / xp.sqrt(xp.sum(xp.abs(l) ** 2))
-        rights.append(r / (l @ r))
-        lefts.append(l)
-        if on_host(M):
-            apart = np.abs(l @ r) * np.sqrt(np.sum(np.abs(r / size) ** 2))
-            if not apart > SINGULAR * np.linalg.norm(l * size) * np.sum(np.abs(r / size) ** 2):
-                raise ComputationError(
-                    "two multipliers coincide, and their modes have no amplitudes of their own: "
-                    "ask for the phase alone by `modes=0`, or change a parameter."
-                )
-    return values, xp.stack(rights) if rights else right.T[:0], lefts
+    modes = [_mode(scaled, size, values[k], right[:, k]) for k in order[:count]]
+    if not modes:
+        return values[:0], right[:0], right[:0]
+    return tuple(xp.stack(x) for x in zip(*modes, strict=True))
 
 
-def _eigenpairs(M: Float[Array, "d d"], value, right):
-    """An eigenvalue with its right and left eigenvectors near an approximation, by one Newton step,
-    which also carries derivatives."""
+def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
+    """An eigenvalue of M with its right and left eigenvectors, in units of the states, near an
+    approximation, by one Newton step, which also carries derivatives.
+
+    **Raises:** `ComputationError` for one that coincides with another.
+    """
     xp, n = namespace(M), len(M)
     still = stop_gradient(M)
 
-    def pair(M, still, x, value):
+    def pair(M, still, x):
         matrix = xp.concatenate([still - value * np.eye(n), xp.conj(x)[None]])
         column = xp.append(-x, 0.0)[:, None]
         off = xp.append(M @ x - value * x, 0.0)
@@ -449,15 +425,23 @@ def _eigenpairs(M: Float[Array, "d d"], value, right):
         return x - step[:n], value - step[n]
 
     *_, rows = xp.linalg.svd(still.T - value * np.eye(n))  # the last is contracted most
-    right, root = pair(M, still, right, value)
-    left, _ = pair(M.T, still.T, xp.conj(rows[-1]), value)
-    return root, right, left
+    (right, root), (left, _) = pair(M, still, right), pair(M.T, still.T, xp.conj(rows[-1]))
+    if on_host(M):
+        apart = np.abs(left @ right) / (np.linalg.norm(left) * np.linalg.norm(right))
+        if not apart > SINGULAR:
+            raise ComputationError(
+                "two multipliers coincide, and their modes have no amplitudes of their own: "
+                "ask for the phase alone by `modes=0`, or change a parameter."
+            )
+    largest, left = left[xp.argmax(xp.abs(left))], left / size
+    left = left * xp.conj(largest) / xp.abs(largest) / xp.sqrt(xp.sum(xp.abs(left) ** 2))
+    return root, right * size / (left @ (right * size)), left
 
 
-def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"] | None:
+def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"]:
     """The effect of pushes in charts of sliding; identity in others."""
     if not any(isinstance(chart, SlidingChart) for chart in s.charts):
-        return None
+        return namespace(flow.q).broadcast_to(np.eye(s.d), flow.by_state.shape)
     effect = flow.evaluated(s, ft.partial(kernels.linear, s, _returned), s.d**2)
     return effect[..., 0].reshape(flow.by_state.shape)
 

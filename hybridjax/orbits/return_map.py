@@ -23,7 +23,7 @@ from ..engine import kernels
 from ..engine.events import arm
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
-from ..engine.replay import replay
+from ..engine.replay import projections, replay
 from ..engine.search.state import Recorded
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
@@ -371,11 +371,8 @@ def across(
     Nothing contracts along the flow of an autonomous system. Projected out of every factor,
     that direction cannot drown a strong contraction across it.
     """
-    xp, f = namespace(factors), f / sizes
-    f = f / xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
-    project = np.eye(f.shape[-1]) - f[..., :, None] * f[..., None, :]
-    project = project * sizes[..., :, None] / sizes[..., None, :]
-    return xp.roll(project, -1, axis=0) @ factors @ project
+    project = projections(f, sizes)
+    return namespace(project).roll(project, -1, axis=0) @ factors @ project
 
 
 def with_derivatives(

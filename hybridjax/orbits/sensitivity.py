@@ -14,13 +14,12 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked_methods
 from .._core.compilation import at_ease
-from .._core.executor import Array, is_traced, namespace, on_host, scan, to_host
+from .._core.executor import Array, is_traced, namespace, on_host
 from .._core.text import number
 from ..engine import kernels
 from ..errors import ComputationError
 from ..systems.structure import Structure
-from ..systems.transition import Scheduled
-from ..systems.varied import Varied
+from ..systems.varied import Varied, under
 from .crossing import AtEvent, ListLevels
 from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
 from .responses import Phases, loop
@@ -71,40 +70,30 @@ def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
     """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`)."""
     varied = Varied(cycle.system, parameter)
     flow = linear_flow(cycle, parameter=parameter)
-    cycle = to_host(cycle) if on_host(flow.q) else cycle
     with at_ease():
         return _sensitivity(cycle, flow, varied)
 
 
 def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     map, period, events = cycle.return_map, cycle.period, cycle.event_sequence
-    s, xp, jumps, f0 = map.structure, namespace(flow.q), flow.jumps, flow.field[0, 0]
-    clocked, due = map.base is None, _due(flow, events, varied)
-    free, forced = flow.forward
-    force = flow.by_input[..., 0] * flow.length[:, None, None]
-    pushed = xp.einsum("piakb,pkb->pia", forced, force)
-    kick = jumps.by_input[..., 0] + jumps.slip * due[:, None]
-    driven = xp.einsum("pab,pb->pa", jumps.by_state, pushed[:, -1]) + kick
-    through = jumps.by_state @ free[:, -1]
-    advance = lambda x, piece: (piece[0] @ x + piece[1], x)  # noqa: E731
-    total, _ = scan(advance, xp.zeros_like(f0), (through, driven))
-    whole = flow.monodromy(free, map.valid)
+    s, xp, f0, clocked = map.structure, namespace(flow.q), flow.field[0, 0], map.base is None
+    # The parameter is an input of frequency 0; the other columns are those of the state at phase 0.
+    starts, late, total = (x[..., 0] for x in flow.driven(xp.ones((*flow.t.shape, 1))))
+    whole = xp.where(map.valid[:, None] & map.valid, total[:, 1:], 0.0)
+    closed, Z = loop(map, whole, f0)
+    longer = -(Z @ total[:, 0])
     if clocked:
-        longer = map.multiplicity * _derivative(varied, lambda x: x.period())
-        closed = whole - xp.eye(len(f0))
+        period_at = lambda k: jnp.asarray(varied.at(k).period(), float)  # noqa: E731
+        longer = map.multiplicity * derivative_at_zero(period_at)
         if on_host(whole) and np.linalg.svd(closed, compute_uv=False)[-1] < SINGULAR:
             raise ComputationError(
                 "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
                 "branch by `continuation`."
             )
-    else:
-        closed, along = loop(map, whole, f0)
-        longer = -(xp.linalg.solve(closed.T, along) @ total)
-    begin = xp.linalg.solve(closed, -(total + f0 * longer))
-    _, starts = scan(advance, begin, (through, driven))
-    change = xp.einsum("pkab,pb->pka", free, starts) + pushed
-    late = xp.einsum("pa,pa->p", jumps.delay_by_state, change[:, -1])
-    late = late + jumps.delay_by_input[:, 0] + due
+    begin = xp.linalg.solve(closed, -(total[:, 0] + f0 * longer))
+    starts, late = starts[..., 0] + starts[..., 1:] @ begin, late[:, 0] + late[:, 1:] @ begin
+    change = xp.einsum("pkab,pb->pka", flow.forward[0], starts)
+    change = change + xp.sum(flow.pushed[..., 0, :], axis=-1)
     if not clocked:  # phase 0 stays on the section
         if isinstance(map.base, AtEvent):
             ahead = late[-1] - longer
@@ -118,26 +107,6 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     wrapped = xp.concatenate([times[1:], times[:1] + longer]) - times
     names = tuple(s.transitions[g].name for g in events)
     return Sensitivity(varied.parameter, longer, names, times, wrapped, s, flow, period, change)
-
-
-def _derivative(varied: Varied, value):
-    """The derivative of a number of the system by the parameter."""
-    return derivative_at_zero(lambda k: jnp.asarray(value(varied.at(k)), float))
-
-
-def _due(flow: LinearFlow, events: tuple[int, ...], varied: Varied) -> Float[Array, " P"]:
-    """Changes of the times of scheduled events, at the ends of pieces."""
-    xp, end = namespace(flow.q), flow.t[:, -1]
-    out = xp.zeros_like(end)
-    for g in sorted(set(events)):
-        guard = list(varied.transitions())[g].guard
-        if isinstance(guard, Scheduled):
-            schedule = lambda x, g=g: list(x.transitions())[g].guard  # noqa: E731
-            offset = _derivative(varied, lambda x, of=schedule: of(x).offset)
-            every = _derivative(varied, lambda x, of=schedule: of(x).period)
-            count = xp.round((end - guard.offset) / guard.period)
-            out = xp.where(flow.event == g, offset + count * every, out)
-    return out
 
 
 def to_section(
@@ -154,5 +123,4 @@ def to_section(
 
 
 def _level(a: int, s: Structure, levels: ListLevels, t, q, u):
-    of = Structure(s.system.at(u[0])) if isinstance(s.system, Varied) else s
-    return levels.level(of, a, jnp.zeros((), int), t, q)[None]
+    return levels.level(under(s, u), a, jnp.zeros((), int), t, q)[None]

@@ -296,8 +296,10 @@ class SettledCycle:
           Default: none, the signals are drawn over time.
         - `u` (n, nu): inputs, each held until the next section. Default: one cycle without inputs.
 
-        **Returns:** a `Trajectory` in the chart `plant`, from time 0 on. Where the plant raises an
-        error (a fall) it ends with `Result.PLANT_STOPPED`.
+        **Returns:** a `Trajectory` in the chart `plant`, from time 0 on. Where the plant raises a
+        `hj.ComputationError` (a fall) it ends with `Result.PLANT_STOPPED`.
+
+        **Raises:** any other error of the plant.
         """
         u = np.zeros((self.sections.n_sections, len(self.inputs))) if u is None else np.asarray(u)
         drive, points, result = self.drive, list[At](), Result.OK
@@ -306,7 +308,7 @@ class SettledCycle:
             for k, held in enumerate(u.tolist(), 1):
                 drive.advance(held, k, points)
             points.append(drive.here())
-        except Exception:
+        except ComputationError:
             result = Result.PLANT_STOPPED
         q, t = np.array([x.z for x in points]), np.array([x.t for x in points])
         n, s = len(t), Structure(Recorded(drive.names, draw))

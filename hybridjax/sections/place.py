@@ -13,7 +13,7 @@ from jaxtyping import Int
 from .._core.boundary.checked import checked
 from .._core.compilation import at_ease, host_first, quick_jit
 from .._core.executor import Array, is_traced, namespace, on_host, put, scan, stop_gradient, to_host
-from .._core.host_derivatives import NotOnHostError, require_program
+from .._core.host_derivatives import NotOnHostError, by_columns, require_program
 from .._core.lanes import by_lane
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -25,14 +25,16 @@ from ..engine.replay import Variation
 from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
+from ..orbits.checks import check_outputs
 from ..orbits.coincidence import SAME, TOGETHER
 from ..orbits.crossing import Crossing, ListLevels, to_section
 from ..orbits.cycle import LimitCycle
+from ..orbits.linear_flow import of_flow
 from ..orbits.return_map import PATIENCE, ReturnMap
 from ..systems.structure import Structure
 from . import families
 from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
-from .placed import PlacedSections, SectionsLike
+from .placed import PlacedSections, SectionsLike, observe
 
 
 # Parts of every step of the flow in which further crossings of a section are sought. Fewer: two
@@ -226,6 +228,32 @@ def place_along(
     rows = dict(drop=many(placed.drop), dims=many(placed.dims), normal=normal)
     moved = dataclasses.replace(placed, bound=bound, lanes=lanes, **rows)
     return placed, moved, along, flow.jacobians(tangents)[-N:]
+
+
+def _observed(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str, ...]):
+    placed = place_sections(cycle, family)
+    return placed.lanes.t, placed.observe(outputs) if outputs else None
+
+
+def _observed_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
+    """`_observed` on the host, and its derivatives."""
+    (cycle, family, outputs), (by_cycle, by_family, _) = arguments, directions
+    placed, moved, s, _ = place_along(cycle, family, by_cycle, by_family)
+    lanes, P = moved.lanes, len(moved.lanes.t) // family.n_sections
+    values, by = (placed.lanes.t, None), (lanes.t, None)
+    if outputs:
+        u = s.pushed(np.arange(len(lanes.t)) % P)
+        values = placed.lanes.t, placed.observe(outputs)
+        by = lanes.t, observe(s, check_outputs(cycle, outputs), lanes, u).T
+    directions_first = lambda x: np.swapaxes(x.reshape(-1, P, *x.shape[1:]), 0, 1)  # noqa: E731
+    tangents = lambda x: directions_first(x.imag) / kernels.TINY  # noqa: E731
+    return values, jax.tree_util.tree_map(tangents, by)
+
+
+observed_at = by_columns(
+    _observed, _observed_along, lambda tangents: (of_flow(tangents[0]), *tangents[1:])
+)
+"""Times (N,) at which a cycle crosses a family's sections, and outputs (N, ny) there."""
 
 
 @quick_jit

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked_methods
 from .._core.compilation import at_ease, host_first
-from .._core.executor import Array, is_inside_program, is_traced, namespace, on_host, to_host
+from .._core.executor import Array, is_hidden, is_traced, namespace, on_host, to_host
 from .._core.html import card, facts
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -139,7 +139,7 @@ class PlacedSections(eqx.Module):
 
         (On the host, the direction of an autonomous flow does not drown strong contraction.)
         """
-        placed = self if is_traced(self) or is_inside_program() else to_host(self)
+        placed = self if is_hidden(self) else to_host(self)
         lanes, n, across = placed.lanes, 1 + placed.lanes.q.shape[0], None
         if on_host(lanes.t) and not self.cycle.clocked and np.isinf(placed.bound.time).all():
             across = placed.cycle.settings.scale

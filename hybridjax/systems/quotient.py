@@ -1,7 +1,5 @@
 """Systems modulo a symmetry: legs that are relabeled, a position that has no effect."""
 
-import dataclasses
-import functools as ft
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -70,6 +68,7 @@ class Quotient(Derived):
     names: tuple[tuple[str, str], ...] = eqx.field(static=True)
     flipped: tuple[str, ...] = eqx.field(static=True)
     translation: tuple[str, ...] = eqx.field(static=True)
+    half_period: str | Callable | bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -80,13 +79,12 @@ class Quotient(Derived):
         translation: SignalNames = (),
         half_period: str | Callable | bool = False,
     ):
-        if half_period:
-            images = {**(swap or {}), **{b: a for a, b in (swap or {}).items()}}
-            images = {name: images.get(name, name) for name in system.charts()}
-            system = _Halves(system, half_period, tuple(images.items()))
-            swap = {name: image + SECOND for name, image in images.items()}
-        self.system, self.solver = system, system.solver
-        self.pairs, self.names = (tuple((x or {}).items()) for x in (swap, relabel))
+        swap = dict(swap or {})
+        if half_period:  # every chart is kept, and has an image
+            swap |= {b: a for a, b in swap.items()}
+            swap = {name: swap.get(name, name) for name in (*system.charts(), *swap)}
+        self.system, self.solver, self.half_period = system, system.solver, half_period
+        self.pairs, self.names = tuple(swap.items()), tuple((relabel or {}).items())
         self.flipped, self.translation = (
             (x,) if isinstance(x, str) else tuple(x) for x in (flipped, translation)
         )
@@ -101,43 +99,89 @@ class Quotient(Derived):
         """States that are exchanged."""
         return dict(self.names)
 
+    @property
+    def _kept_of(self) -> dict[str, str]:
+        """Charts that are left out, each with its mirror image."""
+        return {} if self.half_period else {b: a for a, b in self.pairs}
+
     def __check_init__(self):
         charts = self.system.charts()
         require_among("chart", (*self.swap, *self.swap.values()), charts, "Quotient: ")
         states = sorted({state for chart in charts.values() for state in chart.states})
         named = (*self.relabel, *self.relabel.values(), *self.flipped, *self.translation)
         require_among("state", named, states, "Quotient: ")
-        for kept, left_out in self.swap.items():
+        for kept, image in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
-            if mirrored != set(charts[left_out].states):
+            if mirrored != set(charts[image].states):
                 raise DefinitionError(
                     f"Quotient: mirrored, chart '{kept}' has the states {sorted(mirrored)}, but "
-                    f"chart '{left_out}' has {sorted(charts[left_out].states)}: give the states "
+                    f"chart '{image}' has {sorted(charts[image].states)}: give the states "
                     "that are exchanged by `relabel`."
                 )
+        if self.half_period:
+            self._check_half_period()
+
+    def _check_half_period(self):
+        if (self.system.period() is not None) != (self.half_period is True):
+            sentence = "True if a clock drives the system, else a state or a function of (t, q)"
+            raise DefinitionError(f"Quotient: `half_period` must be {sentence}.")
+        for x in self.system.transitions():
+            if isinstance(x.guard, Scheduled) and not is_traced(x.guard):
+                if abs(math.remainder(x.guard.offset / x.guard.period, 1.0)) < SAME_TIME:
+                    raise DefinitionError(
+                        f"Quotient: with `half_period`, '{x.name}' must not be scheduled at t = 0, "
+                        "where halves begin: let the clock begin earlier."
+                    )
+        for name, chart in self.system.charts().items():
+            named = [self.half_period] if isinstance(self.half_period, str) else []
+            require_among("state", named, chart.states, f"Quotient: in '{name}' ")
+
+    def period(self):
+        return None if self.half_period else self.system.period()
 
     def charts(self):
-        left_out = set(self.swap.values())
-        charts = self.system.charts().items()
-        return {name: _Reduced(x, self.translation) for name, x in charts if name not in left_out}
+        return {x: self._reduced(x) for x in self.system.charts() if x not in self._kept_of}
 
     def transitions(self):
-        left_out = self.swap.values()
-        return [self._transition(x) for x in self.system.transitions() if x.source not in left_out]
+        events = [x for x in self.system.transitions() if x.source not in self._kept_of]
+        made = [self._transition(x, self._kept_of, 1.0) for x in events]
+        return made + [self._transition(x, self.swap, 0.0) for x in self._halves()]
 
-    def _transition(self, x: Transition) -> Transition:
-        at = self._reduced(x.source).lifted
-        target, reset = self._landing(x)
-        guard = x.guard if isinstance(x.guard, Scheduled) else at(x.guard)
-        enabled = None if x.enabled is None else at(x.enabled)
-        return Transition(x.name, x.source, target, guard, x.direction, at(reset), enabled)
+    def _transition(self, x: Transition, images: Mapping[str, str], clock: float) -> Transition:
+        """A transition, with the state in the image of its target; the clock is multiplied."""
+        chart, guard, direction = self._reduced(x.source), x.guard, x.direction
+        target, landed = self._landing(x, images)
+        if isinstance(guard, Scheduled) and chart.clocked:
+            guard, direction = _phase_of(guard), "rising"
+        guard = guard if isinstance(guard, Scheduled) else chart.lifted(guard)
+        enabled = None if x.enabled is None else chart.lifted(x.enabled)
+        at, n = chart.lifted(landed), len(chart.kept)
+        reset = lambda *point: jnp.append(at(*point), clock * point[1][n:])  # noqa: E731
+        return Transition(x.name, x.source, target, guard, direction, reset, enabled)
+
+    def _halves(self):
+        """The ends of half a period, as transitions of the original system."""
+        rises, period, charts = self.half_period, self.system.period(), self.system.charts()
+        for name in self.swap if rises else ():
+            if period is not None:
+                guard = lambda t, q, u: t - period / 2  # noqa: E731
+            elif isinstance(rises, str):
+                place = charts[name].states.index(rises)
+                guard = lambda t, q, u, k=place: q[k]  # noqa: E731
+            else:
+                guard = lambda t, q, u: rises(t, q)  # noqa: E731
+            title = "half period" + f" ({name})" * (len(self.pairs) > 1)
+            yield Transition(title, name, name, guard, "rising")
 
     def guess(self):
         guess = self.system.guess()
         if guess is None or guess.chart not in self.charts():
             return None
-        state = self.charts()[guess.chart].less(guess.state)
-        return Guess(guess.chart, state, guess.time, after=guess.after)
+        chart = self.charts()[guess.chart]
+        state, time = chart.less(guess.state), guess.time
+        if chart.clocked:
+            state, time = jnp.append(state, jnp.asarray(time) % (self.system.period() / 2)), 0.0
+        return Guess(guess.chart, state, time, after=guess.after)
 
     def outputs(self):
         charts, outputs = self.charts(), []
@@ -151,7 +195,8 @@ class Quotient(Derived):
         """The picture of the original system, which stands at the translation 0 and moves."""
         whole, still = self.system.charts()[chart], dict.fromkeys(self.translation, 0.0)
         state = jnp.stack([jnp.asarray((still | dict(q))[x], float) for x in whole.states])
-        drawing = self.system.draw(chart, t, {**q, **still})
+        time = q["clock"] if self.charts()[chart].clocked else t
+        drawing = self.system.draw(chart, time, {**q, **still})
         if drawing is None or len(self.translation) != 1:
             return drawing
         rates = as_vector(whole.field(t, state, jnp.zeros(len(self.inputs))))
@@ -174,63 +219,76 @@ class Quotient(Derived):
         values = both(rng.normal(size=(3, d)), rng.normal(size=3))
         for (sentence, *_), pair in zip(claims, values, strict=True):
             if not _equal(*pair):
-                full = self.system.system if isinstance(self.system, _Halves) else self.system
                 raise DefinitionError(
-                    f"{type(full).__name__} does not have the symmetry of its Quotient: {sentence}."
+                    f"{type(self.system).__name__} does not have the symmetry of its Quotient: "
+                    f"{sentence}."
                 )
 
     def _claims(self):
         """The statements of the symmetry: a sentence for its failure, and two functions of
         (t, q, u) that are equal. The first numbers of q are the state without translations."""
-        charts, events = self.system.charts(), self.system.transitions()
-        kept_of = {name: name for name in charts} | {b: a for a, b in self.swap.items()}
-
-        def parts(name, shift=0.0):
-            """All functions of a chart, with rates mirrored back if it is left out."""
-            kept = kept_of[name]
-            back = lambda x: x if name == kept else self._mirrored(kept, x, back=True)  # noqa: E731
-            field = lambda *point: back(as_vector(charts[name].field(*point)))  # noqa: E731
-            named = [(f"transition '{x.name}'", self._event(x)) for x in events if x.source == name]
-            for what, function in [(f"field of chart '{name}'", field), *named]:
-                yield what, ft.partial(of_kept, function, name, shift)
-
-        def of_kept(function, name, shift, t, q, u):
-            kept = kept_of[name]
-            chart = self._reduced(kept)
-            state = chart.full(q[: len(chart.kept)], shift)
-            return function(t, state if name == kept else self._mirrored(kept, state), u)
-
-        for name in charts if self.translation else ():
-            for (what, before), (_, after) in zip(parts(name), parts(name, 0.7), strict=True):
+        for name in self.system.charts() if self.translation else ():
+            parts = (self._parts(name, self._kept_of, shift=x) for x in (0.0, 0.7))
+            for (what, before), (_, after) in zip(*parts, strict=True):
                 yield f"the {what} changes under the translation", before, after
+        images, later = self._kept_of, 0.0
+        if self.half_period:
+            images, later = self.swap, 0.5 * (self.system.period() or 0.0)
         for kept, other in self.swap.items():
-            ours, images = list(parts(kept)), list(parts(other))
-            if len(ours) != len(images):
+            ours = list(self._parts(kept, self._kept_of))
+            theirs = list(self._parts(other, images, later=later))
+            if len(ours) != len(theirs):
                 sentence = f"'{kept}' and '{other}' have different numbers of transitions"
                 yield sentence, lambda *_: 0.0, lambda *_: 1.0
-            for (what, function), (name, image) in zip(ours, images, strict=False):
+            if kept == other:  # its last transition is the image of its first
+                theirs[1:] = theirs[:0:-1]
+            for (what, function), (name, image) in zip(ours, theirs, strict=False):
                 yield f"the {name} is not the mirror image of the {what}", function, image
 
-    def _reduced(self, name: str) -> "_Reduced":
-        return _Reduced(self.system.charts()[name], self.translation)
+    def _parts(self, name: str, images: Mapping[str, str], shift: Any = 0.0, later: Any = 0.0):
+        """All functions of a chart, of points of the reduced one, with rates and states mirrored if
+        the chart is among the `images`."""
+        kept = images.get(name, name)
+        chart, mirrored = self._reduced(kept), self._mirrored if name in images else _same
+        field = self.system.charts()[name].field
 
-    def _landing(self, x: Transition) -> tuple[str, Callable]:
-        """The chart to which a transition leads, one that is kept, and the state there."""
-        target = {left_out: kept for kept, left_out in self.swap.items()}.get(x.target, x.target)
+        def at(function):
+            def moved(t, q, u):
+                return function(t + later, mirrored(kept, chart.full(q, shift)), u)
+
+            return moved
+
+        back = lambda *point: mirrored(kept, as_vector(field(*point)), back=True)  # noqa: E731
+        yield f"field of chart '{name}'", at(back)
+        for x in self.system.transitions():
+            if x.source == name:
+                yield f"transition '{x.name}'", at(self._event(x, images))
+        sign = -1.0 if name in images else 1.0
+        for x in self._halves() if self.system.period() is None else ():
+            if x.source == name:
+                yield f"sign of '{x.name}'", at(lambda *point, x=x: sign * x.guard(*point))
+
+    def _reduced(self, name: str) -> "_Reduced":
+        clocked = bool(self.half_period) and self.system.period() is not None
+        return _Reduced(self.system.charts()[name], self.translation, clocked)
+
+    def _landing(self, x: Transition, images: Mapping[str, str]) -> tuple[str, Callable]:
+        """The chart to which a transition leads, or its image, and the state there."""
+        target = images.get(x.target, x.target)
+        mirrored = self._mirrored if x.target in images else _same
 
         def reset(t, q, u):
-            new = as_vector(x.reset(t, q, u))
-            mirrored = new if target == x.target else self._mirrored(target, new, back=True)
-            return self._reduced(target).less(mirrored)
+            new = mirrored(target, as_vector(x.reset(t, q, u)), back=True)
+            return self._reduced(target).less(new)
 
         return target, reset
 
-    def _event(self, x: Transition) -> Callable:
+    def _event(self, x: Transition, images: Mapping[str, str]) -> Callable:
         """Guard and reset of a transition, as one vector."""
-        (_, reset), guard = self._landing(x), x.guard
+        (_, reset), sign, guard = self._landing(x, images), x.sign, x.guard
         if isinstance(guard, Scheduled):
-            return reset
-        return lambda t, q, u: jnp.append(reset(t, q, u), x.sign * guard(t, q, u))
+            guard = _phase_of(guard)
+        return lambda t, q, u: jnp.append(reset(t, q, u), sign * guard(t, q, u))
 
     def _partner(self, name: str) -> str:
         back = {b: a for a, b in self.relabel.items()}
@@ -248,125 +306,25 @@ class Quotient(Derived):
         return q[np.array(order)] * np.array([-1.0 if x in self.flipped else 1.0 for x in names])
 
 
-SECOND = " (second half)"
 # Distance from the begin of a half, in periods, at which a scheduled transition coincides with it.
 # Smaller: it is missed. Larger: ones that are distinct are refused.
 SAME_TIME = 1e-9
 
 
-class _Halves(Derived):
-    """A system whose charts have copies for the second half of a cycle."""
-
-    half_period: str | Callable | bool = eqx.field(static=True)
-    images: tuple[tuple[str, str], ...] = eqx.field(static=True)
-
-    def __check_init__(self):
-        if (self.system.period() is not None) != (self.half_period is True):
-            sentence = "True if a clock drives the system, else a state or a function of (t, q)"
-            raise DefinitionError(f"Quotient: `half_period` must be {sentence}.")
-        for x in self.system.transitions():
-            if isinstance(x.guard, Scheduled) and not is_traced(x.guard):
-                if abs(math.remainder(x.guard.offset / x.guard.period, 1.0)) < SAME_TIME:
-                    raise DefinitionError(
-                        f"Quotient: with `half_period`, '{x.name}' must not be scheduled at t = 0, "
-                        "where halves begin: let the clock begin earlier."
-                    )
-        for name, chart in self.system.charts().items():
-            named = [self.half_period] if isinstance(self.half_period, str) else []
-            require_among("state", named, chart.states, f"Quotient: in '{name}' ")
-
-    def period(self):
-        return None
-
-    def charts(self):
-        period, charts = self.system.period(), self.system.charts().items()
-        first, later = (None, None) if period is None else (0.0, period / 2)
-        pairs = [(x, "", first) for x in charts] + [(x, SECOND, later) for x in charts]
-        return {name + when: _Half(chart, later) for (name, chart), when, later in pairs}
-
-    def transitions(self):
-        charts, events, made = self.charts(), list(self.system.transitions()), []
-        for when, other, sign in (("", SECOND, 1), (SECOND, "", -1)):
-            for name, image in self.images:
-                chart = charts[name + when]
-                copies = [chart.copied(x, when) for x in events if x.source == name]
-                guard, places = ft.partial(self._switch, chart, sign), (name + when, name + other)
-                made += copies[::-1] if when and name == image else copies
-                title = "half period" + f" ({name})" * (len(self.images) > 1)
-                made += [Transition(title, *places, guard, "rising", chart.anew)]
-        return made
-
-    def _switch(self, chart: "_Half", sign: int, t, q, u):
-        if (period := self.system.period()) is not None:
-            return q[-1] - period / 2
-        if callable(self.half_period):
-            return sign * self.half_period(t, q)
-        return sign * q[chart.chart.states.index(self.half_period)]
-
-    def guess(self):
-        guess, period = self.system.guess(), self.system.period()
-        if guess is None or period is None:
-            return guess
-        clock = jnp.asarray(guess.time) % (period / 2)
-        return Guess(guess.chart, jnp.append(guess.state, clock), after=guess.after)
-
-    def outputs(self):
-        charts, outputs = self.charts(), []
-        for x in self.system.outputs():
-            given = dict.fromkeys(charts, x.function) if callable(x.function) else x.function
-            lifted = {name: charts[name].lifted(f) for name, f in given.items()}
-            outputs.append(Output(x.name, lifted, x.unit))
-        return outputs
-
-    def draw(self, chart, t, q):
-        return self.system.draw(chart.removesuffix(SECOND), q.get("clock", t), q)
+def _same(kept: str, q: Any, back: bool = False):
+    return q
 
 
-class _Half(DerivedChart):
-    """A chart in one half of a cycle: with the time since its begin, if a clock drives the system,
-    and then for times that are `later` by so much."""
-
-    later: Any
-
-    @property
-    def states(self) -> tuple[str, ...]:  # type: ignore[override]
-        return (*self.chart.states, *(() if self.later is None else ("clock",)))
-
-    @property
-    def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        extra = () if self.later is None or not self.chart.units else ("",)
-        return (*self.chart.units, *extra)
-
-    def lifted(self, function: Callable) -> Callable:
-        if self.later is None:
-            return function
-        return lambda t, q, u: function(q[-1] + self.later, q[:-1], u)
-
-    def field(self, t, q, u):
-        rates = as_vector(self.lifted(self.chart.field)(t, q, u))
-        return rates if self.later is None else jnp.append(rates, 1.0)
-
-    def anew(self, t, q, u):
-        """The state when the other half begins."""
-        return q if self.later is None else jnp.append(q[:-1], 0.0)
-
-    def copied(self, x: Transition, when: str) -> Transition:
-        """A transition of this half; the clock goes on."""
-        at, guard, kept = self.lifted, x.guard, slice(len(self.chart.states), None)
-        if isinstance(tick := x.guard, Scheduled):
-            guard = lambda t, q, u: jnp.sin(2 * jnp.pi * (t - tick.offset) / tick.period)  # noqa: E731
-            x = dataclasses.replace(x, direction="rising")
-        assert callable(guard)
-        reset = lambda t, q, u: jnp.append(as_vector(at(x.reset)(t, q, u)), q[kept])  # noqa: E731
-        copy = dataclasses.replace(x, guard=at(guard), reset=reset)
-        copy = dataclasses.replace(copy, enabled=x.enabled and at(x.enabled))
-        return dataclasses.replace(copy, source=x.source + when, target=x.target + when)
+def _phase_of(guard: Scheduled) -> Callable:
+    """A function that rises through zero at scheduled times."""
+    return lambda t, q, u: jnp.sin(2 * jnp.pi * (t - guard.offset) / guard.period)
 
 
 class _Reduced(DerivedChart):
-    """A chart without the states of a translation."""
+    """A chart without the states of a translation; if `clocked`, the time is its last state."""
 
     translation: Sequence[str] = eqx.field(static=True)
+    clocked: bool = eqx.field(static=True)
 
     @property
     def kept(self) -> np.ndarray:
@@ -374,25 +332,28 @@ class _Reduced(DerivedChart):
 
     @property
     def states(self) -> tuple[str, ...]:  # type: ignore[override]
-        return tuple(self.chart.states[k] for k in self.kept)
+        return *(self.chart.states[k] for k in self.kept), *("clock",) * self.clocked
 
     @property
     def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        return tuple(self.chart.units[k] for k in self.kept) if self.chart.units else ()
+        units = self.chart.units
+        return (*(units[k] for k in self.kept), *("",) * self.clocked) if units else ()
 
     def full(self, q, shift=0.0):
         """The state of the whole chart, translated by a shift."""
-        return jnp.full(len(self.chart.states), shift).at[self.kept].set(q)
+        kept = self.kept
+        return jnp.full(len(self.chart.states), shift).at[kept].set(q[: len(kept)])
 
     def less(self, q):
         return jnp.asarray(q)[self.kept]
 
     def lifted(self, function: Callable) -> Callable:
         """A function of the whole chart's state, of the reduced one."""
-        return lambda t, q, u: function(t, self.full(q), u)
+        return lambda t, q, u: function(q[-1] if self.clocked else t, self.full(q), u)
 
     def field(self, t, q, u):
-        return self.less(as_vector(self.chart.field(t, self.full(q), u)))
+        rates = self.less(as_vector(self.lifted(self.chart.field)(t, q, u)))
+        return jnp.append(rates, 1.0) if self.clocked else rates
 
 
 def _equal(x, y):

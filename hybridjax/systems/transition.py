@@ -10,7 +10,7 @@ from jaxtyping import Float
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers
 from .._core.boundary.values import Reals
-from .._core.executor import Array, namespace
+from .._core.executor import Array, namespace, stop_gradient
 from .._core.precision import real
 from .._core.text import fields
 from ..errors import DefinitionError
@@ -45,6 +45,11 @@ class Scheduled(eqx.Module):
         """`offset` and `period`, as arrays of the kind of t."""
         xp = namespace(t)
         return xp.asarray(self.offset), xp.asarray(self.period)
+
+    def nearest(self, t: Array) -> Array:
+        """The event's time that is nearest to t, as a function of `offset` and `period`."""
+        offset, period = self.numbers(t)
+        return offset + stop_gradient(namespace(t).round((t - offset) / period)) * period
 
 
 def _identity(t, q, u):

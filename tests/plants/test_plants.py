@@ -77,12 +77,14 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
     class Falls(Circle):
         def step(self, u, duration):
             if u[0] > 1:
-                raise RuntimeError("fell")
+                raise hj.ComputationError("fell") if u[0] == 2 else ZeroDivisionError
             return super().step(u, duration)
 
     cycle = hj.plants.settle(Falls(), ANGLE, "x", cycles=20)
     fall = cycle.trajectory(picture, [[0.0], [0.0], [2.0], [0.0]])
     assert fall.result == hj.Result.PLANT_STOPPED and abs(fall.t[-1] - math.pi / 2) < 1e-8
+    with pytest.raises(ZeroDivisionError):  # a mistake in the plant is no fall
+        cycle.trajectory(u=[[3.0]])
 
 
 def test_an_unstable_cycle_is_found_from_a_guess():

@@ -11,7 +11,7 @@ import jax
 
 from ...errors import DefinitionError
 from ..arguments import require_among
-from ..executor import is_inside_program, is_traced
+from ..executor import is_hidden
 from ..memo import Memory
 from .kinds import kind_of
 from .values import Kind, Misfit
@@ -93,7 +93,7 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
         except Misfit as misfit:
             raise DefinitionError(f"{name}: `{misfit.path}` {misfit.problem}.") from None
         except (*_JAX_ERRORS, NeedsValues):
-            if not is_traced(args, kwargs) and not is_inside_program():
+            if not is_hidden(args, kwargs):
                 raise
         raise NeedsValues(
             f"{name} needs values, but JAX traces them here: call it outside of jit, vmap and grad."
