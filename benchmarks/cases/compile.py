@@ -27,6 +27,7 @@ import re
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 
 import one_thread
 
@@ -123,7 +124,7 @@ def derivatives() -> dict[str, float]:
     from .problems import OUTPUTS, sections
 
     hj.enable_x64()
-    hopper, outputs, seconds = hj.models.VerticalHopper(), OUTPUTS["hopper"], {}
+    hopper, outputs = hj.models.VerticalHopper(), OUTPUTS["hopper"]
     family, cycle = sections("hopper", "kinematic"), hj.find_limit_cycle(hopper)
     htf = hj.linearize(cycle, family, outputs).htf(np.linspace(0.01, 0.49, 40), (-1, 0, 1))
 
@@ -132,16 +133,38 @@ def derivatives() -> dict[str, float]:
         return hj.linearize(neighbor, family, outputs).characteristic_polynomial()[2]
 
     near, observed = hj.models.VerticalHopper(k=10.8, b=4.75), hj.ObservedHTF(htf, family)
-    jobs = {
-        "gradient": lambda: eqx.filter_grad(coefficient)(hopper).k.item(),
-        "fit": lambda: hj.fit_model(near, observed, ("k", "b"), guesses=4),
-    }
+    return twice(
+        gradient=lambda: eqx.filter_grad(coefficient)(hopper).k.item(),
+        fit=lambda: hj.fit_model(near, observed, ("k", "b"), guesses=4),
+    )
+
+
+def twice(**jobs: Callable[[], object]) -> dict[str, float]:
+    """CPU seconds of the first and the second call of each job."""
+    seconds = {}
     for name, job in jobs.items():
         for state in ("", "_again"):
             begin = time.process_time()
             job()
             seconds[name + state] = time.process_time() - begin
     return seconds
+
+
+def sweeps(kind: str) -> dict[str, float]:
+    """CPU seconds of the cycles of 2500 systems."""
+    import equinox as eqx
+    import numpy as np
+
+    import hybridjax as hj
+
+    one_thread.pin()
+    hj.enable_x64()
+    hopper, k, b = hj.models.VerticalHopper(), np.linspace(9, 11, 50), np.linspace(4.5, 5.5, 50)
+    if kind == "space":
+        return twice(sweep=lambda: hj.sweep(hopper, {"k": k, "b": b}))
+    make = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))
+    systems, cycle = make(*(x.ravel() for x in np.meshgrid(k, b))), hj.find_limit_cycle(hopper)
+    return twice(find_limit_cycles=lambda: hj.find_limit_cycles(systems, cycle))
 
 
 def responses() -> dict[str, float]:
