@@ -267,7 +267,7 @@ def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
         lowered = jax.jit(run).lower(leaves)
         text = lowered.as_text()
         digest = key[0], hashlib.sha256(text.encode()).digest()
-        _by_kind[key] = _by_text.setdefault(digest, _Program(lowered, calls_lapack(text)))
+        _by_kind[key] = _by_text.setdefault(digest, _Program(lowered, "@lapack_" in text))
     return _by_kind[key]
 
 
@@ -339,11 +339,6 @@ def in_turn(alone: bool) -> Iterator[None]:
     """A context in which one thread is at a time, if it must be `alone`."""
     with _turn if alone else contextlib.nullcontext():
         yield
-
-
-def calls_lapack(text: str) -> bool:
-    """Return whether a lowered program calls LAPACK."""
-    return "@lapack_" in text
 
 
 def kernel(

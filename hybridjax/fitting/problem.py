@@ -14,7 +14,6 @@ from .._core.compilation import kind, quick_jit
 from .._core.executor import is_inside_program, on_the_cpu
 from .._core.host_derivatives import NotOnHostError, only_on_host
 from .._core.results import Result
-from ..engine.lanes import Lanes
 from ..errors import DefinitionError
 from ..identify.weights import estimated_noise
 from ..orbits.cycle import LimitCycle
@@ -198,11 +197,9 @@ class FitProblem(eqx.Module):
         htfs = [x for x in self.observations if isinstance(x, ObservedHTF)]
         return estimated_noise(max((float(x.most) for x in htfs), default=1.0), misfit)[1] ** 2
 
-    def residuals(
-        self, x: Float[Array, " p"], guess: LimitCycle
-    ) -> tuple[Float[Array, " r"], tuple[Lanes, Array]]:
-        """Return the residuals, infinite where there is no limit cycle, or no observation on it;
-        and the anchor and the period of the cycle."""
+    def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> tuple[Array, tuple]:
+        """Return the residuals (r,), infinite where there is no limit cycle, or no observation on
+        it; and the anchor and the period of the cycle."""
         values = self.parameters.decode(x)
         cycle = candidate_cycle(self.parameters.insert(guess.system, values), guess)
         observations = self.parameters.observed(self.observations, values)
@@ -219,10 +216,8 @@ def _joined(parts, result):
 def _with_jacobian(problem: FitProblem, x, guess):
     """Return residuals (r,), their Jacobian (r, p) with all columns in one pass, in forward mode,
     and the anchor and the period."""
-
-    def push(t):
-        return jax.jvp(lambda x: problem.residuals(x, guess), (x,), (t,), has_aux=True)
-
+    at = lambda x: problem.residuals(x, guess)  # noqa: E731
+    push = lambda t: jax.jvp(at, (x,), (t,), has_aux=True)  # noqa: E731
     return jax.vmap(push, out_axes=(None, -1, None))(jnp.eye(x.shape[0]))
 
 

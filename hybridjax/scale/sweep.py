@@ -207,9 +207,8 @@ class SweepJob:
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
         assert self.begun is not None
         systems = self.family.systems(self.space.at(index))
-        points = math.prod(self.blocks.block)
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
-        size, threads = min(BATCH, points), Execution(workers=workers).threads
+        size, threads = min(BATCH, math.prod(self.blocks.block)), Execution(workers=workers).threads
         large = math.prod(self.blocks.shape) > SMALL
         # (Results of a piece do not depend on when it is computed.)
         programs = ft.cache(ft.partial(TwoTiers, large=large, steady=True))
