@@ -206,13 +206,12 @@ class SweepJob:
 
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
         assert self.begun is not None
-        systems = self.family.systems(self.space.at(index))
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
         size, threads = min(BATCH, math.prod(self.blocks.block)), Execution(workers=workers).threads
-        large = math.prod(self.blocks.shape) > SMALL
         # (Results of a piece do not depend on when it is computed.)
-        programs = ft.cache(ft.partial(TwoTiers, large=large, steady=True))
-        return Tiles(systems, self.begun.map, size, threads, programs)
+        tiers = ft.partial(TwoTiers, large=math.prod(self.blocks.shape) > SMALL, steady=True)
+        systems = self.family.systems(self.space.at(index))
+        return Tiles(systems, self.begun.map, size, threads, ft.cache(tiers))
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""
