@@ -32,9 +32,13 @@ from scipy import stats
 import hybridjax as hj
 from hybridjax.identify.denominator import multipliers_of
 from hybridjax.identify.instrument import in_loop
-from hybridjax.identify.joint.model import PeriodicModel, characteristic_slopes, local_coordinates
 from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
+from hybridjax.identify.periodic_model import (
+    PeriodicModel,
+    characteristic_slopes,
+    local_coordinates,
+)
 from hybridjax.identify.series.records import CycleGrid
 
 

@@ -151,6 +151,8 @@ def _add_identify(commands) -> None:
     add("--workers", type=_count, default=1, metavar="N",
         help="processes for the subjects of --table (default: %(default)s)")  # fmt: skip
     add("--input", required=True, type=_names, metavar="NAMES", help="measured perturbations")
+    add("--reference", type=_names, default=(), metavar="NAMES", help="signals that act from "
+        "outside on a loop, if a controller makes the inputs")  # fmt: skip
     add("--outputs", required=True, type=_names, metavar="NAMES", help="measured outputs")
     phase = identify.add_mutually_exclusive_group(required=True)
     phase.add_argument("--phase", type=_two_names, metavar="X,V",

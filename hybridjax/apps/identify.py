@@ -73,7 +73,8 @@ def run(options: Any) -> bool:
 
 def steps_of(options: Any) -> tuple[tuple[str, ...], Callable[[Recording], Identification]]:
     """Return the names of the signals to be read, and the function that identifies a recording."""
-    named = (*options.input, *options.outputs, *(options.phase or (options.crossing or ())[:1]))
+    named = (*options.input, *options.reference, *options.outputs)
+    named += options.phase or (options.crossing or ())[:1]
     if options.phase is not None:
         position, velocity = options.phase
         sections: Any = KinematicPhase(
@@ -87,7 +88,7 @@ def steps_of(options: Any) -> tuple[tuple[str, ...], Callable[[Recording], Ident
     identify = functools.partial(
         identify_recording, phase=sections, inputs=options.input, outputs=options.outputs,
         n_sections=options.sections, order=options.order, bandwidth=options.bandwidth,
-        timing=options.timing, drift=options.drift,
+        timing=options.timing, drift=options.drift, reference=options.reference or None,
     )  # fmt: skip
     return tuple(dict.fromkeys(named)), identify
 
@@ -212,6 +213,7 @@ def summarize(found: Identification) -> dict[str, Any]:
         "notes": list(found.recording.notes),
         "units": {"time": "s"} | dict(zip(data.signals, data.units, strict=True)),
         "inputs": list(data.inputs),
+        "references": list(fit.reference),
         "outputs": list(data.outputs),
         "sections": data.n_sections,
         "cycles": round(data.cycles, 2),
@@ -251,12 +253,17 @@ def _page(found: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
     data, recording, warnings = found.data, found.recording, found.advice.warnings
     trials = escape(", ".join(t.name for t in recording.trials))
+    loop, method = found.fit.reference, "output-error fit"
+    if loop:
+        method = f"instrumental variables of {escape(listed(loop))}"
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(found).items() if amount}
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
     expected = zip(found.advice.strides, found.advice.expected, strict=True)
     parts = [
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",
+        f"<p>A controller makes {escape(listed(data.inputs))}. These are the dynamics without it, "
+        f"as {escape(listed(loop))} tells, which acts from outside.</p>" * bool(loop),
         found.fit._repr_html_(),
         *(f'<p class="warn">{_sentence(repr(w))}</p>' for w in warnings),
         *([] if warnings else ['<p class="fine">Nothing speaks against the fit.</p>']),
@@ -284,7 +291,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
             if name.startswith(figure)
         ),
         f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
-        f"{data.bandwidth:.3g} Hz; output-error fit with {found.fit.numerators.shape[1]} lags; "
+        f"{data.bandwidth:.3g} Hz; {method} with {found.fit.numerators.shape[1]} lags; "
         "regions from the residuals, cycle by cycle.</p>",
     ]  # fmt: skip
     return page_of("Floquet multipliers from a recording", parts)

@@ -13,8 +13,9 @@ from jaxtyping import Float, Int
 from ..errors import DefinitionError
 from ..identify.descent import NormalEquations, Spread
 from ..identify.joint.frequency import transfer, transfer_slopes
-from ..identify.joint.model import LocalCoordinates, PeriodicModel, local_coordinates
-from ..identify.joint.realization import default_horizon, realize
+from ..identify.joint.realization import realize
+from ..identify.periodic_model import LocalCoordinates, PeriodicModel, local_coordinates
+from ..identify.series.subspace import default_horizon
 from ..identify.weights import check_values, error_weights
 from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP

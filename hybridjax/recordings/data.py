@@ -1,6 +1,7 @@
 """Data at the sections of a recorded cycle."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -87,6 +88,20 @@ class SectionData(eqx.Module):
         """Return root mean squares of the deviations of inputs and outputs."""
         size, nu = np.sqrt(np.nanmean(self._deviations() ** 2, axis=0)), len(self.inputs)
         return size[:nu], size[nu:]
+
+    def of_inputs(self, names: Sequence[str]) -> "SectionData":
+        """Return the data with some of the inputs only."""
+        columns = [self.inputs.index(name) for name in names]
+        kept = [*columns, *range(len(self.inputs), len(self.signals))]
+        return replace(
+            self,
+            records=tuple(
+                replace(r, u=r.u[:, columns], inputs=tuple(self.inputs[k] for k in columns))
+                for r in self.records
+            ),
+            cycle_inputs=self.cycle_inputs[:, columns],
+            spikes=tuple(self.spikes[k] for k in kept),
+        )
 
     def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""

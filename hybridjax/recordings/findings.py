@@ -21,8 +21,7 @@ from .recording import Recording, Trial
 CLEAR = 4.0
 
 NAME_REFERENCE = (
-    "Record a signal that acts on the loop from outside, too, and name it as the `reference` of "
-    "`hj.fit_ldtp` or `hj.estimate_htf`."
+    "Record a signal that acts on the loop from outside, too, and name it as the `reference`."
 )
 
 

@@ -102,7 +102,7 @@ def advise(
         warnings.append(Finding("order", text))
     band = input_band(data)
     error = np.where(grid.sampled, grid.y - fit.simulate(grid, True), 0.0)
-    for name, p in answering(grid, error, data.inputs).items():
+    for name, p in ({} if fit.reference else answering(grid, error, data.inputs)).items():
         text = f"{name} answers earlier residuals of the outputs ({p_value(p)}), as by a "
         text += f"controller: fits are biased. {NAME_REFERENCE}"
         warnings.append(Finding("feedback", text))

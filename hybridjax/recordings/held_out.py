@@ -66,10 +66,10 @@ class Split(NamedTuple):
             misfits.append(float(np.log(square).mean()) / 2)
         return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
 
-    def fit(self, order: int) -> HeldOut:
+    def fit(self, order: int, reference: tuple[str, ...] | None = None) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
-        fit = fit_series(self.early, order, check=False)
-        return HeldOut(fit, validate(fit, self.late))
+        fit = fit_series(self.early, order, check=False, reference=reference)
+        return HeldOut(fit, validate(fit, self.late, reference=reference))
 
 
 @checked

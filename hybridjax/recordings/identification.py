@@ -1,5 +1,6 @@
 """All steps from a recording to multipliers, in one call."""
 
+from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
@@ -8,7 +9,10 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
 from .._core.precision import require_x64
 from .._core.progress import say, working
+from ..errors import DefinitionError
+from ..identify.instrument import in_loop
 from ..identify.series.fit import SeriesFit, fit_series
+from ..identify.series.in_loop import predicted
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import Finding, refuse
@@ -60,6 +64,7 @@ def identify_recording(
     bandwidth: Bandwidth | None = None,
     timing: Literal["clock", "duration"] | None = None,
     drift: DriftCycles | None = None,
+    reference: SignalNames | None = None,
 ) -> Identification:
     """Identify multipliers, transfer functions and impulse responses from a recording, and list the
     reasons to doubt them. The recording is inspected first (`hj.recordings.inspect`).
@@ -70,13 +75,19 @@ def identify_recording(
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
+    - `reference`: signals that act from outside on a loop, as many as inputs, which a controller
+      makes. The fit is then that of the plant, see `fit_series`. Default: None.
 
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
     `section_data` and `fit_series`; `PrecisionError` in single precision.
     """
     require_x64()
     say("inspection")
-    inspection = inspect(recording, inputs=inputs, outputs=outputs)
+    outside = None if reference is None else tuple(reference)
+    if both := set(inputs) & set(outside or ()):
+        raise DefinitionError(f"`reference` must name other signals than `inputs`, not {both}.")
+    signals = (*inputs, *(outside or ()))
+    inspection = inspect(recording, inputs=signals, outputs=outputs)
     refuse(inspection.findings)
     recording = inspection.recording
     say("phase")
@@ -87,30 +98,32 @@ def identify_recording(
         recording = without_drift(recording, phase, sorted(drifting), drift)
         phase = phase if definition is None else estimate_phase(recording, definition)
     say("data at the sections")
-    data = section_data(
+    whole = section_data(
         recording,
         phase,
-        inputs=inputs,
+        inputs=signals,
         outputs=outputs,
         n_sections=n_sections,
         bandwidth=bandwidth,
         timing=timing,
     )
-    data = data if drift is None else data.with_drift(drift)
-    findings = (*inspection.findings, *inspect_cycles(recording, phase, data))
+    whole = whole if drift is None else whole.with_drift(drift)
+    # In a loop all that happens begins at the reference.
+    driving = whole if outside is None else whole.of_inputs(outside)
+    findings = (*inspection.findings, *inspect_cycles(recording, phase, driving))
     refuse(findings)
     say("order")
-    parts = split(data)
-    best = parts.best_order(most=4 if order is None else order + 2)
+    data, parts, most = whole.of_inputs(inputs), split(whole), 4 if order is None else order + 2
+    best = (parts if outside is None else split(_without_noise(whole, outside))).best_order(most)
     order = best if order is None else order
     if best > order:
         text = f"held-out strides are predicted better with {best} multipliers than with {order}: "
         text += f"{order} may be biased, and their intervals too narrow. Compare order={best}."
         findings = (*findings, Finding("order", text))
     say("fit to the first three quarters")
-    held = parts.fit(order)
+    held = parts.fit(order, outside)
     say("fit to all")
-    fit = fit_series(data, order, check=False)
+    fit = fit_series(whole, order, check=False, reference=outside)
     findings = (*findings, *undamped(data, fit))
     curve = None
     of_events = all(w.linear for parts in phase.stretches for w in parts)
@@ -120,3 +133,11 @@ def identify_recording(
     responses = impulse_responses(fit, data)
     advice = advise(data, fit, held.validation, findings)
     return Identification(recording, findings, phase, data, fit, held, responses, curve, advice)
+
+
+def _without_noise(data: SectionData, reference: tuple[str, ...]) -> SectionData:
+    """Return data with that part of the plant's inputs that the references explain."""
+    plant, drive = in_loop(data, reference)
+    inputs = [x[:, : r.u.shape[1]] for r, x in zip(plant, predicted(plant, drive, 4), strict=True)]
+    records = tuple(replace(r, u=u) for r, u in zip(plant, inputs, strict=True))
+    return replace(data, records=records)

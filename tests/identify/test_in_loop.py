@@ -109,6 +109,21 @@ def test_regions_of_series_hold_in_the_loop(plant):
     assert sum(held) >= 16  # (of 20 with 95 %: less in one of 2500)
 
 
+def test_instruments_of_series_hold_in_the_loop(plant):
+    fit = hj.fit_series(series(plant, 0), 2, reference="r")
+    assert fit.compare(plant.multipliers).max_error < 1e-8  # (without noise)
+    held, discs, truth = [], [], plant.htf(np.arange(1, 9) / 4)
+    for seed in range(30):
+        fit = hj.fit_series(series(plant, seed, noise=0.7), 2, reference="r")
+        held.append(fit.contains(plant.multipliers)[0])
+        htf = fit.htf(truth.f)
+        discs.append(np.mean(np.abs(htf.H - truth.H) <= htf.confidence_radius()))
+    assert sum(held) >= 25  # (of 30 with 95 %: less in one of 600)
+    assert 0.88 < np.mean(discs) < 0.98
+    with pytest.raises(hj.DefinitionError, match="the reference tells 2 multipliers, not 3"):
+        hj.fit_series(series(plant, 0, noise=0.7), 3, reference="r")
+
+
 def test_fits_without_a_reference_tell_of_the_controller(plant):
     held = []
     for seed in range(8):
@@ -153,9 +168,9 @@ def test_a_plant_that_is_stable_in_its_loop_only():
         u[i] = r[i] - 0.9 * y[i]
         x = 1.2 * x + u[i]
     data = hj.Record(np.stack([u, r], 1), y[:, None], n_sections=N, inputs=("u", "r"))
-    fit = hj.fit_ldtp(data, 1, reference="r")
-    assert fit.contains(plant.multipliers, 0.999).all()
-    assert abs(fit.multipliers[0] - 1.2**N) < 0.1
+    for fit in (hj.fit_ldtp(data, 1, reference="r"), hj.fit_series(data, 1, reference="r")):
+        assert fit.contains(plant.multipliers, 0.999).all()
+        assert abs(fit.multipliers[0] - 1.2**N) < 0.1
 
 
 def test_residuals_tell_of_the_loop(plant):

@@ -27,12 +27,18 @@ from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
+from ..periodic_model import (
+    LocalCoordinates,
+    PeriodicModel,
+    characteristic_slopes,
+    local_coordinates,
+)
 from ..series.records import PreparedRecords
 from ..series.residuals import about_answering, answering
+from ..series.subspace import answers_at_once, default_horizon, subspace_model
 from .frequency import FrequencyProblem, transfer, transfer_slopes
-from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
-from .realization import answers_at_once, default_horizon, given_dims, realize, subspace_model
+from .realization import given_dims, realize
 
 
 Problem = FrequencyProblem | SeriesProblem

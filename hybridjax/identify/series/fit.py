@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, Vector
+from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, SignalNames, Vector
 from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
@@ -22,10 +22,12 @@ from ...linear.ldtp import LDTP
 from .. import denominator
 from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
+from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import refuse_invented
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
+from .in_loop import LoopEquations
 from .linearization import Linearization, each_fit, linearize, measured_outputs, minimize, sum_up
 from .output_error import OutputErrorProblem, SectionRegression
 from .records import (
@@ -64,6 +66,8 @@ class SeriesFit(MultiplierEstimate):
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
     - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
+    - `reference`: signals from outside of the loop of which the fit makes use. `noise` is then that
+      of $\chi y$.
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]
@@ -76,6 +80,7 @@ class SeriesFit(MultiplierEstimate):
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
     feedback: tuple[str, ...] = eqx.field(static=True, default=())
+    reference: tuple[str, ...] = eqx.field(static=True, default=())
 
     @checked
     def impulse_response(self, n_lags: PeriodCount) -> Float[np.ndarray, "N lags ny nu"]:
@@ -123,7 +128,9 @@ class SeriesFit(MultiplierEstimate):
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         noise = signal_values(self.outputs, self.noise)
-        about = f"noise {noise}; {self.n_sections} sections, {self.numerators.shape[1]} lags{state}"
+        loop = f"in a loop, by {', '.join(self.reference)}; " if self.reference else ""
+        about = f"{loop}noise {noise}; {self.n_sections} sections, "
+        about += f"{self.numerators.shape[1]} lags{state}"
         return "; ".join(filter(None, [about, about_answering(self.feedback, _BIASED)]))
 
     @property
@@ -161,6 +168,7 @@ def fit_series(
     start: Literal["free", "cycle"] = "free",
     errors: Literal["residuals", "white"] = "residuals",
     check: bool = True,
+    reference: SignalNames | None = None,
 ) -> SeriesFit:
     r"""Estimate multipliers and HTFs from time series with any input, with their uncertainty.
 
@@ -183,12 +191,19 @@ def fit_series(
       also for errors that are correlated (process noise) or depend on the inputs (nonlinear
       distortion). "white": the variance of the residuals alone. Default: "residuals".
     - `check`: whether to raise an error for an order that the data do not support. Default: True.
+    - `reference`: names of those inputs of the data that act from outside on a loop. The fit is
+      then that of the plant, from the other inputs, by instrumental variables: consistent for any
+      noise and controller, of unstable plants, too. `start` and `errors` have no effect: the first
+      cycles of each record are not used, and errors may be correlated. Default: None.
 
     **Raises:** `DefinitionError` for records that do not fit together, inputs that are zero, too
     few cycles (the message says how many are needed), or an order that the data do not support.
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
+    if reference is not None:
+        equations = LoopEquations(*in_loop(data, reference), order, overhang)
+        return SeriesFit(**equations.fit(check))
     records = data if isinstance(data, PreparedRecords) else PreparedRecords(data)
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ...errors import DefinitionError
-from ...linear.ldtp import LDTP
-from ..descent import ROUNDING
+from ..errors import DefinitionError
+from ..linear.ldtp import LDTP
+from .descent import ROUNDING
 
 
 Blocks = list[Float[np.ndarray, "rows columns"]]

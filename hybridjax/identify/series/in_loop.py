@@ -1,0 +1,211 @@
+r"""Multipliers and transfer functions of a plant in a loop, from time series and a reference.
+
+With a controller at work the noise of the outputs goes round the loop into u. In
+
+$$\chi(q^{-N})\, y[n] = B_{n \bmod N}(q^{-1})\, u[n] + \varepsilon[n]$$
+
+neither the earlier outputs nor u are independent of $\varepsilon$, but the reference r is, and with
+it all that a model from r to (u, y) predicts. These predictions $\hat u$ and $\hat y$ are the
+instruments of u and of the earlier y (instrumental variables: Söderström and Stoica 1983; Gilson
+and Van den Hof 2005): an inaccurate model costs efficiency, and biases nothing. It has few
+dimensions, since noise that a model of many parameters fits would be correlated with $\varepsilon$.
+B is eliminated section by section, and the rest is linear in c.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..._core.results import Result
+from ...errors import DefinitionError
+from ...experiments.record import Record
+from .. import denominator
+from ..denominator import Covariance, in_blocks, multipliers_of
+from ..descent import Coefficients
+from .output_error import RANK, SectionRegression
+from .records import PreparedRecords, delay_cycles, lagged_inputs
+from .subspace import subspace_model
+
+
+# Signal-to-noise ratio of a combination of lagged inputs, above which its coefficient is estimated.
+# Smaller: noise of combinations that the reference hardly excites. Larger: bias by those left out.
+_EXCITED = 5.0
+# Cycles of a block, at least. Fewer: errors of neighboring cycles count as independent, which they
+# are not. More: few blocks.
+_BLOCK = 10
+# Least squared signal-to-noise ratio with which the instruments tell each multiplier. Smaller:
+# noise makes multipliers. Larger: weak ones are refused.
+_TOLD = 10.0
+
+
+def predicted(plant: list[Record], drive: list[Record], order: int) -> list[np.ndarray]:
+    """Return inputs and outputs of each record as the references explain them.
+
+    They are simulated, from zero, by a model with `order` dimensions.
+
+    **Raises:** `DefinitionError` for too few cycles.
+    """
+    closed = [
+        dataclasses.replace(
+            r, y=np.concatenate([r.y, p.y], axis=1), outputs=(*r.outputs, *p.outputs)
+        )
+        for r, p in zip(drive, plant, strict=True)
+    ]
+    records = PreparedRecords(closed)
+    model = subspace_model(records, [order] * records.n_sections, False)
+    signals = []
+    for r in closed:
+        x, z = np.zeros(order), np.zeros(r.y.shape)
+        for i, u in enumerate(r.u):
+            A, B, C, D, _ = (m[(r.first_section + i) % r.n_sections] for m in model)
+            z[i], x = C @ x + D @ u, A @ x + B @ u
+        signals.append(z * records.scale)
+    return signals
+
+
+class SectionEquations(NamedTuple):
+    """The equations of a section without B: errors are `outputs` @ (1, c)."""
+
+    outputs: Float[np.ndarray, "rows ny d1"]
+    """The outputs 0, ..., d cycles earlier, without the parts that inputs explain."""
+    instruments: Float[np.ndarray, "rows ny d"]
+    numerators: Float[np.ndarray, "columns ny d1"]
+    """The coefficients of these parts."""
+    root: Float[np.ndarray, "columns r"]
+    """root @ root.T is their covariance, for noise of variance one."""
+    taken: tuple[Float[np.ndarray, "rows r"], Float[np.ndarray, "rows r"]]
+    """The first, times the second transposed, maps errors to the part that numerators take."""
+    freedom: int
+
+
+class LoopEquations:
+    """The equations of all sections."""
+
+    def __init__(self, plant: list[Record], drive: list[Record], order: int, overhang: int | None):
+        self.records, self.order, self.reference = PreparedRecords(plant), order, drive[0].inputs
+        self.grid = self.records.whole()
+        S, T, N, nu = self.grid.u.shape
+        overhang = N if overhang is None else overhang
+        self.lags = self.records.lead + order * N + overhang + 1
+        z = np.zeros((S, T * N, nu + self.grid.y.shape[3]))
+        for s, (r, x) in enumerate(zip(plant, predicted(plant, drive, order), strict=True)):
+            z[s, r.first_section : r.first_section + len(x)] = x
+        z, free = z.reshape(S, T, N, -1), order + -(-overhang // N)
+        self.sections = [self._section(n, z, free) for n in range(N)]
+
+    def _section(self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int) -> SectionEquations:
+        grid, delays = self.grid, range(self.order + 1)
+        (_, T, _, nu), ny = grid.u.shape, grid.y.shape[3]
+        sampled = [delay_cycles(grid.sampled[:, :, n], j).all(axis=2) for j in delays]
+        used = np.all(sampled, axis=0) & (np.arange(T) >= grid.first[:, n, None] + free)
+        signals = [lagged_inputs(x, n, self.lags, self.records.lead) for x in (z[..., :nu], grid.u)]
+        signals += [delay_cycles(x[:, :, n], j) for x in (z[..., nu:], grid.y) for j in delays]
+        rows = SectionRegression.make(
+            np.concatenate(signals, axis=2), grid.drift[:, :, :0], grid.drift, used
+        ).remainder
+        Z, U, late = np.split(rows, np.cumsum([self.lags * nu] * 2), axis=1)
+        # Combinations of lags, of which the reference excites those that stand out of the noise.
+        _, size, V = np.linalg.svd(Z, full_matrices=False)
+        noise = np.linalg.norm((U - Z) @ V.T, axis=0) / np.sqrt(max(used.sum(), 1))
+        kept = size > np.maximum(_EXCITED * noise, RANK * size.max(initial=0))
+        to_lags = V[kept].T / size[kept]
+        Z, U, inverse = Z @ to_lags, U @ to_lags, np.linalg.inv(to_lags.T @ (Z.T @ U) @ to_lags)
+        late = late.reshape(len(late), 2, -1, ny)
+        predictions, y = (np.swapaxes(late[:, k], 1, 2) for k in (0, 1))
+        fitted = np.tensordot(inverse @ Z.T, y, 1)
+        explained = np.tensordot(inverse.T @ U.T, predictions[..., 1:], 1)
+        return SectionEquations(
+            y - np.tensordot(U, fitted, 1),
+            predictions[..., 1:] - np.tensordot(Z, explained, 1),
+            np.tensordot(to_lags, fitted, 1),
+            to_lags @ inverse,
+            (U @ inverse, Z),
+            int(used.sum() - kept.sum()),
+        )
+
+    def fit(self, check: bool) -> dict[str, Any]:
+        """Return the fields of a `SeriesFit`.
+
+        **Raises:** `DefinitionError` as `solve`.
+        """
+        c, covariance, noise = self.solve(check)
+        N, R, nu, ny = *self.grid.u.shape[2:3], self.lags, self.grid.u.shape[3], len(noise)
+        b = np.array([x.numerators for x in self.sections]).reshape(N, R, nu, ny, -1)
+        b = b.swapaxes(2, 3)
+        roots = np.zeros((N, ny, R, nu, max(x.root.shape[1] for x in self.sections)))
+        for n, x in enumerate(self.sections):
+            roots[n, ..., : x.root.shape[1]] = x.root.reshape(R, nu, -1)
+        return dict(
+            multipliers=multipliers_of(c),
+            coefficients=c,
+            covariance=covariance.matrix,
+            numerators=b @ np.append(1.0, c),
+            slopes=np.moveaxis(b[..., 1:], -1, 0),
+            roots=roots,
+            noise=noise,
+            covariance_freedom=covariance.freedom,
+            result=Result.OK,
+            n_sections=N,
+            inputs=self.records.inputs,
+            outputs=self.records.outputs,
+            lead=self.records.lead,
+            reference=self.reference,
+        )
+
+    def solve(self, check: bool) -> tuple[Coefficients, Covariance, Float[np.ndarray, " ny"]]:
+        """Return c, its covariance, and the standard deviations of the outputs' errors.
+
+        **Raises:** `DefinitionError` for too few cycles, or, with `check`, for an order of which
+        the reference does not tell all multipliers.
+        """
+        d, sections, scale = self.order, self.sections, self.records.scale
+        if (least := min(x.freedom for x in sections)) <= d:
+            raise DefinitionError(
+                f"a section was sampled {d + 1 - least} times too few for numerators of "
+                f"{self.lags} lags: record more, or lower `order` or `overhang`."
+            )
+        freedom = sum(x.freedom for x in sections)
+        for _ in range(2):  # the second time with the weights that the errors suggest
+            y, W = (
+                np.array([x[k] / scale[:, None] for x in sections]).reshape(-1, d + 1 - k)
+                for k in (0, 1)
+            )
+            along = W.T @ y
+            c = -np.linalg.lstsq(along[:, 1:], along[:, 0])[0]
+            square = sum(((x.outputs @ [1.0, *c]) ** 2).sum(axis=0) for x in sections)
+            scale = np.maximum(np.sqrt(square / freedom), RANK * self.records.scale)
+        along = along[:, 1:]
+        # The squared correlations of the earlier outputs with the instruments (Cragg, Donald 1993).
+        part = along.T @ np.linalg.lstsq(W.T @ W, along)[0]
+        part = np.linalg.pinv(y[:, 1:].T @ y[:, 1:], RANK) @ part
+        part = np.clip(np.linalg.eigvals(part).real, 0, 1)
+        told = int((part * freedom * len(scale) > _TOLD * (1 - part)).sum())
+        if check and told < d:
+            raise DefinitionError(
+                f"the reference tells {told} multipliers, not {d}: lower `order`, record longer, "
+                "excite more, or pass check=False."
+            )
+        if told < d:
+            return c, Covariance.unknown(d), scale
+        T = self.records.cycles
+        cycles = max(denominator.correlated_cycles(multipliers_of(c), T) + 1, _BLOCK)
+        score = np.sum([self._scores(x, c, scale, max(1, T // cycles)) for x in sections], axis=0)
+        score = score[score.any(axis=1)]
+        half = np.linalg.solve(along, score.T)
+        share = np.tile(np.eye(d) / len(score), (len(score), 1, 1))
+        return c, Covariance(half @ half.T, denominator.block_freedom(score, share)), scale
+
+    def _scores(self, section: SectionEquations, c, scale, count: int) -> Float[np.ndarray, "B d"]:
+        """Return the sums of errors times instruments over blocks of cycles.
+
+        The errors of a block are those of numerators that are fitted to the other blocks."""
+
+        def blocks(x: np.ndarray) -> np.ndarray:
+            return in_blocks(x.reshape(*self.grid.y.shape[:2], *x.shape[1:]), count)
+
+        error = blocks(section.outputs @ [1.0, *c] / scale)
+        taken = blocks(section.taken[0]) @ blocks(section.taken[1]).swapaxes(1, 2)
+        error = denominator.inverse_of_remainder((taken + taken.swapaxes(1, 2)) / 2) @ error
+        return np.einsum("bki,bkid->bd", error, blocks(section.instruments / scale[:, None]))

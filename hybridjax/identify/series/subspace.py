@@ -1,0 +1,180 @@
+"""First models of time series, by a subspace method."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import special
+
+from ...errors import DefinitionError
+from ..denominator import SLOWEST
+from ..periodic_model import PeriodicModel
+from .records import PreparedRecords
+from .residuals import ANSWER
+
+
+# Sections in which a state is observed, at least, by default. Smaller: less averaging.
+_SHORTEST_HORIZON = 8
+# Samples of a section for each coefficient of the regression on its past. Larger: a short past,
+# which states outlast; smaller: noise.
+_ROWS = 3
+# Part by which the squared length of every regressor is enlarged. Larger: bias; smaller: noise in
+# combinations that are hardly excited.
+_SHRINKAGE = 1e-6
+
+
+def default_horizon(N: int) -> int:
+    """Return the number of sections in which a state is observed; twice as many lags are needed."""
+    return max(_SHORTEST_HORIZON, 2 * N)
+
+
+def subspace_model(
+    records: PreparedRecords, dims: Sequence[int], innovations: bool, direct: bool = True
+) -> PeriodicModel:
+    """Return a model with these dimensions, with or without K and D.
+
+    Each output is regressed on its past and that of the inputs, section by section. The effect of
+    the past of a section on the outputs from there on is a matrix whose rank is the dimension of
+    the state (Chiuso 2007, "PBSID", for each section of the period). Samples before a record count
+    as zero: many short records that begin anywhere give a worse model.
+
+    **Raises:** `DefinitionError` for too few cycles for a past as long as the states need.
+    """
+    grid, N, ny, most = records.whole(), len(dims), len(records.outputs), int(max(dims))
+    z = np.concatenate([grid.u, grid.y / records.scale], axis=3)
+    sampled, columns = np.asarray(grid.sampled.all(axis=3)), z.shape[3]
+    sections = [_Section(z, sampled, n, ny) for n in range(N)]
+    samples = min(len(section.y) for section in sections)
+    past = min(samples // (_ROWS * columns), default_horizon(N))
+    needed = -(-most // columns) + 1
+    if past < needed:
+        raise DefinitionError(
+            f"{samples} cycles are too few to begin with {most} dimensions of the state: "
+            f"about {_ROWS * columns * needed} are needed. Record more, or give `fit_ldtp` a "
+            "model as `guess`, as of `hj.identify.realize(hj.fit_series(...))`."
+        )
+    rules = [section.regression(past, direct) for section in sections]
+    horizon = max(-(-most // ny) + 1, min(past, N, default_horizon(0)))
+    to_state = []
+    for n, section in enumerate(sections):
+        # The effect of rows that are older by i samples.
+        ahead = np.zeros((past * columns, horizon, ny))
+        for i in range(min(horizon, past)):
+            ahead[: (past - i) * columns, i] = rules[(n + i) % N][i * columns :]
+        ahead = ahead.reshape(len(ahead), -1)
+        root = np.linalg.qr(section.past(past), mode="r")
+        _, s, vh = np.linalg.svd(root @ ahead, full_matrices=False)
+        if dims[n] > len(s):
+            text = f"the data show {len(s)} dimensions of section {n}, not {dims[n]}"
+            raise DefinitionError(f"{text}: lower `guess`.")
+        kept = np.maximum(s[: dims[n]], _SHRINKAGE * s[0])
+        to_state.append(ahead @ (vh[: dims[n]].T / kept * np.sqrt(len(section.y))))
+    return _from_states(sections, to_state, past, innovations, direct)
+
+
+def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
+    """Test whether the outputs answer the inputs of a loop at their own section.
+
+    If so, they answer a reference at once, given the past of all signals: the likelihood-ratio
+    test, section by section (Anderson, *Multivariate Statistical Analysis*, 2003, section 8.4),
+    which holds for any controller. Inputs that answer outputs at once look the same in the inputs.
+
+    **Raises:** `DefinitionError` if both answer each other at once: no model of the noise tells
+    them apart.
+    """
+    grid, ny = records.whole(), len(records.outputs)
+    nr = len(drive.inputs)
+    z = np.concatenate([drive.whole().u, grid.u, grid.y / records.scale], axis=3)
+    sampled = np.asarray(grid.sampled.all(axis=3))
+    statistic, freedom, left, whole = 0.0, 0, 0.0, 0.0
+    for n in range(records.n_sections):
+        section = _Section(z, sampled, n, ny)
+        count = len(section.y)
+        length = max(min(count // (_ROWS * z.shape[3]), default_horizon(len(z[0, 0]))), 1)
+        past = section.past(length)
+        r, u = section.u[:, :nr], section.u[:, nr:]
+        rows = np.concatenate([past, r], axis=1)
+        errors = [section.y - x @ _regress(x, section.y) for x in (past, rows)]
+        floor = _SHRINKAGE * section.y.T @ section.y  # errors of the regressions, without noise
+        sizes = [np.linalg.slogdet(e.T @ e + floor)[1] for e in errors]
+        statistic += max(count - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (sizes[0] - sizes[1])
+        freedom += ny * nr
+        left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
+        whole += float((u**2).sum())
+    if special.gammaincc(freedom / 2, statistic / 2) > ANSWER:
+        return False
+    if left > _SHRINKAGE * whole:
+        raise DefinitionError(
+            "outputs answer inputs at the same section, where the inputs have a part that neither "
+            "the reference nor the past explains: no model of the noise tells the two directions "
+            "apart. Pass a model with D = 0 as `guess` if outputs do not respond at once."
+        )
+    return True
+
+
+class _Section:
+    """The samples of a section of all records, where all outputs were sampled."""
+
+    def __init__(
+        self,
+        z: Float[np.ndarray, "R T N columns"],
+        sampled: Bool[np.ndarray, "R T N"],
+        section: int,
+        ny: int,
+    ):
+        self.record, cycle = np.nonzero(sampled[:, :, section])
+        self.time = cycle * z.shape[2] + section
+        self._z = z.reshape(len(z), -1, z.shape[3])
+        self.u, self.y = np.split(self._z[self.record, self.time], [-ny], axis=1)
+
+    def past(self, length: int, later: int = 0) -> Float[np.ndarray, "samples columns"]:
+        """Return the `length` samples before, `later` samples later: newest first, zero before a
+        record."""
+        back = self.time[:, None] + later - 1 - np.arange(length)
+        rows = self._z[self.record[:, None], np.maximum(back, 0)]
+        return np.where((back >= 0)[..., None], rows, 0.0).reshape(len(back), -1)
+
+    def regression(self, length: int, direct: bool) -> Float[np.ndarray, "columns ny"]:
+        """Return the effect of the past on the output."""
+        rows = np.concatenate([self.u * direct, self.past(length)], axis=1)
+        return _regress(rows, self.y)[self.u.shape[1] :]
+
+
+def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return a least-squares solution, shrunk slightly: regressors without power get zero."""
+    size = np.sqrt(np.square(rows).sum(axis=0))
+    rows = rows / np.where(size > 0, size, 1.0)
+    x = np.linalg.solve(rows.T @ rows + _SHRINKAGE * np.eye(len(size)), rows.T @ target)
+    return x / np.where(size > 0, size, 1.0)[:, None]
+
+
+def _from_states(
+    sections: list[_Section], to_state: list[np.ndarray], past: int, innovations: bool, direct: bool
+) -> PeriodicModel:
+    N, nu = len(sections), sections[0].u.shape[1]
+    C, D, A, B, K = [], [], [], [], []
+    for n, section in enumerate(sections):
+        x = section.past(past) @ to_state[n]
+        rows = np.concatenate([x, section.u], axis=1)
+        output = _regress(np.concatenate([x, section.u * direct], axis=1), section.y)
+        rows = np.concatenate([rows, section.y - rows @ output], axis=1)
+        later = _regress(rows, section.past(past, 1) @ to_state[(n + 1) % N])
+        d = x.shape[1]
+        C.append(output[:d].T)
+        D.append(output[d:].T)
+        A.append(later[:d].T)
+        B.append(later[d : d + nu].T)
+        K.append(later[d + nu :].T if innovations else np.zeros((later.shape[1], 0)))
+    model = PeriodicModel(A, B, C, D, K)
+    size = np.abs(np.linalg.eigvals(model.monodromy())).max()
+    shrunk = (SLOWEST / max(size, SLOWEST)) ** (1 / N)
+    model = model._replace(A=[a * shrunk for a in A])
+    while innovations and _slowest_error(model) > SLOWEST:
+        model = model._replace(K=[k / 2 for k in model.K])
+    return model
+
+
+def _slowest_error(model: PeriodicModel) -> float:
+    """Return the largest modulus of a multiplier of A - K C, for errors of predictions."""
+    A = [A - K @ C for A, K, C in zip(model.A, model.K, model.C, strict=True)]
+    return float(np.abs(np.linalg.eigvals(model._replace(A=A).monodromy())).max())

@@ -1,0 +1,72 @@
+"""A recording of a plant whose controller is at work, from files to the plant's multipliers."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import hybridjax as hj
+from hybridjax.apps.cli import main
+from hybridjax.errors import FindingWarning
+
+
+RATE = 100
+
+
+def field(t, x, u=0.0):
+    """x'' + 2 x' + (30 + 8 cos 2 pi t) x = u."""
+    return np.array([x[1], u - 2 * x[1] - (30 + 8 * np.cos(2 * np.pi * t)) * x[0]])
+
+
+@pytest.fixture(scope="module")
+def multipliers():
+    ends = [
+        solve_ivp(field, (0, 1), x, rtol=1e-10, atol=1e-12).y[:, -1] for x in ([1.0, 0], [0, 1.0])
+    ]
+    return np.linalg.eigvals(np.transpose(ends))
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """300 cycles with u = r - 4 x - v, of noisy measurements, and forces that nobody measured."""
+    rng, n, h = np.random.default_rng(1), 310 * RATE, 1 / RATE
+    r, w = (hj.testing.random_force(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2))
+    e = np.array([0.002, 0.01])[:, None] * rng.normal(size=(2, n))
+    x, y, u = np.zeros(2), np.zeros((2, n)), np.zeros(n)
+    for i in range(n):
+        y[:, i] = x + e[:, i]
+        u[i] = r[i] - 4 * y[0, i] - y[1, i]
+        for t in (i * h, i * h + h / 2):  # two steps of the midpoint rule
+            middle = x + h / 4 * field(t, x, u[i] + 0.2 * w[i])
+            x = x + h / 2 * field(t + h / 4, middle, u[i] + 0.2 * w[i])
+    t = np.arange(n) * h
+    clock = np.cos(2 * np.pi * t)
+    signals = {"time": t, "clock": clock, "u": u, "r": r, "x": y[0] + clock, "v": y[1]}
+    return {name: signal[t >= 10] for name, signal in signals.items()}
+
+
+def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
+    np.savez(tmp_path / "trial.npz", **recording)
+    options = "--input u --reference r --outputs x,v --crossing clock:rising --sections 16"
+    with pytest.warns(FindingWarning):
+        assert not main(
+            [
+                "identify",
+                str(tmp_path / "trial.npz"),
+                *options.split(),
+                "--out",
+                str(tmp_path / "o"),
+            ]
+        )
+    summary = json.loads((tmp_path / "o" / "summary.json").read_text())
+    assert summary["references"] == ["r"] and "u" in summary["inputs"]
+    assert not any("feedback" in x.lower() for x in summary["warnings"])
+    assert "A controller makes u" in (tmp_path / "o" / "report.html").read_text()
+    fit = hj.load(tmp_path / "o" / "fit.npz")
+    assert fit.contains(multipliers).all() and fit.standard_errors.max() < 0.2
+    data = hj.Recording(recording["time"], {k: x for k, x in recording.items() if k != "time"})
+    with pytest.raises(hj.DefinitionError, match="must name other signals"):
+        hj.identify_recording(
+            data, hj.Crossing("clock", "rising"), inputs="u", outputs="x", reference="u"
+        )
