@@ -21,7 +21,7 @@ from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape
 from ..engine.settings import Settings
-from ..engine.trajectory import Trajectory, recorded, simulate
+from ..engine.trajectory import Trajectory, observed, recorded, simulate
 from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics
 from ..linear.htf import HTF
@@ -390,12 +390,7 @@ def orbit_picture(
     names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
     if not names:
         return ""
-
-    def axes(t, chart, q):
-        columns = [np.array([s.charts[a].states.index(x) for a in chart]) for x in names]
-        values = [np.take_along_axis(q, c[:, None], axis=1)[:, 0] for c in columns]
-        return values if len(names) == 2 else [t, *values]
-
+    axes = lambda t, *point: [t, *observed(s, names, t, *point)][-2:]  # noqa: E731
     chart, (x, y) = turn[1], axes(*turn)
     curves = []
     for a in np.unique(chart):
@@ -404,10 +399,8 @@ def orbit_picture(
     if sections is not None:
         x, y = axes(*sections)
         curves.append(Curve(x, y, color="currentColor", points=True))
-    labels = [with_unit(x, unit_of(x)) for x in names]
-    if len(names) == 1:
-        labels.insert(0, with_unit("t", orbit.system.time_unit))
-    return picture(curves, *labels)
+    units = ("t", orbit.system.time_unit), *((x, unit_of(x)) for x in names)
+    return picture(curves, *(with_unit(*x) for x in units[-2:]))
 
 
 def fine_factors(cycle: LimitCycle) -> list[Matrix]:

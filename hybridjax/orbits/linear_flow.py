@@ -262,7 +262,7 @@ def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = No
             "responses, sensitivities, fluctuations and HTFs in continuous time need the values of "
             "a cycle, which `jit` and `vmap` hide: call them outside (`grad` and `jvp` work there)."
         )
-    map, nodes, K = to_host(cycle.return_map), rule().nodes, NODES
+    map, nodes, K = cycle.return_map, rule().nodes, NODES
     s, of = map.structure, with_inputs(map.system, parameter)
     d, period, D, tiny = s.d, float(map.expected), 1, 1j * kernels.TINY
     lanes, tape = _turns.recall(cycle, None, lambda: side_by_side(map.pieces(tangents=True)))

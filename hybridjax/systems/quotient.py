@@ -30,7 +30,6 @@ class Quotient(Derived):
     walker = Quotient(Biped(), swap={"left stance": "right stance"}, relabel={"left": "right"},
                       translation=("x",))
     step = hj.find_limit_cycle(walker, section=hj.AtEvent("heelstrike"))
-    stride = hj.find_limit_cycle(walker, step, multiplicity=2)
     ```
 
     A transition into a chart that was left out leads into its mirror image, with the state
