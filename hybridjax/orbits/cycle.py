@@ -21,7 +21,7 @@ from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape
 from ..engine.settings import Settings
-from ..engine.trajectory import Trajectory, recorded, simulate
+from ..engine.trajectory import Trajectory, observed, recorded, simulate
 from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics
 from ..linear.htf import HTF
@@ -31,7 +31,7 @@ from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
-from .linear_flow import hosted, linear_flow, rule
+from .linear_flow import hosted, last_turn, linear_flow, rule
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
@@ -202,6 +202,8 @@ class LimitCycle(eqx.Module):
         """
         _require_values(self, "trajectory")
         self.require_current()
+        if periods == 1 and self.result == Result.OK:
+            return orbit(self)
         s, anchor = self.structure, to_host(self.anchor)
         a = int(anchor.chart[0])
         begin = s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods
@@ -390,12 +392,7 @@ def orbit_picture(
     names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
     if not names:
         return ""
-
-    def axes(t, chart, q):
-        columns = [np.array([s.charts[a].states.index(x) for a in chart]) for x in names]
-        values = [np.take_along_axis(q, c[:, None], axis=1)[:, 0] for c in columns]
-        return values if len(names) == 2 else [t, *values]
-
+    axes = lambda t, *point: [t, *observed(s, names, t, *point)][-2:]  # noqa: E731
     chart, (x, y) = turn[1], axes(*turn)
     curves = []
     for a in np.unique(chart):
@@ -404,10 +401,8 @@ def orbit_picture(
     if sections is not None:
         x, y = axes(*sections)
         curves.append(Curve(x, y, color="currentColor", points=True))
-    labels = [with_unit(x, unit_of(x)) for x in names]
-    if len(names) == 1:
-        labels.insert(0, with_unit("t", orbit.system.time_unit))
-    return picture(curves, *labels)
+    units = ("t", orbit.system.time_unit), *((x, unit_of(x)) for x in names)
+    return picture(curves, *(with_unit(*x) for x in units[-2:]))
 
 
 def fine_factors(cycle: LimitCycle) -> list[Matrix]:
@@ -450,14 +445,13 @@ def log_determinant(cycle: LimitCycle) -> float:
     return float(flow.length @ np.trace(flow.by_state, axis1=2, axis2=3) @ rule().weights)
 
 
-def orbit(map: ReturnMap, tapes: Tape | None = None) -> Trajectory:
-    """One turn from the anchor, in the steps by which it is linearized, which its `tapes` may hold
-    already, one for each piece."""
-    map = to_host(map)
-    rows = to_host(map.pieces(tangents=True)[1] if tapes is None else tapes)
-    pieces = [Tape(*x) for x in zip(*rows, strict=True)]
+def orbit(cycle: LimitCycle) -> Trajectory:
+    """One turn from the anchor, in the steps by which it is linearized."""
+    map, (_, tape) = to_host(cycle.return_map), last_turn(cycle)
+    pieces = [Tape(*(x[..., k, None] for x in tape)) for k in range(tape.t.shape[-1])]
     begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
-    return recorded(map.structure, begin, pieces, u, Result.OK)
+    make = lambda: recorded(map.structure, begin, pieces, u, Result.OK)  # noqa: E731
+    return _trajectories.recall(cycle, 1.0, make)
 
 
 def weakest(factor: Matrix, weaker: int = 0) -> float:

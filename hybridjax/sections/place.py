@@ -21,7 +21,7 @@ from ..engine import kernels
 from ..engine.cubic import interpolate
 from ..engine.lanes import IDLE, Lanes, for_each_chart, only, side_by_side
 from ..engine.move import Options, stride, through
-from ..engine.replay import Variation
+from ..engine.replay import Variation, recorded_moves
 from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
@@ -432,19 +432,11 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     fastest rate of its level (N,), and the rate on the section (N,)."""
     s, N, tape, lanes = placed.structure(), placed.n_sections, placed.tape, placed.lanes
     still = np.zeros((s.nu, 1))
-    # The steps of one period: start, length and end, and the section at their start or -1.
-    section, row = np.nonzero(tape.code.T != IDLE)
-    first = np.append(True, np.diff(section) > 0)
-
-    def start(at_section, ends):
-        before = np.concatenate([ends[:1], ends[:-1]])
-        return np.where(first.reshape(-1, *[1] * (ends.ndim - 1)), at_section[section], before)
-
-    end, after = tape.t[row, section], tape.before[row, :, section].T
-    t, chart = start(lanes.t, end), start(lanes.chart, tape.chart[row, section])
-    q, h = start(lanes.q.T, tape.after[row, :, section]).T, end - t
-    section = np.where(first, section, -1)
-    f0, f1 = slopes(s, t, chart, q, still), slopes(s, end, chart, after, still)
+    # The steps of one period, and the section at their start or -1.
+    t, chart, q, h, _, lane, order = recorded_moves(lanes, tape)
+    section, after = np.where(order == 0, lane, -1), tape.before.transpose(2, 0, 1)
+    after = after[tape.code.T != IDLE].T
+    f0, f1 = slopes(s, t, chart, q, still), slopes(s, t + h, chart, after, still)
     x = np.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
     q = interpolate(x, h, q[:, None], after[:, None], f0[:, None], f1[:, None])
     t, chart, q = (t + h * x).ravel(), np.tile(chart, len(x)), q.reshape(s.d, -1)

@@ -91,8 +91,8 @@ def test_a_step_modulo_the_symmetry():
 
 @pytest.mark.slow
 def test_a_stride_is_two_steps():
-    walker, lands = hj.Quotient(Full(), **MIRROR, translation=("x",)), hj.AtEvent("right lands")
-    stride = hj.find_limit_cycle(walker, section=lands, multiplicity=2)
+    walker = hj.Quotient(Full(), translation=("x",))
+    stride = hj.find_limit_cycle(walker, section=hj.Crossing("left", "falling"))
     np.testing.assert_allclose(stride.period, 2 * 3.88246375285137, rtol=1e-10)
     squares = np.array([LONG_GAIT, np.conj(LONG_GAIT)]) ** 2
     squares, found = (x[np.argsort(x.imag)] for x in (squares, stride.multipliers))
@@ -166,5 +166,7 @@ def test_scheduled_switches_close_after_half_a_period():
     np.testing.assert_allclose(half.state["i"], whole.state["i"], rtol=1e-11)
     np.testing.assert_allclose(half.multipliers[0] ** 2, whole.multipliers[0], rtol=1e-10)
     assert [half.structure.transitions[g].name for g in half.event_sequence][0] == "down"
+    with pytest.raises(hj.DefinitionError, match="transition 'up' is not the mirror image"):
+        hj.find_limit_cycle(hj.Quotient(Inverter(), swap={"plus": "minus"}, flipped="i"))
     with pytest.raises(hj.DefinitionError, match="'down' must not be scheduled at t = 0"):
         hj.Quotient(Inverter(early=0.0), **symmetry)
