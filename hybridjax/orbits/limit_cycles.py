@@ -76,9 +76,10 @@ class LimitCycles(eqx.Module):
         take = lambda x: np.asarray(x)[i]  # (JAX compiles a program for each shape)  # noqa: E731
         pick = lambda tree: from_host(jax.tree_util.tree_map(take, tree))  # noqa: E731
         arrays, static = eqx.partition(self.systems, eqx.is_array)
-        rows = self.period, self.anchor, self.legs, self.factors, self.residual, self.iterations
         return LimitCycle(
-            eqx.combine(pick(arrays), static), self.base, *pick(rows), pick(self.result),
+            eqx.combine(pick(arrays), static), self.base, pick(self.period), pick(self.anchor),
+            pick(self.legs), pick(self.factors), pick(self.residual), pick(self.iterations),
+            pick(self.result),
             tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
             self.conserved, self.multiplicity,
         )  # fmt: skip
