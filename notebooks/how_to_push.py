@@ -96,11 +96,11 @@ hj.plot.strides(study.plan, {"this study": study})
 # ## Comparison with the truth
 #
 # The data determined when the study stopped. The region still contains the true multipliers in 95 %
-# of studies (`docs/experiments.md`). A single study shows little: signs and phases of a design
-# depend on rounding, so that another machine has other blocks and errors.
+# of studies (`docs/experiments.md`); `study.fit.contains(cycle.multipliers)` tests one of them. A
+# single study shows little: signs and phases of a design depend on rounding, so that another
+# machine has other blocks and errors.
 
 # %%
-print("in the region of 95 %:", study.fit.contains(cycle.multipliers))
 study.fit.compare(cycle.multipliers)
 
 # %% [markdown]

@@ -74,11 +74,12 @@ figure = hj.plot.phase_response(walker.responses(modes=0).curve())
 buck = hj.find_limit_cycle(hj.models.BuckConverter())
 f = np.arange(1, 300) / 100 + 0.003
 htf = buck.htf(f, (-1, 0, 1), "v")
-figure, panel = plt.subplots(figsize=(5, 3), layout="constrained")
+with hj.plot.style():
+    figure, panel = plt.subplots(figsize=(5, 3), layout="constrained")
 for m in htf.harmonics:
     panel.semilogy(f, abs(htf[m][:, 0, 0]), label=f"m = {m}")
 panel.set(xlabel="frequency of the reference (cycles/period)", ylabel="|H| (V/V)")
-legend = panel.legend(loc="upper right")
+legend = figure.legend(loc="outside upper right", ncols=3)
 
 # %% [markdown]
 # Jitter of 1 µs of the clock, and 1 mV of noise at the comparator, make the voltage uncertain by

@@ -95,6 +95,6 @@ def many(cycle, n):
     arrays = jax.tree_util.tree_map(lambda x: np.broadcast_to(x, (n, *x.shape)), arrays)
     c, codes = eqx.combine(arrays, rest), np.tile(cycle.event_sequence, (n, 1))
     return LimitCycles(
-        c.system, c.base, c.period, c.anchor, c.legs, c.factors, c.residual, c.iterations,
+        c.system, cycle.base, c.period, c.anchor, c.legs, c.factors, c.residual, c.iterations,
         c.result, codes, cycle.settings, c.conserved, c.multiplicity,
     )  # fmt: skip

@@ -13,7 +13,8 @@ the hopper's).
 `derivatives`: the gradient of a coefficient of the characteristic polynomial by the hopper's nine
 parameters, in reverse mode and outside of `jit`, and a fit of two parameters to HTFs; `again`: the
 second of each. `responses`: the first `cycle.responses()` of the hopper and of a neuron, and the
-hopper's `cycle.htf` at 620 frequencies again.
+hopper's `cycle.htf` at 620 frequencies again. `cycles`: `find_limit_cycles` of 50 x 50 hoppers;
+`sweep`: `hj.sweep` of the same; `branch`: README's continuation; each a second time.
 
 The same in seconds of the processor (`cpu`), and as multiples of a yardstick that is measured
 beside them, `diffeqsolve.cpu`: the first call, in a fresh process, of `diffrax.diffeqsolve` for the
@@ -27,11 +28,15 @@ import re
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 
+import numpy as np
 import one_thread
 
 
 CORES = 2
+# A plane of 50 x 50 hoppers.
+AXES = {"k": np.linspace(9, 11, 50), "b": np.linspace(4.5, 5.5, 50)}
 
 
 def run(show, options) -> None:
@@ -54,7 +59,7 @@ def run(show, options) -> None:
                 hopper = seconds[label.removeprefix("bar."), state, what]
                 show(f"{label}.{state}.{what}.times_hopper", value / hopper)
 
-    for job in ("derivatives", "responses"):
+    for job in ("derivatives", "responses", "cycles", "sweep", "branch"):
         for name, value in call("compile", job).items():
             show(f"{job}.{name}.cpu", value)
             show(f"{job}.{name}.times_diffeqsolve", value / yardstick)
@@ -116,14 +121,13 @@ def defined_here() -> type:
 def derivatives() -> dict[str, float]:
     """CPU seconds of a gradient and a fit, after the cycle was found."""
     import equinox as eqx
-    import numpy as np
 
     import hybridjax as hj
 
     from .problems import OUTPUTS, sections
 
     hj.enable_x64()
-    hopper, outputs, seconds = hj.models.VerticalHopper(), OUTPUTS["hopper"], {}
+    hopper, outputs = hj.models.VerticalHopper(), OUTPUTS["hopper"]
     family, cycle = sections("hopper", "kinematic"), hj.find_limit_cycle(hopper)
     htf = hj.linearize(cycle, family, outputs).htf(np.linspace(0.01, 0.49, 40), (-1, 0, 1))
 
@@ -132,10 +136,15 @@ def derivatives() -> dict[str, float]:
         return hj.linearize(neighbor, family, outputs).characteristic_polynomial()[2]
 
     near, observed = hj.models.VerticalHopper(k=10.8, b=4.75), hj.ObservedHTF(htf, family)
-    jobs = {
-        "gradient": lambda: eqx.filter_grad(coefficient)(hopper).k.item(),
-        "fit": lambda: hj.fit_model(near, observed, ("k", "b"), guesses=4),
-    }
+    return twice(
+        gradient=lambda: eqx.filter_grad(coefficient)(hopper).k.item(),
+        fit=lambda: hj.fit_model(near, observed, ("k", "b"), guesses=4),
+    )
+
+
+def twice(**jobs: Callable[[], object]) -> dict[str, float]:
+    """CPU seconds of the first and the second call of each job."""
+    seconds = {}
     for name, job in jobs.items():
         for state in ("", "_again"):
             begin = time.process_time()
@@ -144,10 +153,38 @@ def derivatives() -> dict[str, float]:
     return seconds
 
 
+def cycles() -> dict[str, float]:
+    """CPU seconds of the cycles of 50 x 50 hoppers, after that of one was found."""
+    import equinox as eqx
+
+    import hybridjax as hj
+
+    hj.enable_x64()
+    make = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))
+    systems = make(*map(np.ravel, np.meshgrid(*AXES.values())))
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    return twice(find_limit_cycles=lambda: hj.find_limit_cycles(systems, cycle))
+
+
+def sweep() -> dict[str, float]:
+    """CPU seconds of `hj.sweep` of as many, with nothing before."""
+    import hybridjax as hj
+
+    hj.enable_x64()
+    return twice(sweep=lambda: hj.sweep(hj.models.VerticalHopper(), AXES))
+
+
+def branch() -> dict[str, float]:
+    """CPU seconds of README's continuation of a buck converter, after the cycle was found."""
+    import hybridjax as hj
+
+    hj.enable_x64()
+    buck = hj.find_limit_cycle(hj.models.BuckConverter())
+    return twice(continuation=lambda: hj.continuation(buck, "Vin", (20.0, 26.0)))
+
+
 def responses() -> dict[str, float]:
     """CPU seconds of first responses, after the cycle was found, and of HTFs again."""
-    import numpy as np
-
     import hybridjax as hj
 
     hj.enable_x64()
@@ -239,7 +276,7 @@ def main(model: str, family: str, folder: str | None) -> None:
 
 
 if __name__ == "__main__":
-    jobs = {x.__name__: x for x in (diffeqsolve, derivatives, responses)}
+    jobs = {x.__name__: x for x in (diffeqsolve, derivatives, responses, cycles, sweep, branch)}
     if sys.argv[1] in jobs:
         print(json.dumps(jobs[sys.argv[1]]()))
     else:

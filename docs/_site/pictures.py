@@ -59,7 +59,7 @@ def thumbnail(cycle: hj.LimitCycle, plane: list[str]) -> str:
     circuits, the orbit with a dot that moves along it."""
     motion = hj.plot.animate(cycle)
     pyplot.close(motion.figure)
-    path, period = cycle.trajectory(1 + 1e-6), float(cycle.period)
+    path, period = cycle.trajectory(), float(cycle.period)
     times = path.t[0] + np.linspace(0, period, FRAMES, endpoint=False)
     about = f'dur="{max(motion.interval * len(motion.times), 1.0):.3g}s"'
     is_circuit = isinstance(cycle.system, hj.models.BuckConverter | hj.models.CukConverter)

@@ -2,8 +2,8 @@
 
 - `quick_jit` compiles with few optimizations: for functions that run a few times.
 - `host_first` runs a function on the host until compiling it is worth its time.
-- `TwoTiers` compiles the experiments twice: a quick executable for the first answer, and the fully
-  optimized one in a thread beside it.
+- `TwoTiers` compiles experiments and sweeps twice: a quick executable for the first answer, and the
+  fully optimized one in a thread beside it.
 - `kernel` compiles single functions of users for code that runs on the host; `whole` programs that
   do more at once, when the host has spent as much time.
 """
@@ -221,11 +221,12 @@ class TwoTiers:
     A job that is `large` waits for the fully optimized executable, so its results do not depend on
     time. Another job uses it if it is there, and else the one that compiles in a third of the time.
     A thread compiles the optimized one for later jobs: in Jupyter and other interactive sessions
-    after the first use, in scripts after `_WORTH_OPTIMIZING` seconds of use.
+    after the first use, in scripts after `_WORTH_OPTIMIZING` seconds of use. If `steady`, jobs that
+    are not large always use the other one.
     """
 
-    def __init__(self, function: Callable, large: bool):
-        self._function, self.large = function, large
+    def __init__(self, function: Callable, large: bool, steady: bool = False):
+        self._function, self.large, self._steady = function, large, steady
         self._chosen: dict[tuple, tuple[_Program, jax.stages.Compiled]] = {}
 
     def __call__(self, *arguments: Any) -> Any:
@@ -244,10 +245,10 @@ class TwoTiers:
                 if key not in self._chosen:  # by another thread in the meantime
                     say_compiling(True)
                     program = _lowered(key, run, leaves)
-                    self._chosen[key] = program, program.choose(self.large)
+                    self._chosen[key] = program, program.choose(self.large, self._steady)
                     say_compiling(False)
         program, executable = self._chosen[key]
-        return program.run(executable, leaves)
+        return program.run(executable, leaves, self._steady)
 
 
 _choosing = threading.Lock()
@@ -266,7 +267,7 @@ def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
         lowered = jax.jit(run).lower(leaves)
         text = lowered.as_text()
         digest = key[0], hashlib.sha256(text.encode()).digest()
-        _by_kind[key] = _by_text.setdefault(digest, _Program(lowered, _calls_lapack(text)))
+        _by_kind[key] = _by_text.setdefault(digest, _Program(lowered, "@lapack_" in text))
     return _by_kind[key]
 
 
@@ -286,10 +287,10 @@ class _Program:
         self._seconds, self._lock = 0.0, threading.Lock()
         self._thread: threading.Thread | None = None
 
-    def choose(self, large: bool) -> jax.stages.Compiled:
+    def choose(self, large: bool, steady: bool) -> jax.stages.Compiled:
         if large and self._thread is not None:
             self._thread.join()
-        if large or self._full is not None:
+        if large or (self._full is not None and not steady):
             return self._optimize()
         if self._quick is None:
             self._quick = self._lowered.compile(compiler_options=compiler_options())
@@ -299,11 +300,11 @@ class _Program:
         self._full = self._full or self._lowered.compile()
         return self._full
 
-    def run(self, executable: jax.stages.Compiled, leaves: list) -> Any:
+    def run(self, executable: jax.stages.Compiled, leaves: list, steady: bool) -> Any:
         begin = time.perf_counter()
         with in_turn(self._alone):
             results = jax.block_until_ready(executable(leaves))
-        if executable is self._quick and self._thread is None:
+        if executable is self._quick and self._thread is None and not steady:
             with self._lock:
                 self._seconds += time.perf_counter() - begin
                 # (`ps1`, the prompt, exists in interactive sessions only.)
@@ -338,22 +339,6 @@ def in_turn(alone: bool) -> Iterator[None]:
     """A context in which one thread is at a time, if it must be `alone`."""
     with _turn if alone else contextlib.nullcontext():
         yield
-
-
-def is_left_to_lapack(program: Any, *arguments: Any) -> bool:
-    """Return whether a program of `quick_jit` or `equinox.filter_jit` calls LAPACK for arguments of
-    this kind."""
-    key = program, kind(arguments)
-    if key not in _left_to_lapack:
-        _left_to_lapack[key] = _calls_lapack(program.lower(*arguments).lowered.as_text())
-    return _left_to_lapack[key]
-
-
-_left_to_lapack: dict[Hashable, bool] = {}
-
-
-def _calls_lapack(text: str) -> bool:
-    return "@lapack_" in text
 
 
 def kernel(

@@ -79,29 +79,14 @@ def complex_number(z: complex, digits: int = 6) -> str:
 
 
 def multiplier_table(
-    values: Complex[np.ndarray, " d"], covariances: Float[np.ndarray, "d 2 2"] | None = None
+    values: Complex[np.ndarray, " d"], errors: Float[np.ndarray, " d"] | None = None
 ) -> str:
-    """The multipliers and their moduli, with the standard errors of their real and imaginary parts
-    if covariances of these are given."""
-    if covariances is None:
-        rows = [(complex_number(z), f"{abs(z):.6g}") for z in values]
-        return table(("multiplier", "modulus"), rows)
-    errors = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
-    rows = [
-        (_with_error(z.real, a), _with_error(z.imag, b) if z.imag else "", f"{abs(z):.4g}")
-        for z, (a, b) in zip(values, errors, strict=True)
-    ]
-    return table(("multiplier ± standard error", "imaginary part", "modulus"), rows)
-
-
-def _with_error(value: float, error: float) -> str:
-    """A text such as `-0.24898 ± 0.00012`, with two digits of the standard error."""
-    if not np.isfinite(error):
-        return f"{value:.4g} (unknown)"
-    if not error:
-        return f"{value:.6g}"
-    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 12))
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
+    """The multipliers, their standard errors if they are given, and their moduli."""
+    columns = {"multiplier": [complex_number(z, 6 if errors is None else 8) for z in values]}
+    if errors is not None:
+        columns["± standard error"] = [f"{x:.1e}" if np.isfinite(x) else "unknown" for x in errors]
+    columns["modulus"] = [f"{abs(z):.6g}" for z in values]
+    return table(tuple(columns), list(zip(*columns.values(), strict=True)))
 
 
 class Curve(NamedTuple):

@@ -248,7 +248,7 @@ class Study(eqx.Module):
     def _repr_html_(self) -> str:
         if self.fit is None:
             return card("Study", self._state())
-        multipliers = multiplier_table(self.fit.multipliers, self.fit.multiplier_covariances)
+        multipliers = multiplier_table(self.fit.multipliers, self.fit.standard_errors)
         strides = table(("strides", "standard errors"), self._rows())
         return card("Study", self._state(), multipliers, strides, text(self._outlook(self.fit)))
 

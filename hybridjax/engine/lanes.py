@@ -33,10 +33,10 @@ class Lanes(NamedTuple):
 
 def start_lanes(s: Structure, t: Times, chart: Index, q: Padded) -> Lanes:
     """Lanes before their first step. No guard is armed yet: the search does that."""
-    L, xp = t.shape[0], namespace(t)
-    pace = xp.asarray(np.repeat([[0.0], [np.inf], [0.0], [0.0]], L, axis=1), dtype=float)
-    armed = xp.asarray(np.zeros((len(s.transitions), L), bool))
-    return Lanes(t, chart, q, armed, xp.asarray(np.zeros(L, np.int32)), pace)
+    # (Zeros of the lanes: where `jax.vmap` maps these, JAX would trace loops over constants again.)
+    zero, armed = chart * 0, np.zeros((len(s.transitions), t.shape[0]), bool)
+    pace = np.array([[0.0], [np.inf], [0.0], [0.0]]) + zero
+    return Lanes(t, chart, q, namespace(t).asarray(armed), zero, pace)
 
 
 def lane_at(s: Structure, chart: str, state: Array, t: ArrayLike, name: str) -> Lanes:

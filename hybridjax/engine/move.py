@@ -247,8 +247,8 @@ def _push(s, lanes, target, tape, of_states, wanted):
             return _columns(s, lanes, target, tape, of_states)
 
         def zeros():
-            shapes = jax.eval_shape(columns)
-            return jax.tree_util.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+            L, n = lanes.t.shape[0], 1 + s.d
+            return jnp.zeros((s.d if of_states else n + s.nu, n, L)), jnp.zeros((n, L))
 
         return columns() if wanted is True else jax.lax.cond(wanted, columns, zeros)
 

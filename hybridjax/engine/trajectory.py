@@ -109,7 +109,9 @@ class Trajectory(eqx.Module):
         chart = np.broadcast_to(self.chart[:-1, None], t.shape)
         keep = np.ones(t.shape, bool)
         keep[1:, 0] = self.event[1:-1] >= 0  # a step's start repeats the last end, but for resets
-        return t[keep], chart[keep], q[keep]
+        last = np.flatnonzero(self.event[-1:] >= 0) - 1
+        t, chart = np.append(t[keep], self.t[last]), np.append(chart[keep], self.chart[last])
+        return t, chart, np.vstack([q[keep], self.after[last]])
 
     def at(
         self, t: Annotated[Numbers, Reals("p")]
@@ -122,10 +124,11 @@ class Trajectory(eqx.Module):
         t = np.asarray(t)
         if len(t) and not self.t[0] <= t.min() <= t.max() <= self.t[-1]:
             raise DefinitionError(f"times must lie between {self.t[0]:.9g} and {self.t[-1]:.9g}.")
-        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
-        h = np.diff(self.t)[k, None]
+        k = np.searchsorted(self.t, t, side="right") - 1
+        j = np.minimum(k + 1, len(self.t) - 1)
+        h = (self.t[j] - self.t[k])[:, None]
         x = np.divide(t[:, None] - self.t[k, None], h, out=np.zeros_like(h), where=h > 0)
-        ends = self.after[k], self.before[k + 1], self.slope_after[k], self.slope_before[k + 1]
+        ends = self.after[k], self.before[j], self.slope_after[k], self.slope_before[j]
         return self.chart[k], interpolate(x, h, *ends)
 
     def __call__(self, *names: str, per_step: Count = 32) -> tuple[np.ndarray, ...]:
@@ -232,17 +235,20 @@ def simulate(
 def recorded(
     s: Structure, begin: Lanes, tapes: Sequence[Tape], u: np.ndarray, result: Result
 ) -> Trajectory:
-    """The trajectory of one lane, from the tapes of its pieces, under a constant input (nu, 1)."""
+    """The trajectory of one lane, from the tapes of its pieces, under a constant input (nu, 1), or
+    under another one in each piece (nu, pieces)."""
     rows = [(begin.t, begin.q.T, begin.q.T, begin.chart, np.full(1, -1))]
     for tape in tapes:
         tape = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
         columns = tape.t, tape.before, tape.after, tape.chart, tape.code
         rows.append(tuple(x[tape.code != IDLE] for x in columns))
     t, before, after, chart, event = (np.concatenate(x) for x in zip(*rows, strict=True))
-
-    source = np.concatenate([chart[:1], chart[:-1]])
+    source, until = np.append(chart[:1], chart[:-1]), u
+    if u.shape[1] > 1:
+        u = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
+        until, u = np.hstack([u[:, :1], u]), np.hstack([u, u[:, -1:]])
     with at_ease():
-        left, right = slopes(s, t, source, before.T, u).T, slopes(s, t, chart, after.T, u).T
+        left, right = slopes(s, t, source, before.T, until).T, slopes(s, t, chart, after.T, u).T
     return Trajectory(s, t, chart, before, after, left, right, event, result)
 
 

@@ -1,31 +1,29 @@
 """The whole motion of a single experiment, of which data have the sections only."""
 
-import dataclasses
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Index, Numbers
+from .._core.boundary.kinds import Numbers
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease
 from .._core.executor import to_host
 from .._core.precision import require_x64
 from .._core.results import Result
+from ..engine.lanes import Tape
 from ..engine.move import Options, move
 from ..engine.trajectory import Trajectory, recorded
-from ..errors import ComputationError, DefinitionError
+from ..errors import ComputationError
 from ..sections.placed import PlacedSections
-from .data import ExperimentData
 from .response import require_shape
 
 
 @checked
 def perturbed_trajectory(
     placed: PlacedSections,
-    inputs: ExperimentData | Annotated[Numbers, Reals("samples inputs")],
-    experiment: Index = 0,
+    inputs: Annotated[Numbers, Reals("samples inputs")],
 ) -> Trajectory:
     """Return the motion from section 0 of the cycle under inputs that are held from section to
     section, for `hj.plot.animate` and `hj.plot.cycle`.
@@ -33,24 +31,19 @@ def perturbed_trajectory(
     **Arguments:**
 
     - `placed`: the sections of the experiments.
-    - `inputs`: data of experiments, or the inputs (n, nu) of a single one, in whole periods.
-    - `experiment`: index in the data. (One that did not start on the cycle differs until its
-        transient has decayed.) Default: 0.
+    - `inputs` (n, nu), in whole periods, such as `data.u[0]`. (An experiment that did not start on
+        the cycle differs until its transient has decayed.)
 
-    **Raises:** `DefinitionError` for an experiment that is not in the data, or inputs of another
-    shape; `ComputationError` if a section is not reached.
+    **Raises:** `DefinitionError` for inputs of another shape; `ComputationError` if a section is
+    not reached.
     """
     require_x64()
-    if isinstance(inputs, ExperimentData):
-        if experiment >= len(inputs.u):
-            raise DefinitionError(f"the data hold {len(inputs.u)} experiments, none {experiment}.")
-        inputs = inputs.u[experiment]
     held: np.ndarray = np.asarray(inputs)
     s, placed, N = placed.structure(), to_host(placed), placed.n_sections
     require_shape((1, *held.shape), N, s.nu)
     lanes = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
     period, turn = float(placed.cycle.period), len(placed.cycle.event_sequence)
-    settings, pieces, shift = placed.cycle.settings, [], 0.0
+    settings, tapes, shift, begin = placed.cycle.settings, list[Tape](), 0.0, lanes
     for k, u in enumerate(held[..., None]):
         j, turns = (k + 1) % N, int((k + 1) % N == 0)
         target = placed.target(np.array([j]), lanes.t, np.array([turns]))
@@ -59,30 +52,9 @@ def perturbed_trajectory(
         assert tape is not None
         if (code := Result(int(moved.result[0]))) != Result.OK:
             raise ComputationError(f"the motion stops after sample {k}: {code.message}.")
-        piece = recorded(s, lanes, [tape], u, code)
-        pieces.append(dataclasses.replace(piece, t=piece.t + shift))
+        tapes.append(tape._replace(t=tape.t + shift))
         shift += turns * period
         lanes = moved.lanes._replace(
             t=moved.lanes.t - turns * period, events=moved.lanes.events - turns * turn
         )
-    return _joined(pieces)
-
-
-def _joined(pieces: list[Trajectory]) -> Trajectory:
-    """One trajectory of pieces that follow each other. Where two meet, the input jumps, and with it
-    the slope."""
-    last = pieces[-1]
-
-    def column(name: str, after: bool) -> np.ndarray:
-        parts = [getattr(x, name) for x in pieces]
-        cut = slice(None, -1) if after else slice(1, None)
-        inner = [x[cut] for x in parts]
-        return np.concatenate([*inner, parts[-1][-1:]] if after else [parts[0][:1], *inner])
-
-    columns: Any = {
-        name: column(name, name in ("after", "slope_after", "chart")) for name in _COLUMNS
-    }
-    return dataclasses.replace(last, **columns)
-
-
-_COLUMNS = "t", "chart", "before", "after", "slope_before", "slope_after", "event"
+    return recorded(s, begin, tapes, held.T, Result.OK)

@@ -117,7 +117,7 @@ def identifiability(
     problem, near = _prepare(system, data, free, guess)
     parameters, cycle = problem.parameters, find_limit_cycle(system, near)
     x = parameters.encode(parameters.read(system, problem.observations))
-    residuals, jacobian = evaluate(problem, x, cycle)
+    residuals, jacobian, _ = evaluate(problem, x, cycle)
     if not np.isfinite(residuals).all():
         text = "predicts NaN or infinity for these data: change its parameters."
         raise ComputationError(f"the system has a limit cycle, but {text}")
@@ -180,7 +180,7 @@ class End(NamedTuple):
     jacobian: Float[np.ndarray, "r p"]
     """Their derivatives by the coordinates."""
     cycle: LimitCycle
-    """The cycle of the guess."""
+    """A guess for the cycle of the fit."""
     steps: int
     result: int
 
@@ -207,11 +207,11 @@ def _descend(
     if cycle.result != Result.OK:
         none = np.zeros(0), np.zeros((0, len(start)))
         return End(start, start, np.inf, *none, cycle, 0, int(cycle.result))
-    x, r, J, steps, converged = descend(problem, start, cycle)
+    x, r, J, near, steps, converged = descend(problem, start, cycle)
     if not np.isfinite(r).all():  # there is a cycle, but no observation on it
         return End(start, start, np.inf, r, J, cycle, steps, int(Result.NOT_CONVERGED))
     result = Result.OK if converged else Result.NOT_CONVERGED
-    return End(start, x, float(r @ r), r, J, cycle, steps, int(result))
+    return End(start, x, float(r @ r), r, J, near, steps, int(result))
 
 
 def _summary(problem: FitProblem, system: HybridSystem, ends: list[End], best: End) -> ModelFit:
@@ -220,7 +220,6 @@ def _summary(problem: FitProblem, system: HybridSystem, ends: list[End], best: E
     guesses = tuple(
         ParameterGuess(decode(e.start), decode(e.x), e.cost, e.steps, e.result) for e in ends
     )
-    # The cycle of the guess is nearer than the first one, which may be too far away.
     cycle = _cycle_at(problem, system, best.x, best.cycle)
     values, residuals = decode(best.x), best.residuals
     size = np.asarray(_sizes(jnp.asarray(values)))

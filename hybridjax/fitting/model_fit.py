@@ -205,7 +205,7 @@ class ModelFit(eqx.Module):
             raise DefinitionError(f"`true` must have a value of '{missing[0]}', which was fitted.")
         values = jnp.array([float(true[name]) for name in self.names])
         x = self.problem.parameters.encode(values)
-        r, _ = evaluate(self.problem, x, self.cycle)
+        r, *_ = evaluate(self.problem, x, self.cycle)
         misfit = self.cost / max(self.freedom, 1)
         return (float(r @ r) - self.cost) / self.problem.unit(misfit)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -196,12 +197,14 @@ class FitProblem(eqx.Module):
         htfs = [x for x in self.observations if isinstance(x, ObservedHTF)]
         return estimated_noise(max((float(x.most) for x in htfs), default=1.0), misfit)[1] ** 2
 
-    def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> Float[Array, " r"]:
-        """Return the residuals, infinite where there is no limit cycle, or no observation on it."""
+    def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> tuple[Array, tuple]:
+        """Return the residuals (r,), infinite where there is no limit cycle, or no observation on
+        it; and the anchor and the period of the cycle."""
         values = self.parameters.decode(x)
         cycle = candidate_cycle(self.parameters.insert(guess.system, values), guess)
         observations = self.parameters.observed(self.observations, values)
-        return _joined([observation.residuals(cycle) for observation in observations], cycle.result)
+        parts = [observation.residuals(cycle) for observation in observations]
+        return _joined(parts, cycle.result), (cycle.anchor, cycle.period)
 
 
 @jax.jit
@@ -211,9 +214,11 @@ def _joined(parts, result):
 
 
 def _with_jacobian(problem: FitProblem, x, guess):
-    """Return residuals (r,) and Jacobian (r, p): all columns in one pass, in forward mode."""
-    push = lambda t: jax.jvp(lambda x: problem.residuals(x, guess), (x,), (t,))  # noqa: E731
-    return jax.vmap(push, out_axes=(None, -1))(jnp.eye(x.shape[0]))
+    """Return residuals (r,), their Jacobian (r, p) with all columns in one pass, in forward mode,
+    and the anchor and the period."""
+    at = lambda x: problem.residuals(x, guess)  # noqa: E731
+    push = lambda t: jax.jvp(at, (x,), (t,), has_aux=True)  # noqa: E731
+    return jax.vmap(push, out_axes=(None, -1, None))(jnp.eye(x.shape[0]))
 
 
 _compiled = quick_jit(_with_jacobian)
@@ -222,51 +227,54 @@ _not_on_host: set[tuple] = set()
 
 def evaluate(
     problem: FitProblem, x: Float[Array | np.ndarray, " p"], guess: LimitCycle
-) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
-    """Return residuals and Jacobian at x, from the host if it has these derivatives."""
+) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle]:
+    """Return residuals and Jacobian at x, from the host if it has these derivatives; and a guess
+    for parameters near x."""
+    arguments = problem, jnp.asarray(x), guess
     with on_the_cpu():
-        arguments = problem, jnp.asarray(x), guess
-        if (key := kind(arguments)) not in _not_on_host:
+        key, values = kind(arguments), None
+        if key not in _not_on_host:
             try:
                 with only_on_host():
-                    return jax.device_get(_with_jacobian(*arguments))
+                    values = _with_jacobian(*arguments)
             except NotOnHostError:
                 _not_on_host.add(key)
-        return jax.device_get(_compiled(*arguments))
+        r, J, (anchor, period) = values or _compiled(*arguments)
+    return *jax.device_get((r, J)), dataclasses.replace(guess, anchor=anchor, period=period)
 
 
 def descend(
     problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " r"], Float[np.ndarray, "r p"], int, bool]:
+) -> tuple[Any, Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle, int, bool]:
     """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals and their
-    Jacobian, number of evaluations, and whether it has converged.
+    Jacobian, a guess for their cycle, number of evaluations, and whether it has converged.
 
     Steps are accepted and their damping changes as in `optimistix.LevenbergMarquardt`. Here the
     iteration runs on the host, so that only the model is compiled.
     """
     trial, damping = x, 1.0
-    r, J = evaluate(problem, x, guess)
+    r, J, near = evaluate(problem, x, guess)
     for steps in range(1, MAX_STEPS + 1):
         if steps > 1:
             change = trial - x
-            r_new, J_new = evaluate(problem, trial, guess)
+            r_new, J_new, nearer = evaluate(problem, trial, near)
             predicted = (J @ change) @ (J @ change + 2 * r)
             gain = (r_new - r) @ (r_new + r)
             # (Rounding decides whether a step of this size is accepted.)
             done = _small(change, trial) and _small(r_new - r, r_new)
             if gain <= _ACCEPTED * predicted:
                 damping /= _LESS if gain < _GOOD * predicted < 0 else 1.0
-                x, r, J = trial, r_new, J_new
+                x, r, J, near = trial, r_new, J_new, nearer
             else:
                 damping *= _MORE
             if done:
-                return x, r, J, steps, True
+                return x, r, J, near, steps, True
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
             break
         damped = np.concatenate([J, np.sqrt(damping) * np.eye(len(x))])
         short = np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
         trial = x - short
-    return x, r, J, steps, False
+    return x, r, J, near, steps, False
 
 
 def _small(change: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"]) -> bool:

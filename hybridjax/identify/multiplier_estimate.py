@@ -186,7 +186,7 @@ class MultiplierEstimate(eqx.Module):
         regions = []
         if np.isfinite(self.multiplier_covariances).all():
             regions = [self.ellipse(k) for k in range(len(self.multipliers))]
-        shown = multiplier_table(self.multipliers, self.multiplier_covariances)
+        shown = multiplier_table(self.multipliers, self.standard_errors)
         circle = unit_circle(self.multipliers, regions)
         return card(type(self).__name__, "", shown, circle, text(self._about()))
 

@@ -213,12 +213,9 @@ class FiveLinkBiped(HybridSystem):
             [[1, 0, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, -1, 0]]
         )
         arms = self.length * links + center[:, None] * np.diag([-1, -1, 1, -1, -1])
-        hip = [1, 1, 0, 0, 0]
-        stance = np.array([[0, 0, 0, 0, 0], [1, 0, 0, 0, 0], hip])
-        swing = np.array([hip, [1, 1, 0, -1, 0], [1, 1, 0, -1, -1]])
-        torso = jnp.stack([0 * self.length, 2 * self.torso_center])[:, None] * np.eye(5)[2]
-        torso = torso + self.length * np.array(hip)
-        drawn = {"stance": self.length * stance, "swing": self.length * swing, "torso": torso}
+        ends = self.length * np.vstack([0 * links[0], links[:2], links[4], [1, 1, 0, -1, -1]])
+        torso = jnp.stack([ends[2], ends[2] + 2 * self.torso_center * np.eye(5)[2]])
+        drawn = {"stance": ends[:3], "swing": ends[2:], "torso": torso}
         return chain(arms, m, about_joint - m * center**2, self.g, drawn)
 
     def _swing_foot(self, q):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -16,33 +16,29 @@ from ..systems.transition import Scheduled, Transition
 
 # Symbols of a circuit, as steps from their begin, in units of their length.
 _COIL = [(k / 48, 0.1 * math.sin(math.pi * (k % 12) / 12)) for k in range(49)]
-_LOAD = [
-    *((0.0, 0.0), (0.2, 0.0), (0.2, 0.12), (0.8, 0.12), (0.8, -0.12), (0.2, -0.12), (0.2, 0.12)),
-    *((0.8, 0.12), (0.8, 0.0), (1.0, 0.0)),
-]
 _DIODE = [
     *((0.0, 0.0), (0.35, 0.0), (0.35, 0.15), (0.65, 0.0), (0.35, -0.15), (0.35, 0.0), (0.65, 0.0)),
     *((0.65, 0.15), (0.65, -0.15), (0.65, 0.0), (1.0, 0.0)),
 ]
-_Way = Literal["right", "up", "down"]
+_WAYS = {"right": (1, 0), "up": (0, 1), "down": (0, -1)}
 
 
-def _along(symbol: Sequence[tuple[Any, Any]], x: float, y: float, way: _Way = "right") -> list:
+def _along(symbol: Sequence[tuple[Any, Any]], x: float, y: float, way: str = "right") -> list:
     """A symbol of length 1 from (x, y) on."""
-    if way == "right":
-        return [(x + a, y + b) for a, b in symbol]
-    side = 1 if way == "up" else -1
-    return [(x + b, y + side * a) for a, b in symbol]
+    c, s = _WAYS[way]
+    return [(x + c * a - s * b, y + s * a + c * b) for a, b in symbol]
 
 
-def _capacitor(x: float, y: float, charge: ArrayLike, way: _Way = "down") -> dict[str, list]:
-    """Two plates, the distance of which shows the charge, from 0 to 1."""
+def _plates(charge: ArrayLike) -> list[list]:
+    """Both halves of a capacitor, the gap of which shows the charge, from 0 to 1."""
     gap = 0.05 + 0.1 * jnp.clip(charge, 0, 1)
-    first, second = 0.5 - gap, 0.5 + gap
-    return {
-        f"plate {x:g}": _along([(0, 0), (first, 0), (first, -0.25), (first, 0.25)], x, y, way),
-        f"plate {x:g}'": _along([(1, 0), (second, 0), (second, -0.25), (second, 0.25)], x, y, way),
-    }
+    ends = (0, 0.5 - gap), (1, 0.5 + gap)
+    return [[(end, 0), (x, 0), (x, -0.25), (x, 0.25)] for end, x in ends]
+
+
+def _load(begin: float, x: float) -> list:
+    """A resistor at x, and its wires from the capacitor to the supply."""
+    return [(begin, 1.0), *Drawing.spring((x, 1.0), (x, 0.0)), (0.0, 0.0)]
 
 
 class BuckConverter(HybridSystem):
@@ -100,15 +96,14 @@ class BuckConverter(HybridSystem):
     def draw(self, chart, t, q):
         """The circuit: supply, switch (or diode), coil, capacitor, load."""
         blade = (0.9, 1.0) if chart == "closed" else (0.7, 1.4)
+        above, below = _plates(q["v"] / self.Vin)
         lines = {
             "switch": [(0.0, 1.0), (0.2, 1.0), blade],
-            "contact": [(0.9, 1.0), (1.0, 1.0)],
+            "coil": [(0.9, 1.0), *_along(_COIL, 1.0, 1.0)],
             "diode": _along(_DIODE, 1.0, 0.0, "up"),
-            "coil": _along(_COIL, 1.0, 1.0),
-            **_capacitor(2.0, 1.0, q["v"] / self.Vin),
-            "top": [(2.0, 1.0), (3.0, 1.0)],
-            "load": _along(_LOAD, 3.0, 1.0, "down"),
-            "bottom": [(0.0, 0.0), (3.0, 0.0)],
+            "upper plate": _along(above, 2.0, 1.0, "down"),
+            "load": _load(2.0, 3.0),
+            "lower plate": _along(below, 2.0, 1.0, "down"),
         }
         return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
@@ -170,17 +165,19 @@ class CukConverter(HybridSystem):
     def draw(self, chart, t, q):
         """The circuit: supply, first coil, switch, capacitor, diode, second coil, load."""
         foot = (1.0, 0.2) if chart == "closed" else (1.35, 0.3)
+        left, right = _plates(q["v1"] / (4 * self.E))
+        above, below = _plates(q["v2"] / (2 * self.E))
         lines = {
             "first coil": _along(_COIL, 0.0, 1.0),
             "switch": [(1.0, 1.0), (1.0, 0.8), foot],
-            "below": [(1.0, 0.2), (1.0, 0.0)],
-            **_capacitor(1.0, 1.0, q["v1"] / (4 * self.E), "right"),
+            "contact": [(1.0, 0.2), (1.0, 0.0)],
+            "left plate": _along(left, 1.0, 1.0),
+            "right plate": _along(right, 1.0, 1.0),
             "diode": _along(_DIODE, 2.0, 1.0, "down"),
             "second coil": _along(_COIL, 2.0, 1.0),
-            **_capacitor(3.0, 1.0, q["v2"] / (2 * self.E)),
-            "top": [(3.0, 1.0), (3.7, 1.0)],
-            "load": _along(_LOAD, 3.7, 1.0, "down"),
-            "bottom": [(0.0, 0.0), (3.7, 0.0)],
+            "upper plate": _along(above, 3.0, 1.0, "down"),
+            "lower plate": _along(below, 3.0, 1.0, "down"),
+            "load": _load(3.0, 3.7),
         }
         return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 

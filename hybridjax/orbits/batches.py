@@ -1,6 +1,7 @@
 """Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.compilation import is_left_to_lapack, one_tier, uncollected
+from .._core.compilation import TwoTiers, uncollected
 from .._core.execution import in_threads
 from .._core.progress import working
 from .._core.results import Result
@@ -128,8 +129,8 @@ class Tiles(NamedTuple):
     size: int
     """Systems in one compiled call."""
     workers: int
-    large: bool
-    """Whether there are so many systems in all that programs are fully optimized."""
+    programs: Callable[[Callable], TwoTiers]
+    """A function's program, the same in each call."""
     known: Known | None = None
 
     @property
@@ -290,7 +291,7 @@ class Tiles(NamedTuple):
 
     def _in_tiles(self, function, rows, *arguments, options=(), then=lambda x: x):
         """`function` of some systems, in calls of one size, so that one program serves all."""
-        program = one_tier(function, self.large)
+        program = self.programs(function)
         arrays, static = eqx.partition(self.systems, eqx.is_array)
 
         def of_tile(k):
@@ -301,9 +302,8 @@ class Tiles(NamedTuple):
         def run(k):
             return _pick(then(program(*of_tile(k))), slice(len(rows) - k))
 
-        several = self.workers > 1 and len(rows) > self.size
-        alone = not several or is_left_to_lapack(program, *of_tile(0))
-        return _join(*in_threads(run, range(0, len(rows), self.size), 1 if alone else self.workers))
+        tiles = range(0, len(rows), self.size)
+        return _join(*in_threads(run, tiles, min(self.workers, len(tiles))))
 
 
 def _numbers(systems: HybridSystem | None) -> Float[np.ndarray, "S p"]:

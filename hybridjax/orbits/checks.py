@@ -12,7 +12,6 @@ from .._core.compilation import at_ease
 from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
 from ..engine import kernels, unresolved
-from ..engine.lanes import Tape
 from ..engine.trajectory import simulate
 from ..engine.unresolved import column_name, jumps, lines_of_jumps, may_be_sudden, passed_over
 from ..errors import DefinitionError
@@ -186,17 +185,14 @@ def _no_period(system: HybridSystem, problem: str) -> str:
     )
 
 
-def check_jumps(cycle: LimitCycle, tapes: Tape | None = None) -> None:
+def check_jumps(cycle: LimitCycle) -> None:
     """**Raises:** `DefinitionError` if the field of a chart jumps on the cycle without an event, or
-    has a pulse that is shorter than a step.
-
-    **Arguments:** `tapes`: see `orbit`.
-    """
+    has a pulse that is shorter than a step."""
     s, period = cycle.structure, float(cycle.period)
     charts = [a for a in range(len(s.charts)) if unresolved.may_have_pulses(s, a)]
     if not charts:
         return
-    scale, path = np.asarray(cycle.settings.scale), orbit(cycle.return_map, tapes)
+    scale, path = np.asarray(cycle.settings.scale), orbit(cycle)
     pulse = passed_over(path, np.zeros(s.nu), to_host(cycle.settings), linear=True)
     if pulse is not None:
         a, begin = int(path.chart[pulse[0]]), path.t[pulse[0]]

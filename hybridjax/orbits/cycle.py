@@ -31,7 +31,7 @@ from ..systems.system import HybridSystem, OutputNames
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
-from .linear_flow import hosted, linear_flow, rule
+from .linear_flow import hosted, last_turn, linear_flow, rule
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
@@ -202,6 +202,8 @@ class LimitCycle(eqx.Module):
         """
         _require_values(self, "trajectory")
         self.require_current()
+        if periods == 1 and self.result == Result.OK:
+            return orbit(self)
         s, anchor = self.structure, to_host(self.anchor)
         a = int(anchor.chart[0])
         begin = s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods
@@ -443,14 +445,13 @@ def log_determinant(cycle: LimitCycle) -> float:
     return float(flow.length @ np.trace(flow.by_state, axis1=2, axis2=3) @ rule().weights)
 
 
-def orbit(map: ReturnMap, tapes: Tape | None = None) -> Trajectory:
-    """One turn from the anchor, in the steps by which it is linearized, which its `tapes` may hold
-    already, one for each piece."""
-    map = to_host(map)
-    rows = to_host(map.pieces(tangents=True)[1] if tapes is None else tapes)
-    pieces = [Tape(*x) for x in zip(*rows, strict=True)]
+def orbit(cycle: LimitCycle) -> Trajectory:
+    """One turn from the anchor, in the steps by which it is linearized."""
+    map, (_, tape) = to_host(cycle.return_map), last_turn(cycle)
+    pieces = [Tape(*(x[..., k, None] for x in tape)) for k in range(tape.t.shape[-1])]
     begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
-    return recorded(map.structure, begin, pieces, u, Result.OK)
+    make = lambda: recorded(map.structure, begin, pieces, u, Result.OK)  # noqa: E731
+    return _trajectories.recall(cycle, 1.0, make)
 
 
 def weakest(factor: Matrix, weaker: int = 0) -> float:

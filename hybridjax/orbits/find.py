@@ -176,7 +176,7 @@ def find_limit_cycle(
     checks.check_times(s, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
         check_begin(cycle.return_map)
-        checks.check_jumps(cycle, solution.turn.tapes)
+        checks.check_jumps(cycle)
         if conserved:
             checks.check_conserved(cycle)
     if throw and code != Result.OK:

@@ -1,6 +1,7 @@
 """Limit cycles of many systems at once: the points of a parameter sweep side by side."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable, Sequence
 from typing import SupportsIndex
 
@@ -11,6 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index
+from .._core.compilation import TwoTiers
 from .._core.execution import Execution
 from .._core.executor import from_host
 from .._core.memo import remembered
@@ -29,9 +31,9 @@ from .cycle import LimitCycle
 from .return_map import ReturnMap, turn_product
 
 
-# Largest number of systems for programs that are compiled in half the time and run longer. Larger:
-# they run more than 3 s longer. Smaller: compiling takes longer than they run.
-SMALL = 2000
+# Largest number of systems for programs that are compiled in a third of the time and run four times
+# as long. Larger: they run more than 5 s longer. Smaller: compiling takes longer than they run.
+SMALL = 8000
 # Cycles that are tested for whether events that coincide commute, and whether the cycle closes
 # early; all are, if one of these fails. More: the test takes longer. Fewer: exceptions are missed.
 _LOOKED_AT = 50
@@ -159,7 +161,8 @@ def find_limit_cycles(
     S = len(jax.tree_util.tree_leaves(arrays)[0])
     check_periodic(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
     map = map_for_sweep(guess, settings)
-    tiles = Tiles(systems, map, min(execution.batch or BATCH, S), execution.threads, S > SMALL)
+    programs = ft.cache(ft.partial(TwoTiers, large=S > SMALL))
+    tiles = Tiles(systems, map, min(execution.batch or BATCH, S), execution.threads, programs)
     return as_cycles(tiles, tiles.solve(S))
 
 

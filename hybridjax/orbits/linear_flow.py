@@ -233,6 +233,12 @@ def hosted(cycle: Any) -> Any:
     return _hosted.recall(cycle, None, lambda: to_host(cycle))
 
 
+def last_turn(cycle: Any) -> tuple[Lanes, Tape]:
+    """The starts and the steps of the pieces of a cycle's last turn, side by side."""
+    make = lambda: side_by_side(to_host(cycle.return_map).pieces(tangents=True))  # noqa: E731
+    return _turns.recall(cycle, None, make)
+
+
 def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = None) -> LinearFlow:
     """Linearize the flow along a cycle, in pieces no longer than this part of the period. Inputs
     are those of the system, or a change of a parameter.
@@ -265,7 +271,7 @@ def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = No
     map, nodes, K = cycle.return_map, rule().nodes, NODES
     s, of = map.structure, with_inputs(map.system, parameter)
     d, period, D, tiny = s.d, float(map.expected), 1, 1j * kernels.TINY
-    lanes, tape = _turns.recall(cycle, None, lambda: side_by_side(map.pieces(tangents=True)))
+    lanes, tape = last_turn(cycle)
     moves = recorded_moves(lanes, tape)
     t, q = np.append(moves.t, map.anchor.t[0] + period)[:, None], moves.q.T[..., None]
     if by is not None:

@@ -315,14 +315,14 @@ class ReturnMap(eqx.Module):
             moved, extra = flow(lanes, target, h, result, piece)
             return (moved.lanes, moved.h, moved.result), extra
 
-        lanes, result = self.departure(q), xp.zeros(1, xp.int32)
+        lanes = self.departure(q)  # (no `events` is `Result.OK`)
         h = (0.5 * self.expected / LEGS)[None]
         if isinstance(flow, Options):
-            u, begin = xp.zeros((self.structure.nu, 1)), (lanes, stride(h), result)
+            u, begin = xp.zeros((self.structure.nu, 1)), (lanes, stride(h), lanes.events)
             (end, _, result), extra = through(self.structure, begin, u, ends, self.settings, flow)
         else:
             each = ends.time, ends.index, ends.event, ends.limit, record
-            (end, _, result), extra = scan(leg, (lanes, h, result), each)
+            (end, _, result), extra = scan(leg, (lanes, h, lanes.events), each)
         same = (result[0] == Result.OK) & (end.chart[0] == self.anchor.chart[0])
         residual = xp.where(self.valid, end.q[:, 0], 0.0) - q - self.held(q)[0]
         residual = xp.where(same, residual, np.nan)

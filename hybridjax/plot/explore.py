@@ -1,8 +1,5 @@
 """Sliders for parameters: the limit cycle, its multipliers and its gain follow them."""
 
-import base64
-import functools
-import io
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -10,7 +7,7 @@ import numpy as np
 from matplotlib import pyplot
 from matplotlib.widgets import Slider
 
-from .._core.arguments import Numbers, package
+from .._core.arguments import Numbers, package, require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.values import Reals
 from .._core.results import Result
@@ -20,9 +17,9 @@ from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.system import HybridSystem, unit_of_parameter
 from ..systems.varied import parameter_of, with_parameters
-from .film import PNG, Easel
+from .film import PNG, Easel, png
 from .look import COLORS, CYCLE, close_in_notebook, style
-from .motion import portrait
+from .motion import portrait, widened
 from .orbit import plane_of
 
 
@@ -33,7 +30,6 @@ _FREQUENCIES = np.linspace(0.02, 1.98, 50)
 # the sliders is kept; once they rest, the gain is asked for.
 _PAGE = """
 function render({ model, el }) {
-  const note = document.createElement("div"), picture = document.createElement("img");
   const values = { ...model.get("asked").values };
   let moved = false, waiting = false, number = 0;
   const ask = (gain) => {
@@ -41,31 +37,23 @@ function render({ model, el }) {
     model.set("asked", { values: { ...values }, gain, number: ++number });
     model.save_changes();
   };
-  for (const [name, label, low, high] of model.get("sliders")) {
-    const row = document.createElement("label"), text = document.createElement("span");
-    const about = { type: "range", min: low, max: high, step: (high - low) / 100 };
-    const slider = Object.assign(document.createElement("input"), about);
-    const show = () => { text.textContent = ` ${label} = ${(+slider.value).toPrecision(4)}`; };
-    slider.value = values[name];
-    slider.oninput = () => {
-      show();
-      [values[name], moved] = [+slider.value, true];
-      if (!waiting) ask(false);
-    };
-    row.style.display = "block";
-    row.append(slider, text);
-    el.append(row);
-    show();
-  }
+  const row = ([name, label, min, max]) => `<label style="display: block">
+    <input type="range" name="${name}" min="${min}" max="${max}" step="${(max - min) / 100}"
+    value="${values[name]}"> ${label} = <output>${values[name].toPrecision(4)}</output></label>`;
+  el.innerHTML = model.get("answer").sliders.map(row).join("") + '<img style="max-width: 100%">';
+  const picture = el.querySelector("img");
+  el.oninput = ({ target }) => {
+    target.nextElementSibling.value = (+target.value).toPrecision(4);
+    [values[target.name], moved] = [+target.value, true];
+    if (!waiting) ask(false);
+  };
   const update = () => {
     const answer = model.get("answer");
-    [picture.src, note.textContent, waiting] = [answer.picture, answer.message, false];
+    [picture.src, waiting] = [answer.picture, false];
     if (moved || !answer.gain) ask(!moved);
   };
-  picture.style.maxWidth = "100%";
   model.on("change:answer", update);
   update();
-  el.append(note, picture);
 }
 export default { render };
 """
@@ -75,26 +63,25 @@ class Explorer:
     """Sliders that move parameters of a system. A notebook shows them (with the extra `explore`).
 
     **Fields:** `cycle`: the last limit cycle that was found; `message`: "", or where and why the
-    cycle was lost; `figure`: orbit, multipliers and gain.
+    cycle was lost; `figure`: orbit, multipliers and gain, below the message.
     """
 
-    def __init__(self, cycle: LimitCycle, ranges: dict[str, np.ndarray], plane: tuple[str, str]):
-        self.cycle, self.message, self.ranges, self._plane = cycle, "", ranges, plane
-        self.values = {name: float(parameter_of(cycle.system, name)) for name in ranges}
-        s, places = cycle.structure, {"left": 0.07, "right": 0.99, "bottom": 0.14, "top": 0.86}
+    def __init__(self, cycle: LimitCycle, sliders: list, plane: tuple[str, str]):
+        self.cycle, self.message, self._sliders, self._plane = cycle, "", sliders, plane
+        self.values = {name: float(parameter_of(cycle.system, name)) for name, *_ in sliders}
+        s, places = cycle.structure, {"left": 0.07, "right": 0.99, "bottom": 0.14, "top": 0.84}
         with style():
             # (A layout that is computed for each picture takes longer than the cycle.)
             self.figure, self._axes = pyplot.subplots(1, 3, figsize=(9.0, 3.2))
-            self.figure.subplots_adjust(**places, wspace=0.3)
+            self.figure.subplots_adjust(**places, wspace=0.4)
             orbit, circle, gain = self._axes
             self._portrait = portrait(orbit, circle, s, plane)
             orbit.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4)
             (self._gain,) = gain.semilogy([], [], color=CYCLE[0])
             pushed = f", {s.inputs[0]} to {plane[0]}" if s.nu else ""
             gain.set(xlabel="input frequency (cycles/period)", ylabel=f"$|H_0|${pushed}")
-            self._lost = self.figure.suptitle("", fontsize=8, color=COLORS["red"])
+            self._lost = self.figure.suptitle("", fontsize=8, color=COLORS["red"], wrap=True)
         self._easel: Easel | None = None
-        self._limits = np.zeros(0)
         self._draw()
         close_in_notebook(self.figure)
 
@@ -108,11 +95,10 @@ class Explorer:
 
         **Raises:** `DefinitionError` for a parameter without a slider.
         """
-        for name in values:
-            if name not in self.ranges:
-                raise DefinitionError(f"'{name}' has no slider; {', '.join(self.ranges)} have one.")
+        require_among("slider", values, self.values)
         self._follow(values)
         self._draw()
+        self.figure.canvas.draw_idle()
 
     def _follow(self, values: Mapping[str, float]) -> None:
         self.values |= {name: float(x) for name, x in values.items()}
@@ -140,33 +126,21 @@ class Explorer:
             htf = cycle.htf(f, outputs=self._plane[0], inputs=s.inputs[0])
             self._gain.set_data(f, np.abs(htf[0][:, 0, 0]))
         self._gain.set_alpha(1.0 if gain else 0.3)
-        self._lost.set_text("the last cycle that was found" if self.message else "")
+        self._lost.set_text(self.message)
         self._moving = [*self._portrait(cycle), self._gain, self._lost]
-        for ax in self._axes[::2]:  # wider axes where the curves leave them
-            ax.relim(visible_only=True)
-            if not all(ax.viewLim.contains(*corner) for corner in ax.dataLim.corners()):
-                ax.margins(0.2)
-                ax.autoscale_view()
-        limits = np.stack([ax.viewLim.get_points() for ax in self._axes])
-        if not np.array_equal(limits, self._limits):
-            self._limits, self._easel = limits, None
+        if any([widened(ax) for ax in self._axes]):
+            self._easel = None
 
     def show(self) -> None:
         """Open a window with the sliders (in scripts)."""
-        window = pyplot.figure(figsize=(5, 0.5 * len(self.ranges) + 0.3))
-        self._sliders = []
-        for k, (name, (low, high)) in enumerate(self.ranges.items()):
-            ax = window.add_axes((0.25, 1 - (k + 1) / (len(self.ranges) + 1), 0.55, 0.05))
-            slider = Slider(ax, _label(self.cycle, name), low, high, valinit=self.values[name])
-            slider.on_changed(functools.partial(self._slid, name))
-            self._sliders.append(slider)
+        window = pyplot.figure(figsize=(5, 0.5 * len(self._sliders) + 0.3))
+        self._widgets = []  # (a slider that nobody holds does not move)
+        for k, (name, label, low, high) in enumerate(self._sliders, 1):
+            ax = window.add_axes((0.25, 1 - k / (len(self._sliders) + 1), 0.55, 0.05))
+            self._widgets.append(Slider(ax, label, low, high, valinit=self.values[name]))
+            move = lambda value, name=name: self.move({name: value})  # type: ignore[misc]  # noqa: E731
+            self._widgets[-1].on_changed(move)
         pyplot.show()
-
-    def _slid(self, name: str, value: float) -> None:
-        self.move({name: value})
-        if self.message:
-            print(self.message)
-        self.figure.canvas.draw_idle()
 
     def widget(self) -> Any:
         """Return the widget, for notebooks that wrap widgets themselves (`marimo.ui.anywidget`).
@@ -175,15 +149,10 @@ class Explorer:
         """
         anywidget: Any = package("anywidget")
         traitlets = package("traitlets")
-        sliders = [
-            [name, _label(self.cycle, name), *map(float, limits)]
-            for name, limits in self.ranges.items()
-        ]
         explorer = self
 
         class Sliders(anywidget.AnyWidget):
             _esm = _PAGE
-            sliders = traitlets.List().tag(sync=True)
             asked = traitlets.Dict().tag(sync=True)
             answer = traitlets.Dict().tag(sync=True)
 
@@ -191,18 +160,15 @@ class Explorer:
             def _moved(self, change) -> None:
                 self.answer = explorer._answer(**change["new"])
 
-        first: Any = {"values": self.values, "gain": True, "number": 0}
-        return Sliders(sliders=sliders, asked=first, answer=self._answer(**first))
+        return Sliders(asked={"values": self.values, "gain": True, "number": 0})
 
     def _answer(self, values: Mapping[str, float], gain: bool, number: int) -> dict[str, Any]:
         if values != self.values:
             self._follow(values)
         self._draw(gain)
         self._easel = self._easel or Easel(self.figure, self._moving, 110)
-        file = io.BytesIO()
-        self._easel.image(self._moving).save(file, "png", compress_level=1)
-        picture = PNG + base64.b64encode(file.getvalue()).decode()
-        return {"picture": picture, "message": self.message, "gain": gain, "number": number}
+        picture = png(self._easel.image(self._moving), compress_level=1)
+        return {"picture": picture, "gain": gain, "number": number, "sliders": self._sliders}
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
         try:
@@ -240,19 +206,16 @@ def explore(
     cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)
     if cycle.result != Result.OK:
         raise DefinitionError("`system` is a cycle that was not found: explore another one.")
-    limits = {}
+    sliders = []
     for name in dict.fromkeys((*parameters, *(ranges or {}))):
         value = float(parameter_of(cycle.system, name))
-        given = (ranges or {}).get(name, sorted((0.5 * value, 1.5 * value)))
-        low, high = limits[name] = np.asarray(given, float)
+        low, high = map(float, (ranges or {}).get(name, sorted((0.5 * value, 1.5 * value))))
         if not low <= value <= high or low == high:
             raise DefinitionError(
                 f"`ranges` of '{name}' must be two numbers around its present value {value:.6g}."
             )
-    if not limits:
+        unit = Signal(name, unit_of_parameter(cycle.system, name)).unit
+        sliders.append([name, with_unit(name, unit), low, high])
+    if not sliders:
         raise DefinitionError("explore: name one parameter or more, such as 'k'.")
-    return Explorer(cycle, limits, plane_of(cycle.structure, x, y))
-
-
-def _label(cycle: LimitCycle, name: str) -> str:
-    return with_unit(name, Signal(name, unit_of_parameter(cycle.system, name)).unit)
+    return Explorer(cycle, sliders, plane_of(cycle.structure, x, y))

@@ -4,6 +4,7 @@ import base64
 import io
 import uuid
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -17,17 +18,16 @@ from .look import COLORS
 
 BODY = "#e3ebf3"
 """The color of bodies."""
+PNG = "data:image/png;base64,"
 _PLAYER = """<div id="{id}" style="display:inline-block;max-width:100%">
-<div style="position:relative;width:{width}px;max-width:100%">
-<img alt="{alt}" src="{still}" style="width:100%">
-<img alt="" src="{first}" style="width:100%;position:absolute;left:0;top:0"></div>
+<div><img alt="{alt}" src="{first}" style="width:{width}px;max-width:100%"></div>
 <button title="pause or play">&#9199;</button>
 <input type="range" min="0" max="{last}" value="0" style="width:75%;vertical-align:middle">
 <script>(() => {{
-const box = document.getElementById("{id}"), [image, button, slider] =
-  ["img+img", "button", "input"].map(x => box.querySelector(x)), frames = {frames};
+const box = document.getElementById("{id}"), frames = {frames};
+const [image, button, slider] = ["img", "button", "input"].map(x => box.querySelector(x));
 let playing = true;
-const show = k => {{ image.src = "data:image/png;base64," + frames[k]; slider.value = k; }};
+const show = k => {{ image.src = frames[k]; slider.value = k; }};
 button.onclick = () => {{ playing = !playing; }};
 slider.oninput = () => {{ playing = false; show(+slider.value); }};
 const timer = setInterval(() => {{
@@ -58,11 +58,11 @@ class Easel:
 def frames(
     figure: Figure, draw: Callable[[int], Sequence[Artist]], count: int, dpi: float
 ) -> list[Image.Image]:
-    """What stands still, and the frames, as images with one palette."""
+    """Images with one palette."""
     canvas, before = figure.canvas, figure.dpi
     try:
         easel = Easel(figure, draw(0), dpi)
-        images = [easel.image([]), *(easel.image(draw(k)) for k in range(count))]
+        images = [easel.image(draw(k)) for k in range(count)]
     finally:
         figure.set_dpi(before)
         figure.set_canvas(canvas)
@@ -80,33 +80,25 @@ _PALETTE = 255 * np.vstack([np.ones(3), to_rgb(BODY), _SHADES])
 def gif(images: Sequence[Image.Image], interval: float) -> bytes:
     """A GIF that repeats. Its times are whole hundredths of a second, which together last as long
     as the frames."""
-    first, *following = images
     ends = np.round(100 * interval * np.arange(len(images) + 1))
-    durations = [int(10 * max(2, x)) for x in np.diff(ends)]
-    file, options = io.BytesIO(), {"duration": durations, "loop": 0, "disposal": 1}
-    first.save(file, "gif", save_all=True, append_images=following, **options)
+    file, durations = io.BytesIO(), [10 * max(2, int(x)) for x in np.diff(ends)]
+    options: Any = {"save_all": True, "loop": 0, "disposal": 1}
+    images[0].save(file, "gif", append_images=images[1:], duration=durations, **options)
     return file.getvalue()
 
 
-def player(still: Image.Image, images: Sequence[Image.Image], interval: float, alt: str) -> str:
+def player(images: Sequence[Image.Image], interval: float, alt: str) -> str:
     """HTML that shows the frames one after the other, with a button and a slider, and needs no
-    other file. Each frame holds what differs from the still image, upon which it lies."""
-    frames = [_encoded(image, np.asarray(image) == np.asarray(still)) for image in images]
+    other file."""
+    files, width = [png(image, optimize=True) for image in images], images[0].width * 4 // 5
     return _PLAYER.format(
-        id=f"motion-{uuid.uuid4().hex[:8]}", width=still.width * 2 // 3, alt=alt,
-        still=PNG + _encoded(still), first=PNG + frames[0], last=len(images) - 1,
-        frames=frames, milliseconds=round(1000 * interval),
+        id=f"motion-{uuid.uuid4().hex[:8]}", width=width, alt=alt, first=files[0],
+        last=len(files) - 1, frames=files, milliseconds=round(1000 * interval),
     )  # fmt: skip
 
 
-PNG = "data:image/png;base64,"
-
-
-def _encoded(image: Image.Image, clear: np.ndarray | bool = False) -> str:
-    # (The clear color is the last of the palette: browsers show one beyond its end as gray.)
-    last = len(_PALETTE)
-    picture = Image.fromarray(np.where(clear, last, np.asarray(image)).astype(np.uint8), "P")
-    picture.putpalette([*(image.getpalette() or [])[: 3 * last], 0, 0, 0])
+def png(image: Image.Image, **options: Any) -> str:
+    """The address of an image that holds the image itself."""
     file = io.BytesIO()
-    picture.save(file, "png", optimize=True, **({} if clear is False else {"transparency": last}))
-    return base64.b64encode(file.getvalue()).decode()
+    image.save(file, "png", **options)
+    return PNG + base64.b64encode(file.getvalue()).decode()

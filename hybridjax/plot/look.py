@@ -147,6 +147,7 @@ def letters(axes: Any) -> None:
     """Call the Axes of a figure A, B, C, ..."""
     for ax, letter in zip(np.ravel(axes), "ABCDEFGHIJKLMNOPQRSTUVWXYZ", strict=False):
         ax.set_title(letter, loc="left", fontweight="bold")
+        ax.yaxis.set_offset_position("right")  # (a power of ten would cover the letter)
 
 
 @checked

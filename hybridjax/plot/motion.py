@@ -1,6 +1,7 @@
 """Animations: the mechanism, its orbit with sections and events, and its multipliers."""
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from matplotlib.patches import Circle
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, FilePath, Positive, SignalNames
+from .._core.executor import to_host
 from .._core.results import Result
 from .._core.writing import replacing
 from ..engine.trajectory import Trajectory, observed
@@ -25,11 +27,14 @@ from ..experiments.data import ExperimentData
 from ..experiments.motion import perturbed_trajectory
 from ..orbits.continuation import Branch
 from ..orbits.cycle import LimitCycle
+from ..orbits.find import find_limit_cycle
 from ..sections.placed import PlacedSections
+from ..systems.quotient import Quotient
 from ..systems.structure import Structure
+from ..systems.system import Guess
 from .film import BODY, frames, gif, player
 from .look import COLORS, CYCLE, axis_of, close_in_notebook, style
-from .orbit import CHARTS, cycle as draw_cycle, pieces, plane_of
+from .orbit import CHARTS, by_chart, cycle as draw_cycle, plane_of, require_same_system
 from .over_parameters import branch as draw_branch
 from .pictures import Pictures, drawing_of
 from .plane import multipliers as draw_multipliers
@@ -42,9 +47,10 @@ _SMALL: dict[Any, Any] = {
     **dict.fromkeys(("xtick.major.pad", "ytick.major.pad", "axes.labelpad", "axes.titlepad"), 1),
     **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 2),
 }
+_GROUND: dict[str, Any] = {"color": COLORS["gray"], "lw": 1.0, "zorder": 1}
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
-Draw = Callable[[int], Sequence[Artist]]
-"""A function that draws frame k, and returns what it has moved."""
+Part = tuple[Artist, Callable[[Any], Any], Sequence[Any]]
+"""An artist, a function that moves it, and its argument for each frame."""
 Portrait = Callable[[LimitCycle], list[Artist]]
 
 
@@ -55,16 +61,23 @@ class Motion(FuncAnimation):
     (of a branch, values of the parameter); `interval`, seconds from one frame to the next.
     """
 
-    def __init__(self, figure: Figure, draw: Draw, times: np.ndarray, interval: float, title: str):
+    def __init__(
+        self, figure: Figure, parts: Sequence[Part], times: np.ndarray, interval: float, title: str
+    ):
         self.figure, self.times, self.interval = figure, times, interval
-        self._draw, self._title = draw, title
-        draw(0)
+        self._parts, self._title = parts, title
+        self._draw(0)
         # (What windows do by `blit` is one more drawing for files and notebooks.)
         options: Any = {"blit": figure.canvas.required_interactive_framework is not None}
         options |= {"frames": len(times), "interval": 1000 * interval, "cache_frame_data": False}
-        super().__init__(figure, draw, **options)
+        super().__init__(figure, self._draw, **options)
         self._draw_was_started = True  # else matplotlib warns of animations that are only saved
         close_in_notebook(figure)
+
+    def _draw(self, k: int) -> list[Artist]:
+        for _, move, values in self._parts:
+            move(values[k])
+        return list(dict.fromkeys(artist for artist, *_ in self._parts))
 
     @checked
     def save(self, path: FilePath) -> Path:  # type: ignore[override]
@@ -83,7 +96,7 @@ class Motion(FuncAnimation):
             raise DefinitionError("an .mp4 needs the program ffmpeg: write a .gif or .html.")
         with replacing(path) as new:
             if path.suffix == ".gif":
-                new.write_bytes(gif(self._frames(100)[1:], self.interval))
+                new.write_bytes(gif(self._frames(100), self.interval))
             elif path.suffix == ".html":
                 new.write_text(self._repr_html_())
             else:
@@ -96,29 +109,38 @@ class Motion(FuncAnimation):
         return frames(self.figure, self._draw, len(self.times), dpi)
 
     def _repr_html_(self) -> str:
-        still, *images = self._frames(150)
-        return player(still, images, self.interval, self._title)
+        return player(self._frames(125), self.interval, self._title)
+
+    def __repr__(self) -> str:
+        return f"Motion({self._title}: {len(self.times)} frames, {self.interval:.3g} s each)"
 
 
 class Track(NamedTuple):
-    """A trajectory to animate, and its times at all frames."""
+    """A trajectory to animate."""
 
     title: str
+    color: str
     trajectory: Trajectory
-    period: float | None
-    """Of a cycle."""
     times: Float[np.ndarray, " n"]
-    flash: float
-    """Time for which an event is shown."""
+    """Those of its frames. A cycle begins anew after its `period`."""
+    period: float = math.inf
 
-    def events(self, k: int) -> list[str]:
-        """Names of the events just before frame k."""
-        path = self.trajectory
-        rows = np.flatnonzero(path.event >= 0)
-        ago = self.times[k] - path.t[rows]
-        ago = ago if self.period is None else np.mod(ago, self.period)
+    def wrapped(self, t: Any) -> Any:
+        """Times of the trajectory."""
+        first, last = self.trajectory.t[[0, -1]]
+        return np.minimum(first + np.mod(t - first, self.period), last)
+
+    def observed(self, names: Sequence[str], t: Float[np.ndarray, " p"]):
+        """States or outputs (n, p) at times."""
+        path, at = self.trajectory, self.wrapped(t)
+        return observed(path.structure, names, at, *path.at(at))
+
+    def events(self, flash: float) -> list[list[str]]:
+        """Names of the events in so much time before each frame."""
+        path, rows = self.trajectory, np.flatnonzero(self.trajectory.event >= 0)
         names = [path.structure.transitions[g].name for g in path.event[rows]]
-        return [name for name, x in zip(names, ago, strict=True) if 0 <= x < self.flash]
+        ago = np.mod(self.times[:, None] - path.t[rows], self.period)
+        return [list(itertools.compress(names, row)) for row in (ago >= 0) & (ago < flash)]
 
 
 @checked
@@ -143,7 +165,8 @@ def animate(
     **Arguments:**
 
     - `motion`: a limit cycle, a trajectory, or a branch, of which each frame is a cycle at another
-        value of the parameter.
+        value of the parameter. Where `hj.Quotient(half_period=)` halves a cycle, both halves are
+        drawn, with the multipliers of the whole (not beside `sections` or `perturbed`).
     - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
     - `sections`: from `place_sections`, on this cycle.
     - `perturbed`: a motion beside the cycle: a trajectory, from `simulate` or
@@ -164,63 +187,66 @@ def animate(
     if isinstance(motion, Branch):
         return _of_branch(motion, x, y, 1 / fps / (speed or 1.0))
     cycle = motion if isinstance(motion, LimitCycle) else None
+    if cycle is not None and cycle.result != Result.OK:
+        reason = Result(int(cycle.result)).message
+        raise DefinitionError(f"a cycle that was not found cannot be animated ({reason}).")
     if isinstance(perturbed, ExperimentData):
         if cycle is None or sections is None:
             raise DefinitionError("data of experiments need a limit cycle and their `sections`.")
         perturbed = perturbed_trajectory(sections, perturbed.u[0, : 4 * sections.n_sections])
-    _require(cycle, motion.structure, sections, perturbed)
+    if cycle is not None and sections is perturbed is None:
+        motion = cycle = _both_halves(cycle)
     s, unit = motion.structure, motion.system.time_unit
+    if cycle is None and not sections is perturbed is None:
+        raise DefinitionError("`sections` and `perturbed` are for limit cycles: animate the cycle.")
+    require_same_system(s, sections, perturbed)
     everywhere, has_picture = s.states_everywhere(), drawing_of(s, 0) is not None
     plane = plane_of(s, x, y) if len(everywhere) > 1 or (x and y) else None
     default = (plane or everywhere)[:1] if has_picture else s.state_names()[:4]
     names = s.resolve_outputs(default if traces is None else traces).names
-    path = motion.trajectory(1 + 1e-6) if isinstance(motion, LimitCycle) else motion
-    period = None if cycle is None else float(cycle.period)
-    last = path if perturbed is None else perturbed
-    length = period if period and perturbed is None else float(np.ptp(last.t))
+    path = motion.trajectory() if isinstance(motion, LimitCycle) else motion
+    period = math.inf if cycle is None else float(cycle.period)
+    last = perturbed or path
+    length = period if cycle is not None and perturbed is None else float(np.ptp(last.t))
     pace = _pace(length, unit, speed)
     times = np.linspace(0, length, max(12, round(length / pace * fps)), endpoint=False)
-    phase = last.t[0] + times - path.t[0]
-    at = path.t[0] + (np.mod(phase, period) if period else phase)
-    tracks = [Track("cycle" if perturbed else "", path, period, at, 0.2 * pace)]
+    begin = last.t[0] + times
+    tracks = [Track("cycle" if perturbed else "", CYCLE[0], path, begin, period)]
     if perturbed is not None:
-        tracks.append(Track("perturbed", perturbed, None, last.t[0] + times, 0.2 * pace))
+        tracks.append(Track("perturbed", COLORS["red"], perturbed, begin))
+    events = [track.events(0.2 * pace) for track in tracks]
     with style(), matplotlib.rc_context(_SMALL):
         figure, grid = _sheet()
-        draws: list[Draw] = []
-        if has_picture:
-            cells, shape = grid[0, 0].subgridspec(1, len(tracks)), 1.5 / len(tracks)
-            draws += [
-                _picture(figure.add_subplot(cells[i]), x, shape) for i, x in enumerate(tracks)
-            ]
         cells = (grid[1, 0] if has_picture else grid[:, 0]).subgridspec(len(names), 1, hspace=0.05)
         axes = [figure.add_subplot(cells[i]) for i in range(len(names))]
-        draws.append(_traces(axes, tracks, names, times))
+        parts = _traces(axes, tracks, names, events)
         axes[0].set_title(_label(pace, unit), fontsize=6, loc="right")
+        if has_picture:
+            cells = grid[0, 0].subgridspec(1, len(tracks))
+            for i, track in enumerate(tracks):
+                parts += _picture(figure.add_subplot(cells[i]), track)
         has_circle = cycle is not None and len(cycle.multipliers) > 0
         if plane is not None:
             panel = figure.add_subplot(grid[0, 1] if has_circle else grid[:, 1])
-            draws.append(_orbit(panel, cycle, tracks, plane, sections))
+            if cycle is not None:
+                draw_cycle(cycle, *plane, sections=sections, perturbed=perturbed, ax=panel)
+                panel.legend([], [])
+            parts += _dots(panel, tracks, plane, events, sections)
         if has_circle:
             panel = figure.add_subplot(grid[1, 1])
             draw_multipliers(cycle, zoom=False, ax=panel)
             panel.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1])
-        draw: Draw = lambda k: [artist for part in draws for artist in part(k)]  # noqa: E731
         title = f"motion of {type(s.system).__name__}"
-        return Motion(figure, draw, times, length / pace / len(times), title)
+        return Motion(figure, parts, times, length / pace / len(times), title)
 
 
-def _require(cycle: LimitCycle | None, s: Structure, sections, perturbed) -> None:
-    """**Raises:** `DefinitionError`, as `animate`."""
-    if cycle is not None and cycle.result != Result.OK:
-        reason = Result(int(cycle.result)).message
-        raise DefinitionError(f"a cycle that was not found cannot be animated ({reason}).")
-    added = {"sections": sections and sections.cycle, "perturbed": perturbed}
-    for name, other in added.items():
-        if other is not None and cycle is None:
-            raise DefinitionError(f"`{name}` is for a limit cycle: animate the cycle.")
-        if other is not None and other.structure.names != s.names:
-            raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
+def _both_halves(cycle: LimitCycle) -> LimitCycle:
+    """The cycle of the system itself, where a `Quotient` with `half_period` has a half of it."""
+    s, anchor = cycle.structure, to_host(cycle.anchor)
+    a = int(anchor.chart[0])
+    at = Guess(s.names[a], anchor.q[: s.dims[a], 0], anchor.t[0])
+    whole = cycle.system.whole(at) if isinstance(cycle.system, Quotient) else None
+    return cycle if whole is None else find_limit_cycle(*whole)
 
 
 def _sheet() -> tuple[Figure, Any]:
@@ -244,44 +270,33 @@ def _label(pace: float, unit: str) -> str:
     return f"{real:.2g} x real speed" if real and abs(real - 1) > 1e-9 else ""
 
 
-def _picture(ax: Axes, track: Track, shape: float) -> Draw:
-    """The mechanism, in a picture of this width over height."""
-    pictures = Pictures(track.trajectory, track.period)
-    scenes, size = pictures.at(track.times), float(max(*(pictures.high - pictures.low), 1e-9))
-    extent, center = pictures.high - pictures.low, (pictures.high + pictures.low) / 2
-    height = 1.16 * max(extent[0] / shape, extent[1]) or 1.0
-    x, y = np.outer(center, [1, 1]) + np.outer([shape, 1], [-height / 2, height / 2])
-    ax.set(xlim=x, ylim=y, xticks=[], yticks=[], aspect="equal")
+def _picture(ax: Axes, track: Track) -> list[Part]:
+    """The mechanism."""
+    pictures, at = Pictures(track.trajectory, track.period), track.wrapped(track.times)
+    scenes, size = pictures.at(at), float(max(*(pictures.high - pictures.low), 1e-9))
+    ax.update_datalim([pictures.low - 0.08 * size, pictures.high + 0.08 * size])
+    ax.autoscale_view()
+    ax.set(xticks=[], yticks=[], aspect="equal", adjustable="datalim", title=track.title)
     ax.spines[:].set_visible(False)
-    ax.set_title(track.title)
-    shapes: dict[str, Any] = {}
-    lines = [name for name in scenes[0].lines if name != "ground"]
-    colors = itertools.cycle(CYCLE[: 3 if len(lines) <= 3 else 1])
-    gray: dict[str, Any] = {"color": COLORS["gray"], "lw": 1.0, "zorder": 1}
-    for name in scenes[0].lines:
-        look = {"color": next(colors), "lw": 1.6, "zorder": 3} if name in lines else gray
-        (shapes[name],) = ax.plot([], [], solid_joinstyle="round", **look)
-    for name, (x, y, radius) in scenes[0].circles.items():
-        circle = Circle((x, y), radius, fc=BODY, ec="black", lw=0.8, zorder=4)
-        shapes[name] = ax.add_patch(circle)
-    (marks,), (dots,) = ax.plot([], [], **gray), ax.plot([], [], "ko", ms=2.5, zorder=5)
-    stride = abs(float(pictures.stride[0]))
-    spacing = stride / max(1, round(stride / (0.1 * size))) or 0.1 * size
-
-    def draw(k: int) -> list[Artist]:
-        scene = scenes[k]
-        for name, line in scene.lines.items():
-            if name == "ground":
-                line = to_borders(line, size)
-                marks.set_data(*_marks(line, scene.ground[0], spacing, size))
-            shapes[name].set_data(*line.T)
-        for name, (x, y, radius) in scene.circles.items():
-            shapes[name].set(center=(x, y), radius=radius)
-        if scene.points:
-            dots.set_data(*np.stack([*scene.points.values()]).T)
-        return [marks, *shapes.values(), dots]
-
-    return draw
+    (dots,), nowhere = ax.plot([], [], "ko", ms=2.5, zorder=5), np.full(3, np.nan)
+    points = [np.stack([nowhere[:2], *x.points.values()]).T for x in scenes]
+    parts: list[Part] = [(dots, dots.set_data, points)]
+    colors = itertools.cycle(CYCLE[: 3 if len(scenes[0].lines) <= 4 else 1])
+    for name in dict.fromkeys(name for x in scenes for name in x.lines):
+        lines, look = [x.lines.get(name, nowhere[None, :2]) for x in scenes], _GROUND
+        if name == "ground":
+            lines = [to_borders(line, size) for line in lines]
+            (marks,) = ax.plot([], [], ls="", marker=[(0, 0), (-3, -4)], ms=8, **_GROUND)
+            parts.append((marks, marks.set_data, _marks(lines, pictures, at, size)))
+        else:
+            look = {"color": next(colors), "lw": 1.6, "zorder": 3, "solid_joinstyle": "round"}
+        (shape,) = ax.plot([], [], **look)
+        parts.append((shape, shape.set_data, [line.T for line in lines]))
+    for name in dict.fromkeys(name for x in scenes for name in x.circles):
+        circle = ax.add_patch(Circle((0, 0), 1, fc=BODY, ec="black", lw=0.8, zorder=4))
+        about = [x.circles.get(name, nowhere) for x in scenes]
+        parts.append((circle, circle.update, [{"center": x[:2], "radius": x[2]} for x in about]))
+    return parts
 
 
 def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray, "k 2"]:
@@ -291,79 +306,57 @@ def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray,
     return np.vstack([ends[0], line[1:-1], ends[1]])
 
 
-def _marks(line, begin: float, spacing: float, size: float) -> Float[np.ndarray, "2 n"]:
-    """Short strokes below the ground, at equal distances from the one that moves with it."""
-    x = begin % spacing + spacing * np.arange(*np.round(line[[0, -1], 0] / spacing))
-    y, gap = np.interp(x, *line.T), np.full_like(x, np.nan)
-    rows = (x, x - 0.03 * size, gap), (y, y - 0.04 * size, gap)
-    return np.array([np.stack(row, axis=1).ravel() for row in rows])
+def _marks(lines, pictures: Pictures, at, size: float) -> list[Float[np.ndarray, "2 n"]]:
+    """Places on the ground, at equal distances from one that moves with it."""
+    stride = abs(float(pictures.stride[0]))
+    spacing = stride / max(1, round(stride / (0.1 * size))) or 0.1 * size
+    marks = []
+    for line, begin in zip(lines, -pictures.camera(at)[:, 0], strict=True):
+        x = begin % spacing + spacing * np.arange(*np.round(line[[0, -1], 0] / spacing))
+        marks.append(np.stack([x, np.interp(x, *line.T)]))
+    return marks
 
 
-def _traces(axes: list[Axes], tracks: list[Track], names: Sequence[str], times) -> Draw:
+def _traces(axes: list[Axes], tracks: list[Track], names: Sequence[str], events) -> list[Part]:
     """Signals over time, where they are now, and the names of events."""
-    span, unit = 2 * times[-1] - times[-2], tracks[0].trajectory.system.time_unit
-    cursors = []
+    times, unit = tracks[0].times - tracks[0].times[0], tracks[0].trajectory.system.time_unit
+    fine = np.linspace(0, 2 * times[-1] - times[-2], 2000, endpoint=False)
+    for track in tracks:
+        for ax, values in zip(axes, track.observed(names, track.times[0] + fine), strict=True):
+            ax.plot(fine, values, color=track.color, lw=0.9)
+    text = axes[0].set_title("", loc="left", color=COLORS["red"])
+    texts = [", ".join(dict.fromkeys(itertools.chain(*x))) for x in zip(*events, strict=True)]
+    parts: list[Part] = [(text, text.set_text, texts)]
     for ax, name in zip(axes, names, strict=True):
-        for track, color in zip(tracks, (CYCLE[0], COLORS["red"]), strict=False):
-            t, values = track.trajectory(name)
-            once, begin = t - t[0] < (track.period or np.inf), t[0] - track.times[0]
-            for shift in np.arange(begin, span, track.period or span):
-                ax.plot(shift + (t - t[0])[once], values[once], color=color, lw=0.9)
-        ax.set(xlim=(0, span), ylabel=axis_of(name))
-        ax.margins(y=0.1)
+        ax.set(ylabel=axis_of(name))
+        ax.margins(x=0, y=0.1)
         ax.locator_params(axis="y", nbins=4)
         ax.tick_params(labelbottom=ax is axes[-1])
-        cursors.append(ax.axvline(0, color="black", lw=0.8))
+        cursor = ax.axvline(0, color="black", lw=0.8)
+        parts.append((cursor, cursor.set_xdata, times[:, None]))
     axes[-1].set_xlabel(f"time ({unit})" if unit else "time")
-    text = axes[0].set_title("", loc="left", color=COLORS["red"])
-
-    def draw(k: int) -> list[Artist]:
-        text.set_text(", ".join(dict.fromkeys(name for x in tracks for name in x.events(k))))
-        for cursor in cursors:
-            cursor.set_xdata([times[k], times[k]])
-        return [*cursors, text]
-
-    return draw
+    return parts
 
 
-def _orbit(
-    ax: Axes,
-    cycle: LimitCycle | None,
-    tracks: list[Track],
-    plane: tuple[str, str],
-    sections: PlacedSections | None,
-) -> Draw:
-    """The orbit with its sections, dots that move along it, and rings at events."""
-    if cycle is not None:
-        draw_cycle(cycle, *plane, sections=sections, ax=ax)
-        ax.legend([], [])
-    for track in tracks if cycle is None else tracks[1:]:
-        for _, x, y in pieces(track.trajectory, *plane):
-            ax.plot(x, y, color=COLORS["red"] if track.title else CYCLE[0], lw=0.6, zorder=1)
+def _dots(ax: Axes, tracks: list[Track], plane, events, sections) -> list[Part]:
+    """Dots that move along the orbit, rings at events, and the section that was passed last."""
     ax.set(xlabel=axis_of(plane[0]), ylabel=axis_of(plane[1]))
     ax.locator_params(nbins=5)
-    places, dots, rings = [], [], []
-    for track, color in zip(tracks, (CYCLE[0], COLORS["red"]), strict=False):
-        path = track.trajectory
-        states = path.at(track.times)
-        places.append(observed(path.structure, plane, track.times, *states).T)
-        dots += ax.plot([], [], "o", ms=6, mfc=color, mec="white", zorder=8)
-        rings += ax.plot([], [], "o", ms=13, mfc="none", mec=color, mew=1.5, zorder=7)
-    (bar,) = ax.plot([], [], "o", ms=9, mfc="none", mec=COLORS["green"], mew=1.4, zorder=6)
-    marks = np.zeros((0, 3))
+    marks, ring = list[tuple](), {"mfc": "none", "mew": 1.5, "zorder": 7}
+    for track, names in zip(tracks, events, strict=True):
+        if np.isinf(track.period) and len(tracks) == 1:
+            for line in by_chart(track.trajectory, *plane).values():
+                ax.plot(*line, color=track.color, lw=0.6, zorder=1)
+        points = track.observed(plane, track.times).T
+        marks.append((points, {"ms": 6, "mfc": track.color, "mec": "white", "zorder": 8}))
+        rings = np.where([[bool(x)] for x in names], points, np.nan)
+        marks.append((rings, {"ms": 13, "mec": track.color, **ring}))
     if sections is not None:
-        marks = np.column_stack([sections.lanes.t, sections.observe(plane)])
-
-    def draw(k: int) -> list[Artist]:
-        for track, points, dot, ring in zip(tracks, places, dots, rings, strict=True):
-            dot.set_data(*points[[k]].T)
-            ring.set_data(*points[[k]].T if track.events(k) else ([], []))
-        if len(marks):
-            ago = np.mod(tracks[0].times[k] - marks[:, 0], tracks[0].period or np.inf)
-            bar.set_data(*marks[[int(np.argmin(ago))], 1:].T)
-        return [bar, *rings, *dots]
-
-    return draw
+        ago = np.mod(tracks[0].times[:, None] - sections.lanes.t, tracks[0].period)
+        passed = sections.observe(plane)[ago.argmin(axis=1)]
+        marks.append((passed, {"ms": 9, "mec": COLORS["green"], **ring}))
+    lines = [ax.plot([], [], "o", **look)[0] for _, look in marks]
+    return [(x, x.set_data, p[..., None]) for x, (p, _) in zip(lines, marks, strict=True)]
 
 
 def portrait(above: Axes, below: Axes, s: Structure, plane: tuple[str, str]) -> Portrait:
@@ -373,32 +366,38 @@ def portrait(above: Axes, below: Axes, s: Structure, plane: tuple[str, str]) -> 
     orbits = [above.plot([], [], color=color, lw=1.8, label=name)[0] for color, name in colors]
     (marks,) = above.plot([], [], "ko", ms=4, zorder=5)
     about: Any = {"xytext": (4, 5), "textcoords": "offset points", "zorder": 6}
-    notes = [above.annotate(x.name, (np.nan, np.nan), **about) for x in s.transitions]
+    notes = [above.annotate(x.name, (0, 0), **about) for x in s.transitions]
     above.set(xlabel=axis_of(plane[0]), ylabel=axis_of(plane[1]))
     draw_multipliers(np.zeros(1), zoom=False, ax=below)
     points = below.lines[-1]
 
     def draw(cycle: LimitCycle) -> list[Artist]:
-        path = cycle.trajectory(1 + 1e-6)  # with an event at the very end of a period
-        parts, gap = pieces(path, *plane), np.full((2, 1), np.nan)
+        path = cycle.trajectory()
+        curves = by_chart(path, *plane)
         for a, line in enumerate(orbits):
-            line.set_data(np.hstack([gap, *(x for b, *xy in parts if b == a for x in (xy, gap))]))
+            line.set_data(curves.get(a, ([], [])))
             line.set_linestyle("-" if cycle.stable else "--")
         rows = np.flatnonzero(path.event >= 0)
         ends = observed(s, plane, path.t[rows], path.chart[rows - 1], path.before[rows])
         marks.set_data(ends)
-        for note in notes:
-            note.set_visible(False)
+        for g, note in enumerate(notes):
+            note.set_visible(g in path.event[rows])
         for g, end in zip(path.event[rows], ends.T, strict=True):
-            notes[g].set_visible(True)
             notes[g].xy = end
         points.set_data(cycle.multipliers.real, cycle.multipliers.imag)
-        far = 1.1 * float(np.abs(cycle.multipliers).max(initial=1.0))
-        if far > below.get_xlim()[1]:
-            below.set(xlim=(-far, far), ylim=(-far, far))
         return [*orbits, marks, *notes, points]
 
     return draw
+
+
+def widened(ax: Axes) -> bool:
+    """Whether its curves had left its limits, which are wider now."""
+    ax.relim(visible_only=True)
+    if all(ax.viewLim.contains(*corner) for corner in ax.dataLim.corners()):
+        return False
+    ax.margins(0.2)
+    ax.autoscale_view()
+    return True
 
 
 def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) -> Motion:
@@ -414,17 +413,14 @@ def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) ->
         cursor = left.axvline(values[0], color="black", lw=0.8)
         draw_cycle = portrait(above, below, cycles[0].structure, plane)
         for cycle in cycles:
-            above.plot(
-                *cycle.trajectory(1 + 1e-6)(*plane)[1:], color=COLORS["gray"], lw=0.3, alpha=0.3
-            )
-            draw_cycle(cycle)
+            above.plot(*cycle.trajectory()(*plane)[1:], color=COLORS["gray"], lw=0.3, alpha=0.3)
+            moved = draw_cycle(cycle)
+            widened(below)
         text = above.set_title("", loc="left")
-
-        def draw(k: int) -> list[Artist]:
-            cursor.set_xdata([values[k], values[k]])
-            unstable = "" if cycles[k].stable else ", unstable"
-            text.set_text(f"{branch.parameter} = {values[k]:.4g}{unstable}")
-            return [*draw_cycle(cycles[k]), cursor, text]
-
+        unstable = ["" if x.stable else ", unstable" for x in cycles]
+        texts = [f"{branch.parameter} = {x:.4g}{y}" for x, y in zip(values, unstable, strict=True)]
+        parts: list[Part] = [(x, lambda _: None, values) for x in moved]
+        parts += [(text, text.set_text, texts), (cursor, cursor.set_xdata, values[:, None])]
+        parts.append((moved[0], draw_cycle, cycles))
         interval = max(interval, 4 / len(values))
-        return Motion(figure, draw, values, interval, f"branch along {branch.parameter}")
+        return Motion(figure, parts, values, interval, f"branch along {branch.parameter}")

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
@@ -55,24 +56,19 @@ def cycle(
     """
     s = cycle.structure
     x, y = plane_of(s, x, y)
-    added: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
-    for name, other in added.items():
-        if other is not None and other.structure.names != s.names:
-            raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
-    orbit = cycle.trajectory(1 + 1e-6)  # with an event at the very end of a period
+    require_same_system(s, sections, perturbed)
+    orbit = cycle.trajectory()
     with panels(ax, height=3.0) as axes:
         panel = axes[0, 0]
         if perturbed is not None:
-            parts = pieces(perturbed, x, y)
-            for _, px, py in parts:
-                panel.plot(px, py, color=COLORS["red"], lw=0.7, zorder=1)
-            panel.plot(parts[0][1][0], parts[0][2][0], "s", ms=3.5, color=COLORS["red"], zorder=5)
-        labeled = set()
-        for a, px, py in pieces(orbit, x, y):
-            label = None if a in labeled else s.names[a]
-            labeled.add(a)
-            color = CHARTS[a % len(CHARTS)]
-            panel.plot(px, py, color=color, lw=1.8, label=label, zorder=3, solid_capstyle="butt")
+            points = np.array(perturbed(x, y)[1:])
+            begin = points[:, np.isfinite(points).all(axis=0)][:, :1]
+            panel.plot(*begin, "s", ms=3.5, color=COLORS["red"], zorder=5)
+            for line in by_chart(perturbed, x, y).values():
+                panel.plot(*line, color=COLORS["red"], lw=0.7, zorder=1)
+        look = {"lw": 1.8, "zorder": 3, "solid_capstyle": "butt"}
+        for a, line in by_chart(orbit, x, y).items():
+            panel.plot(*line, color=CHARTS[a % len(CHARTS)], label=s.names[a], **look)
         _, px, py = orbit(x, y)
         center = np.array([(np.nanmin(v) + np.nanmax(v)) / 2 for v in (px, py)])
         panel.margins(0.1)
@@ -98,13 +94,24 @@ def plane_of(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
     return x, y
 
 
-def pieces(trajectory: Trajectory, x: str, y: str):
-    """(chart, x, y) of each stay between two events."""
+def require_same_system(
+    s: Structure, sections: PlacedSections | None, perturbed: Trajectory | None
+) -> None:
+    """**Raises:** `DefinitionError` if something is not of the system of a cycle."""
+    added: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
+    for name, other in added.items():
+        if other is not None and other.structure.names != s.names:
+            raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
+
+
+def by_chart(trajectory: Trajectory, x: str, y: str) -> dict[int, Float[np.ndarray, "2 p"]]:
+    """The curve in each chart that a trajectory visits, with NaN between its stays."""
     t, chart, _ = trajectory.dense()
-    _, px, py = trajectory(x, y)
     cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
-    parts = zip(np.split(chart, cuts), np.split(px, cuts), np.split(py, cuts), strict=True)
-    return [(int(c[0]), x, y) for c, x, y in parts if len(c) > 1 and np.any(np.isfinite(x + y))]
+    curve = np.insert(trajectory(x, y)[1:], cuts, np.nan, axis=1)
+    chart = np.insert(chart, cuts, chart[cuts])
+    curves = {a: np.where(chart == a, curve, np.nan) for a in np.unique(chart).tolist()}
+    return {a: x for a, x in curves.items() if np.isfinite(x).all(axis=0).any()}
 
 
 def _points(s: Structure, a: int, names, t, q) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,8 @@
 """Pictures of a trajectory: the shapes of `HybridSystem.draw`, where the motion has taken them."""
 
-from typing import Any, NamedTuple
+import functools
+import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,60 +16,48 @@ from ..systems.drawing import Drawing
 from ..systems.structure import Structure
 
 
-class Picture(NamedTuple):
-    """Shapes by name, as those of a `Drawing`, as a camera sees them."""
-
-    lines: dict[str, Float[np.ndarray, "_ 2"]]
-    circles: dict[str, Float[np.ndarray, "3"]]
-    points: dict[str, Float[np.ndarray, "2"]]
-    ground: Float[np.ndarray, "2"]
-    """The position of a mark on the ground."""
-
-
 class Pictures:
-    """The pictures of a trajectory, pictures by a camera of constant velocity.
+    """The pictures of a trajectory, seen by a camera of constant velocity.
 
     The camera moves as far in a `period` as the body of the system does (of a trajectory without a
     period: in all of its time), so that the last picture of a cycle is followed by the first.
     """
 
-    def __init__(self, trajectory: Trajectory, period: float | None = None):
+    def __init__(self, trajectory: Trajectory, period: float = math.inf):
         self.trajectory = trajectory
         t, chart, q = trajectory.dense(6)
         drawings = drawn(trajectory.structure, t, chart, q)
         place = np.array([drawing.place for drawing in drawings])
-        velocity = np.array([drawing.velocity for drawing in drawings])
+        self._t, self._velocity = t, np.array([drawing.velocity for drawing in drawings])
         # Over an event the body stays; between events the origin moves by its velocity.
-        moves = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t)[:, None]
-        jumps = np.where((np.diff(t) == 0)[:, None], place[:-1] - place[1:], 0.0)
-        self._origin = np.vstack([np.zeros(2), np.cumsum(moves + jumps, axis=0)])
-        self._t, self._velocity = t, velocity
-        if period is None:
-            self.period, self.stride = t[-1] - t[0], self._origin[-1] + place[-1] - place[0]
-        else:
-            after = t[0] + period - t[-1]
-            self.period, self.stride = period, self._origin[-1] + velocity[-1] * after
-        pictures = self._seen(t, self._origin, drawings)
-        corners = np.vstack([_corners(picture) for picture in pictures])
+        moves = 0.5 * (self._velocity[1:] + self._velocity[:-1]) * np.diff(t)[:, None]
+        moves = np.where((np.diff(t) == 0)[:, None], place[:-1] - place[1:], moves)
+        self._origin = np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
+        self.period = min(period, t[-1] - t[0])
+        after = self.period - (t[-1] - t[0])
+        self.stride = self._origin[-1] + self._velocity[-1] * after
+        if np.isinf(period):
+            self.stride += place[-1] - place[0]
+        corners = np.vstack([_corners(x) for x in self._seen(t, self._origin, drawings)])
         self.low, self.high = corners.min(axis=0), corners.max(axis=0)
 
-    def at(self, t: Float[np.ndarray, " n"]) -> list[Picture]:
+    def at(self, t: Float[np.ndarray, " n"]) -> list[Drawing]:
         """The pictures at times of the trajectory."""
         drawings = drawn(self.trajectory.structure, t, *self.trajectory.at(t))
         k = np.searchsorted(self._t, t, side="right") - 1
         origin = self._origin[k] + self._velocity[k] * (t - self._t[k])[:, None]
         return self._seen(t, origin, drawings)
 
-    def _seen(self, t, origin, drawings) -> list[Picture]:
-        cameras = (t - self._t[0])[:, None] / self.period * self.stride
+    def camera(self, t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+        """The places of the camera over the ground."""
+        return (t - self._t[0])[:, None] / self.period * self.stride
+
+    def _seen(self, t, origin, drawings: list[Drawing]) -> list[Drawing]:
+        ways = np.pad(origin - self.camera(t), ((0, 0), (0, 1)))  # (a radius stays)
+        moved = lambda x, by: x + by[: x.shape[-1]]  # noqa: E731
         return [
-            Picture(
-                {name: x + by for name, x in drawing.lines.items()},
-                {name: x + np.append(by, 0.0) for name, x in drawing.circles.items()},
-                {name: x + by for name, x in drawing.points.items()},
-                -camera,
-            )
-            for drawing, by, camera in zip(drawings, origin - cameras, cameras, strict=True)
+            jax.tree_util.tree_map(functools.partial(moved, by=by), drawing)
+            for drawing, by in zip(drawings, ways, strict=True)
         ]
 
 
@@ -105,7 +95,7 @@ def _flat(a: int, s: Structure, t, q):
     return jnp.concatenate([jnp.ravel(x) for x in jax.tree_util.tree_leaves(s.drawing(a, t, q))])
 
 
-def _corners(picture: Picture) -> Float[np.ndarray, "_ 2"]:
+def _corners(picture: Drawing) -> Float[np.ndarray, "_ 2"]:
     """Points between which a picture lies, without its ground."""
     lines = [x for name, x in picture.lines.items() if name != "ground"]
     circles = [x[:2] + side * x[2] for x in picture.circles.values() for side in (-1, 1)]

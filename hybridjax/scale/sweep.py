@@ -1,6 +1,7 @@
 """Limit cycles over a space of parameters."""
 
 import dataclasses
+import functools as ft
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
@@ -12,6 +13,7 @@ from scipy.stats import qmc
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, FilePath
+from .._core.compilation import TwoTiers
 from .._core.execution import Execution
 from .._core.pieces.description import digest_of, versions
 from .._core.pieces.run import DaskClient, fill
@@ -204,12 +206,12 @@ class SweepJob:
 
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
         assert self.begun is not None
-        systems = self.family.systems(self.space.at(index))
-        points = math.prod(self.blocks.block)
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
-        size, threads = min(BATCH, points), Execution(workers=workers).threads
-        large = math.prod(self.blocks.shape) > SMALL
-        return Tiles(systems, self.begun.map, size, threads, large)
+        size, threads = min(BATCH, math.prod(self.blocks.block)), Execution(workers=workers).threads
+        # (Results of a piece do not depend on when it is computed.)
+        tiers = ft.partial(TwoTiers, large=math.prod(self.blocks.shape) > SMALL, steady=True)
+        systems = self.family.systems(self.space.at(index))
+        return Tiles(systems, self.begun.map, size, threads, ft.cache(tiers))
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""

@@ -11,6 +11,28 @@ from jaxtyping import Array, Float
 from ..errors import DefinitionError
 
 
+def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
+    array = jnp.asarray(value, float)
+    fits = [n in (None, m) for n, m in zip(shape, array.shape, strict=False)]
+    if array.ndim != len(shape) or not all(fits):
+        text = str(shape).replace("None", "k")
+        raise DefinitionError(f"Drawing: '{name}' must have the shape {text}, not {array.shape}.")
+    return array
+
+
+def _shapes(*shape: int | None, **options: Any) -> Any:
+    """A field of shapes by name."""
+
+    def arrays(shapes: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: _array(name, x, shape) for name, x in shapes.items()}
+
+    return eqx.field(converter=arrays, default_factory=dict, **options)
+
+
+def _velocity(value: ArrayLike | Sequence[ArrayLike]) -> Any:
+    return _array("velocity", value, (2,))
+
+
 class Drawing(eqx.Module):
     """A system seen from the side in one state, as `HybridSystem.draw` returns it.
 
@@ -35,28 +57,17 @@ class Drawing(eqx.Module):
     **Raises:** `DefinitionError` for other shapes, or a `body` that has no place.
     """
 
-    lines: dict[str, Float[Array, "_ 2"]]
-    circles: dict[str, Float[Array, "3"]]
-    points: dict[str, Float[Array, "2"]]
-    body: str | None = eqx.field(static=True)
-    velocity: Float[Array, "2"]
+    lines: Mapping[str, Any] = _shapes(None, 2)
+    circles: Mapping[str, Any] = _shapes(3, kw_only=True)
+    points: Mapping[str, Any] = _shapes(2, kw_only=True)
+    body: str | None = eqx.field(static=True, default=None, kw_only=True)
+    velocity: Any = eqx.field(converter=_velocity, default=(0.0, 0.0), kw_only=True)
 
-    def __init__(
-        self,
-        lines: Mapping[str, Any] | None = None,
-        *,
-        circles: Mapping[str, Any] | None = None,
-        points: Mapping[str, Any] | None = None,
-        body: str | None = None,
-        velocity: ArrayLike | Sequence[ArrayLike] = (0.0, 0.0),
-    ):
-        self.lines, self.circles, self.points = (
-            {name: _array(name, x, shape) for name, x in (parts or {}).items()}
-            for parts, shape in ((lines, (None, 2)), (circles, (3,)), (points, (2,)))
-        )
-        self.velocity, self.body = _array("velocity", velocity, (2,)), body
-        if body is not None and body not in {**self.circles, **self.points}:
-            raise DefinitionError(f"Drawing: `body` must be a circle or a point, not '{body}'.")
+    def __check_init__(self):
+        if self.body is not None and self.body not in {**self.circles, **self.points}:
+            raise DefinitionError(
+                f"Drawing: `body` must be a circle or a point, not '{self.body}'."
+            )
 
     @property
     def place(self) -> Float[Array, "2"]:
@@ -78,12 +89,3 @@ class Drawing(eqx.Module):
         part = jnp.concatenate([jnp.zeros(1), jnp.linspace(0.15, 0.85, 13), jnp.ones(1)])
         side = jnp.array([0.0, 0.0, *[1.0, -1.0] * 5, 1.0, 0.0, 0.0])
         return a + part[:, None] * along + side[:, None] * across
-
-
-def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
-    array = jnp.asarray(value, float)
-    fits = [n in (None, m) for n, m in zip(shape, array.shape, strict=False)]
-    if array.ndim != len(shape) or not all(fits):
-        text = str(shape).replace("None", "k")
-        raise DefinitionError(f"Drawing: '{name}' must have the shape {text}, not {array.shape}.")
-    return array

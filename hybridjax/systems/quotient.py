@@ -202,6 +202,15 @@ class Quotient(Derived):
         along = rates[whole.states.index(self.translation[0])]
         return eqx.tree_at(lambda x: x.velocity, drawing, jnp.stack([along, 0 * along]))
 
+    def whole(self, at: Guess) -> tuple[HybridSystem, Guess] | None:
+        """With `half_period`, the system whose cycle has both halves, and there a state of this."""
+        if not self.half_period:
+            return None
+        if self.charts()[at.chart].clocked:
+            at = Guess(at.chart, at.state[:-1], at.state[-1])
+        still = self.translation
+        return Quotient(self.system, translation=still) if still else self.system, at
+
     def check(self) -> None:
         """Raise an error for a function that does not have the symmetry."""
         if is_traced(self):

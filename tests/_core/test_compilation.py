@@ -8,7 +8,6 @@ import shutil
 import threading
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +15,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core import compilation
-from hybridjax._core.compilation import TwoTiers, in_turn, is_left_to_lapack, kernel, quick_jit
+from hybridjax._core.compilation import TwoTiers, in_turn, kernel, quick_jit
 from hybridjax._core.lanes import by_lane
 
 from ..sessions import run_python
@@ -93,6 +92,9 @@ def test_later_jobs_take_the_optimized_program(tiers, monkeypatch):
     later = TwoTiers(total, large=False)
     np.testing.assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
     assert [x[1] for x in later._chosen.values()] == [program._full] and len(tiers) == 2
+    steady = TwoTiers(total, large=False, steady=True)
+    assert steady(X, jnp.sin, 1) == job(X, jnp.sin, 1)
+    assert [x[1] for x in steady._chosen.values()] == [program._quick]
 
 
 def test_functions_that_are_written_anew_share_a_program(tiers):
@@ -129,8 +131,10 @@ def test_a_kernel_of_any_number_of_lanes(lanes):
 
 def test_programs_that_call_lapack_take_turns():
     A = np.eye(2)
-    assert is_left_to_lapack(eqx.filter_jit(lambda A: jnp.linalg.eigvals(A)), A)
-    assert not is_left_to_lapack(eqx.filter_jit(lambda A: A @ A), A)
+    TwoTiers(jnp.linalg.eigvals, False)(A)
+    TwoTiers(jnp.linalg.matmul, False)(A, A)
+    alone = {key[0]: program._alone for key, program in compilation._by_kind.items()}
+    assert alone[jnp.linalg.eigvals] and not alone[jnp.linalg.matmul]
     inside, counts, met = [], [], threading.Barrier(2)
 
     def work():

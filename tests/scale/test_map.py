@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation import is_left_to_lapack, one_tier
 from hybridjax.apps.cli import main
 from hybridjax.orbits import batches
 from hybridjax.scale.family import Points
@@ -206,7 +205,8 @@ def test_programs_in_threads_factorize_nothing(wheel):
     repeat = lambda x: np.repeat(np.asarray(x)[None], 4, 0)  # noqa: E731
     start, period = jax.tree_util.tree_map(repeat, (wheel.anchor, wheel.period))
     arguments = systems, wheel.return_map, start, period, jnp.array(True)
-    assert not is_left_to_lapack(one_tier(batches._turn, False), *arguments)
+    text = eqx.filter_jit(batches._turn).lower(*arguments).lowered.as_text()
+    assert "@lapack_" not in text
 
 
 def test_a_guess_with_too_long_a_period(wheel):
