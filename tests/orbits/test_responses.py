@@ -237,7 +237,8 @@ def test_phase_responses_are_differences_of_asymptotic_phases(name):
 def test_pushes_off_a_surface_on_which_the_cycle_slides_are_lost():
     cycle = hj.find_limit_cycle(hj.models.BeltOscillator())
     flow = cycle.trajectory()
-    sticks = flow.t[flow.chart == cycle.structure.chart_index("sticks")] - flow.t[0]
+    inside = (flow.chart == cycle.structure.chart_index("sticks")) & (flow.event < 0)
+    sticks = flow.t[inside] - flow.t[0]
     phase = cycle.responses().phase(sticks[:-1] / float(cycle.period))
     assert np.all(phase["v"] == 0) and np.all(np.abs(phase["x"]) > 1)
     assert "2 faster modes left out" not in str(cycle.responses())
