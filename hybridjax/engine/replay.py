@@ -148,7 +148,7 @@ def chain(
     drown the other directions, however strongly the flow contracts.
     """
     n, moves = 1 + s.d, recorded_moves(lanes, tape)
-    end, by = _linear_moves(s, moves, target)
+    end, by = linear_moves(s, moves, target)
     if across is not None:
         f = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
         by[:, :, 1:n] = by[:, :, 1:n] @ projections(f, np.asarray(across)[moves.chart])
@@ -199,7 +199,7 @@ class Variation:
             target, time=many(target.time) + 1j * kernels.TINY * later,
             index=many(np.broadcast_to(target.index, target.time.shape)),
         )  # fmt: skip
-        end, by = _linear_moves(s, along, target)
+        end, by = linear_moves(s, along, target)
         by, end = by.reshape(len(moves.t), -1, *by.shape[1:]), end.reshape(len(moves.t), -1, n)
         self._by, self._change = np.real(by[:, 0]), np.imag(by) / kernels.TINY
         self._kick = np.moveaxis(np.imag(end[:, -P:]) / kernels.TINY, 1, 2)
@@ -231,7 +231,7 @@ class Variation:
         return t + aside[0], chart, q + aside[1:], u
 
 
-def _linear_moves(s: Structure, moves: Moves, target: Target) -> tuple[np.ndarray, np.ndarray]:
+def linear_moves(s: Structure, moves: Moves, target: Target) -> tuple[np.ndarray, np.ndarray]:
     """(t, q) after some moves (M, n), and its derivatives by (t, q, u) before them (M, n, m)."""
     n, M = 1 + s.d, len(moves.t)
     end, by = (np.zeros((M, *x), target.time.dtype) for x in ((n,), (n, n + s.nu)))

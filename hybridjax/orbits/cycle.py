@@ -20,8 +20,10 @@ from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape
+from ..engine.replay import linear_moves, recorded_moves
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, observed, recorded, simulate
+from ..engine.watch import slopes
 from ..errors import DefinitionError
 from ..linear.frequency_response import Frequencies, Harmonics
 from ..linear.htf import HTF
@@ -411,18 +413,21 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
 
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
-    map, flow = hosted(cycle).return_map, linear_flow(cycle)
+    map, record = hosted(cycle).return_map, last_turn(cycle)
+    structure, moves = map.structure, recorded_moves(*record)
+    by = linear_moves(structure, moves, map.ends())[1]
+    fields = slopes(structure, moves.t, moves.chart, moves.q, np.zeros((structure.nu, 1))).T
     frames: list[tuple[int, Matrix, Matrix]] = []
-    for chart, f in zip(flow.chart, flow.field[:, 0], strict=True):
-        n = map.structure.dims[chart]
-        basis, size = np.eye(n), np.asarray(map.scale)[chart, :n]
+    for chart, f in zip(moves.chart, fields, strict=True):
+        n = structure.dims[chart]
+        size, basis = np.append(map.expected, map.scale[chart, :n]), np.eye(1 + n)
         if map.base is not None:
-            basis = np.linalg.svd(f[None, :n] / size)[2][1:].T
-        frames.append((n, (basis / size[:, None]).T, basis * size[:, None]))
+            basis = np.pad(np.linalg.svd(f[None, :n] / size[1:])[2][1:].T, [(1, 0), (0, 0)])
+        frames.append((1 + n, (basis / size[:, None]).T, basis * size[:, None]))
     factors: list[Matrix] = []
     for k, (n, _, into) in enumerate(frames):
         m, out, _ = frames[(k + 1) % len(frames)]
-        parts = out, flow.through[k, :m, :n], into
+        parts = out, by[k, :m, :n], into
         factor = np.linalg.multi_dot(parts)
         # (A zero that comes out as rounding would be a multiplier.)
         least = np.finfo(float).eps * np.prod([np.linalg.norm(x) for x in parts])
