@@ -8,7 +8,8 @@ of a tenth of the outputs' rms, which goes round the loop. Printed, as `name val
 - `bound`: Cramer-Rao bound of the plant's first multiplier, for 300 strides of the loop.
 - `ldtp.rms`, `ldtp.ratio` (to the bound), `ldtp.covered`, `ldtp.p`: of `fit_ldtp(reference="r")`:
   rms error, how often its 95 % region holds the true multiplier, p-value of 95 % (binomial test).
-  `without.covered`: without the reference, and with D free.
+  `without.covered`: without the reference, and with D free. `series.*`: of
+  `fit_series(reference="r")`.
 - `plant.covered`, `plant.p`, `controller.*`: how often the 95 % discs of HTFs hold the truth, of
   `hj.identify.loop` with two references, and noise of a fifth of r in what the controller does;
   the p-value is that of their mean over draws (t test).
@@ -109,6 +110,7 @@ def parametric(model, size, sensor, rng) -> dict[str, float]:
         results[f"{name}.covered"] = float(fit.contains(true).all())
 
     dims = np.asarray(model.dims)
+    record("series", lambda: hj.fit_series(data, 2, check=False, reference="r"))
     record("ldtp", lambda: hj.fit_ldtp(data, dims, reference="r"))
     alone = hj.Record(data.u[:, :1], data.y, n_sections=N, inputs="u", outputs=data.outputs)
     record("without", lambda: hj.fit_ldtp(alone, dims, noise="innovations"))
@@ -248,7 +250,7 @@ def main() -> None:
         one = parametric(model, options.size, sensor, np.random.default_rng((1, k)))
         for name, value in one.items():
             found.setdefault(name, []).append(value)
-    for name in ("ldtp", "without"):
+    for name in ("series", "ldtp", "without"):
         covered, error = (np.array(found[f"{name}.{x}"]) for x in ("covered", "error"))
         rms = np.sqrt((error**2).mean())
         show(f"{name}.rms", rms)

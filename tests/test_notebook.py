@@ -95,6 +95,14 @@ def population(found):
     assert low < np.mean(found.true[6:]) - np.mean(found.true[:6]) < high < 0
 
 
+def in_the_loop(found):
+    for fit in (found.fit, found.series):
+        assert fit.contains(found.cycle.multipliers, 0.999).all()
+    truth = found.controller.htf(found.f).H
+    held = np.abs(found.loop.controller.H - truth) <= found.loop.controller.confidence_radius()
+    assert held.mean() > 0.9
+
+
 def simulator(found):
     assert found.fit.contains(found.returns.multipliers[:2]).all()
 

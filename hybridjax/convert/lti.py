@@ -21,7 +21,7 @@ from ..errors import ComputationError, DefinitionError
 from ..linear.frequency_response import Frequencies
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
-from ..orbits.continuous_htf import asked, observed
+from ..orbits.continuous_htf import asked, linear_outputs
 from ..orbits.cycle import LimitCycle
 from ..orbits.linear_flow import hosted, linear_flow, rule
 from ..systems.system import OutputNames
@@ -161,7 +161,7 @@ def to_harmonic_state_space(
             f"{type(s.system).__name__} has events at which deviations jump, which no finite "
             "number of harmonics represents: use `cycle.htf`, which is exact."
         )
-    _, by_state, by_input = observed(s, flow, z)
+    _, by_state, by_input = linear_outputs(s, flow, z)
     series = flow.by_state, flow.by_input[..., columns], by_state, by_input[..., columns]
     while True:
         m, k = np.arange(-n, n + 1), np.arange(-2 * n, 2 * n + 1)

@@ -39,7 +39,7 @@ _EXTRA = 12
 _LARGEST = 2**21
 
 
-def observed(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, Array, Array]:
+def linear_outputs(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, Array, Array]:
     """Outputs at the nodes (P, K, ny), and their derivatives by states and inputs."""
     outputs = lambda a, *point: kernels.outputs(s, a, tuple(z.items), *point)  # noqa: E731
     by = flow.evaluated(s, outputs, len(z.names))
@@ -112,7 +112,7 @@ def _transfer(
     harmonics: tuple[int, ...],
 ) -> Complex[Array, "M F ny nu"]:
     s, xp, h, period = map.structure, namespace(flow.q), flow.length, map.expected
-    values, by_state, by_input = observed(s, flow, z)
+    values, by_state, by_input = linear_outputs(s, flow, z)
     (P, K, d), nu, size, rows = flow.q.shape, s.nu, map.sizes, len(harmonics) * len(z.names)
     whole = flow.monodromy(map.valid)
     if on_host(whole):

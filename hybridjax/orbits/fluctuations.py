@@ -23,7 +23,7 @@ from ..systems.structure import Structure
 from .linear_flow import LinearFlow, linear_flow, rule
 from .responses import Phases, loop, surface
 from .return_map import SINGULAR
-from .sensitivity import to_section
+from .sensitivity import section_delay
 
 
 Strengths = Mapping[str, NonNegative]
@@ -133,7 +133,7 @@ def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets
     M, last = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0), xp.eye(n)
     _, Z = loop(map, M[:d, :d], f)
     if not (clocked or events):
-        delay = to_section(map, f)[0][None]
+        delay = section_delay(map, f)[0][None]
         last = _timing(np.eye(d)[None], delay, np.ones(1, bool), np.ones((1, 1), bool))[0]
     diffusion, to_end = Z @ Q[:d, :d] @ Z / period, flow.covectors(xp.eye(d))
     # (A state ahead of the cycle meets the next events earlier.)

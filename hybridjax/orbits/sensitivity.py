@@ -98,7 +98,7 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
         if isinstance(map.base, AtEvent):
             ahead = late[-1] - longer
         else:
-            by_state, by_parameter = to_section(map, f0, parameter=varied.parameter)
+            by_state, by_parameter = section_delay(map, f0, parameter=varied.parameter)
             ahead = by_state @ begin + by_parameter
         change, late = change + ahead * flow.field, late - ahead
     change = change + flow.field * (flow.after(map) / period * longer)[..., None]
@@ -109,7 +109,7 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     return Sensitivity(varied.parameter, longer, names, times, wrapped, s, flow, period, change)
 
 
-def to_section(
+def section_delay(
     map: ReturnMap, f: Float[Array, " d"], parameter: str | None = None
 ) -> tuple[Float[Array, " d"], Array]:
     """The time by which a changed state at phase 0 comes later to the section, per change of the
