@@ -65,9 +65,13 @@ def thumbnail(cycle: hj.LimitCycle, plane: list[str]) -> str:
     is_circuit = isinstance(cycle.system, hj.models.BuckConverter | hj.models.CukConverter)
     if is_circuit or drawing_of(cycle.structure, 0) is None:
         names = plane or cycle.structure.states_everywhere()[:2]
-        points = np.array(path(*names, per_step=4)[1:]).T
+        points = np.array(path(*names)[1:]).T
         now = observed(cycle.structure, names, times, *path.at(times)).T
         size = np.maximum(np.ptp(points, axis=0), 1e-9 * (1 + np.abs(points).max(axis=0)))
+        # At equal distances, so that their number does not depend on the steps.
+        way = np.append(0, np.cumsum(np.hypot(*(np.diff(points, axis=0) / size).T)))
+        at = np.linspace(0, way[-1], 200)
+        points = np.stack([np.interp(at, way, x) for x in points.T], axis=1)
         to = lambda x: 20 + (x - points.min(axis=0)) / size * (120, 80)  # noqa: E731
         shapes = [
             _line("orbit", [to(points)], CYCLE[0]),
@@ -128,9 +132,9 @@ def run(name: str) -> tuple[hj.LimitCycle, list[str]]:
 
 
 def numbers(plot: Plot) -> list[list[float]]:
-    """Sum and sum of squares of each curve's values."""
+    """Least and largest value of each curve."""
     curves = [line.get_ydata() for panel in plot.axes.flat for line in panel.get_lines()]
-    return [[float(f"{x:.6g}") for x in (np.nansum(y), np.nansum(np.square(y)))] for y in curves]
+    return [[float(f"{x:.6g}") for x in (np.nanmin(y), np.nanmax(y))] for y in curves]
 
 
 def drawn(name: str) -> list[list[float]]:
