@@ -20,12 +20,14 @@ BODY = "#e3ebf3"
 """The color of bodies."""
 PNG = "data:image/png;base64,"
 _PLAYER = """<div id="{id}" style="display:inline-block;max-width:100%">
-<div><img alt="{alt}" src="{first}" style="width:{width}px;max-width:100%"></div>
+<div style="position:relative;width:{width}px;max-width:100%">
+<img alt="{alt}" src="{still}" style="width:100%">
+<img alt="" src="{first}" style="width:100%;position:absolute;left:0;top:0"></div>
 <button title="pause or play">&#9199;</button>
 <input type="range" min="0" max="{last}" value="0" style="width:75%;vertical-align:middle">
 <script>(() => {{
 const box = document.getElementById("{id}"), frames = {frames};
-const [image, button, slider] = ["img", "button", "input"].map(x => box.querySelector(x));
+const [image, button, slider] = ["img+img", "button", "input"].map(x => box.querySelector(x));
 let playing = true;
 const show = k => {{ image.src = frames[k]; slider.value = k; }};
 button.onclick = () => {{ playing = !playing; }};
@@ -89,11 +91,24 @@ def gif(images: Sequence[Image.Image], interval: float) -> bytes:
 
 def player(images: Sequence[Image.Image], interval: float, alt: str) -> str:
     """HTML that shows the frames one after the other, with a button and a slider, and needs no
-    other file."""
-    files, width = [png(image, optimize=True) for image in images], images[0].width * 4 // 5
+    other file. Each frame holds what differs from the pixels that most frames have, upon which it
+    lies."""
+    pixels = np.stack([np.asarray(image) for image in images])
+    usual = np.sort(pixels, axis=0)[len(pixels) // 2]
+    # (The clear color is the last of the palette: browsers show one beyond its end as gray.)
+    clear, colors = len(_PALETTE), images[0].getpalette() or []
+    palette = [*colors[: 3 * clear], 0, 0, 0]
+
+    def encoded(pixels: np.ndarray, **options: Any) -> str:
+        image = Image.fromarray(pixels.astype(np.uint8), "P")
+        image.putpalette(palette)
+        return png(image, optimize=True, **options)
+
+    files = [encoded(np.where(x == usual, clear, x), transparency=clear) for x in pixels]
     return _PLAYER.format(
-        id=f"motion-{uuid.uuid4().hex[:8]}", width=width, alt=alt, first=files[0],
-        last=len(files) - 1, frames=files, milliseconds=round(1000 * interval),
+        id=f"motion-{uuid.uuid4().hex[:8]}", width=images[0].width * 4 // 5, alt=alt,
+        still=encoded(usual), first=files[0], last=len(files) - 1, frames=files,
+        milliseconds=round(1000 * interval),
     )  # fmt: skip
 
 
