@@ -35,7 +35,7 @@ from hybridjax.identify.denominator import multipliers_of
 from hybridjax.identify.instrument import in_loop
 from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
-from hybridjax.identify.periodic_model import (
+from hybridjax.identify.periodic import (
     PeriodicModel,
     characteristic_slopes,
     local_coordinates,

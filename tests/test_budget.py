@@ -29,17 +29,17 @@ PRONOUNS = set(
 # subjects, 1040 motion and sliders, 610 simulators of others; of the tests, 1860 are those of all.
 # (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 28_650,
-    "files": 242,
+    "code": 28_690,
+    "files": 244,
     "longest": 500,
     "public_names": 186,
     "many_parameters": 8,
-    "thresholds": 301,
+    "thresholds": 304,
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_850,
-    "doc_words": 40_400,
+    "test_lines": 17_960,
+    "doc_words": 40_600,
 }
 
 

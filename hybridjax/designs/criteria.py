@@ -12,7 +12,7 @@ from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
 from ..identify.denominator import chi, multipliers_of
-from ..identify.periodic_model import characteristic_slopes
+from ..identify.periodic import characteristic_slopes
 from ..identify.variable_projection import grouped
 from ..linear.htf import HTF
 from .candidates import Candidates, Model, Noise, Powers, measured_htfs

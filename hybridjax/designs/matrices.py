@@ -14,7 +14,7 @@ from ..errors import DefinitionError
 from ..identify.descent import NormalEquations, Spread
 from ..identify.joint.frequency import transfer, transfer_slopes
 from ..identify.joint.realization import realize
-from ..identify.periodic_model import LocalCoordinates, PeriodicModel, local_coordinates
+from ..identify.periodic import LocalCoordinates, PeriodicModel, local_coordinates
 from ..identify.series.subspace import default_horizon
 from ..identify.weights import check_values, error_weights
 from ..linear.frequency_response import Harmonics, check_harmonics

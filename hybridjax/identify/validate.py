@@ -19,7 +19,7 @@ from ..linear.ldtp import LDTP
 from .instrument import in_loop
 from .joint.fit import LDTPFit
 from .joint.prediction import Predictor
-from .periodic_model import PeriodicModel
+from .periodic import PeriodicModel
 from .series.fit import SeriesFit
 from .series.records import CycleGrid, drift_waves
 from .series.residuals import FEWEST_SAMPLES, independence_test, whiteness_test

@@ -11,7 +11,7 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.joint.frequency import transfer, transfer_slopes
-from hybridjax.identify.periodic_model import (
+from hybridjax.identify.periodic import (
     PeriodicModel,
     characteristic_slopes,
     local_coordinates,

@@ -7,7 +7,7 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem, noise_spectrum
-from hybridjax.identify.periodic_model import PeriodicModel, local_coordinates
+from hybridjax.identify.periodic import PeriodicModel, local_coordinates
 from hybridjax.identify.series.records import CycleGrid
 
 from .test_series import record

@@ -27,12 +27,7 @@ from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
-from ..periodic_model import (
-    LocalCoordinates,
-    PeriodicModel,
-    characteristic_slopes,
-    local_coordinates,
-)
+from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from ..series.records import PreparedRecords
 from ..series.residuals import about_answering, answering
 from ..series.subspace import answers_at_once, default_horizon, subspace_model
@@ -129,9 +124,8 @@ class LDTPFit(MultiplierEstimate):
         **Arguments:** `harmonics`: Default: those that were fitted.
         """
         f = np.atleast_1d(np.asarray(f, float))
-        harmonics = (
-            self.harmonics if harmonics is None else check_harmonics(harmonics, self.n_sections)
-        )
+        fitted = harmonics is None
+        harmonics = self.harmonics if fitted else check_harmonics(harmonics, self.n_sections)
         H = transfer(self._coordinates.model, f, harmonics)
         variance, spread = np.zeros(H.shape), Spread(self._root, self._hidden)
         for rows, slopes in transfer_slopes(self._coordinates, f, harmonics):

@@ -23,7 +23,7 @@ from jaxtyping import Complex, Float
 
 from ...linear.htf import HTF
 from ..descent import NormalEquations
-from ..periodic_model import LocalCoordinates, PeriodicModel
+from ..periodic import LocalCoordinates, PeriodicModel
 
 
 # Numbers of a Jacobian that are held at once, 32 MB. Larger: memory; smaller: loops in Python.

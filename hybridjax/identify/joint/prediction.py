@@ -19,7 +19,7 @@ from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.ldtp import LDTP
 from ..descent import NormalEquations
-from ..periodic_model import LocalCoordinates, PeriodicModel
+from ..periodic import LocalCoordinates, PeriodicModel
 from ..series.output_error import RANK
 from ..series.records import CycleGrid
 from ..weights import SMALLEST_ERROR

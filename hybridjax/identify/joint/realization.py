@@ -15,7 +15,7 @@ from ...linear.frequency_response import all_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..descent import ROUNDING
-from ..periodic_model import PeriodicModel
+from ..periodic import PeriodicModel
 from ..series.fit import SeriesFit
 from ..series.subspace import default_horizon
 from ..weights import SMALLEST_ERROR

@@ -8,7 +8,7 @@ from scipy import special
 
 from ...errors import DefinitionError
 from ..denominator import SLOWEST
-from ..periodic_model import PeriodicModel
+from ..periodic import PeriodicModel
 from .records import PreparedRecords
 from .residuals import ANSWER
 
