@@ -181,7 +181,7 @@ def test_the_command(files, tmp_path, monkeypatch):
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") >= 7 and "<script" not in page
     top = page[: page.index("<img")]
-    assert "multiplier ± standard error" in top and f"<td>{found.real:.3f}" in top
+    assert "± standard error" in top and f"<td>{found.real:.3f}" in top
     assert "from force (N) to x (m), v (m/s)" in top
     said = re.sub("</?code>", "`", top)
     assert all(f'<p class="warn">{html.escape(w)}</p>' in said for w in summary["warnings"])
