@@ -269,8 +269,8 @@ class Campaign:
         """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures,
         errors, and what a controller added to the inputs."""
         stepping, N, base = self.stepping, self.placed.n_sections, self.at_sections.on_cycle
-        feedback, on_cycle = self.feedback, jax.numpy.asarray(base)
-        loop = None if feedback is None else from_host(Feedback(feedback, on_cycle))
+        feedback = self.feedback
+        loop = None if feedback is None else from_host(Feedback(feedback, jax.numpy.asarray(base)))
 
         def arguments(rows):
             # (Nobody changes them before the program is done, so they may share memory.)

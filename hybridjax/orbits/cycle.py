@@ -204,7 +204,7 @@ class LimitCycle(eqx.Module):
         """
         _require_values(self, "trajectory")
         self.require_current()
-        if periods == 1 and self.result == Result.OK:
+        if periods == 1 and int(self.result) == Result.OK:
             return orbit(self)
         s, anchor = self.structure, to_host(self.anchor)
         a = int(anchor.chart[0])
