@@ -62,6 +62,11 @@ def fit(found):
     assert error < 2e-3 < before
 
 
+def play(found):
+    for cycle in (found.hopper, found.wheel, found.juggler):
+        assert (np.abs(cycle.multipliers) < 1).all()
+
+
 def sweep(found):
     radius = np.abs(found.best.multipliers).max()
     assert abs(radius - found.winner[2]) < 1e-3

@@ -319,13 +319,14 @@ def _pack(drive: Drive) -> bytes:
 
     **Raises:** `DefinitionError` for a plant that cannot be pickled.
     """
-    module, packer = sys.modules.get(type(drive.plant).__module__), pickle
+    packer = pickle
     try:
         with contextlib.suppress(ImportError):
             import cloudpickle as packer  # type: ignore
 
-            if module is not None and module.__spec__ is None:  # (in no file)
-                packer.register_pickle_by_value(module)  # type: ignore
+            for module in list(sys.modules.values()):
+                if getattr(module, "__spec__", packer) is None:  # (in no file)
+                    packer.register_pickle_by_value(module)  # type: ignore
         return packer.dumps(drive)
     except Exception as error:
         text = "give it `__getstate__`, or use `processes=0`"
