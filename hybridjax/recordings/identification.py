@@ -9,6 +9,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
 from .._core.precision import require_x64
 from .._core.progress import say, working
+from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.instrument import in_loop
 from ..identify.series.fit import SeriesFit, fit_series
@@ -75,8 +76,8 @@ def identify_recording(
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
-    - `reference`: signals that act from outside on a loop, as many as inputs, which a controller
-      makes. The fit is then that of the plant, see `fit_series`. Default: None.
+    - `reference`: signals that act from outside on a loop in which a controller makes the inputs,
+      at least as many as these. The fit is then that of the plant, see `fit_series`. Default: None.
 
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
     `section_data` and `fit_series`; `PrecisionError` in single precision.
@@ -84,8 +85,9 @@ def identify_recording(
     require_x64()
     say("inspection")
     outside = None if reference is None else tuple(reference)
-    if both := set(inputs) & set(outside or ()):
-        raise DefinitionError(f"`reference` must name other signals than `inputs`, not {both}.")
+    if both := [x for x in outside or () if x in (*inputs, *outputs)]:
+        text = f"other signals than `inputs` and `outputs`, not {listed(both)}"
+        raise DefinitionError(f"`reference` must name {text}.")
     signals = (*inputs, *(outside or ()))
     inspection = inspect(recording, inputs=signals, outputs=outputs)
     refuse(inspection.findings)
