@@ -40,8 +40,8 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
 
 def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     data = observed(oscillation, noise=1e-3)
-    fit = hj.fit_model(oscillation.system, data, ("p", "q", "w"), guess=oscillation)
-    assert fit.weighted and fit.freedom == 7
+    fit = hj.fit_model(Oscillator(w=1.02), data, ("p", "q", "w"), guess=oscillation)
+    assert fit.weighted and fit.freedom == 7 and fit.result == hj.Result.OK
     assert 0 < fit.chi_square(oscillation.system) < 13.8  # 0.1 %
     assert fit.contains({"p": 0.5, "q": 2.0, "w": 1.0}, level=0.999)
     assert not fit.contains({"p": 0.5, "q": 2.0, "w": 1.1})
