@@ -67,11 +67,7 @@ def thumbnail(cycle: hj.LimitCycle, plane: list[str]) -> str:
         names = plane or cycle.structure.states_everywhere()[:2]
         points = np.array(path(*names)[1:]).T
         now = observed(cycle.structure, names, times, *path.at(times)).T
-        size = np.maximum(np.ptp(points, axis=0), 1e-9 * (1 + np.abs(points).max(axis=0)))
-        # At equal distances, so that their number does not depend on the steps.
-        way = np.append(0, np.cumsum(np.hypot(*(np.diff(points, axis=0) / size).T)))
-        at = np.linspace(0, way[-1], 200)
-        points = np.stack([np.interp(at, way, x) for x in points.T], axis=1)
+        points, size = spaced(points, 200)
         to = lambda x: 20 + (x - points.min(axis=0)) / size * (120, 80)  # noqa: E731
         shapes = [
             _line("orbit", [to(points)], CYCLE[0]),
@@ -95,6 +91,15 @@ def thumbnail(cycle: hj.LimitCycle, plane: list[str]) -> str:
         rows = [x.circles[name] for x in scenes]
         shapes.append(_circle([(*to(x[:2]), x[2] * scale) for x in rows], about))
     return _svg(shapes)
+
+
+def spaced(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points at equal distances along a line, which do not depend on the steps of a search, and
+    the size of the line."""
+    size = np.maximum(np.ptp(points, axis=0), 1e-9 * (1 + np.abs(points).max(axis=0)))
+    way = np.append(0, np.cumsum(np.hypot(*(np.diff(points, axis=0) / size).T)))
+    at = np.linspace(0, way[-1], count)
+    return np.stack([np.interp(at, way, x) for x in points.T], axis=1), size
 
 
 def _svg(shapes: list[str]) -> str:
@@ -131,13 +136,18 @@ def run(name: str) -> tuple[hj.LimitCycle, list[str]]:
     return scope["cycle"], re.findall(r', "(\w+)"', last)
 
 
-def numbers(plot: Plot) -> list[list[float]]:
-    """Least and largest value of each curve."""
-    curves = [line.get_ydata() for panel in plot.axes.flat for line in panel.get_lines()]
-    return [[float(f"{x:.6g}") for x in (np.nanmin(y), np.nanmax(y))] for y in curves]
+def numbers(plot: Plot) -> list[list[tuple[float, ...]]]:
+    """Of each curve 20 points at equal distances, of marks all."""
+    curves = []
+    for line in (line for panel in plot.axes.flat for line in panel.get_lines()):
+        points = line.get_xydata()[np.isfinite(line.get_xydata()).all(axis=1)]
+        if line.get_linestyle() != "None" and len(points) > 1:
+            points = spaced(points, 20)[0]
+        curves.append([tuple(float(f"{x:.9g}") for x in point) for point in points])
+    return curves
 
 
-def drawn(name: str) -> list[list[float]]:
+def drawn(name: str) -> list[list[tuple[float, ...]]]:
     """The numbers that a file holds."""
     with Image.open(IMAGES / f"{name}.png") as picture:
         return json.loads(picture.info["Comment"])

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.compilation import quick_jit
+from .._core.executor import to_host
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..systems.system import HybridSystem
@@ -152,13 +153,10 @@ class Curve:
         An event that moves across the phase at which the cycle begins changes the chart there, and
         is no obstacle to the cycle.
         """
-        codes, legs = point.turn.codes, point.turn.legs
-        events = np.flatnonzero((codes >= 0).any(axis=1)) + 0.5
+        legs, events = point.turn.legs, point.turn.times[point.turn.codes >= 0]
         if self.map.base is not None or not len(events):
             return None
-        K = len(codes)
-        apart = np.abs(np.arange(K)[:, None] - events)
-        k = int(np.argmax(np.min(np.minimum(apart, K - apart), axis=1)))
+        k = far_from_events(legs.t, events, float(point.turn.period))
         phase = legs.t[k : k + 1] / point.turn.period * float(self.map.expected)
         anchor = point.anchor._replace(t=jnp.asarray(phase), chart=jnp.asarray(legs.chart[[k]]))
         forward = self._by_value() * np.sign(point.tangent[-1])
@@ -228,6 +226,26 @@ def _turn_along(
 
     turn = map.turn_with_jacobian(q, along=along)
     return map.departure(q), turn._replace(record=None)
+
+
+def far_from_events(
+    t: Float[np.ndarray, " K"], events: Float[np.ndarray, " n"], period: float
+) -> int:
+    """Which of the times of a cycle is farthest from all events."""
+    apart = np.mod(t[:, None] - events + 0.5 * period, period) - 0.5 * period
+    return int(np.abs(apart).min(axis=1).argmax())
+
+
+def away_from_events(cycle: LimitCycle) -> LimitCycle:
+    """A guess for neighbors of a clocked cycle, which begins far from all events: one that moves
+    across the phase of the begin changes the chart there."""
+    path, legs, anchor = cycle.trajectory(), to_host(cycle.legs), cycle.anchor
+    events = path.t[path.event >= 0]
+    if not cycle.clocked or not len(events):
+        return cycle
+    k = far_from_events(legs.t, events, float(cycle.period))
+    at = anchor._replace(t=legs.t[[k]], chart=legs.chart[[k]], q=legs.q[:, [k]])
+    return dataclasses.replace(cycle, anchor=at)
 
 
 def _rotated(sequence: Iterable[int]) -> tuple[int, ...]:

@@ -13,6 +13,7 @@ from .._core.boundary.values import Reals
 from .._core.results import Result
 from .._core.signal import Signal, with_unit
 from ..errors import DefinitionError
+from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.system import HybridSystem, unit_of_parameter
@@ -108,7 +109,7 @@ class Explorer:
             at = min(share + step, 1.0)
             mixed = {n: (1 - at) * x + at * self.values[n] for n, x in begin.items()}
             system = with_parameters(self.cycle.system, mixed)
-            cycle = find_limit_cycle(system, self.cycle, throw=False)
+            cycle = find_limit_cycle(system, away_from_events(self.cycle), throw=False)
             if cycle.result == Result.OK:
                 self.cycle, share = cycle, at
             elif step > 1 / 16:

@@ -24,7 +24,6 @@ from .._core.writing import replacing
 from ..engine.trajectory import Trajectory, observed
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.motion import perturbed_trajectory
 from ..orbits.continuation import Branch
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
@@ -193,6 +192,8 @@ def animate(
     if isinstance(perturbed, ExperimentData):
         if cycle is None or sections is None:
             raise DefinitionError("data of experiments need a limit cycle and their `sections`.")
+        from ..experiments.motion import perturbed_trajectory  # (a thirtieth of a second)
+
         perturbed = perturbed_trajectory(sections, perturbed.u[0, : 4 * sections.n_sections])
     if cycle is not None and sections is perturbed is None:
         motion = cycle = _both_halves(cycle)
@@ -235,7 +236,8 @@ def animate(
         if has_circle:
             panel = figure.add_subplot(grid[1, 1])
             draw_multipliers(cycle, zoom=False, ax=panel)
-            panel.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+            # (A formula as a label would take a twentieth of a second.)
+            panel.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], xlabel="Re λ", ylabel="Im λ")
         title = f"motion of {type(s.system).__name__}"
         return Motion(figure, parts, times, length / pace / len(times), title)
 

@@ -26,6 +26,15 @@ def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     pyplot.close("all")
 
 
+def test_an_event_passes_the_phase_at_which_the_clock_begins():
+    explorer = hj.explore(hj.models.VerticalHopper(), "k")
+    for k in (13.0, 14.4):  # the begin is in flight, then in stance
+        explorer.move({"k": k})
+        assert explorer.message == "" and float(explorer.cycle.system.k) == k
+    np.testing.assert_allclose(explorer.cycle.period, 1.0)
+    pyplot.close("all")
+
+
 def test_the_widget_sends_pictures():
     pytest.importorskip("anywidget", reason="pip install 'hybridjax[explore]' installs it")
     explorer = hj.explore(hj.models.VanDerPol(), "mu")
