@@ -66,8 +66,8 @@ def test_the_pictures_of_the_home_page_are_those_that_are_drawn_now(monkeypatch)
     pictures = importlib.import_module("pictures")
     for name, plot in pictures.draw().items():
         for now, file in zip(pictures.numbers(plot), pictures.drawn(name), strict=True):
-            largest = np.abs(file).max(axis=0, initial=0)
-            np.testing.assert_array_less(np.abs(np.subtract(now, file)), 1e-6 * largest + 1e-15)
+            off, size = np.subtract(now["points"], file["points"]), np.abs(file["points"])
+            assert np.all(np.abs(off) <= file["within"] * size.max(axis=0, initial=1e-9))
     pyplot.close("all")
 
 

@@ -136,18 +136,24 @@ def run(name: str) -> tuple[hj.LimitCycle, list[str]]:
     return scope["cycle"], re.findall(r', "(\w+)"', last)
 
 
-def numbers(plot: Plot) -> list[list[tuple[float, ...]]]:
-    """Of each curve 20 points at equal distances, of marks all."""
+def numbers(plot: Plot) -> list[dict]:
+    """Of each curve 20 points at equal distances, of marks all, and how far others may be, relative
+    to the largest."""
     curves = []
     for line in (line for panel in plot.axes.flat for line in panel.get_lines()):
-        points = line.get_xydata()[np.isfinite(line.get_xydata()).all(axis=1)]
-        if line.get_linestyle() != "None" and len(points) > 1:
+        points, within = line.get_xydata()[np.isfinite(line.get_xydata()).all(axis=1)], 1e-6
+        if line.get_label() == "optimal":
+            # Rounding shifts power between neighbors: its part up to each frequency is compared.
+            f, power = np.linspace(0, 10, 21), np.cumsum(points[:, 1] ** 2)
+            points, within = np.stack([f, np.interp(f, points[:, 0], power / power[-1])]).T, 0.03
+        elif line.get_linestyle() != "None" and line.get_linewidth() and len(points) > 1:
             points = spaced(points, 20)[0]
-        curves.append([tuple(float(f"{x:.9g}") for x in point) for point in points])
+        rounded = [tuple(float(f"{x:.9g}") for x in point) for point in points]
+        curves.append({"points": rounded, "within": within})
     return curves
 
 
-def drawn(name: str) -> list[list[tuple[float, ...]]]:
+def drawn(name: str) -> list[dict]:
     """The numbers that a file holds."""
     with Image.open(IMAGES / f"{name}.png") as picture:
         return json.loads(picture.info["Comment"])

@@ -228,9 +228,7 @@ def _turn_along(
     return map.departure(q), turn._replace(record=None)
 
 
-def far_from_events(
-    t: Float[np.ndarray, " K"], events: Float[np.ndarray, " n"], period: float
-) -> int:
+def far_from_events(t: np.ndarray, events: np.ndarray, period: float) -> int:
     """Which of the times of a cycle is farthest from all events."""
     apart = np.mod(t[:, None] - events + 0.5 * period, period) - 0.5 * period
     return int(np.abs(apart).min(axis=1).argmax())

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib import pyplot
@@ -39,13 +38,6 @@ from .pictures import Pictures, drawing_of
 from .plane import multipliers as draw_multipliers
 
 
-# Small labels, close to small panels.
-_SMALL: dict[Any, Any] = {
-    **dict.fromkeys(("font.size", "xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 6),
-    **dict.fromkeys(("axes.labelsize", "axes.titlesize"), 7),
-    **dict.fromkeys(("xtick.major.pad", "ytick.major.pad", "axes.labelpad", "axes.titlepad"), 1),
-    **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 2),
-}
 _GROUND: dict[str, Any] = {"color": COLORS["gray"], "lw": 1.0, "zorder": 1}
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 Part = tuple[Artist, Callable[[Any], Any], Sequence[Any]]
@@ -95,12 +87,12 @@ class Motion(FuncAnimation):
             raise DefinitionError("an .mp4 needs the program ffmpeg: write a .gif or .html.")
         with replacing(path) as new:
             if path.suffix == ".gif":
-                new.write_bytes(gif(self._frames(100), self.interval))
+                new.write_bytes(gif(self._frames(86), self.interval))
             elif path.suffix == ".html":
                 new.write_text(self._repr_html_())
             else:
                 film = new.with_suffix(".mp4")
-                super().save(str(film), writer="ffmpeg", fps=round(1 / self.interval), dpi=200)
+                super().save(str(film), writer="ffmpeg", fps=round(1 / self.interval), dpi=172)
                 film.rename(new)
         return path
 
@@ -108,7 +100,7 @@ class Motion(FuncAnimation):
         return frames(self.figure, self._draw, len(self.times), dpi)
 
     def _repr_html_(self) -> str:
-        return player(self._frames(125), self.interval, self._title)
+        return player(self._frames(107), self.interval, self._title)
 
     def __repr__(self) -> str:
         return f"Motion({self._title}: {len(self.times)} frames, {self.interval:.3g} s each)"
@@ -216,12 +208,12 @@ def animate(
     if perturbed is not None:
         tracks.append(Track("perturbed", COLORS["red"], perturbed, begin))
     events = [track.events(0.2 * pace) for track in tracks]
-    with style(), matplotlib.rc_context(_SMALL):
+    with style():
         figure, grid = _sheet()
         cells = (grid[1, 0] if has_picture else grid[:, 0]).subgridspec(len(names), 1, hspace=0.05)
         axes = [figure.add_subplot(cells[i]) for i in range(len(names))]
         parts = _traces(axes, tracks, names, events)
-        axes[0].set_title(_label(pace, unit), fontsize=6, loc="right")
+        axes[0].set_title(_label(pace, unit), loc="right")
         if has_picture:
             cells = grid[0, 0].subgridspec(1, len(tracks))
             for i, track in enumerate(tracks):
@@ -253,7 +245,7 @@ def _both_halves(cycle: LimitCycle) -> LimitCycle:
 
 def _sheet() -> tuple[Figure, Any]:
     """A figure and its cells, at fixed places, so that labels find theirs before it is drawn."""
-    figure = pyplot.figure(figsize=(4.8, 3.1), dpi=100)
+    figure = pyplot.figure(figsize=(5.6, 3.6), dpi=86)
     borders: dict[str, float] = {"left": 0.1, "right": 0.98, "bottom": 0.11, "top": 0.96}
     ratios: Any = {"width_ratios": (1.15, 1), "height_ratios": (1.4, 1)}
     return figure, figure.add_gridspec(2, 2, **borders, **ratios, wspace=0.3, hspace=0.3)
@@ -407,7 +399,7 @@ def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) ->
     rows = np.unique(np.linspace(0, len(branch) - 1, 100).round().astype(int))
     cycles, values = [branch[int(k)] for k in rows], branch.values[rows]
     plane = plane_of(cycles[0].structure, x, y)
-    with style(), matplotlib.rc_context(_SMALL):
+    with style():
         figure, grid = _sheet()
         left, above, below = (figure.add_subplot(x) for x in (grid[:, 0], grid[0, 1], grid[1, 1]))
         draw_branch(branch, output=plane[0], ax=left)
