@@ -19,7 +19,7 @@ from .._core.text import number
 from ..engine import kernels
 from ..errors import ComputationError
 from ..systems.structure import Structure
-from ..systems.varied import Varied, under
+from ..systems.varied import Varied, parameter_of
 from .crossing import AtEvent, ListLevels
 from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
 from .responses import Phases, loop
@@ -68,10 +68,10 @@ class Sensitivity(eqx.Module):
 
 def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
     """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`)."""
-    varied = Varied(cycle.system, parameter)
+    parameter_of(cycle.system, parameter)
     flow = linear_flow(cycle, parameter=parameter)
     with at_ease():
-        return _sensitivity(cycle, flow, varied)
+        return _sensitivity(cycle, flow, Varied(cycle.system, parameter))
 
 
 def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
@@ -83,7 +83,7 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     closed, Z = loop(map, whole, f0)
     longer = -(Z @ total[:, 0])
     if clocked:
-        period_at = lambda k: jnp.asarray(varied.at(k).period(), float)  # noqa: E731
+        period_at = lambda k: jnp.asarray(varied.under(k[None]).system.period(), float)  # noqa: E731
         longer = map.multiplicity * derivative_at_zero(period_at)
         if on_host(whole) and np.linalg.svd(closed, compute_uv=False)[-1] < SINGULAR:
             raise ComputationError(
@@ -123,4 +123,4 @@ def section_delay(
 
 
 def _level(a: int, s: Structure, levels: ListLevels, t, q, u):
-    return levels.level(under(s, u), a, jnp.zeros((), int), t, q)[None]
+    return levels.level(s.under(u), a, jnp.zeros((), int), t, q)[None]
