@@ -138,7 +138,7 @@ def watched_at(
     """The guards of chart a, of these kinds, and the level of section i if the chart has one."""
     guards = s.guard_values(kinds, t, q, u)
     if levels is not None and levels.present(s, a):
-        guards = [*guards, levels.level(s, a, i, t, q)]
+        guards = [*guards, levels.level(s.under(u), a, i, t, q)]
     return stacked(guards)
 
 

@@ -199,11 +199,9 @@ def _at_events(s: Structure, guards: Strengths, resets: Resets):
     names = [x.name for x in s.transitions]
     for argument, given in (("guards", guards), ("resets", resets)):
         require_among("transition", given, names, f"`{argument}`: ")
-    levels, scatter = np.zeros(len(names) + 1), np.zeros((len(names) + 1, s.d))
-    for g, transition in enumerate(s.transitions):
-        levels[g] = guards.get(transition.name, 0.0)
-        states = s.charts[s.chart_index(transition.target)].states
-        chosen = resets.get(transition.name, {})
-        require_among("state", chosen, states, f"`resets`: after '{transition.name}' ")
-        scatter[g, : len(states)] = [chosen.get(x, 0.0) for x in states]
-    return levels, scatter
+    scatter = np.zeros((len(names) + 1, s.d))
+    for row, x in zip(scatter, s.transitions, strict=False):
+        states, chosen = s.charts[s.chart_index(x.target)].states, resets.get(x.name, {})
+        require_among("state", chosen, states, f"`resets`: after '{x.name}' ")
+        row[: len(states)] = [chosen.get(y, 0.0) for y in states]
+    return np.array([*(guards.get(x, 0.0) for x in names), 0.0]), scatter

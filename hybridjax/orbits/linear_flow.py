@@ -321,10 +321,7 @@ def _along(
     s: kernels.Tangents, map: ReturnMap, lanes: Lanes, tape: Tape, by: Any
 ) -> Float[np.ndarray, "M n D"]:
     """Tangents of times and states at the starts of recorded moves and at the end of the turn."""
-    ends, begin = map.ends(), np.zeros((1 + s.d, s.directions))
-    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
-    begin[1:] = 0.0 if by.anchor.q is None else by.anchor.q[..., 0].T
-    longer = 0.0 if by.period is None else by.period
+    ends, (begin, longer) = map.ends(), beginning(by, s.d, s.directions)
     # A turn that ends on a section ends at a time, too.
     start, full = map.anchor.t[0], map.expected
     time = np.where(np.isfinite(ends.time), ends.time, start + full)
@@ -332,6 +329,14 @@ def _along(
     times = begin[0][:, None] + np.outer(longer, (time - start) / full)
     ends = dataclasses.replace(ends, time=time, levels=None)
     return Variation(s, lanes, ends, tape, times, twice=False).tangents(begin)
+
+
+def beginning(by: Any, d: int, directions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Tangents of (t, q) at the anchor of a cycle, and of its period."""
+    begin = np.zeros((1 + d, directions))
+    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
+    begin[1:] = 0.0 if by.anchor.q is None else by.anchor.q[..., 0].T
+    return begin, np.zeros(directions) if by.period is None else by.period
 
 
 def of_flow(tangents: Any) -> Any:
@@ -394,10 +399,8 @@ def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
 
 def by_name(s: Structure, chart: Int[Array, " p"], states: Inexact[Array, "p d"]):
     """Padded states, or what belongs to them, by name; NaN in charts that lack one."""
-    xp, out = namespace(states), {}
-    for name in s.state_names():
-        rows = [c.states.index(name) if name in c.states else -1 for c in s.charts]
-        column = xp.asarray(rows)[chart]
-        value = xp.take_along_axis(states, xp.maximum(column, 0)[:, None], axis=1)[:, 0]
-        out[name] = xp.where(column >= 0, value, xp.nan)
-    return out
+    xp, points = namespace(states), np.arange(len(chart))
+    wide = xp.pad(states, [(0, 0), (0, 1)], constant_values=np.nan)
+    places = [dict(zip(c.states, range(s.d), strict=False)) for c in s.charts]
+    row = lambda name: xp.asarray([x.get(name, s.d) for x in places])[chart]  # noqa: E731
+    return {name: wide[points, row(name)] for name in s.state_names()}

@@ -130,12 +130,9 @@ class Coupling(eqx.Module):
 
         steps = 16 * len(self.coefficients)
         grid = (np.arange(steps + 1) - 0.5) / steps
-        sign = np.sign(self(grid))
-        crossed = zip(grid[:-1], grid[1:], sign[:-1] * sign[1:] < 0, strict=True)
-        value = lambda x: float(self([x])[0])  # noqa: E731
-        roots = [
-            optimize.root_scalar(value, bracket=(a, b)).root for a, b, turns in crossed if turns
-        ]
+        sign, value = np.sign(self(grid)), lambda x: float(self([x])[0])
+        crossed = np.flatnonzero(sign[:-1] * sign[1:] < 0)
+        roots = [optimize.brentq(value, *grid[k : k + 2]) for k in crossed]
         return tuple(Locked(x % 1.0, float(self._slope([x])[0])) for x in roots)
 
 

@@ -115,12 +115,8 @@ def section_delay(
     """The time by which a changed state at phase 0 comes later to the section, per change of the
     state and of the first input."""
     assert map.base is not None
-    levels = ListLevels((map.base,))
+    levels, index = ListLevels((map.base,)), np.zeros(1, np.int32)
     of, (t, chart, q, *_) = with_inputs(map.system, parameter), map.anchor
-    level = lambda a, *at: kernels.linear(of, _level, a, *at, levels)  # noqa: E731
+    level = lambda a, *at: kernels.watched(of, a, levels, *at, index)[-1:]  # noqa: E731
     by = with_derivatives(of, level, chart, t, q, 1)[0, 2 : 3 + len(f), 0]
     return by[:-1] / -(by[:-1] @ f), by[-1] / -(by[:-1] @ f)
-
-
-def _level(a: int, s: Structure, levels: ListLevels, t, q, u):
-    return levels.level(s.under(u), a, jnp.zeros((), int), t, q)[None]

@@ -200,6 +200,9 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
     np.testing.assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
     # By symmetry each quarter takes its part.
     np.testing.assert_allclose(np.reshape(a.durations, (4, 2)).sum(1), a.period / 4, rtol=1e-9)
+    # It can be followed, although it begins where sliding ends: there, its guess is on a guard.
+    periods = [hj.find_limit_cycle(Square(a=x), cycle).period for x in (0.19, 0.21)]
+    np.testing.assert_allclose(np.diff(periods)[0] / 0.02, a.period, rtol=1e-3)
 
 
 # All of `hj.models` without a clock, except a family of cycles (SLIPRunner).
@@ -263,6 +266,13 @@ def test_htfs_at_many_frequencies_come_from_fewer():
     some = [0, 7, 311, 619]
     many, few = cycle.htf(f, (-1, 0, 1)).H, cycle.htf(f[some], (-1, 0, 1)).H
     np.testing.assert_allclose(many[:, some], few, rtol=0, atol=1e-12 * np.abs(few).max())
+
+
+def test_responses_to_held_inputs_approach_those_in_continuous_time():
+    cycle, x = hj.find_limit_cycle(hj.models.Mathieu()), 2j * np.pi * 0.25 / 64
+    held = hj.linearize(cycle, hj.ClockPhase(64), "x").htf(0.25, (-1, 0, 1)).H
+    exact = cycle.htf(0.25, (-1, 0, 1), "x").H
+    np.testing.assert_allclose(held * x / (1 - np.exp(-x)), exact, rtol=1e-7)
 
 
 def test_harmonic_state_spaces_converge_to_the_exact_htf():
@@ -340,9 +350,9 @@ def test_sensitivities_are_differences_of_cycles(system, name):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "system, name, output",
-    [(Neuron(), "current", "v"), (hj.models.VerticalHopper(), "k", "yM"),
-     (hj.models.BuckConverter(), "Vin", "v")],
-    ids=["a phase", "two charts", "a schedule"],
+    [(Neuron(grip=0.3), "current", "v"), (hj.models.VerticalHopper(), "k", "yM"),
+     (hj.models.BuckConverter(), "Vin", "v"), (hj.models.TwoLeggedBar(), "m", "y")],
+    ids=["a phase", "two charts", "a schedule", "four charts"],
 )  # fmt: skip
 def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, output):
     guess, begin = hj.find_limit_cycle(system), jnp.asarray(getattr(system, name), float)
@@ -356,7 +366,9 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         noisy = noise.covariance(at)[0, 0, 0] if guess.clocked else noise.diffusion
         change = cycle.sensitivity(name)
         shape = change.shape(at)[output][0] if guess.clocked else change.period
-        return jnp.real(jnp.stack([jnp.abs(push[output][0]), jnp.abs(htf), noisy, shape]))
+        impulse = responses.impulses(0 if guess.clocked else None)[0].weight["u"]
+        values = [push[output][0], htf, noisy, shape, impulse, change.durations[0]]
+        return jnp.abs(jnp.stack(values))
 
     forward = jax.jvp(result, (begin,), (jnp.ones(()),))[1]
     central = lambda h: (result(begin + h) - result(begin - h)) / (2 * h)
