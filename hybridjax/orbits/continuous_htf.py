@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import SignalNames
-from .._core.compilation import at_ease
+from .._core.compilation import at_ease, one_program
 from .._core.executor import Array, namespace, on_host
 from .._core.memo import Memory
 from ..engine import kernels
@@ -92,8 +92,9 @@ def continuous_htf(
     map = cycle.return_map
     z, names, columns = asked(map.structure, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, longest_piece(frequencies, harmonics))
+    coarse, fine = _interpolation(frequencies)
     with at_ease():
-        H = _transfer(map, flow, z, frequencies, harmonics)
+        H = _transfer(map, flow, tuple(z.items), frequencies, coarse, fine, harmonics)
     return HTF(frequencies, H[..., columns], harmonics, 0, names, z.names, "exact")
 
 
@@ -114,14 +115,18 @@ def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Array]:
     return coarse, mix * np.exp(1j * np.pi * (coarse - f[:, None]))
 
 
+@one_program
 def _transfer(
     map: ReturnMap,
     flow: LinearFlow,
-    z: Outputs,
-    f: Float[np.ndarray, " F"],
+    outputs: tuple[str | Output, ...],
+    f: Float[Array, " F"],
+    coarse: Float[Array, " n"],
+    fine: Array,
     harmonics: tuple[int, ...],
 ) -> Complex[Array, "M F ny nu"]:
     s, xp, h, period = map.structure, namespace(flow.q), flow.length, map.expected
+    z = s.resolve_outputs(outputs)
     values, by_state, by_input = linear_outputs(s, flow, z)
     (P, K, d), nu, size, rows = flow.q.shape, s.nu, map.sizes, len(harmonics) * len(z.names)
     whole = flow.monodromy(map.valid)
@@ -134,7 +139,6 @@ def _transfer(
                 f"lie at {where}: leave it out."
             )
     # Responses to inputs, and to states at phase 0, are columns.
-    coarse, fine = _interpolation(f)
     inside = xp.exp((h[:, None] * rule().nodes / period)[..., None] * (2j * np.pi * coarse))
     back, (begin, delay, end) = xp.conj(inside), flow.driven(inside)
     pushed = (by_state @ flow.pushed.reshape(P, K, d, -1)).reshape(*by_input.shape, K)

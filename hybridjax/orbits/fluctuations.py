@@ -16,6 +16,7 @@ from jaxtyping import Float
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, NonNegative
+from .._core.compilation import one_program
 from .._core.executor import Array, is_traced, namespace, on_host, scan
 from .._core.text import number
 from ..errors import ComputationError
@@ -99,8 +100,14 @@ class Fluctuations(eqx.Module):
 
 def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets) -> Fluctuations:
     """Deviations from a cycle under noise (see `LimitCycle.fluctuations`)."""
-    flow, events = linear_flow(cycle), cycle.event_sequence
-    map = cycle.return_map
+    return _fluctuations(cycle, linear_flow(cycle), white, guards, resets)
+
+
+@one_program
+def _fluctuations(
+    cycle: Any, flow: LinearFlow, white: Strengths, guards: Strengths, resets: Resets
+) -> Fluctuations:
+    map, events = cycle.return_map, cycle.event_sequence
     s, period = map.structure, map.expected
     levels, scatter = _at_events(s, guards, resets)
     xp, jumps = namespace(flow.q), flow.jumps

@@ -20,7 +20,7 @@ from .._core.arguments import require_among, require_index
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers
 from .._core.boundary.values import Reals
-from .._core.compilation import at_ease
+from .._core.compilation import at_ease, one_program
 from .._core.executor import Array, is_traced, namespace, on_host, stop_gradient, svdvals, to_host
 from .._core.results import Result
 from .._core.signal import unit_of
@@ -218,8 +218,8 @@ class Responses(eqx.Module):
         phase = (flow.t - flow.t[0, 0]) / period
         tail = np.where(flow.event >= 0, np.nan, pushed[:, -1]) / period
         pairs = (phase, phase[:, -1]), (pushed / period, tail)
-        both = (np.concatenate([x, y[:, None]], axis=1).ravel() for x, y in pairs)
-        return PhaseCurve(*both, signal, time_unit=self.structure.system.time_unit)
+        phase, values = (np.concatenate([x, y[:, None]], axis=1).ravel() for x, y in pairs)
+        return PhaseCurve(phase, values, signal, time_unit=self.structure.system.time_unit)
 
     def coupling(
         self, push: Callable | str, input: str | None = None, harmonics: Count = 64
@@ -290,6 +290,7 @@ class Responses(eqx.Module):
         require_index("mode with an amplitude", mode, len(self.exponents))
         return self.of_amplitudes[mode]
 
+    @one_program
     def _named(
         self, covector: Inexact[Array, "P K d"], phase: Phases, scale: Array = 1.0
     ) -> dict[str, Array]:
@@ -304,7 +305,11 @@ class Responses(eqx.Module):
 
 def responses(cycle: Any, modes: int | None) -> Responses:
     """The responses of a cycle (see `LimitCycle.responses`)."""
-    flow = linear_flow(cycle)
+    return _responses(cycle, linear_flow(cycle), modes)
+
+
+@one_program
+def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
     host, xp, map = on_host(flow.t), namespace(flow.t), cycle.return_map
     period, clocked = map.expected, map.base is None
     whole = flow.monodromy(map.valid)

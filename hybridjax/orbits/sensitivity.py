@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked_methods
-from .._core.compilation import at_ease
+from .._core.compilation import at_ease, one_program
 from .._core.executor import Array, is_traced, namespace, on_host
 from .._core.text import number
 from ..engine import kernels
@@ -74,6 +74,7 @@ def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
         return _sensitivity(cycle, flow, Varied(cycle.system, parameter))
 
 
+@one_program
 def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     map, period, events = cycle.return_map, cycle.period, cycle.event_sequence
     s, xp, f0, clocked = map.structure, namespace(flow.q), flow.field[0, 0], map.base is None
@@ -117,6 +118,6 @@ def section_delay(
     assert map.base is not None
     levels, index = ListLevels((map.base,)), np.zeros(1, np.int32)
     of, (t, chart, q, *_) = with_inputs(map.system, parameter), map.anchor
-    level = lambda a, *at: kernels.watched(of, a, levels, *at, index)[-1:]  # noqa: E731
+    level = lambda a, t, q, u: kernels.watched(of, a, levels, t, q, u, index)[-1:]  # noqa: E731
     by = with_derivatives(of, level, chart, t, q, 1)[0, 2 : 3 + len(f), 0]
     return by[:-1] / -(by[:-1] @ f), by[-1] / -(by[:-1] @ f)

@@ -184,8 +184,7 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     kept = np.isfinite(curve.values)
     np.testing.assert_allclose(curve.values[kept], exact[kept], rtol=1e-12)
     assert 0 < np.sum(~kept) <= 2 and curve.input == "u"
-    # Sustained: T = arctan(1) - arctan(low), whose derivative is -1 / (1 + low^2).
-    change = cycle.sensitivity("low")
+    change = cycle.sensitivity("low")  # T = arctan(1) - arctan(low)
     np.testing.assert_allclose(change.period, -1 / 5, rtol=1e-11)
     np.testing.assert_allclose(change.durations, [-1 / 5], rtol=1e-11)
     np.testing.assert_allclose(change.shape([0.0])["v"], [1.0], rtol=1e-11)
@@ -200,7 +199,7 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
     np.testing.assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
     # By symmetry each quarter takes its part.
     np.testing.assert_allclose(np.reshape(a.durations, (4, 2)).sum(1), a.period / 4, rtol=1e-9)
-    # It can be followed, although it begins where sliding ends: there, its guess is on a guard.
+    # A cycle that begins where sliding ends can be followed.
     periods = [hj.find_limit_cycle(Square(a=x), cycle).period for x in (0.19, 0.21)]
     np.testing.assert_allclose(np.diff(periods)[0] / 0.02, a.period, rtol=1e-3)
 
