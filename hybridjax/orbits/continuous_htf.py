@@ -92,27 +92,26 @@ def continuous_htf(
     map = cycle.return_map
     z, names, columns = asked(map.structure, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, longest_piece(frequencies, harmonics))
-    coarse, fine = _interpolation(frequencies)
     with at_ease():
-        H = _transfer(map, flow, tuple(z.items), frequencies, coarse, fine, harmonics)
+        H = _transfer(map, flow, tuple(z.items), _interpolation(frequencies), harmonics)
     return HTF(frequencies, H[..., columns], harmonics, 0, names, z.names, "exact")
 
 
-def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, Array]:
-    """Chebyshev's frequencies where these are fewer than f, else f, and the matrix from values
-    there to values at f, of functions of the frequency that are sums of exp(-2 pi i f s), s from 0
-    to 1.
+def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """f, Chebyshev's frequencies where these are fewer than f, else f again, and the matrix from
+    values there to values at f, of functions of the frequency that are sums of exp(-2 pi i f s), s
+    from 0 to 1.
     """
     middle, half = (np.max(f) + np.min(f)) / 2, np.ptp(f) / 2
     n = int(np.pi * half + _EXTRA * np.cbrt(1 + np.pi * half))
     if n >= len(f) or not half:
-        return f, np.eye(len(f))
+        return f, f, np.eye(len(f))
     k, chebyshev = np.arange(n), np.polynomial.chebyshev
     x = np.cos(np.pi * (k + 0.5) / n)
     values = chebyshev.chebvander(x, n - 1).T * (2 - (k == 0))[:, None] / n
     coarse, mix = middle + half * x, chebyshev.chebvander((f - middle) / half, n - 1) @ values
     # Their mean exponent, s = 1/2, is taken out: the others turn half as fast.
-    return coarse, mix * np.exp(1j * np.pi * (coarse - f[:, None]))
+    return f, coarse, mix * np.exp(1j * np.pi * (coarse - f[:, None]))
 
 
 @one_program
@@ -120,13 +119,11 @@ def _transfer(
     map: ReturnMap,
     flow: LinearFlow,
     outputs: tuple[str | Output, ...],
-    f: Float[Array, " F"],
-    coarse: Float[Array, " n"],
-    fine: Array,
+    interpolation: tuple[Array, Array, Array],
     harmonics: tuple[int, ...],
 ) -> Complex[Array, "M F ny nu"]:
     s, xp, h, period = map.structure, namespace(flow.q), flow.length, map.expected
-    z = s.resolve_outputs(outputs)
+    z, (f, coarse, fine) = s.resolve_outputs(outputs), interpolation
     values, by_state, by_input = linear_outputs(s, flow, z)
     (P, K, d), nu, size, rows = flow.q.shape, s.nu, map.sizes, len(harmonics) * len(z.names)
     whole = flow.monodromy(map.valid)

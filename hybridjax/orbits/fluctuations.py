@@ -71,7 +71,7 @@ class Fluctuations(eqx.Module):
         **Raises:** `ComputationError` if an implicit method steps over fast decays.
         """
         if on_host(self.period) and self.unresolved > SINGULAR:
-            raise ComputationError("steps pass over decays: use an explicit method or `durations`.")
+            raise ComputationError("steps skip fast decays: use an explicit method or `durations`.")
         C, d = self.at_nodes, self.at_nodes.shape[-1]
         if lag:
             turns = namespace(C).linalg.matrix_power(self.step[:d, :d], lag - 1)
@@ -100,13 +100,11 @@ class Fluctuations(eqx.Module):
 
 def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets) -> Fluctuations:
     """Deviations from a cycle under noise (see `LimitCycle.fluctuations`)."""
-    return _fluctuations(cycle, linear_flow(cycle), white, guards, resets)
+    return _noisy(cycle, linear_flow(cycle), white, guards, resets)
 
 
 @one_program
-def _fluctuations(
-    cycle: Any, flow: LinearFlow, white: Strengths, guards: Strengths, resets: Resets
-) -> Fluctuations:
+def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -> Fluctuations:
     map, events = cycle.return_map, cycle.event_sequence
     s, period = map.structure, map.expected
     levels, scatter = _at_events(s, guards, resets)
