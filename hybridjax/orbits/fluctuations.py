@@ -17,7 +17,7 @@ from .._core.arguments import require_among
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, NonNegative
 from .._core.compilation import one_program
-from .._core.executor import Array, is_traced, namespace, on_host, scan
+from .._core.executor import Array, is_traced, namespace, on_host, put, scan
 from .._core.text import number
 from ..errors import ComputationError
 from ..systems.structure import Structure
@@ -119,9 +119,16 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
     collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
     # Noise of events, and what each makes of the states before, of the delay of the last event,
     # and of durations.
-    hit = flow.event >= 0
+    hit, delay = flow.event >= 0, jumps.delay_by_state
+    if not (clocked or events):  # the section is the event
+        hit, delay = put(hit, -1, True), put(delay, -1, section_delay(map, f)[0])
     slot = (xp.cumsum(hit)[:, None] - 1 == np.arange(E)) & hit[:, None]
-    jump = _timing(jumps.by_state, jumps.delay_by_state, hit, slot)
+    each, none = slot[..., None], xp.zeros((P, d, 1 + E))
+    jump = xp.block([
+        [jumps.by_state, none],
+        [delay[:, None], 1.0 - hit[:, None, None], none[:, :1, 1:]],
+        [each * delay[:, None], -1.0 * each, (1.0 - each) * np.eye(E)],
+    ])  # fmt: skip
     late = xp.asarray(levels)[flow.event] * jumps.delay_by_level
     late = late[:, None] * xp.concatenate([jumps.slip, xp.ones((P, 1)), slot], axis=1)
     added = late[:, :, None] * late[:, None]
@@ -135,15 +142,12 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
 
     pieces = forward, _pad(collected, n), jump, added
     (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
-    M, last = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0), xp.eye(n)
+    M = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0)
     _, Z = loop(map, M[:d, :d], f)
-    if not (clocked or events):
-        delay = section_delay(map, f)[0][None]
-        last = _timing(np.eye(d)[None], delay, np.ones(1, bool), np.ones((1, 1), bool))[0]
     diffusion, to_end = Z @ Q[:d, :d] @ Z / period, flow.covectors(xp.eye(d))
     # (A state ahead of the cycle meets the next events earlier.)
     ahead = xp.concatenate([-f, xp.ones(1), xp.zeros(E)])
-    last = last + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
+    last = xp.eye(n) + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
     across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
     step, Q = last @ M, last @ Q @ last.T
     joint = _pad(_stationary(step[:d, :d], Q[:d, :d]), n)
@@ -168,17 +172,6 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
 def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:
     more = n - x.shape[-1]
     return namespace(x).pad(x, [(0, 0)] * (x.ndim - 2) + [(0, more), (0, more)])
-
-
-def _timing(by_state: Array, delay: Array, hit: Array, slot: Array) -> Float[Array, "P n n"]:
-    """Map states, the delay of the last event and durations before an event to those after it."""
-    xp, ((P, d), E) = namespace(delay), (delay.shape, slot.shape[1])
-    each = slot[..., None]
-    return xp.block([
-        [by_state, xp.zeros((P, d, 1 + E))],
-        [delay[:, None], 1.0 - hit[:, None, None], xp.zeros((P, 1, E))],
-        [each * delay[:, None], -1.0 * each, (1.0 - each) * np.eye(E)],
-    ])  # fmt: skip
 
 
 def _stationary(step: Float[Array, "d d"], noise: Float[Array, "d d"]) -> Float[Array, "d d"]:
