@@ -111,7 +111,8 @@ def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, np.ndarray, 
     values = chebyshev.chebvander(x, n - 1).T * (2 - (k == 0))[:, None] / n
     coarse, mix = middle + half * x, chebyshev.chebvander((f - middle) / half, n - 1) @ values
     # Their mean exponent, s = 1/2, is taken out: the others turn half as fast.
-    return f, coarse, mix * np.exp(1j * np.pi * (coarse - f[:, None]))
+    turn = lambda x: np.exp(1j * np.pi * x)  # noqa: E731
+    return f, coarse, mix * turn(coarse) * turn(-f)[:, None]
 
 
 @one_program

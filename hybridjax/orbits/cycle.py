@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers, Positive, SignalNames
 from .._core.boundary.values import Reals
-from .._core.executor import is_hidden, is_traced, to_host
+from .._core.executor import is_traced, to_host
 from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, unit_circle
 from .._core.meaning import code_digest
 from .._core.memo import Memory, remembered
@@ -41,7 +41,7 @@ from .sensitivity import Sensitivity, sensitivity
 
 
 Matrix = Float[np.ndarray, "_ _"]
-_trajectories, _maps = Memory(), Memory()
+_trajectories = Memory()
 
 # A piece of a turn is computed in factors of its own steps if its weakest direction keeps less than
 # this, and these are multiplied as long as their product keeps as much. Larger: more factors, for
@@ -92,11 +92,10 @@ class LimitCycle(eqx.Module):
     @property
     def return_map(self) -> ReturnMap:
         """The map that has the cycle as a fixed point."""
-        make = lambda: ReturnMap(  # noqa: E731
+        return ReturnMap(
             self.system, self.settings, self.anchor, self.base, self.period, self.conserved,
             self.multiplicity,
         )  # fmt: skip
-        return make() if is_hidden(self) else _maps.recall(self, None, make)
 
     def require_current(self) -> None:
         """**Raises:** `DefinitionError` if the system's code has changed since the cycle was
