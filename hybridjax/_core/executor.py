@@ -10,7 +10,7 @@ arrays themselves: functions come from their `namespace`, and those below do for
 import contextlib
 import contextvars
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
@@ -102,8 +102,9 @@ def while_loop(going: Callable, body: Callable, carry: Any) -> Any:
     return carry
 
 
-def scan(body: Callable, carry: Any, xs: Any) -> tuple[Any, Any]:
-    """`jax.lax.scan`."""
+def scan(body: Callable, carry: Any, xs: Any, fill: Callable | None = None) -> tuple[Any, Any]:
+    """`jax.lax.scan`. On the host, results may differ in length: `fill(result, length)` fills the
+    shorter ones up."""
     first = jax.tree_util.tree_leaves(xs)[0]
     if not on_host(first):
         return jax.lax.scan(body, carry, xs)
@@ -111,7 +112,13 @@ def scan(body: Callable, carry: Any, xs: Any) -> tuple[Any, Any]:
     for k in range(len(first)):
         carry, row = body(carry, jax.tree_util.tree_map(lambda x, k=k: x[k], xs))
         rows.append(row)
-    return carry, jax.tree_util.tree_map(lambda *x: np.stack(x), *rows)
+    return carry, jax.tree_util.tree_map(lambda *x: np.stack(_of_one_length(x, fill)), *rows)
+
+
+def _of_one_length(parts: Sequence[np.ndarray], fill: Callable | None) -> Sequence[np.ndarray]:
+    if fill is None or len({x.shape for x in parts}) == 1:
+        return parts
+    return [fill(x, max(map(len, parts))) for x in parts]
 
 
 def for_each_row(function: Callable, rows: Any) -> Any:
@@ -137,8 +144,9 @@ def svdvals(x: Any) -> Any:
     """`jnp.linalg.svd(x, compute_uv=False)`: NaN where x is not finite."""
     if not on_host(x):
         return jnp.linalg.svd(x, compute_uv=False)
-    finite = np.isfinite(x).all()
-    return np.linalg.svd(x, compute_uv=False) if finite else np.full(min(x.shape), np.nan)
+    finite = np.isfinite(x).all(axis=(-2, -1), keepdims=True)
+    values = np.linalg.svd(np.where(finite, x, 0.0), compute_uv=False)
+    return np.where(finite[..., 0], values, np.nan)
 
 
 def stop_gradient(x: Array) -> Array:

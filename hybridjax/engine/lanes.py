@@ -107,8 +107,10 @@ def needed(mask: Mask, tree):
 
 
 def side_by_side(tree):
-    """An axis of pieces of the flow of a single lane, as one of lanes."""
-    return jax.tree_util.tree_map(lambda x: namespace(x).moveaxis(x[..., 0], 0, -1), tree)
+    """An axis of pieces of the flow of lanes, joined with that of lanes, if there is one."""
+    join = lambda x: x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])  # noqa: E731
+    move = lambda x: join(namespace(x).moveaxis(x, 0, -2)) if x.ndim > 1 else x  # noqa: E731
+    return jax.tree_util.tree_map(move, tree)
 
 
 # Codes on a tape. Codes >= 0 are the transition that fires at the end of a move.
@@ -138,6 +140,12 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
     times, states = lambda: xp.zeros((rows, L)), lambda: xp.zeros((rows, d, L))
     code, chart = xp.full((rows, L), IDLE, xp.int32), xp.zeros((rows, L), xp.int32)
     return Tape(times(), code, times(), states(), states(), chart)
+
+
+def filled_up(x: np.ndarray, rows: int) -> np.ndarray:
+    """An array of a tape with so many rows, those that are added without moves."""
+    blank = IDLE if x.dtype.kind == "i" else 0
+    return np.concatenate([x, np.full((rows - len(x), *x.shape[1:]), blank, x.dtype)])
 
 
 def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:

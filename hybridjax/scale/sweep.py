@@ -1,7 +1,6 @@
 """Limit cycles over a space of parameters."""
 
 import dataclasses
-import functools as ft
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
@@ -13,7 +12,6 @@ from scipy.stats import qmc
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, FilePath
-from .._core.compilation import TwoTiers
 from .._core.execution import Execution
 from .._core.pieces.description import digest_of, versions
 from .._core.pieces.run import DaskClient, fill
@@ -22,10 +20,10 @@ from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..engine.settings import Settings
 from ..errors import ComputationError, DefinitionError
-from ..orbits.batches import Known, Tiles
+from ..orbits.batches import BATCH, SIDE_BY_SIDE, SMALL, Known, Tiles, tiles_of
 from ..orbits.cycle import LimitCycle, rough
 from ..orbits.find import find_limit_cycle
-from ..orbits.limit_cycles import BATCH, SMALL, LimitCycles, as_cycles, map_for_sweep
+from ..orbits.limit_cycles import LimitCycles, as_cycles, map_for_sweep
 from ..orbits.return_map import ReturnMap
 from ..systems.system import HybridSystem
 from .family import Axes, Family, Points, Space
@@ -100,7 +98,7 @@ def sweep(
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
     system = family.check(middle)
     wanted, total = Wanted(want, system), math.prod(space.shape)
-    most = chunk or (BATCH if wanted.measures else min(max(total // _PIECES, BATCH), _MOST))
+    most = chunk or (BATCH if wanted.measures else min(max(total // _PIECES, SIDE_BY_SIDE), _MOST))
     blocks = Blocks(space.shape, near_cube(space.shape, most))
     description = {
         "kind": "sweep",
@@ -206,12 +204,11 @@ class SweepJob:
 
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
         assert self.begun is not None
+        systems, total = self.family.systems(self.space.at(index)), math.prod(self.blocks.shape)
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
-        size, threads = min(BATCH, math.prod(self.blocks.block)), Execution(workers=workers).threads
-        # (Results of a piece do not depend on when it is computed.)
-        tiers = ft.partial(TwoTiers, large=math.prod(self.blocks.shape) > SMALL, steady=True)
-        systems = self.family.systems(self.space.at(index))
-        return Tiles(systems, self.begun.map, size, threads, ft.cache(tiers))
+        size = min(math.prod(self.blocks.block), BATCH if total > SMALL else SIDE_BY_SIDE)
+        threads = Execution(workers=workers).threads
+        return tiles_of(systems, self.begun.map, size, threads, total)
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""
