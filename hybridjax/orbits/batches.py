@@ -1,4 +1,5 @@
-"""Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
+"""Cycles of many systems, solved side by side, each from a guess of its own: in the lanes of the host,
+or, if there are many, in compiled calls of one size."""
 
 import dataclasses
 from collections.abc import Callable
@@ -168,7 +169,7 @@ class Tiles(NamedTuple):
 
         with working("cycles", S) as call:
             if self.known is None:
-                call.done, rows = 0, order[: self.size]
+                call.done, rows = 0, order[: min(self.size, WIDE)]
                 with uncollected():  # the programs are compiled during this call
                     out = self._newton(rows, *self._given(len(rows)), FEW_STEPS)
                     out = self._settle(rows, out)
@@ -176,7 +177,7 @@ class Tiles(NamedTuple):
                 out = None
             while (done := 0 if out is None else len(out.result)) < S:
                 call.done = done
-                more = slice(done, max(2 * done, self.size))
+                more = slice(done, max(4 * done, self.size))
                 rows = order[more]
                 rows = rows[_tree(parameters[rows]).indices]  # systems of one call are neighbors
                 order[more] = rows

@@ -127,7 +127,7 @@ def find_limit_cycles(
     """Find the limit cycles of many systems that differ in their parameters.
 
     Newton's method first finds the cycles of a few systems in parallel, from the guess. Each
-    further round doubles the number of solved systems, with the cycles of neighboring systems as
+    further round solves four times as many systems, with the cycles of neighboring systems as
     guesses. If Newton's method fails for a system, the system is simulated for 40 periods, and
     Newton's method starts again from the final state.
 
@@ -138,7 +138,8 @@ def find_limit_cycles(
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
     - `settings`: accuracy of the flow (Default: 1e-9 per step) and its `solver`.
-    - `execution`: systems per compiled call (`batch`, Default: 250) and threads (`workers`).
+    - `execution`: systems per call (`batch`, Default: 1024, and 250 in the compiled calls of more
+        than 8000 systems) and threads (`workers`).
 
     **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
     for those.

@@ -98,7 +98,8 @@ def sweep(
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
     system = family.check(middle)
     wanted, total = Wanted(want, system), math.prod(space.shape)
-    most = chunk or (BATCH if wanted.measures else min(max(total // _PIECES, SIDE_BY_SIDE), _MOST))
+    few = BATCH if wanted.measures or total > SMALL else _MOST
+    most = chunk or min(max(total // _PIECES, few), _MOST)
     blocks = Blocks(space.shape, near_cube(space.shape, most))
     description = {
         "kind": "sweep",

@@ -205,7 +205,7 @@ def test_programs_in_threads_factorize_nothing(wheel):
     repeat = lambda x: np.repeat(np.asarray(x)[None], 4, 0)  # noqa: E731
     start, period = jax.tree_util.tree_map(repeat, (wheel.anchor, wheel.period))
     arguments = systems, wheel.return_map, start, period, jnp.array(True)
-    text = eqx.filter_jit(batches._turn).lower(*arguments).lowered.as_text()
+    text = eqx.filter_jit(batches._turns).lower(*arguments).lowered.as_text()
     assert "@lapack_" not in text
 
 

@@ -67,7 +67,8 @@ def search(
             return end, None if tape is None else write_row(tape, state.i, row)
 
         end, written = while_loop(going, iterate, (begin, tape))
-        if written is not None and on_host(end.i):  # (copies of empty rows take time)
+        # (Copies of many empty rows take time. A single lane's tape has as many as XLA's.)
+        if written is not None and on_host(end.i) and s.by_system:
             written = Tape(*(x[: end.i] for x in written))
         result = update_result(end.result, end.active, Result.STEP_LIMIT)
         return Recorded(Moved(end.lanes, end.h, end.error, result), written)
