@@ -1,5 +1,5 @@
-"""Cycles of many systems, solved side by side, each from a guess of its own: in the lanes of the host,
-or, if there are many, in compiled calls of one size."""
+"""Cycles of many systems side by side, each from a guess of its own: in lanes of the host, or if there
+are many, in compiled calls of one size."""
 
 import dataclasses
 from collections.abc import Callable
