@@ -29,7 +29,6 @@ from jax.core import eval_context
 from ..errors import ComputationError
 from . import executor
 from .executor import from_host, is_hidden, on_cpu, on_the_cpu, to_host
-from .lanes import split_of
 from .progress import say_compiling
 from .vector_math import rewrite
 
@@ -359,8 +358,7 @@ def kernel(
     (XLA runs the smallest programs, of a thousand operations, in the thread that calls them, and
     hands larger ones to another thread, which takes longer than they do.)
     """
-    program, common, by_lane = _bound(function, form, static, trees, lanes)
-    return ft.partial(_run_lanes, program, common, lanes, *map(np.asarray, by_lane))
+    return ft.partial(_run_lanes, *_bound(function, form, static, trees, lanes), lanes)
 
 
 def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=None) -> np.ndarray:
@@ -387,7 +385,7 @@ def whole(function: Callable, static: tuple, trees: Any) -> Callable[..., Any]:
 
     In interactive sessions there is time between calls: the thread starts earlier.
     """
-    program, arrays, _ = _bound(function, ft.partial, static, trees, 1)
+    program, arrays = _bound(function, ft.partial, static, trees, 1)
 
     def compiled(*arguments):
         return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
@@ -413,30 +411,22 @@ _spent: dict[Callable, float] = {}
 _ready: set[Callable] = set()
 
 
-def _bound(function, form, static, trees, lanes) -> tuple[Callable, list, list]:
-    """The program of a kernel, and the arrays of its trees: common ones, and those of lanes."""
+def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:
+    """The program of a kernel, and the arrays of its trees."""
     leaves, structure = jax.tree_util.tree_flatten(trees)
     # (Arrays of an accelerator are copied once, by way of NumPy, and not in each call.)
     is_near = lambda x: isinstance(x, jax.Array) and getattr(x.device, "platform", "") == "cpu"  # noqa: E731
     arrays = [x if is_near(x) else jax.device_put(np.asarray(x)) for x in leaves if _is_array(x)]
     # (1, 1.0 and True are equal, and not the same.)
     static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
-    split = tuple(own for tree in trees for own in split_of(tree))
-    program = _kernel_program(function, form, static, structure, static_leaves, split, lanes)
-    parts = [
-        [x for x, own in zip(arrays, split, strict=True) if own is wanted]
-        for wanted in (False, True)
-    ]
-    return program, *parts
+    return _kernel_program(function, form, static, structure, static_leaves, lanes), arrays
 
 
 @ft.lru_cache(_KEPT)
-def _kernel_program(function, form, static, structure, static_leaves, split, lanes):
-    def run(common, *arguments):
-        by_lane, arguments = iter(arguments[: sum(split)]), arguments[sum(split) :]
-        common, owner = iter(common), iter(split)
-        take = lambda: next(by_lane if next(owner) else common)  # noqa: E731
-        leaves = [take() if x is None else x[1] for x in static_leaves]
+def _kernel_program(function, form, static, structure, static_leaves, lanes):
+    def run(arrays, *arguments):
+        arrays = iter(arrays)
+        leaves = [next(arrays) if x is None else x[1] for x in static_leaves]
         trees = jax.tree_util.tree_unflatten(structure, leaves)
         return form(ft.partial(function, *static), *trees)(*arguments)
 

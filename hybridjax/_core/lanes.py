@@ -37,34 +37,17 @@ class PerLane(eqx.Module):
         structure = jax.tree_util.tree_structure(eqx.filter(self.tree, eqx.is_array))
         return jax.tree_util.tree_unflatten(structure, [-1 if x else None for x in self.split])
 
-    def at(self, lane: Int[np.ndarray, " L"]) -> "PerLane":
-        """Return the parts of lanes of these indices, by way of the host."""
-        arrays, static = eqx.partition(self.tree, eqx.is_array)
-        leaves, structure = jax.tree_util.tree_flatten(arrays)
-        parts = [
-            np.asarray(x)[..., lane] if own else x
-            for x, own in zip(leaves, self.split, strict=True)
-        ]
-        arrays = jax.tree_util.tree_unflatten(structure, jax.device_put(parts))
-        return PerLane(eqx.combine(arrays, static), self.split)
-
 
 def shared(tree: Any) -> Any:
     """Return the tree itself, of a tree that may be marked as `PerLane`."""
     return tree.tree if isinstance(tree, PerLane) else tree
 
 
-def split_of(tree: Any) -> tuple[bool, ...]:
-    """Return which arrays of a tree have lanes, in the order of its leaves."""
-    arrays = jax.tree_util.tree_leaves(eqx.filter(shared(tree), eqx.is_array))
-    return tree.split if isinstance(tree, PerLane) else (False,) * len(arrays)
-
-
 def one_lane(tree: Any) -> Any:
     """Return the part of a tree that belongs to a single lane, with shapes in place of arrays."""
     arrays, static = eqx.partition(shared(tree), eqx.is_array)
     leaves, structure = jax.tree_util.tree_flatten(arrays)
-    split = split_of(tree)
+    split = tree.split if isinstance(tree, PerLane) else (False,) * len(leaves)
     shapes = [
         jax.ShapeDtypeStruct(x.shape[:-1] if s else x.shape, x.dtype)
         for x, s in zip(leaves, split, strict=True)
@@ -147,7 +130,7 @@ def _join(x, mapped: bool, by_lane: bool, size: int, L: int):
 
 def _join_common(tree, mapped, size: int, L: int):
     mapped = jax.tree_util.tree_leaves(mapped)
-    split = split_of(tree)
+    split = tree.split if isinstance(tree, PerLane) else (False,) * len(mapped)
     if not any(split) and not any(mapped):
         return tree
     arrays, static = eqx.partition(shared(tree), eqx.is_array)

@@ -1,5 +1,5 @@
-"""Cycles of many systems side by side, each from a guess of its own: in lanes of the host, or if there
-are many, in compiled calls of one size."""
+"""Cycles of many systems side by side, each from a guess of its own: in lanes of the host, or in
+compiled calls if there are many."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,11 +17,11 @@ from .._core.executor import on_the_cpu, to_host
 from .._core.lanes import PerLane
 from .._core.progress import working
 from .._core.results import Result
+from ..engine.kernels import WIDE
 from ..engine.lanes import Lanes
 from ..engine.move import move
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.target import toward, until
-from ..systems.structure import WIDE
 from ..systems.system import HybridSystem
 from .coincidence import together
 from .crossing import AtEvent, to_section

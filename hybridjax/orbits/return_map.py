@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import at_ease
 from .._core.executor import Array, namespace, on_host, put, scan, stop_gradient, svdvals
+from .._core.lanes import PerLane
 from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
@@ -126,7 +127,8 @@ class ReturnMap(eqx.Module):
 
     @remembered
     def structure(self) -> Structure:
-        return Structure(self.system)
+        systems = isinstance(self.system, PerLane)
+        return kernels.Systems(self.system) if systems else Structure(self.system)
 
     @property
     def scale(self) -> Float[Array, "A d"]:
@@ -251,8 +253,8 @@ class ReturnMap(eqx.Module):
             held = derivative_at_zero(lambda step: along(step).held(q)[0])
             jacobian = jnp.column_stack([jacobian, jnp.where(valid, total, 0.0) - held])
         if self.base is not None:
-            points = self.slopes(lanes).T, self.scale[lanes.chart]
-            factors = across(*(x.reshape(LEGS, *q.shape) for x in points), factors)
+            f, scale = self.slopes(lanes).T, self.scale[lanes.chart]
+            factors = across(f.reshape(LEGS, *q.shape), scale.reshape(LEGS, *q.shape), factors)
         defect = xp.abs(end.residual) + xp.abs(off)
         times, meetings = each(xp.moveaxis(tapes.t, -1, 0)), self._meetings(lanes, codes)
         legs = jax.tree_util.tree_map(lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs)

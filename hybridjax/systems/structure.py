@@ -9,7 +9,6 @@ Contacts that are written once and differ by an index are of one kind: of
 one.
 """
 
-import copy
 import dataclasses
 import functools as ft
 import operator
@@ -137,9 +136,6 @@ class ByName(dict):
 
 
 _kinds = Memory()
-# Lanes of programs of the host for systems side by side. More: the last call has more empty lanes.
-# Fewer: calls cost more than what they compute.
-WIDE = 256
 
 
 @jax.tree_util.register_pytree_node_class
@@ -226,24 +222,16 @@ class Structure:
     def kernel(self, function: Callable, form, *static: Hashable, trees=(), lanes=1) -> Callable:
         """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
         compiled (see `_core/compilation/kernel.py`)."""
-        source = self.source
-        is_own = isinstance(source, PerLane)
-        s = PerLane(Structure(source.tree), source.split) if is_own else self
-        make = lambda: kernel(function, form, static, (s, *trees), WIDE if is_own else lanes)  # noqa: E731
-        return self.once((function, form, static, lanes), trees, make)
+        name = function, form, static, lanes
+        every = self, *trees
+        return self.once(name, trees, lambda: kernel(function, form, static, every, lanes))
 
-    @property
-    def by_system(self) -> bool:
-        """Whether lanes have systems of their own."""
-        return isinstance(self.source, PerLane)
+    # Whether lanes of the host have systems of their own (see `engine.kernels.Systems`).
+    by_system = False
 
     def at(self, lane: Int[np.ndarray, " L"]) -> "Structure":
-        """The structure of lanes of these indices (on the host)."""
-        if not isinstance(self.source, PerLane):
-            return self
-        other = copy.copy(self)  # (with its charts and transitions)
-        other.source, other._made = self.source.at(lane), {}
-        return other
+        """The structure for lanes of these indices."""
+        return self
 
     def once(self, name: Hashable, trees: tuple, make: Callable[[], Any]) -> Any:
         """Return what was made under this name for these trees, made anew only for other trees."""
@@ -285,7 +273,7 @@ class Structure:
     def field(self, a: int, t: Array, q: Array, u: Array) -> jax.Array:
         return as_vector(self.charts[a].field(t, q, self.chart_input(a, t, u)))
 
-    @ft.cached_property
+    @property
     def kinds(self) -> list[Kind]:
         """The transitions, those of one kind together."""
 
