@@ -10,7 +10,7 @@ arrays themselves: functions come from their `namespace`, and those below do for
 import contextlib
 import contextvars
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
@@ -102,9 +102,8 @@ def while_loop(going: Callable, body: Callable, carry: Any) -> Any:
     return carry
 
 
-def scan(body: Callable, carry: Any, xs: Any, fill: Callable | None = None) -> tuple[Any, Any]:
-    """`jax.lax.scan`. On the host, results may differ in length: `fill(result, length)` fills the
-    shorter ones up."""
+def scan(body: Callable, carry: Any, xs: Any, stack: Callable = np.stack) -> tuple[Any, Any]:
+    """`jax.lax.scan`; on the host results are joined by `stack`."""
     first = jax.tree_util.tree_leaves(xs)[0]
     if not on_host(first):
         return jax.lax.scan(body, carry, xs)
@@ -112,13 +111,7 @@ def scan(body: Callable, carry: Any, xs: Any, fill: Callable | None = None) -> t
     for k in range(len(first)):
         carry, row = body(carry, jax.tree_util.tree_map(lambda x, k=k: x[k], xs))
         rows.append(row)
-    return carry, jax.tree_util.tree_map(lambda *x: np.stack(_of_one_length(x, fill)), *rows)
-
-
-def _of_one_length(parts: Sequence[np.ndarray], fill: Callable | None) -> Sequence[np.ndarray]:
-    if fill is None or len({x.shape for x in parts}) == 1:
-        return parts
-    return [fill(x, max(map(len, parts))) for x in parts]
+    return carry, jax.tree_util.tree_map(lambda *x: stack(x), *rows)
 
 
 def for_each_row(function: Callable, rows: Any) -> Any:

@@ -265,16 +265,15 @@ class _BySystem(NamedTuple):
     form: Callable
 
     def __call__(self, function: Callable, s: Structure, *trees: Any) -> Callable:
-        arrays, static = eqx.partition(s.source, eqx.is_array)
+        arrays, static = eqx.partition(s, eqx.is_array)
         leaves, structure = jax.tree_util.tree_flatten(arrays)
         ends = np.cumsum([x.size for x in leaves])[:-1]
 
         def lanes(numbers, *point):
             parts = zip(leaves, jnp.split(numbers, ends), strict=True)
             own = [y.reshape(*x.shape, -1).astype(x.dtype) for x, y in parts]
-            source = eqx.combine(jax.tree_util.tree_unflatten(structure, own), static)
-            systems = PerLane(Structure(source), (True,) * len(own))
-            return self.form(function, systems, *trees)(*point)
+            systems = eqx.combine(jax.tree_util.tree_unflatten(structure, own), static)
+            return self.form(function, PerLane(systems, (True,) * len(own)), *trees)(*point)
 
         return lanes
 

@@ -142,10 +142,13 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
     return Tape(times(), code, times(), states(), states(), chart)
 
 
-def filled_up(x: np.ndarray, rows: int) -> np.ndarray:
-    """An array of a tape with so many rows, those that are added without moves."""
-    blank = IDLE if x.dtype.kind == "i" else 0
-    return np.concatenate([x, np.full((rows - len(x), *x.shape[1:]), blank, x.dtype)])
+def stack_rows(parts: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Arrays of several tapes, the shorter ones with further rows without moves."""
+    rows, blank = max(map(len, parts)), IDLE if parts[0].dtype.kind == "i" else 0
+    out = np.full((len(parts), rows, *parts[0].shape[1:]), blank, parts[0].dtype)
+    for whole, part in zip(out, parts, strict=True):
+        whole[: len(part)] = part
+    return out
 
 
 def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:

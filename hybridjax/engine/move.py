@@ -15,7 +15,7 @@ from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
 from .arrays import Array, Index, Inputs, Times
-from .lanes import Lanes, Tape, filled_up, fixed
+from .lanes import Lanes, Tape, fixed, stack_rows
 from .replay import chain, replay
 from .search.search import initial_step, search
 from .search.state import Moved, Options, Recorded, Stride
@@ -105,7 +105,7 @@ def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
         carry = moved.lanes, stride._replace(h=moved.h), moved.result
         return carry, (lanes, moved, tape)
 
-    return scan(piece, begin, ends, filled_up)
+    return scan(piece, begin, ends, stack_rows)
 
 
 @eqx.filter_jit

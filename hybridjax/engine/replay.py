@@ -292,10 +292,10 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndar
         zero = flow.locate(*point, which[lands])
         t[lands] += zero.past
         q[:, lands] = zero.q
-        point = t[lands], q[:, lands], u[:, lands]
-        by_field = np.moveaxis(kernels.field(those, a, *point), -1, 0)
+        at = t[lands], q[:, lands], u[:, lands]
+        by_field = np.moveaxis(kernels.field(those, a, *at), -1, 0)
         f, (f_t, f_q, f_u) = by_field[:, :, :1], _split(by_field, n)
-        jac = kernels.watched(those, a, target.levels, *point, index[lands])
+        jac = kernels.watched(those, a, target.levels, *at, index=index[lands])
         row = np.argmax(np.array(flow.rows)[:, None] == which[lands], axis=0)
         by_t, by_q, by_u = _split(jac[row, :, np.arange(len(lands))][:, None], n)
         # (Over the time past: nothing but rounding errors, with derivatives.)

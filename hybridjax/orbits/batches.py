@@ -33,9 +33,8 @@ from .scale import ROUNDING
 # Largest number of systems whose turns are computed on the host. Larger: that takes longer than
 # compiling them. Smaller: compiling takes longer than they run.
 SMALL = 8000
-# Systems per compiled call, and per call on the host. More: their arrays leave the cache. Fewer:
-# calls cost more.
-BATCH, SIDE_BY_SIDE = 250, 1024
+# Systems per compiled call. More: their arrays leave the cache. Fewer: calls cost more.
+BATCH = 250
 # Periods for which a system is simulated before Newton's method tries again. Fewer: slow transients
 # remain. More: each failure takes longer.
 _SETTLE = 40
@@ -338,7 +337,7 @@ def tiles_of(
     if map.base is None:
         of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731
         periods = np.asarray(eqx.filter_vmap(of_one)(systems))
-    size = min(size or (BATCH if large else SIDE_BY_SIDE), total)
+    size = min(size or (BATCH if large else 4 * WIDE), total)
     program = TwoTiers(_turns, large=True) if large else None
     return Tiles(systems, to_host(map), periods, size, workers, program)
 

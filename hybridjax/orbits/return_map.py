@@ -127,8 +127,8 @@ class ReturnMap(eqx.Module):
 
     @remembered
     def structure(self) -> Structure:
-        systems = isinstance(self.system, PerLane)
-        return kernels.Systems(self.system) if systems else Structure(self.system)
+        system: Any = self.system  # (may have lanes on the host)
+        return (kernels.Systems if isinstance(system, PerLane) else Structure)(system)
 
     @property
     def scale(self) -> Float[Array, "A d"]:

@@ -20,7 +20,7 @@ from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..engine.settings import Settings
 from ..errors import ComputationError, DefinitionError
-from ..orbits.batches import BATCH, SIDE_BY_SIDE, SMALL, Known, Tiles, tiles_of
+from ..orbits.batches import BATCH, SMALL, Known, Tiles, tiles_of
 from ..orbits.cycle import LimitCycle, rough
 from ..orbits.find import find_limit_cycle
 from ..orbits.limit_cycles import LimitCycles, as_cycles, map_for_sweep
@@ -30,9 +30,9 @@ from .family import Axes, Family, Points, Space
 from .wanted import Measure, Want, Wanted
 
 
-# Points of a piece at most, and pieces of a large sweep at least. Smaller pieces: many small files,
-# and worse first guesses. Larger ones: more is lost with a worker.
-_MOST, _PIECES = 4000, 64
+# Pieces of a large sweep. More: many small files, and worse first guesses. Fewer: more is lost with
+# a worker.
+_PIECES = 64
 # Cycles of the coarse pass. Fewer: worse first guesses in each piece. More: it takes longer than
 # they save.
 _COARSE = 250
@@ -79,7 +79,8 @@ def sweep(
         always the same shape. NaN where they raise `ComputationError`. The code of the cycle's
         `Result` is always kept. Default: period and spectral radius.
     - `guess`: the cycle of a similar system. Default: that of the model in the middle.
-    - `chunk`: largest number of points in a piece. Default: up to 4000, with functions 250.
+    - `chunk`: largest number of points in a piece. Default: 4000, with functions 250;
+        more in sweeps of more than 64 such pieces without functions.
     - `store`: a folder, or an address for fsspec, of a Zarr group. Points that are in it already
         are not computed again: after an interruption, repeat the call.
     - `client`: a `distributed.Client`, whose workers compute the pieces.
@@ -98,8 +99,7 @@ def sweep(
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
     system = family.check(middle)
     wanted, total = Wanted(want, system), math.prod(space.shape)
-    few = BATCH if wanted.measures or total > SMALL else _MOST
-    most = chunk or min(max(total // _PIECES, few), _MOST)
+    most = chunk or (BATCH if wanted.measures else max(total // _PIECES, SMALL // 2))
     blocks = Blocks(space.shape, near_cube(space.shape, most))
     description = {
         "kind": "sweep",
@@ -207,7 +207,7 @@ class SweepJob:
         assert self.begun is not None
         systems, total = self.family.systems(self.space.at(index)), math.prod(self.blocks.shape)
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
-        size = min(math.prod(self.blocks.block), BATCH if total > SMALL else SIDE_BY_SIDE)
+        size = min(BATCH, math.prod(self.blocks.block)) if total > SMALL else None
         threads = Execution(workers=workers).threads
         return tiles_of(systems, self.begun.map, size, threads, total)
 
