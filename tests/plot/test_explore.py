@@ -30,7 +30,6 @@ def test_an_event_passes_the_phase_at_which_the_clock_begins():
     explorer = hj.explore(hj.models.VerticalHopper(), "k")
     explorer.move({"k": 14.4})  # (at 10 it is in flight, here in stance)
     assert explorer.message == "" and float(explorer.cycle.system.k) == 14.4
-    pyplot.close("all")
 
 
 def test_the_widget_sends_pictures():
