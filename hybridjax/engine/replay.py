@@ -171,7 +171,7 @@ def _products(moves: "Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndar
 
 class Variation:
     """Recorded lanes that follow each other, each beginning where the last one ended, and their
-    derivatives in P directions: landing of `s`, and of the `times` (P, L) of their targets. If not
+    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets. If not
     `twice`, their Jacobians have no derivatives."""
 
     def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times, twice):
