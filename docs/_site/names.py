@@ -24,7 +24,8 @@ def _special(word: str) -> bool:
 
 # Terms of the glossary, by their anchors.
 _TERMS = {
-    "chart": "charts?", "excited-line": "excited (?:lines?|frequenc(?:y|ies))", "isochron": "isochrons?",
+    "chart": "charts?", "isochron": "isochrons?",
+    "excited-line": "excited (?:lines?|frequenc(?:y|ies))",
     "htf": r"harmonic transfer functions?(?: \(HTFs?\))?|HTFs?", "ldtp": "LDTPs?(?: systems?)?",
     "limit-cycle": "limit cycles?", "multiplier": "(?:Floquet )?multipliers?",
     "section": "(?:Poincaré )?sections?", "return-map": "return maps?",

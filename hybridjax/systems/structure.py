@@ -226,6 +226,13 @@ class Structure:
         every = self, *trees
         return self.once(name, trees, lambda: kernel(function, form, static, every, lanes))
 
+    # Whether lanes of the host have systems of their own (see `engine.kernels.Systems`).
+    by_system = False
+
+    def at(self, lane: Int[np.ndarray, " L"]) -> "Structure":
+        """The structure for lanes of these indices."""
+        return self
+
     def once(self, name: Hashable, trees: tuple, make: Callable[[], Any]) -> Any:
         """Return what was made under this name for these trees, made anew only for other trees."""
         if name in self._made and all(map(operator.is_, self._made[name][1], trees)):
