@@ -160,6 +160,13 @@ def quick_jit(function: Callable) -> Callable:
     return call
 
 
+def one_program(function: Callable) -> Callable:
+    """A function that runs on the host, and where JAX traces its arguments, as one program (there,
+    single operations would be compiled one by one)."""
+    program = quick_jit(function)
+    return ft.wraps(function)(lambda *x: (program if is_hidden(x) else function)(*x))
+
+
 def host_first(function: Callable, derived: Callable = lambda compiled: compiled) -> Callable:
     """A function of few lanes, run on the host (see `executor.py`) while that is faster in total;
     compiled by `quick_jit` once the host has spent as much on arguments of the same kind as

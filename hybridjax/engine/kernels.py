@@ -24,7 +24,6 @@ from ..systems.solver import Method
 from ..systems.structure import Kind, Member, Structure, stacked
 from ..systems.system import Output
 from ..systems.transition import Scheduled
-from ..systems.varied import under
 from .arrays import AnyInputs as Inputs, AnyTimes as Times, Array, States
 from .runge_kutta import Step, step_along as _along, take_step
 from .target import AbstractLevels
@@ -144,7 +143,7 @@ def watched_at(
     """The guards of chart a, of these kinds, and the level of section i if the chart has one."""
     guards = s.guard_values(kinds, t, q, u)
     if levels is not None and levels.present(s, a):
-        guards = [*guards, levels.level(s, a, i, t, q)]
+        guards = [*guards, levels.level(s.under(u), a, i, t, q)]
     return stacked(guards)
 
 
@@ -161,7 +160,7 @@ def _outputs(a: int, s: Structure, items: Items, t, q, u):
 
 
 def _due(g: int, s: Structure, t, q, u):
-    guard = under(s, u).transitions[g].guard
+    guard = s.under(u).transitions[g].guard
     assert isinstance(guard, Scheduled)
     return jnp.stack([guard.nearest(t) - t])
 
@@ -209,7 +208,7 @@ class Tangents(Structure):
     def __init__(self, s: Structure, along: Structure, levels, by_levels, directions: int):
         super().__init__(s.source)
         self.directions, self._levels, self._plain = directions, levels, s
-        self._along = along, by_levels
+        self._along, self.nu = (along, by_levels), s.nu
 
     def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:
         """Inputs of zero, and the directions of lanes; of negative index, none."""
@@ -330,7 +329,9 @@ class _ByMethod(NamedTuple):
 
 
 def _step(method: Method, field: Callable, t, q, u, h, *x):
-    return jnp.stack(take_step(method, lambda t, q: field(t, q, u, h, *x), t, q, h))
+    at = lambda t, q: field(t, q, u, h, *x)  # noqa: E731
+    # (With directions x it is differentiated.)
+    return jnp.stack(take_step(method, at, t, q, h, still=at if x else None))
 
 
 def _step_along(method: Method, field: Callable, t, q, u, h, along):
