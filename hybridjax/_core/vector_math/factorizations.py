@@ -32,8 +32,8 @@ MOST_ROWS, UNROLLED_PIVOTED = 12, 7
 def solve_positive(
     matrix: Float[Array, "n n"], right: Float[Array, "*b n"]
 ) -> Float[Array, "*b n"]:
-    """Return x in `matrix @ x = right` for a symmetric positive definite matrix, of which the lower
-    triangle is read, by L D L^T, which is computed once for all right sides.
+    """Return x in `matrix @ x = right` for a symmetric positive definite matrix, by L D L^T, which
+    is computed once for all right sides and for derivatives.
 
     NaN where a pivot is not positive, up to rounding: the matrix is singular, or not definite.
     """
