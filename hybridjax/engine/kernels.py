@@ -270,9 +270,9 @@ class _BySystem(NamedTuple):
 
         def lanes(numbers, *point):
             parts = zip(leaves, jnp.split(numbers, ends), strict=True)
-            own = [y.reshape(*x.shape, -1).astype(x.dtype) for x, y in parts]
-            systems = eqx.combine(jax.tree_util.tree_unflatten(structure, own), static)
-            return self.form(function, PerLane(systems, (True,) * len(own)), *trees)(*point)
+            arrays = [y.reshape(*x.shape, -1).astype(x.dtype) for x, y in parts]
+            systems = eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static)
+            return self.form(function, PerLane(systems, (True,) * len(arrays)), *trees)(*point)
 
         return lanes
 

@@ -237,8 +237,8 @@ def linear_moves(s: Structure, moves: Moves, target: Target) -> tuple[np.ndarray
     end, by = (np.zeros((M, *x), target.time.dtype) for x in ((n,), (n, n + s.nu)))
     for a in np.unique(moves.chart):
         in_chart = np.flatnonzero(moves.chart == a)
-        here = Moves(*(x[..., in_chart] for x in moves))
-        end[in_chart], by[in_chart] = _linear(s.at(here.lane), int(a), here, target)
+        of_chart = Moves(*(x[..., in_chart] for x in moves))
+        end[in_chart], by[in_chart] = _linear(s.at(of_chart.lane), int(a), of_chart, target)
     return end, by
 
 
@@ -287,15 +287,15 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndar
     which = np.where(code == ARRIVE_LEVEL, len(s.transitions), np.where(by_clock, -1, code))
     lands = np.flatnonzero(which >= 0)
     if len(lands):
-        point, those = (t[lands], q[:, lands], f[:, lands]), s.at(lands)
-        flow = ChartFlow(those, a, u[:, lands], dataclasses.replace(target, index=index[lands]))
+        point, landing = (t[lands], q[:, lands], f[:, lands]), s.at(lands)
+        flow = ChartFlow(landing, a, u[:, lands], dataclasses.replace(target, index=index[lands]))
         zero = flow.locate(*point, which[lands])
         t[lands] += zero.past
         q[:, lands] = zero.q
         at = t[lands], q[:, lands], u[:, lands]
-        by_field = np.moveaxis(kernels.field(those, a, *at), -1, 0)
+        by_field = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
         f, (f_t, f_q, f_u) = by_field[:, :, :1], _split(by_field, n)
-        jac = kernels.watched(those, a, target.levels, *at, index=index[lands])
+        jac = kernels.watched(landing, a, target.levels, *at, index=index[lands])
         row = np.argmax(np.array(flow.rows)[:, None] == which[lands], axis=0)
         by_t, by_q, by_u = _split(jac[row, :, np.arange(len(lands))][:, None], n)
         # (Over the time past: nothing but rounding errors, with derivatives.)
