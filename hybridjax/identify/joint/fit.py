@@ -27,7 +27,13 @@ from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
-from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
+from ..periodic import (
+    LocalCoordinates,
+    PeriodicModel,
+    characteristic_slopes,
+    local_coordinates,
+    refined,
+)
 from ..series.records import PreparedRecords
 from ..series.residuals import about_answering, answering
 from ..series.subspace import answers_at_once, default_horizon, subspace_model
@@ -370,9 +376,8 @@ class ModelPoint(Point):
 
     def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
         self.problem, self.direct, self.model = problem, direct, model
-        if isinstance(problem, FrequencyProblem):  # of series, this costs as much as a step
-            with suppress(np.linalg.LinAlgError):  # a resonant model stays as it is
-                self.model = problem.refined(model, direct)
+        with suppress(np.linalg.LinAlgError):  # a resonant model stays as it is
+            self.model = refined(model, direct, problem.linearize)
         self.cost = problem.cost(self.model)
 
     @cached_property
