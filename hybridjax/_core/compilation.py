@@ -59,15 +59,15 @@ def enable_loop_kernels() -> None:
     XLA otherwise makes a function of every few operations in a loop, and calls one after the other
     in each iteration, which takes up to half of the time of an experiment. With whole loops,
     experiments run 1.3 to 1.5 times as fast; programs compile 1.1 to 2.4 times as long (figures:
-    docs/benchmarks.md). So it pays for long studies. Results are the same up to rounding. (The XLA
-    of JAX 0.12 compiles whole loops by default.)
+    docs/benchmarks.md). It is worthwhile for long studies. Results are the same up to rounding.
+    (The XLA of JAX 0.12 compiles whole loops by default.)
 
     Call it before JAX computes anything: XLA reads its options once. The option is set in the
     environment variable `XLA_FLAGS`, so it holds for all programs of JAX in this process and in
     those that it starts. On other devices than CPU it changes nothing.
 
     **Raises:** `ComputationError`, on CPU, if XLA has read its options already, or does not have
-    this one.
+    this option.
     """
     before = os.environ.get("XLA_FLAGS")
     os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*(before or "").split(), _LOOP_KERNELS]))

@@ -124,8 +124,8 @@ def identify_subjects(
     """Identify all subjects of a table, write a report for each, and one for all of them.
 
     Rows with the same subject, group and condition are trials of one recording. A subject that
-    fails is named and does not stop the others. A later call goes on where an earlier one ended:
-    reports are kept unless files, options or the version have changed.
+    fails is named and does not stop the others. A later call continues an interrupted one: reports
+    are kept unless files, options or the version have changed.
 
     Files in `folder`: `SUBJECT-GROUP-CONDITION/` with the files of `hj.write_report`;
     `subjects.csv`, a row for each report; `population.csv`, means and differences;
@@ -134,14 +134,15 @@ def identify_subjects(
     **Arguments:**
 
     - `table`: CSV file with the columns `file` (relative to the table) and `subject`; `condition`
-      and `group`, if there are any; other columns (age, speed) are handed on.
+      and `group`, if there are any; other columns (age, speed) are kept in
+      `Study.population.table`.
     - `identify`: function from a `Recording` to the result of `identify_recording`, e.g.
       `functools.partial(hj.identify_recording, phase=..., inputs=..., outputs=...)`.
     - `time`: name of the column with the times. Default: "time". `signals`: names of the signals
       to be read. Default: all.
-    - `formats` of the figures. Default: PNG.
+    - `formats`: formats of the figures. Default: PNG.
     - `client`: a client of Dask, or an executor of `concurrent.futures`, whose processes do the
-      work and see the same files. Default: this process.
+      work and can read the same files. Default: this process.
 
     **Raises:** `DefinitionError` for a table without these columns or rows, a subject in two
     groups, a folder that cannot be written, and if pandas is not installed; `ComputationError` if

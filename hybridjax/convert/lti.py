@@ -143,9 +143,9 @@ def to_harmonic_state_space(
 
     **Arguments:**
 
-    - `order`: the largest harmonic. Default: the first of 2, 4, ..., 64 whose `error` beside
-        `cycle.htf` is below `tolerance` (Default: 1e-6).
-    - `outputs`, `inputs`: as of `LimitCycle.htf`.
+    - `order`: the largest harmonic. Default: the first of 2, 4, ..., 64 whose `error`, compared
+      with `cycle.htf`, is below `tolerance` (default: 1e-6).
+    - `outputs`, `inputs`: as in `LimitCycle.htf`.
 
     **Raises:** `DefinitionError` for cycles with events at which deviations jump;
     `ComputationError` if no order is large enough.
@@ -176,7 +176,7 @@ def to_harmonic_state_space(
         if order or space.error < tolerance:
             return space
         if n == _MOST:
-            raise ComputationError(f"the error is {space.error:.1e} at order {n}: give an `order`.")
+            raise ComputationError(f"order {n} has the error {space.error:.1e}: set `order`.")
         n *= 2
 
 

@@ -56,16 +56,15 @@ class Settings(eqx.Module):
     atol: Float[Array, ""] | None
     """Error of a step relative to each state's `scale`."""
     max_steps: int = eqx.field(static=True)
-    """Bound on the number of iterations (steps, tried or taken) of one piece of flow. Where the
-    default, 256, ends a search for a limit cycle, it is repeated with 4096."""
+    """Largest number of steps, accepted or rejected, in one piece of flow. If
+    the default, 256, ends a search for a limit cycle, the search is repeated with 4096."""
     scale: Float[Array, "A d"] | None
-    """Characteristic magnitudes of states, by chart, padded to the dimension of the largest with
-    any positive numbers. `None`: magnitudes are taken from each step (see `tolerance`), which is
-    not enough for derivatives."""
+    """Characteristic magnitudes of states, by chart, padded with positive numbers to the largest
+    dimension. `None`: magnitudes in the current step, which do not suffice for derivatives."""
     solver: Any = eqx.field(static=True)
-    """Solver of the charts in place of that of the system: a Runge-Kutta method of diffrax with an
-    error estimate, `hj.Radau()`, or several of them by the names of charts; or "auto", for
-    `find_limit_cycle`: an implicit one where the cycle is stiff."""
+    """Method for the charts, which overrides that of the system: a Runge-Kutta method of diffrax
+    with an error estimate, `hj.Radau()`, a mapping from names of charts to methods, or "auto" (in
+    `find_limit_cycle`), an implicit method in charts that are stiff on the cycle."""
 
     def __repr__(self):
         return fields(self)

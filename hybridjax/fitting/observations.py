@@ -93,8 +93,8 @@ class ObservedHTF(AbstractObservation):
     output's HTFs over all inputs. In the second case, choose units in which the inputs have effects
     of similar magnitude.
 
-    With `delay` inputs act later, and outputs are measured later; `fit_model` fits those of its
-    two entries that `free` names, "input_delay" and "output_delay".
+    With `delay`, a pair, inputs act later, and outputs are measured later. `fit_model` fits these
+    delays if `free` contains "input_delay" or "output_delay".
     """
 
     f: Float[Array, " F"]

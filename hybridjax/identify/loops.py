@@ -68,7 +68,7 @@ def loop(
     r, d = at_input or (), at_output or ()
     if not (r or d):
         raise DefinitionError(
-            "a loop is told apart by references: name those that enter at the plant's input "
+            "`loop` needs references: name those that enter at the plant's input "
             "(`at_input`), at its output (`at_output`), or both."
         )
     roles = Roles.of(data.inputs, (*r, *d), fewest=0)

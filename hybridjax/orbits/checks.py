@@ -61,7 +61,7 @@ def check_clock(s: Structure) -> None:
             if not abs(ratio - round(min(ratio, 1e9))) < SAME:
                 raise DefinitionError(
                     f"the schedule of '{transition.name}' must divide the clock's period, which is "
-                    f"{period}: otherwise no turn is like the last one."
+                    f"{period}: otherwise events do not repeat in each period."
                 )
     for a, chart in enumerate(s.names):
         times: dict[str, np.ndarray] = {}

@@ -65,7 +65,7 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
 
     If the orders of a group commute, `find_limit_cycle`, sweeps and `continuation` treat the cycle
     as ok; otherwise its result is `Result.COINCIDENCE` (`find_limit_cycle` returns it with
-    `throw=False`). A group may contain scheduled events, but not only these.
+    `throw=False`). A group contains at least one event that is not scheduled.
     """
     cycle = to_host(cycle)
     s, period, path, groups = cycle.structure, float(cycle.period), cycle.trajectory(2.0), []

@@ -181,7 +181,7 @@ def continuation(
     - `parameter`: the name of a parameter of the system, or of a part of the system with dots, such
         as `"leg.k"`.
     - `values`: two or more numbers, ascending or descending. The branch ends at the first and the
-        last. It has a cycle at each value, every time that it passes the value, and others in
+        last. It contains a cycle wherever it passes one of the values, and further cycles in
         between.
     - `step`: the longest step, as a fraction of the range of values and of the magnitudes of the
         states. Default: 0.05.
@@ -192,7 +192,7 @@ def continuation(
     equilibrium in place of a cycle).
 
     **Raises:** `DefinitionError` for a parameter that does not exist, values without order, or a
-    cycle that was not found or lies outside of them.
+    cycle that was not found or lies outside of the values.
     """
     values = _check(cycle, values)
     curve = Curve(cycle, parameter, float(np.ptp(values)))

@@ -70,7 +70,7 @@ class Fluctuations(eqx.Module):
         **Raises:** `ComputationError` if an implicit method steps over fast decays.
         """
         if on_host(self.period) and self.unresolved > SINGULAR:
-            raise ComputationError("steps pass over decays: use an explicit method or `durations`.")
+            raise ComputationError("steps skip fast decays: use an explicit method or `durations`.")
         C, d = self.at_nodes, self.at_nodes.shape[-1]
         if lag:
             turns = namespace(C).linalg.matrix_power(self.step[:d, :d], lag - 1)

@@ -49,7 +49,7 @@ class MuJoCoPlant(_Made):
         step. It may read `data.time` if `period` is given, and keeps memory in
         `data.userdata` only. An error that it raises (a fall) ends an experiment. Default: zero.
     - `period`: period of the clock in seconds. Default: no clock.
-    - `substeps`: number of time steps between two looks at the signals. Default: 1.
+    - `substeps`: number of time steps between two readings of the signals. Default: 1.
 
     **Raises:** `DefinitionError` for other models, and for unknown actuators.
     """
@@ -106,7 +106,7 @@ class MuJoCoPlant(_Made):
         return dict(zip(self._names, np.concatenate(values).tolist(), strict=True))
 
     def get_state(self) -> np.ndarray:
-        """Return `states`, and then all else that MuJoCo continues from."""
+        """Return `states`, then all other numbers from which MuJoCo continues."""
         x = np.empty(self._mujoco.mj_stateSize(self.model, self._kept))
         self._mujoco.mj_getState(self.model, self.data, x, self._kept)
         return x

@@ -396,7 +396,7 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
         drive.restore(drive.start)
         change = np.abs(np.array([x.z for x in turn()[1]]) - [x.z for x in at])
         if (change[:, list(drive.columns)] > 1e-6 * size).any():
-            raise DefinitionError("`set_state` does not continue as before: save more.")
+            raise DefinitionError("`set_state` does not continue as before: save all of the state.")
     names, units = [drive.names[c] for c in drive.columns], getattr(plant, "units", {})
     outputs = signals(names, [units.get(name, "") for name in names])
     about = plant, family, Names(units=True, empty=True).take(plant.inputs), outputs
@@ -428,7 +428,7 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     began = phase.turns
     while abs(phase.turns - began) < turns:
         if drive.t > drive.longest:
-            raise ComputationError(f"{pair} do not circle around {center}")
+            raise ComputationError(f"{pair} do not circle around {center}: set `center`")
         drive.step(drive.zero, drive.dt)
         phase.level(0, drive.t, drive.z)
     phase.sense = float(np.sign(phase.turns - began))

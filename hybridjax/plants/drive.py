@@ -24,7 +24,7 @@ from ..errors import ComputationError, DefinitionError
 
 @runtime_checkable
 class Plant(Protocol):
-    """A simulator that can be reset and stepped. Nothing of JAX is needed.
+    """A simulator that can be reset and stepped. It does not need JAX.
 
     **Fields:**
 
@@ -43,7 +43,7 @@ class Plant(Protocol):
 
     - `get_state()` and `set_state(x)`: the state, from which the plant continues exactly. For
       `perturbed_returns` it is an array of numbers, which can be changed by small amounts.
-    - `states`: names of these numbers. `time` is the clock's.
+    - `states`: names of these numbers. `time` is the time of the clock.
     - `period`: period of the clock, on which the plant depends.
     - `fixed_step`: True if a step always lasts `dt`. Otherwise steps end on clock sections, and on
       others if the state can be set.

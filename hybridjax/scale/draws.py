@@ -49,9 +49,9 @@ def monte_carlo(
 
     **Arguments:**
 
-    - `function` of a `numpy.random.Generator`: returns a number, an array, or a mapping of names to
-        numbers and arrays, with the same names and shapes in every draw. A draw that raises
-        `ComputationError` is NaN.
+    - `function`: takes a `numpy.random.Generator`, and returns a number, an array, or a mapping of
+        names to numbers and arrays, with the same names and shapes in every draw. A draw that
+        raises `ComputationError` is NaN.
     - `draws`: number of draws. `seed`: seed of all draws. Default: 0.
     - `chunk`: number of draws in a piece. Default: a 256th of all.
     - `store`, `client`: as for `sweep`.

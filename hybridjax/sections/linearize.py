@@ -59,10 +59,10 @@ def linearize(
     - `sections`: a family or `PlacedSections`.
     - `outputs`: names or `Output`s. Default: all states that every chart defines.
     - `inputs`: names. Default: all.
-    - `delay`: (of the inputs, of the outputs), in the unit of time, for `ClockPhase` sections: the
-      input of section n acts from so much later on, and the outputs at section n are those that the
-      system had so much earlier. The coordinates are those at that earlier time, then the inputs
-      that still act or wait. Default: none.
+    - `delay`: pair of delays, of the inputs and of the outputs, in the unit of time, for
+      `ClockPhase` sections. The input of section n begins to act one delay later; the outputs at
+      section n are those of one delay earlier. Coordinates are the states at that earlier time,
+      then past inputs whose effect has not ended. Default: none.
 
     **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
     lies, or uses the time without having the period of a clock, or an input that does not exist,

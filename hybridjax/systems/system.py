@@ -36,7 +36,7 @@ class Output(Definition):
     - `function`: one function (t, q, u) -> number for all charts, or a mapping from chart names to
         such functions. If the output is needed in a chart that is not in the mapping, an error is
         raised.
-    - `unit`: its unit, for figures and prints.
+    - `unit`: its unit, for figures and printed summaries.
     """
 
     name: str = eqx.field(static=True)
@@ -58,11 +58,11 @@ Parameter = Float[Array, ""] | float
 def parameter(default: float | None = None, *, doc: str = "", unit: str = "") -> Any:
     """A physical parameter: a field of a `HybridSystem` that is stored as a floating-point array.
 
-    An array is differentiable and may change its value without recompilation; a Python float
-    would be neither. Declare it as `k: hj.Parameter = hj.parameter(10.0, unit="N/m")`.
+    An array is differentiable, and another value does not cause recompilation; a Python float has
+    neither property. Declare it as `k: hj.Parameter = hj.parameter(10.0, unit="N/m")`.
 
     **Arguments:** `default`, a number (without it, the constructor needs one); `doc`, what it is;
-    `unit`, in words.
+    `unit`, as text.
     """
     metadata = {"doc": doc, "unit": unit}
     options: dict[str, Any] = {} if default is None else {"default": default}

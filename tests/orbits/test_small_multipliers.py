@@ -18,6 +18,12 @@ def decaying(rates):
     return toy({"a": Field(("x", "y", "z"), field)}, period=1.0)
 
 
+def test_a_small_multiplier_of_an_autonomous_cycle():
+    """exp(-2 mu T) from steps between which the direction of the flow turns."""
+    cycle = hj.find_limit_cycle(hj.models.HopfOscillator(mu=40.0))
+    assert cycle.log_multipliers == pytest.approx([-80.0], rel=1e-11)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "rates, sections",

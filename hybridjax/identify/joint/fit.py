@@ -160,8 +160,8 @@ class LDTPFit(MultiplierEstimate):
         """
         if self.noise is None:
             raise DefinitionError(
-                "no noise was fitted: HTFs tell its variance at their own lines only "
-                "(`HTF.variance`); fit to series."
+                "no noise was fitted, because HTFs give its variance at their lines only "
+                "(`HTF.variance`): fit time series."
             )
         return noise_spectrum(self.noise, np.atleast_1d(np.asarray(f, float)), harmonics)
 
