@@ -1,6 +1,6 @@
 r"""Periodic models on the host: matrices without padding, in local coordinates.
 
-Predictions of y are linear in $B - K D$, K and D, given $F = A - K C$ and C. The coordinates of each
+Predictions are linear in $B - K D$, K and D, given $F = A - K C$ and C. The coordinates of each
 x[n] are free. They are fixed by the output-normal form
 
 $$\rho^2 F[n]^T F[n] + C[n]^T C[n] = I,$$
@@ -175,7 +175,7 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
 def refined(
     model: PeriodicModel, direct: bool, linearize: Callable[[LocalCoordinates], NormalEquations]
 ) -> PeriodicModel:
-    """Return the model with the best B, K and D (if free), in which predictions and HTFs are linear.
+    """Return the model with the best B, K and D (if free): predictions and HTFs are linear in them.
 
     **Raises:** `LinAlgError` for a model that is resonant or overflows.
     """
