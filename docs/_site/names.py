@@ -24,11 +24,15 @@ def _special(word: str) -> bool:
 
 # Terms of the glossary, by their anchors.
 _TERMS = {
-    "chart": "charts?", "excited-line": "excited (?:line|frequenc)s?", "isochron": "isochrons?",
+    "chart": "charts?", "isochron": "isochrons?",
+    "excited-line": "excited (?:lines?|frequenc(?:y|ies))",
     "htf": r"harmonic transfer functions?(?: \(HTFs?\))?|HTFs?", "ldtp": "LDTPs?(?: systems?)?",
     "limit-cycle": "limit cycles?", "multiplier": "(?:Floquet )?multipliers?",
     "section": "(?:Poincaré )?sections?", "return-map": "return maps?",
     "saltation": "saltation matri(?:x|ces)",
+    "autonomous": "autonomous systems?", "coverage": "coverage", "cramer-rao": "Cramér-Rao bounds?",
+    "distortion": "(?:nonlinear )?distortion", "realization": "realizations?",
+    "phase-response": "phase responses?(?: curves?)?",
 }  # fmt: skip
 # Where no link may begin: in code, equations, headings, tables, HTML and other links.
 _OTHER = r"```.*?^```|`[^`]*`|\$[^$]*\$|^[#|<!].*?$|\[[^\]]*\](?:\([^)]*\))?|^ {4}.*?$"

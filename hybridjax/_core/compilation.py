@@ -58,7 +58,7 @@ def enable_loop_kernels() -> None:
 
     XLA otherwise makes a function of every few operations in a loop, and calls one after the other
     in each iteration, which takes up to half of the time of an experiment. With whole loops,
-    experiments run 1.3 to 1.5 times as fast; programs compile 1.1 to 2.4 times as long (figures:
+    experiments run 1.5 to 1.7 times as fast; programs compile 1.1 to 4 times as long (figures:
     docs/benchmarks.md). It is worthwhile for long studies. Results are the same up to rounding.
     (The XLA of JAX 0.12 compiles whole loops by default.)
 

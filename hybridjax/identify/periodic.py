@@ -90,6 +90,18 @@ class PeriodicModel(NamedTuple):
             product = self.A[(first + k) % self.n_sections] @ product
         return product
 
+    def refined(
+        self, direct: bool, linearize: Callable[["LocalCoordinates"], NormalEquations]
+    ) -> "PeriodicModel":
+        """Return the model with the best B, K and D (if free): predictions and HTFs are linear in
+        them.
+
+        **Raises:** `LinAlgError` for a model that is resonant or overflows.
+        """
+        to_A, to_C = ([np.zeros((len(x), 0)) for x in blocks] for blocks in (self.A, self.C))
+        coordinates = LocalCoordinates(self, to_A, to_C, direct)
+        return coordinates.moved(linearize(coordinates).step(0.0)[0])
+
 
 class LocalCoordinates(NamedTuple):
     """Directions in which a model can change: Y in F and C, and the entries of B - K D, K and D."""
@@ -170,18 +182,6 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
         to_C.append(left[len(F) :])
         to_A.append(left[: len(F)] / rho + K @ to_C[-1])
     return LocalCoordinates(model, to_A, to_C, direct)
-
-
-def refined(
-    model: PeriodicModel, direct: bool, linearize: Callable[[LocalCoordinates], NormalEquations]
-) -> PeriodicModel:
-    """Return the model with the best B, K and D (if free): predictions and HTFs are linear in them.
-
-    **Raises:** `LinAlgError` for a model that is resonant or overflows.
-    """
-    to_A, to_C = ([np.zeros((len(x), 0)) for x in blocks] for blocks in (model.A, model.C))
-    coordinates = LocalCoordinates(model, to_A, to_C, direct)
-    return coordinates.moved(linearize(coordinates).step(0.0)[0])
 
 
 def _gramians(model: PeriodicModel, rho: float) -> Blocks:

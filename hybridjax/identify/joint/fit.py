@@ -27,13 +27,7 @@ from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
-from ..periodic import (
-    LocalCoordinates,
-    PeriodicModel,
-    characteristic_slopes,
-    local_coordinates,
-    refined,
-)
+from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from ..series.records import PreparedRecords
 from ..series.residuals import about_answering, answering
 from ..series.subspace import answers_at_once, default_horizon, subspace_model
@@ -377,7 +371,7 @@ class ModelPoint(Point):
     def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
         self.problem, self.direct, self.model = problem, direct, model
         with suppress(np.linalg.LinAlgError):  # a resonant model stays as it is
-            self.model = refined(model, direct, problem.linearize)
+            self.model = model.refined(direct, problem.linearize)
         self.cost = problem.cost(self.model)
 
     @cached_property

@@ -15,7 +15,7 @@ from ...linear.frequency_response import all_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..descent import ROUNDING
-from ..periodic import PeriodicModel, refined
+from ..periodic import PeriodicModel
 from ..series.fit import SeriesFit
 from ..series.subspace import default_horizon
 from ..weights import SMALLEST_ERROR
@@ -182,7 +182,7 @@ def _from_htf(htf: HTF, dims: Any, order: int) -> LDTP:
         f, tuple(m.tolist()), H / unit, np.broadcast_to(weight * unit, H.shape)
     )
     for _ in range(2):  # the second time removes rounding errors
-        model = refined(model, True, problem.linearize)
+        model = model.refined(True, problem.linearize)
     return model.to_ldtp(scale, htf.inputs, htf.outputs)
 
 
