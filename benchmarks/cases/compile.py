@@ -14,7 +14,9 @@ the hopper's).
 parameters, in reverse mode and outside of `jit`, and a fit of two parameters to HTFs; `again`: the
 second of each. `responses`: the first `cycle.responses()` of the hopper and of a neuron, and the
 hopper's `cycle.htf` at 620 frequencies again. `cycles`: `find_limit_cycles` of 50 x 50 hoppers;
-`sweep`: `hj.sweep` of the same; `branch`: README's continuation; each a second time.
+`sweep`: `hj.sweep` of the same; `branch`: README's continuation; each a second time. `walkers`: a
+cycle of the hopper and of the five-link biped, and 80 experiments on a kneed walker (32 cycles, 16
+sections, steady start), each a second time.
 
 The same in seconds of the processor (`cpu`), and as multiples of a yardstick that is measured
 beside them, `diffeqsolve.cpu`: the first call, in a fresh process, of `diffrax.diffeqsolve` for the
@@ -59,7 +61,7 @@ def run(show, options) -> None:
                 hopper = seconds[label.removeprefix("bar."), state, what]
                 show(f"{label}.{state}.{what}.times_hopper", value / hopper)
 
-    for job in ("derivatives", "responses", "cycles", "sweep", "branch"):
+    for job in ("derivatives", "responses", "cycles", "sweep", "branch", "walkers"):
         for name, value in call("compile", job).items():
             show(f"{job}.{name}.cpu", value)
             show(f"{job}.{name}.times_diffeqsolve", value / yardstick)
@@ -183,6 +185,24 @@ def branch() -> dict[str, float]:
     return twice(continuation=lambda: hj.continuation(buck, "Vin", (20.0, 26.0)))
 
 
+def walkers() -> dict[str, float]:
+    """CPU seconds of cycles of the hopper and the biped, and of experiments on a kneed walker."""
+    import hybridjax as hj
+
+    from .kneed import KneedWalker
+
+    hj.enable_x64()
+    cycle = hj.find_limit_cycle(KneedWalker())
+    angles = [hj.Crossing("stance", "rising", x) for x in np.linspace(-0.15, 0.25, 15)]
+    placed = hj.place_sections(cycle, [hj.AtEvent("heelstrike"), *angles])
+    u = 1e-3 * np.random.default_rng(0).standard_normal((80, 32 * 16, 1))
+    return twice(
+        hopper=lambda: hj.find_limit_cycle(hj.models.VerticalHopper()),
+        biped=lambda: hj.find_limit_cycle(hj.models.FiveLinkBiped()),
+        kneed=lambda: hj.run_experiments(cycle, placed, u, "stance", start="steady"),
+    )
+
+
 def responses() -> dict[str, float]:
     """CPU seconds of first responses, after the cycle was found, and of HTFs again."""
     import hybridjax as hj
@@ -276,7 +296,9 @@ def main(model: str, family: str, folder: str | None) -> None:
 
 
 if __name__ == "__main__":
-    jobs = {x.__name__: x for x in (diffeqsolve, derivatives, responses, cycles, sweep, branch)}
+    jobs = {
+        x.__name__: x for x in (diffeqsolve, derivatives, responses, cycles, sweep, branch, walkers)
+    }
     if sys.argv[1] in jobs:
         print(json.dumps(jobs[sys.argv[1]]()))
     else:

@@ -2,7 +2,7 @@
 
 - `quick_jit` compiles with few optimizations: for functions that run a few times.
 - `host_first` runs a function on the host until compiling it is worth its time.
-- `TwoTiers` compiles experiments and sweeps twice: a quick executable for the first answer, and the
+- `TwoTiers` compiles experiments twice: a quick executable for the first answer, and the
   fully optimized one in a thread beside it.
 - `kernel` compiles single functions of users for code that runs on the host; `whole` programs that
   do more at once, when the host has spent as much time.
@@ -160,6 +160,13 @@ def quick_jit(function: Callable) -> Callable:
     return call
 
 
+def one_program(function: Callable) -> Callable:
+    """A function that runs on the host, and where JAX traces its arguments, as one program (there,
+    single operations would be compiled one by one)."""
+    program = quick_jit(function)
+    return ft.wraps(function)(lambda *x: (program if is_hidden(x) else function)(*x))
+
+
 def host_first(function: Callable, derived: Callable = lambda compiled: compiled) -> Callable:
     """A function of few lanes, run on the host (see `executor.py`) while that is faster in total;
     compiled by `quick_jit` once the host has spent as much on arguments of the same kind as
@@ -221,12 +228,11 @@ class TwoTiers:
     A job that is `large` waits for the fully optimized executable, so its results do not depend on
     time. Another job uses it if it is there, and else the one that compiles in a third of the time.
     A thread compiles the optimized one for later jobs: in Jupyter and other interactive sessions
-    after the first use, in scripts after `_WORTH_OPTIMIZING` seconds of use. If `steady`, jobs that
-    are not large always use the other one.
+    after the first use, in scripts after `_WORTH_OPTIMIZING` seconds of use.
     """
 
-    def __init__(self, function: Callable, large: bool, steady: bool = False):
-        self._function, self.large, self._steady = function, large, steady
+    def __init__(self, function: Callable, large: bool):
+        self._function, self.large = function, large
         self._chosen: dict[tuple, tuple[_Program, jax.stages.Compiled]] = {}
 
     def __call__(self, *arguments: Any) -> Any:
@@ -245,10 +251,10 @@ class TwoTiers:
                 if key not in self._chosen:  # by another thread in the meantime
                     say_compiling(True)
                     program = _lowered(key, run, leaves)
-                    self._chosen[key] = program, program.choose(self.large, self._steady)
+                    self._chosen[key] = program, program.choose(self.large)
                     say_compiling(False)
         program, executable = self._chosen[key]
-        return program.run(executable, leaves, self._steady)
+        return program.run(executable, leaves)
 
 
 _choosing = threading.Lock()
@@ -287,10 +293,10 @@ class _Program:
         self._seconds, self._lock = 0.0, threading.Lock()
         self._thread: threading.Thread | None = None
 
-    def choose(self, large: bool, steady: bool) -> jax.stages.Compiled:
+    def choose(self, large: bool) -> jax.stages.Compiled:
         if large and self._thread is not None:
             self._thread.join()
-        if large or (self._full is not None and not steady):
+        if large or self._full is not None:
             return self._optimize()
         if self._quick is None:
             self._quick = self._lowered.compile(compiler_options=compiler_options())
@@ -300,11 +306,11 @@ class _Program:
         self._full = self._full or self._lowered.compile()
         return self._full
 
-    def run(self, executable: jax.stages.Compiled, leaves: list, steady: bool) -> Any:
+    def run(self, executable: jax.stages.Compiled, leaves: list) -> Any:
         begin = time.perf_counter()
         with in_turn(self._alone):
             results = jax.block_until_ready(executable(leaves))
-        if executable is self._quick and self._thread is None and not steady:
+        if executable is self._quick and self._thread is None:
             with self._lock:
                 self._seconds += time.perf_counter() - begin
                 # (`ps1`, the prompt, exists in interactive sessions only.)

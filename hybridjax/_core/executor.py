@@ -102,8 +102,8 @@ def while_loop(going: Callable, body: Callable, carry: Any) -> Any:
     return carry
 
 
-def scan(body: Callable, carry: Any, xs: Any) -> tuple[Any, Any]:
-    """`jax.lax.scan`."""
+def scan(body: Callable, carry: Any, xs: Any, stack: Callable = np.stack) -> tuple[Any, Any]:
+    """`jax.lax.scan`; on the host results are joined by `stack`."""
     first = jax.tree_util.tree_leaves(xs)[0]
     if not on_host(first):
         return jax.lax.scan(body, carry, xs)
@@ -111,7 +111,7 @@ def scan(body: Callable, carry: Any, xs: Any) -> tuple[Any, Any]:
     for k in range(len(first)):
         carry, row = body(carry, jax.tree_util.tree_map(lambda x, k=k: x[k], xs))
         rows.append(row)
-    return carry, jax.tree_util.tree_map(lambda *x: np.stack(x), *rows)
+    return carry, jax.tree_util.tree_map(lambda *x: stack(x), *rows)
 
 
 def for_each_row(function: Callable, rows: Any) -> Any:
@@ -137,8 +137,9 @@ def svdvals(x: Any) -> Any:
     """`jnp.linalg.svd(x, compute_uv=False)`: NaN where x is not finite."""
     if not on_host(x):
         return jnp.linalg.svd(x, compute_uv=False)
-    finite = np.isfinite(x).all()
-    return np.linalg.svd(x, compute_uv=False) if finite else np.full(min(x.shape), np.nan)
+    finite = np.isfinite(x).all(axis=(-2, -1), keepdims=True)
+    values = np.linalg.svd(np.where(finite, x, 0.0), compute_uv=False)
+    return np.where(finite[..., 0], values, np.nan)
 
 
 def stop_gradient(x: Array) -> Array:

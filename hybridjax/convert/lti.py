@@ -121,9 +121,9 @@ class HarmonicStateSpace(NamedTuple):
         return H.reshape(len(rates), M, -1, D.shape[-1])
 
 
-# The largest order that is tried, and frequencies of the comparison, in cycles per period. More:
+# Orders that are tried, and frequencies of the comparison, in cycles per period. More:
 # calls take longer. Fewer: an error between them is not seen.
-_MOST = 64
+_ORDERS = 2, 4, 8, 16, 32, 64
 _TRIED = np.array([0.13, 0.37, 0.5])
 
 
@@ -151,10 +151,10 @@ def to_harmonic_state_space(
     `ComputationError` if no order is large enough.
     """
     exact = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs).H.swapaxes(0, 1)
-    map, n = hosted(cycle).return_map, order or 2
+    map = hosted(cycle).return_map
     s, period = map.structure, map.expected
     z, _, columns = asked(s, cycle.event_sequence, outputs, inputs)
-    flow = linear_flow(cycle, 0.25 / (order or _MOST))
+    flow = linear_flow(cycle, 0.25 / (order or _ORDERS[-1]))
     jumps = flow.jumps.by_state - np.eye(s.d), flow.jumps.by_input
     if any(np.abs(x).max() > 1e-9 for x in jumps):
         raise DefinitionError(
@@ -163,7 +163,7 @@ def to_harmonic_state_space(
         )
     _, by_state, by_input = linear_outputs(s, flow, z)
     series = flow.by_state, flow.by_input[..., columns], by_state, by_input[..., columns]
-    while True:
+    for n in [order] if order else _ORDERS:
         m, k = np.arange(-n, n + 1), np.arange(-2 * n, 2 * n + 1)
         waves = np.exp(-2j * np.pi * k[:, None, None] * flow.after(map) / period)
         waves = waves * flow.length[:, None] * rule().weights / period
@@ -175,9 +175,7 @@ def to_harmonic_state_space(
         space = space._replace(error=float(off / np.abs(exact).max()))
         if order or space.error < tolerance:
             return space
-        if n == _MOST:
-            raise ComputationError(f"order {n} has the error {space.error:.1e}: set `order`.")
-        n *= 2
+    raise ComputationError(f"order {n} has the error {space.error:.1e}: set `order`.")
 
 
 @checked

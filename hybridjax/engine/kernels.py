@@ -6,23 +6,24 @@ column of values stands before those of derivatives, by the time, the n states a
 one lane may stand for all.
 """
 
+import copy
 import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import kernel
-from .._core.executor import on_host
+from .._core.executor import from_host, on_host
 from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method
 from ..systems.structure import Kind, Member, Structure, stacked
 from ..systems.system import Output
 from ..systems.transition import Scheduled
-from ..systems.varied import under
 from .arrays import AnyInputs as Inputs, AnyTimes as Times, Array, States
 from .runge_kutta import Step, step_along as _along, take_step
 from .target import AbstractLevels
@@ -35,6 +36,9 @@ Items = tuple[str | Output, ...]
 # Lanes of programs that are called for many points at once. Higher: single points wait for lanes
 # that nobody needs. Lower: many points take more calls.
 _POINTS = 16
+# Lanes of programs for systems side by side. More: the last call has more empty lanes. Fewer: calls
+# cost more than they compute.
+WIDE = 256
 
 
 def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
@@ -139,7 +143,7 @@ def watched_at(
     """The guards of chart a, of these kinds, and the level of section i if the chart has one."""
     guards = s.guard_values(kinds, t, q, u)
     if levels is not None and levels.present(s, a):
-        guards = [*guards, levels.level(s, a, i, t, q)]
+        guards = [*guards, levels.level(s.under(u), a, i, t, q)]
     return stacked(guards)
 
 
@@ -156,7 +160,7 @@ def _outputs(a: int, s: Structure, items: Items, t, q, u):
 
 
 def _due(g: int, s: Structure, t, q, u):
-    guard = under(s, u).transitions[g].guard
+    guard = s.under(u).transitions[g].guard
     assert isinstance(guard, Scheduled)
     return jnp.stack([guard.nearest(t) - t])
 
@@ -204,7 +208,7 @@ class Tangents(Structure):
     def __init__(self, s: Structure, along: Structure, levels, by_levels, directions: int):
         super().__init__(s.source)
         self.directions, self._levels, self._plain = directions, levels, s
-        self._along = along, by_levels
+        self._along, self.nu = (along, by_levels), s.nu
 
     def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:
         """Inputs of zero, and the directions of lanes; of negative index, none."""
@@ -229,6 +233,48 @@ class Tangents(Structure):
             return both[0] + 1j * TINY * both[1]
 
         return call
+
+
+class Systems(Structure):
+    """Systems in lanes of the host, whose arrays have the lanes on a last axis."""
+
+    by_system = True
+
+    def __init__(self, source: PerLane):
+        super().__init__(source)
+        first = lambda x: np.asarray(x)[..., 0] if eqx.is_array(x) else x  # noqa: E731
+        arrays = map(np.asarray, jax.tree_util.tree_leaves(eqx.filter(source.tree, eqx.is_array)))
+        self._numbers = np.concatenate([x.reshape(-1, x.shape[-1]) for x in arrays])
+        self._single = Structure(from_host(jax.tree_util.tree_map(first, source.tree)))
+
+    def at(self, lane):
+        other = copy.copy(self)
+        other._made, other._numbers = {}, self._numbers[:, lane]
+        return other
+
+    def kernel(self, function, form, *static, trees=(), lanes=1):
+        every = self._single, *trees
+        make = lambda: kernel(function, _BySystem(form), static, every, WIDE)  # noqa: E731
+        return ft.partial(self.once((function, form, static), trees, make), self._numbers)
+
+
+class _BySystem(NamedTuple):
+    """A form for systems in lanes, whose numbers are the rows of the first argument."""
+
+    form: Callable
+
+    def __call__(self, function: Callable, s: Structure, *trees: Any) -> Callable:
+        arrays, static = eqx.partition(s, eqx.is_array)
+        leaves, structure = jax.tree_util.tree_flatten(arrays)
+        ends = np.cumsum([x.size for x in leaves])[:-1]
+
+        def lanes(numbers, *point):
+            parts = zip(leaves, jnp.split(numbers, ends), strict=True)
+            arrays = [y.reshape(*x.shape, -1).astype(x.dtype) for x, y in parts]
+            systems = eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static)
+            return self.form(function, PerLane(systems, (True,) * len(arrays)), *trees)(*point)
+
+        return lanes
 
 
 # Scale of tangents as imaginary parts. Their products vanish beside real parts.
@@ -283,7 +329,9 @@ class _ByMethod(NamedTuple):
 
 
 def _step(method: Method, field: Callable, t, q, u, h, *x):
-    return jnp.stack(take_step(method, lambda t, q: field(t, q, u, h, *x), t, q, h))
+    at = lambda t, q: field(t, q, u, h, *x)  # noqa: E731
+    # (With directions x it is differentiated.)
+    return jnp.stack(take_step(method, at, t, q, h, still=at if x else None))
 
 
 def _step_along(method: Method, field: Callable, t, q, u, h, along):

@@ -107,8 +107,10 @@ def needed(mask: Mask, tree):
 
 
 def side_by_side(tree):
-    """An axis of pieces of the flow of a single lane, as one of lanes."""
-    return jax.tree_util.tree_map(lambda x: namespace(x).moveaxis(x[..., 0], 0, -1), tree)
+    """An axis of pieces of the flow of lanes, joined with that of lanes, if there is one."""
+    join = lambda x: x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])  # noqa: E731
+    move = lambda x: join(namespace(x).moveaxis(x, 0, -2)) if x.ndim > 1 else x  # noqa: E731
+    return jax.tree_util.tree_map(move, tree)
 
 
 # Codes on a tape. Codes >= 0 are the transition that fires at the end of a move.
@@ -138,6 +140,15 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
     times, states = lambda: xp.zeros((rows, L)), lambda: xp.zeros((rows, d, L))
     code, chart = xp.full((rows, L), IDLE, xp.int32), xp.zeros((rows, L), xp.int32)
     return Tape(times(), code, times(), states(), states(), chart)
+
+
+def stack_rows(parts: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Arrays of several tapes, the shorter ones with further rows without moves."""
+    rows, blank = max(map(len, parts)), IDLE if parts[0].dtype.kind == "i" else 0
+    out = np.full((len(parts), rows, *parts[0].shape[1:]), blank, parts[0].dtype)
+    for whole, part in zip(out, parts, strict=True):
+        whole[: len(part)] = part
+    return out
 
 
 def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:

@@ -15,7 +15,7 @@ from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
 from .arrays import Array, Index, Inputs, Times
-from .lanes import Lanes, Tape, fixed
+from .lanes import Lanes, Tape, fixed, stack_rows
 from .replay import chain, replay
 from .search.search import initial_step, search
 from .search.state import Moved, Options, Recorded, Stride
@@ -53,7 +53,7 @@ def move(
         setout = stride(setout)
     if result is None:
         result = xp.full(lanes.t.shape, Result.OK, xp.int32)
-    if on_host(lanes.t) and len(lanes.t) == 1:
+    if on_host(lanes.t) and len(lanes.t) == 1 and not s.by_system:
         _, (_, *row) = through(s, (lanes, setout, result), u, target, settings, options)
         return Recorded(*jax.tree_util.tree_map(lambda x: x[0], row))
     if on_host(lanes.t):
@@ -75,16 +75,17 @@ def through(
     options: Options,
     patience: float = np.inf,
 ) -> tuple[tuple[Lanes, Stride, Index], tuple[Lanes, Moved, Tape | None]]:
-    """Flow a single lane to one of the `targets` after the other, waiting for each no longer than
-    `patience`. On the host these are many calls of small programs, until the whole is compiled.
+    """Flow a single lane, or lanes with systems of their own, to one of the `targets` after the
+    other, waiting for each no longer than `patience`. On the host these are many calls of small
+    programs, until the whole is compiled for a single lane.
 
-    **Arguments:** `begin`: the lane, its stride and its result.
+    **Arguments:** `begin`: the lanes, their strides and their results.
 
-    **Returns:** the same at the end; by target (rows) the lane before, its end, and the tape.
+    **Returns:** the same at the end; by target (rows) the lanes before, their ends, and the tape.
     """
     ends, levels = (targets.time, targets.index, targets.event, targets.limit), targets.levels
     by = targets.missed, targets.event_sequence
-    if not on_host(u):
+    if not on_host(u) or s.by_system:
         return _pieces((move, options, *by), s, levels, settings, ends, begin, u, patience)
     static = search, options._replace(tangents=bool(options.tangents)), *by
     make = lambda: whole(_pieces, (static,), (s, levels, settings))  # noqa: E731
@@ -97,14 +98,14 @@ def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
 
     def piece(carry, end):
         lanes, stride, result = carry
-        time, index, event, limit = (x[None] for x in end)
+        time, index, event, limit = (namespace(x).atleast_1d(x) for x in end)
         limit = namespace(time).minimum(limit, lanes.t + patience)
         target = Target(time, index, event, limit, sequence, levels, missed)
         moved, tape = flow(s, lanes, u, target, settings, stride, result, options)
         carry = moved.lanes, stride._replace(h=moved.h), moved.result
         return carry, (lanes, moved, tape)
 
-    return scan(piece, begin, ends)
+    return scan(piece, begin, ends, stack_rows)
 
 
 @eqx.filter_jit
@@ -212,6 +213,8 @@ def tape_jacobian(
     """Derivative of (t, q) at the targets of a recorded flow with respect to (t, q, u) at the
     start, at u = 0, or to q only (`of_states`), and (t, q) at the targets; both are zeros if they
     are not `wanted`. `across`: see `chain`; traced, it makes no difference."""
+    if on_host(lanes.t) and not wanted:
+        return np.zeros((len(lanes.t), 1 + s.d, s.d)), np.zeros((1 + s.d, len(lanes.t)))
     if on_host(lanes.t):
         return chain(s, lanes, target, tape, of_states, across)
     columns, end = _push(s, lanes, target, tape, of_states, wanted)

@@ -238,7 +238,7 @@ def linear_moves(s: Structure, moves: Moves, target: Target) -> tuple[np.ndarray
     for a in np.unique(moves.chart):
         in_chart = np.flatnonzero(moves.chart == a)
         of_chart = Moves(*(x[..., in_chart] for x in moves))
-        end[in_chart], by[in_chart] = _linear(s, int(a), of_chart, target)
+        end[in_chart], by[in_chart] = _linear(s.at(of_chart.lane), int(a), of_chart, target)
     return end, by
 
 
@@ -287,14 +287,15 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndar
     which = np.where(code == ARRIVE_LEVEL, len(s.transitions), np.where(by_clock, -1, code))
     lands = np.flatnonzero(which >= 0)
     if len(lands):
-        point = t[lands], q[:, lands], f[:, lands]
-        flow = ChartFlow(s, a, u[:, lands], dataclasses.replace(target, index=index[lands]))
+        point, landing = (t[lands], q[:, lands], f[:, lands]), s.at(lands)
+        flow = ChartFlow(landing, a, u[:, lands], dataclasses.replace(target, index=index[lands]))
         zero = flow.locate(*point, which[lands])
         t[lands] += zero.past
         q[:, lands] = zero.q
-        by_field = np.moveaxis(kernels.field(s, a, t[lands], q[:, lands], u[:, lands]), -1, 0)
+        at = t[lands], q[:, lands], u[:, lands]
+        by_field = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
         f, (f_t, f_q, f_u) = by_field[:, :, :1], _split(by_field, n)
-        jac = kernels.watched(s, a, target.levels, t[lands], q[:, lands], u[:, lands], index[lands])
+        jac = kernels.watched(landing, a, target.levels, *at, index=index[lands])
         row = np.argmax(np.array(flow.rows)[:, None] == which[lands], axis=0)
         by_t, by_q, by_u = _split(jac[row, :, np.arange(len(lands))][:, None], n)
         # (Over the time past: nothing but rounding errors, with derivatives.)
@@ -316,7 +317,7 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndar
             continue
         if kind != (-1,):
             place = np.argmax(np.array(kind)[:, None] == code[now], axis=0).astype(np.int32)
-            by_reset = kernels.reset(s, Member(kind, place), t[now], new, u[:, now])
+            by_reset = kernels.reset(s.at(now), Member(kind, place), t[now], new, u[:, now])
             new = by_reset[:, 0]
             by_t, by_q, by_u = _split(np.moveaxis(by_reset, -1, 0), n)
             dnew = by_t @ dt[now] + by_q @ dnew
@@ -333,7 +334,7 @@ def _linear_step(s: Structure, a: int, t, q, u, h):
     """`kernels.linear_step`; of an explicit method, by derivatives of the field at its stages,
     which needs no program."""
     (n, M), method = q.shape, s.method(a)
-    if method.implicit:
+    if method.implicit or s.by_system:
         return kernels.linear_step(s, a, t, q, u, h)
     m = 2 + n + s.nu
     stages = len(method.b) + 1

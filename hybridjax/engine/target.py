@@ -60,12 +60,12 @@ class Target(eqx.Module):
 def toward(time: Float[Array, " L"], event: int, limit: Float[Array, "..."]) -> Target:
     """The target of lanes that end at times, or where `time` is infinite, at an event (or at a
     level that is filled in later), giving up at `limit`."""
-    xp, L = namespace(time), time.shape[0]
+    xp, shape = namespace(time), time.shape
     later = xp.nextafter(stop_gradient(time), xp.inf)
     return Target(
         time,
-        xp.zeros(L, xp.int32),
-        xp.full(L, event, xp.int32),
+        xp.zeros(shape, xp.int32),
+        xp.full(shape, event, xp.int32),
         xp.where(xp.isfinite(time), later, limit),
         None,
         None,

@@ -35,7 +35,7 @@ from .design.design import DISCARD, Design
 from .noise import ProcessNoise
 from .plan import Accuracy, Stepping, plan_flow
 from .response import Course, Feedback, course, flow_batch, require_shape
-from .start import StartName, linearized, periodic_start, predict, settle_batch
+from .start import StartName, linearized, periodic_start, steady_start
 
 
 DesignLike = (
@@ -194,11 +194,13 @@ class Campaign:
         workers = self.execution.workers if workers is None else workers
         execution = dataclasses.replace(self.execution, workers=workers)
         u, N = self.inputs.part(rows), self.placed.n_sections
-        start = self._starts(u, rows.start, execution)
+        start, parts = self._starts(u, rows.start, execution)
         applied = u
         if self.process_noise is not None:
             applied = u + self.process_noise.draw(u.shape, N, rows.start)
-        y, result, failed_at, error, answer = self._respond(applied, start, execution)
+        if parts is None or applied is not u:
+            parts = self._flow(applied, start, execution, "experiments")
+        y, result, failed_at, error, answer = self._deviations(u.shape, parts)
         self._require_outputs(y, result)
         z, label = self.at_sections.outputs, self.placed.family.label
         inputs: tuple[str, ...] = z.structure.inputs
@@ -231,31 +233,33 @@ class Campaign:
         return _resolved.recall(self.placed, names, make)
 
     @remembered
-    def _programs(self) -> tuple[TwoTiers, TwoTiers]:
-        return TwoTiers(flow_batch, self.large), TwoTiers(settle_batch, self.large)
+    def _program(self) -> TwoTiers:
+        return TwoTiers(flow_batch, self.large)
 
-    def _starts(self, u, first: int, execution: Execution) -> Float[np.ndarray, "m S"]:
-        """Return times and states on section 0 at which experiments start.
+    def _starts(
+        self, u, first: int, execution: Execution
+    ) -> tuple[Float[np.ndarray, "m S"], list | None]:
+        """Return times and states on section 0 at which experiments start, and if the search for
+        them has run the experiments themselves, all that `_flow` yields.
 
         **Raises:** `ComputationError` if a periodic response is not found near the predicted one.
         """
         if self.model is None:
-            return np.tile(to_host(self.placed).section_zero[:, None], len(u))
+            return np.tile(to_host(self.placed).section_zero[:, None], len(u)), None
         stepping, periods = self.stepping, self.inputs.periods
         window = u[:, : periods * self.placed.n_sections]
         predicted = periodic_start(self.placed, self.model, window)
         if self.start == "periodic":
-            return predicted
-        prediction = predict(self.placed, self.model, stepping, periods)
-        silent = dataclasses.replace(self.at_sections.course, outputs=())
+            return predicted, None
+        parts: list = []
 
-        def arguments(rows):
-            start, u = from_host((predicted[:, rows], window[rows]))
-            return silent, stepping.plan, start, u, stepping.settings, prediction
+        def flow(start, rows):
+            parts[:] = self._flow(window[rows], start, execution, "steady starts")
+            return np.concatenate([part.end for _, part in parts]).T
 
-        parts = in_batches(self._programs[1], arguments, len(u), execution, "steady starts")
-        each = zip(*(part for _, part in parts), strict=True)
-        start, change = (np.concatenate(x).astype(float) for x in each)
+        start, change, still = steady_start(
+            self.placed, self.model, stepping, periods, predicted, flow
+        )
         if (change > stepping.accuracy).any():
             s = int(np.nanargmax(change))
             raise ComputationError(
@@ -263,13 +267,27 @@ class Campaign:
                 f"linearization predicts (Newton's last step is {change[s]:.1e} of the state's "
                 "size): make the input smaller, or discard cycles instead."
             )
-        return np.where(np.isnan(change), predicted, start.T)
+        start = np.where(np.isnan(change), predicted, start)
+        return start, parts if still and window.shape == u.shape else None
 
-    def _respond(self, u, start, execution: Execution):
+    def _deviations(self, shape: tuple[int, int, int], responses):
         """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures,
-        errors, and what a controller added to the inputs."""
-        stepping, N, base = self.stepping, self.placed.n_sections, self.at_sections.on_cycle
-        feedback = self.feedback
+        errors, and what a controller added to the inputs, of such a shape."""
+        N, base = self.placed.n_sections, self.at_sections.on_cycle
+        S, n, _ = shape
+        answer = None if self.feedback is None else np.empty(shape)
+        y, parts = np.empty((S, n // N, *base.shape)), []
+        for rows, part in responses:
+            np.subtract(part.y.reshape(-1, *y.shape[1:]), base, out=y[rows])
+            parts.append((part.result, part.failed_at, part.error))
+            if answer is not None:
+                answer[rows] = part.feedback
+        result, failed_at, error = map(np.concatenate, zip(*parts, strict=True))
+        return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error, answer
+
+    def _flow(self, u, start, execution: Execution, name: str) -> Iterator[tuple[slice, Any]]:
+        """Yield rows and their `Response`, batch after batch."""
+        stepping, base, feedback = self.stepping, self.at_sections.on_cycle, self.feedback
         loop = None if feedback is None else from_host(Feedback(feedback, jax.numpy.asarray(base)))
 
         def arguments(rows):
@@ -278,16 +296,7 @@ class Campaign:
             course = self.at_sections.course
             return course, stepping.plan, x, held, stepping.settings, loop
 
-        S, n, _ = u.shape
-        answer = None if loop is None else np.empty(u.shape)
-        y, parts = np.empty((S, n // N, *base.shape)), []
-        for rows, part in in_batches(self._programs[0], arguments, S, execution, "experiments"):
-            np.subtract(part.y.reshape(-1, *y.shape[1:]), base, out=y[rows])
-            parts.append((part.result, part.failed_at, part.error))
-            if answer is not None:
-                answer[rows] = part.feedback
-        result, failed_at, error = map(np.concatenate, zip(*parts, strict=True))
-        return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error, answer
+        return in_batches(self._program, arguments, len(u), execution, name)
 
     def _require_outputs(self, y, result) -> None:
         finite = np.isfinite(y)

@@ -1,22 +1,19 @@
 """Initial conditions of experiments: on the limit cycle, or in a periodic response."""
 
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from .._core.executor import from_host, to_host
+from .._core.executor import to_host
 from .._core.memo import Memory
-from ..engine.settings import Settings
 from ..linear.ldtp import LDTP
 from ..linear.time_response import monodromy
 from ..sections.linearize import linearize
 from ..sections.placed import PlacedSections
 from ..systems.system import Output
-from .plan import Plan, Stepping
-from .response import Course, flow_batch
+from .plan import Stepping
 
 
 StartName = Literal["cycle", "periodic", "steady"]
@@ -24,6 +21,10 @@ StartName = Literal["cycle", "periodic", "steady"]
 # Newton steps. Fewer: large inputs have no steady start. More: it takes longer to report that there
 # is none.
 MOST_STEPS = 12
+
+# Part of the accuracy up to which a Newton step is not taken, and experiments need not run again.
+# Larger: starts leave a transient. Smaller: experiments run again for nothing.
+_LAST = 1e-2
 
 # A linear model has at least one output. This one is defined in every chart.
 _NOTHING = Output("nothing", lambda t, q, u: 0.0)
@@ -49,58 +50,39 @@ def periodic_start(
     return to_host(placed).section_zero[:, None] + embed @ np.asarray(x0).T
 
 
-class Prediction(NamedTuple):
-    """The linearization of the map from a start to the state one window later."""
+def steady_start(
+    placed: PlacedSections,
+    model: LDTP,
+    stepping: Stepping,
+    periods: int,
+    start: Float[np.ndarray, "m S"],
+    flow: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> tuple[Float[np.ndarray, "m S"], Float[np.ndarray, " S"], bool]:
+    r"""Return starts whose responses to a repeated window of `periods` periods are periodic, the
+    last Newton steps relative to the sizes of the states (NaN for experiments that fail), and
+    whether the last `flow` was that of all experiments from these starts.
 
-    gain: Float[Array, "m m"]
-    r"""$(I - \Phi^P)^{-1} \Phi^P$ in times and states: Newton's step is the defect plus `gain`
-    times the defect."""
-    size: Float[Array, "m 1"]
-    """Characteristic magnitudes of time and states."""
-    moves: Float[Array, "m 1"]
-    """0 for the time where it is no state, else 1."""
-    accuracy: Float[Array, ""]
+    The Jacobian is that of the linearization, $\Phi^P$, as accurate as the response is linear.
 
-
-def predict(placed: PlacedSections, model: LDTP, stepping: Stepping, periods: int) -> Prediction:
-    """Return the linearization over a window of `periods` periods."""
+    **Arguments:** `start`: the first guess. `flow(start, rows)`: times and states one window after
+    the starts of the experiments `rows`.
+    """
     embed, back = (x[0] for x in to_host(placed).frames())
     phi = monodromy(to_host(model.A))
     power, d = np.linalg.matrix_power(phi, periods), len(phi)
+    # Newton's step is the defect plus `gain` times the defect.
     gain = embed[:, :d] @ np.linalg.solve(np.eye(d) - power, power) @ back[:d]
     moves = np.ones((len(gain), 1))
     moves[0] = to_host(placed).time_is_state[0]
-    size = stepping.scales[0][:, None]
-    return Prediction(*from_host((gain, size, moves, np.array(stepping.accuracy))))
-
-
-def settle_batch(
-    course: Course,
-    plan: Plan,
-    start: Float[Array, "m S"],
-    u: Float[Array, "S n nu"],
-    settings: Settings,
-    predicted: Prediction,
-) -> tuple[Float[Array, "S m"], Float[Array, " S"]]:
-    r"""Return starts whose responses to the repeated window `u` are periodic, and the last Newton
-    steps relative to the sizes of the states (NaN for experiments that fail). An experiment that
-    has converged is not changed any more.
-
-    The Jacobian is that of the linearization, $\Phi^P$, as accurate as the response is linear.
-    """
-
-    def unfinished(carry):
-        _, change, k = carry
-        return (k < MOST_STEPS) & jnp.any(change > predicted.accuracy)
-
-    def step(carry):
-        x, change, k = carry
-        active = change > predicted.accuracy  # False where the change is NaN
-        defect = (flow_batch(course, plan, x, u, settings).end.T - x) * predicted.moves
-        move = defect + predicted.gain @ defect
-        size = jnp.max(jnp.abs(move) / predicted.size, axis=0)
-        return jnp.where(active, x + move, x), jnp.where(active, size, change), k + 1
-
-    begin = start, jnp.full(start.shape[1], jnp.inf), 0
-    start, change, _ = jax.lax.while_loop(unfinished, step, begin)
-    return start.T, change
+    start, change = start.copy(), np.full(start.shape[1], np.inf)
+    for _ in range(MOST_STEPS):
+        rows = np.flatnonzero(change > stepping.accuracy)  # (not where it is NaN)
+        if len(rows) == 0:
+            break
+        defect = (flow(start[:, rows], rows) - start[:, rows]) * moves
+        step = defect + gain @ defect
+        change[rows] = np.max(np.abs(step) / stepping.scales[0][:, None], axis=0)
+        if len(rows) == len(change) and (change <= _LAST * stepping.accuracy).all():
+            return start, change, True
+        start[:, rows] += step
+    return start, change, False

@@ -11,9 +11,10 @@ from .._core.compilation import host_first
 from .._core.executor import Array, namespace, scan
 
 
-def monodromy(A: Float[Array, "N d d"]) -> Float[Array, "d d"]:
+def monodromy(A: Float[Array, "N *S d d"]) -> Float[Array, "*S d d"]:
     """The product `A[N-1] ... A[0]`."""
-    return scan(_multiplied, namespace(A).eye(A.shape[-1], dtype=A.dtype), A)[0]
+    xp = namespace(A)
+    return scan(_multiplied, xp.zeros_like(A[0]) + xp.eye(A.shape[-1], dtype=A.dtype), A)[0]
 
 
 @functools.partial(jax.jit, static_argnames="section")

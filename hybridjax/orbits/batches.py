@@ -1,4 +1,5 @@
-"""Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
+"""Cycles of many systems side by side, each from a guess of its own: in lanes of the host, or in
+compiled calls if there are many."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,10 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.compilation import TwoTiers, uncollected
+from .._core.compilation import TwoTiers, at_ease, uncollected
 from .._core.execution import in_threads
+from .._core.executor import on_the_cpu, to_host
+from .._core.lanes import PerLane
 from .._core.progress import working
 from .._core.results import Result
+from ..engine.kernels import WIDE
 from ..engine.lanes import Lanes
 from ..engine.move import move
 from ..engine.settings import TRANSIENT, Settings
@@ -26,6 +30,11 @@ from .return_map import ReturnMap, Turn
 from .scale import ROUNDING
 
 
+# Largest number of systems whose turns are computed on the host. Larger: that takes longer than
+# compiling them. Smaller: compiling takes longer than they run.
+SMALL = 8000
+# Systems per compiled call. More: their arrays leave the cache. Fewer: calls cost more.
+BATCH = 250
 # Periods for which a system is simulated before Newton's method tries again. Fewer: slow transients
 # remain. More: each failure takes longer.
 _SETTLE = 40
@@ -37,56 +46,49 @@ _NEAR = 0.06
 _QUADRATIC = 4
 
 
-def _one(map: ReturnMap, system: HybridSystem, anchor: Lanes, expected) -> ReturnMap:
-    """The return map of one system, begun at the same phase of its own clock."""
-    map = map.at_phase_of(system)
-    if map.base is not None:
-        map = dataclasses.replace(map, expected=expected)
-    return dataclasses.replace(map, anchor=anchor._replace(t=map.anchor.t))
+def _apart(map: ReturnMap, lanes: Lanes) -> Lanes:
+    """Lanes as single ones, on the first axis; the lane of a single system as it is."""
+    first = lambda x: np.moveaxis(x, -1, 0)[..., None]  # noqa: E731
+    return jax.tree_util.tree_map(first, lanes) if map.expected.ndim else lanes
 
 
-def _turn(systems, map: ReturnMap, anchor: Lanes, period, wanted):
-    """One turn of every system from its anchor, with the Jacobian if it is `wanted`."""
-
-    def turn(*system):
-        each = _one(map, *system)
-        turned = each.turn_with_jacobian(each.anchor.q[:, 0], wanted)
-        events = turned.codes.ravel(), turned.times.ravel()
-        turned = turned._replace(codes=None, times=None, record=None, tapes=None)
-        return each.anchor, each.expected, turned, *events
-
-    return eqx.filter_vmap(turn)(systems, anchor, period)
+def _turn(map: ReturnMap, wanted):
+    """The anchor, the expected period, and one turn with its Jacobian if it is `wanted`, of a
+    system, or of systems side by side on the host."""
+    turn = map.turn_with_jacobian(map.each(map.anchor.q.T), wanted)
+    return _apart(map, map.anchor), map.expected, turn._replace(record=None, tapes=None)
 
 
-def _verdict(systems, map: ReturnMap, anchor: Lanes, period, turn: Turn):
+def _verdict(map: ReturnMap, turn: Turn):
     """The anchors at the beginning of a turn, periods, and result codes."""
-
-    def judge(system, anchor, expected, turn):
-        each, q = _one(map, system, anchor, expected), anchor.q[:, 0]
-        period = each.expected if each.base is None else turn.period
-        return each.departure(q), period, each.judge(q, turn)
-
-    return eqx.filter_vmap(judge)(systems, anchor, period, turn)
+    q = map.anchor.q.T
+    period = map.expected if map.base is None else turn.period
+    return _apart(map, map.departure(q)), period, map.judge(q, turn)
 
 
-def _settle(systems, map: ReturnMap, anchor: Lanes, period):
+def _settle(map: ReturnMap):
     """The ends of a simulation, at the guess's phase or section (NaN for systems that do not get
     there), and expected periods."""
     patient = Settings(TRANSIENT, TRANSIENT, 512 * _SETTLE, map.settings.scale)
+    s, anchor, expected = map.structure, map.anchor, map.expected
+    u = np.zeros((s.nu, len(expected)))
+    moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient).moved
+    if map.base is not None:
+        target = toward(np.full_like(expected, np.inf), -1, moved.lanes.t + 3 * expected)
+        target = to_section(target, map.base, map.event)
+        moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result).moved
+    q = np.where(moved.result == Result.OK, moved.lanes.q, np.nan)
+    return _apart(map, anchor._replace(chart=moved.lanes.chart, q=q)), expected
 
-    def settle(*system):
-        each = _one(map, *system)
-        s, anchor, expected = each.structure, each.anchor, each.expected
-        u = jnp.zeros((s.nu, 1))
-        moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient).moved
-        if each.base is not None:
-            target = toward(jnp.full(1, jnp.inf), -1, moved.lanes.t + 3 * expected)
-            target = to_section(target, each.base, each.event)
-            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result).moved
-        q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
-        return anchor._replace(chart=moved.lanes.chart, q=q), expected
 
-    return eqx.filter_vmap(settle)(systems, anchor, period)
+def _turns(systems, map: ReturnMap, anchor: Lanes, period, wanted):
+    """`_turn` of every system from its anchor, in JAX."""
+
+    def of_one(system, anchor, expected):
+        replaced = dict(system=system, anchor=anchor, expected=expected)
+        return _turn(dataclasses.replace(map, **replaced), wanted)
+
+    return eqx.filter_vmap(of_one)(systems, anchor, period)
 
 
 class Rounds(NamedTuple):
@@ -125,12 +127,14 @@ class Tiles(NamedTuple):
     systems: HybridSystem
     """Their arrays have a leading axis of S systems."""
     map: ReturnMap
-    """The return map of the guess, with the settings asked for."""
+    """The return map of the guess, with the settings asked for, on the host."""
+    periods: Float[np.ndarray, " S"] | None
+    """Periods of one turn of clocked systems."""
     size: int
-    """Systems in one compiled call."""
+    """Systems in one call."""
     workers: int
-    programs: Callable[[Callable], TwoTiers]
-    """A function's program, the same in each call."""
+    program: Callable | None
+    """`_turn` of systems with a leading axis, compiled; `None` for turns on the host."""
     known: Known | None = None
 
     @property
@@ -164,14 +168,15 @@ class Tiles(NamedTuple):
 
         with working("cycles", S) as call:
             if self.known is None:
-                call.done, rows = 0, order[: self.size]
+                call.done, rows = 0, order[: min(self.size, WIDE)]
                 with uncollected():  # the programs are compiled during this call
-                    out = self._settle(rows, self._newton(rows, *self._given(len(rows)), FEW_STEPS))
+                    out = self._newton(rows, *self._given(len(rows)), FEW_STEPS)
+                    out = self._settle(rows, out)
             else:
                 out = None
             while (done := 0 if out is None else len(out.result)) < S:
                 call.done = done
-                more = slice(done, max(2 * done, self.size))
+                more = slice(done, max(4 * done, self.size))
                 rows = order[more]
                 rows = rows[_tree(parameters[rows]).indices]  # systems of one call are neighbors
                 order[more] = rows
@@ -280,30 +285,61 @@ class Tiles(NamedTuple):
         """Anchors, expected periods, turns, codes of events, and whether two coincide."""
 
         def events(turned):
-            anchor, expected, turn, codes, times = jax.tree_util.tree_map(np.asarray, turned)
+            anchor, expected, turn = jax.tree_util.tree_map(np.asarray, turned)
+            codes, times = (x.reshape(len(x), -1) for x in (turn.codes, turn.times))
             at_event = isinstance(self.map.base, AtEvent)
             begin = anchor.t[:, 0] if at_event else np.full(len(codes), -np.inf)
             coincide = together(codes, times, begin, turn.period)
-            return anchor, expected, turn, front(codes), coincide
+            return anchor, expected, turn._replace(codes=None, times=None), front(codes), coincide
 
-        options = (np.asarray(wanted),)
-        return self._in_tiles(_turn, rows, anchor, period, options=options, then=events)
+        return self._in_tiles(_turn, rows, anchor, period, options=(wanted,), then=events)
 
-    def _in_tiles(self, function, rows, *arguments, options=(), then=lambda x: x):
-        """`function` of some systems, in calls of one size, so that one program serves all."""
-        program = self.programs(function)
+    def _in_tiles(
+        self, function, rows, anchor: Lanes, period, *others, options=(), then=lambda x: x
+    ):
+        """`function` of the return maps of some systems, and of further arguments, in calls of few
+        sizes. (JAX compiles operations on numbers of systems for each size.)"""
         arrays, static = eqx.partition(self.systems, eqx.is_array)
-
-        def of_tile(k):
-            tile = np.arange(k, k + self.size) % len(rows)
-            systems = eqx.combine(_pick(arrays, rows[tile]), static)
-            return systems, self.map, *_pick(arguments, tile), *options
+        compiled, map = self.program is not None and function is _turn, self.map
 
         def run(k):
-            return _pick(then(program(*of_tile(k))), slice(len(rows) - k))
+            left = len(rows) - k
+            size = self.size if compiled else min(self.size, -(-left // WIDE) * WIDE)
+            tile = np.arange(k, k + size) % len(rows)
+            systems = _pick(arrays, rows[tile])
+            begin, expected, *further = _pick((anchor, period, *others), tile)
+            if self.periods is not None:
+                expected = self.periods[rows[tile]]
+            grown = expected / map.expected if map.base is None else np.ones(size)
+            begin = begin._replace(t=map.anchor.t * grown[:, None])
+            if compiled:
+                systems = eqx.combine(systems, static)
+                results = self.program(systems, map, begin, expected, *further, *options)
+            else:
+                last = jax.tree_util.tree_map(lambda x: np.moveaxis(x, 0, -1), systems)
+                split = (True,) * len(jax.tree_util.tree_leaves(last))
+                side = PerLane(eqx.combine(jax.device_put(last), static), split)
+                begin = jax.tree_util.tree_map(lambda x: np.moveaxis(x[..., 0], 0, -1), begin)
+                replaced: Any = dict(system=side, anchor=begin, expected=expected)
+                with on_the_cpu(), at_ease():
+                    results = function(dataclasses.replace(map, **replaced), *further, *options)
+            return _pick(then(results), slice(left))
 
         tiles = range(0, len(rows), self.size)
         return _join(*in_threads(run, tiles, min(self.workers, len(tiles))))
+
+
+def tiles_of(
+    systems: HybridSystem, map: ReturnMap, size: int | None, workers: int, total: int
+) -> Tiles:
+    """Systems, of so many in `total`, and how they are solved."""
+    large, periods = total > SMALL, None
+    if map.base is None:
+        of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731
+        periods = np.asarray(eqx.filter_vmap(of_one)(systems))
+    size = min(size or (BATCH if large else 4 * WIDE), total)
+    program = TwoTiers(_turns, large=True) if large else None
+    return Tiles(systems, to_host(map), periods, size, workers, program)
 
 
 def _numbers(systems: HybridSystem | None) -> Float[np.ndarray, "S p"]:

@@ -200,7 +200,9 @@ def check_begin(map: ReturnMap) -> None:
     if not (base is None or isinstance(base, AtEvent)):
         return
     guards, rates = jax.device_get(_at_anchor(map))
-    due = (rates < 0) & (np.abs(guards) <= -TOGETHER * float(map.expected) * rates)
+    # (At the end of sliding the rate of the guard that began it is zero.)
+    due = rates < -TOGETHER * np.abs(rates).max(initial=0.0)
+    due &= np.abs(guards) <= -TOGETHER * float(map.expected) * rates
     if base is not None:
         due[map.event] = False
     if due.any():

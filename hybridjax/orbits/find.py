@@ -151,7 +151,7 @@ def find_limit_cycle(
     if isinstance(guess, LimitCycle) and traced:
         return _cycle(map, solve(map, True), guess.event_sequence)
     s.resolve_outputs(tuple(map.conserved)).require(int(np.asarray(map.anchor.chart)[0]))
-    if isinstance(map.base, AtEvent):
+    if isinstance(map.base, AtEvent) and not isinstance(guess, LimitCycle):
         check_begin(map)
     solution = search(map, patient)
     if patient and int(solution.result) == Result.STEP_LIMIT:

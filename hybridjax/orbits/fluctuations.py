@@ -16,7 +16,8 @@ from jaxtyping import Float
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, NonNegative
-from .._core.executor import Array, is_traced, namespace, on_host, scan
+from .._core.compilation import one_program
+from .._core.executor import Array, is_traced, namespace, on_host, put, scan
 from .._core.text import number
 from ..errors import ComputationError
 from ..systems.structure import Structure
@@ -99,8 +100,12 @@ class Fluctuations(eqx.Module):
 
 def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets) -> Fluctuations:
     """Deviations from a cycle under noise (see `LimitCycle.fluctuations`)."""
-    flow, events = linear_flow(cycle), cycle.event_sequence
-    map = cycle.return_map
+    return _noisy(cycle, linear_flow(cycle), white, guards, resets)
+
+
+@one_program
+def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -> Fluctuations:
+    map, events = cycle.return_map, cycle.event_sequence
     s, period = map.structure, map.expected
     levels, scatter = _at_events(s, guards, resets)
     xp, jumps = namespace(flow.q), flow.jumps
@@ -114,9 +119,16 @@ def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets
     collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
     # Noise of events, and what each makes of the states before, of the delay of the last event,
     # and of durations.
-    hit = flow.event >= 0
+    hit, delay = flow.event >= 0, jumps.delay_by_state
+    if not (clocked or events):  # the section is the event
+        hit, delay = put(hit, -1, True), put(delay, -1, section_delay(map, f)[0])
     slot = (xp.cumsum(hit)[:, None] - 1 == np.arange(E)) & hit[:, None]
-    jump = _timing(jumps.by_state, jumps.delay_by_state, hit, slot)
+    each, none = slot[..., None], xp.zeros((P, d, 1 + E))
+    jump = xp.block([
+        [jumps.by_state, none],
+        [delay[:, None], 1.0 - hit[:, None, None], none[:, :1, 1:]],
+        [each * delay[:, None], -1.0 * each, (1.0 - each) * np.eye(E)],
+    ])  # fmt: skip
     late = xp.asarray(levels)[flow.event] * jumps.delay_by_level
     late = late[:, None] * xp.concatenate([jumps.slip, xp.ones((P, 1)), slot], axis=1)
     added = late[:, :, None] * late[:, None]
@@ -130,15 +142,12 @@ def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets
 
     pieces = forward, _pad(collected, n), jump, added
     (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
-    M, last = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0), xp.eye(n)
+    M = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0)
     _, Z = loop(map, M[:d, :d], f)
-    if not (clocked or events):
-        delay = section_delay(map, f)[0][None]
-        last = _timing(np.eye(d)[None], delay, np.ones(1, bool), np.ones((1, 1), bool))[0]
     diffusion, to_end = Z @ Q[:d, :d] @ Z / period, flow.covectors(xp.eye(d))
     # (A state ahead of the cycle meets the next events earlier.)
     ahead = xp.concatenate([-f, xp.ones(1), xp.zeros(E)])
-    last = last + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
+    last = xp.eye(n) + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
     across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
     step, Q = last @ M, last @ Q @ last.T
     joint = _pad(_stationary(step[:d, :d], Q[:d, :d]), n)
@@ -165,17 +174,6 @@ def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:
     return namespace(x).pad(x, [(0, 0)] * (x.ndim - 2) + [(0, more), (0, more)])
 
 
-def _timing(by_state: Array, delay: Array, hit: Array, slot: Array) -> Float[Array, "P n n"]:
-    """Map states, the delay of the last event and durations before an event to those after it."""
-    xp, ((P, d), E) = namespace(delay), (delay.shape, slot.shape[1])
-    each = slot[..., None]
-    return xp.block([
-        [by_state, xp.zeros((P, d, 1 + E))],
-        [delay[:, None], 1.0 - hit[:, None, None], xp.zeros((P, 1, E))],
-        [each * delay[:, None], -1.0 * each, (1.0 - each) * np.eye(E)],
-    ])  # fmt: skip
-
-
 def _stationary(step: Float[Array, "d d"], noise: Float[Array, "d d"]) -> Float[Array, "d d"]:
     xp, d = namespace(step), len(step)
     if on_host(step) and not np.abs(np.linalg.eigvals(step)).max(initial=0.0) < 1 - SINGULAR:
@@ -199,11 +197,9 @@ def _at_events(s: Structure, guards: Strengths, resets: Resets):
     names = [x.name for x in s.transitions]
     for argument, given in (("guards", guards), ("resets", resets)):
         require_among("transition", given, names, f"`{argument}`: ")
-    levels, scatter = np.zeros(len(names) + 1), np.zeros((len(names) + 1, s.d))
-    for g, transition in enumerate(s.transitions):
-        levels[g] = guards.get(transition.name, 0.0)
-        states = s.charts[s.chart_index(transition.target)].states
-        chosen = resets.get(transition.name, {})
-        require_among("state", chosen, states, f"`resets`: after '{transition.name}' ")
-        scatter[g, : len(states)] = [chosen.get(x, 0.0) for x in states]
-    return levels, scatter
+    scatter = np.zeros((len(names) + 1, s.d))
+    for row, x in zip(scatter, s.transitions, strict=False):
+        states, chosen = s.charts[s.chart_index(x.target)].states, resets.get(x.name, {})
+        require_among("state", chosen, states, f"`resets`: after '{x.name}' ")
+        row[: len(states)] = [chosen.get(y, 0.0) for y in states]
+    return np.array([*(guards.get(x, 0.0) for x in names), 0.0]), scatter

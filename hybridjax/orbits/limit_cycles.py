@@ -1,7 +1,6 @@
 """Limit cycles of many systems at once: the points of a parameter sweep side by side."""
 
 import dataclasses
-import functools as ft
 from collections.abc import Callable, Sequence
 from typing import SupportsIndex
 
@@ -12,7 +11,6 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index
-from .._core.compilation import TwoTiers
 from .._core.execution import Execution
 from .._core.executor import from_host
 from .._core.memo import remembered
@@ -23,7 +21,7 @@ from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem
-from .batches import Rounds, Tiles
+from .batches import Rounds, Tiles, tiles_of
 from .checks import check_jumps, check_periodic, closes_early
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
@@ -31,16 +29,11 @@ from .cycle import LimitCycle
 from .return_map import ReturnMap, turn_product
 
 
-# Largest number of systems for programs that are compiled in a third of the time and run four times
-# as long. Larger: they run more than 5 s longer. Smaller: compiling takes longer than they run.
-SMALL = 8000
 # Cycles that are tested for whether events that coincide commute, and whether the cycle closes
 # early; all are, if one of these fails. More: the test takes longer. Fewer: exceptions are missed.
 _LOOKED_AT = 50
 # Cycles that are tested for jumps and pulses of fields, which takes longer.
 _TESTED = 8
-# Systems per compiled call. More: their arrays leave the cache. Fewer: calls cost more.
-BATCH = 250
 
 
 @checked_methods
@@ -134,7 +127,7 @@ def find_limit_cycles(
     """Find the limit cycles of many systems that differ in their parameters.
 
     Newton's method first finds the cycles of a few systems in parallel, from the guess. Each
-    further round doubles the number of solved systems, with the cycles of neighboring systems as
+    further round solves four times as many systems, with the cycles of neighboring systems as
     guesses. If Newton's method fails for a system, the system is simulated for 40 periods, and
     Newton's method starts again from the final state.
 
@@ -145,7 +138,8 @@ def find_limit_cycles(
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
     - `settings`: accuracy of the flow (Default: 1e-9 per step) and its `solver`.
-    - `execution`: systems per compiled call (`batch`, Default: 250) and threads (`workers`).
+    - `execution`: systems per call (`batch`, Default: 1024, and 250 in the compiled calls of more
+        than 8000 systems) and threads (`workers`).
 
     **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
     for those.
@@ -161,8 +155,7 @@ def find_limit_cycles(
     S = len(jax.tree_util.tree_leaves(arrays)[0])
     check_periodic(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
     map = map_for_sweep(guess, settings)
-    programs = ft.cache(ft.partial(TwoTiers, large=S > SMALL))
-    tiles = Tiles(systems, map, min(execution.batch or BATCH, S), execution.threads, programs)
+    tiles = tiles_of(systems, map, execution.batch, execution.threads, S)
     return as_cycles(tiles, tiles.solve(S))
 
 

@@ -51,15 +51,14 @@ class Rule(NamedTuple):
 
 @ft.lru_cache
 def rule() -> Rule:
-    legendre, last = np.polynomial.legendre, np.eye(NODES)[-1]
+    legendre = np.polynomial.legendre
     # (Roots are real here, and complex numbers since NumPy 2.5.)
-    x = np.r_[-1.0, np.sort(legendre.legroots(legendre.legder(last)).real), 1.0]
+    x = np.r_[-1.0, np.sort(legendre.legroots(legendre.legder(np.eye(NODES)[-1])).real), 1.0]
     x = (x - x[::-1]) / 2
     vander = legendre.legvander(x, NODES - 1)
     slopes = np.stack([legendre.legval(x, legendre.legder(e)) for e in np.eye(NODES)], axis=1)
     inverse = np.linalg.inv(vander)
-    weights = 1 / (NODES * (NODES - 1) * legendre.legval(x, last) ** 2)
-    return Rule((x + 1) / 2, weights, 2 * slopes @ inverse, inverse)
+    return Rule((x + 1) / 2, inverse[0], 2 * slopes @ inverse, inverse)
 
 
 def polynomials(x: Float[Array, " p"]) -> Float[Array, "p K"]:
@@ -253,7 +252,7 @@ def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = Non
 
 
 def with_inputs(system: HybridSystem, parameter: str | None) -> Structure:
-    return Structure(system if parameter is None else Varied(system, parameter))
+    return Structure(system) if parameter is None else Varied(system, parameter)
 
 
 # Explicit steps of a piece. More: its polynomials lose digits. Fewer: more pieces than needed.
@@ -276,12 +275,8 @@ def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = No
     t, q = np.append(moves.t, map.anchor.t[0] + period)[:, None], moves.q.T[..., None]
     if by is not None:
         D = len(jax.tree_util.tree_leaves(by)[0])
-        inputs = by.structure
-        if isinstance(of.system, Varied):
-            inputs = eqx.tree_at(lambda x: x.system.system, of, inputs.system)
-        s, of = (
-            kernels.Tangents(x, y, None, None, D) for x, y in ((s, by.structure), (of, inputs))
-        )
+        pairs = (s, by.structure), (of, with_inputs(by.system, parameter))
+        s, of = (kernels.Tangents(x, y, None, None, D) for x, y in pairs)
         tangents = _along(s, map, lanes, tape, by)
         t, q = t + tiny * tangents[:, 0], q + tiny * tangents[:-1, 1:]
     # Pieces of several steps between events, because a step of an explicit method is short for the
@@ -326,10 +321,7 @@ def _along(
     s: kernels.Tangents, map: ReturnMap, lanes: Lanes, tape: Tape, by: Any
 ) -> Float[np.ndarray, "M n D"]:
     """Tangents of times and states at the starts of recorded moves and at the end of the turn."""
-    ends, begin = map.ends(), np.zeros((1 + s.d, s.directions))
-    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
-    begin[1:] = 0.0 if by.anchor.q is None else by.anchor.q[..., 0].T
-    longer = 0.0 if by.period is None else by.period
+    ends, (begin, longer) = map.ends(), beginning(by, s.d, s.directions)
     # A turn that ends on a section ends at a time, too.
     start, full = map.anchor.t[0], map.expected
     time = np.where(np.isfinite(ends.time), ends.time, start + full)
@@ -337,6 +329,14 @@ def _along(
     times = begin[0][:, None] + np.outer(longer, (time - start) / full)
     ends = dataclasses.replace(ends, time=time, levels=None)
     return Variation(s, lanes, ends, tape, times, twice=False).tangents(begin)
+
+
+def beginning(by: Any, d: int, directions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Tangents of (t, q) at the anchor of a cycle, and of its period."""
+    begin = np.zeros((1 + d, directions))
+    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
+    begin[1:] = 0.0 if by.anchor.q is None else by.anchor.q[..., 0].T
+    return begin, np.zeros(directions) if by.period is None else by.period
 
 
 def of_flow(tangents: Any) -> Any:
@@ -363,11 +363,7 @@ def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:
 
     def work(a, here, out):
         n = s.dims[a]
-        point = t[here], q[:n, here], u[:, here], h[here]
-        if s.method(a).implicit:
-            out[:n, here] = kernels.linear_step(s, a, *point)[:, 0]
-        else:
-            out[:n, here] = kernels.step(s, a, *point).q
+        out[:n, here] = kernels.step(s, a, t[here], q[:n, here], u[:, here], h[here]).q
         return out
 
     return for_each_chart(s, chart, np.ones(len(t), bool), work, np.zeros_like(q))
@@ -403,10 +399,8 @@ def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
 
 def by_name(s: Structure, chart: Int[Array, " p"], states: Inexact[Array, "p d"]):
     """Padded states, or what belongs to them, by name; NaN in charts that lack one."""
-    xp, out = namespace(states), {}
-    for name in s.state_names():
-        rows = [c.states.index(name) if name in c.states else -1 for c in s.charts]
-        column = xp.asarray(rows)[chart]
-        value = xp.take_along_axis(states, xp.maximum(column, 0)[:, None], axis=1)[:, 0]
-        out[name] = xp.where(column >= 0, value, xp.nan)
-    return out
+    xp, points = namespace(states), np.arange(len(chart))
+    wide = xp.pad(states, [(0, 0), (0, 1)], constant_values=np.nan)
+    places = [dict(zip(c.states, range(s.d), strict=False)) for c in s.charts]
+    row = lambda name: xp.asarray([x.get(name, s.d) for x in places])[chart]  # noqa: E731
+    return {name: wide[points, row(name)] for name in s.state_names()}

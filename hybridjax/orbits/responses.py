@@ -20,7 +20,7 @@ from .._core.arguments import require_among, require_index
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers
 from .._core.boundary.values import Reals
-from .._core.compilation import at_ease
+from .._core.compilation import at_ease, one_program
 from .._core.executor import Array, is_traced, namespace, on_host, stop_gradient, svdvals, to_host
 from .._core.results import Result
 from .._core.signal import unit_of
@@ -130,12 +130,9 @@ class Coupling(eqx.Module):
 
         steps = 16 * len(self.coefficients)
         grid = (np.arange(steps + 1) - 0.5) / steps
-        sign = np.sign(self(grid))
-        crossed = zip(grid[:-1], grid[1:], sign[:-1] * sign[1:] < 0, strict=True)
-        value = lambda x: float(self([x])[0])  # noqa: E731
-        roots = [
-            optimize.root_scalar(value, bracket=(a, b)).root for a, b, turns in crossed if turns
-        ]
+        sign, value = np.sign(self(grid)), lambda x: float(self([x])[0])
+        crossed = np.flatnonzero(sign[:-1] * sign[1:] < 0)
+        roots = [optimize.brentq(value, *grid[k : k + 2]) for k in crossed]
         return tuple(Locked(x % 1.0, float(self._slope([x])[0])) for x in roots)
 
 
@@ -214,17 +211,14 @@ class Responses(eqx.Module):
         **Raises:** `DefinitionError` for an input that does not exist or acts at events, for a
         cycle that is driven by a clock, and inside of transformations of JAX.
         """
-        of_phase = self._covector(None)
-        signal, column = self._input(input)
+        signal, pushed = self._pushed(input)
         if any(x.weight[signal] != 0 for x in self.impulses()):
             raise DefinitionError(f"'{signal}' acts at events alone: see `impulses()`.")
-        flow = to_host(self.flow)
-        values = np.einsum("pki,pkiu->pku", of_phase, flow.by_input)
-        values = values[..., column] / float(self.period)
-        phase = (flow.t - flow.t[0, 0]) / float(self.period)
-        tail = np.where(flow.event >= 0, np.nan, values[:, -1])[:, None]
-        values = np.concatenate([values, tail], axis=1).ravel()
-        phase = np.concatenate([phase, phase[:, -1:]], axis=1).ravel()
+        flow, period = to_host(self.flow), float(self.period)
+        phase = (flow.t - flow.t[0, 0]) / period
+        tail = np.where(flow.event >= 0, np.nan, pushed[:, -1]) / period
+        pairs = (phase, phase[:, -1]), (pushed / period, tail)
+        phase, values = (np.concatenate([x, y[:, None]], axis=1).ravel() for x, y in pairs)
         return PhaseCurve(phase, values, signal, time_unit=self.structure.system.time_unit)
 
     def coupling(
@@ -242,13 +236,12 @@ class Responses(eqx.Module):
         that is driven by a clock.
         """
         flow, xp, period = self.flow, namespace(self.flow.q), self.period
-        signal, column = self._input(input)
+        signal, pushed = self._pushed(input)
         # Nodes within parts of pieces that resolve the fastest wave.
         parts, (x, weight) = 1 + harmonics // 2, np.polynomial.legendre.leggauss(NODES)
         x = ((np.arange(parts)[:, None] + (x + 1) / 2) / parts).ravel()
         phase = ((flow.turn[:, None] + flow.length[:, None] * x) / period).ravel()
         weight = (flow.length[:, None] / period * np.tile(weight / 2 / parts, parts)).ravel()
-        pushed = xp.einsum("pki,pki->pk", self._covector(None), flow.by_input[..., column])
         chart, Z, states = flow.at(phase, period, pushed, flow.q)
         if isinstance(push, str):
             require_among("state", [push], self.structure.state_names(), "`push`: ")
@@ -280,9 +273,11 @@ class Responses(eqx.Module):
         period = number(self.period, 9, self.structure.system.time_unit)
         return f"Responses({name}: period {period})" + "".join(f"\n  {x}" for x in kinds)
 
-    def _input(self, name: str | None) -> tuple[str, int]:
-        names, columns = self.structure.inputs_among(name if name is None else [name])
-        return names[0], columns[0]
+    def _pushed(self, name: str | None) -> tuple[str, Float[Array, "P K"]]:
+        """An input (Default: the first), and the response of the phase to it at the nodes."""
+        (name, *_), columns = self.structure.inputs_among(name if name is None else [name])
+        by_input = self.flow.by_input[..., columns[0]]
+        return name, namespace(by_input).sum(self._covector(None) * by_input, axis=-1)
 
     def _covector(self, mode: int | None) -> Inexact[Array, "P K d"]:
         if mode is None:
@@ -295,6 +290,7 @@ class Responses(eqx.Module):
         require_index("mode with an amplitude", mode, len(self.exponents))
         return self.of_amplitudes[mode]
 
+    @one_program
     def _named(
         self, covector: Inexact[Array, "P K d"], phase: Phases, scale: Array = 1.0
     ) -> dict[str, Array]:
@@ -309,7 +305,11 @@ class Responses(eqx.Module):
 
 def responses(cycle: Any, modes: int | None) -> Responses:
     """The responses of a cycle (see `LimitCycle.responses`)."""
-    flow = linear_flow(cycle)
+    return _responses(cycle, linear_flow(cycle), modes)
+
+
+@one_program
+def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
     host, xp, map = on_host(flow.t), namespace(flow.t), cycle.return_map
     period, clocked = map.expected, map.base is None
     whole = flow.monodromy(map.valid)

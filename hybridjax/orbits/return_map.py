@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import at_ease
 from .._core.executor import Array, namespace, on_host, put, scan, stop_gradient, svdvals
+from .._core.lanes import PerLane
 from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
@@ -126,7 +127,8 @@ class ReturnMap(eqx.Module):
 
     @remembered
     def structure(self) -> Structure:
-        return Structure(self.system)
+        system: Any = self.system  # (may have lanes on the host)
+        return (kernels.Systems if isinstance(system, PerLane) else Structure)(system)
 
     @property
     def scale(self) -> Float[Array, "A d"]:
@@ -137,19 +139,24 @@ class ReturnMap(eqx.Module):
     @property
     def sizes(self) -> Float[Array, " d"]:
         """Sizes of the states of the anchor's chart."""
-        return self.scale[self.anchor.chart][0]
+        return self.each(self.scale[self.anchor.chart])
 
     @property
     def valid(self) -> Bool[Array, " d"]:
         """The entries of the padded state that the anchor's chart has."""
-        chart = self.anchor.chart[0]
-        return np.arange(self.structure.d) < namespace(chart).asarray(self.structure.dims)[chart]
+        chart = self.each(self.anchor.chart)
+        dims = namespace(chart).asarray(self.structure.dims)[chart]
+        return np.arange(self.structure.d) < dims[..., None]
 
     @property
     def event(self) -> int:
         """Index of the transition with which every turn begins and ends; -1 for none."""
         base = self.base
         return self.structure.transition_index(base.name) if isinstance(base, AtEvent) else -1
+
+    def each(self, x: Array) -> Array:
+        """Entries of lanes (on the first axis), or that of the only lane."""
+        return x if self.expected.ndim else x[0]
 
     def at_phase_of(self, system: HybridSystem) -> "ReturnMap":
         """The map of another system; a clocked one begins at the same phase of its own clock."""
@@ -163,18 +170,26 @@ class ReturnMap(eqx.Module):
         """Guards and levels at lanes, without input."""
         xp, L = namespace(lanes.t), lanes.t.shape[0]
         u, everywhere = xp.zeros((self.structure.nu, L)), xp.ones(L, bool)
-        return watch(self.structure, lanes.t, lanes.chart, lanes.q, u, target, everywhere)
+        s = self._structure_of(lanes)
+        return watch(s, lanes.t, lanes.chart, lanes.q, u, target, everywhere)
 
     def slopes(self, lanes: Lanes) -> Float[Array, "d L"]:
         """The vector field at lanes, without input."""
         u = namespace(lanes.t).zeros((self.structure.nu, lanes.t.shape[0]))
-        return slopes(self.structure, lanes.t, lanes.chart, lanes.q, u)
+        return slopes(self._structure_of(lanes), lanes.t, lanes.chart, lanes.q, u)
+
+    def _structure_of(self, lanes: Lanes) -> Structure:
+        """The structure, of the pieces of every lane if `lanes` are those."""
+        own, count = len(self.anchor.t), len(lanes.t)
+        same = own == count
+        return self.structure if same else self.structure.at(np.arange(count) % own)
 
     def departure(self, q: Float[Array, " d"]) -> Lanes:
         """The lane at the beginning of a turn; an event that has just happened is not armed."""
-        s, anchor = self.structure, self.anchor
-        lanes = start_lanes(s, anchor.t, anchor.chart, q[:, None])
-        lanes = arm(s, lanes, self.watch(lanes, until(lanes.t)), self.expected[None])
+        s, anchor, xp = self.structure, self.anchor, namespace(q)
+        lanes = start_lanes(s, anchor.t, anchor.chart, xp.atleast_2d(q).T)
+        span = xp.atleast_1d(self.expected)
+        lanes = arm(s, lanes, self.watch(lanes, until(lanes.t)), span)
         other = np.arange(len(s.transitions))[:, None] != self.event
         return lanes._replace(armed=lanes.armed & other) if self.event >= 0 else lanes
 
@@ -201,7 +216,7 @@ class ReturnMap(eqx.Module):
         otherwise they are meaningless. `along`: the map after a step of the parameters. `record`:
         see `turn`.
         """
-        s, xp, settings = self.structure, namespace(q), self.settings
+        s, xp, settings, each = self.structure, namespace(q), self.settings, self.each
 
         def flow(lanes, target, h, result, piece):
             if piece is None:
@@ -215,32 +230,37 @@ class ReturnMap(eqx.Module):
                 other = along  # (known to be a function in the function below, too)
                 moves = derivative_at_zero(lambda step: self._end(other(step), lanes, target, tape))
             steps = Tape(tape.h, tape.code, tape.t, None, None, None)
-            return moved, (lanes, jacobian[0, 1:], moves, tape, Recorded(moved, steps))
+            return moved, (lanes, each(jacobian[:, 1:]), moves, tape, Recorded(moved, steps))
 
         if on_host(q):  # (all pieces are linearized together)
             options = Options(True, new_input=False, tangents=wanted)
             (end, (legs, _, tapes)), moves, recorded = self.travel(q, options), None, None
         else:
             end, (legs, factors, moves, tapes, recorded) = self.travel(q, flow, record)
-        legs, tape = side_by_side((legs, tapes))
+        (ends, levels), d = self.ends().split(), s.d
+        lanes, tape, ends = side_by_side((legs, tapes, ends))
         if on_host(q):
-            factors = tape_jacobian(s, legs, self.ends(), tape, of_states=True)[0][:, 1:]
-        codes, valid = tapes.code[..., 0], self.valid
+            many, ends = self._structure_of(lanes), ends.with_levels(levels)
+            factors = tape_jacobian(many, lanes, ends, tape, True, wanted)[0][:, 1:]
+            factors = factors.reshape(LEGS, *q.shape, d)
+        codes, valid = each(xp.moveaxis(tapes.code, -1, 0)), self.valid
         off, by_state = self.held(q)
-        returned = xp.where(valid[:, None], monodromy(factors), 0.0)
-        jacobian = returned - np.eye(len(q)) - by_state
+        returned = xp.where(valid[..., None], monodromy(factors), 0.0)
+        jacobian = returned - np.eye(d) - by_state
         if along is not None:
             add = lambda total, leg: (leg[0] @ total + leg[1], None)  # noqa: E731
             total, _ = scan(add, jnp.zeros_like(q), (factors, moves))
             held = derivative_at_zero(lambda step: along(step).held(q)[0])
             jacobian = jnp.column_stack([jacobian, jnp.where(valid, total, 0.0) - held])
         if self.base is not None:
-            factors = across(self.slopes(legs).T, self.scale[legs.chart], factors)
+            f, scale = self.slopes(lanes).T, self.scale[lanes.chart]
+            factors = across(f.reshape(LEGS, *q.shape), scale.reshape(LEGS, *q.shape), factors)
         defect = xp.abs(end.residual) + xp.abs(off)
+        times, meetings = each(xp.moveaxis(tapes.t, -1, 0)), self._meetings(lanes, codes)
+        legs = jax.tree_util.tree_map(lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs)
         return Turn(
-            end.residual, jacobian, legs, factors, codes, tapes.t[..., 0],
-            end.period, xp.max(defect / self.sizes), end.result, self._meetings(legs, codes),
-            recorded, tapes,
+            end.residual, jacobian, legs, xp.moveaxis(factors, 0, -3), codes, times, end.period,
+            xp.max(defect / self.sizes, axis=-1), end.result, meetings, recorded, tapes,
         )  # fmt: skip
 
     def _end(self, other: "ReturnMap", lanes: Lanes, target: Target, tape) -> Float[Array, " d"]:
@@ -254,16 +274,18 @@ class ReturnMap(eqx.Module):
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
         sizes, valid, xp = self.sizes, self.valid, namespace(q)
-        defect = monodromy(turn.factors) - xp.diag(valid * 1.0) - self.held(q)[1]
-        singular = svdvals(defect * sizes / sizes[:, None])
-        smallest = xp.min(xp.where(np.arange(len(q)) < valid.sum(), singular, np.inf))
+        unit, held = valid[..., None] * np.eye(self.structure.d), self.held(q)[1]
+        defect = monodromy(xp.moveaxis(turn.factors, -3, 0)) - unit - held
+        singular = svdvals(defect * sizes[..., None, :] / sizes[..., None])
+        counts = np.arange(self.structure.d) < valid.sum(axis=-1)[..., None]
+        smallest = xp.min(xp.where(counts, singular, np.inf), axis=-1)
         code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
         closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
         code = xp.where(turn.closed & ~xp.isnan(smallest), closed, code)
         if self.base is not None:
-            same = turn.legs.chart == self.anchor.chart
-            apart = xp.max(xp.abs(turn.legs.q - q[:, None]) / sizes[:, None], axis=0)
-            farthest = xp.max(xp.where(same, apart, np.inf))
+            same = turn.legs.chart == self.each(self.anchor.chart)[..., None]
+            apart = xp.max(xp.abs(turn.legs.q - q[..., None]) / sizes[..., None], axis=-2)
+            farthest = xp.max(xp.where(same, apart, np.inf), axis=-1)
             still = farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
@@ -279,14 +301,15 @@ class ReturnMap(eqx.Module):
         """
         xp, sizes = namespace(q), self.sizes
         if not self.conserved:
-            return xp.zeros_like(q), xp.zeros((len(q), len(q)))
+            return xp.zeros_like(q), xp.zeros((*q.shape, q.shape[-1]))
         values, gradient = self.outputs(q, tuple(self.conserved))
         excess = values - xp.stack(list(self.conserved.values()))
-        steep = xp.linalg.norm(gradient * sizes, axis=1, keepdims=True)
+        scaled = gradient * sizes[..., None, :]
+        steep = xp.linalg.norm(scaled, axis=-1, keepdims=True)
         steep = xp.where(steep > 0, steep, 1.0)
-        back = sizes[:, None] * xp.linalg.pinv(gradient * sizes / steep) / steep.T
+        back = sizes[..., None] * xp.linalg.pinv(scaled / steep) / xp.swapaxes(steep, -1, -2)
         back = stop_gradient(back)
-        return back @ excess, back @ gradient
+        return (back @ excess[..., None])[..., 0], back @ gradient
 
     def outputs(
         self, q: Float[Array, " d"], names: tuple[str, ...]
@@ -294,8 +317,9 @@ class ReturnMap(eqx.Module):
         """Outputs at the anchor's time in its chart, and their derivatives by the state."""
         s, (t, chart, *_) = self.structure, self.anchor
         outputs = lambda a, *point: kernels.outputs(s, a, names, *point)  # noqa: E731
-        by = with_derivatives(s, outputs, chart, t, q[:, None], len(names))[..., 0]
-        return by[:, 0], by[:, 2 : 2 + s.d]
+        q = namespace(q).atleast_2d(q).T
+        by = self.each(with_derivatives(s, outputs, chart, t, q, len(names)).transpose(2, 0, 1))
+        return by[..., 0], by[..., 2 : 2 + s.d]
 
     def travel(
         self, q: Float[Array, " d"], flow: Any, record: Recorded | None = None
@@ -310,23 +334,23 @@ class ReturnMap(eqx.Module):
         def leg(carry, end):
             lanes, h, result = carry
             *end, piece = end
-            time, index, event, limit = (x[None] for x in end)
+            time, index, event, limit = (xp.atleast_1d(x) for x in end)
             target = Target(time, index, event, limit, None, ends.levels, ends.missed)
             moved, extra = flow(lanes, target, h, result, piece)
             return (moved.lanes, moved.h, moved.result), extra
 
-        lanes = self.departure(q)  # (no `events` is `Result.OK`)
-        h = (0.5 * self.expected / LEGS)[None]
+        lanes, each = self.departure(q), self.each  # (no `events` is `Result.OK`)
+        h = xp.atleast_1d(0.5 * self.expected / LEGS)
         if isinstance(flow, Options):
-            u, begin = xp.zeros((self.structure.nu, 1)), (lanes, stride(h), lanes.events)
+            u, begin = xp.zeros((self.structure.nu, len(h))), (lanes, stride(h), lanes.events)
             (end, _, result), extra = through(self.structure, begin, u, ends, self.settings, flow)
         else:
-            each = ends.time, ends.index, ends.event, ends.limit, record
-            (end, _, result), extra = scan(leg, (lanes, h, lanes.events), each)
-        same = (result[0] == Result.OK) & (end.chart[0] == self.anchor.chart[0])
-        residual = xp.where(self.valid, end.q[:, 0], 0.0) - q - self.held(q)[0]
-        residual = xp.where(same, residual, np.nan)
-        return Return(residual, end.t[0] - self.anchor.t[0], result[0]), extra
+            rows = ends.time, ends.index, ends.event, ends.limit, record
+            (end, _, result), extra = scan(leg, (lanes, h, lanes.events), rows)
+        same = each((result == Result.OK) & (end.chart == self.anchor.chart))
+        residual = xp.where(self.valid, each(end.q.T), 0.0) - q - self.held(q)[0]
+        residual = xp.where(same[..., None], residual, np.nan)
+        return Return(residual, each(end.t - self.anchor.t), each(result)), extra
 
     def pieces(self, tangents: bool = False) -> tuple[Lanes, Tape]:
         """The starts and tapes of the pieces of one turn."""
@@ -336,9 +360,9 @@ class ReturnMap(eqx.Module):
         return lanes, tapes
 
     def ends(self) -> Target:
-        """The ends of the pieces, as lanes."""
-        t0, expected, xp = self.anchor.t[0], self.expected, namespace(self.expected)
-        k = xp.arange(1, LEGS + 1)
+        """The ends of the pieces, as lanes; of several lanes, by piece and lane."""
+        t0, expected, xp = self.each(self.anchor.t), self.expected, namespace(self.expected)
+        k = xp.arange(1, LEGS + 1).reshape(LEGS, *[1] * expected.ndim)
         if self.base is None:
             return toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
         free = 1 - (1 - _FREE) / self.multiplicity
@@ -352,14 +376,15 @@ class ReturnMap(eqx.Module):
         )
 
     def _meetings(self, legs: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
-        xp = namespace(codes)
+        xp, shape = namespace(codes), codes.shape[:-2]
         if self.base is None:
-            return xp.asarray(self.multiplicity, dtype=np.int32)
+            return xp.full(shape, self.multiplicity, np.int32)
         if self.event >= 0:
-            return xp.sum(codes == self.event, dtype=np.int32)
+            return xp.sum(codes == self.event, axis=(-2, -1), dtype=np.int32)
         level = self.watch(legs, to_section(until(legs.t), self.base)).value[-1]
-        falls = (level[1:-1] > 0) & (level[2:] <= 0) & (legs.events[1:-1] == legs.events[2:])
-        return 1 + xp.sum(falls, dtype=np.int32)
+        level, events = (x.reshape(LEGS, *shape) for x in (level, legs.events))
+        falls = (level[1:-1] > 0) & (level[2:] <= 0) & (events[1:-1] == events[2:])
+        return 1 + xp.sum(falls, axis=0, dtype=np.int32)
 
 
 def across(

@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked_methods
-from .._core.compilation import at_ease
+from .._core.compilation import at_ease, one_program
 from .._core.executor import Array, is_traced, namespace, on_host
 from .._core.text import number
 from ..engine import kernels
 from ..errors import ComputationError
 from ..systems.structure import Structure
-from ..systems.varied import Varied, under
+from ..systems.varied import Varied, parameter_of
 from .crossing import AtEvent, ListLevels
 from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
 from .responses import Phases, loop
@@ -68,12 +68,13 @@ class Sensitivity(eqx.Module):
 
 def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
     """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`)."""
-    varied = Varied(cycle.system, parameter)
+    parameter_of(cycle.system, parameter)
     flow = linear_flow(cycle, parameter=parameter)
     with at_ease():
-        return _sensitivity(cycle, flow, varied)
+        return _sensitivity(cycle, flow, Varied(cycle.system, parameter))
 
 
+@one_program
 def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     map, period, events = cycle.return_map, cycle.period, cycle.event_sequence
     s, xp, f0, clocked = map.structure, namespace(flow.q), flow.field[0, 0], map.base is None
@@ -83,7 +84,7 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     closed, Z = loop(map, whole, f0)
     longer = -(Z @ total[:, 0])
     if clocked:
-        period_at = lambda k: jnp.asarray(varied.at(k).period(), float)  # noqa: E731
+        period_at = lambda k: jnp.asarray(varied.under(k[None]).system.period(), float)  # noqa: E731
         longer = map.multiplicity * derivative_at_zero(period_at)
         if on_host(whole) and np.linalg.svd(closed, compute_uv=False)[-1] < SINGULAR:
             raise ComputationError(
@@ -115,12 +116,8 @@ def section_delay(
     """The time by which a changed state at phase 0 comes later to the section, per change of the
     state and of the first input."""
     assert map.base is not None
-    levels = ListLevels((map.base,))
+    levels, index = ListLevels((map.base,)), np.zeros(1, np.int32)
     of, (t, chart, q, *_) = with_inputs(map.system, parameter), map.anchor
-    level = lambda a, *at: kernels.linear(of, _level, a, *at, levels)  # noqa: E731
+    level = lambda a, t, q, u: kernels.watched(of, a, levels, t, q, u, index)[-1:]  # noqa: E731
     by = with_derivatives(of, level, chart, t, q, 1)[0, 2 : 3 + len(f), 0]
     return by[:-1] / -(by[:-1] @ f), by[-1] / -(by[:-1] @ f)
-
-
-def _level(a: int, s: Structure, levels: ListLevels, t, q, u):
-    return levels.level(under(s, u), a, jnp.zeros((), int), t, q)[None]

@@ -1,7 +1,6 @@
 """Limit cycles over a space of parameters."""
 
 import dataclasses
-import functools as ft
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
@@ -13,7 +12,6 @@ from scipy.stats import qmc
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, FilePath
-from .._core.compilation import TwoTiers
 from .._core.execution import Execution
 from .._core.pieces.description import digest_of, versions
 from .._core.pieces.run import DaskClient, fill
@@ -22,19 +20,19 @@ from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..engine.settings import Settings
 from ..errors import ComputationError, DefinitionError
-from ..orbits.batches import Known, Tiles
+from ..orbits.batches import BATCH, SMALL, Known, Tiles, tiles_of
 from ..orbits.cycle import LimitCycle, rough
 from ..orbits.find import find_limit_cycle
-from ..orbits.limit_cycles import BATCH, SMALL, LimitCycles, as_cycles, map_for_sweep
+from ..orbits.limit_cycles import LimitCycles, as_cycles, map_for_sweep
 from ..orbits.return_map import ReturnMap
 from ..systems.system import HybridSystem
 from .family import Axes, Family, Points, Space
 from .wanted import Measure, Want, Wanted
 
 
-# Points of a piece at most, and pieces of a large sweep at least. Smaller pieces: many small files,
-# and worse first guesses. Larger ones: more is lost with a worker.
-_MOST, _PIECES = 4000, 64
+# Pieces of a large sweep. More: many small files, and worse first guesses. Fewer: more is lost with
+# a worker.
+_PIECES = 64
 # Cycles of the coarse pass. Fewer: worse first guesses in each piece. More: it takes longer than
 # they save.
 _COARSE = 250
@@ -81,7 +79,8 @@ def sweep(
         always the same shape. NaN where they raise `ComputationError`. The code of the cycle's
         `Result` is always kept. Default: period and spectral radius.
     - `guess`: the cycle of a similar system. Default: that of the model in the middle.
-    - `chunk`: largest number of points in a piece. Default: up to 4000, with functions 250.
+    - `chunk`: largest number of points in a piece. Default: 4000, with functions 250;
+        more in sweeps of more than 64 such pieces without functions.
     - `store`: a folder, or an address for fsspec, of a Zarr group. Points that are in it already
         are not computed again: after an interruption, repeat the call.
     - `client`: a `distributed.Client`, whose workers compute the pieces.
@@ -100,7 +99,7 @@ def sweep(
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
     system = family.check(middle)
     wanted, total = Wanted(want, system), math.prod(space.shape)
-    most = chunk or (BATCH if wanted.measures else min(max(total // _PIECES, BATCH), _MOST))
+    most = chunk or (BATCH if wanted.measures else max(total // _PIECES, SMALL // 2))
     blocks = Blocks(space.shape, near_cube(space.shape, most))
     description = {
         "kind": "sweep",
@@ -206,12 +205,11 @@ class SweepJob:
 
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
         assert self.begun is not None
+        systems, total = self.family.systems(self.space.at(index)), math.prod(self.blocks.shape)
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
-        size, threads = min(BATCH, math.prod(self.blocks.block)), Execution(workers=workers).threads
-        # (Results of a piece do not depend on when it is computed.)
-        tiers = ft.partial(TwoTiers, large=math.prod(self.blocks.shape) > SMALL, steady=True)
-        systems = self.family.systems(self.space.at(index))
-        return Tiles(systems, self.begun.map, size, threads, ft.cache(tiers))
+        size = min(BATCH, math.prod(self.blocks.block)) if total > SMALL else None
+        threads = Execution(workers=workers).threads
+        return tiles_of(systems, self.begun.map, size, threads, total)
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""

@@ -29,7 +29,7 @@ from ..orbits.checks import check_outputs
 from ..orbits.coincidence import SAME, TOGETHER
 from ..orbits.crossing import Crossing, ListLevels, to_section
 from ..orbits.cycle import LimitCycle
-from ..orbits.linear_flow import of_flow
+from ..orbits.linear_flow import beginning, of_flow
 from ..orbits.return_map import PATIENCE, ReturnMap
 from ..systems.structure import Structure
 from . import families
@@ -190,9 +190,7 @@ def place_along(
         raise NotOnHostError
     P = len(jax.tree_util.tree_leaves((by_cycle, by_family))[0])
     s, bound = map.structure, placed.bound
-    x, longer = np.zeros((1 + s.d, P)), np.zeros(P) if by_cycle.period is None else by_cycle.period
-    x[0] = 0.0 if by_cycle.anchor.t is None else by_cycle.anchor.t[:, 0]
-    x[1:] = 0.0 if by_cycle.anchor.q is None else by_cycle.anchor.q[..., 0].T
+    x, longer = beginning(by_cycle, s.d, P)
 
     def follow(flow, by_levels, times, twice=False):
         lanes, tape = side_by_side((flow[0], flow[2]))

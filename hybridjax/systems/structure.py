@@ -226,12 +226,23 @@ class Structure:
         every = self, *trees
         return self.once(name, trees, lambda: kernel(function, form, static, every, lanes))
 
+    # Whether lanes of the host have systems of their own (see `engine.kernels.Systems`).
+    by_system = False
+
+    def at(self, lane: Int[np.ndarray, " L"]) -> "Structure":
+        """The structure for lanes of these indices."""
+        return self
+
     def once(self, name: Hashable, trees: tuple, make: Callable[[], Any]) -> Any:
         """Return what was made under this name for these trees, made anew only for other trees."""
         if name in self._made and all(map(operator.is_, self._made[name][1], trees)):
             return self._made[name][0]
         self._made[name] = made, _ = make(), trees
         return made
+
+    def under(self, u: Array) -> "Structure":
+        """The structure under inputs that are added to parameters (see `Varied`)."""
+        return self
 
     def chart_index(self, name: str) -> int:
         return _index("chart", name, self.names)
@@ -288,10 +299,9 @@ class Structure:
             return s.guard(x, *point), s.reset(x, *point), s.enabled(x, *point)
 
         real, array = jnp.result_type(float), jax.ShapeDtypeStruct
-        place = array((), jnp.result_type(int))
-        point = array((), real), array((n,), real), array((self.nu,), real)
+        place, single = array((), jnp.result_type(int)), Structure(one_lane(self.source))
+        point = array((), real), array((n,), real), array((single.nu,), real)
         try:
-            single = Structure(one_lane(self.source))
             program, *_ = eqx.filter_make_jaxpr(at_a_point)(single, place, *point)
         except Exception:  # any error of a user's function, or of JAX in it
             return False

@@ -1,19 +1,17 @@
 """Parameters by name, and parameters as inputs: a system whose inputs are added to them."""
 
-import dataclasses
 import operator
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from .._core.arguments import require_among
 from .._core.executor import Array
-from .chart import Chart, FieldChart
 from .structure import Structure
-from .system import Derived, HybridSystem, parameters_of
-from .transition import Scheduled
+from .system import HybridSystem, parameters_of
 
 
 def parameter_of(system: HybridSystem, parameter: str) -> Array:
@@ -32,52 +30,35 @@ def with_parameters(system: HybridSystem, values: Mapping[str, Any]) -> HybridSy
     return eqx.tree_at(where, system, [jnp.asarray(x, float) for x in values.values()])
 
 
-class Varied(Derived):
-    """`system`, whose one input is added to a parameter; its own inputs are zero."""
+def _under(name: str) -> Any:
+    def function(self, x, t, q, u):
+        s = self.under(u)
+        return getattr(s, name)(x, t, q, jnp.zeros(s.nu))
 
-    input_units: ClassVar[tuple[str, ...]] = ()
-    parameter: str = eqx.field(static=True)
-
-    def __init__(self, system: HybridSystem, parameter: str):
-        parameter_of(system, parameter)
-        self.system, self.parameter, self.solver = system, parameter, system.solver
-
-    @property
-    def inputs(self) -> tuple[str, ...]:  # type: ignore[override]  # pyright: ignore[reportIncompatibleVariableOverride]
-        return (self.parameter,)
-
-    def at(self, change: Array) -> HybridSystem:
-        """The system after a change of the parameter."""
-        value = parameter_of(self.system, self.parameter)
-        return with_parameters(self.system, {self.parameter: value + change})
-
-    def charts(self):
-        return {name: self._chart(name, x) for name, x in self.system.charts().items()}
-
-    def _chart(self, name: str, x: Chart):
-        still = jnp.zeros(self._size(name))
-        field = lambda t, q, u: self.at(u[0]).charts()[name].field(t, q, still)  # noqa: E731
-        return FieldChart(field, x.states, x.units, x.solver)
-
-    def transitions(self):
-        return [self._transition(g, x) for g, x in enumerate(self.system.transitions())]
-
-    def _transition(self, g: int, x: Any):
-        still = jnp.zeros(self._size(x.source))
-
-        def of(name):
-            function = getattr(x, name)
-            if function is None or isinstance(function, Scheduled):
-                return function
-            return lambda t, q, u: getattr(list(self.at(u[0]).transitions())[g], name)(t, q, still)
-
-        return dataclasses.replace(x, **{name: of(name) for name in ("guard", "reset", "enabled")})
-
-    def _size(self, chart: str) -> int:
-        inputs = self.system.charts()[chart].inputs
-        return len(self.system.inputs if inputs is None else inputs)
+    return function
 
 
-def under(s: Structure, u: Array) -> Structure:
-    """The structure of a system at the parameter to which its input is added, if it is `Varied`."""
-    return Structure(s.system.at(u[0])) if isinstance(s.system, Varied) else s
+@jax.tree_util.register_pytree_node_class
+class Varied(Structure):
+    """The structure of a system whose one input is added to a parameter; its own inputs are zero.
+
+    Transitions have the guards of the unchanged system, but for those of `under`.
+    """
+
+    nu = 1  # type: ignore[assignment]
+    field, guard, reset = map(_under, ("field", "guard", "reset"))
+
+    def __init__(self, source: HybridSystem, parameter: str):
+        super().__init__(source)
+        self.parameter = parameter
+
+    def tree_flatten(self):
+        return (self.source,), self.parameter
+
+    @classmethod
+    def tree_unflatten(cls, parameter, children):
+        return cls(*children, parameter)
+
+    def under(self, u: Array) -> Structure:
+        value = parameter_of(self.system, self.parameter) + u[0]
+        return Structure(with_parameters(self.system, {self.parameter: value}))

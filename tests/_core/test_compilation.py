@@ -92,9 +92,6 @@ def test_later_jobs_take_the_optimized_program(tiers, monkeypatch):
     later = TwoTiers(total, large=False)
     np.testing.assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
     assert [x[1] for x in later._chosen.values()] == [program._full] and len(tiers) == 2
-    steady = TwoTiers(total, large=False, steady=True)
-    assert steady(X, jnp.sin, 1) == job(X, jnp.sin, 1)
-    assert [x[1] for x in steady._chosen.values()] == [program._quick]
 
 
 def test_functions_that_are_written_anew_share_a_program(tiers):

@@ -35,6 +35,11 @@ def test_experiments_start_in_their_periodic_response(run, start, least, most):
         run(hj.multisine(4, 3, (0, 1.2), 0.05, seed=2), start=start)
 
 
+def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
+    whole = run(DESIGN.inputs(6), start="steady", discard=0)
+    np.testing.assert_allclose(whole.y, run(DESIGN, start="steady").y, rtol=0, atol=1e-8)
+
+
 def test_a_steady_start_that_is_not_there_is_named(run, monkeypatch):
     monkeypatch.setattr(steady, "MOST_STEPS", 1)
     u = np.tile(DESIGN.inputs(6)[:1], (3, 1, 1)) * np.array([0.0, 1.0, 0.0])[:, None, None]

@@ -184,8 +184,7 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     kept = np.isfinite(curve.values)
     np.testing.assert_allclose(curve.values[kept], exact[kept], rtol=1e-12)
     assert 0 < np.sum(~kept) <= 2 and curve.input == "u"
-    # Sustained: T = arctan(1) - arctan(low), whose derivative is -1 / (1 + low^2).
-    change = cycle.sensitivity("low")
+    change = cycle.sensitivity("low")  # T = arctan(1) - arctan(low)
     np.testing.assert_allclose(change.period, -1 / 5, rtol=1e-11)
     np.testing.assert_allclose(change.durations, [-1 / 5], rtol=1e-11)
     np.testing.assert_allclose(change.shape([0.0])["v"], [1.0], rtol=1e-11)
@@ -200,6 +199,9 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
     np.testing.assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
     # By symmetry each quarter takes its part.
     np.testing.assert_allclose(np.reshape(a.durations, (4, 2)).sum(1), a.period / 4, rtol=1e-9)
+    # A cycle that begins where sliding ends can be followed.
+    periods = [hj.find_limit_cycle(Square(a=x), cycle).period for x in (0.19, 0.21)]
+    np.testing.assert_allclose(np.diff(periods)[0] / 0.02, a.period, rtol=1e-3)
 
 
 # All of `hj.models` without a clock, except a family of cycles (SLIPRunner).
@@ -254,6 +256,9 @@ def test_mathieus_equation_has_the_published_continuous_htf():
     ]
     np.testing.assert_allclose(htf.H[:, 0, 0, 0], published, rtol=0, atol=1e-11)
     assert "continuous time" in str(htf) and htf[1].shape == (1, 1, 1)
+    held = hj.linearize(cycle, hj.ClockPhase(64), "x").htf(0.25, (-1, 0, 1)).H
+    x = 2j * np.pi * 0.25 / 64  # less aliases, the factor of the hold
+    np.testing.assert_allclose(held * x / (1 - np.exp(-x)), htf.H, rtol=1e-7)
     with pytest.raises(hj.DefinitionError, match="takes HTFs between sections"):
         htf.predict(np.ones((32, 1)))
 
@@ -340,9 +345,9 @@ def test_sensitivities_are_differences_of_cycles(system, name):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "system, name, output",
-    [(Neuron(), "current", "v"), (hj.models.VerticalHopper(), "k", "yM"),
-     (hj.models.BuckConverter(), "Vin", "v")],
-    ids=["a phase", "two charts", "a schedule"],
+    [(Neuron(grip=0.3), "current", "v"), (hj.models.VerticalHopper(), "k", "yM"),
+     (hj.models.BuckConverter(), "Vin", "v"), (hj.models.TwoLeggedBar(), "m", "y")],
+    ids=["a phase", "two charts", "a schedule", "four charts"],
 )  # fmt: skip
 def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, output):
     guess, begin = hj.find_limit_cycle(system), jnp.asarray(getattr(system, name), float)
@@ -356,7 +361,9 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         noisy = noise.covariance(at)[0, 0, 0] if guess.clocked else noise.diffusion
         change = cycle.sensitivity(name)
         shape = change.shape(at)[output][0] if guess.clocked else change.period
-        return jnp.real(jnp.stack([jnp.abs(push[output][0]), jnp.abs(htf), noisy, shape]))
+        impulse = responses.impulses(0 if guess.clocked else None)[0].weight["u"]
+        later = change.durations[0]
+        return jnp.abs(jnp.stack([push[output][0], htf, noisy, shape, impulse, later]))
 
     forward = jax.jvp(result, (begin,), (jnp.ones(()),))[1]
     central = lambda h: (result(begin + h) - result(begin - h)) / (2 * h)

@@ -32,15 +32,14 @@ MOST_ROWS, UNROLLED_PIVOTED = 12, 7
 def solve_positive(
     matrix: Float[Array, "n n"], right: Float[Array, "*b n"]
 ) -> Float[Array, "*b n"]:
-    """Return x in `matrix @ x = right` for a symmetric positive definite matrix, of which the lower
-    triangle is read, by L D L^T, which is computed once for all right sides.
+    """Return x in `matrix @ x = right` for a symmetric positive definite matrix, by L D L^T, which
+    is computed once for all right sides and for derivatives.
 
     NaN where a pivot is not positive, up to rounding: the matrix is singular, or not definite.
     """
     n = right.shape[-1]
     lower, below = _square(n), _square(n)
     pivots: list[Array] = []
-    x: list[Array] = []
     singular = jnp.asarray(False)
     for j in range(n):
         for i in range(j, n):
@@ -50,12 +49,19 @@ def solve_positive(
         pivots.append(1 / pivot)
         for i in range(j + 1, n):
             lower[i][j] = below[i][j] * pivots[j]
-    for i in range(n):
-        b = right[..., i] if i else jnp.where(singular, jnp.nan, right[..., i])
-        x.append(_less(b, [(lower[i][k], x[k]) for k in range(i)]))
-    for i in reversed(range(n)):
-        x[i] = _less(x[i] * pivots[i], [(lower[k][i], x[k]) for k in range(i + 1, n)])
-    return jnp.stack(x, axis=-1)
+
+    def by_factors(_, right):
+        x: list[Array] = []
+        for i in range(n):
+            b = right[..., i] if i else jnp.where(singular, jnp.nan, right[..., i])
+            x.append(_less(b, [(lower[i][k], x[k]) for k in range(i)]))
+        for i in reversed(range(n)):
+            x[i] = _less(x[i] * pivots[i], [(lower[k][i], x[k]) for k in range(i + 1, n)])
+        return jnp.stack(x, axis=-1)
+
+    # (Derivatives use the factors, too.)
+    times = lambda x: x @ matrix  # noqa: E731
+    return jax.lax.custom_linear_solve(times, right, by_factors, symmetric=True)
 
 
 @jax.jit

@@ -6,13 +6,13 @@ its decisions are recorded in a `Tape`, which `replay` follows.
 
 import numpy as np
 
-from ..._core.executor import cond, namespace, put, while_loop
+from ..._core.executor import cond, namespace, on_host, put, while_loop
 from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..arrays import Index, Inputs, Mask, Times
 from ..events import SAME_TIME, arm, next_schedule
-from ..lanes import Lanes, blank_tape, for_each_chart, only, write_row
+from ..lanes import Lanes, Tape, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
 from ..target import Target
 from ..watch import chart_field, watch
@@ -67,6 +67,9 @@ def search(
             return end, None if tape is None else write_row(tape, state.i, row)
 
         end, written = while_loop(going, iterate, (begin, tape))
+        # (Copies of many empty rows take time. A single lane's tape has as many as XLA's.)
+        if written is not None and on_host(end.i) and s.by_system:
+            written = Tape(*(x[: end.i] for x in written))
         result = update_result(end.result, end.active, Result.STEP_LIMIT)
         return Recorded(Moved(end.lanes, end.h, end.error, result), written)
 
