@@ -8,11 +8,12 @@ both delays, from 11, 4.5 and twice 0.06. Printed, as `name value` lines, over `
 the noise, for each of the four:
 
 - `bias`, `rms`: mean and rms error. `said`: rms of the standard errors. `largest`: largest error in
-  standard errors.
+  standard errors; `largest.p`: how often the largest of as many normal errors is larger.
 - `covered`, `p`: how often the 95 % interval holds the truth, p-value of 95 % (binomial test);
-  `joint.*`: the same of the joint region. `seconds`: CPU seconds of a fit (median).
+  `joint.*`: the same of the joint region; `series.*`: of the multipliers by `fit_series`.
+  `seconds`: CPU seconds of a fit (median).
 
-    python benchmarks/delays.py [--draws 200]
+    python benchmarks/delays.py [--draws 200] [--first 0]
 """
 
 import argparse
@@ -49,21 +50,23 @@ def experiments(cycle: hj.LimitCycle, settling: int = 20) -> hj.ExperimentData:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
     options = parser.parse_args()
     hj.enable_x64()
     cycle, phase = hj.find_limit_cycle(hj.models.VerticalHopper()), hj.ClockPhase(N)
     data = experiments(cycle)
     noise = 0.1 * data.y.std(axis=(0, 1))
     rows = []
-    for k in range(options.draws):
+    for k in range(options.first, options.first + options.draws):
         noisy = hj.experiments.add_noise(data, std=noise, seed=k)
         observed = hj.ObservedHTF(hj.estimate_htf(noisy), phase, delay=(0.06, 0.06))
         began = time.process_time()
         start = hj.models.VerticalHopper(k=11.0, b=4.5)
         fit = hj.fit_model(start, observed, tuple(TRUE), guess=cycle)
         seconds = time.process_time() - began
-        rows.append((fit.values, fit.standard_errors, fit.contains(TRUE), seconds))
-    values, said, joint, seconds = map(np.array, zip(*rows, strict=True))
+        series = hj.fit_series(noisy, 2, check=False).contains(cycle.multipliers).all()
+        rows.append((fit.values, fit.standard_errors, fit.contains(TRUE), series, seconds))
+    values, said, joint, series, seconds = map(np.array, zip(*rows, strict=True))
     show = lambda name, value: print(f"delays.{name} {value:.4g}", flush=True)  # noqa: E731
     error = values - np.array(list(TRUE.values()))
 
@@ -75,9 +78,11 @@ def main() -> None:
         show(f"{name}.bias", e.mean())
         show(f"{name}.rms", np.sqrt((e**2).mean()))
         show(f"{name}.said", np.sqrt((s**2).mean()))
-        show(f"{name}.largest", np.abs(e / s).max())
+        show(f"{name}.largest", largest := np.abs(e / s).max())
+        show(f"{name}.largest.p", 1 - (1 - 2 * stats.norm.sf(largest)) ** len(e))
         held(name, np.abs(e / s) < stats.norm.ppf(0.975))
     held("joint", joint)
+    held("series", series)
     show("draws", len(error))
     show("seconds", np.median(seconds))
 

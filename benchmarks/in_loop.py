@@ -17,13 +17,15 @@ of a tenth of the outputs' rms, which goes round the loop. Printed, as `name val
 - with `--random 20`: `short_gait.*`, errors of the multiplier 4.00386 of the simplest walker's
   short gait, from nonlinear experiments in a loop that stabilizes it; and of random plants (2 to 5
   states, 1 to 2 inputs, 8 to 24 sections, every tenth unstable) in random loops, how many are
-  identified (`right`: the region of 99.99 % holds), refused or not converged (`reported`), `wrong`.
+  identified (`right`: the region of 99.99 % holds), refused or not converged (`reported`), `wrong`,
+  and how many regions of 95 % hold; and `recording.*`, CPU seconds of `identify_recording`.
 
-    python benchmarks/in_loop.py [--draws 400] [--size 1.0]
+    python benchmarks/in_loop.py [--draws 400] [--size 1.0] [--first 0]
 """
 
 import argparse
 import time
+import warnings
 
 import equinox as eqx
 import numpy as np
@@ -179,10 +181,10 @@ def in_a_loop(model: hj.LDTP, gain: np.ndarray, rng, noise: float, strides: int)
     return hj.Record(np.concatenate([u, r], axis=1), y, n_sections=len(A), inputs=names)
 
 
-def random_loops(count: int) -> dict[str, int]:
+def random_loops(first: int, count: int) -> dict[str, int]:
     """Count random loops that are identified, refused or reported, and silently wrong."""
-    counts = dict.fromkeys(("right", "reported", "wrong"), 0)
-    for k in range(count):
+    counts = dict.fromkeys(("right", "reported", "wrong", "covered"), 0)
+    for k in range(first, first + count):
         model, rng = unlike(k), np.random.default_rng((6, k))
         gain = regulator(model, 10 ** rng.uniform(-1, 2))
         data = in_a_loop(model, gain, rng, 0.5, 400)
@@ -194,16 +196,42 @@ def random_loops(count: int) -> dict[str, int]:
         right = fit.contains(model.multipliers, 0.9999).all()
         name = "reported" if fit.result != hj.Result.OK else "right" if right else "wrong"
         counts[name] += 1
+        counts["covered"] += int(fit.contains(model.multipliers).all())
         print(
             f"in_loop.random.{k} {name}: {fit.compare(model.multipliers).max_error:.2g}", flush=True
         )
     return counts
 
 
-def short_gait() -> tuple[float, float]:
+def recording_seconds(rate: int = 100, strides: int = 300) -> dict[str, float]:
+    """Return CPU seconds of `identify_recording`: of a plant in its loop by the reference, and of
+    the loop itself, from the reference as its input (the least of three calls)."""
+    n, r = strides * rate, hj.testing.random_force(strides + 1, rate, 8.0, seed=1)[:, 0]
+    t, x, u, y = np.arange(n) / rate, np.zeros(2), np.zeros(n), np.zeros((2, n))
+    noise = np.random.default_rng(0).normal(size=(2, n))
+    for i in range(n):  # x'' + 2 x' + (30 + 8 cos 2 pi t) x = u
+        y[:, i] = x + np.array([0.002, 0.01]) * noise[:, i]
+        u[i] = r[i] - 4 * y[0, i] - y[1, i]
+        v = x[1] + (u[i] - 2 * x[1] - (30 + 8 * np.cos(2 * np.pi * t[i])) * x[0]) / rate
+        x = np.array([x[0] + v / rate, v])
+    signals = {"u": u, "r": r[:n], "x": y[0], "v": y[1], "clock": np.cos(2 * np.pi * t)}
+    recording, section = hj.Recording(t, signals), hj.Crossing("clock", "rising")
+    ways = {"with": dict(inputs="u", reference="r"), "without": dict(inputs="r")}
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    for name, way in 3 * list(ways.items()):
+        began = time.process_time()
+        with warnings.catch_warnings(action="ignore"):
+            hj.identify_recording(recording, section, outputs=("x", "v"), n_sections=16, **way)
+        seconds[name].append(time.process_time() - began)
+    least = {name: min(values) for name, values in seconds.items()}
+    return least | {"ratio": least["with"] / least["without"]}
+
+
+def short_gait() -> dict[str, float]:
     """Identify the unstable gait of the simplest walker, which a regulator stabilizes.
 
-    Return errors of the multiplier 4.00386436, from HTFs, and from time series with 1 % of noise.
+    Return errors of the multiplier 4.00386436, from HTFs and time series without noise, and with
+    sensor noise of a thousandth of the outputs (`noisy`).
     """
     walker = hj.models.SimplestWalker()
     strike, outputs = hj.AtEvent("heelstrike"), ("phi", "w", "p")
@@ -217,10 +245,14 @@ def short_gait() -> tuple[float, float]:
         cycle, phase, design, outputs, feedback=regulator(model, 1.0), discard=30
     )
     htf = hj.estimate_htf(data, reference="r")
-    # (without noise, its descent does not converge)
-    noisy = hj.experiments.add_noise(data, std=0.01 * data.y.std(axis=(0, 1)), seed=1)
-    fits = hj.fit_multipliers(htf, 2, check=False), hj.fit_ldtp(noisy, model.dims, reference="r")
-    return tuple(float(fit.compare(cycle.multipliers).max_error) for fit in fits)
+    noisy = hj.experiments.add_noise(data, std=0.001 * data.y.std(axis=(0, 1)), seed=1)
+    fits = {
+        "htf": hj.fit_multipliers(htf, 2, check=False),
+        "series": hj.fit_series(data, 2, reference="r"),
+        "ldtp": hj.fit_ldtp(data, model.dims, reference="r"),
+        "ldtp.noisy": hj.fit_ldtp(noisy, model.dims, reference="r"),
+    }
+    return {x: float(fit.compare(cycle.multipliers).max_error) for x, fit in fits.items()}
 
 
 def main() -> None:
@@ -230,14 +262,17 @@ def main() -> None:
     parser.add_argument(
         "--random", type=int, default=0, help="only the short gait, and so many random loops"
     )
+    parser.add_argument("--first", type=int, default=0, help="seed of the first draw or loop")
     options = parser.parse_args()
     hj.enable_x64()
     model, rng, draws = hopper(), np.random.default_rng(0), options.draws
     sensor = SENSOR * sizes(model)
     if options.random:
-        for name, error in zip(("htf", "ldtp"), short_gait(), strict=True):
+        for name, error in short_gait().items():
             print(f"in_loop.short_gait.{name} {error:.2g}")
-        for name, count in random_loops(options.random).items():
+        for name, seconds in recording_seconds().items():
+            print(f"in_loop.recording.{name} {seconds:.3g}")
+        for name, count in random_loops(options.first, options.random).items():
             print(f"in_loop.random.{name} {count}")
         return
     show = lambda what, value: print(f"in_loop.{what} {value:.4g}", flush=True)  # noqa: E731
@@ -246,7 +281,7 @@ def main() -> None:
     least = bound(model, options.size, sensor, records)
     show("bound", least)
     found: dict[str, list[float]] = {}
-    for k in range(draws):
+    for k in range(options.first, options.first + draws):
         one = parametric(model, options.size, sensor, np.random.default_rng((1, k)))
         for name, value in one.items():
             found.setdefault(name, []).append(value)
@@ -269,7 +304,7 @@ def main() -> None:
     truths = {"plant": model.htf(f).H, "controller": gain.htf(f).H}
     shares = [
         discs(model, options.size, sensor, design, truths, np.random.default_rng((2, k)))
-        for k in range(draws)
+        for k in range(options.first, options.first + draws)
     ]
     for name in truths:
         share = np.array([x[name] for x in shares])

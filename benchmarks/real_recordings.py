@@ -6,12 +6,13 @@ python benchmarks/recordings.py real
 import pathlib
 import time
 
+import equinox as eqx
 import numpy as np
 from scipy import stats
 
 import hybridjax as hj
 from hybridjax.recordings.beats.estimation import WAVES, fit_curve
-from hybridjax.recordings.beats.model import basis, intervals_of
+from hybridjax.recordings.beats.model import basis, forecast, intervals_of, tabulated
 
 
 DATA = pathlib.Path(__file__).parents[1] / "notebooks/data"
@@ -116,6 +117,31 @@ def neurons(every=2):
             f"difference {own:.2f}, of plain regression {plain:.2f}"
         )
         print(f"R2 of intervals left out: {found.left_out:.3f}; flat: {found.left_out_flat:.3f}")
+        both, _ = neuron(cell)
+        print(f"R2 of the trials that were not fitted: {explained(found, both, every):.3f}")
+        for first, last in ((0, 5), (10, 20), (40, 70)):
+            some = eqx.tree_at(lambda r: r.trials, both, both.trials[first:last])
+            part = hj.recordings.phase_response(some, hj.AtEvent("spike"), input="current")
+            error = np.sqrt(part.covariance[0, 0])
+            print(f"mean of Z, {first + 1} to {last} Hz: {part.coefficients[0]:.3f} ± {error:.3f}")
+
+
+def explained(curve, recording, every):
+    """R2 of the other trials, whose rates alone are fitted."""
+    others = tuple(x for k, x in enumerate(recording.trials) if k % every)
+    recording = eqx.tree_at(lambda r: r.trials, recording, others)
+    phase = hj.recordings.estimate_phase(recording, hj.AtEvent("spike"))
+    intervals = intervals_of(recording, phase, "current")
+    count = intervals.sums(np.ones(len(intervals.start)))
+    rates = count / intervals.sums(intervals.duration)
+    for _ in range(12):
+        ahead = forecast(intervals, tabulated(WAVES, curve.jitter), curve.coefficients, rates)
+        left, slope = intervals.duration - ahead.duration, ahead.slopes[:, -1]
+        used = np.abs(left * ahead.rate) < 0.5
+        rates = rates + intervals.sums(left * slope * used) / intervals.sums(slope**2 * used)
+    mean = intervals.sums(intervals.duration * used) / intervals.sums(1.0 * used)
+    whole = (intervals.duration - mean[intervals.trial])[used]
+    return 1 - (left[used] ** 2).sum() / (whole**2).sum()
 
 
 def robots():

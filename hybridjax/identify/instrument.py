@@ -214,15 +214,20 @@ def solve(
         cross = block(y, u, G) @ H.conj().swapaxes(1, 2)
         square = block(y, y, G) - cross - cross.conj().swapaxes(1, 2)
         square = square + H @ block(u, u, G) @ H.conj().swapaxes(1, 2)
-        mean = np.maximum(np.einsum("kii->ki", square).real, 0) / rows
-        return mean[:, :, None] * np.einsum("kii->ki", spread).real[:, None]
+        mean = np.maximum(np.einsum("kii->ki", square).real, 0)[:, :, None] / rows
+        return mean * np.einsum("kii->ki", spread).real[:, None]
 
-    freedom = sums.experiments - len(u)
+    freedom = np.full(len(classes), float(sums.experiments - len(u)))
     total = noise = None
-    if kind != "noise" and freedom > 0:
-        # The error of P multiplies all of U in E, of which the references explain only a part.
-        whole = np.einsum("kij,kji->k", spread, block(u, u)).real
-        total = variance(G, (freedom - len(u) + whole)[:, None])
+    if kind != "noise" and freedom[0] > 0:
+        # The error of P multiplies all of U in E, of which the references explain only a part. The
+        # other part adds errors of entries of P to E: of one at the edge of its disc, where they
+        # count three times, and of all others, whose scatter takes degrees of freedom.
+        left = spread @ block(u, u) - np.eye(len(u))
+        edge = np.einsum("kij,kji->ki", left, spread).real / np.einsum("kii->ki", spread).real
+        rows = freedom + np.einsum("kii->k", left).real
+        total = variance(G, rows[:, None, None] + 2 * edge[:, None])
+        freedom = 1 / (1 / freedom + np.einsum("kij,kji->k", left, left).real / rows**2)
     if repeats > 1:
         noise = variance(sums.between[classes], sums.experiments)
     if kind == "total" and total is None:
@@ -231,7 +236,8 @@ def solve(
             "several realizations (`Design.realizations`), or pass variance='noise'."
         )
     if total is None:
-        total, freedom, noise = noise, sums.experiments * (repeats - 1), None
+        total, noise = noise, None
+        freedom[:] = sums.experiments * (repeats - 1)
 
     f = (classes[:, None] + P * np.arange(N)) / P
     f = np.unique(np.round(P * np.abs((f + N / 2) % N - N / 2)).astype(int)) / P
@@ -240,7 +246,9 @@ def solve(
     def entries(x):
         return None if x is None else lines.entries(x, N // 2).real
 
-    scatter = None if total is None else Scatter(np.full(len(f), float(freedom)), shared=True)
+    by_line = np.zeros(len(f))
+    by_line[lines.row] = freedom[:, None]
+    scatter = None if total is None else Scatter(by_line, shared=True)
     return HTF(
         f, lines.entries(H, N // 2), check_harmonics(None, N), N, inputs, outputs, "estimate",
         variance=entries(total), noise_variance=entries(noise), scatter=scatter,

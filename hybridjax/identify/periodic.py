@@ -1,14 +1,16 @@
 r"""Periodic models on the host: matrices without padding, in local coordinates.
 
-The coordinates of each x[n] are free. They are fixed by the output-normal form
+Predictions are linear in $B - K D$, K and D, given $F = A - K C$ and C. The coordinates of each
+x[n] are free. They are fixed by the output-normal form
 
-$$\rho^2 A[n]^T A[n] + C[n]^T C[n] = I,$$
+$$\rho^2 F[n]^T F[n] + C[n]^T C[n] = I,$$
 
-in which only those changes of A[n] and C[n] are made whose columns are orthogonal to the columns of
-$[\rho A[n]; C[n]]$; no change of the coordinates of states is among these to first order (McKelvey,
-Helmersson and Ribarits 2004, for each section of the period).
+in which only those changes of F[n] and C[n] are made whose columns are orthogonal to the columns of
+$[\rho F[n]; C[n]]$; no change of the coordinates of states is among these to first order (McKelvey,
+Helmersson and Ribarits 2004; Ribarits, Deistler and Hanzon 2005; for each section of the period).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,13 +18,13 @@ from jaxtyping import Float
 
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
-from .descent import ROUNDING
+from .descent import ROUNDING, NormalEquations
 
 
 Blocks = list[Float[np.ndarray, "rows columns"]]
 """One matrix for each section."""
 
-# Largest modulus of a multiplier of rho A. At 1 the form does not exist; near 0 the coordinates
+# Largest modulus of a multiplier of rho F. At 1 the form does not exist; near 0 the coordinates
 # weight the first period only.
 _LARGEST_MODULUS = 0.5
 
@@ -70,6 +72,17 @@ class PeriodicModel(NamedTuple):
     def n_sections(self) -> int:
         return len(self.A)
 
+    @property
+    def gain(self) -> Blocks:
+        """K, (d[n+1], ny); zero where noise does not enter the state."""
+        free = zip(self.K, self.C, strict=True)
+        return [K if K.shape[1] else np.zeros((len(K), len(C))) for K, C in free]
+
+    @property
+    def F(self) -> Blocks:
+        """A - K C, of the errors of predictions."""
+        return [A - K @ C for A, K, C in zip(self.A, self.gain, self.C, strict=True)]
+
     def monodromy(self, first: int = 0) -> Float[np.ndarray, "d d"]:
         """Return the product of A over one period from section `first` on."""
         product = np.eye(self.A[first].shape[1])
@@ -77,14 +90,26 @@ class PeriodicModel(NamedTuple):
             product = self.A[(first + k) % self.n_sections] @ product
         return product
 
+    def refined(
+        self, direct: bool, linearize: Callable[["LocalCoordinates"], NormalEquations]
+    ) -> "PeriodicModel":
+        """Return the model with the best B, K and D (if free): predictions and HTFs are linear in
+        them.
+
+        **Raises:** `LinAlgError` for a model that is resonant or overflows.
+        """
+        to_A, to_C = ([np.zeros((len(x), 0)) for x in blocks] for blocks in (self.A, self.C))
+        coordinates = LocalCoordinates(self, to_A, to_C, direct)
+        return coordinates.moved(linearize(coordinates).step(0.0)[0])
+
 
 class LocalCoordinates(NamedTuple):
-    """Directions in which a model can change: Y in A and C, and the entries of B, K and D."""
+    """Directions in which a model can change: Y in F and C, and the entries of B - K D, K and D."""
 
     model: PeriodicModel
     """In output-normal form."""
     to_A: list[Float[np.ndarray, "after q"]]
-    """A changes by `to_A @ Y` with Y (q, d)."""
+    """A changes by `to_A @ Y` with Y (q, d), F by `to_A - K to_C` times Y."""
     to_C: list[Float[np.ndarray, "ny q"]]
     """C changes by `to_C @ Y`."""
     direct: bool
@@ -115,16 +140,22 @@ class LocalCoordinates(NamedTuple):
         return max(place.stop for place in self.places[-1].values())
 
     def moved(self, step: Float[np.ndarray, " P"]) -> PeriodicModel:
-        """Return the model with these coordinates; those of `model` are zero."""
+        """Return the model with these coordinates; those of `model` are zero.
+
+        A and B follow from F and B - K D, so that steps go straight where A and K C nearly cancel.
+        """
         A, B, C, D, K = map(list, self.model)
-        places = self.places
+        places, F, gain = self.places, self.model.F, self.model.gain
         for n in range(self.model.n_sections):
             change = {name: step[places[n][name]].reshape(s) for name, s in self.blocks(n)}
-            A[n] = A[n] + self.to_A[n] @ change["Y"]
-            C[n] = C[n] + self.to_C[n] @ change["Y"]
-            B[n] = B[n] + change["B"]
             K[n] = K[n] + change["K"]
+            later = K[n] if K[n].shape[1] else gain[n]
+            F[n] = F[n] + (self.to_A[n] - gain[n] @ self.to_C[n]) @ change["Y"]
+            C[n] = C[n] + self.to_C[n] @ change["Y"]
+            A[n] = F[n] + later @ C[n]
+            B[n] = B[n] - gain[n] @ D[n] + change["B"]
             D[n] = D[n] + change.get("D", 0.0)
+            B[n] = B[n] + later @ D[n]
         return PeriodicModel(A, B, C, D, K)
 
 
@@ -133,10 +164,10 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
 
     **Raises:** `DefinitionError` for unobservable states.
     """
-    N = model.n_sections
-    largest = np.abs(np.linalg.eigvals(model.monodromy())).max()
+    N, predictor = model.n_sections, model._replace(A=model.F)
+    largest = np.abs(np.linalg.eigvals(predictor.monodromy())).max()
     rho = float((_LARGEST_MODULUS / max(largest, _LARGEST_MODULUS)) ** (1 / N))
-    roots, back = zip(*[_root(n, P) for n, P in enumerate(_gramians(model, rho))], strict=True)
+    roots, back = zip(*[_root(n, P) for n, P in enumerate(_gramians(predictor, rho))], strict=True)
     after = (*roots[1:], roots[0])
     model = PeriodicModel(
         [after[n].T @ model.A[n] @ back[n] for n in range(N)],
@@ -146,10 +177,10 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
         [after[n].T @ model.K[n] for n in range(N)],
     )
     to_A, to_C = [], []
-    for A, C in zip(model.A, model.C, strict=True):
-        left = np.linalg.qr(np.concatenate([rho * A, C]), mode="complete")[0][:, A.shape[1] :]
-        to_A.append(left[: len(A)] / rho)
-        to_C.append(left[len(A) :])
+    for F, K, C in zip(model.F, model.gain, model.C, strict=True):
+        left = np.linalg.qr(np.concatenate([rho * F, C]), mode="complete")[0][:, F.shape[1] :]
+        to_C.append(left[len(F) :])
+        to_A.append(left[: len(F)] / rho + K @ to_C[-1])
     return LocalCoordinates(model, to_A, to_C, direct)
 
 
@@ -204,7 +235,9 @@ def characteristic_slopes(
         before.append(model.A[n] @ before[-1])
     after = np.eye(d)
     for n, entering in zip(reversed(order), reversed(before), strict=True):
-        left, place = after @ coordinates.to_A[n], places[n]["Y"]
-        slopes[:, place] = (left.T @ np.array(by_phi) @ entering.T).reshape(d, -1)
+        by_A = after.T @ np.array(by_phi) @ entering.T
+        slopes[:, places[n]["Y"]] = (coordinates.to_A[n].T @ by_A).reshape(d, -1)
+        if model.K[n].shape[1]:
+            slopes[:, places[n]["K"]] = (by_A @ model.C[n].T).reshape(d, -1)
         after = after @ model.A[n]
     return np.array(c), slopes

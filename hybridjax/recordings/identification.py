@@ -1,6 +1,5 @@
 """All steps from a recording to multipliers, in one call."""
 
-from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
@@ -11,9 +10,8 @@ from .._core.precision import require_x64
 from .._core.progress import say, working
 from .._core.text import listed
 from ..errors import DefinitionError
-from ..identify.instrument import in_loop
 from ..identify.series.fit import SeriesFit, fit_series
-from ..identify.series.in_loop import predicted
+from ..identify.series.in_loop import best_order
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import Finding, refuse
@@ -72,7 +70,8 @@ def identify_recording(
 
     **Arguments:** those of `section_data`, and
 
-    - `order`: the number of multipliers. Default: the result of `choose_order`.
+    - `order`: the number of multipliers. Default: the result of `choose_order`; in a loop, the most
+      that the reference tells, up to 4.
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
@@ -116,10 +115,11 @@ def identify_recording(
     refuse(findings)
     say("order")
     data, parts, most = whole.of_inputs(inputs), split(whole), 4 if order is None else order + 2
-    best = (parts if outside is None else split(_without_noise(whole, outside))).best_order(most)
+    best = best_order(whole, outside, most) if outside else parts.best_order(most)
     order = best if order is None else order
     if best > order:
         text = f"held-out strides are predicted better with {best} multipliers than with {order}: "
+        text = text if outside is None else f"the reference tells {best} multipliers, not {order}: "
         text += f"{order} may be biased, and their intervals too narrow. Compare order={best}."
         findings = (*findings, Finding("order", text))
     say("fit to the first three quarters")
@@ -135,11 +135,3 @@ def identify_recording(
     responses = impulse_responses(fit, data)
     advice = advise(data, fit, held.validation, findings)
     return Identification(recording, findings, phase, data, fit, held, responses, curve, advice)
-
-
-def _without_noise(data: SectionData, reference: tuple[str, ...]) -> SectionData:
-    """Return data with that part of the plant's inputs that the references explain."""
-    plant, drive = in_loop(data, reference)
-    inputs = [x[:, : r.u.shape[1]] for r, x in zip(plant, predicted(plant, drive, 4), strict=True)]
-    records = tuple(replace(r, u=u) for r, u in zip(plant, inputs, strict=True))
-    return replace(data, records=records)

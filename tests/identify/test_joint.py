@@ -76,15 +76,18 @@ def test_the_coordinates_are_as_many_as_there_are_models(model, exact, growth):
     assert np.linalg.matrix_rank(np.concatenate([J.real, J.imag], axis=1)) == coordinates.size
 
 
-def test_derivatives_are_those_of_jax(model):
-    coordinates = local_coordinates(PeriodicModel.of(model, ONE), direct=True)
+@pytest.mark.parametrize("errors", (0, 2))
+def test_derivatives_are_those_of_jax(model, errors):
     rng = np.random.default_rng(0)
+    matrices = PeriodicModel.of(model, ONE, errors)
+    matrices = matrices._replace(K=[x + 0.3 * rng.normal(size=x.shape) for x in matrices.K])
+    coordinates = local_coordinates(matrices, direct=True)
     step = rng.normal(size=coordinates.size)
     arrays = lambda m: [  # noqa: E731
         jnp.asarray(getattr(m.to_ldtp(ONE, model.inputs, model.outputs), x)) for x in "ABCD"
     ]
-    here, there = arrays(coordinates.model), arrays(coordinates.moved(step))
-    change = [b - a for a, b in zip(here, there, strict=True)]
+    here, *ends = map(arrays, (coordinates.model, *map(coordinates.moved, (-step, step))))
+    change = [(b - a) / 2 for a, b in zip(*ends, strict=True)]  # (no terms of third order)
     _, true = jax.jvp(lambda *x: harmonic_transfer(*x, jnp.asarray(F)), tuple(here), tuple(change))
     harmonics = (-2, 0, 1)
     slopes = np.concatenate([s for _, s in transfer_slopes(coordinates, F, harmonics)], axis=2)

@@ -370,9 +370,8 @@ class ModelPoint(Point):
 
     def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
         self.problem, self.direct, self.model = problem, direct, model
-        if isinstance(problem, FrequencyProblem):  # of series, this costs as much as a step
-            with suppress(np.linalg.LinAlgError):  # a resonant model stays as it is
-                self.model = problem.refined(model, direct)
+        with suppress(np.linalg.LinAlgError):  # a resonant model stays as it is
+            self.model = model.refined(direct, problem.linearize)
         self.cost = problem.cost(self.model)
 
     @cached_property

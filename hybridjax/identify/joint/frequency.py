@@ -68,15 +68,6 @@ class FrequencyProblem(NamedTuple):
             return np.inf
         return cost if np.isfinite(cost) else np.inf
 
-    def refined(self, model: PeriodicModel, direct: bool) -> PeriodicModel:
-        """Return the model with the best B (and D, if free), in which the HTFs are linear.
-
-        **Raises:** `LinAlgError` for a model that is resonant or overflows.
-        """
-        to_A, to_C = ([np.zeros((len(x), 0)) for x in blocks] for blocks in (model.A, model.C))
-        coordinates = LocalCoordinates(model, to_A, to_C, direct)
-        return coordinates.moved(self.linearize(coordinates).step(0.0)[0])
-
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P, error = coordinates.size, self.errors(coordinates.model)
         gram, gradient = np.zeros((P, P)), np.zeros(P)
@@ -138,15 +129,20 @@ def _slopes(
         shapes = dict(coordinates.blocks(n))
         left = _real_times(coordinates.to_A[n].T, after)  # (q, M, F, ny)
         left += coordinates.to_C[n].T[:, None, None, :] * wave
-        Y, B = (J[at[name]].reshape(*shapes[name], *weight.shape) for name in ("Y", "B"))
+        Y, B, K = (J[at[name]].reshape(*shapes[name], *weight.shape) for name in ("Y", "B", "K"))
+        outputs = _real_times(model.C[n], states[n]) + model.D[n][:, None]
         for j in range(nu):
-            x = states[n][None, :, None, :, None, j]  # (1, d, 1, F, 1)
+            x, y = (z[None, :, None, :, None, j] for z in (states[n], outputs))  # (1, d, 1, F, 1)
             np.multiply((left * weight[..., j])[:, None], x, out=Y[..., j])
             B[:, j, ..., j] = after * weight[..., j]
+            K[..., j] = (after * weight[..., j])[:, None] * y[:, : K.shape[1]]
         if coordinates.direct:
             D = J[at["D"]].reshape(*shapes["D"], *weight.shape)
+            through = _real_times(model.gain[n].T, after)  # (ny, M, F, ny)
+            for j in range(nu):
+                D[:, j, ..., j] = through * weight[..., j]
             for i, j in np.ndindex(ny, nu):
-                D[i, j, ..., i, j] = wave[..., 0] * weight[..., i, j]
+                D[i, j, ..., i, j] += wave[..., 0] * weight[..., i, j]
     return J
 
 

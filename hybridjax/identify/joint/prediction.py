@@ -254,9 +254,10 @@ def _slopes(
         unit = np.eye(later.shape[2])[None, None]
         later[..., place["B"]] += _outer(unit, u)
         if model.K[n].shape[1]:
-            later[..., place["K"]] += _outer(unit, path.entering[n])
+            y = path.x[n] @ model.C[n].T + u @ model.D[n].T + path.entering[n]
+            later[..., place["K"]] += _outer(unit, y)
         if coordinates.direct:
-            later[..., place["D"]] -= _outer(gain, u)
+            later[..., place["D"]] += _outer(model.gain[n] - gain, u)
 
     ends = [max(s.stop for s in place.values()) for place in places]
     shape = (*part.shape, coordinates.size)

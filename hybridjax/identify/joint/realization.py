@@ -182,7 +182,7 @@ def _from_htf(htf: HTF, dims: Any, order: int) -> LDTP:
         f, tuple(m.tolist()), H / unit, np.broadcast_to(weight * unit, H.shape)
     )
     for _ in range(2):  # the second time removes rounding errors
-        model = problem.refined(model, True)
+        model = model.refined(True, problem.linearize)
     return model.to_ldtp(scale, htf.inputs, htf.outputs)
 
 

@@ -13,6 +13,9 @@ B is eliminated section by section, and the rest is linear in c.
 """
 
 import dataclasses
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +23,11 @@ from jaxtyping import Float
 
 from ..._core.results import Result
 from ...errors import DefinitionError
-from ...experiments.record import Record
+from ...experiments.record import Record, RecordedData
 from .. import denominator
 from ..denominator import Covariance, in_blocks, multipliers_of
 from ..descent import Coefficients
+from ..instrument import in_loop
 from .output_error import RANK, SectionRegression
 from .records import PreparedRecords, delay_cycles, lagged_inputs
 from .subspace import subspace_model
@@ -78,6 +82,27 @@ class SectionEquations(NamedTuple):
     taken: tuple[Float[np.ndarray, "rows r"], Float[np.ndarray, "rows r"]]
     """The first, times the second transposed, maps errors to the part that numerators take."""
     freedom: int
+
+
+class Solution(NamedTuple):
+    """The solution of the equations of all sections."""
+
+    c: Coefficients
+    along: Float[np.ndarray, "d d"]
+    """Products of instruments and earlier outputs."""
+    scale: Float[np.ndarray, " ny"]
+    """Standard deviations of the outputs' errors."""
+    told: int
+    """The number of multipliers that the references tell."""
+
+
+def best_order(data: RecordedData, reference: Sequence[str], most: int) -> int:
+    """Return the largest number of multipliers, up to `most`, all of which the references tell."""
+    for order in range(most, 1, -1):
+        with suppress(DefinitionError):  # too few cycles for so many
+            if LoopEquations(*in_loop(data, reference), order, None).solution.told >= order:
+                return order
+    return 1
 
 
 class LoopEquations:
@@ -154,12 +179,9 @@ class LoopEquations:
             reference=self.reference,
         )
 
-    def solve(self, check: bool) -> tuple[Coefficients, Covariance, Float[np.ndarray, " ny"]]:
-        """Return c, its covariance, and the standard deviations of the outputs' errors.
-
-        **Raises:** `DefinitionError` for too few cycles, or, with `check`, for an order of which
-        the reference does not tell all multipliers.
-        """
+    @cached_property
+    def solution(self) -> Solution:
+        """**Raises:** `DefinitionError` for too few cycles."""
         d, sections, scale = self.order, self.sections, self.records.scale
         if (least := min(x.freedom for x in sections)) <= d:
             raise DefinitionError(
@@ -182,6 +204,15 @@ class LoopEquations:
         part = np.linalg.pinv(y[:, 1:].T @ y[:, 1:], RANK) @ part
         part = np.clip(np.linalg.eigvals(part).real, 0, 1)
         told = int((part * freedom * len(scale) > _TOLD * (1 - part)).sum())
+        return Solution(c, along, scale, told)
+
+    def solve(self, check: bool) -> tuple[Coefficients, Covariance, Float[np.ndarray, " ny"]]:
+        """Return c, its covariance, and the standard deviations of the outputs' errors.
+
+        **Raises:** `DefinitionError` for too few cycles, or, with `check`, for an order of which
+        the reference does not tell all multipliers.
+        """
+        (c, along, scale, told), d = self.solution, self.order
         if check and told < d:
             raise DefinitionError(
                 f"the reference tells {told} multipliers, not {d}: lower `order`, record longer, "
@@ -191,7 +222,8 @@ class LoopEquations:
             return c, Covariance.unknown(d), scale
         T = self.records.cycles
         cycles = max(denominator.correlated_cycles(multipliers_of(c), T) + 1, _BLOCK)
-        score = np.sum([self._scores(x, c, scale, max(1, T // cycles)) for x in sections], axis=0)
+        blocks = max(1, T // cycles)
+        score = np.sum([self._scores(x, c, scale, blocks) for x in self.sections], axis=0)
         score = score[score.any(axis=1)]
         half = np.linalg.solve(along, score.T)
         share = np.tile(np.eye(d) / len(score), (len(score), 1, 1))

@@ -176,5 +176,4 @@ def _from_states(
 
 def _slowest_error(model: PeriodicModel) -> float:
     """Return the largest modulus of a multiplier of A - K C, for errors of predictions."""
-    A = [A - K @ C for A, K, C in zip(model.A, model.K, model.C, strict=True)]
-    return float(np.abs(np.linalg.eigvals(model._replace(A=A).monodromy())).max())
+    return float(np.abs(np.linalg.eigvals(model._replace(A=model.F).monodromy())).max())
