@@ -24,22 +24,22 @@ PRONOUNS = set(
     "found own known one seen here some there these those it them others rest thing things".split()
 )
 # What the package may have at most. A change that needs more says why, and raises the number here;
-# a change that needs less lowers it. Of the code, 890 lines are the algebra of HTFs, loops and
-# delays, 1310 the responses of cycles with noise, coupling and symmetry in time, 770 populations of
-# subjects, 1040 motion and sliders, 610 simulators of others; of the tests, 1860 are those of all.
-# (The thirteenth structure is that of a trajectory of a simulator.)
+# a change that needs less lowers it. Of the code, 1150 lines are the algebra of HTFs, loops and
+# delays, 1160 the responses of cycles with noise, coupling and symmetry in time, 770 populations of
+# subjects, 980 motion and sliders, 610 simulators of others, 70 sweeps on the host; of the tests,
+# 1900 are those of all. (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 28_690,
+    "code": 28_800,
     "files": 244,
     "longest": 500,
     "public_names": 186,
     "many_parameters": 8,
-    "thresholds": 304,
+    "thresholds": 305,
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_960,
-    "doc_words": 40_600,
+    "test_lines": 18_000,
+    "doc_words": 40_730,
 }
 
 

@@ -179,10 +179,11 @@ class ReturnMap(eqx.Module):
         return slopes(self._structure_of(lanes), lanes.t, lanes.chart, lanes.q, u)
 
     def _structure_of(self, lanes: Lanes) -> Structure:
-        """The structure, of the pieces of every lane if `lanes` are those."""
-        own, count = len(self.anchor.t), len(lanes.t)
-        same = own == count
-        return self.structure if same else self.structure.at(np.arange(count) % own)
+        """The structure, for each piece of its turn if `lanes` are the pieces of all turns."""
+        turns, count = len(self.anchor.t), len(lanes.t)
+        if turns == count:
+            return self.structure
+        return self.structure.at(np.arange(count) % turns)
 
     def departure(self, q: Float[Array, " d"]) -> Lanes:
         """The lane at the beginning of a turn; an event that has just happened is not armed."""
