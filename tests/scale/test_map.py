@@ -197,6 +197,7 @@ def test_systems_that_are_alike_or_undefined(wheel):
     assert alike.ok.all()
 
 
+@pytest.mark.slow
 def test_many_systems_are_compiled_and_factorize_nothing(wheel, monkeypatch):
     """XLA's pool would deadlock on LAPACK's calls for many matrices at once."""
     systems = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(
