@@ -62,6 +62,7 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
         hj.fit_model(oscillation.system, unseen, ("p", "q", "w"), guess=oscillation)
 
 
+@pytest.mark.slow
 def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     nothing_fits = hj.ObservedCycle(
         PHASES, ("x", "v"), np.arange(8.0).reshape(4, 2) - 3.0, period=oscillation.period, **STD
