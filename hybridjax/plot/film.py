@@ -23,7 +23,7 @@ _PLAYER = """<div id="{id}" style="display:inline-block;max-width:100%">
 <div style="position:relative;width:{width}px;max-width:100%">
 <img alt="{alt}" src="{still}" style="width:100%">
 <img alt="" src="{first}" style="width:100%;position:absolute;left:0;top:0"></div>
-<button title="pause or play">&#9199;</button>
+<button title="pause or play">&#9654;&#8214;</button>
 <input type="range" min="0" max="{last}" value="0" style="width:75%;vertical-align:middle">
 <script>(() => {{
 const box = document.getElementById("{id}"), frames = {frames};
