@@ -179,7 +179,6 @@ fit.compare(cycle.multipliers)
 # ## Which parameter would help?
 #
 # Everything can be differentiated: here the multiplier, with respect to all parameters at once.
-# (Compiling takes most of the time. Forward mode suits a few parameters.)
 
 
 # %%
@@ -188,7 +187,7 @@ def multiplier(robot):
     return jnp.trace(hj.linearize(neighbor, [apex], outputs="y").monodromy())
 
 
-slopes = jax.jit(jax.jacfwd(multiplier))(robot)
+slopes = jax.grad(multiplier)(robot)  # without `jit`: that would compile for a minute
 for name in ("m", "g", "l0", "k", "b", "thrust"):
     value = getattr(robot, name)
     change = round(float(0.01 * value * getattr(slopes, name)), 12) or 0.0  # less is rounding
