@@ -29,7 +29,7 @@ PRONOUNS = set(
 # subjects, 980 motion and sliders, 610 simulators of others, 70 sweeps on the host; of the tests,
 # 1900 are those of all. (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 28_800,
+    "code": 28_806,
     "files": 244,
     "longest": 500,
     "public_names": 186,
@@ -38,7 +38,7 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 18_000,
+    "test_lines": 18_004,
     "doc_words": 40_760,
 }
 

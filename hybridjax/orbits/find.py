@@ -25,6 +25,7 @@ from ..systems.system import Guess, HybridSystem, integrated
 from . import checks
 from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
+from .curve import away_from_events
 from .cycle import LimitCycle
 from .guess import return_map_near
 from .linear_flow import keep_turn
@@ -69,7 +70,8 @@ def find_limit_cycle(
 
     - `guess`: a rough `Guess`, or the `LimitCycle` of a similar system, which is the best guess.
         With a cycle, leave out `settle` and `max_period`; a clocked system begins at the same phase
-        of its own clock. Default: the model's own guess.
+        of its own clock, or, if an event has passed this phase, far from events. Default: the
+        model's own guess.
     - `section`: the section of the return map of an autonomous system, e.g. `Crossing("v",
         "falling")` or `AtEvent("heelstrike")`. Newton's method starts at the guess if it lies on
         the section, else where the flow from the guess first crosses it. Default: the section
@@ -154,6 +156,12 @@ def find_limit_cycle(
     if isinstance(map.base, AtEvent) and not isinstance(guess, LimitCycle):
         check_begin(map)
     solution = search(map, patient)
+    if int(solution.result) == Result.NOT_CONVERGED and isinstance(guess, LimitCycle):
+        distant = away_from_events(guess).return_map.at_phase_of(system)
+        if float(distant.anchor.t[0]) != float(map.anchor.t[0]):
+            say("the same from a phase far from events")
+            map = dataclasses.replace(map, anchor=distant.anchor)
+            solution = search(map, patient)
     if patient and int(solution.result) == Result.STEP_LIMIT:
         say("the same with more steps")
         settings = dataclasses.replace(map.settings, max_steps=_ENOUGH)

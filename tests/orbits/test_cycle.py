@@ -155,3 +155,11 @@ def test_derivatives_of_scheduled_events():
 
     exact = jax.grad(lambda duty: Switched(duty=duty).exact())(0.3)
     np.testing.assert_allclose(eqx.filter_grad(start)(system).duty, exact * np.exp(0.5), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_an_event_may_pass_the_phase_at_which_a_guess_begins(hopper_cycle):
+    """Liftoff is later than t = 0.5 s for k > 13.53, so the hopper is in another chart then."""
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper(k=14.5), hopper_cycle)
+    settled = hj.find_limit_cycle(hj.models.VerticalHopper(k=14.5), settle=60.0)
+    np.testing.assert_allclose(cycle.multipliers, settled.multipliers, rtol=1e-9)
