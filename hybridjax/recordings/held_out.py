@@ -41,12 +41,12 @@ class Split(NamedTuple):
     early: PreparedRecords
     late: list[Record]
 
-    def best_order(self) -> int:
+    def best_order(self, most: int = 4) -> int:
         """Choose an order; see `choose_order`."""
         ends = uninterrupted_records(self.late)
         fits: list[SeriesFit] = []
         N = self.early.n_sections
-        for d in range(1, 5):
+        for d in range(1, most + 1):
             problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
             solution = linearize(problem, total_least_squares(late_outputs(problem, d)))
             if (solution.freedom <= 2 * d).any():

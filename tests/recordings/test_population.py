@@ -49,6 +49,11 @@ def test_equal_errors_give_the_t_interval():
     assert row["spread"][0] == pytest.approx(np.sqrt(y.var(ddof=1) - 0.09))
 
 
+def test_equal_estimates_have_the_error_of_their_fits():
+    row = study(np.ones(N), np.full(N, 0.3)).mean("gain")
+    assert row["standard_error"][0] == pytest.approx(0.3 / np.sqrt(N)) and row["spread"][0] == 0
+
+
 def test_the_bcg_trials():
     """Vaccination trials of the R package metafor (Viechtbauer 2010): `rma(yi, vi, test="knha")`
     prints -0.7145 (0.1808), tau^2 0.3132, and `confint` tau 0.3460 to 1.0543."""
