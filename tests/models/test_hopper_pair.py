@@ -17,6 +17,15 @@ def placed():
 
 
 @pytest.mark.slow
+def test_small_multipliers_are_not_dropped(placed):
+    cycle = placed.cycle
+    np.testing.assert_allclose(cycle.multipliers[4:].real, SMALL, rtol=1e-6)
+    model = hj.linearize(cycle, placed, OUTPUTS)
+    assert model.inputs == ("u1", "u2") and len(model.multipliers) == 6
+    np.testing.assert_allclose(model.multipliers[4:].real, SMALL, rtol=1e-5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude, accuracy", [(1e-2, 1e-3), (1e-5, 1e-6)])
 def test_both_inputs_are_told_apart(placed, amplitude, accuracy):
     """All harmonics from both inputs to both outputs, estimated from a steady start."""
