@@ -11,11 +11,6 @@ import hybridjax as hj
 from ..linear.conftest import blocks_at_random
 
 
-def test_the_transient_of_the_paper(hopper, paper_estimate, exact):
-    errors = paper_estimate.harmonic_errors(exact)[16]
-    assert np.all((errors > 5e-5) & (errors < 2.5e-4))
-
-
 # Dimensions at each section (N even, odd and 1), outputs, inputs, periods.
 SHAPES = [((2, 3, 1, 2), 2, 1, 6), ((1, 3, 2), 1, 2, 5), ((2,), 1, 1, 9)]
 
