@@ -102,7 +102,8 @@ def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, np.ndarray, 
     values there to values at f, of functions of the frequency that are sums of exp(-2 pi i f s), s
     from 0 to 1.
     """
-    middle, half = (np.max(f) + np.min(f)) / 2, np.ptp(f) / 2
+    low, high = (np.min(f), np.max(f)) if len(f) else (0.0, 0.0)
+    middle, half = (low + high) / 2, (high - low) / 2
     n = int(np.pi * half + _EXTRA * np.cbrt(1 + np.pi * half))
     if n >= len(f) or not half:
         return f, f, np.eye(len(f))
