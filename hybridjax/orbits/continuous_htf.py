@@ -14,7 +14,7 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import SignalNames
 from .._core.compilation import at_ease, one_program
-from .._core.executor import Array, namespace, on_host
+from .._core.executor import Array, namespace, on_host, solve
 from .._core.memo import Memory
 from ..engine import kernels
 from ..errors import DefinitionError
@@ -57,7 +57,7 @@ def linear_outputs(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, A
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
     """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of the
     root of 2, so that calls with similar frequencies share a linearization."""
-    fastest = max(1.25 * np.max(np.abs(f), initial=0.0), np.max(np.abs(harmonics)), 0.1)
+    fastest = max(1.25 * np.max(np.abs(f)), np.max(np.abs(harmonics)), 0.1)
     longest = float(2.0 ** (np.floor(2 * np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))) / 2))
     if max(len(f), 64) / longest > _LARGEST:
         raise DefinitionError(
@@ -89,6 +89,8 @@ def continuous_htf(
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
     harmonics, frequencies = check_harmonics(harmonics, 0), np.asarray(f, float).reshape(-1)
+    if not len(frequencies):
+        raise DefinitionError("`f` holds no frequency: give one or more.")
     map = cycle.return_map
     z, names, columns = asked(map.structure, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, longest_piece(frequencies, harmonics))
@@ -159,6 +161,6 @@ def _transfer(
     H = xp.concatenate([H, xp.moveaxis(end, -1, 0)], axis=1).reshape(len(coarse), -1)
     H, end = xp.split((fine @ H).reshape(len(f), rows + d, -1), [rows], axis=1)
     turned = xp.eye(d) - xp.exp(-2j * np.pi * f)[:, None, None] * (whole * size / size[:, None])
-    start = xp.linalg.solve(turned, end[..., :nu] / size[:, None]) * size[:, None]
+    start = solve(turned, end[..., :nu] / size[:, None]) * size[:, None]
     H = (H[..., :nu] + H[..., nu:] @ start).reshape(-1, len(harmonics), len(z.names), nu)
     return xp.moveaxis(H, 0, 1) / period
