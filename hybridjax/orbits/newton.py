@@ -184,7 +184,7 @@ def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.
 
 
 def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Levenberg and Marquardt's steps, with the constants of optimistix."""
+    """Levenberg-Marquardt steps, with the constants of optimistix."""
     sizes, least, damping, best = map.sizes, np.inf, 1.0, None
     x, step = map.anchor.q[:, 0] / sizes, 0.0
     for steps in itertools.count(1):
