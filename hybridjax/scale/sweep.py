@@ -214,8 +214,7 @@ class SweepJob:
         """Return the beginning before the cycles of the coarse pass are known."""
         map = _rounded(map_for_sweep(self._guess(), Settings()))
         # (A Halton sequence: to import that of scipy takes 0.7 s.)
-        primes = [p for p in range(2, 1000) if all(p % k for k in range(2, p))]
-        base = np.array(primes[: len(self.blocks.shape)])[:, None]
+        base = np.resize([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31], len(self.blocks.shape))[:, None]
         k, power = np.arange(1, 1 + _COARSE)[:, None, None], base ** np.arange(16.0)
         unit = (k // power % base / (power * base)).sum(axis=2)
         index = tuple(np.unique((unit * np.array(self.blocks.shape)).astype(int), axis=0).T)
