@@ -32,6 +32,9 @@ _SETTLED_GAIN = 1e-14
 # If no step lowers the cost: the gain, relative to the cost, that rounding explains. Smaller:
 # minima of exact data count as not converged; larger: stalled descents count as converged.
 _STALLED_GAIN = 1e-6
+# Steps of a rough fit, and the decrease of its cost, in units of the noise, that is not worth one.
+# More, and smaller: steps that follow noise; fewer, and larger: fits that stay where they began.
+ROUGH = (6, 2.0)
 
 
 class Point(ABC):

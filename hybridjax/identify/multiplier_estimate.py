@@ -1,5 +1,8 @@
 """Estimated Floquet multipliers: their confidence regions, and comparison with true ones."""
 
+import warnings
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Annotated
 
 import equinox as eqx
@@ -11,7 +14,9 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Probability
 from .._core.boundary.values import Complexes
 from .._core.html import card, multiplier_table, text, unit_circle
-from ..errors import DefinitionError
+from ..errors import DefinitionError, FindingWarning
+from .denominator import Covariance, multipliers_of
+from .descent import Coefficients
 
 
 Multipliers = Annotated[Numbers, Complexes()]
@@ -71,6 +76,37 @@ def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComp
     rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
     order = np.lexsort((-np.imag(truth[columns]), -np.abs(truth[columns])))
     return MultiplierComparison(true=truth[columns][order], estimated=values[rows][order])
+
+
+def about_orders(
+    fit: "MultiplierEstimate",
+    higher: Iterable[Callable[[], tuple[Coefficients, Callable[[], Covariance]]]],
+    warn: bool,
+) -> str:
+    """Return a sentence if a fit of a higher order contradicts the multipliers; else an empty one.
+
+    It does if a multiplier is outside of its confidence regions, and its nearest one outside of
+    those of the fit.
+
+    **Arguments:** `higher`: functions that return the coefficients of a higher order, and a
+    function for their covariance; a `DefinitionError` means too few data. `warn`: whether to emit
+    the sentence as a warning, too.
+    """
+    for estimate in higher:
+        with suppress(DefinitionError):
+            c, covariance = estimate()
+            multipliers = multipliers_of(c)
+            near = np.abs(multipliers - fit.multipliers[:, None]).argmin(axis=1)
+            moved = ~fit.contains(multipliers[near])
+            if not moved.any():
+                continue
+            more = MultiplierEstimate(multipliers, c, *covariance())
+            if (moved & ~more.contains(fit.multipliers)).any():
+                text = f"`order` may be too low: {len(c)} gives other {more.show_multipliers()}"
+                if warn:
+                    warnings.warn(f"Order: {text}.", FindingWarning, stacklevel=5)
+                return text
+    return ""
 
 
 class MultiplierEstimate(eqx.Module):

@@ -1,7 +1,8 @@
 """Multipliers and transfer functions from recorded time series with any input: output error."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from .. import denominator
 from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate
+from ..multiplier_estimate import MultiplierEstimate, about_orders
 from ..multipliers import refuse_invented
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
@@ -65,6 +66,7 @@ class SeriesFit(MultiplierEstimate):
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
+    - `higher_order`: a sentence if a fit of the next order contradicts the multipliers; else empty.
     - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
     - `reference`: signals from outside of the loop of which the fit makes use. `noise` is then that
       of $\chi y$.
@@ -79,6 +81,7 @@ class SeriesFit(MultiplierEstimate):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
+    higher_order: str = eqx.field(static=True, default="")
     feedback: tuple[str, ...] = eqx.field(static=True, default=())
     reference: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -131,7 +134,8 @@ class SeriesFit(MultiplierEstimate):
         loop = f"in a loop, by {', '.join(self.reference)}; " if self.reference else ""
         about = f"{loop}noise {noise}; {self.n_sections} sections, "
         about += f"{self.numerators.shape[1]} lags{state}"
-        return "; ".join(filter(None, [about, about_answering(self.feedback, _BIASED)]))
+        feedback = about_answering(self.feedback, _BIASED)
+        return "; ".join(filter(None, [about, self.higher_order, feedback]))
 
     @property
     def free_cycles(self) -> int:
@@ -202,8 +206,10 @@ def fit_series(
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
     if reference is not None:
-        equations = LoopEquations(*in_loop(data, reference), order, overhang)
-        return SeriesFit(**equations.fit(check))
+        plant, drive = in_loop(data, reference)
+        fit = SeriesFit(**LoopEquations(plant, drive, order, overhang).fit(check))
+        more = [lambda: LoopEquations(plant, drive, order + 1, overhang).coefficients()]
+        return dataclasses.replace(fit, higher_order=about_orders(fit, more, check))
     records = data if isinstance(data, PreparedRecords) else PreparedRecords(data)
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
@@ -221,7 +227,26 @@ def fit_series(
         refuse_order(delayed, noise * _noise(solution), feedback)
     covariance = coefficient_covariance(problem, solution, errors)
     fit = assemble(problem, solution, covariance, converged)
-    return dataclasses.replace(fit, feedback=feedback)
+    # One more multiplier, or a pair.
+    more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
+    text = about_orders(fit, more, check)
+    return dataclasses.replace(fit, feedback=feedback, higher_order=text)
+
+
+def _of_order(
+    order: int, records: PreparedRecords, fit: SeriesFit, free_start: bool
+) -> tuple[Coefficients, Callable[[], Covariance]]:
+    """Fit a higher order, beginning at a fit, for `about_orders`.
+
+    **Raises:** `DefinitionError` for too few cycles.
+    """
+    (N, R), d = fit.numerators.shape[:2], len(fit.coefficients)
+    problem = OutputErrorProblem.from_data(records, order, R - 1 - fit.lead - d * N, free_start)
+    problem = problem._replace(scale=fit.noise)
+    start = np.pad(fit.coefficients, (0, order - d))
+    solution, _ = minimize(problem, start, rough=True)
+    _require_freedom(problem, solution)
+    return solution.c, partial(coefficient_covariance, problem, solution, "residuals")
 
 
 def assemble(

@@ -13,7 +13,7 @@ B is eliminated section by section, and the rest is linear in c.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -178,6 +178,14 @@ class LoopEquations:
             lead=self.records.lead,
             reference=self.reference,
         )
+
+    def coefficients(self) -> tuple[Coefficients, Callable[[], Covariance]]:
+        """Return c and a function for its covariance, for `about_orders`.
+
+        **Raises:** `DefinitionError` as `solve`.
+        """
+        c, covariance, _ = self.solve(True)
+        return c, lambda: covariance
 
     @cached_property
     def solution(self) -> Solution:
