@@ -174,7 +174,7 @@ def maximum_likelihood(
     problem. `rough`: whether to stop where noise of variance one explains the next step.
     """
     start = _linearized(groups, order) if start is None else start
-    return least_squares(lambda c: residuals_of(groups, c), start, *ROUGH[: 2 * rough])
+    return least_squares(lambda c: residuals_of(groups, c), start, **(ROUGH if rough else {}))
 
 
 def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:

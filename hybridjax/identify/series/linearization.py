@@ -243,5 +243,6 @@ def minimize(
             last[:] = [linearize(problem, c)]
         return last[0]
 
-    c, converged = least_squares(lambda c: at(c).as_residuals(), start, *ROUGH[: 2 * rough])
+    rules = ROUGH if rough else {}
+    c, converged = least_squares(lambda c: at(c).as_residuals(), start, **rules)
     return at(c), converged
