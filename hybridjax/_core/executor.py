@@ -133,6 +133,19 @@ def lane(x: Array, i: Array) -> Array:
     return x[..., i : i + 1] if on_host(x) else jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
 
 
+def solve(matrices: Array, right: Array) -> Array:
+    """`linalg.solve` of a stack of matrices, with one right side for each or for all.
+
+    A program solves one after the other. XLA would divide a stack among its threads and wait for
+    them in one of these: two stacks at once wait for ever on two cores (JAX 0.10).
+    """
+    if on_host(matrices):
+        return np.linalg.solve(matrices, right)
+    right = jnp.broadcast_to(right, (*matrices.shape[:-2], *right.shape[-2:]))
+    rows = [x.reshape(-1, *x.shape[-2:]) for x in (matrices, right)]
+    return jax.lax.map(lambda row: jnp.linalg.solve(*row), rows).reshape(right.shape)
+
+
 def svdvals(x: Any) -> Any:
     """`jnp.linalg.svd(x, compute_uv=False)`: NaN where x is not finite."""
     if not on_host(x):

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from .._core.arguments import require_axes
 from .._core.compilation import host_first
-from .._core.executor import Array, is_traced, namespace
+from .._core.executor import Array, is_traced, namespace, solve
 from ..errors import DefinitionError
 
 
@@ -71,7 +71,7 @@ def connect(
         return xp.concatenate([upper, lower], axis=1)
 
     A, B, C, D = (beside(x, y) for x, y in zip(a[:4], b[:4], strict=True))
-    to_inputs = xp.linalg.solve(
+    to_inputs = solve(
         xp.eye(len(K)) - K @ D, xp.concatenate([K @ C, xp.broadcast_to(L, (len(D), *L.shape))], 2)
     )
     by_state, by_input = to_inputs[..., : C.shape[2]], to_inputs[..., C.shape[2] :]

@@ -11,7 +11,7 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import Scalar, Vector
 from .._core.compilation import host_first
-from .._core.executor import Array, namespace, scan
+from .._core.executor import Array, namespace, scan, solve
 from .._core.host_derivatives import must_be_on_host
 from ..errors import DefinitionError
 from .time_response import monodromy
@@ -99,7 +99,7 @@ def _states(A: Array, forcing: Array, f: Array) -> Array:
     start = xp.zeros(forcing.shape[1:], forcing.dtype)
     forced, _ = scan(advance, start, (A, forcing))
     z_N = xp.exp(2j * np.pi * f)[:, None, None]
-    start = xp.linalg.solve(z_N * np.eye(A.shape[-1]) - monodromy(A), forced)
+    start = solve(z_N * np.eye(A.shape[-1]) - monodromy(A), forced)
     return scan(advance, start, (A, forcing))[1]
 
 

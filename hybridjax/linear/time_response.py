@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.compilation import host_first
-from .._core.executor import Array, namespace, scan
+from .._core.executor import Array, namespace, scan, solve
 
 
 def monodromy(A: Float[Array, "N *S d d"]) -> Float[Array, "*S d d"]:
@@ -91,7 +91,7 @@ def periodic_states(
     w = xp.tensordot(u, after[::-1] @ B, ((2, 3), (0, 2)))
     z_N = np.exp(2j * np.pi * np.arange(periods) / periods)
     resolvent = z_N[:, None, None] * identity - phi
-    x = xp.linalg.solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1))
+    x = solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1))
     return xp.mean(x, axis=0).real.T
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import SignalNames
 from .._core.compilation import at_ease, one_program
-from .._core.executor import Array, namespace, on_host
+from .._core.executor import Array, namespace, on_host, solve
 from .._core.memo import Memory
 from ..engine import kernels
 from ..errors import DefinitionError
@@ -159,6 +159,6 @@ def _transfer(
     H = xp.concatenate([H, xp.moveaxis(end, -1, 0)], axis=1).reshape(len(coarse), -1)
     H, end = xp.split((fine @ H).reshape(len(f), rows + d, -1), [rows], axis=1)
     turned = xp.eye(d) - xp.exp(-2j * np.pi * f)[:, None, None] * (whole * size / size[:, None])
-    start = xp.linalg.solve(turned, end[..., :nu] / size[:, None]) * size[:, None]
+    start = solve(turned, end[..., :nu] / size[:, None]) * size[:, None]
     H = (H[..., :nu] + H[..., nu:] @ start).reshape(-1, len(harmonics), len(z.names), nu)
     return xp.moveaxis(H, 0, 1) / period

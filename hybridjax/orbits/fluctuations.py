@@ -17,7 +17,7 @@ from .._core.arguments import require_among
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, NonNegative
 from .._core.compilation import one_program
-from .._core.executor import Array, is_traced, namespace, on_host, put, scan
+from .._core.executor import Array, is_traced, namespace, on_host, put, scan, solve
 from .._core.text import number
 from ..errors import ComputationError
 from ..systems.structure import Structure
@@ -154,7 +154,7 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
     for _ in range(2):  # durations follow from the states of this turn and from the last
         joint = step @ joint @ step.T + Q
     _, (_, C, after) = scan(turn, (xp.eye(n), joint), pieces)
-    inward = xp.linalg.inv(free) @ B
+    inward = solve(free, B)
     rate = flow.length[:, None, None, None] * inward @ xp.swapaxes(inward, -1, -2)
     integral = np.pad(np.linalg.inv(rule().derivative[1:, 1:]), [(1, 0), (1, 0)])
     whole = xp.einsum("ij,pjab->piab", integral, rate)

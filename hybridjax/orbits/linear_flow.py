@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
 from .._core.boundary.checked import NeedsValues
-from .._core.executor import Array, is_hidden, namespace, on_host, scan, to_host
+from .._core.executor import Array, is_hidden, namespace, on_host, scan, solve, to_host
 from .._core.host_derivatives import by_columns
 from .._core.memo import Memory, remembered
 from ..engine import kernels
@@ -125,8 +125,7 @@ class LinearFlow(eqx.Module):
         field = xp.eye(n)[:, None, :, None] * matrix[:, rows, :, None, :]
         whole = D[:, None, :, None] * np.eye(d)[:, None, :]
         whole = whole + sign * self.length[:, None, None, None, None] * field
-        shape = len(self.length), n * d, n * d
-        return xp.linalg.inv(whole.reshape(shape)).reshape(-1, n, d, n, d)
+        return solve(whole.reshape(-1, n * d, n * d), np.eye(n * d)).reshape(-1, n, d, n, d)
 
     @remembered
     def forward(self) -> tuple[Float[Array, "P K d d"], Float[Array, "P K d K d"]]:

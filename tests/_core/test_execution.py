@@ -10,7 +10,9 @@ import pytest
 from hybridjax._core import execution
 from hybridjax._core.compilation import host_first
 from hybridjax._core.execution import Execution, Library, on_all_cores, one_blas_thread
-from hybridjax._core.executor import on_cpu, on_host
+from hybridjax._core.executor import on_cpu, on_host, solve
+from hybridjax.linear.frequency_response import harmonic_transfer
+from hybridjax.linear.time_response import periodic_states
 
 
 def test_the_default_device_counts_more_than_the_backend(monkeypatch):
@@ -28,6 +30,22 @@ def test_a_machine_with_a_gpu_computes_few_lanes_on_its_cpu(monkeypatch):
     function = host_first(lambda x: (executors.append(on_host(x)), 2 * x)[1])
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert function(jnp.ones(1)).devices() == {jax.devices("cpu")[0]} and executors == [True]
+
+
+def test_programs_factorize_one_matrix_at_a_time():
+    """Two stacks in one program wait for each other's threads for ever on two cores (JAX 0.10)."""
+    rng = np.random.default_rng(0)
+    A, B, C, u = (rng.normal(size=x) for x in ((8, 3, 3), (8, 3, 2), (8, 1, 3), (1, 5, 8, 2)))
+    matrices, right = rng.normal(size=(3, 2, 4, 4)), rng.normal(size=(4, 1))
+    exact = np.linalg.solve(matrices, right)
+    np.testing.assert_allclose(jax.jit(solve)(matrices, right), exact, rtol=1e-10)
+    for program, arguments in (
+        (solve, (matrices, right)),
+        (harmonic_transfer, (A, B, C, np.zeros((8, 1, 2)), np.arange(9.0) / 9)),
+        (periodic_states, (A, B, u)),
+    ):
+        calls = jax.jit(program).lower(*map(jnp.asarray, arguments)).as_text().split("getrf_ffi")
+        assert len(calls) == 2 and 'num_batch_dims = "0"' in calls[1]
 
 
 @pytest.fixture
