@@ -22,6 +22,9 @@ from .descent import Coefficients
 Multipliers = Annotated[Numbers, Complexes()]
 """Supposed or true multipliers, one or several."""
 
+RoughFit = tuple[Coefficients, Callable[[], Covariance]]
+"""Coefficients, and a function for their covariance."""
+
 
 class MultiplierComparison(eqx.Module):
     """Estimated Floquet multipliers, each paired with a true one.
@@ -76,37 +79,6 @@ def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComp
     rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
     order = np.lexsort((-np.imag(truth[columns]), -np.abs(truth[columns])))
     return MultiplierComparison(true=truth[columns][order], estimated=values[rows][order])
-
-
-def about_orders(
-    fit: "MultiplierEstimate",
-    higher: Iterable[Callable[[], tuple[Coefficients, Callable[[], Covariance]]]],
-    warn: bool,
-) -> str:
-    """Return a sentence if a fit of a higher order contradicts the multipliers; else an empty one.
-
-    It does if a multiplier is outside of its confidence regions, and its nearest one outside of
-    those of the fit.
-
-    **Arguments:** `higher`: functions that return the coefficients of a higher order, and a
-    function for their covariance; a `DefinitionError` means too few data. `warn`: whether to emit
-    the sentence as a warning, too.
-    """
-    for estimate in higher:
-        with suppress(DefinitionError):
-            c, covariance = estimate()
-            multipliers = multipliers_of(c)
-            near = np.abs(multipliers - fit.multipliers[:, None]).argmin(axis=1)
-            moved = ~fit.contains(multipliers[near])
-            if not moved.any():
-                continue
-            more = MultiplierEstimate(multipliers, c, *covariance())
-            if (moved & ~more.contains(fit.multipliers)).any():
-                text = f"`order` may be too low: {len(c)} gives other {more.show_multipliers()}"
-                if warn:
-                    warnings.warn(f"Order: {text}.", FindingWarning, stacklevel=5)
-                return text
-    return ""
 
 
 class MultiplierEstimate(eqx.Module):
@@ -213,6 +185,32 @@ class MultiplierEstimate(eqx.Module):
     def compare(self, true: Multipliers) -> MultiplierComparison:
         """Pair the multipliers with the true ones; printing the result shows a table."""
         return compare_multipliers(self.multipliers, true)
+
+    def contradiction(self, higher: Iterable[Callable[[], RoughFit]], warn: bool) -> str:
+        """Return a sentence if a fit of a higher order contradicts the multipliers; else "".
+
+        It does if a multiplier is outside of its confidence regions, and its nearest one outside of
+        those of this fit.
+
+        **Arguments:** `higher`: the fits; a `DefinitionError` means too few data. `warn`: whether
+        to emit the sentence as a warning, too.
+        """
+        for fit in higher:
+            with suppress(DefinitionError):
+                c, covariance = fit()
+                multipliers = multipliers_of(c)
+                near = np.abs(multipliers - self.multipliers[:, None]).argmin(axis=1)
+                moved = ~self.contains(multipliers[near])
+                if not moved.any():
+                    continue
+                other = MultiplierEstimate(multipliers, c, *covariance())
+                if (moved & ~other.contains(self.multipliers)).any():
+                    text = f"`order` may be too low: order {len(c)} gives other "
+                    text += f"{other.show_multipliers()}; compare both fits"
+                    if warn:
+                        warnings.warn(f"Order: {text}.", FindingWarning, stacklevel=4)
+                    return text
+        return ""
 
     def __repr__(self) -> str:
         about = "; ".join(filter(None, [self.show_multipliers(), self._about()]))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
@@ -19,9 +18,9 @@ from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from . import variable_projection as varpro
-from .denominator import Covariance, chi, multipliers_of
-from .descent import ROUNDING, Coefficients
-from .multiplier_estimate import MultiplierEstimate, about_orders
+from .denominator import chi, multipliers_of
+from .descent import ROUNDING
+from .multiplier_estimate import MultiplierEstimate, RoughFit
 from .variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of, numerator_size
 from .weights import (
     SMALLEST_ERROR,
@@ -65,8 +64,8 @@ class StructuredFit(MultiplierEstimate):
       narrow band of frequencies many give the same fit; these are the smallest.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `harmonics` (M,), `n_sections`, `inputs`, `outputs`: names and numbers of the fitted HTFs.
-    - `higher_order`: a sentence if fits with one or two more multipliers contradict those of this
-      fit; else empty.
+    - `higher_order`: a sentence if one more multiplier, or two, contradict those of this fit: they
+      lie outside of each other's 95 % regions. Empty otherwise, and without `check`.
     """
 
     residual: Float[np.ndarray, " ny"]
@@ -192,15 +191,17 @@ def fit_multipliers(
     if not check:
         return fit
 
-    def of_order(order: int) -> tuple[Coefficients, Callable[[], Covariance]]:
-        groups = group_htf(htf, weights, numerator_size(htf, order, overhang))
+    def of_order(order: int) -> RoughFit:
+        # No larger numerators, if possible: without zero multipliers they are large enough.
+        fewer = max(size - 1 - order * htf.n_sections, 0)
+        groups = group_htf(htf, weights, numerator_size(htf, order, fewer))
         start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
         c, _ = maximum_likelihood(groups, order, start, rough=True)
         return c, lambda: varpro.summarize(groups, c, errors)[0]
 
     # One more multiplier, or a pair.
     more = [functools.partial(of_order, order + k) for k in (1, 2)]
-    return dataclasses.replace(fit, higher_order=about_orders(fit, more, check))
+    return dataclasses.replace(fit, higher_order=fit.contradiction(more, check))
 
 
 @checked

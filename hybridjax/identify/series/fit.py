@@ -1,7 +1,7 @@
 """Multipliers and transfer functions from recorded time series with any input: output error."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -24,7 +24,7 @@ from .. import denominator
 from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate, about_orders
+from ..multiplier_estimate import MultiplierEstimate, RoughFit
 from ..multipliers import refuse_invented
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
@@ -66,7 +66,8 @@ class SeriesFit(MultiplierEstimate):
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
-    - `higher_order`: a sentence if a fit of the next order contradicts the multipliers; else empty.
+    - `higher_order`: a sentence if one more multiplier, or two, contradict those of this fit: they
+      lie outside of each other's 95 % regions. Otherwise empty.
     - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
     - `reference`: signals from outside of the loop of which the fit makes use. `noise` is then that
       of $\chi y$.
@@ -194,7 +195,8 @@ def fit_series(
     - `errors`: source of the covariance. "residuals": the residuals in blocks of successive cycles,
       also for errors that are correlated (process noise) or depend on the inputs (nonlinear
       distortion). "white": the variance of the residuals alone. Default: "residuals".
-    - `check`: whether to raise an error for an order that the data do not support. Default: True.
+    - `check`: whether to raise an error for an order that the data do not support, and to emit
+      `higher_order` as a `FindingWarning`. Default: True.
     - `reference`: names of those inputs of the data that act from outside on a loop. The fit is
       then that of the plant, from the other inputs, by instrumental variables: consistent for any
       noise and controller, of unstable plants, too. `start` and `errors` have no effect: the first
@@ -208,8 +210,9 @@ def fit_series(
     if reference is not None:
         plant, drive = in_loop(data, reference)
         fit = SeriesFit(**LoopEquations(plant, drive, order, overhang).fit(check))
-        more = [lambda: LoopEquations(plant, drive, order + 1, overhang).coefficients()]
-        return dataclasses.replace(fit, higher_order=about_orders(fit, more, check))
+        fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
+        more = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
+        return dataclasses.replace(fit, higher_order=fit.contradiction(more, check))
     records = data if isinstance(data, PreparedRecords) else PreparedRecords(data)
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
@@ -229,19 +232,18 @@ def fit_series(
     fit = assemble(problem, solution, covariance, converged)
     # One more multiplier, or a pair.
     more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
-    text = about_orders(fit, more, check)
-    return dataclasses.replace(fit, feedback=feedback, higher_order=text)
+    return dataclasses.replace(fit, feedback=feedback, higher_order=fit.contradiction(more, check))
 
 
-def _of_order(
-    order: int, records: PreparedRecords, fit: SeriesFit, free_start: bool
-) -> tuple[Coefficients, Callable[[], Covariance]]:
-    """Fit a higher order, beginning at a fit, for `about_orders`.
+def _of_order(order: int, records: PreparedRecords, fit: SeriesFit, free_start: bool) -> RoughFit:
+    """Fit a higher order roughly, beginning at a fit.
 
     **Raises:** `DefinitionError` for too few cycles.
     """
     (N, R), d = fit.numerators.shape[:2], len(fit.coefficients)
-    problem = OutputErrorProblem.from_data(records, order, R - 1 - fit.lead - d * N, free_start)
+    # No more lags than the fit has, if possible: without zero multipliers they are enough.
+    overhang = max(R - 1 - fit.lead - order * N, 0)
+    problem = OutputErrorProblem.from_data(records, order, overhang, free_start)
     problem = problem._replace(scale=fit.noise)
     start = np.pad(fit.coefficients, (0, order - d))
     solution, _ = minimize(problem, start, rough=True)

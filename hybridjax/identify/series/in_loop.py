@@ -13,7 +13,7 @@ B is eliminated section by section, and the rest is linear in c.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -28,6 +28,7 @@ from .. import denominator
 from ..denominator import Covariance, in_blocks, multipliers_of
 from ..descent import Coefficients
 from ..instrument import in_loop
+from ..multiplier_estimate import RoughFit
 from .output_error import RANK, SectionRegression
 from .records import PreparedRecords, delay_cycles, lagged_inputs
 from .subspace import subspace_model
@@ -179,11 +180,8 @@ class LoopEquations:
             reference=self.reference,
         )
 
-    def coefficients(self) -> tuple[Coefficients, Callable[[], Covariance]]:
-        """Return c and a function for its covariance, for `about_orders`.
-
-        **Raises:** `DefinitionError` as `solve`.
-        """
+    def coefficients(self) -> RoughFit:
+        """**Raises:** `DefinitionError` as `solve`."""
         c, covariance, _ = self.solve(True)
         return c, lambda: covariance
 
