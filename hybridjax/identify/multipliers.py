@@ -24,7 +24,6 @@ from .multiplier_estimate import MultiplierEstimate, RoughFit
 from .variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of, numerator_size
 from .weights import (
     SMALLEST_ERROR,
-    are_alike,
     check_values,
     error_weights,
     estimated_noise,
@@ -94,8 +93,6 @@ class StructuredFit(MultiplierEstimate):
     def _about(self) -> str:
         misfit = ", ".join(f"{n} {x:.1e}" for n, x in zip(self.outputs, self.residual, strict=True))
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
-        if are_alike(self.correlation, self.freedom):
-            state += "; the misfit is alike at neighboring frequencies: `order` is too low"
         state += self.higher_order and f"; {self.higher_order}"
         return (
             f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
