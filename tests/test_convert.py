@@ -27,15 +27,6 @@ def _model(dims, nu=2):
     )
 
 
-def whole_operator(htf, f):
-    """From all harmonics of an input to all of an output: [f, m, k] is H_(m-k) at f + k."""
-    full = htf((f[:, None] + np.arange(N)).ravel())
-    H = np.asarray(full.H).reshape(N, len(f), N)
-    which = (np.arange(N)[:, None] - np.arange(N) - full.harmonics[0]) % N
-    blocks = H[which, :, np.arange(N)[None]]  # m, k, f
-    return np.moveaxis(blocks, 2, 0)
-
-
 def test_the_lifted_system_is_the_periodic_one(model):
     """In time, sample by sample, and in frequency, harmonic by harmonic."""
     lti = convert.to_lti(model)
@@ -72,16 +63,6 @@ def test_python_control(model):
     lines = control.bode_plot(convert.to_control(H.select([0]))[0, 0]).lines
     np.testing.assert_allclose(lines[0, 0][0].get_ydata(), np.abs(H[0][:, 0, 0]))
     pyplot.close("all")
-
-
-def test_the_norm_of_the_lifted_system_is_that_of_the_transfer_functions():
-    """The H-infinity norm of python-control, and the largest gain over all harmonics together."""
-    control = pytest.importorskip("control")
-    model = _model([2] * N, nu=1)
-    f = np.linspace(0, 1, 4001)[:-1]
-    gain = np.linalg.svd(whole_operator(model.htf, f), compute_uv=False).max()
-    norm = control.norm(convert.to_control(model), p="inf", tol=1e-13)
-    assert norm == pytest.approx(gain, rel=1e-5)
 
 
 def test_scipy(model):

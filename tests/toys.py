@@ -10,16 +10,12 @@ from jaxtyping import Array, Float
 
 import hybridjax as hj
 from hybridjax.orbits.limit_cycles import LimitCycles
+from hybridjax.systems.chart import FieldChart
 
 
-class Field(hj.Chart):
+def Field(states, function):
     """A chart from a function (t, q, u) -> rates."""
-
-    states: tuple[str, ...] = eqx.field(static=True)
-    function: Callable = eqx.field(static=True)
-
-    def field(self, t, q, u):
-        return self.function(t, q, u)
+    return FieldChart(function, states)
 
 
 def toy(charts, transitions=(), period=None, outputs=(), **names):

@@ -13,6 +13,7 @@ from .._core.boundary.kinds import Count, Seed
 from .._core.progress import counted, working
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
+from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.system import Guess, HybridSystem
@@ -133,26 +134,11 @@ def _prepare(
         raise DefinitionError("`data` must be one observation or more, not an empty list.")
     parameters = free_parameters(system, free, observations)
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
-    near = _anchored(near)
+    moved = away_from_events(near)
+    if moved is not near:
+        near = find_limit_cycle(near.system, moved, settings=near.settings)
     prepared = tuple(observation.prepare(near) for observation in observations)
     return FitProblem(parameters, prepared), near
-
-
-def _anchored(cycle: LimitCycle) -> LimitCycle:
-    """Return the same cycle, begun as far as possible from any change of charts: there the cycles
-    of other systems are most likely to be in the same chart at the same phase of the clock."""
-    charts = np.asarray(cycle.legs.chart)
-    apart = np.subtract.outer(np.arange(len(charts)), np.arange(len(charts))) % len(charts)
-    apart = np.minimum(apart, apart.T)
-    room = np.where(charts != charts[:, None], apart, len(charts)).min(axis=1)
-    if not cycle.clocked or room[0] == room.max():
-        return cycle
-    k, s = int(np.argmax(room)), cycle.structure
-    a, q = int(charts[k]), cycle.legs.q[:, k]
-    return find_limit_cycle(
-        cycle.system, Guess(s.names[a], q[: s.dims[a]], cycle.legs.t[k]),
-        multiplicity=cycle.multiplicity, conserved=cycle.conserved, settings=cycle.settings,
-    )  # fmt: skip
 
 
 def _relative(

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Complex, Float
 
 from .._core.arguments import Numbers, require_index
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import PeriodCount, Probability
+from .._core.boundary.kinds import Probability
 from .._core.boundary.values import Complexes
 from .._core.html import card, multiplier_table, text, unit_circle
 from ..errors import DefinitionError, FindingWarning
@@ -163,9 +163,7 @@ class MultiplierEstimate(eqx.Module):
         return self.distance(truth) <= self._radius(level, np.where(np.imag(truth) == 0, 1, 2))
 
     @checked
-    def ellipse(
-        self, index: int = 0, level: Probability = 0.95, points: PeriodCount = 100
-    ) -> Complex[np.ndarray, " points"]:
+    def ellipse(self, index: int = 0, level: Probability = 0.95) -> Complex[np.ndarray, " points"]:
         """Return the border of a multiplier's confidence region, to first order: a closed curve.
 
         For a real multiplier it is an interval, drawn forth and back. NaN if the covariance is
@@ -176,7 +174,7 @@ class MultiplierEstimate(eqx.Module):
         require_index("multiplier", index, len(self.multipliers))
         degrees = 1 if self.multipliers[index].imag == 0 else 2
         values, vectors = np.linalg.eigh(self.multiplier_covariances[index])
-        angle = np.linspace(0, 2 * np.pi, points)
+        angle = np.linspace(0, 2 * np.pi, 100)
         circle = np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
         x, y = np.sqrt(self._radius(level, degrees)) * (vectors @ circle)
         return self.multipliers[index] + x + 1j * y

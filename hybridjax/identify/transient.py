@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Index, Order
+from .._core.boundary.kinds import Order
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
@@ -34,7 +34,7 @@ class TransientFit(eqx.Module):
 
     **Fields:**
 
-    - `data`: the records from period `skip` on, less the transient.
+    - `data`: the records from the second period on, less the transient.
     - `multipliers` (d,): those of the decay, by decreasing modulus. A by-product: fits to all of
       the data are more accurate.
     - `removed` (S, ny): rms of the transient in the window, per experiment and output; NaN
@@ -52,22 +52,20 @@ class TransientFit(eqx.Module):
 
 
 @checked
-def remove_transient(
-    data: ExperimentData, order: Order | None = None, *, skip: Index = 1
-) -> TransientFit:
+def remove_transient(data: ExperimentData, order: Order | None = None) -> TransientFit:
     """Fit the decay of the initial condition's response, and subtract it.
 
     No model is needed. The input must repeat after P periods in the whole record, and the record
-    must be at least `skip` periods longer than P. If it is longer by several (20, say), the decay
-    is separated from everything that repeats after P periods, distortion included, and any design
-    will do. With fewer, it is separated only from the response at excited lines, so that the design
-    must leave out half of them (`multisine(lines="odd")`).
+    must be at least one period longer than P: the first, in which zero multipliers vanish, is cut
+    off. If it is longer by several (20, say), the decay is separated from everything that repeats
+    after P periods, distortion included, and any design will do. With fewer, it is separated only
+    from the response at excited lines, so that the design must leave out half of them
+    (`multisine(lines="odd")`).
 
     **Arguments:**
 
     - `order`: d, the number of non-zero multipliers. Default: the one of 1 to 4 with the
       shortest description (Rissanen 1978).
-    - `skip`: periods at the start in which zero multipliers vanish; they are cut off. Default: 1.
 
     **Returns:** `TransientFit`, whose `data` are the argument of `estimate_htf`.
 
@@ -76,13 +74,13 @@ def remove_transient(
     """
     N, P = data.n_sections, data.periods
     S, n, ny = data.y.shape
-    cycles = n // N - skip
+    cycles = n // N - 1
     if order is not None and order > cycles // 2:
         raise DefinitionError(f"`order` must be at most half of the {cycles} cycles, not {order}.")
     if cycles < P:
         raise DefinitionError(
             f"the record has {n // N} cycles, but to remove a transient it must hold the "
-            f"window of P = {P} and the {skip} skipped ones before it: record some more."
+            f"window of P = {P} and the one before it, which is cut off: record some more."
         )
     data.require_ok()
     change = np.abs(data.u[data.ok, N * P :] - data.u[data.ok, : -N * P]).max(axis=(1, 2))
@@ -95,7 +93,7 @@ def remove_transient(
 
     size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
     good = np.flatnonzero(data.ok).tolist()
-    y = (data.y[data.ok] / np.where(size > 0, size, 1.0)).reshape(len(good), -1, N * ny)[:, skip:]
+    y = (data.y[data.ok] / np.where(size > 0, size, 1.0)).reshape(len(good), -1, N * ny)[:, 1:]
     everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
     if everything:
         free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(good)
@@ -119,16 +117,16 @@ def remove_transient(
     c = min(fits, key=lambda fit: fit[0])[1]
 
     basis = _decays(c, cycles)
-    clean, removed = data.y[:, skip * N :].copy(), np.full((S, ny), np.nan)
+    clean, removed = data.y[:, N:].copy(), np.full((S, ny), np.nan)
     for Q, z, s in zip(free, left, good, strict=True):
         transient = basis @ np.linalg.lstsq(Q @ basis, z, rcond=None)[0]
         transient = transient.reshape(-1, ny) * size
         clean[s] -= transient
         removed[s] = np.sqrt(np.mean(transient[-N * P :] ** 2, axis=0))
-    failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - skip * N, 0), -1)
+    failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - N, 0), -1)
     # Events, some of which lie in the cycles that were cut off, are left out.
     simulated = None if data.simulated is None else Simulated(failed_at, data.error)
-    data = dataclasses.replace(data, u=data.u[:, skip * N :], y=clean, simulated=simulated)
+    data = dataclasses.replace(data, u=data.u[:, N:], y=clean, simulated=simulated)
     return TransientFit(data, multipliers_of(c), removed)
 
 

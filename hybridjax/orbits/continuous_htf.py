@@ -57,7 +57,7 @@ def linear_outputs(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, A
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
     """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of the
     root of 2, so that calls with similar frequencies share a linearization."""
-    fastest = max(1.25 * np.max(np.abs(f), initial=0.0), np.max(np.abs(harmonics)), 0.1)
+    fastest = max(1.25 * np.max(np.abs(f)), np.max(np.abs(harmonics)), 0.1)
     longest = float(2.0 ** (np.floor(2 * np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))) / 2))
     if max(len(f), 64) / longest > _LARGEST:
         raise DefinitionError(
@@ -89,6 +89,8 @@ def continuous_htf(
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
     harmonics, frequencies = check_harmonics(harmonics, 0), np.asarray(f, float).reshape(-1)
+    if not len(frequencies):
+        raise DefinitionError("`f` holds no frequency: give one or more.")
     map = cycle.return_map
     z, names, columns = asked(map.structure, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, longest_piece(frequencies, harmonics))

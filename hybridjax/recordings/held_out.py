@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Order, Probability
+from .._core.boundary.kinds import Order
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Covariance
@@ -73,42 +73,41 @@ class Split(NamedTuple):
 
 
 @checked
-def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) -> int:
+def choose_order(data: SectionData) -> int:
     """Return the number of multipliers that predicts held-out strides best.
 
     For each number, the model is estimated by total least squares (which is consistent) without the
     held-out strides (see `hold_out`), and then simulates these strides. The result is the smallest
-    number whose misfit is within 2 % of the best. At most the first 1000 cycles of a recording are
-    used.
+    number, up to four, whose misfit is within 2 % of the best. At most the first 1000 cycles of a
+    recording are used.
 
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
-    return split(data, share).best_order(most)
+    return split(data).best_order()
 
 
 @checked
-def hold_out(data: SectionData, order: Order, share: Probability = 0.25) -> HeldOut:
-    """Fit all but the last `share` of every record, and validate the fit on this part.
+def hold_out(data: SectionData, order: Order) -> HeldOut:
+    """Fit all but the last quarter of every record, and validate the fit on this part.
 
     If this part of a record would be shorter than twelve cycles, whole records are held out
-    instead, a `share` of them. At most the first 1000 cycles of a recording are used.
+    instead, a quarter of them. At most the first 1000 cycles of a recording are used.
 
     **Raises:** `DefinitionError` if too few cycles are left for either.
     """
-    return split(data, share).fit(order)
+    return split(data).fit(order)
 
 
-def split(data: SectionData, share: float = 0.25) -> Split:
-    """Split the records into a part to be fitted, and a part to be held out."""
+def split(data: SectionData) -> Split:
+    """Split the records into a part to be fitted, and a quarter to be held out."""
     enough = min(1.0, _ENOUGH / data.cycles)
     ends = [round(len(r.u) * enough) for r in data.records]
-    short = [k for k, n in enumerate(ends) if n * share < _SHORTEST_END * data.n_sections]
-    every = round(1 / share)
-    held_out = short[every - 1 :: every]
+    short = [k for k, n in enumerate(ends) if n / 4 < _SHORTEST_END * data.n_sections]
+    held_out = short[3::4]
     fitted = short if held_out or len(short) < len(ends) else []
     early, late = [], []
     for k, (r, end) in enumerate(zip(data.records, ends, strict=True)):
-        cut = 0 if k in held_out else end if k in fitted else round(end * (1 - share))
+        cut = 0 if k in held_out else end if k in fitted else round(end * 0.75)
         early += [r.part(0, cut)] if cut else []
         late += [r.part(cut, end)] if cut < end else []
     return Split(PreparedRecords(early), late)

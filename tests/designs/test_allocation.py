@@ -27,16 +27,6 @@ def limits(cost, curved=None):
     return PowerLimits(tuple("abc"[: len(cost)]), cost, empty if curved is None else curved)
 
 
-def test_unknowns_that_are_measured_one_by_one():
-    """The sum of 1 / (s^2 p) within w p = 1 is smallest for p ~ 1 / (s sqrt(w))."""
-    s, w = np.array([1.0, 2.0, 5.0, 0.3]), np.array([1.0, 3.0, 0.5, 1.0])
-    result = allocate(criterion(np.diag(s)), limits(w), np.ones(4))
-    best = 1 / (s * np.sqrt(w))
-    np.testing.assert_allclose(result.power, best / (w @ best), rtol=0.05)
-    assert 1 - 1e-9 < result.certificate.excess < 1.021
-    np.testing.assert_allclose(result.certificate.relative, 1, atol=0.03)
-
-
 @pytest.mark.parametrize("linear, quadratic", [(3, 0), (0, 2), (1, 2)])
 def test_several_limits(linear, quadratic):
     """Against sequential quadratic programming, without majorization or linear limits around

@@ -45,22 +45,6 @@ def test_strides(optimal_two, two_usual):
     assert all(plan.rms[f"u{i}"] <= power[i] * (1 + 1e-9) for i in (0, 1))
 
 
-def test_noise_by_frequency(optimal_two):
-    """A spectrum that is constant is white noise; less noise at a frequency attracts power."""
-    limit = {"u0": 0.1, "u1": 0.1}
-    white = optimal_two(limit=limit)
-    level = {name: (lambda f, s=s: np.full(f.shape, s)) for name, s in TWO_NOISE.items()}
-    same = optimal_two(limit=limit, noise=level)
-    assert same.usual_criterion == pytest.approx(white.usual_criterion, rel=1e-9)
-    quiet = {
-        n: (lambda f, s=s: np.where(np.abs(f - 1.5) < 0.5, s / 10, s)) for n, s in TWO_NOISE.items()
-    }
-    goal = hj.designs.Multipliers(harmonics=0)
-    plans = [optimal_two(limit=limit, goal=goal, noise=noise) for noise in (quiet, TWO_NOISE)]
-    band = np.abs(plans[0].frequencies - 1.5) < 0.5
-    assert plans[0].power[band].sum() > 1.1 * plans[1].power[band].sum()
-
-
 def test_noise_that_differs_between_harmonics(two, optimal_two):
     """Against `multiplier_bound`, which takes numerators out in another way."""
     red = {n: (lambda f, s=s: s / np.sqrt(0.2 + f**2)) for n, s in TWO_NOISE.items()}

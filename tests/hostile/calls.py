@@ -153,7 +153,7 @@ def experiments(t):
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
     yield hj.identify.loop, dict(data=t.data, at_input=t.data.inputs[1])
-    yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
+    yield hj.identify.remove_transient, dict(data=t.repeated, order=2)
     yield hj.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
     yield t.rational.compare, dict(true=[0.5])

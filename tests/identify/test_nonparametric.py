@@ -11,31 +11,6 @@ import hybridjax as hj
 from ..linear.conftest import blocks_at_random
 
 
-DESIGNS = {
-    "paper": hj.paper_design(),
-    "minimum": hj.multisine(),
-    "two-phase": hj.multisine(lines="two-phase"),
-}
-
-
-@pytest.mark.parametrize("name", DESIGNS)
-def test_the_hopper_is_identified_exactly(name, hopper, exact):
-    data = hj.experiments.simulate_experiments(hopper, DESIGNS[name], start="periodic")
-    estimate = hj.estimate_htf(data)
-    np.testing.assert_array_equal(estimate.f, DESIGNS[name].frequencies)
-    assert estimate.harmonics == tuple(range(-16, 16))
-    assert estimate.error(hopper.htf(estimate.f)).max() < 1e-12
-    measured = np.isin(estimate.f, exact.f)
-    assert measured.sum() == 620
-    scale = np.abs(exact[0]).max(axis=0)
-    assert (np.abs(estimate.H[:, measured] - exact.H) / scale).max() < 1e-12
-
-
-def test_the_transient_of_the_paper(hopper, paper_estimate, exact):
-    errors = paper_estimate.harmonic_errors(exact)[16]
-    assert np.all((errors > 5e-5) & (errors < 2.5e-4))
-
-
 # Dimensions at each section (N even, odd and 1), outputs, inputs, periods.
 SHAPES = [((2, 3, 1, 2), 2, 1, 6), ((1, 3, 2), 1, 2, 5), ((2,), 1, 1, 9)]
 

@@ -16,15 +16,6 @@ MINIMAL = [4] * 21 + [2] * 5 + [3] + [4] * 5
 F = np.linspace(0.05, 9.95, 40)
 
 
-def test_the_hopper_from_markov_parameters(hopper, multipliers):
-    model = hj.identify.realize(hopper.impulse_response(150))
-    np.testing.assert_array_equal(model.dims, MINIMAL)
-    np.testing.assert_allclose(model.multipliers[:2], multipliers, atol=1e-10)
-    np.testing.assert_allclose(
-        model.impulse_response(300), hopper.impulse_response(300), atol=1e-12
-    )
-
-
 def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
     """620 frequencies up to 10 of 16 cycles per period."""
     model = hj.identify.realize(exact)

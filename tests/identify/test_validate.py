@@ -62,14 +62,6 @@ def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
     np.testing.assert_allclose(more / few, 0.5, rtol=0.15)
 
 
-def test_process_noise_is_correlated_in_time_only(small):
-    data = record(small, 4 * 300, 0)
-    hidden = np.random.default_rng(1).normal(size=data.u.shape)
-    y = data.y + 0.3 * np.asarray(small.simulate(hidden))
-    found = hj.validate(small, hj.Record(data.u, y, n_sections=4))
-    assert not found.white and found.whiteness.max() < 1e-6
-
-
 @pytest.mark.parametrize("start", ["free", "cycle"])
 def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     """Neither residuals nor p-values of the true model change, however large the drift is."""

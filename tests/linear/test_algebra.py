@@ -60,20 +60,6 @@ def test_systems_against_lifted_ones(pair):
     np.testing.assert_allclose(inside, P.feedback(F).htf(0.3).H, rtol=0, atol=1e-12)
 
 
-def test_systems_against_those_of_python_control(pair):
-    control = pytest.importorskip("control")
-    P, F = pair
-    plant, controller = map(hj.convert.to_control, pair)
-    for ours, theirs in (
-        (P @ F, plant * controller),
-        (P + P, plant + plant),
-        (P.feedback(F), control.feedback(plant, controller)),
-    ):
-        z = np.exp(2j * np.pi * np.array([0.0, 0.17, 0.5]))
-        exact = np.moveaxis(theirs(z), 2, 0)
-        np.testing.assert_allclose(lifted(ours, z), exact, rtol=0, atol=1e-12)
-
-
 def test_transfer_functions_against_systems(pair):
     P, K = pair
     H, G = P.htf(F), K.htf(F)

@@ -19,22 +19,6 @@ SHAPES = [((3, 2, 4, 1), 2, 2), ((2, 3, 2, 1, 2), 1, 2), ((2,), 1, 1)]
 seeds = st.integers(0, 2**32)
 
 
-@pytest.fixture(scope="module")
-def exact(hopper, reference):
-    return hopper.htf(reference("htf_exact_isochron")["f"])
-
-
-def test_hopper_at_all_frequencies_and_harmonics(exact, reference):
-    truth = reference("htf_exact_isochron")
-    expected = hj.HTF(
-        truth["f"], np.moveaxis(truth["H"], 0, 1)[..., None], truth["m"], 32, outputs=("yM", "vM")
-    )
-    assert exact.H.shape == (32, 620, 2, 1) and exact.harmonics == tuple(range(-16, 16))
-    assert np.max(exact.error(expected)) < 1e-12
-    np.testing.assert_array_equal(exact.error(exact), 0)
-    assert exact.harmonic_errors(expected).shape == (32, 2)
-
-
 @settings(max_examples=8)
 @given(seeds, st.sampled_from(SHAPES), st.sampled_from([0.125, 0.375, -0.375, 0.875]))
 def test_three_ways_agree(seed, shape, f):

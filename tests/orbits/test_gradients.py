@@ -1,7 +1,6 @@
 """What is seen on a cycle has the derivatives of the cycle."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,21 +8,6 @@ import pytest
 import hybridjax as hj
 
 from ..conftest import APEX
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("order", [1, 2])
-def test_the_period_of_van_der_pol_by_its_parameter(vanderpol_cycle, order):
-    def period(mu):
-        system = hj.models.VanDerPol(mu=mu)
-        return hj.find_limit_cycle(system, vanderpol_cycle).period
-
-    slope = jax.jacfwd(period) if order == 1 else jax.jacfwd(jax.jacfwd(period))
-    found = jax.jit(slope)(jnp.asarray(1.0))
-    e = 1e-2
-    at = [float(period(jnp.asarray(1.0 + k * e))) for k in range(-2, 3)]
-    weights = {1: np.array([1, -8, 0, 8, -1]) / e, 2: np.array([-1, 16, -30, 16, -1]) / e**2}
-    np.testing.assert_allclose(found, np.dot(weights[order], at) / 12, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -85,25 +85,11 @@ class Square(hj.HybridSystem):
         return hj.Guess("inside", (1.0, 0.2), after="off right")
 
 
-def _paddle(t):
-    return 0.15 * jnp.sin(2 * jnp.pi * t)
-
-
-class Juggler(hj.HybridSystem):
-    """A ball on a moving paddle."""
+class Juggler(hj.models.PaddleJuggler):
+    """A force acts on the ball."""
 
     def charts(self):
-        return {"flight": FieldChart(lambda t, q, u: (q[1], u[0] - 9.81), ("y", "v"))}
-
-    def impact(self, t, q, u):
-        return q[0], 1.7 * jax.grad(_paddle)(t) - 0.7 * q[1], *q[2:]
-
-    def transitions(self):
-        gap = lambda t, q, u: q[0] - _paddle(t)  # noqa: E731
-        return [hj.Transition("impact", "flight", "flight", gap, reset=self.impact)]
-
-    def period(self):
-        return 1.0
+        return {"fall": FieldChart(lambda t, q, u: (q[1], u[0] - self.g), ("y", "v"))}
 
 
 @pytest.mark.core
@@ -284,7 +270,7 @@ def test_harmonic_state_spaces_converge_to_the_exact_htf():
 
 def test_the_continuous_htf_of_a_speed_that_jumps_is_that_of_the_derivative_of_the_height():
     """With the impulses of the speed at impacts whose time moves."""
-    cycle = hj.find_limit_cycle(Juggler(), hj.Guess("flight", (0.2, 4.5), time=0.1))
+    cycle = hj.find_limit_cycle(Juggler(), hj.Guess("fall", (0.2, 4.5), time=0.1))
     f, m = np.array([0.3, 1.7]), np.arange(-3, 4)
     y, v = np.moveaxis(cycle.htf(f, m, ("y", "v")).H[..., 0], -1, 0)
     np.testing.assert_allclose(v, 2j * np.pi * (f + m[:, None]) * y, rtol=1e-9)

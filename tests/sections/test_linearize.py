@@ -56,7 +56,12 @@ def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, reque
 def test_resets_that_depend_on_time():
     """The velocity of the paddle at the impact is told by the time of the impact."""
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
-    *_, exact = hj.models.PaddleJuggler().exact()
+    time, *state, exact = cycle.system.exact()
+    (impact,) = cycle.trajectory().events
+    np.testing.assert_allclose([impact.time % 1, *impact.after.values()], [time, *state], atol=1e-9)
+    np.testing.assert_allclose(
+        np.sort_complex(cycle.multipliers), np.sort_complex(exact), atol=1e-9
+    )
     found = hj.linearize(cycle, hj.ClockPhase(8)).multipliers
     np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(exact), atol=1e-9)
 

@@ -16,16 +16,6 @@ LAMBDA = -0.248983334735609 + 0.699333251798004j
 VDP = 8.59695063603805e-4
 
 
-def test_the_apex_is_section_zero(reference, placed_kinematic):
-    data = reference("limit_cycle")
-    assert abs(placed_kinematic.lanes.t[0] % 1 - data["apex_clock"]) < 1e-10
-    assert np.all(placed_kinematic.duration > 0)
-    np.testing.assert_allclose(np.sum(placed_kinematic.duration), 1.0, atol=1e-12)
-    q = np.asarray(placed_kinematic.lanes.q)
-    angle = np.unwrap(np.angle((q[0] - 1.9) / 0.3 + 1j * q[1] / 1.9))
-    np.testing.assert_allclose(angle, -2 * np.pi * np.arange(32) / 32, atol=1e-10)
-
-
 def test_a_list_of_sections_of_every_kind(hopper_cycle):
     """State-based, on events, and in one chart only; the monodromy is that of the cycle."""
     sections, times, names = zip(

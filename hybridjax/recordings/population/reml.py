@@ -107,7 +107,7 @@ def weighted_squares(y: Reals, v: Reals, x: Design) -> float:
     return float(np.sum((y - x @ np.linalg.lstsq(x, y)[0]) ** 2))
 
 
-def spread_interval(y: Reals, v: Reals, x: Design, level: float = 0.95) -> tuple[float, float]:
+def spread_interval(y: Reals, v: Reals, x: Design) -> tuple[float, float]:
     """Return bounds of the standard deviation between subjects: those for which the sum of squares
     lies between quantiles of chi-squared (Q profile: Viechtbauer 2007)."""
     largest = 1e3 * (np.ptp(y) ** 2 + v.max())
@@ -119,7 +119,7 @@ def spread_interval(y: Reals, v: Reals, x: Design, level: float = 0.95) -> tuple
         excess = lambda variance: weighted_squares(y, v + variance, x) - quantile  # noqa: E731
         return float(np.sqrt(_root(excess, 0.0, largest)))
 
-    return bound((1 - level) / 2), bound((1 + level) / 2)
+    return bound(0.025), bound(0.975)
 
 
 def moderated(v: Reals, freedom: Reals, trend: Float[np.ndarray, "N k"]) -> Reals:
