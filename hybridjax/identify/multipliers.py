@@ -64,7 +64,7 @@ class StructuredFit(MultiplierEstimate):
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `harmonics` (M,), `n_sections`, `inputs`, `outputs`: names and numbers of the fitted HTFs.
     - `higher_order`: a sentence if one more multiplier, or two, contradict those of this fit: they
-      lie outside of each other's 95 % regions. Empty otherwise, and without `check`.
+      lie outside of each other's confidence regions. Empty otherwise, and without `check`.
     """
 
     residual: Float[np.ndarray, " ny"]

@@ -67,7 +67,7 @@ class SeriesFit(MultiplierEstimate):
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
     - `higher_order`: a sentence if one more multiplier, or two, contradict those of this fit: they
-      lie outside of each other's 95 % regions. Otherwise empty.
+      lie outside of each other's confidence regions. Otherwise empty.
     - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
     - `reference`: signals from outside of the loop of which the fit makes use. `noise` is then that
       of $\chi y$.
