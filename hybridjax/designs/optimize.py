@@ -117,10 +117,11 @@ class OptimalDesign(eqx.Module):
         special = [n for n in self.limited if n.startswith(prefixes)]
         rms = " and ".join(n for n in self.limited if n not in special)
         limits = " and ".join([f"rms of {rms}"] * bool(rms) + special)
-        verdict = "the usual design is nearly optimal"
-        if self.saved > _WORTH_IT:
-            verdict = "it matters where the power is"
-        return f"With the {limits} limited {verdict}: one stride does the work of {self.saved:.3g}."
+        verdict = "" if self.saved > _WORTH_IT else ", which is nearly optimal"
+        return (
+            f"With the {limits} limited, one stride of this design replaces {self.saved:.3g} "
+            f"of the usual design{verdict}."
+        )
 
     def __repr__(self) -> str:
         width = max(map(len, self.names))

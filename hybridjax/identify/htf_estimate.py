@@ -62,11 +62,10 @@ def estimate_htf(
       "auto".
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
-    - `reference`: names of those inputs of the data that act from outside on a loop, and not on
-      the plant itself. The result is then that of the plant, from the other inputs, which a
-      controller makes, to the outputs, without the bias of noise that goes round the loop
-      (`identify/instrument.py`). References have to excite all lines of a class f + integers, up to
-      N/2. Default: None, inputs that act on the plant from outside.
+    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+      the other inputs; the HTFs are those of the plant from these to the outputs, and noise that
+      the controller feeds back does not bias them (`identify/instrument.py`). References have to
+      excite all lines of a class f + integers, up to N/2. Default: None; there is no controller.
 
     **Returns:** `HTF` with ascending frequencies, source "estimate". At a frequency that was
     measured in one realization only, `variance` is computed from the mean residual of the other

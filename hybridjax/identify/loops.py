@@ -15,14 +15,15 @@ from .instrument import Roles, Sums, solve, spectral_products
 
 
 class Loop(eqx.Module):
-    r"""What the experiments tell of the loop $u = r - F y$, $y = P u + d$.
+    r"""Estimated HTFs of the control loop $u = r - F y$, $y = P u + d$ with references r and d.
 
-    **Fields**, each with variances, or None where no reference tells it:
+    **Fields**, each with variances:
 
-    - `plant`: P, from u to y. `controller`: F, from y to u (fed back with a negative sign).
+    - `plant`: P, from u to y; None without a reference r. `controller`: F, from y to u (fed back
+      with a negative sign); None without a reference d.
     - `closed`: $(I + P F)^{-1} P$, from r to y. `sensitivity`: $(I + F P)^{-1}$, from r to u. With
       the reference d alone: $-F (I + P F)^{-1}$, from d to u, and $(I + P F)^{-1}$, from d to y.
-    - `missing`: the experiments that would tell the rest.
+    - `missing`: sentences that name the experiments with which the others can be estimated.
     """
 
     plant: HTF | None
@@ -45,20 +46,20 @@ def loop(
     at_output: SignalNames | None = None,
     repeats: Count = 1,
 ) -> Loop:
-    """Tell the plant and its controller apart, from references that enter their loop.
+    """Estimate the HTFs of a plant and of its controller from experiments in closed loop.
 
-    A reference at the plant's input, of which u contains a part, is the instrument for the plant,
-    one at its output, of which y contains a part, that for the controller. Both may act in the
-    same experiments or in different ones; each counts as known while the other is used. The HTFs
-    come with first-order variances, see `estimate_htf` with `reference`; `hj.fit_multipliers` and
-    `hj.fit_ldtp` take them, those of unstable plants, too.
+    The plant is estimated from references that are added to its input u, the controller from
+    references that are added to the measured output y. Both kinds may act in the same experiments
+    or in different ones: the response to references of the other kind is subtracted. Variances are
+    of first order, see `estimate_htf` with `reference`. `hj.fit_multipliers` and `hj.fit_ldtp`
+    accept the HTFs, also those of unstable plants.
 
     **Arguments:**
 
-    - `data`: experiments whose inputs hold u and the references, with periodic references that
-      excite all lines f + integers.
-    - `at_input`: names of references at the plant's input, as many as inputs u.
-    - `at_output`: names of references at its output, as many as outputs y.
+    - `data`: experiments whose inputs are u and the references. References are periodic and excite
+      all lines f + integers.
+    - `at_input`: names of the references that are added to u, at least as many as inputs u.
+    - `at_output`: names of the references that are added to y, at least as many as outputs y.
     - `repeats`: as for `estimate_htf`. Default: 1.
 
     **Raises:** `DefinitionError` without a reference, for references that are not among the inputs,
@@ -93,13 +94,13 @@ def loop(
     missing = []
     if not r:
         missing.append(
-            "The plant: experiments with a reference at its input (a push, an injected current) "
-            "would tell it; this one reaches it through the controller only."
+            "The plant is not estimated: this needs experiments with a reference that is added to "
+            "its input (a push, an injected current)."
         )
     if not d:
         missing.append(
-            "The controller: experiments with a reference at its sensor (a moved scene, an offset "
-            "added to y) would tell it; this one reaches it through the plant only."
+            "The controller is not estimated: this needs experiments with a reference that is "
+            "added to its measured signal y (a moved scene, an offset)."
         )
     first = r or d
     answer, entered = (y, u) if r else (u, y)

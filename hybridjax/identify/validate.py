@@ -190,9 +190,9 @@ def validate(
     - `start`: "free", the default, estimates the initial state of each record from the record;
       "cycle" takes it as zero. Declared drift of the records is estimated in either case.
     - `level`: significance level of the tests. Default: 0.01.
-    - `reference`: names of those inputs of the data that act from outside on a loop. The model is
-      that of the plant, from the other inputs, and residuals are tested for independence of the
-      reference, since these inputs answer the noise. Default: None.
+    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+      the other inputs, which respond to noise; `model` is that of the plant from these to the
+      outputs. Residuals are tested for independence of the reference. Default: None.
 
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few
     cycles, all records are too short to be compared or for so many lags, or a plant that is

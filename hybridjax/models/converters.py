@@ -1,10 +1,11 @@
 """DC-DC converters with a switch that a controller closes and opens."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -14,31 +15,23 @@ from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Scheduled, Transition
 
 
-# Symbols of a circuit, as steps from their begin, in units of their length.
-_COIL = [(k / 48, 0.1 * math.sin(math.pi * (k % 12) / 12)) for k in range(49)]
-_DIODE = [
-    *((0.0, 0.0), (0.35, 0.0), (0.35, 0.15), (0.65, 0.0), (0.35, -0.15), (0.35, 0.0), (0.65, 0.0)),
-    *((0.65, 0.15), (0.65, -0.15), (0.65, 0.0), (1.0, 0.0)),
-]
-_WAYS = {"right": (1, 0), "up": (0, 1), "down": (0, -1)}
+# Symbols of a circuit, of length 1, in the complex plane.
+_COIL = np.array([k / 48 + 0.1j * math.sin(math.pi * (k % 12) / 12) for k in range(49)])
+_DIODE = np.array([0, 35, 35 + 15j, 65, 35 - 15j, 35, 65, 65 + 15j, 65 - 15j, 65, 100]) / 100
 
 
-def _along(symbol: Sequence[tuple[Any, Any]], x: float, y: float, way: str = "right") -> list:
-    """A symbol of length 1 from (x, y) on."""
-    c, s = _WAYS[way]
-    return [(x + c * a - s * b, y + s * a + c * b) for a, b in symbol]
-
-
-def _plates(charge: ArrayLike) -> list[list]:
+def _plates(charge: ArrayLike) -> tuple[Array, Array]:
     """Both halves of a capacitor, the gap of which shows the charge, from 0 to 1."""
-    gap = 0.05 + 0.1 * jnp.clip(charge, 0, 1)
-    ends = (0, 0.5 - gap), (1, 0.5 + gap)
-    return [[(end, 0), (x, 0), (x, -0.25), (x, 0.25)] for end, x in ends]
+    half = jnp.array([0, 0.45, 0.45 - 0.25j, 0.45 + 0.25j])
+    half -= 0.1 * jnp.clip(charge, 0, 1) * np.array([0, 1, 1, 1])
+    return half, 1 - half
 
 
-def _load(begin: float, x: float) -> list:
-    """A resistor at x, and its wires from the capacitor to the supply."""
-    return [(begin, 1.0), *Drawing.spring((x, 1.0), (x, 0.0)), (0.0, 0.0)]
+def _circuit(begin: float, x: float, lines: Mapping[str, Any]) -> Drawing:
+    """Lines in the complex plane, a load at x with wires from `begin`, and poles of the supply."""
+    drawn = {name: jnp.stack([jnp.real(z), jnp.imag(z)], -1) for name, z in lines.items()}
+    load = [(begin, 1.0), *Drawing.spring((x, 1.0), (x, 0.0)), (0.0, 0.0)]
+    return Drawing(drawn | {"load": load}, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
 
 class BuckConverter(HybridSystem):
@@ -95,17 +88,15 @@ class BuckConverter(HybridSystem):
 
     def draw(self, chart, t, q):
         """The circuit: supply, switch (or diode), coil, capacitor, load."""
-        blade = (0.9, 1.0) if chart == "closed" else (0.7, 1.4)
         above, below = _plates(q["v"] / self.Vin)
         lines = {
-            "switch": [(0.0, 1.0), (0.2, 1.0), blade],
-            "coil": [(0.9, 1.0), *_along(_COIL, 1.0, 1.0)],
-            "diode": _along(_DIODE, 1.0, 0.0, "up"),
-            "upper plate": _along(above, 2.0, 1.0, "down"),
-            "load": _load(2.0, 3.0),
-            "lower plate": _along(below, 2.0, 1.0, "down"),
+            "switch": np.array([1j, 0.2 + 1j, 0.9 + 1j if chart == "closed" else 0.7 + 1.4j]),
+            "coil": np.append(0.9 + 1j, 1 + 1j + _COIL),
+            "diode": 1 + 1j * _DIODE,
+            "upper plate": 2 + 1j - 1j * above,
+            "lower plate": 2 + 1j - 1j * below,
         }
-        return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
+        return _circuit(2.0, 3.0, lines)
 
     def guess(self):
         return Guess("open", (12.0, 0.6, self.lower))
@@ -164,22 +155,17 @@ class CukConverter(HybridSystem):
 
     def draw(self, chart, t, q):
         """The circuit: supply, first coil, switch, capacitor, diode, second coil, load."""
-        foot = (1.0, 0.2) if chart == "closed" else (1.35, 0.3)
         left, right = _plates(q["v1"] / (4 * self.E))
         above, below = _plates(q["v2"] / (2 * self.E))
         lines = {
-            "first coil": _along(_COIL, 0.0, 1.0),
-            "switch": [(1.0, 1.0), (1.0, 0.8), foot],
-            "contact": [(1.0, 0.2), (1.0, 0.0)],
-            "left plate": _along(left, 1.0, 1.0),
-            "right plate": _along(right, 1.0, 1.0),
-            "diode": _along(_DIODE, 2.0, 1.0, "down"),
-            "second coil": _along(_COIL, 2.0, 1.0),
-            "upper plate": _along(above, 3.0, 1.0, "down"),
-            "lower plate": _along(below, 3.0, 1.0, "down"),
-            "load": _load(3.0, 3.7),
+            "switch": 1 + np.array([1j, 0.8j, 0.2j if chart == "closed" else 0.35 + 0.3j]),
+            "contact": np.array([1 + 0.2j, 1]),
+            **{"first coil": 1j + _COIL, "second coil": 2 + 1j + _COIL},
+            **{"left plate": 1 + 1j + left, "right plate": 1 + 1j + right},
+            "diode": 2 + 1j - 1j * _DIODE,
+            **{"upper plate": 3 + 1j - 1j * above, "lower plate": 3 + 1j - 1j * below},
         }
-        return Drawing(lines, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
+        return _circuit(3.0, 3.7, lines)
 
     def guess(self):
         return Guess("open", (0.55, 25.0, 0.85, 10.0), 0.9 * self.T)

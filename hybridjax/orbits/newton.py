@@ -6,6 +6,7 @@ attempt of another kind, such as a restart from a random state, is added there.
 
 import dataclasses
 import functools as ft
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.compilation import host_first, quick_jit
+from .._core.compilation import host_first
 from .._core.executor import Array, on_host
 from .._core.host_derivatives import NotOnHostError, by_columns
 from .._core.progress import say
@@ -132,7 +133,7 @@ def solve(map: ReturnMap, once_more: bool = False, factors: bool = True) -> Solu
     return _solve(map, once_more)
 
 
-@quick_jit
+@host_first
 def _solve_damped(map: ReturnMap) -> Solution:
     q, turn, steps = root(map, True, 2 * MAX_STEPS)
     return Solution(map.departure(q), turn._replace(record=None), steps, map.judge(q, turn))
@@ -164,7 +165,9 @@ def root(
 
     Differentiable once and twice; only the state has derivatives.
     """
-    return _root_on_host(map, max_steps) if on_host(map.expected) else _root(map, damped, max_steps)
+    if not on_host(map.expected):
+        return _root(map, damped, max_steps)
+    return (_damped_on_host if damped else _root_on_host)(map, max_steps)
 
 
 def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
@@ -178,6 +181,29 @@ def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.
         done = excess(x[None], step[None])[0] < 1 and np.max(np.abs(residual)) < _ATOL
         if done or steps == max_steps or not np.isfinite(x).all():
             return x * sizes, turn, np.asarray(steps)
+
+
+def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
+    """Levenberg-Marquardt steps, with the constants of optimistix."""
+    sizes, least, damping, best = map.sizes, np.inf, 1.0, None
+    x, step = map.anchor.q[:, 0] / sizes, 0.0
+    for steps in itertools.count(1):
+        turn = map.turn_with_jacobian((x + step) * sizes)
+        residual = turn.residual / sizes
+        if (size := np.linalg.norm(residual)) < least:
+            x, least, damping, best = x + step, size, damping / 3.5, turn
+            jacobian = np.vstack([turn.jacobian * sizes / sizes[:, None], np.eye(len(x))])
+            error = np.append(residual, 0 * x)
+        elif best is None:  # (no turn closes from here)
+            break
+        else:
+            damping *= 4
+        jacobian[len(x) :] = np.sqrt(damping) * np.eye(len(x))
+        step = -np.linalg.lstsq(jacobian, error)[0]
+        # (Short steps are at the end, or where none helps.)
+        if excess(x[None], step[None])[0] < 1 or steps == max_steps:
+            break
+    return x * sizes, best or turn, np.asarray(steps)
 
 
 @eqx.filter_custom_jvp

@@ -178,9 +178,8 @@ def animate(
     if isinstance(motion, Branch):
         return _of_branch(motion, x, y, 1 / fps / (speed or 1.0))
     cycle = motion if isinstance(motion, LimitCycle) else None
-    if cycle is not None and cycle.result != Result.OK:
-        reason = Result(int(cycle.result)).message
-        raise DefinitionError(f"a cycle that was not found cannot be animated ({reason}).")
+    if cycle is not None and (code := Result(int(cycle.result))) != Result.OK:
+        raise DefinitionError(f"a cycle that was not found cannot be animated ({code.message}).")
     if isinstance(perturbed, ExperimentData):
         if cycle is None or sections is None:
             raise DefinitionError("data of experiments need a limit cycle and their `sections`.")

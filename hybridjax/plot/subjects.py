@@ -76,11 +76,8 @@ def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
     """
     is_complex = np.iscomplexobj(result.values)
     size = np.abs if is_complex else np.asarray
-    values, inside, label = (
-        size(result.values),
-        result.significant,
-        with_unit("response", result.unit),
-    )
+    values, inside = size(result.values), result.significant
+    label = with_unit("response", result.unit)
     if len(result.axes) > 2:
         raise DefinitionError("a figure has at most two axes, but the maps have more.")
     with panels(ax, width=COLUMN if len(result.axes) == 1 else 0.6 * PAGE) as axes:
@@ -97,11 +94,11 @@ def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
         else:
             y, x = result.axes.values()
             top = np.abs(values).max()
-            look = (
-                {"cmap": "viridis", "vmin": 0} if is_complex else {"cmap": "RdBu_r", "vmin": -top}
+            cmap, low = ("viridis", 0) if is_complex else ("RdBu_r", -top)
+            look = {"cmap": cmap, "vmin": low, "vmax": top, "shading": "nearest"}
+            panel.figure.colorbar(
+                panel.pcolormesh(x, y, values, **look, rasterized=True), ax=panel, label=label
             )
-            look |= {"vmax": top, "shading": "nearest", "rasterized": True}
-            panel.figure.colorbar(panel.pcolormesh(x, y, values, **look), ax=panel, label=label)
             if inside.any() and not inside.all():
                 panel.contour(x, y, inside, [0.5], colors="black", linewidths=1.2)
             panel.set(xlabel=other[0], ylabel=name)

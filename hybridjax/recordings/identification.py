@@ -75,8 +75,8 @@ def identify_recording(
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
-    - `reference`: signals that act from outside on a loop in which a controller makes the inputs,
-      at least as many as these. The fit is then that of the plant, see `fit_series`. Default: None.
+    - `reference`: signals that enter a control loop from outside, at least as many as inputs. The
+      controller makes the inputs; the plant is fitted, see `fit_series`. Default: None.
 
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
     `section_data` and `fit_series`; `PrecisionError` in single precision.

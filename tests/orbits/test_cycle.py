@@ -131,3 +131,14 @@ def test_an_event_may_pass_the_phase_at_which_a_guess_begins(hopper_cycle):
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper(k=14.5), hopper_cycle)
     settled = hj.find_limit_cycle(hj.models.VerticalHopper(k=14.5), settle=60.0)
     np.testing.assert_allclose(cycle.multipliers, settled.multipliers, rtol=1e-9)
+
+
+def test_damped_steps_reach_a_cycle_that_newtons_method_misses():
+    """The juggler's unstable cycle; its trace and that of the stable one have the mean 1 + e^2."""
+    juggler = hj.models.PaddleJuggler()
+    cycle = hj.find_limit_cycle(juggler, hj.Guess("fall", (1.3, -1.0), 0.56))
+    e, stable = juggler.restitution, hj.find_limit_cycle(juggler)
+    np.testing.assert_allclose(np.prod(cycle.multipliers), e**2, rtol=1e-9)
+    traces = sum(np.sum(x.multipliers) for x in (cycle, stable))
+    np.testing.assert_allclose(traces, 2 * (1 + e**2), rtol=1e-9)
+    assert stable.stable and not cycle.stable

@@ -61,8 +61,8 @@ _REMEDIES = (
     "D = 0 was taken; if outputs answer inputs at the same section, name their `reference`",
 )
 _UNSEEN = (
-    "outputs and inputs go together at the same section: D is free, and biased if a controller "
-    "makes inputs there (then name their `reference`, or give a guess with D = 0)"
+    "outputs are correlated with inputs at the same section, so D was fitted: if a controller "
+    "causes the correlation, D is biased (then name its `reference`, or give a guess with D = 0)"
 )
 
 
@@ -241,14 +241,13 @@ def fit_ldtp(
       none. Default: "free".
     - `check`: whether to raise an error if outputs do not respond to the inputs. It has no effect
       with "innovations". Default: True.
-    - `reference`: names of those inputs of the series that act from outside on a loop. The fit is
-      then that of the plant, from the other inputs, which a controller makes, always with
-      innovations, and of stable and unstable plants alike. It is consistent in the loop if D is
-      zero wherever the controller answers at once; whether D is zero is found from the answer of
-      the outputs to the reference. In a loop whose reference was not recorded, pass
-      noise="innovations". Then D is zero if outputs do not depend on inputs at the same section,
-      or if inputs answer earlier residuals; otherwise D is free, and `feedback` reports that a
-      controller could look the same. Default: None.
+    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+      the other inputs; the plant from these to the outputs is fitted, stable or unstable, always
+      with innovations. The fit is consistent if D is zero at sections where the controller responds
+      without delay; the response of the outputs to the reference shows whether D is zero. If the
+      reference was not recorded, pass noise="innovations". Then D is zero if outputs do not depend
+      on inputs at the same section, or if inputs respond to earlier residuals; otherwise D is
+      fitted, and `feedback` reports that a controller could cause the dependence. Default: None.
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data

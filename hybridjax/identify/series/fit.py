@@ -69,8 +69,8 @@ class SeriesFit(MultiplierEstimate):
     - `higher_order`: a sentence if one more multiplier, or two, contradict those of this fit: they
       lie outside of each other's confidence regions. Otherwise empty.
     - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
-    - `reference`: signals from outside of the loop of which the fit makes use. `noise` is then that
-      of $\chi y$.
+    - `reference`: signals that enter the loop from outside. With a reference, `noise` is the
+      standard deviation of $\chi y$.
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]
@@ -197,10 +197,11 @@ def fit_series(
       distortion). "white": the variance of the residuals alone. Default: "residuals".
     - `check`: whether to raise an error for an order that the data do not support, and to emit
       `higher_order` as a `FindingWarning`. Default: True.
-    - `reference`: names of those inputs of the data that act from outside on a loop. The fit is
-      then that of the plant, from the other inputs, by instrumental variables: consistent for any
-      noise and controller, of unstable plants, too. `start` and `errors` have no effect: the first
-      cycles of each record are not used, and errors may be correlated. Default: None.
+    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+      the other inputs; the plant from these to the outputs is fitted, stable or unstable, by
+      instrumental variables, which are consistent for any noise and controller. `start` and
+      `errors` have no effect: the first cycles of each record are not used, and errors may be
+      correlated. Default: None.
 
     **Raises:** `DefinitionError` for records that do not fit together, inputs that are zero, too
     few cycles (the message says how many are needed), or an order that the data do not support.
