@@ -20,12 +20,21 @@ of a tenth of the outputs' rms, which goes round the loop. Printed, as `name val
   identified (`right`: the region of 99.99 % holds), refused or not converged (`reported`), `wrong`,
   and how many regions of 95 % hold; and `recording.*`, CPU seconds of `identify_recording`.
 
-    python benchmarks/in_loop.py [--draws 400] [--size 1.0] [--first 0]
+- with `--orders 100`: how often `fit_series` doubts the order (`doubted`). As many random plants
+  have 2 to 4 multipliers, 1 to 3 outputs, and noise of sensors and process: without feedback
+  (`open`), with nonlinear outputs (`bent`), and in a loop (`loop`); the hopper has amplitudes at
+  which it distorts (`hopper`). Orders that `fit_series` refuses are not counted. `wrong`: fits of
+  too low an order with an error above 5 standard errors; `near`: the others; `right`: those of the
+  right order. `seconds`: CPU time relative to fits without this test.
+
+    python benchmarks/in_loop.py [--draws 400] [--size 1.0] [--first 0] [--random 20] [--orders 100]
 """
 
 import argparse
 import time
 import warnings
+from collections import Counter, defaultdict
+from unittest import mock
 
 import equinox as eqx
 import numpy as np
@@ -42,6 +51,7 @@ from hybridjax.identify.periodic import (
     characteristic_slopes,
     local_coordinates,
 )
+from hybridjax.identify.series.fit import SeriesFit
 from hybridjax.identify.series.records import CycleGrid
 
 
@@ -166,15 +176,18 @@ def regulator(model: hj.LDTP, weight: float) -> np.ndarray:
     return np.stack([k @ np.linalg.pinv(c) for k, c in zip(K, C, strict=True)])
 
 
-def in_a_loop(model: hj.LDTP, gain: np.ndarray, rng, noise: float, strides: int) -> hj.Record:
+def in_a_loop(
+    model: hj.LDTP, gain: np.ndarray, rng, noise: float, strides: int, sensor=None
+) -> hj.Record:
     """Return a record with a white reference and white noise of process and sensors."""
+    sensor = noise / 5 if sensor is None else sensor
     A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
     n = len(A) * strides
     r, w = rng.normal(size=(2, n, B.shape[2]))
     x, u, y = np.zeros(A.shape[1]), np.zeros(r.shape), np.zeros((n, C.shape[1]))
     for i in range(n):
         k = i % len(A)
-        y[i] = C[k] @ x + noise / 5 * rng.normal(size=y.shape[1])
+        y[i] = C[k] @ x + sensor * rng.normal(size=y.shape[1])
         u[i] = r[i] - gain[k] @ y[i]
         x = A[k] @ x + B[k] @ (u[i] + noise * w[i])
     names = tuple(f"u{j}" for j in range(r.shape[1])) + tuple(f"r{j}" for j in range(r.shape[1]))
@@ -201,6 +214,89 @@ def random_loops(first: int, count: int) -> dict[str, int]:
             f"in_loop.random.{k} {name}: {fit.compare(model.multipliers).max_error:.2g}", flush=True
         )
     return counts
+
+
+def few_outputs(k: int) -> hj.LDTP:
+    """Return the k-th of random plants: 2 to 4 multipliers, some complex, and 1 to 3 outputs."""
+    rng = np.random.default_rng((7, k))
+    d, nu, n, ny = 2 + k % 3, *(int(rng.integers(*x)) for x in ((1, 3), (4, 13), (1, 4)))
+    root, i = np.zeros((d, d)), 0
+    while i < d:
+        pair, size = i + 1 < d and rng.random() < 0.5, rng.uniform(0.3, 0.9) ** (1 / n)
+        z = size * np.exp(1j * pair * rng.uniform(0.2, np.pi - 0.2) / n)
+        part = np.array([[z.real, -z.imag], [z.imag, z.real]])[: 1 + pair, : 1 + pair]
+        root[i : i + len(part), i : i + len(part)], i = part, i + len(part)
+    T = rng.normal(size=(n, d, d)) / 2 + 1.5 * np.eye(d)
+    turn = np.linalg.qr(rng.normal(size=(d, d)))[0]
+    A = [T[(i + 1) % n] @ turn @ root @ turn.T @ np.linalg.inv(T[i]) for i in range(n)]
+    return hj.LDTP(A, rng.normal(size=(n, d, nu)), rng.normal(size=(n, ny, d)))
+
+
+def noisy(model: hj.LDTP, kind: str, rng) -> tuple[hj.Record, tuple[str, ...] | None]:
+    """Return 300 cycles of a random plant, and the names of its references."""
+    (N, ny, _), nu = model.C.shape, model.B.shape[2]
+    gain = rng.normal(size=(N, nu, ny)) * (kind == "loop")
+    while np.abs(model.feedback(gain).multipliers).max() > 0.9:
+        gain = gain / 1.5
+    sensor, process = rng.choice([0.003, 0.03, 0.1, 0.3]), rng.choice([0.0, 0.1, 0.5])
+    size = in_a_loop(model, gain, np.random.default_rng(0), 0.0, 300).y.std(axis=0)
+    data = in_a_loop(model, gain, rng, process, 300, sensor * size)
+    if kind == "loop":
+        return data, data.inputs[nu:]
+    x = data.y / size
+    bent = 10 ** rng.uniform(-2, -0.5) * (0.7 * x**2 + 0.3 * x**3) * (kind == "bent")
+    drift = np.inf if kind == "bent" else None  # (even powers have a mean)
+    return hj.Record(data.u[:, :nu], data.y + size * bent, n_sections=N, drift=drift), None
+
+
+def bent_hopper(count: int, seed: int) -> list[hj.Record]:
+    """Return 300 strides each, at amplitudes at which half a percent to half is distortion."""
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    phase = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
+    rng = np.random.default_rng((9, seed))
+    u = rng.normal(size=(count, STRIDES * N, 1)) * 10 ** rng.uniform(-3, -1.5, (count, 1, 1))
+    data = hj.run_experiments(cycle, phase, u, ("yM", "vM"), start="cycle", discard=0)
+    y = data.y + 0.01 * data.y.std(axis=1, keepdims=True) * rng.normal(size=data.y.shape)
+    return [hj.Record(u[k], y[k], n_sections=N) for k in np.flatnonzero(data.ok)]
+
+
+def too_low(first: int, count: int) -> None:
+    """Print how often orders that are too low are noticed, and right ones doubted."""
+    cases = [(kind, few_outputs(k), k) for kind in ("open", "bent", "loop") for k in
+             range(first, first + count)]  # fmt: skip
+    draws = [
+        (kind, np.asarray(model.multipliers), *noisy(model, kind, np.random.default_rng((10, k))))
+        for kind, model, k in cases
+    ]
+    true = np.asarray(hopper().multipliers)
+    draws += [("hopper", true, data, None) for data in bent_hopper(count, first)]
+    counts: dict[str, Counter] = defaultdict(Counter)
+    seconds = defaultdict(lambda: np.zeros(2))
+    contradiction, spent = SeriesFit.contradiction, [0.0]
+
+    def timed(*arguments) -> str:
+        began = time.process_time()
+        text = contradiction(*arguments)
+        spent[0] = time.process_time() - began
+        return text
+
+    for kind, true, data, reference in draws:
+        for order in range(2, len(true) + 1):
+            began = time.process_time()
+            try:
+                with mock.patch.object(SeriesFit, "contradiction", timed):
+                    fit = hj.fit_series(data, order, reference=reference)
+            except hj.DefinitionError:
+                continue
+            whole = time.process_time() - began
+            seconds[kind] += [whole, whole - spent[0]]
+            error = np.abs(fit.multipliers[:, None] - true).min(axis=1) / fit.standard_errors
+            name = "right" if order == len(true) else "wrong" if error.max() > 5 else "near"
+            counts[kind].update({name: 1, f"{name}.doubted": int(bool(fit.higher_order))})
+    for kind, values in counts.items():
+        for name, value in values.items():
+            print(f"in_loop.orders.{kind}.{name} {value}", flush=True)
+        print(f"in_loop.orders.{kind}.seconds {seconds[kind][0] / seconds[kind][1]:.3g}")
 
 
 def recording_seconds(rate: int = 100, strides: int = 300) -> dict[str, float]:
@@ -263,8 +359,13 @@ def main() -> None:
         "--random", type=int, default=0, help="only the short gait, and so many random loops"
     )
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw or loop")
+    parser.add_argument(
+        "--orders", type=int, default=0, help="only orders that are too low, of so many plants"
+    )
     options = parser.parse_args()
     hj.enable_x64()
+    if options.orders:
+        return too_low(options.first, options.orders)
     model, rng, draws = hopper(), np.random.default_rng(0), options.draws
     sensor = SENSOR * sizes(model)
     if options.random:

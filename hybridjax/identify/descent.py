@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Inexact
@@ -32,6 +32,9 @@ _SETTLED_GAIN = 1e-14
 # If no step lowers the cost: the gain, relative to the cost, that rounding explains. Smaller:
 # minima of exact data count as not converged; larger: stalled descents count as converged.
 _STALLED_GAIN = 1e-6
+# Options of a rough fit: steps, and the decrease of the cost, in units of the noise, that is not
+# worth one. More, and smaller: steps that follow noise; fewer, and larger: fits that hardly move.
+ROUGH: dict[str, Any] = {"max_steps": 4, "settled_gain": 5.0}
 
 
 class Point(ABC):

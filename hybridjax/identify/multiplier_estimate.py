@@ -1,5 +1,8 @@
 """Estimated Floquet multipliers: their confidence regions, and comparison with true ones."""
 
+import warnings
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Annotated
 
 import equinox as eqx
@@ -11,11 +14,16 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability
 from .._core.boundary.values import Complexes
 from .._core.html import card, multiplier_table, text, unit_circle
-from ..errors import DefinitionError
+from ..errors import DefinitionError, FindingWarning
+from .denominator import Covariance, multipliers_of
+from .descent import Coefficients
 
 
 Multipliers = Annotated[Numbers, Complexes()]
 """Supposed or true multipliers, one or several."""
+
+RoughFit = tuple[Coefficients, Callable[[], Covariance]]
+"""Coefficients, and a function for their covariance."""
 
 
 class MultiplierComparison(eqx.Module):
@@ -175,6 +183,32 @@ class MultiplierEstimate(eqx.Module):
     def compare(self, true: Multipliers) -> MultiplierComparison:
         """Pair the multipliers with the true ones; printing the result shows a table."""
         return compare_multipliers(self.multipliers, true)
+
+    def contradiction(self, higher: Iterable[Callable[[], RoughFit]], warn: bool) -> str:
+        """Return a sentence if a fit of a higher order contradicts the multipliers; else "".
+
+        It does if a multiplier is outside of its confidence regions, and its nearest one outside of
+        those of this fit.
+
+        **Arguments:** `higher`: the fits; a `DefinitionError` means too few data. `warn`: whether
+        to emit the sentence as a warning, too.
+        """
+        for fit in higher:
+            with suppress(DefinitionError):
+                c, covariance = fit()
+                multipliers = multipliers_of(c)
+                near = np.abs(multipliers - self.multipliers[:, None]).argmin(axis=1)
+                moved = ~self.contains(multipliers[near])
+                if not moved.any():
+                    continue
+                other = MultiplierEstimate(multipliers, c, *covariance())
+                if (moved & ~other.contains(self.multipliers)).any():
+                    text = f"`order` may be too low: order {len(c)} gives other "
+                    text += f"{other.show_multipliers()}; compare both fits"
+                    if warn:
+                        warnings.warn(f"Order: {text}.", FindingWarning, stacklevel=4)
+                    return text
+        return ""
 
     def __repr__(self) -> str:
         about = "; ".join(filter(None, [self.show_multipliers(), self._about()]))

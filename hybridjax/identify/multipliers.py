@@ -20,11 +20,10 @@ from ..linear.ldtp import LDTP
 from . import variable_projection as varpro
 from .denominator import chi, multipliers_of
 from .descent import ROUNDING
-from .multiplier_estimate import MultiplierEstimate
+from .multiplier_estimate import MultiplierEstimate, RoughFit
 from .variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of, numerator_size
 from .weights import (
     SMALLEST_ERROR,
-    are_alike,
     check_values,
     error_weights,
     estimated_noise,
@@ -64,6 +63,8 @@ class StructuredFit(MultiplierEstimate):
       narrow band of frequencies many give the same fit; these are the smallest.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `harmonics` (M,), `n_sections`, `inputs`, `outputs`: names and numbers of the fitted HTFs.
+    - `higher_order`: a sentence if one more multiplier, or two, contradict those of this fit: they
+      lie outside of each other's confidence regions. Empty otherwise, and without `check`.
     """
 
     residual: Float[np.ndarray, " ny"]
@@ -76,6 +77,7 @@ class StructuredFit(MultiplierEstimate):
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+    higher_order: str = eqx.field(static=True, default="")
 
     @checked
     def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
@@ -91,8 +93,7 @@ class StructuredFit(MultiplierEstimate):
     def _about(self) -> str:
         misfit = ", ".join(f"{n} {x:.1e}" for n, x in zip(self.outputs, self.residual, strict=True))
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
-        if are_alike(self.correlation, self.freedom):
-            state += "; the misfit is alike at neighboring frequencies: `order` is too low"
+        state += self.higher_order and f"; {self.higher_order}"
         return (
             f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}{state}"
@@ -151,12 +152,14 @@ def fit_multipliers(
         raise DefinitionError("errors='variance' needs HTFs with variances: take 'residuals'.")
     size = numerator_size(htf, order, overhang)
     f, H = np.asarray(htf.f), np.asarray(htf.H)
-    groups = group_htf(htf, error_weights(htf, rms), size)
+    weights = error_weights(htf, rms)
+    groups = group_htf(htf, weights, size)
     c, converged = maximum_likelihood(groups, order)
     if htf.variance is None:
         for _ in range(_REWEIGHTINGS):
             variance = varpro.error_spectrum(groups, c, f, line_variances(htf), len(rms))
-            groups = group_htf(htf, np.broadcast_to(weights_of(variance, rms), H.shape), size)
+            weights = np.broadcast_to(weights_of(variance, rms), H.shape)
+            groups = group_htf(htf, weights, size)
             c, converged = maximum_likelihood(groups, order, c)
     covariance, cost, freedom = varpro.summarize(groups, c, errors)
     b = [varpro.numerators_of(group, c) for group in groups]
@@ -166,7 +169,7 @@ def fit_multipliers(
     if check:
         require_order(groups, htf, order, cost / freedom, residual)
 
-    return StructuredFit(
+    fit = StructuredFit(
         multipliers=multipliers_of(c),
         coefficients=c,
         covariance=covariance.matrix,
@@ -182,6 +185,20 @@ def fit_multipliers(
         inputs=htf.inputs,
         outputs=htf.outputs,
     )
+    if not check:
+        return fit
+
+    def of_order(order: int) -> RoughFit:
+        # No larger numerators, if possible: without zero multipliers they are large enough.
+        fewer = max(size - 1 - order * htf.n_sections, 0)
+        groups = group_htf(htf, weights, numerator_size(htf, order, fewer))
+        start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
+        c, _ = maximum_likelihood(groups, order, start, rough=True)
+        return c, lambda: varpro.summarize(groups, c, errors)[0]
+
+    # One more multiplier, or a pair.
+    more = [functools.partial(of_order, order + k) for k in (1, 2)]
+    return dataclasses.replace(fit, higher_order=fit.contradiction(more, check))
 
 
 @checked

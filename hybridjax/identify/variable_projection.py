@@ -18,7 +18,7 @@ from jaxtyping import Complex, Float, Inexact, Int
 from ..errors import DefinitionError
 from ..linear.htf import HTF
 from .denominator import Covariance, chi, inverse_of_remainder, sandwich
-from .descent import NO_LEADING_COEFFICIENT, ROUNDING, Coefficients, least_squares
+from .descent import NO_LEADING_COEFFICIENT, ROUGH, ROUNDING, Coefficients, least_squares
 from .weights import check_values, error_weights
 
 
@@ -166,15 +166,15 @@ def residuals_of(
 
 
 def maximum_likelihood(
-    groups: list[HTFGroup], order: int, start: Coefficients | None = None
+    groups: list[HTFGroup], order: int, start: Coefficients | None = None, rough: bool = False
 ) -> tuple[Coefficients, bool]:
     """Return the coefficients with the smallest misfit, and whether they are a minimum.
 
     **Arguments:** `start`: where the descent starts. Default: the solution of the linearized
-    problem.
+    problem. `rough`: whether to stop where noise of variance one explains the next step.
     """
     start = _linearized(groups, order) if start is None else start
-    return least_squares(lambda c: residuals_of(groups, c), start)
+    return least_squares(lambda c: residuals_of(groups, c), start, **(ROUGH if rough else {}))
 
 
 def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
+from hybridjax.errors import FindingWarning
 from hybridjax.identify.series.fit import gradient_covariance
 from hybridjax.identify.series.linearization import each_fit, linearize
 from hybridjax.identify.series.output_error import OutputErrorProblem
@@ -153,6 +154,22 @@ def test_spurious_multipliers_raise_an_error(small):
     assert covered(refused, runs, 0.98)
     data = record(small, 400, 0, 0.3)
     assert len(hj.fit_series(data, 3, check=False).multipliers) == 3
+
+
+def test_an_order_that_is_too_low_is_noticed(small):
+    """One multiplier of a pair; with the right order, nonlinear outputs are no reason for doubt."""
+    for seed in range(6):
+        data = record(small, 400, seed, 0.3, drift=np.inf)  # (a constant)
+        with pytest.warns(FindingWarning, match="Order: `order` may be too low: order 2 gives"):
+            fit = hj.fit_series(data, 1)
+        assert fit.higher_order in repr(fit) and "may be too low" in fit._repr_html_()
+        bent = with_outputs(data, data.y + 0.1 * data.y**2 / data.y.std())
+        assert not hj.fit_series(bent, 2).higher_order
+    design = hj.multisine(4, 8, amplitude=1.0).realizations(4)
+    data = hj.experiments.simulate_experiments(small, design)
+    htf = hj.estimate_htf(hj.experiments.add_noise(data, snr=40, seed=1))
+    assert "2 gives other" in hj.fit_multipliers(htf, 1).higher_order
+    assert not hj.fit_multipliers(htf, 2).higher_order
 
 
 def test_announced_drift_is_removed(small):

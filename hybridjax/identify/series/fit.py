@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from .. import denominator
 from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate
+from ..multiplier_estimate import MultiplierEstimate, RoughFit
 from ..multipliers import refuse_invented
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
@@ -65,6 +66,8 @@ class SeriesFit(MultiplierEstimate):
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
+    - `higher_order`: a sentence if one more multiplier, or two, contradict those of this fit: they
+      lie outside of each other's confidence regions. Otherwise empty.
     - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
     - `reference`: signals that enter the loop from outside. With a reference, `noise` is the
       standard deviation of $\chi y$.
@@ -79,6 +82,7 @@ class SeriesFit(MultiplierEstimate):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
+    higher_order: str = eqx.field(static=True, default="")
     feedback: tuple[str, ...] = eqx.field(static=True, default=())
     reference: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -131,7 +135,8 @@ class SeriesFit(MultiplierEstimate):
         loop = f"in a loop, by {', '.join(self.reference)}; " if self.reference else ""
         about = f"{loop}noise {noise}; {self.n_sections} sections, "
         about += f"{self.numerators.shape[1]} lags{state}"
-        return "; ".join(filter(None, [about, about_answering(self.feedback, _BIASED)]))
+        feedback = about_answering(self.feedback, _BIASED)
+        return "; ".join(filter(None, [about, self.higher_order, feedback]))
 
     @property
     def free_cycles(self) -> int:
@@ -190,7 +195,8 @@ def fit_series(
     - `errors`: source of the covariance. "residuals": the residuals in blocks of successive cycles,
       also for errors that are correlated (process noise) or depend on the inputs (nonlinear
       distortion). "white": the variance of the residuals alone. Default: "residuals".
-    - `check`: whether to raise an error for an order that the data do not support. Default: True.
+    - `check`: whether to raise an error for an order that the data do not support, and to emit
+      `higher_order` as a `FindingWarning`. Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, by
       instrumental variables, which are consistent for any noise and controller. `start` and
@@ -203,8 +209,11 @@ def fit_series(
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
     if reference is not None:
-        equations = LoopEquations(*in_loop(data, reference), order, overhang)
-        return SeriesFit(**equations.fit(check))
+        plant, drive = in_loop(data, reference)
+        fit = SeriesFit(**LoopEquations(plant, drive, order, overhang).fit(check))
+        fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
+        more = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
+        return dataclasses.replace(fit, higher_order=fit.contradiction(more, check))
     records = data if isinstance(data, PreparedRecords) else PreparedRecords(data)
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
@@ -222,7 +231,25 @@ def fit_series(
         refuse_order(delayed, noise * _noise(solution), feedback)
     covariance = coefficient_covariance(problem, solution, errors)
     fit = assemble(problem, solution, covariance, converged)
-    return dataclasses.replace(fit, feedback=feedback)
+    # One more multiplier, or a pair.
+    more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
+    return dataclasses.replace(fit, feedback=feedback, higher_order=fit.contradiction(more, check))
+
+
+def _of_order(order: int, records: PreparedRecords, fit: SeriesFit, free_start: bool) -> RoughFit:
+    """Fit a higher order roughly, beginning at a fit.
+
+    **Raises:** `DefinitionError` for too few cycles.
+    """
+    (N, R), d = fit.numerators.shape[:2], len(fit.coefficients)
+    # No more lags than the fit has, if possible: without zero multipliers they are enough.
+    overhang = max(R - 1 - fit.lead - order * N, 0)
+    problem = OutputErrorProblem.from_data(records, order, overhang, free_start)
+    problem = problem._replace(scale=fit.noise)
+    start = np.pad(fit.coefficients, (0, order - d))
+    solution, _ = minimize(problem, start, rough=True)
+    _require_freedom(problem, solution)
+    return solution.c, partial(coefficient_covariance, problem, solution, "residuals")
 
 
 def assemble(

@@ -28,6 +28,7 @@ from .. import denominator
 from ..denominator import Covariance, in_blocks, multipliers_of
 from ..descent import Coefficients
 from ..instrument import in_loop
+from ..multiplier_estimate import RoughFit
 from .output_error import RANK, SectionRegression
 from .records import PreparedRecords, delay_cycles, lagged_inputs
 from .subspace import subspace_model
@@ -178,6 +179,11 @@ class LoopEquations:
             lead=self.records.lead,
             reference=self.reference,
         )
+
+    def coefficients(self) -> RoughFit:
+        """**Raises:** `DefinitionError` as `solve`."""
+        c, covariance, _ = self.solve(True)
+        return c, lambda: covariance
 
     @cached_property
     def solution(self) -> Solution:

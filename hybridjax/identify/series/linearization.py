@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..._core.execution import on_all_cores
-from ..descent import Coefficients, least_squares
+from ..descent import ROUGH, Coefficients, least_squares
 from .output_error import OutputErrorProblem, SectionRegression, root_of
 from .records import CycleGrid, divide_by_chi
 
@@ -229,8 +229,13 @@ def each_fit(
     return [[x for grids in by_section for x in grids[k]] for k in range(len(parts))]
 
 
-def minimize(problem: OutputErrorProblem, start: Coefficients) -> tuple[Linearization, bool]:
-    """Return the problem at the c that minimizes the sum of squares, and whether it settled."""
+def minimize(
+    problem: OutputErrorProblem, start: Coefficients, rough: bool = False
+) -> tuple[Linearization, bool]:
+    """Return the problem at the c that minimizes the sum of squares, and whether it settled.
+
+    **Arguments:** `rough`: whether to stop where noise of variance one explains the next step.
+    """
     last: list[Linearization] = []
 
     def at(c: Coefficients) -> Linearization:
@@ -238,5 +243,6 @@ def minimize(problem: OutputErrorProblem, start: Coefficients) -> tuple[Lineariz
             last[:] = [linearize(problem, c)]
         return last[0]
 
-    c, converged = least_squares(lambda c: at(c).as_residuals(), start)
+    rules = ROUGH if rough else {}
+    c, converged = least_squares(lambda c: at(c).as_residuals(), start, **rules)
     return at(c), converged
