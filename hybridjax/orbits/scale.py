@@ -214,8 +214,12 @@ def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
     smooth = smooth + by_time * (later - t[:, None])
     off = np.abs(values - f[..., None] - smooth)
     # (Rounding of time itself, as in a phase omega * t, is no error of the field.)
-    off[..., len(_SHIFTS) + 1 :] -= 2 * eps * np.abs(by_time * t[:, None])
-    return _Fields(f, change, derivative, np.max(off, axis=-1))  # without a shift it is zero
+    by_state, in_time = np.split(off, [len(_SHIFTS) + 1], axis=-1)
+    in_time = in_time - 2 * eps * np.abs(by_time * t[:, None])
+    # A field that jumps with the clock jumps on one side of a time only: earlier, or later.
+    sides = [x.max(axis=-1) for x in np.split(in_time, 2, axis=-1)]
+    rounding = np.maximum(by_state.max(axis=-1), np.minimum(*sides))  # without a shift it is zero
+    return _Fields(f, change, derivative, rounding)
 
 
 def _reached(s: Structure, chart: int, t: float, q) -> Float[np.ndarray, "A d"]:

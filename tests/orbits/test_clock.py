@@ -46,3 +46,4 @@ def test_a_force_that_jumps_with_the_clock():
     x = (1 - np.exp(-0.5)) * np.exp(-0.5) / (1 - np.exp(-1.0))
     x = 1 + (x - 1) * np.exp(-0.25)
     np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-6)
+    np.testing.assert_allclose(cycle.settings.scale, 1 / (1 + np.exp(-0.5)), rtol=1e-3)
