@@ -26,10 +26,11 @@ PRONOUNS = set(
 # What the package may have at most. A change that needs more says why, and raises the number here;
 # a change that needs less lowers it. Of the code, 1150 lines are the algebra of HTFs, loops and
 # delays, 1160 the responses of cycles with noise, coupling and symmetry in time, 770 populations of
-# subjects, 980 motion and sliders, 610 simulators of others, 70 sweeps on the host; of the tests,
-# 1900 are those of all. (The thirteenth structure is that of a trajectory of a simulator.)
+# subjects, 980 motion and sliders, 610 simulators of others, 70 sweeps on the host, 60 the comparison of a fit with higher orders; of
+# the tests, 1900 are those of all. (The thirteenth structure is that of a trajectory of a
+# simulator.)
 LIMITS = {
-    "code": 28_806,
+    "code": 28_870,
     "files": 244,
     "longest": 500,
     "public_names": 186,
@@ -38,8 +39,8 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 18_004,
-    "doc_words": 40_760,
+    "test_lines": 17_812,
+    "doc_words": 40_872,
 }
 
 
