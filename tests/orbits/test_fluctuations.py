@@ -20,7 +20,7 @@ paddle, slope, bend = (
 
 @pytest.fixture(scope="module")
 def juggler():
-    return hj.find_limit_cycle(Juggler(), hj.Guess("flight", (0.2, 4.5), time=0.1))
+    return hj.find_limit_cycle(Juggler(), hj.Guess("fall", (0.2, 4.5), time=0.1))
 
 
 def _at_impact(cycle):
