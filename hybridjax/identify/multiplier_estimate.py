@@ -187,9 +187,9 @@ class MultiplierEstimate(eqx.Module):
     def contradiction(self, higher: Iterable[Callable[[], RoughFit]], warn: bool) -> str:
         """Return a sentence if a fit of a higher order contradicts the multipliers; else "".
 
-        It does if a multiplier is outside of its 99 % confidence regions, and its nearest one
-        outside of the 95 % regions of this fit. (With 95 % for both, twice as many right
-        orders are doubted.)
+        It does if a multiplier is outside of its confidence regions, and its nearest one outside of
+        those of this fit. (At 95 %. At 99 % half as many right orders are doubted, and a few more
+        that are too low pass.)
 
         **Arguments:** `higher`: the fits; a `DefinitionError` means too few data. `warn`: whether
         to emit the sentence as a warning, too.
@@ -203,7 +203,7 @@ class MultiplierEstimate(eqx.Module):
                 if not moved.any():
                     continue
                 other = MultiplierEstimate(multipliers, c, *covariance())
-                if (moved & ~other.contains(self.multipliers, 0.99)).any():
+                if (moved & ~other.contains(self.multipliers)).any():
                     text = f"`order` may be too low: order {len(c)} gives other "
                     text += f"{other.show_multipliers()}; compare both fits"
                     if warn:
