@@ -38,6 +38,7 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     assert "not seen: p and q apart" in repr(fit) and "1 of 1 guesses" in repr(fit)
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     data = observed(oscillation, noise=1e-3)
     fit = hj.fit_model(Oscillator(w=1.02), data, ("p", "q", "w"), guess=oscillation)
