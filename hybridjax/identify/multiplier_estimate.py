@@ -207,7 +207,7 @@ class MultiplierEstimate(eqx.Module):
                     text = f"`order` may be too low: order {len(c)} gives other "
                     text += f"{other.show_multipliers()}; compare both fits"
                     if warn:
-                        warnings.warn(f"Order: {text}.", FindingWarning, stacklevel=4)
+                        warnings.warn(f"Order: {text}.", FindingWarning, stacklevel=6)
                     return text
         return ""
 

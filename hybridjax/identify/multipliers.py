@@ -198,7 +198,7 @@ def fit_multipliers(
 
     # One more multiplier, or a pair.
     more = [functools.partial(of_order, order + k) for k in (1, 2)]
-    return dataclasses.replace(fit, higher_order=fit.contradiction(more, check))
+    return dataclasses.replace(fit, higher_order=fit.contradiction(more, warn=True))
 
 
 @checked

@@ -264,12 +264,12 @@ class FiveLinkBiped(HybridSystem):
         return self.mechanism().draw(jnp.stack(list(q.values())[:5]), _GROUND, "stance")
 
     def guess(self):
-        s, k, lift, lean = (float(x) for x in (self.stride, self.knee, self.lift, self.lean))
-        k, rate, bend = k / 2, 1.5, 2 * lift / s
+        s, k = self.stride, self.knee / 2
+        rate, bend = 1.5, 2 * self.lift / self.stride
         return Guess(
             "step",
             (
-                *(-s + k, -s - k, lean, s - k, s + k),
+                *(-s + k, -s - k, self.lean, s - k, s + k),
                 *(rate, rate, 0.0, -rate * (1 + bend / 2), -rate * (1 - bend / 2)),
             ),
             after="touchdown",

@@ -160,8 +160,10 @@ def test_an_order_that_is_too_low_is_noticed(small):
     """One multiplier of a pair; with the right order, nonlinear outputs are no reason for doubt."""
     for seed in range(6):
         data = record(small, 400, seed, 0.3, drift=np.inf)  # (a constant)
-        with pytest.warns(FindingWarning, match="Order: `order` may be too low: order 2 gives"):
+        text = "Order: `order` may be too low: order 2 gives"
+        with pytest.warns(FindingWarning, match=text) as caught:
             fit = hj.fit_series(data, 1)
+        assert caught[0].filename == __file__
         assert fit.higher_order in repr(fit) and "may be too low" in fit._repr_html_()
         bent = with_outputs(data, data.y + 0.1 * data.y**2 / data.y.std())
         assert not hj.fit_series(bent, 2).higher_order
