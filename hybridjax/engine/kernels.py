@@ -79,9 +79,7 @@ def watched(
     static = a, s.guard_kinds(a)
     if not on_host(q):
         return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(t, q, u, index)
-    # (A program for many points is worth its compilation from so many calls on.)
-    lanes = 1 if q.shape[-1] < 4 * _POINTS else _POINTS
-    rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
+    rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=_lanes(q))
     return rows(t, q, u, index.astype(np.int32), some=some)
 
 
@@ -95,11 +93,16 @@ def reset(s: Structure, g: Member, t: Times, q: States, u: Inputs, some: Some = 
 def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Array, " L"]:
     """Test whether the predicates of transitions of one kind hold."""
     of_lanes = (
-        s.kernel(_enabled, by_lane, g.kind)
+        s.kernel(_enabled, by_lane, g.kind, lanes=_lanes(q))
         if on_host(q)
         else s.by_lane(ft.partial(_enabled, g.kind))
     )
     return of_lanes(t, q, u, g.place)
+
+
+def _lanes(q: States) -> int:
+    # (A program for many points is worth its compilation from so many calls on.)
+    return 1 if q.shape[-1] < 4 * _POINTS else _POINTS
 
 
 def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
