@@ -145,8 +145,8 @@ def axis_of(name: str, *, deviation: bool = False) -> str:
 
 def legend(ax: Axes, place: str, **options: Any) -> None:
     """The legend of a panel, beside all panels of a new figure, where it covers no curve."""
-    handles, labels = ax.get_legend_handles_labels()
-    ax.get_figure(root=True).legend(handles, labels, loc=f"outside {place}", **options)
+    figure = cast(Any, ax.get_figure(root=True))
+    figure.legend(*ax.get_legend_handles_labels(), loc=f"outside {place}", **options)
 
 
 def letters(axes: Any) -> None:
