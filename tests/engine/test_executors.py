@@ -23,8 +23,8 @@ from ..fuzz.structures import Random
 from ..toys import Field
 
 
-# Systems of which both executors are compiled in every run of the tests; the rest is slow.
-FEW = ("PaddleJuggler", "VerticalHopper")
+# Systems of which both executors are compiled in every run of the tests; those of others are slow.
+FEW = ("PaddleJuggler",)
 
 
 def slow_but(names, few):
