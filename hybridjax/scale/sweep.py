@@ -17,7 +17,7 @@ from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable, near_cube
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from ..engine.settings import Settings
+from ..engine.settings import SWEEP, Settings
 from ..errors import ComputationError, DefinitionError
 from ..orbits.batches import BATCH, SMALL, Known, Tiles, tiles_of
 from ..orbits.cycle import LimitCycle, rough
@@ -60,8 +60,9 @@ def sweep(
     map.spectral_radius.plot()
     ```
 
-    A coarse pass finds cycles at points all over the space. A piece of neighboring points then
-    starts from these cycles, and continues from its own solved points. A piece does not depend on
+    If there are several pieces, a coarse pass first finds cycles at points all over the space. A
+    piece of neighboring points then starts from these cycles, and continues from its own solved
+    points. A piece does not depend on
     which process computes it, nor when: results are the same to the last bit for any number of
     processes and interruptions (on machines of one kind). A point at which the search fails is
     tried again from the nearest point that succeeded, and after a simulation of the transient.
@@ -124,7 +125,7 @@ def _axes(over: Axes) -> dict[str, np.ndarray]:
 
 class Begun(NamedTuple):
     """The common beginning of all pieces: the return map of the guess, the indices of the points of
-    the coarse pass, and their cycles (without the systems)."""
+    the coarse pass (all points, if there is one piece), and their cycles (without the systems)."""
 
     map: ReturnMap
     index: tuple[np.ndarray, ...]  # type: ignore[assignment]  # (not the method of tuples)
@@ -140,7 +141,8 @@ class Begun(NamedTuple):
 class SweepJob:
     """**Fields:** `family`: systems as a function of parameters; `system`: that in the middle of
     the `space` of points, which is cut into `blocks`; `wanted`: quantities to keep of each cycle,
-    as `variables`; `guess`: a cycle, or None; `begun`: the common beginning of all pieces."""
+    as `variables`; `guess`: a cycle, or None; `begun`: the common beginning of all pieces;
+    `cycles`: those of the only piece, if this process has found them."""
 
     family: Family
     system: HybridSystem
@@ -151,6 +153,7 @@ class SweepJob:
     description: Mapping[str, Any]
     begun: Begun | None = None
     variables: Mapping[str, Variable] = dataclasses.field(default_factory=dict)
+    cycles: LimitCycles | None = None
 
     def begin(self) -> tuple["SweepJob", Layout]:
         """Return the job after the coarse pass, and the form of its results."""
@@ -164,7 +167,8 @@ class SweepJob:
             self.description,
         )  # fmt: skip
         begun = begun._replace(coarse=solved)
-        return dataclasses.replace(self, begun=begun, variables=variables), layout
+        whole = cycles if len(self.blocks) == 1 else None
+        return dataclasses.replace(self, begun=begun, variables=variables, cycles=whole), layout
 
     def arrays(self) -> list[np.ndarray]:
         """Return the arrays of the common beginning."""
@@ -182,14 +186,22 @@ class SweepJob:
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
         """Return the results at the points of piece k."""
         assert self.begun is not None
+        if len(self.blocks) == 1:
+            cycles = self.cycles or self.coarse()[1]
+        else:
+            tiles = self._tiles(index := self._points(k), workers)
+            coarse = self.family.systems(self.space.at(self.begun.index))
+            tiles = tiles._replace(known=self.begun.coarse._replace(systems=coarse))
+            cycles = as_cycles(tiles, tiles.solve(len(index[0])))
+        shape = [x.stop - x.start for x in self.blocks.slices(k)]
+        values = self.wanted.values(cycles, self.variables)
+        return {name: x.reshape(*shape, *x.shape[1:]) for name, x in values.items()}
+
+    def _points(self, k: int) -> tuple[np.ndarray, ...]:
+        """Return the indices of the points of piece k."""
         place = self.blocks.slices(k)
         index = np.meshgrid(*(np.arange(x.start, x.stop) for x in place), indexing="ij")
-        tiles = self._tiles(tuple(x.ravel() for x in index), workers)
-        coarse = self.family.systems(self.space.at(self.begun.index))
-        tiles = tiles._replace(known=self.begun.coarse._replace(systems=coarse))
-        cycles = as_cycles(tiles, tiles.solve(index[0].size))
-        values = self.wanted.values(cycles, self.variables)
-        return {name: x.reshape(*index[0].shape, *x.shape[1:]) for name, x in values.items()}
+        return tuple(x.ravel() for x in index)
 
     def coarse(self) -> tuple[Known, LimitCycles]:
         """Return the cycles of the coarse pass."""
@@ -218,6 +230,7 @@ class SweepJob:
         k, power = np.arange(1, 1 + _COARSE)[:, None, None], base ** np.arange(16.0)
         unit = (k // power % base / (power * base)).sum(axis=2)
         index = tuple(np.unique((unit * np.array(self.blocks.shape)).astype(int), axis=0).T)
+        index = self._points(0) if len(self.blocks) == 1 else index
         n, d = len(index[0]), map.anchor.q.shape[0]
         anchor = jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor)
         blank = Known(cast(Any, None), anchor, np.zeros(n), np.zeros((n, d, d)), np.zeros(n, int))
@@ -228,7 +241,7 @@ class SweepJob:
             return self.guess
         say("a cycle in the middle")
         try:
-            return find_limit_cycle(self.system)
+            return find_limit_cycle(self.system, settings=Settings(SWEEP, SWEEP))
         except (ComputationError, DefinitionError) as error:
             raise type(error)(
                 "no limit cycle was found in the middle of the axes, so give one by `guess=`: "
