@@ -106,9 +106,9 @@ def unchecked_host():
 compilation.at_ease = unchecked_host
 # Results of one test come from one program.
 compilation._WORTH_OPTIMIZING = np.inf
-# The tests of a process find many cycles of one kind, and few that take longer on the host than
-# compiling them would.
-compilation.WORTH_COMPILING = 5.0
+# The tests of a process find many cycles of one kind, of which few take longer on the host than
+# compiling would.
+compilation.WORTH_COMPILING = 15.0
 
 
 # Programs that a worker keeps, of some 5 MB each. Doubled: twice the memory.

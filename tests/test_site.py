@@ -81,6 +81,7 @@ def test_thumbnails_are_those_of_the_code_on_their_pages(monkeypatch):
         np.testing.assert_allclose(values(pictures.thumbnail(*pictures.run(name))), file, atol=1.01)
 
 
+@pytest.mark.slow
 def test_the_gallery_has_a_page_with_code_for_each_thumbnail(site):
     pages = re.findall(
         r'<a href="(gallery/[\w-]+\.html)"><svg', (site / "gallery.html").read_text()
@@ -89,6 +90,7 @@ def test_the_gallery_has_a_page_with_code_for_each_thumbnail(site):
     assert all("find_limit_cycle" in (site / page).read_text() for page in pages)
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched_from_another_host(site):
     fetched = re.compile(r"<(?!a\s)[^>]*\s(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
     for page in site.rglob("*.html"):
@@ -97,6 +99,7 @@ def test_nothing_is_fetched_from_another_host(site):
         assert not re.findall(r"url\([\"']?(?:https?:)?//|@import", style.read_text()), style
 
 
+@pytest.mark.slow
 def test_links_lead_somewhere(site):
     """Also those that MkDocs does not look at: in HTML, and in the theme's."""
     pages = {page: page.read_text() for page in site.rglob("*.html")}
@@ -111,12 +114,14 @@ def test_links_lead_somewhere(site):
             assert anchor in known.get(target, {anchor}) | {""}, (page, link)
 
 
+@pytest.mark.slow
 def test_equations_are_rendered(site):
     page = (site / "mathematics.html").read_text()
     assert page.count("<math") > 100 and "arithmatex" not in page
     assert "$" not in re.sub(r"<(pre|code|script).*?</\1>", "", page, flags=re.DOTALL)
 
 
+@pytest.mark.slow
 def test_notebooks_come_with_their_pictures(site):
     for notebook in (ROOT / "notebooks").glob("*.ipynb"):
         page = (site / "notebooks" / f"{notebook.stem}.html").read_text()

@@ -42,7 +42,6 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
             "multipliers_fit_structured_error": family.structured.compare(true).max_error,
             "multipliers_fit_2p1z": {
                 output: {
-                    "form": f"{family.rational.form}, {family.rational.weighting} weights",
                     "multipliers": complex_pairs(family.rational.multipliers[k]),
                     "error": family.rational.compare(true, k).max_error,
                     "error_of_the_same_fit_to_the_exact_htf": biases[k],
@@ -118,8 +117,7 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
         note(
             f"{name}: eigenvalues from the fits are right up to the third significant digit",
             max(close) < 5e-3,
-            f"|error|: {_pairs(close)} (form {family.rational.form}, "
-            f"{family.rational.weighting} weights)",
+            f"|error|: {_pairs(close)}",
         )
     exact = next(iter(families.values())).ldtp.multipliers
     note(

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Iterator
-from typing import Literal
 
 import equinox as eqx
 import numpy as np
@@ -16,13 +15,13 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
-from .descent import ROUNDING, least_squares
+from .descent import least_squares
 from .multiplier_estimate import MultiplierComparison, Multipliers, compare_multipliers
 from .variable_projection import HTFGroup, equal_weights, late_columns, numerators_of, residuals_of
 
 
-# Iterations of Sanathanan and Koerner from which descents start. Fewer: other minima are found for
-# some forms and weightings; more: the same result in longer time.
+# Iterations of Sanathanan and Koerner from which descents start. Fewer: other minima are found;
+# more: the same result in longer time.
 _STARTS = (0, 1, 4, 29)
 # Part of the residual, relative to H, that a step may still explain at the end, and by which equal
 # costs differ (a converged fit is then preferred). Smaller: descents on exact data stall in
@@ -33,13 +32,11 @@ _ACCURACY = 1e-8
 class RationalFit(eqx.Module):
     r"""Rational functions of $z = e^{2 \pi i f / N}$ fitted to one harmonic, one per output.
 
-    $$H(z) \approx \frac{z^{-\delta} (b_0 + b_1 z^{-1} + \ldots + b_q z^{-q})}
+    $$H(z) \approx \frac{b_0 z^{-1} + b_1 z^{-2} + \ldots + b_q z^{-q-1}}
     {1 + a_1 z^{-1} + \ldots + a_p z^{-p}}$$
 
-    with real coefficients; $\delta = 1$ in the form "delayed" (no feed-through), 0 in "direct".
-    A pole $p$ stands for the Floquet multiplier $p^N$. The true $H_m$ has all N-th roots of
-    every multiplier as poles, so a fit of low order is biased even on exact data, by an amount
-    that depends on form and weighting: both are part of the result.
+    with real coefficients. A pole $p$ stands for the Floquet multiplier $p^N$. The true $H_m$ has
+    all N-th roots of every multiplier as poles, so a fit of low order is biased even on exact data.
 
     **Fields** (ny outputs on the first axis):
 
@@ -47,10 +44,9 @@ class RationalFit(eqx.Module):
     - `poles` (ny, p) and `zeros` (ny, q) in z, without those at the origin; a zero at infinity is
       NaN. Sorted by decreasing modulus.
     - `multipliers` (ny, p): poles to the power N, in the order of the poles.
-    - `residual` (ny,): root mean square misfit; relative to the rms of H with uniform weighting,
-      of the relative error with relative weighting.
+    - `residual` (ny,): root mean square misfit, relative to the rms of H.
     - `result` (ny,): codes of `Result`, OK or NOT_CONVERGED.
-    - `harmonic`, `n_sections`, `form`, `weighting`, `outputs`, `input`: the arguments of the fit.
+    - `harmonic`, `n_sections`, `outputs`, `input`: the arguments of the fit.
     """
 
     numerator: Float[np.ndarray, "ny b"]
@@ -62,8 +58,6 @@ class RationalFit(eqx.Module):
     result: Int[np.ndarray, " ny"]
     harmonic: int = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
-    form: str = eqx.field(static=True)
-    weighting: str = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     input: str = eqx.field(static=True)
 
@@ -74,7 +68,7 @@ class RationalFit(eqx.Module):
         w = np.exp(-2j * np.pi * f / N)
         polyval = np.polynomial.polynomial.polyval
         top, bottom = (polyval(w, x.T) for x in (self.numerator, self.denominator))
-        H = (top / bottom * (w if self.form == "delayed" else 1.0)).T[None, :, :, None]
+        H = (top / bottom * w).T[None, :, :, None]
         harmonic = (self.harmonic + N // 2) % N - N // 2  # (they count modulo N)
         return HTF(f, H, harmonic, N, self.input, self.outputs, "rational fit")
 
@@ -95,7 +89,7 @@ class RationalFit(eqx.Module):
     def __repr__(self) -> str:
         rows = [
             f"RationalFit(H_{self.harmonic} from {self.input}, {self.denominator.shape[1] - 1} "
-            f"poles, {self.numerator.shape[1] - 1} zeros, {self.form}, {self.weighting} weighting)"
+            f"poles, {self.numerator.shape[1] - 1} zeros)"
         ]
         for name, multipliers, residual, code in zip(
             self.outputs, self.multipliers, self.residual, self.result, strict=True
@@ -118,15 +112,13 @@ def fit_rational(
     input: str | int = 0,
     poles: Order = 2,
     zeros: Index = 1,
-    form: Literal["delayed", "direct"] = "delayed",
-    weighting: Literal["uniform", "relative"] = "uniform",
 ) -> RationalFit:
     """Fit a rational function of z with real coefficients to one harmonic.
 
-    The residual `W (H - B/A)` is minimized by Gauss-Newton steps in
-    the denominator only: for a given denominator the best numerator solves a linear problem
-    (variable projection). The descents start from several solutions of the linearized
-    problem (Levy 1959; Sanathanan and Koerner 1963) and the best result is kept.
+    The residual `H - B/A` is minimized by Gauss-Newton steps in the denominator only: for a given
+    denominator the best numerator solves a linear problem (variable projection). The descents start
+    from several solutions of the linearized problem (Levy 1959; Sanathanan and Koerner 1963) and
+    the best result is kept.
 
     **Arguments:**
 
@@ -134,15 +126,12 @@ def fit_rational(
       have complex coefficients, which this form does not have.
     - `output`: name or index. Default: every output. `input`: name or index. Default: 0.
     - `poles`, `zeros`: their numbers. Default: 2 and 1, the paper's.
-    - `form`: `"delayed"`, the default, numerator from z^-1 on (the output does not depend on the
-      input of its own section), or `"direct"`, from z^0 on.
-    - `weighting`: `"uniform"`, the default, or `"relative"`, each residual divided by |H|.
 
     **Returns:** `RationalFit`, outputs on the first axis also where there is only one.
 
     **Raises:** `DefinitionError` for a harmonic, output or input that is not there, for fewer
-    lines than coefficients, for NaN or, with relative weighting, zeros in H;
-    `ComputationError` if no start leads to a finite fit.
+    lines than coefficients, and for an H with NaN or of zeros; `ComputationError` if no start leads
+    to a finite fit.
     """
     require_x64(htf.H)
     htf.require_sampled("`fit_rational`")
@@ -157,7 +146,7 @@ def fit_rational(
         )
     # The denominator of a system with one section.
     f = np.asarray(htf.f) / htf.n_sections
-    powers = np.exp(-2j * np.pi * f[:, None] * (int(form == "delayed") + np.arange(zeros + 1)))
+    powers = np.exp(-2j * np.pi * f[:, None] * (1 + np.arange(zeros + 1)))
     fits = []
     for row in rows:
         h = H[:, row]
@@ -165,10 +154,9 @@ def fit_rational(
         if not np.isfinite(h).all():
             raise DefinitionError(f"{name} holds NaN or infinity: leave these frequencies out.")
         rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
-        if rms == 0 or (weighting == "relative" and np.abs(h).min() < ROUNDING * rms):
-            raise DefinitionError(f"{name} is zero at a frequency: leave it out.")
-        weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
-        entry = (0, -1, 1.0, (row, column), h / rms, weight / np.sqrt(len(h)))
+        if rms == 0:
+            raise DefinitionError(f"{name} is zero: leave this output out.")
+        entry = (0, -1, 1.0, (row, column), h / rms, np.full(len(h), len(h) ** -0.5))
         (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [entry])
         linearize = functools.partial(residuals_of, [group])
         with np.errstate(all="ignore"):
@@ -197,8 +185,6 @@ def fit_rational(
         result=result,
         harmonic=harmonic,
         n_sections=htf.n_sections,
-        form=form,
-        weighting=weighting,
         outputs=tuple(htf.outputs[row] for row in rows),
         input=htf.inputs[column],
     )

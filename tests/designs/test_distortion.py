@@ -177,6 +177,7 @@ def test_one_cosine_in_closed_form(quadratic, f):
     np.testing.assert_allclose(both[:, 1], both[:, 0] + u2, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_designs_within_a_distortion(hopper_cycle):
     """The limit holds for the experiments that are made, and those of equal amplitudes."""
     sections = hj.ClockPhase(8, anchor=APEX)

@@ -23,8 +23,8 @@ from ..fuzz.structures import Random
 from ..toys import Field
 
 
-# Systems of which both executors are compiled in every run of the tests; the rest is slow.
-FEW = ("PaddleJuggler", "VerticalHopper")
+# Systems of which both executors are compiled in every run of the tests; those of others are slow.
+FEW = ("PaddleJuggler",)
 
 
 def slow_but(names, few):
@@ -137,31 +137,6 @@ def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
     results = [call(from_host(np.arange(3.0))) for _ in range(3)]
     assert seen == [True, False]  # on the host, then traced, then no more
     np.testing.assert_array_equal(results, [[0.0, 2.0, 4.0]] * 3)
-
-
-@pytest.fixture(scope="module")
-def compiled(hopper_cycle):
-    """The hopper's cycle by compiled programs only."""
-    patience = compilation.WORTH_COMPILING
-    compilation.WORTH_COMPILING = -1.0
-    try:
-        return hj.find_limit_cycle(hopper_cycle.system)
-    finally:
-        compilation.WORTH_COMPILING = patience
-
-
-@pytest.mark.slow
-def test_both_find_the_same_cycle(hopper_cycle, compiled):
-    cycle = compiled
-    assert cycle.event_sequence == hopper_cycle.event_sequence
-    assert int(cycle.iterations) == int(hopper_cycle.iterations)
-    np.testing.assert_allclose(cycle.anchor.q, hopper_cycle.anchor.q, atol=1e-12)
-    after = np.roll(cycle.dims, -1)
-    for one, other, m, n in zip(
-        cycle.factors, hopper_cycle.factors, after, cycle.dims, strict=True
-    ):
-        np.testing.assert_allclose(one[:m, :n], other[:m, :n], atol=1e-11)
-    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, atol=1e-11)
 
 
 def first_kick(system):

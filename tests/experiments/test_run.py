@@ -19,7 +19,7 @@ from ..orbits import hopper_scipy
 from ..toys import RESTING
 
 
-FAMILIES = ("isochron", "kinematic")
+FAMILIES = ("isochron", pytest.param("kinematic", marks=pytest.mark.slow))
 N, CYCLES = 32, 84
 BATCH = dict(execution=hj.Execution(batch=40))
 

@@ -14,14 +14,17 @@ ALONE = hj.Execution(workers=1)
 
 
 @pytest.fixture(scope="module")
-def run(vanderpol_cycle):
+def placed(vanderpol_cycle):
+    return hj.place_sections(vanderpol_cycle, hj.KinematicPhase(4, position="x", velocity="v"))
+
+
+@pytest.fixture(scope="module")
+def run(placed):
     """Experiments of six cycles: one program for all tests."""
-    sections = hj.KinematicPhase(4, position="x", velocity="v")
-    placed = hj.place_sections(vanderpol_cycle, sections)
     usual = dict(discard=3, execution=ALONE)
 
     def run(design, **options):
-        return hj.run_experiments(vanderpol_cycle, placed, design, ("x", "v"), **usual | options)
+        return hj.run_experiments(placed.cycle, placed, design, ("x", "v"), **usual | options)
 
     return run
 
@@ -38,6 +41,13 @@ def test_experiments_start_in_their_periodic_response(run, start, least, most):
 def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
     whole = run(DESIGN.inputs(6), start="steady", discard=0)
     np.testing.assert_allclose(whole.y, run(DESIGN, start="steady").y, rtol=0, atol=1e-8)
+
+
+def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
+    data = run(1e-3 * DESIGN.inputs(6), discard=0)
+    model = hj.linearize(placed.cycle, placed, ("x", "v"))
+    exact = np.stack([model.simulate(u) for u in data.u])
+    np.testing.assert_allclose(data.y, exact, rtol=0, atol=1e-3 * np.abs(exact).max())
 
 
 def test_a_steady_start_that_is_not_there_is_named(run, monkeypatch):

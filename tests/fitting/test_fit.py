@@ -117,30 +117,40 @@ def test_the_hopper_comes_back_from_experiments(hopper_cycle):
         assert found == pytest.approx(true, rel=1e-6), name
 
 
-def test_both_delays_come_back_and_other_values_compile_nothing(hopper_cycle):
-    """A cycle, a gradient and a fit (programs of whole turns aside)."""
+@pytest.fixture(scope="module")
+def fitted(hopper_cycle):
+    """A fit of a stiffness and both delays, which begins near the cycle of another stiffness."""
     lines = np.arange(1, 33) / 16 + 0.01
     htf = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS, delay=(0.037, 0.081)).htf(lines)
-    free = "k", "input_delay", "output_delay"
     data = hj.ObservedHTF(htf, SECTIONS, delay=(0.0625, 0.0625))  # (together a whole section)
+    free = "k", "input_delay", "output_delay"
+    return lambda near: hj.fit_model(near.system, data, free, guess=near)
 
-    def work(k):
-        hopper = hj.models.VerticalHopper(k=k)
-        near = hj.find_limit_cycle(hopper)
 
-        def trace(system):
-            model = hj.linearize(hj.find_limit_cycle(system, near), SECTIONS)
-            return model.characteristic_polynomial()[1]
-
-        eqx.filter_grad(trace)(hopper)
-        return hj.fit_model(hopper, data, free, guess=near)
-
-    with no_compilation(after=lambda: work(10.3)):
-        fit = work(10.7)
+def test_both_delays_come_back(hopper_cycle, hopper_htf, fitted):
+    fit = fitted(hj.find_limit_cycle(hj.models.VerticalHopper(k=10.3)))
     np.testing.assert_allclose(fit.values, (10.0, 0.037, 0.081), rtol=1e-8)
     # (Without noise, a region is as small as rounding errors, which are not independent.)
     assert not fit.contains({"k": 10.0, "input_delay": 0.037, "output_delay": 0.082})
     with pytest.raises(hj.DefinitionError, match="must have a value of 'input_delay'"):
         fit.contains(hopper_cycle.system)
     with pytest.raises(hj.DefinitionError, match="no data have a delay"):
-        hj.fit_model(hopper_cycle.system, hj.ObservedHTF(htf, SECTIONS), free)
+        hj.fit_model(hopper_cycle.system, hj.ObservedHTF(hopper_htf, SECTIONS), "input_delay")
+
+
+@pytest.mark.slow
+def test_other_values_compile_nothing(fitted):
+    """A cycle, a gradient and a fit (programs of whole turns aside)."""
+
+    def work(k):
+        near = hj.find_limit_cycle(hj.models.VerticalHopper(k=k))
+
+        def trace(system):
+            model = hj.linearize(hj.find_limit_cycle(system, near), SECTIONS)
+            return model.characteristic_polynomial()[1]
+
+        eqx.filter_grad(trace)(near.system)
+        fitted(near)
+
+    with no_compilation(after=lambda: work(10.3)):
+        work(10.7)

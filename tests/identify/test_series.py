@@ -144,7 +144,7 @@ def test_experiments_are_used_from_their_start(small):
 
 
 def test_spurious_multipliers_raise_an_error(small):
-    refused, runs = 0, 8
+    refused, runs = 0, 4
     for seed in range(runs):
         try:
             hj.fit_series(record(small, 400, seed, 0.3), 3)
@@ -158,7 +158,7 @@ def test_spurious_multipliers_raise_an_error(small):
 
 def test_an_order_that_is_too_low_is_noticed(small):
     """One multiplier of a pair; with the right order, nonlinear outputs are no reason for doubt."""
-    for seed in range(6):
+    for seed in range(2):
         data = record(small, 400, seed, 0.3, drift=np.inf)  # (a constant)
         text = "Order: `order` may be too low: order 2 gives"
         with pytest.warns(FindingWarning, match=text) as caught:

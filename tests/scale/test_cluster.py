@@ -202,6 +202,7 @@ def experiments():
     return cycle, hj.ClockPhase(4), u, "x"
 
 
+@pytest.mark.slow
 def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
     call = {"options": hj.experiments.Options(discard=2), "chunk": 2}
     stream = hj.experiments.stream_experiments

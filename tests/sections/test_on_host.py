@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
@@ -25,11 +24,9 @@ def measured(guess, family):
     def measure(system):
         cycle = hj.find_limit_cycle(system, guess)
         model = hj.linearize(cycle, family)
-        # (Under transformations, matrices are padded with zeros.)
-        matrices = model.A[:, :1, :1], model.B[:, :1], model.C[..., :1], cycle.factors
-        polynomial = model.characteristic_polynomial()[:2]
-        parts = *matrices, polynomial, cycle.period, cycle.anchor.q, cycle.legs.q
-        return jnp.concatenate([jnp.ravel(x) for x in parts])
+        matrices = model.A, model.B, model.C, cycle.factors
+        polynomial = model.characteristic_polynomial()
+        return *matrices, polynomial, cycle.period, cycle.anchor.q, cycle.legs.q
 
     return measure
 
@@ -40,14 +37,20 @@ def agrees(system, measure, rtol):
     flat, unravel = ravel_pytree(numbers)
     along = flat * np.random.default_rng(0).uniform(-1, 1, flat.shape)
     at = lambda h: measure(eqx.combine(unravel(flat + h * along), others))  # noqa: E731
-    by_host = np.asarray(jax.jacfwd(at)(0.0))
+    values, reverse = jax.vjp(at, 0.0)
+    # (Under transformations, matrices are padded with zeros.)
+    sizes = [np.shape(x) for x in at(0.0)]
+    kept = lambda xs: np.concatenate(  # noqa: E731
+        [np.asarray(x)[tuple(map(slice, n))].ravel() for x, n in zip(xs, sizes, strict=True)]
+    )
+    by_host = jax.jvp(at, (0.0,), (1.0,))[1]
     e = 2e-4
-    minus2, minus, plus, plus2 = (np.asarray(at(k * e)) for k in (-2, -1, 1, 2))
-    differences = (8 * (plus - minus) - (plus2 - minus2)) / (12 * e)
-    np.testing.assert_allclose(by_host, differences, rtol=rtol, atol=rtol * np.max(np.abs(by_host)))
-    weights = np.cos(np.arange(len(by_host)))
-    reverse = jax.grad(lambda h: weights @ at(h))(0.0)
-    np.testing.assert_allclose(reverse, weights @ by_host, rtol=1e-11)
+    minus2, minus, plus, plus2 = (kept(at(k * e)) for k in (-2, -1, 1, 2))
+    differences, size = (8 * (plus - minus) - (plus2 - minus2)) / (12 * e), kept(by_host)
+    np.testing.assert_allclose(size, differences, rtol=rtol, atol=rtol * np.max(np.abs(size)))
+    weights = [np.cos(np.arange(np.size(x)).reshape(np.shape(x))) for x in values]
+    expected = sum(np.sum(w * np.asarray(x)) for w, x in zip(weights, by_host, strict=True))
+    np.testing.assert_allclose(reverse(tuple(weights))[0], expected, rtol=1e-11)
 
 
 FAMILIES = {

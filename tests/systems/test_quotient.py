@@ -116,19 +116,13 @@ def test_what_is_no_symmetry_is_refused(system, symmetry, message):
         hj.find_limit_cycle(hj.Quotient(system, **symmetry))
 
 
-def test_odd_oscillators_close_after_half_a_period():
+def test_an_odd_oscillator_closes_after_half_a_period():
     pol, duffing, at = hj.models.VanDerPol(), hj.models.Duffing(), hj.AtEvent("half period")
-    halves = [
-        (pol, hj.Crossing("x", "falling"), "x", hj.Guess("oscillation", (0.0, -1.9))),
-        (duffing, None, True, None),
-    ]
-    for system, section, half_period, guess in halves:
-        whole = hj.find_limit_cycle(system, section=section)
-        folded = hj.Quotient(system, flipped=("x", "v"), half_period=half_period)
-        half = hj.find_limit_cycle(folded, guess, section=at)
-        np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-11)
-        squares = np.sort_complex(half.multipliers**2)
-        np.testing.assert_allclose(squares, np.sort_complex(whole.multipliers), rtol=1e-9)
+    whole = hj.find_limit_cycle(pol, section=hj.Crossing("x", "falling"))
+    folded = hj.Quotient(pol, flipped=("x", "v"), half_period="x")
+    half = hj.find_limit_cycle(folded, hj.Guess("oscillation", (0.0, -1.9)), section=at)
+    np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-11)
+    np.testing.assert_allclose(half.multipliers**2, whole.multipliers, rtol=1e-9)
     with pytest.raises(hj.DefinitionError, match="Duffing does not have the symmetry"):
         hj.find_limit_cycle(hj.Quotient(duffing, flipped="x", half_period=True), section=at)
     with pytest.raises(hj.DefinitionError, match="must be True if a clock drives the system"):
