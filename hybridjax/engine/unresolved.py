@@ -204,13 +204,16 @@ def values_at(s: Structure, a: int, points: Points, u: Float[np.ndarray, " nu"],
     """The field of chart a at points and its derivatives by the inputs; if so asked, the `guards`
     and whether their predicates hold, too."""
 
+    lanes = kernels.POINTS if may_have_pulses(s, a) <= _POLES else kernels.WIDE
+
     def at(x):
         point, n = (x[:, 0], x[:, 1:].T, u[:, None]), s.dims[a]
-        by = kernels.field(s, a, *point)
+        by = kernels.field(s, a, *point, lanes=lanes)
         rows = [by[:, 0], by[:, 2 + n :].reshape(-1, len(x))]
         if guards:
-            rows += [kernels.watched(s, a, None, *point, np.zeros(1, int))[:, 0]]
-            rows += [kernels.enabled(s, s.member(g), *point)[None] for g in s.guards(a)]
+            members, first = map(s.member, s.guards(a)), np.zeros(1, int)
+            rows += [kernels.watched(s, a, None, *point, first, lanes=lanes)[:, 0]]
+            rows += [kernels.enabled(s, x, *point, lanes=lanes)[None] for x in members]
         return np.concatenate(rows).T
 
     return np.concatenate([at(x) for x in np.split(points, range(_POINTS, len(points), _POINTS))])
