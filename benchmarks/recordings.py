@@ -46,10 +46,10 @@ NOISES = (1e-4, 1e-3)
 HINTS = {"noise", "band", "outputs", "left over"}
 
 
-def hopper(strides, seeds, force=RMS):
+def hopper(strides, seeds):
     """Recordings of the paper's hopper, one for each seed, and its multipliers."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    u = [hj.testing.random_force(strides, RATE, BANDWIDTH, rms=force, seed=seed) for seed in seeds]
+    u = [hj.testing.random_force(strides, RATE, BANDWIDTH, rms=RMS, seed=seed) for seed in seeds]
     both = hj.testing.simulate_recording(cycle, np.stack(u), ("yM", "vM"), rate=RATE, steps=1)
     return [eqx.tree_at(lambda r: r.trials, both, (t,)) for t in both.trials], cycle.multipliers
 
