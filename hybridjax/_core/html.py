@@ -39,6 +39,8 @@ _INK = "#010203"
 COLORS = ("#2b8cc4", "#d9692b", "#12a37a", "#c46fa0", "#c99214", "#8c8c8c")
 """Colors of curves: those of `hj.plot`, light enough for a black page and dark enough for a white
 one."""
+CHARTS = tuple(COLORS[k] for k in (0, 4, 2, 3))
+"""Those of the charts of a system, as in `hj.plot.cycle`."""
 
 
 def card(kind: str, of: str, *parts: str) -> str:

@@ -11,7 +11,7 @@ from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers, Positive, SignalNames
 from .._core.boundary.values import Reals
 from .._core.executor import is_traced, to_host
-from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, unit_circle
+from .._core.html import CHARTS, Curve, card, facts, multiplier_table, picture, unit_circle
 from .._core.meaning import code_digest
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
@@ -399,7 +399,7 @@ def orbit_picture(
     curves = []
     for a in np.unique(chart):
         name = s.names[a] if len(s.names) > 1 else ""
-        curves.append(Curve(np.where(chart == a, x, np.nan), y, name, COLORS[a % len(COLORS)]))
+        curves.append(Curve(np.where(chart == a, x, np.nan), y, name, CHARTS[a % len(CHARTS)]))
     if sections is not None:
         x, y = axes(*sections)
         curves.append(Curve(x, y, color="currentColor", points=True))

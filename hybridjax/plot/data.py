@@ -19,7 +19,7 @@ from ..recordings.beats.response import PhaseResponse
 from ..recordings.data import SectionData, input_spectrum
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase import Phase
-from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, axis_of, letters, panels  # fmt: skip
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, axis_of, legend, letters, panels
 
 
 # Factors of what is per one unit of time, per another.
@@ -67,26 +67,33 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     with panels(ax, len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names)) as axes:
         for i, (name, x) in enumerate(zip(names, values.T, strict=True)):
             average, spread, last = axes[i]
-            deviation = axis_of(name, deviation=True)
             average.plot(phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
             average.set_ylabel(axis_of(name))
             spread.plot(at[thin] / N, x[thin], ",", color=COLORS["gray"], rasterized=True)
             std = np.array([np.nanstd(x[at == n]) for n in range(N)])
             for sign in (-2, 2):
                 spread.plot(phase, sign * std, color=CYCLE[0])
-            spread.set_ylabel(deviation)
+            spread.set_ylabel(axis_of(name, deviation=True))
+            for panel in (average, spread):
+                _powers_of_ten(panel)
             if i < nu:
                 last.semilogy(f, np.maximum(power[:, i], 1e-12 * power[:, i].max()), color=CYCLE[1])
-                label = with_unit("power", square(name))
-                last.set(xlabel="frequency (cycles/period)", ylabel=label)
+                last.set(xlabel="f (1/period)", ylabel=with_unit("power", square(name)))
             else:
                 last.plot(x[at == np.argmax(std)], lw=0.5, color=CYCLE[1])
-                last.set(xlabel="cycle", ylabel=deviation)
+                last.set_xlabel("cycle")
+                last.sharey(spread)
+                last.tick_params(labelleft=False)
         for panel in axes[-1, :2]:
             panel.set_xlabel("phase (cycles)")
         axes[0, 0].get_figure(root=True).align_ylabels(axes)
         letters(axes)
     return Plot(axes)
+
+
+def _powers_of_ten(ax: Axes) -> None:
+    """One power of ten for small and large values, and not their zeros at each tick."""
+    ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
 
 
 @checked
@@ -97,8 +104,8 @@ def impulse_responses(
     input: str | int = 0,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """Left: responses to a push against its phase and the time since. Right: some of them with
-    bands of 95 %, and dashed those of a model with the same sections."""
+    """Left: responses to a push against its phase and the time since. Right: those at the phases
+    marked left, with bands of 95 %; dashed, those of a model with the same sections."""
     ny, N = len(found.outputs), len(found.phase)
     pushing = channel_index("input", input, found.inputs)
     chosen = [0, N // 4, N // 2, 3 * N // 4]
@@ -114,13 +121,15 @@ def impulse_responses(
             )  # fmt: skip
             pushed = found.inputs[pushing]
             impulse = Signal(pushed, unit_of(pushed) and f"{unit_of(pushed)} s")
-            label = with_unit(f"{name} / impulse", ratio(name, impulse))
+            label = with_unit(f"{name} / impulse\n", ratio(name, impulse))
             plane.get_figure().colorbar(image, ax=plane, label=label)
             plane.set_ylabel("phase of the push")
             for k, m in enumerate(dict.fromkeys(chosen)):
                 band = 1.96 * found.errors[m, :, i, pushing]
                 line = {"color": CYCLE[k % len(CYCLE)]}
-                curves.plot(found.lag, values[m], label=f"phase {found.phase[m]:.2f}", **line)
+                arrow = {"marker": 9, "clip_on": False, "transform": plane.get_yaxis_transform()}
+                plane.plot(1.0, found.phase[m], **line, **arrow)
+                curves.plot(found.lag, values[m], label=f"{found.phase[m]:.2f}", **line)
                 if theory is not None:
                     curves.plot(found.lag, theory[m, :, i, pushing], "k--", lw=0.8)
                 curves.fill_between(
@@ -130,12 +139,9 @@ def impulse_responses(
         if theory is not None:
             axes[0, 1].plot([], [], "k--", lw=0.8, label="model")
         if ax is None:
-            shown = axes[0, 1].get_legend_handles_labels()
-            axes[0, 1].get_figure(root=True).legend(*shown, loc="outside lower right", ncols=5)
-        else:
-            axes[0, 1].legend()
+            legend(axes[0, 1], "upper right", ncols=5, title="pushed at phase")
         for panel in axes[-1]:
-            panel.set_xlabel("time since the push (cycles)")
+            panel.set_xlabel("time (cycles)")
         letters(axes)
     return Plot(axes)
 
@@ -195,7 +201,7 @@ def experiment(data: ExperimentData, index: int = 0, *, ax: AxesLike | None = No
                 panel.axvspan(0, data.window.start / data.n_sections, color="0.92", zorder=0)
             if not data.ok[index] and data.failed_at[index] >= 0:
                 panel.axvline(time[data.failed_at[index]], color=COLORS["red"], lw=0.8)
-            panel.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
+            _powers_of_ten(panel)
             panel.margins(x=0)
         axes[-1, 0].set_xlabel("time (cycles)")
         title = f"experiment {index}"
@@ -228,22 +234,24 @@ def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | Non
             measured = dict(ls="", marker=".", ms=3, color="black", label="measured")
             signal.plot(time, found.measured[shown, i], **measured)
             signal.set_ylabel(axis_of(name, deviation=True))
-            signal.set_title(f"fit {found.fit[i]:.2f} %")
+            signal.set_title(f"fit {found.fit[i]:.3g} %\n", loc="right")  # (above the power of ten)
             signal.margins(x=0.02)
+            _powers_of_ten(signal)
+            auto.set_ylabel("standard deviations")
             after = np.arange(1, 1 + found.autocorrelation.shape[1])
             _stems(auto, after, found.autocorrelation[:, :, i], CYCLE[0], 0.0, limit)
-            auto.set_title(f"residuals: {p_value(found.whiteness[i])}")
+            auto.set_title(f"residuals\n{p_value(found.whiteness[i])}", loc="right")
             for j, _ in enumerate(found.inputs):
                 lags = np.arange(found.cross_correlation.shape[1])
                 values = found.cross_correlation[:, :, i, j]
                 _stems(cross, lags, values, CYCLE[(1 + j) % len(CYCLE)], 0.2 * j, limit)
-            cross.set_title(f"with the input: {p_value(found.independence[i])}")
-        axes[0, 0].legend(loc="lower left", bbox_to_anchor=(0, 1.12), ncols=2)
+            cross.set_title(f"with the input\n{p_value(found.independence[i])}", loc="right")
+        if ax is None:
+            legend(axes[0, 0], "upper left", ncols=2)
         axes[-1, 0].set_xlabel("time (cycles)")
         for lags in axes[-1, 1:]:
             lags.set_xlabel("lag (sections)")
         axes[0, 0].get_figure(root=True).align_ylabels(axes[:, 0])
-        letters(axes)
     return Plot(axes)
 
 
@@ -253,5 +261,4 @@ def _stems(ax: Axes, lags, values, color, shift: float, limit: float) -> None:
     ax.axhspan(-limit, limit, color="0.9", zorder=0)
     ax.vlines(lags + shift, 0, mean, color=color, lw=1.2)
     ax.axhline(0, color="black", lw=0.5)
-    ax.set_ylabel("std. deviations")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))

@@ -15,10 +15,13 @@ from ..errors import DefinitionError
 from ..identify.multipliers import StructuredFit
 from ..identify.rational import RationalFit
 from ..linear.htf import HTF
+from ..linear.ldtp import LDTP
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, letters, panels
 
 
 Fit = RationalFit | StructuredFit
+Transfer = HTF | LDTP
+"""HTFs, and models, whose HTFs are drawn at the frequencies of the first HTF beside them."""
 FREQUENCY = "input frequency $f$ (cycles/period)"
 _OUTPUTS = [COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")]
 _FIT_STYLE = {"color": "black", "lw": 0.8, "ls": (0, (4, 1.5))}
@@ -27,7 +30,7 @@ _FIT_NAMES: dict[type, str] = {RationalFit: "rational fit", StructuredFit: "stru
 
 @checked
 def magnitude(
-    *htfs: HTF,
+    *htfs: Transfer,
     output: str | int = 0,
     input: str | int = 0,
     harmonics: Sequence[int] = (0, 1, -1),
@@ -36,9 +39,10 @@ def magnitude(
 ) -> Plot:
     """|H_m| of one output against the input frequency, on a logarithmic scale.
 
-    One color per |m|, dashed for negative m. Exact HTFs are drawn as broad pale lines under the
-    estimates, in any order of the arguments. HTFs with a variance have a band that holds the true
-    value at each frequency with a probability of 95 %.
+    One color per |m|, dashed for negative m. Exact HTFs, and those of models (`LDTP`) at the
+    frequencies of the first HTF, are drawn as broad pale lines under the estimates, in any order of
+    the arguments. HTFs with a variance have a band that holds the true value at each frequency with
+    a probability of 95 %.
 
     **Arguments:** `output`, `input`: names or indices. `decades`: how far below the largest value
     the scale reaches. `ax`: Axes. Default: a new figure.
@@ -47,13 +51,14 @@ def magnitude(
     """
     if not harmonics:
         raise DefinitionError("`harmonics` must hold one harmonic or more.")
+    drawn = _exact_first(htfs)
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
-        for htf in _exact_first(htfs):
+        for htf in drawn:
             for m in harmonics:
                 f, values, radius = _values(htf, m, output, input)
                 size, style = np.abs(values), _harmonic_style(m, harmonics)
-                line = _line(htf, htfs, style, _name(m))
+                line = _line(htf, drawn, style, _name(m))
                 panel.plot(f, size, **line)
                 _band(panel, f, size, radius, line["color"], 0.3 * np.min(size))
         name, pushed = _pick("output", output, htf.outputs), _pick("input", input, htf.inputs)
@@ -62,13 +67,13 @@ def magnitude(
         _frequency_limits(panel, f)
         top = max(np.nanmax(line.get_ydata()) for line in panel.get_lines())
         panel.set_ylim(top * 10.0**-decades, top * 2)
-        _legend(panel, htfs)
+        _legend(panel, drawn)
     return Plot(axes)
 
 
 @checked
 def harmonics(
-    families: Mapping[str, HTF | Sequence[HTF]],
+    families: Mapping[str, Transfer | Sequence[Transfer]],
     harmonics: Sequence[int] = (0, 1, -1),
     *,
     input: str | int = 0,
@@ -77,9 +82,9 @@ def harmonics(
 ) -> Plot:
     """The paper's Fig. 3: |H_m|, one row per output and one column per section family.
 
-    **Arguments:** `families`: by the name of the family, an HTF or several (estimate and exact),
-    all with the same outputs. `harmonics`, `input` and `decades` as in `magnitude`; a row shares
-    one scale.
+    **Arguments:** `families`: by the name of the family, an HTF or several (an estimate, and an
+    exact HTF or a model), all with the same outputs. `harmonics`, `input` and `decades` as in
+    `magnitude`; a row shares one scale.
     """
     columns = _columns(families)
     outputs = next(iter(columns.values()))[0].outputs
@@ -98,7 +103,7 @@ def harmonics(
 
 @checked
 def bode(
-    *htfs: HTF,
+    *htfs: Transfer,
     fits: Fit | Sequence[Fit] = (),
     harmonic: int = 0,
     outputs: SignalNames | None = None,
@@ -109,16 +114,17 @@ def bode(
 
     **Arguments:**
 
-    - `htfs`: exact HTFs are drawn as broad pale lines under the estimates. HTFs with a variance
-      have bands that contain the true values with a probability of 95 %. Their phase is not drawn
-      where the band of the magnitude contains zero.
+    - `htfs`: exact HTFs, and those of models (`LDTP`) at the frequencies of the first HTF, are
+      drawn as broad pale lines under the estimates. HTFs with a variance have bands that contain
+      the true values with a probability of 95 %. Their phase is not drawn where the band of the
+      magnitude contains zero.
     - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs.
     - `outputs`: names of outputs, one color for each. Default: all.
     - `ax`: two Axes, for magnitude and phase. Default: a new figure.
 
     **Raises:** `DefinitionError` for a name or harmonic that is not there.
     """
-    first, *_ = _exact_first(htfs)
+    first, *_ = drawn = _exact_first(htfs)
     names = first.outputs if outputs is None else outputs
     pushed = _pick("input", input, first.inputs)
     units = [ratio(_pick("output", name, first.outputs), pushed) for name in names]
@@ -129,10 +135,13 @@ def bode(
         for number, (name, unit) in enumerate(zip(names, units, strict=True)):
             color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
             label = with_unit(name, "" if same else unit)
-            for htf in _exact_first(htfs):
+            for htf in drawn:
                 f, values, radius = _values(htf, harmonic, name, input)
-                size, line = np.abs(values), _line(htf, htfs, {"color": color}, label)
+                size, line = np.abs(values), _line(htf, drawn, {"color": color}, label)
                 is_certain = np.full(len(f), True) if radius is None else radius < size
+                is_certain &= (
+                    np.convolve(is_certain, (1, 1, 1), "same") > 1
+                )  # single points: no line
                 phase = _phase(f, values, is_certain, reference)
                 reference = f[is_certain], phase[is_certain]
                 upper.plot(f, size, **line)
@@ -154,13 +163,13 @@ def bode(
         _frequency_limits(upper, f)
         _frequency_limits(lower, f)
         lower.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 4.5, 9]))
-        _legend(upper, htfs)
+        _legend(upper, drawn)
     return Plot(axes)
 
 
 @checked
 def bodes(
-    families: Mapping[str, HTF | Sequence[HTF]],
+    families: Mapping[str, Transfer | Sequence[Transfer]],
     *,
     fits: Mapping[str, Fit | Sequence[Fit]] | None = None,
     harmonic: int = 0,
@@ -182,13 +191,13 @@ def bodes(
     return Plot(axes)
 
 
-def _columns(families) -> dict[str, tuple[HTF, ...]]:
-    columns = {k: (v,) if isinstance(v, HTF) else tuple(v) for k, v in dict(families).items()}
+def _columns(families) -> dict[str, list[HTF]]:
+    columns = {k: (v,) if isinstance(v, Transfer) else tuple(v) for k, v in dict(families).items()}
     if not columns or not all(columns.values()):
         raise DefinitionError("`families` must hold at least one HTF in each family.")
     if len({htf.outputs for htfs in columns.values() for htf in htfs}) > 1:
         raise DefinitionError("the families must have the same outputs to share a figure.")
-    return columns
+    return {name: _exact_first(htfs) for name, htfs in columns.items()}
 
 
 @contextlib.contextmanager
@@ -206,10 +215,12 @@ def _grid(columns, rows: int, height: float, ax: AxesLike | None) -> Iterator[np
         letters(axes)
 
 
-def _exact_first(htfs: Sequence[HTF]) -> list[HTF]:
-    if not htfs:
-        raise DefinitionError("`htfs` holds no HTF to draw.")
-    return sorted(htfs, key=lambda htf: htf.source != "exact")
+def _exact_first(htfs: Sequence[Transfer]) -> list[HTF]:
+    grids = [htf.f for htf in htfs if isinstance(htf, HTF)]
+    if not grids:
+        raise DefinitionError("`htfs` holds no HTF to draw: of a model alone, draw `model.htf(f)`.")
+    drawn = [htf if isinstance(htf, HTF) else htf.htf(grids[0]) for htf in htfs]
+    return sorted(drawn, key=lambda htf: htf.source != "exact")
 
 
 def _pick(kind: str, which: str | int, names: Sequence[str]) -> str:

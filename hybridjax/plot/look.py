@@ -143,6 +143,12 @@ def axis_of(name: str, *, deviation: bool = False) -> str:
     return with_unit(rf"$\delta$ {name}" if deviation else name, unit_of(name))
 
 
+def legend(ax: Axes, place: str, **options: Any) -> None:
+    """The legend of a panel, beside all panels of a new figure, where it covers no curve."""
+    figure = cast(Any, ax.get_figure(root=True))
+    figure.legend(*ax.get_legend_handles_labels(), loc=f"outside {place}", **options)
+
+
 def letters(axes: Any) -> None:
     """Call the Axes of a figure A, B, C, ..."""
     for ax, letter in zip(np.ravel(axes), "ABCDEFGHIJKLMNOPQRSTUVWXYZ", strict=False):

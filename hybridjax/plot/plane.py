@@ -13,7 +13,7 @@ from ..identify.multiplier_estimate import MultiplierEstimate, Multipliers, comp
 from ..identify.rational import RationalFit
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
-from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, letters, panels
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, legend, letters, panels
 
 
 _MARKERS = "osD^vP*X"
@@ -62,10 +62,8 @@ def multipliers(
         far = 1.1 * max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
         panel.set(xlim=(-far, far), ylim=(-far, far), aspect="equal")
         panel.locator_params(nbins=5)
-        boxes = [panel]
-        if zoom and (series or borders):
-            boxes.append(_zoom(panel, true, series, borders))
-        for box in boxes:
+        inset = _zoom(panel, true, series, borders) if zoom and (series or borders) else None
+        for box in filter(None, (panel, inset)):
             for label, text, z, line in drawn:
                 box.plot(np.real(z), np.imag(z), ls="", label=text, **line)
                 for border in borders.get(label, ()):
@@ -76,8 +74,7 @@ def multipliers(
                     box.plot(x, y, color=line["color"], **edge)
         _complex_axes(panel, r"\lambda")
         if ax is None and series:
-            shown = panel.get_legend_handles_labels()
-            panel.get_figure(root=True).legend(*shown, loc="outside lower center")
+            legend(panel, "lower center")
         elif series:
             panel.legend()
     return Plot(axes)
@@ -121,10 +118,7 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
             lower.set_title("enlarged: around the poles")
             _complex_axes(lower, "z")
             _complex_axes(upper, "z")
-        axes[0, 0].get_figure(root=True).legend(
-            *axes[0, 0].get_legend_handles_labels(), loc="outside upper center",
-            ncols=4 if len(outputs) > 1 else 2,
-        )  # fmt: skip
+        legend(axes[0, 0], "upper center", ncols=4 if len(outputs) > 1 else 2)
         letters(axes)
     return Plot(axes)
 
@@ -155,27 +149,29 @@ def _borders(estimates: Mapping[str, Any]) -> dict[str, list[np.ndarray]]:
     }
 
 
-def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders) -> Axes:
-    """An inset around the leading true multiplier, at a place that is free of markers."""
+def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders) -> Axes | None:
+    """An inset around the leading true multiplier, at a place that is free of markers; none where
+    it would enlarge less than twice."""
     leading = complex(true[np.lexsort((-np.imag(true), -np.abs(true)))[0]])
     nearest = [z[np.argmin(np.abs(z - leading))] for z in series.values()]
     # Of the region next to the leading multiplier, all of it.
     regions = [min(np.abs(x - leading).max() for x in region) for region in borders.values()]
     reach = 1.35 * max([1e-12, *(np.abs(z - leading) for z in nearest), *regions])
-    side = 0.36
-    points = (np.concatenate([true, *series.values()]) / ax.get_xlim()[1] + 1 + 1j) / 2
+    side, far = 0.36, ax.get_xlim()[1]
+    if 2 * reach > side * far:
+        return None
+    points = (np.concatenate([true, *series.values()]) / far + 1 + 1j) / 2
     places = [0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j]
     place = max(places, key=lambda c: np.abs(points - c).min())
     inset = ax.inset_axes(
         (place.real - side / 2, place.imag - side / 2, side, side),
         xlim=leading.real + np.array([-reach, reach]),
         ylim=leading.imag + np.array([-reach, reach]),
-        aspect="equal",
-    )
-    inset.tick_params(labelsize="xx-small", length=2)
+        aspect="equal", xticks=[], yticks=[],
+    )  # fmt: skip
+    # (Numbers at its ticks would be long and differ in their last digits.)
+    inset.text(0.5, 0.02, f"{2 * reach:.1e} wide", transform=inset.transAxes, ha="center", size=6)
     inset.spines[:].set(visible=True, color="0.4")
-    inset.locator_params(nbins=3)
-    inset.tick_params(axis="x", labelrotation=30)  # long labels would overlap
     ax.indicate_inset_zoom(inset, edgecolor="0.4")
     return inset
 

@@ -1,10 +1,13 @@
 import dataclasses
+import itertools
 
 import equinox as eqx
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.text import Text
 
 import hybridjax as hj
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
@@ -29,6 +32,15 @@ def test_magnitude_draws_the_values(estimate, exact):
     assert drawn.get_linestyle() == "-" and lines["$H_{-1}$"].get_linestyle() == "--"
     assert ax.get_yscale() == "log" and "cycles/period" in ax.get_xlabel()
     assert ax.get_ylabel() == "$|H_m|$, vM"
+
+
+def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
+    for draw in (hj.plot.magnitude, hj.plot.bode, lambda *x: hj.plot.harmonics({"a": x})):
+        drawn = [[x.get_xydata() for x in draw(estimate, m).ax.lines] for m in (hopper, exact)]
+        for line, expected in zip(*drawn, strict=True):
+            np.testing.assert_allclose(line, expected, rtol=1e-9)
+    with pytest.raises(hj.DefinitionError, match="model alone"):
+        hj.plot.bode(hopper)
 
 
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
@@ -163,10 +175,24 @@ def test_validation_draws_signals_and_correlations(found):
     np.testing.assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
     np.testing.assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
     assert grid[1, 0].get_ylabel() == r"$\delta$ vM"
-    assert grid[0, 0].get_title() == f"fit {found.fit[0]:.2f} %"
+    assert grid[0, 0].get_title("right") == f"fit {found.fit[0]:.3g} %\n"
     for k, values in ((1, found.autocorrelation[:, :, 0]), (2, found.cross_correlation[:, :, 0])):
         heights = [path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()]
         np.testing.assert_allclose(heights, values.sum(axis=0).ravel() / np.sqrt(32), atol=1e-12)
+
+
+def test_no_texts_overlap_at_the_width_of_a_column(found):
+    """None is cut."""
+    with hj.plot.style():
+        figure, axes = pyplot.subplots(2, 3, figsize=(3.5, 3.0), layout="constrained")
+        hj.plot.validation(found, ax=axes)
+        figure.canvas.draw()
+    texts = [x for x in figure.findobj(Text) if "mathdefault" not in x.get_text()]  # no ticks
+    words = [x for x in texts if any(map(str.isalpha, x.get_text()))]
+    boxes = [x.get_window_extent().padded(-1) for x in words]
+    assert len(boxes) == 13  # six titles, and seven labels of axes
+    assert all(figure.bbox.count_contains(box.corners()) == 4 for box in boxes)
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
 def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():

@@ -3,11 +3,13 @@
 import functools
 import warnings
 
+import equinox as eqx
 import numpy as np
 import pytest
 from scipy import signal
 
 import hybridjax as hj
+from hybridjax.recordings.fit_warnings import _about_residuals
 
 from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle, signals
 
@@ -114,6 +116,20 @@ def test_an_order_that_is_too_low_is_named():
         result = hj.identify_recording(recording, TOP, **names)
         order = [x for x in result.advice.warnings if "Compare order=2" in x.text]
         assert len(order) == named
+
+
+def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_cycle):
+    """Distortion of small pushes, without noise, is no reason to doubt; a third is."""
+    force = hj.testing.random_force(100, 100, 8, rms=0.02, seed=0)
+    made = hj.testing.simulate_recording(hopper_cycle, force[None], ("yM", "vM"), rate=100)
+    names = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16, "order": 2}
+    result = hj.identify_recording(made, APEX, **names)
+    validation = result.held_out.validation
+    assert not validation.independent and validation.fit.min() > 99
+    assert "left over" not in [x.cause for x in result.findings]
+    worse = eqx.tree_at(lambda x: x.fit, validation, np.array([70.0, 70.0]))
+    (finding,) = _about_residuals(worse)
+    assert finding.cause == "left over"
 
 
 APEX = hj.Crossing("vM", "falling")
