@@ -10,7 +10,9 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.meaning import current
+from hybridjax.engine.unresolved import may_have_pulses, may_jump
 from hybridjax.orbits.checks import check_jumps
+from hybridjax.systems.structure import Structure
 
 
 hj.enable_x64()
@@ -87,6 +89,11 @@ def test_a_jump_is_refused(smooth, further):
 )
 def test_a_continuous_field_is_not(smooth, further):
     assert not is_refused(smooth, further)
+
+
+def test_a_mass_matrix_may_have_poles_only():
+    biped = Structure(hj.models.FiveLinkBiped())
+    assert may_have_pulses(biped, 0) == {"div"} and not may_jump(biped, 0)
 
 
 @SLOW
