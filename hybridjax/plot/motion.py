@@ -199,7 +199,7 @@ def animate(
     period = math.inf if cycle is None else float(cycle.period)
     last = perturbed or path
     length = period if cycle is not None and perturbed is None else float(np.ptp(last.t))
-    pace = _pace(length, unit, speed)
+    pace, note = _pace(length, unit, speed)
     times = np.linspace(0, length, max(12, round(length / pace * rate)), endpoint=False)
     begin = last.t[0] + times
     tracks = [Track("cycle" if perturbed else "", CYCLE[0], path, begin, period)]
@@ -211,7 +211,7 @@ def animate(
         cells = (grid[1, 0] if has_picture else grid[:, 0]).subgridspec(len(names), 1, hspace=0.05)
         axes = [figure.add_subplot(cells[i]) for i in range(len(names))]
         parts = _traces(axes, tracks, names, events)
-        axes[0].set_title(_label(pace, unit), loc="right")
+        axes[0].set_title(note, loc="right")
         if has_picture:
             cells = grid[0, 0].subgridspec(1, len(tracks))
             for i, track in enumerate(tracks):
@@ -249,17 +249,13 @@ def _sheet() -> tuple[Figure, Any]:
     return figure, figure.add_gridspec(2, 2, **borders, **ratios, wspace=0.3, hspace=0.3)
 
 
-def _pace(length: float, unit: str, speed: float | None) -> float:
-    """Units of the system's time in a second of playback."""
-    real = length * _SECONDS.get(unit, 0.0)
+def _pace(length: float, unit: str, speed: float | None) -> tuple[float, str]:
+    """Units of the system's time in a second of playback, and a note if that is not real speed."""
+    pace, real = length / 2 * (speed or 1.0), length * _SECONDS.get(unit, 0.0)
     if real and (speed is not None or 0.25 <= real <= 20):
-        return (speed or 1.0) / _SECONDS[unit]
-    return length / 2 * (speed or 1.0)
-
-
-def _label(pace: float, unit: str) -> str:
-    real = pace * _SECONDS.get(unit, 0.0)
-    return f"{real:.2g} x real speed" if real and abs(real - 1) > 1e-9 else ""
+        pace = (speed or 1.0) / _SECONDS[unit]
+    share = pace / length * real
+    return pace, f"{share:.2g} x real speed" if real and abs(share - 1) > 1e-9 else ""
 
 
 def _picture(ax: Axes, track: Track) -> list[Part]:
