@@ -417,17 +417,17 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     structure, moves = map.structure, recorded_moves(*record)
     by = linear_moves(structure, moves, map.ends())[1]
     fields = slopes(structure, moves.t, moves.chart, moves.q, np.zeros((structure.nu, 1))).T
-    frames: list[tuple[int, Matrix, Matrix]] = []
+    frames: list[tuple[int, np.ndarray, Matrix]] = []
     for chart, f in zip(moves.chart, fields, strict=True):
         n = structure.dims[chart]
         size, basis = np.append(map.expected, map.scale[chart, :n]), np.eye(1 + n)
         if map.base is not None:
             basis = np.pad(np.linalg.svd(f[None, :n] / size[1:])[2][1:].T, [(1, 0), (0, 0)])
-        frames.append((1 + n, (basis / size[:, None]).T, basis * size[:, None]))
+        frames.append((1 + n, size, basis))
     factors: list[Matrix] = []
-    for k, (n, _, into) in enumerate(frames):
-        m, out, _ = frames[(k + 1) % len(frames)]
-        parts = out, by[k, :m, :n], into
+    for k, (n, size, basis) in enumerate(frames):
+        m, size_after, basis_after = frames[(k + 1) % len(frames)]
+        parts = basis_after.T, by[k, :m, :n] * size / size_after[:, None], basis
         factor = np.linalg.multi_dot(parts)
         # (A zero that comes out as rounding would be a multiplier.)
         least = np.finfo(float).eps * np.prod([np.linalg.norm(x) for x in parts])

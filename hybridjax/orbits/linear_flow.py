@@ -101,6 +101,8 @@ class LinearFlow(eqx.Module):
     """Derivative of the field."""
     by_input: Float[Array, "P K d nu"]
     jumps: Jumps
+    size: Float[Array, "P d"]
+    """Magnitudes of the states."""
 
     @property
     def turn(self) -> Float[Array, " P"]:
@@ -118,21 +120,23 @@ class LinearFlow(eqx.Module):
         """Times of the nodes: those of the clock, or since the anchor of an autonomous cycle."""
         return self.t if map.base is None else self.t - self.t[0, 0]
 
-    def _implicit(self, sign: float, rows: slice, matrix: Float[Array, "P K d d"]):
-        """The inverse of (derivative + sign h matrix) on some of the nodes."""
+    def _implicit(self, sign: float, rows: slice, matrix: Float[Array, "P K d d"], size: Array):
+        """The inverse of (derivative + sign h matrix) on some of the nodes, computed in sizes."""
+        ratio = size[:, :, None] / size[:, None]
         d, D = self.q.shape[2], rule().derivative[rows, rows]
         n, xp = len(D), namespace(self.q)
-        field = xp.eye(n)[:, None, :, None] * matrix[:, rows, :, None, :]
+        field = xp.eye(n)[:, None, :, None] * (matrix / ratio[:, None])[:, rows, :, None, :]
         whole = D[:, None, :, None] * np.eye(d)[:, None, :]
         whole = whole + sign * self.length[:, None, None, None, None] * field
-        return solve(whole.reshape(-1, n * d, n * d), np.eye(n * d)).reshape(-1, n, d, n, d)
+        inverse = solve(whole.reshape(-1, n * d, n * d), np.eye(n * d)).reshape(-1, n, d, n, d)
+        return inverse * ratio[:, None, :, None, :]
 
     @remembered
     def forward(self) -> tuple[Float[Array, "P K d d"], Float[Array, "P K d K d"]]:
         """Deviations at the nodes of each piece by that at its beginning, and by forces at the
         nodes (times the length of the piece)."""
         xp, d = namespace(self.q), self.q.shape[2]
-        inverse = self._implicit(-1.0, slice(1, None), self.by_state)
+        inverse = self._implicit(-1.0, slice(1, None), self.by_state, self.size)
         free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[1:, 0])
         free = xp.concatenate([xp.broadcast_to(xp.eye(d), (len(free), 1, d, d)), free], axis=1)
         return free, xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
@@ -141,7 +145,8 @@ class LinearFlow(eqx.Module):
     def adjoint(self) -> Float[Array, "P K d d"]:
         """Covectors at the nodes of each piece by that at its end."""
         xp, d = namespace(self.q), self.q.shape[2]
-        inverse = self._implicit(1.0, slice(0, -1), xp.swapaxes(self.by_state, -1, -2))
+        by_state = xp.swapaxes(self.by_state, -1, -2)
+        inverse = self._implicit(1.0, slice(0, -1), by_state, 1 / self.size)
         free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[:-1, -1])
         return xp.concatenate([free, xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))], axis=1)
 
@@ -309,6 +314,7 @@ def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = No
     arrays = LinearFlow(
         lay(time.ravel()), (h / parts).T, None, None, states, f,
         lay(with_field[:, 2 : 2 + d]), lay(with_field[:, 2 + d :]), jumps,
+        np.broadcast_to(map.scale[moves.chart[first]], (D, P, d)),
     )  # fmt: skip
     if by is not None:
         return jax.tree_util.tree_map(lambda x: x.imag / kernels.TINY, arrays)

@@ -183,9 +183,9 @@ class Responses(eqx.Module):
         """Change of the amplitude of a mode after a brief push at some phases, by names of states
         and inputs; complex unless its multiplier is positive.
 
-        An amplitude a moves the state by a times the mode, plus the conjugate if it is complex, and
-        changes by the factor exp(exponent * t) in a time t. Real and imaginary parts are two real
-        amplitudes.
+        An amplitude a moves the state by a times the mode, plus the conjugate if the multiplier is
+        complex, and changes by the factor exp(exponent * t) in a time t. Real and imaginary parts
+        are two real amplitudes.
 
         **Raises:** `DefinitionError` for a mode that does not exist.
         """
@@ -320,7 +320,7 @@ def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
             "inside of `grad` and `jvp`, `responses` needs the number of `modes`."
         )
     values, right, left = _modes(whole, map.sizes, modes)
-    exponents = xp.log(values) / period
+    exponents = xp.log(values + 0j) / period
     phase = None if clocked else flow.covectors(Z[:, None])[..., 0]
     # Amplitudes grow by their exponents; rounding adds responses of the phase.
     to_go = period - (flow.t - flow.t[0, 0])[..., None]
@@ -330,7 +330,7 @@ def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
         slip = xp.einsum("rpki,pki->rpk", amplitudes, flow.field)
         amplitudes = amplitudes - slip[..., None] * phase
     if host and not np.any(np.iscomplex(exponents)):
-        amplitudes, right = np.real(amplitudes), np.real(right)
+        amplitudes, right, exponents = (np.real(x) for x in (amplitudes, right, exponents))
     total = int(np.sum(map.valid)) - (not clocked) if host else len(values)
     off = surface(map.structure, flow)
     return Responses(

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked_methods
 from .._core.compilation import at_ease, one_program
-from .._core.executor import Array, is_traced, namespace, on_host
+from .._core.executor import Array, is_traced, namespace, on_host, svdvals
 from .._core.text import number
 from ..engine import kernels
 from ..errors import ComputationError
@@ -86,7 +86,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     if clocked:
         period_at = lambda k: jnp.asarray(varied.under(k[None]).system.period(), float)  # noqa: E731
         longer = map.multiplicity * derivative_at_zero(period_at)
-        if on_host(whole) and np.linalg.svd(closed, compute_uv=False)[-1] < SINGULAR:
+        scaled = closed * map.sizes / map.sizes[:, None]
+        if on_host(whole) and svdvals(scaled)[-1] < SINGULAR:
             raise ComputationError(
                 "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
                 "branch by `continuation`."

@@ -12,6 +12,8 @@ import hybridjax as hj
 from hybridjax.orbits.linear_flow import linear_flow
 from hybridjax.systems.chart import FieldChart
 
+from ..toys import toy
+
 
 PHASES = np.array([0.0, 0.13, 0.31, 0.52, 0.77, 0.98])
 
@@ -54,6 +56,21 @@ class Neuron(hj.HybridSystem):
 
     def guess(self):
         return hj.Guess("membrane", jnp.atleast_1d(self.low), after="spike")
+
+
+class Driven(hj.HybridSystem):
+    """A clocked cycle whose states are proportional to the force, and differ in size."""
+
+    force: hj.Parameter = hj.parameter(1.0)
+
+    def charts(self):
+        return {"plane": FieldChart(self.field, ("x", "y"))}
+
+    def field(self, t, q, u):
+        return self.force * jnp.cos(2 * jnp.pi * t) - q[0], 1e12 * q[0] - q[1]
+
+    def period(self):
+        return 1.0
 
 
 class Square(hj.HybridSystem):
@@ -112,6 +129,41 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     phase = cycle.asymptotic_phase("plane", (0.3, 0.15))
     exact = np.arctan2(0.15, 0.3) + 0.4 * np.log(np.hypot(0.3, 0.15) / np.sqrt(0.1))
     np.testing.assert_allclose(phase, exact / (2 * np.pi), rtol=1e-9)
+
+
+def test_responses_and_sensitivities_do_not_depend_on_the_units_of_states():
+    """Stuart and Landau's oscillator with y in another unit, and a clocked oscillator."""
+    size = 1e12
+
+    class Scaled(StuartLandau):
+        def field(self, t, q, u):
+            x, y = super().field(t, (q[0], q[1] / size), u)
+            return x, y * size
+
+    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
+    cycle = hj.find_limit_cycle(Scaled(), guess, section=section)
+    exact = -(np.sin(2 * np.pi * PHASES) - 0.4 * np.cos(2 * np.pi * PHASES)) / np.sqrt(0.1)
+    phase = cycle.responses().phase(PHASES, "radians")
+    np.testing.assert_allclose(phase["x"], exact, rtol=0, atol=1e-12)
+    slower = cycle.sensitivity("mu").period
+    np.testing.assert_allclose(slower, -2 * np.pi * 0.4 / 1.04**2, rtol=1e-11)
+    driven = hj.find_limit_cycle(Driven(), hj.Guess("plane", (0.1, 1e11)))
+    shape = driven.sensitivity("force").shape([0.0])
+    state = driven.state
+    np.testing.assert_allclose([shape[x][0] / state[x] for x in "xy"], 1.0, rtol=1e-11)
+
+
+def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
+    """x' = cos(2 pi t) - 0.3 x, and x changes its sign at each tick."""
+    field = lambda t, q, u: (jnp.cos(2 * jnp.pi * t) - 0.3 * q[0] + u[0],)
+    tick = hj.Scheduled(1.0, 0.5)
+    turned = hj.Transition("tick", "line", "line", tick, reset=lambda t, q, u: (-q[0],))
+    system = toy({"line": FieldChart(field, ("x",))}, [turned], period=1.0)
+    responses = hj.find_limit_cycle(system, hj.Guess("line", (0.1,))).responses()
+    np.testing.assert_allclose(responses.exponents, [-0.3 + 1j * np.pi], rtol=1e-12)
+    before_tick = np.where(PHASES < 0.5, PHASES, PHASES - 1)
+    exact = np.exp(1j * np.pi * before_tick) * responses.amplitude(0, [0.0])["x"]
+    np.testing.assert_allclose(responses.amplitude(0, PHASES)["x"], exact, rtol=1e-11)
 
 
 def test_the_closed_form_of_a_response_has_its_derivative():

@@ -203,3 +203,16 @@ def test_other_bad_files(tmp_path):
         hj.read_recording(tmp_path / "x.xls")
     with pytest.raises(hj.DefinitionError, match="cannot read .*No such file"):
         hj.read_recording(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize("strides", [4, 6])
+def test_a_recording_that_is_too_short_is_refused(rhythm, strides):
+    trial = rhythm.trials[0]
+    kept = trial.time < strides
+    signals = dict(zip(rhythm.signals, trial.values[kept].T, strict=True))
+    short = hj.Recording(trial.time[kept], signals)
+    inputs, *outputs = rhythm.signals
+    with pytest.raises(hj.DefinitionError, match="too few|reach beyond"):
+        hj.identify_recording(
+            short, hj.Crossing(outputs[0], "rising"), inputs=inputs, outputs=outputs, n_sections=8
+        )

@@ -89,8 +89,9 @@ class SectionRegression(NamedTuple):
         self, a: Float[np.ndarray, "r *columns"], x: Float[np.ndarray, "S T *columns"]
     ) -> Float[np.ndarray, "S T *columns"]:
         """Return the response to the inputs and to the initial conditions that fit x best."""
-        forced = self.inputs @ a.reshape(len(a), -1)
-        left = self.weight * (x.reshape(forced.shape) - forced)
+        x_columns = x.reshape(*x.shape[:2], -1)
+        forced = self.inputs @ a.reshape(len(a), x_columns.shape[2])
+        left = self.weight * (x_columns - forced)
         free = self.to_starts @ (self.basis.swapaxes(1, 2) @ left)
         return (forced + self.starts @ free).reshape(x.shape)
 
