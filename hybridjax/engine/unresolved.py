@@ -27,12 +27,12 @@ _SMOOTH = frozenset(
     "dynamic_slice squeeze stack unstack split transpose".split()
 )
 _CALLS = frozenset("jit pjit closed_call core_call".split())
-# Operations that may have poles. Beside these, values fall as powers of the distance, so that few
-# points in a step see them.
-_POLES = frozenset(("div", "integer_pow"))
+# Operations that may have poles. Beside these, values fall as low powers of the distance, which few
+# points in a step see, unless the program has higher powers than this.
+_POLES, _POWER = frozenset(("div", "integer_pow")), 4
 # Pieces of a step, each with four points, and four times as many on cycles, but few if there may be
 # poles only. Fewer: short pulses are missed. More: time.
-_PIECES, _FEW = 64, 32
+_PIECES, _FEW = 64, 8
 # In a step, the integrals of a rate and of a polynomial through eight of its values may differ by
 # so many times the accuracy, and those of a gain, whose kinks no step meets, by this part of the
 # integral over all steps. Smaller: kinks are refused. Larger: pulses with this effect are missed.
@@ -81,6 +81,8 @@ def sudden(program: jex.Jaxpr) -> Iterator[tuple[str, Any]]:
             yield from ((name, equation) for call in calls for name, _ in sudden(call))
             if not _is_smooth(equation, moves):
                 yield equation.primitive.name, equation
+            elif equation.params.get("y", 0) > _POWER:
+                yield "power", equation  # (in a denominator it makes pulses)
 
 
 def may_be_sudden(s: Structure, a: int, function: Callable) -> frozenset[str]:
@@ -89,6 +91,8 @@ def may_be_sudden(s: Structure, a: int, function: Callable) -> frozenset[str]:
     if key not in _sudden:
         names = (name for name, _ in sudden(program_of(s, a, ft.partial(function, s, a))))
         _sudden[key] = frozenset(names)
+        if _sudden[key] == {"power"}:
+            _sudden[key] = frozenset()
     return _sudden[key]
 
 
@@ -271,7 +275,7 @@ def has_kinks(s: Structure) -> bool:
 def lines_of_jumps(s: Structure, a: int) -> list[str]:
     """The lines of code by which the field of a chart may jump: those that decide, if there are
     any."""
-    lines = [(name, _line_of(x)) for name, x in sudden(program_of(s, a))]
+    lines = [(name, _line_of(x)) for name, x in sudden(program_of(s, a)) if name != "power"]
     decisions = [x for x in lines if x[0] in _DECISIONS]
     return [line for line in dict.fromkeys(line for _, line in decisions or lines) if line]
 
