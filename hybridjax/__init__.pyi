@@ -16,7 +16,6 @@ from ._core.execution import Execution as Execution
 from ._core.precision import enable_x64 as enable_x64
 from ._core.progress import enable_progress as enable_progress
 from ._core.results import Result as Result
-from ._core.vector_math.rewrite import enable_vector_math as enable_vector_math
 from .apps.identify import write_report as write_report
 from .apps.subjects import identify_subjects as identify_subjects
 from .designs.optimize import optimal_design as optimal_design

@@ -60,6 +60,11 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.core)
 
 
+def pytest_configure(config):
+    """Files stay in their order: by default one with a single long test is the last to start."""
+    config.option.loadscopereorder = False
+
+
 def pytest_xdist_auto_num_workers(config):
     """A single process for a part of the tests: starting others takes longer than the tests."""
     if config.args != config.getini("testpaths"):

@@ -30,7 +30,6 @@ from ..errors import ComputationError
 from . import executor
 from .executor import from_host, is_hidden, on_cpu, on_the_cpu, to_host
 from .progress import say_compiling
-from .vector_math import rewrite
 
 
 # No optimization passes of LLVM, and the older of XLA's two code generators: compiles in a third of
@@ -332,7 +331,7 @@ def _is_simple() -> bool:
 def _settings() -> tuple:
     """Settings by which the same function becomes another program."""
     names = "jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion"
-    return rewrite.is_enabled(), *(getattr(jax.config, name) for name in names)
+    return tuple(getattr(jax.config, name) for name in names)
 
 
 # XLA hands factorizations that are left in a program (`vector_math/rewrite.py`) to LAPACK, on the

@@ -1,4 +1,4 @@
-"""The paper's parametric fit: one rational function of z for one harmonic (Sec. VI-C3)."""
+"""The paper's parametric fit: a rational function of z for H_0 (Sec. VI-C3)."""
 
 import functools
 from collections.abc import Iterator
@@ -30,12 +30,12 @@ _ACCURACY = 1e-8
 
 
 class RationalFit(eqx.Module):
-    r"""Rational functions of $z = e^{2 \pi i f / N}$ fitted to one harmonic, one per output.
+    r"""Rational functions of $z = e^{2 \pi i f / N}$ fitted to $H_0$, one per output.
 
-    $$H(z) \approx \frac{b_0 z^{-1} + b_1 z^{-2} + \ldots + b_q z^{-q-1}}
+    $$H_0(z) \approx \frac{b_0 z^{-1} + b_1 z^{-2} + \ldots + b_q z^{-q-1}}
     {1 + a_1 z^{-1} + \ldots + a_p z^{-p}}$$
 
-    with real coefficients. A pole $p$ stands for the Floquet multiplier $p^N$. The true $H_m$ has
+    with real coefficients. A pole $p$ stands for the Floquet multiplier $p^N$. The true $H_0$ has
     all N-th roots of every multiplier as poles, so a fit of low order is biased even on exact data.
 
     **Fields** (ny outputs on the first axis):
@@ -46,7 +46,7 @@ class RationalFit(eqx.Module):
     - `multipliers` (ny, p): poles to the power N, in the order of the poles.
     - `residual` (ny,): root mean square misfit, relative to the rms of H.
     - `result` (ny,): codes of `Result`, OK or NOT_CONVERGED.
-    - `harmonic`, `n_sections`, `outputs`, `input`: the arguments of the fit.
+    - `n_sections`, `outputs`, `input`: those of the HTF.
     """
 
     numerator: Float[np.ndarray, "ny b"]
@@ -56,7 +56,6 @@ class RationalFit(eqx.Module):
     multipliers: Complex[np.ndarray, "ny p"]
     residual: Float[np.ndarray, " ny"]
     result: Int[np.ndarray, " ny"]
-    harmonic: int = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     input: str = eqx.field(static=True)
@@ -69,8 +68,7 @@ class RationalFit(eqx.Module):
         polyval = np.polynomial.polynomial.polyval
         top, bottom = (polyval(w, x.T) for x in (self.numerator, self.denominator))
         H = (top / bottom * w).T[None, :, :, None]
-        harmonic = (self.harmonic + N // 2) % N - N // 2  # (they count modulo N)
-        return HTF(f, H, harmonic, N, self.input, self.outputs, "rational fit")
+        return HTF(f, H, 0, N, self.input, self.outputs, "rational fit")
 
     @checked
     def compare(self, true: Multipliers, output: str | int | None = None) -> MultiplierComparison:
@@ -88,7 +86,7 @@ class RationalFit(eqx.Module):
 
     def __repr__(self) -> str:
         rows = [
-            f"RationalFit(H_{self.harmonic} from {self.input}, {self.denominator.shape[1] - 1} "
+            f"RationalFit(H_0 from {self.input}, {self.denominator.shape[1] - 1} "
             f"poles, {self.numerator.shape[1] - 1} zeros)"
         ]
         for name, multipliers, residual, code in zip(
@@ -106,14 +104,13 @@ class RationalFit(eqx.Module):
 @checked
 def fit_rational(
     htf: HTF,
-    harmonic: int = 0,
     *,
     output: str | int | None = None,
     input: str | int = 0,
     poles: Order = 2,
     zeros: Index = 1,
 ) -> RationalFit:
-    """Fit a rational function of z with real coefficients to one harmonic.
+    """Fit a rational function of z with real coefficients to $H_0$.
 
     The residual `H - B/A` is minimized by Gauss-Newton steps in the denominator only: for a given
     denominator the best numerator solves a linear problem (variable projection). The descents start
@@ -122,14 +119,14 @@ def fit_rational(
 
     **Arguments:**
 
-    - `htf`: estimated or exact. `harmonic`: usually 0, the default; the others of a real system
-      have complex coefficients, which this form does not have.
+    - `htf`: estimated or exact. (Other harmonics of a real system have complex coefficients, which
+      this form does not have.)
     - `output`: name or index. Default: every output. `input`: name or index. Default: 0.
     - `poles`, `zeros`: their numbers. Default: 2 and 1, the paper's.
 
     **Returns:** `RationalFit`, outputs on the first axis also where there is only one.
 
-    **Raises:** `DefinitionError` for a harmonic, output or input that is not there, for fewer
+    **Raises:** `DefinitionError` for an output or input that is not there, for fewer
     lines than coefficients, and for an H with NaN or of zeros; `ComputationError` if no start leads
     to a finite fit.
     """
@@ -138,7 +135,7 @@ def fit_rational(
     column, rows = channel_index("input", input, htf.inputs), range(len(htf.outputs))
     if output is not None:
         rows = [channel_index("output", output, htf.outputs)]
-    H = np.asarray(htf[harmonic])[:, :, column]
+    H = np.asarray(htf[0])[:, :, column]
     if 2 * len(H) < poles + zeros + 1:
         raise DefinitionError(
             f"{poles} poles and {zeros} zeros have {poles + zeros + 1} coefficients, too many for "
@@ -150,7 +147,7 @@ def fit_rational(
     fits = []
     for row in rows:
         h = H[:, row]
-        name = f"H_{harmonic} of {htf.outputs[row]}"
+        name = f"H_0 of {htf.outputs[row]}"
         if not np.isfinite(h).all():
             raise DefinitionError(f"{name} holds NaN or infinity: leave these frequencies out.")
         rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
@@ -183,7 +180,6 @@ def fit_rational(
         multipliers=multipliers,
         residual=residual,
         result=result,
-        harmonic=harmonic,
         n_sections=htf.n_sections,
         outputs=tuple(htf.outputs[row] for row in rows),
         input=htf.inputs[column],

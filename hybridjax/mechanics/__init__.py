@@ -1,6 +1,1 @@
 """Equations of motion of mechanisms, from their energies."""
-
-from .._core.moved import attach
-
-
-__getattr__, __dir__, __all__ = attach(__name__, __file__)

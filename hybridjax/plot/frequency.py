@@ -286,8 +286,8 @@ def _evaluate(fit: Fit, f, harmonic: int, output: str, input: str | int) -> np.n
     if isinstance(fit, StructuredFit):
         k = channel_index("input", input, fit.inputs)
         return np.asarray(fit.htf(f, harmonic).H)[0, :, i, k]
-    if fit.harmonic != harmonic:
-        raise DefinitionError(f"the rational fit is of H_{fit.harmonic}, not of H_{harmonic}.")
+    if harmonic != 0:
+        raise DefinitionError(f"the rational fit is of H_0, not of H_{harmonic}.")
     return np.asarray(fit.htf(f).H)[0, :, i, 0]
 
 

@@ -1,6 +1,1 @@
 """Families of Poincaré sections; subclass `AbstractSections` to add one."""
-
-from .._core.moved import attach
-
-
-__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -16,7 +16,6 @@ from .._core.boundary.kinds import Count, Fraction, NonNegative, Positive, Seed,
 from .._core.boundary.values import Reals
 from .._core.limits import PERIODS, SECTIONS
 from .._core.signal import unit_of
-from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..experiments.response import ResponseFunction, response_function
 from ..orbits.checks import check_outputs
@@ -38,16 +37,15 @@ def random_force(
     bandwidth: Positive,
     *,
     rms: NonNegative = 1.0,
-    inputs: Count = 1,
     seed: Seed = 0,
-) -> Float[np.ndarray, "n nu"]:
+) -> Float[np.ndarray, "n 1"]:
     """Return a random perturbation with power up to `bandwidth`: white noise, low-passed.
 
     The filter is a Butterworth filter of order 4, applied forwards and backwards. The perturbation
     is not aligned to any phase, so any hardware that plays a file can apply it.
 
     **Arguments:** `duration` in seconds. `rate` in samples per second. `bandwidth` in Hz, where
-    half of the amplitude is left. `rms`. Default: 1. `inputs`: their number. Default: 1. `seed`.
+    half of the amplitude is left. `rms`. Default: 1. `seed`.
 
     **Raises:** `DefinitionError` for a bandwidth of more than half the rate.
     """
@@ -56,15 +54,14 @@ def random_force(
             f"`bandwidth` must be less than half of `rate`, {rate / 2:g}, but is {bandwidth:g}."
         )
     transient = 4 * rate / bandwidth  # samples cut off at either end, where the filter starts
-    samples = (duration * rate + 2 * transient) * inputs
+    samples = duration * rate + 2 * transient
     if not samples <= PERIODS:
         raise DefinitionError(
-            f"`duration`, `rate` and `bandwidth` need {samples:.3g} samples of all inputs, more "
-            f"than {PERIODS}."
+            f"`duration`, `rate` and `bandwidth` need {samples:.3g} samples, more than {PERIODS}."
         )
     n, pad = round(duration * rate), round(transient)
     sos = signal.butter(4, bandwidth, fs=rate, output="sos")
-    white = np.random.default_rng(seed).normal(size=(n + 2 * pad, inputs))
+    white = np.random.default_rng(seed).normal(size=(n + 2 * pad, 1))
     force = signal.sosfiltfilt(sos, white, axis=0)[pad : pad + n]
     return rms * force / np.sqrt(np.mean(force**2, axis=0))
 
@@ -77,7 +74,6 @@ def simulate_recording(
     *,
     rate: Positive = 500,
     steps: Count = 4,
-    accuracy: Positive = EXPERIMENT,
 ) -> Recording:
     """Simulate the recording of a system that is perturbed by a sampled force.
 
@@ -90,7 +86,6 @@ def simulate_recording(
     - `outputs`: names or `Output`s to be recorded in addition to the inputs.
     - `rate`: samples per unit of time, changed slightly so that a whole number of them fits into
       a period. Default: 500. `steps`: steps of the force from sample to sample. Default: 4.
-    - `accuracy`: accuracy of the simulation, as in `run_experiments`.
 
     **Returns:** a `Recording` with S trials. A trial that fails ends there.
 
@@ -115,7 +110,7 @@ def simulate_recording(
     x = np.concatenate([force, np.zeros((S, cycles * K + 1 - n, nu))], axis=1)
     middle = (np.arange(steps) + 0.5) / steps
     u = x[:, :-1, None] + (x[:, 1:] - x[:, :-1])[:, :, None] * middle[:, None]
-    response = response_function(cycle, ClockPhase(K * steps), outputs, accuracy=accuracy)
+    response = response_function(cycle, ClockPhase(K * steps), outputs)
     y = np.asarray(_respond(response, jnp.asarray(u.reshape(S, -1, nu))))[:, ::steps]
     s = response.placed.structure()
     names = s.inputs + s.resolve_outputs(response.outputs).names

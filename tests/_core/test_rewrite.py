@@ -10,10 +10,8 @@ import re
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import hybridjax as hj
-from hybridjax._core.lanes import by_lane
 from hybridjax._core.vector_math.rewrite import vectorized
 
 
@@ -154,24 +152,3 @@ def test_a_zoo_of_functions_gives_what_it_gave_before():
         assert a.dtype == b.dtype and a.shape == b.shape
         atol = tolerance * max(1.0, np.abs(b).max())
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=atol, err_msg=str(path))
-
-
-@pytest.fixture
-def switched_off():
-    hj.enable_vector_math(False)
-    yield
-    hj.enable_vector_math()
-
-
-def test_it_can_be_switched_off(switched_off):
-    """Also for what was compiled before."""
-    x = jnp.linspace(0.0, 1.0, 16)
-    by_lanes = by_lane(jnp.sin)
-    compiled = jax.jit(lambda x: by_lanes(x))
-    assert left(lambda x: by_lane(jnp.sin)(x), x) == {"sin"}
-    np.testing.assert_array_equal(compiled(x), jax.jit(jnp.sin)(x))
-    hj.enable_vector_math()
-    assert not left(lambda x: by_lane(jnp.sin)(x), x)
-    assert "sine" not in compiled.lower(x).as_text()
-    hj.enable_vector_math(False)
-    assert "sine" in compiled.lower(x).as_text()

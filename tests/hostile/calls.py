@@ -45,7 +45,6 @@ def systems(t):
     yield hj.parameter, dict(default=1.0)
     yield hj.models.VerticalHopper, dict(k=10.0)
     yield hj.models.BouncingChain, dict(n=2)
-    yield hj.enable_vector_math, dict(enabled=True)
     yield hj.enable_progress, dict(enabled=False)
     yield hj.enable_compilation_cache, dict(folder=None)
     yield hj.Settings, dict(rtol=1e-09, atol=1e-09)

@@ -54,7 +54,7 @@ SLOW = {
     "linearize", "optimize_phases", "place_sections", "response_function", "run_experiments",
     "section_map", "simulate", "simulate_recording", "stream_experiments", "sweep", "monte_carlo",
     "write_report", "ObservedCycle.prepare", "ObservedCycle.residuals", "ObservedHTF.prepare",
-    "ObservedHTF.residuals", "enable_vector_math", "enable_compilation_cache",
+    "ObservedHTF.residuals", "enable_compilation_cache",
 }  # fmt: skip
 
 

@@ -18,7 +18,6 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jax.extend.core import primitives
 
-from ..boundary.checked import checked
 from ..executor import on_cpu
 from . import factorizations
 from .trigonometry import arccos, arcsin, arctan, arctan2, cos, sin, tan
@@ -43,38 +42,13 @@ _FACTORIZATIONS = {
 _OUTER = ("jit", "pjit", "cond", "while", "scan", "custom_linear_solve")
 
 
-_enabled = True
-
-
-@checked
-def enable_vector_math(enabled: bool = True) -> None:
-    """Switch vectorized trigonometric functions and small factorizations on or off in vector
-    fields, guards, resets and outputs, for this process. Default: on.
-
-    On CPU, `jnp.sin` and other trigonometric functions take 8 to 22 ns for every number in double
-    precision. Their replacements take 2 to 3 ns, and their errors are at most 1.5 to 3.3 units in
-    the last place (see docs/how-to/speed-up.md). Replacing LAPACK cuts the solution of 3 equations
-    from 150 to 10 ns. Switched off, users' functions are evaluated as they are written.
-
-    A change of the setting discards all programs that JAX has compiled in this process.
-    """
-    global _enabled
-    if bool(enabled) != _enabled:
-        _enabled = bool(enabled)
-        jax.clear_caches()
-
-
-def is_enabled() -> bool:
-    return _enabled
-
-
 def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
     """`function` with the functions of `factorizations`, and if wanted with those of
     `trigonometry`, in place of those of `jnp`.
 
     It is traced anew at every call, so it may close over tracers. What is written with `jax.lax`
     counts too, and so does what is inside of `jit`, `cond`, `while_loop` and `scan`. Away from
-    CPU, and after `enable_vector_math(False)`, `function` is called as it is.
+    CPU `function` is called as it is.
 
     **Arguments:** `function`, from pytrees of arrays or numbers to a pytree of arrays or numbers.
 
@@ -84,7 +58,7 @@ def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
 
     @ft.wraps(function, updated=())
     def call(*arguments: Any) -> Any:
-        if not _enabled or not on_cpu():
+        if not on_cpu():
             return function(*arguments)
         # A new function every time: a program of earlier parameters is never taken for this one.
         trace = jax.make_jaxpr(lambda *arguments: function(*arguments), return_shape=True)
