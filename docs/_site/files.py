@@ -52,7 +52,9 @@ def _pages(path: Path) -> dict[str, str | bytes]:
                 name = f"{path.stem}-{len(pictures) + 1}.png"
                 pictures[name] = base64.b64decode(data["image/png"])
                 code = re.sub(r"[\[\]`\n]", " ", source.strip().rsplit("\n", 1)[-1])
-                parts.append(f"![Figure that the code above draws: {code}]({name})")
+                is_wide = int.from_bytes(pictures[name][16:20]) > 800  # (where PNGs have it)
+                kind = "{ .wide }" if is_wide else ""
+                parts.append(f"![Figure that the code above draws: {code}]({name}){kind}")
             elif "text/plain" in data:  # (what a long call said of itself is empty in the end)
                 parts.append(f"```text\n{''.join(data['text/plain'])}\n```")
     return {f"{path.stem}.md": "\n\n".join(parts)} | pictures

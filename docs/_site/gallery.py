@@ -57,7 +57,7 @@ def on_files(files, config):
         words = _words(text, name)
         parts = [
             f"# {title[0].upper()}{title[1:]}\n\n{words}", _moving(name, title, "0s"),
-            f"```python\n{code}```", f"![{_alt(title)}](../images/gallery/{name}.png)",
+            f"```python\n{code}```", f"![{_alt(title)}](../images/gallery/{name}.png){{ .wide }}",
             f"| number | value |\n|---|---|\n{about}",
             "[All models, and the meaning of the numbers](../gallery.md)",
         ]  # fmt: skip

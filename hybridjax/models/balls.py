@@ -1,7 +1,5 @@
 """Balls that bounce: on fixed ground, on a vibrating paddle, and in a row on a shaken table."""
 
-import itertools
-
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -34,10 +32,6 @@ class BouncingBall(HybridSystem):
     def transitions(self):
         bounced = lambda t, q, u: (0.0, -self.restitution * q[1])  # noqa: E731
         return (Transition("bounce", "fall", "fall", lambda t, q, u: q[0], reset=bounced),)
-
-    def draw(self, chart, t, q):
-        ground = [(-0.5, 0.0), (0.5, 0.0)]
-        return Drawing({"ground": ground}, circles={"ball": (0.0, q["y"] + 0.05, 0.05)})
 
 
 class PaddleJuggler(HybridSystem):
@@ -168,15 +162,6 @@ class BouncingChain(HybridSystem):
 
     def period(self):
         return self.T
-
-    def draw(self, chart, t, q):
-        places = [(0.6 * i, q[f"y{i + 1}"] + 0.1) for i in range(self.n)]
-        springs = [Drawing.spring(a, b, 0.04) for a, b in itertools.pairwise(places)]
-        lines: dict = {f"spring {i + 1}": spring for i, spring in enumerate(springs)}
-        for i, (x, _) in enumerate(places):
-            height, _ = ChainContact(self, i).table(t)
-            lines[f"table {i + 1}"] = [(x - 0.2, height), (x + 0.2, height)]
-        return Drawing(lines, circles={f"mass {i + 1}": (*p, 0.1) for i, p in enumerate(places)})
 
     def guess(self):
         """The cycle of masses that are not coupled (see `PaddleJuggler.exact`)."""

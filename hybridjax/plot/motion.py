@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, FilePath, Positive, SignalNames
+from .._core.boundary.kinds import FilePath, Positive, SignalNames
 from .._core.executor import to_host
 from .._core.results import Result
 from .._core.writing import replacing
@@ -32,7 +32,7 @@ from ..systems.structure import Structure
 from ..systems.system import Guess
 from .film import BODY, frames, gif, player
 from .look import COLORS, CYCLE, axis_of, close_in_notebook, style
-from .orbit import CHARTS, by_chart, cycle as draw_cycle, plane_of, require_same_system
+from .orbit import CHARTS, at_events, by_chart, cycle as draw_cycle, plane_of, require_same_system
 from .over_parameters import branch as draw_branch
 from .pictures import Pictures, drawing_of
 from .plane import multipliers as draw_multipliers
@@ -144,7 +144,6 @@ def animate(
     perturbed: Trajectory | ExperimentData | None = None,
     traces: SignalNames | None = None,
     speed: Positive | None = None,
-    fps: Count = 25,
 ) -> Motion:
     """Animate a motion: the mechanism, its orbit in a plane, states over time, and multipliers.
 
@@ -167,7 +166,6 @@ def animate(
         a picture, else up to four states.
     - `speed`: multiple of real speed. Default: 1. A motion of less than 0.25 s or more than 20 s,
         or without a unit of time, takes 2 s over `speed`.
-    - `fps`: frames per second. Default: 25.
 
     **Returns:** an animation of matplotlib, which a notebook shows. Its method `save` writes a GIF,
     an MP4 or a page.
@@ -175,8 +173,9 @@ def animate(
     **Raises:** `DefinitionError` for a name that does not exist, a cycle that was not found, and
     sections or a perturbed motion of another system.
     """
+    rate = 25  # frames per second
     if isinstance(motion, Branch):
-        return _of_branch(motion, x, y, 1 / fps / (speed or 1.0))
+        return _of_branch(motion, x, y, 1 / rate / (speed or 1.0))
     cycle = motion if isinstance(motion, LimitCycle) else None
     if cycle is not None and (code := Result(int(cycle.result))) != Result.OK:
         raise DefinitionError(f"a cycle that was not found cannot be animated ({code.message}).")
@@ -200,8 +199,8 @@ def animate(
     period = math.inf if cycle is None else float(cycle.period)
     last = perturbed or path
     length = period if cycle is not None and perturbed is None else float(np.ptp(last.t))
-    pace = _pace(length, unit, speed)
-    times = np.linspace(0, length, max(12, round(length / pace * fps)), endpoint=False)
+    pace, note = _pace(length, unit, speed)
+    times = np.linspace(0, length, max(12, round(length / pace * rate)), endpoint=False)
     begin = last.t[0] + times
     tracks = [Track("cycle" if perturbed else "", CYCLE[0], path, begin, period)]
     if perturbed is not None:
@@ -212,7 +211,7 @@ def animate(
         cells = (grid[1, 0] if has_picture else grid[:, 0]).subgridspec(len(names), 1, hspace=0.05)
         axes = [figure.add_subplot(cells[i]) for i in range(len(names))]
         parts = _traces(axes, tracks, names, events)
-        axes[0].set_title(_label(pace, unit), loc="right")
+        axes[0].set_title(note, loc="right")
         if has_picture:
             cells = grid[0, 0].subgridspec(1, len(tracks))
             for i, track in enumerate(tracks):
@@ -250,17 +249,13 @@ def _sheet() -> tuple[Figure, Any]:
     return figure, figure.add_gridspec(2, 2, **borders, **ratios, wspace=0.3, hspace=0.3)
 
 
-def _pace(length: float, unit: str, speed: float | None) -> float:
-    """Units of the system's time in a second of playback."""
-    real = length * _SECONDS.get(unit, 0.0)
+def _pace(length: float, unit: str, speed: float | None) -> tuple[float, str]:
+    """Units of the system's time in a second of playback, and a note if that is not real speed."""
+    pace, real = length / 2 * (speed or 1.0), length * _SECONDS.get(unit, 0.0)
     if real and (speed is not None or 0.25 <= real <= 20):
-        return (speed or 1.0) / _SECONDS[unit]
-    return length / 2 * (speed or 1.0)
-
-
-def _label(pace: float, unit: str) -> str:
-    real = pace * _SECONDS.get(unit, 0.0)
-    return f"{real:.2g} x real speed" if real and abs(real - 1) > 1e-9 else ""
+        pace = (speed or 1.0) / _SECONDS[unit]
+    share = pace / length * real
+    return pace, f"{share:.2g} x real speed" if real and abs(share - 1) > 1e-9 else ""
 
 
 def _picture(ax: Axes, track: Track) -> list[Part]:
@@ -370,12 +365,11 @@ def portrait(above: Axes, below: Axes, s: Structure, plane: tuple[str, str]) -> 
         for a, line in enumerate(orbits):
             line.set_data(curves.get(a, ([], [])))
             line.set_linestyle("-" if cycle.stable else "--")
-        rows = np.flatnonzero(path.event >= 0)
-        ends = observed(s, plane, path.t[rows], path.chart[rows - 1], path.before[rows])
-        marks.set_data(ends)
+        events, ends, _ = at_events(path, *plane)
+        marks.set_data(ends.T)
         for g, note in enumerate(notes):
-            note.set_visible(g in path.event[rows])
-        for g, end in zip(path.event[rows], ends.T, strict=True):
+            note.set_visible(g in events)
+        for g, end in zip(events, ends, strict=True):
             notes[g].xy = end
         points.set_data(cycle.multipliers.real, cycle.multipliers.imag)
         return [*orbits, marks, *notes, points]

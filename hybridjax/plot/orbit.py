@@ -10,7 +10,7 @@ from matplotlib.patheffects import withStroke
 
 from .._core.boundary.checked import checked
 from ..engine import kernels
-from ..engine.trajectory import Trajectory
+from ..engine.trajectory import Trajectory, observed
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import PlacedSections
@@ -114,32 +114,26 @@ def by_chart(trajectory: Trajectory, x: str, y: str) -> dict[int, Float[np.ndarr
     return {a: x for a, x in curves.items() if np.isfinite(x).all(axis=0).any()}
 
 
-def _points(s: Structure, a: int, names, t, q) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places of states (n, L) of chart a in the plane, and their rates: (L, 2) each."""
-    q, u = q[: s.dims[a]], np.zeros((s.nu, 1))
-    flow = kernels.field(s, a, t, q, u)[:, 0]
-    point, by_time, *by_state = np.moveaxis(
-        kernels.outputs(s, a, tuple(s.resolve_outputs(names).items), t, q, u), 1, 0
-    )
-    rate = by_time + sum(x * f for x, f in zip(by_state, flow, strict=False))
-    return point.T, rate.T
+def at_events(path: Trajectory, *names: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the transitions (e,) of the events, and the points (e, n) before and after each."""
+    rows, s = np.flatnonzero(path.event >= 0), path.structure
+    before = observed(s, names, path.t[rows], path.chart[rows - 1], path.before[rows]).T
+    after = observed(s, names, path.t[rows], path.chart[rows], path.after[rows]).T
+    return path.event[rows], before, after
 
 
 def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
     texts: dict[tuple, dict[str, None]] = {}  # names of what happens at a point
-    for k in np.flatnonzero(orbit.event >= 0):
-        transition = s.transitions[orbit.event[k]]
-        a, b = s.chart_index(transition.source), s.chart_index(transition.target)
-        (before,), _ = _points(s, a, names, orbit.t[k : k + 1], orbit.before[k][:, None])
-        (after,), _ = _points(s, b, names, orbit.t[k : k + 1], orbit.after[k][:, None])
+    for g, before, after in zip(*at_events(orbit, *names), strict=True):
+        name = s.transitions[g].name
         if not np.all(np.isfinite([before, after])):
             continue
         if np.any(np.abs(after - before) > 1e-9 * (1 + np.abs(before))):
             ax.plot(*np.stack([before, after], axis=1), "--", color="black", lw=0.8, zorder=2)
             ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
         ax.plot(*before, "o", ms=4, color="black", zorder=5)
-        if not any(transition.name in there for there in texts.values()):
-            texts.setdefault(tuple(before.round(9)), {})[transition.name] = None
+        if not any(name in there for there in texts.values()):
+            texts.setdefault(tuple(before.round(9)), {})[name] = None
     ax.autoscale_view()
     drawn = [*ax.transData.transform(np.transpose(orbit(*names)[1:]))]
     for point, there in texts.items():
@@ -195,9 +189,13 @@ def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tup
     lanes, normals = placed.lanes, np.asarray(placed.normal)
     charts, times, states = (np.asarray(v) for v in (lanes.chart, lanes.t, lanes.q))
     points, rates = np.empty((2, len(charts), 2))
-    for a in np.unique(charts):
+    items = tuple(s.resolve_outputs(names).items)
+    for a in np.unique(charts).tolist():
         mask = charts == a
-        points[mask], rates[mask] = _points(s, int(a), names, times[mask], states[:, mask])
+        at = times[mask], states[: s.dims[a], mask], np.zeros((s.nu, 1))
+        flow = kernels.field(s, a, *at)[:, 0]
+        points[mask], by_time, *by_state = kernels.outputs(s, a, items, *at).transpose(1, 2, 0)
+        rates[mask] = by_time + sum(x * f[:, None] for x, f in zip(by_state, flow, strict=False))
     for a, normal, point, rate in zip(charts, normals, points, rates, strict=True):
         states = s.charts[a].states
         inside = [1 + states.index(name) for name in names if name in states]

@@ -72,7 +72,7 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
     t, x = motion("x")
     assert abs(motion.t[-1] - 2 * math.pi) < 1e-8 and np.abs(x - np.cos(t)).max() < 1e-3
     assert np.abs(motion.after[:, 0] - np.cos(motion.t)).max() < 1e-9
-    assert len(hj.plot.animate(motion, "x", "y", fps=4).times) > 4
+    assert len(hj.plot.animate(motion, "x", "y").times) > 4
 
     class Falls(Circle):
         def step(self, u, duration):
