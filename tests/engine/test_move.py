@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
@@ -54,30 +53,6 @@ def test_reverse_mode_and_second_derivatives_have_a_closed_form():
     slope, exact = jax.jit(lambda x: (jax.jacfwd(ball_exact)(x), jax.hessian(ball_exact)(x)))(X)
     np.testing.assert_allclose(first, slope, rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
-
-
-def hopper(x):
-    """Body of the lossy hopper after a touchdown; x = (q, input, retention, stiffness, end)."""
-    system = hj.models.VerticalHopper(retention=x[5], k=x[6])
-    return flow(system, "flight", x[:4], x[4:5], jnp.asarray(0.3), x[7])[0][:2]
-
-
-H = jnp.array([1.58, 1.2, 0.13, -4.1, 0.1, 0.8, 10.0, 0.45])
-
-
-def differences(f, x, e=1e-4):
-    """Derivative by central differences of fourth order."""
-    step = [(f(x + e * d) - f(x - e * d)) / (2 * e) for d in np.eye(len(x))]
-    wide = [(f(x + 2 * e * d) - f(x - 2 * e * d)) / (4 * e) for d in np.eye(len(x))]
-    return (4 * np.stack(step, -1) - np.stack(wide, -1)) / 3
-
-
-@pytest.mark.slow
-def test_second_derivatives_through_a_touchdown_that_loses_speed():
-    first = jax.jit(jax.jacfwd(hopper))
-    np.testing.assert_allclose(first(H), jax.jit(jax.jacrev(hopper))(H), rtol=1e-12, atol=1e-13)
-    hessian = jax.jit(jax.jacfwd(jax.jacfwd(hopper)))(H)
-    np.testing.assert_allclose(hessian, differences(first, H), atol=1e-7)
 
 
 def test_lanes_fail_one_by_one():
