@@ -35,15 +35,17 @@ Items = tuple[str | Output, ...]
 
 # Lanes of programs that are called for many points at once. Higher: single points wait for lanes
 # that nobody needs. Lower: many points take more calls.
-_POINTS = 16
+POINTS = 16
 # Lanes of programs for systems side by side. More: the last call has more empty lanes. Fewer: calls
 # cost more than they compute.
 WIDE = 256
 
 
-def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
+def field(
+    s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None, lanes: int = POINTS
+) -> Expanded:
     """The field of chart a, and its derivatives (on the host)."""
-    return s.kernel(_field, _expanded, a, lanes=_POINTS)(t, q, u, some=some)
+    return s.kernel(_field, _expanded, a, lanes=lanes)(t, q, u, some=some)
 
 
 def step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: Some = None) -> Step:
@@ -62,7 +64,7 @@ def step_along(
 def linear_step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
     states, inputs and length of the step."""
-    return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=_POINTS)(t, q, u, h)
+    return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=POINTS)(t, q, u, h)
 
 
 def watched(
@@ -74,13 +76,14 @@ def watched(
     u: Inputs,
     index: Int[Array, " #L"],
     some: Some = None,
+    lanes: int | None = None,
 ) -> Expanded:
     """The guards of chart a, and the level if it has one, with their derivatives."""
     static = a, s.guard_kinds(a)
     if not on_host(q):
         return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(t, q, u, index)
     # (A program for many points is worth its compilation from so many calls on.)
-    lanes = 1 if q.shape[-1] < 4 * _POINTS else _POINTS
+    lanes = lanes or (1 if q.shape[-1] < 4 * POINTS else POINTS)
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
@@ -92,10 +95,12 @@ def reset(s: Structure, g: Member, t: Times, q: States, u: Inputs, some: Some = 
     return s.by_lane(ft.partial(_reset, g.kind))(t, q, u, g.place)[:, None]
 
 
-def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Array, " L"]:
+def enabled(
+    s: Structure, g: Member, t: Times, q: States, u: Inputs, lanes: int = 1
+) -> Bool[Array, " L"]:
     """Test whether the predicates of transitions of one kind hold."""
     of_lanes = (
-        s.kernel(_enabled, by_lane, g.kind)
+        s.kernel(_enabled, by_lane, g.kind, lanes=lanes)
         if on_host(q)
         else s.by_lane(ft.partial(_enabled, g.kind))
     )
@@ -118,7 +123,7 @@ def linear(
     """A vector function (chart, structure, *trees, t, q, u) of chart a, and its derivatives."""
     if not on_host(q):
         return s.by_lane(_columns(ft.partial(function, a), 1 + len(trees)), *trees)(t, q, u)
-    lanes = _POINTS if q.shape[-1] < 16 * _POINTS else 4 * _POINTS
+    lanes = POINTS if q.shape[-1] < 16 * POINTS else 4 * POINTS
     return s.kernel(function, _expanded, a, trees=trees, lanes=lanes)(t, q, u)
 
 
@@ -126,7 +131,7 @@ def levels(
     s: Structure, a: int, levels: AbstractLevels, n_sections: int, t: Times, q: States
 ) -> Float[Array, "N 2 L"]:
     """The levels of all sections in chart a, and their rates along the flow."""
-    return s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=_POINTS)(t, q)
+    return s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=POINTS)(t, q)
 
 
 # Functions of a point, by what is static, the structure, and other trees. (They belong to the
@@ -222,7 +227,7 @@ class Tangents(Structure):
             still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
             along = [self._along[1] if x is self._levels else still(x) for x in trees]
             every, along = (self._plain, *trees), (self._along[0], *along)
-            return kernel(function, _Tangent(form, moving), static, (every, along), 4 * _POINTS)
+            return kernel(function, _Tangent(form, moving), static, (every, along), 4 * POINTS)
 
         of_lanes = self.once((function, form, static), trees, make)
 

@@ -11,10 +11,11 @@ import numpy as np
 from jax.extend import core as jex
 from jaxtyping import Float
 
-from .._core.compilation import kind, quick_jit
+from .._core.compilation import kind
 from .._core.meaning import is_of_package
 from ..systems.solver import Method
-from ..systems.structure import Member, Structure, stacked
+from ..systems.structure import Structure
+from . import kernels
 from .cubic import interpolate
 from .settings import ROUNDING, Settings
 
@@ -26,9 +27,12 @@ _SMOOTH = frozenset(
     "dynamic_slice squeeze stack unstack split transpose".split()
 )
 _CALLS = frozenset("jit pjit closed_call core_call".split())
-# Pieces of a step, each with four points, and four times as many on cycles. Fewer: short pulses are
-# missed. More: time.
-_PIECES = 64
+# Operations that may have poles. Beside these, values fall as powers of the distance, so that few
+# points in a step see them.
+_POLES = frozenset(("div", "integer_pow"))
+# Pieces of a step, each with four points, and four times as many on cycles, but few if there may be
+# poles only. Fewer: short pulses are missed. More: time.
+_PIECES, _FEW = 64, 32
 # In a step, the integrals of a rate and of a polynomial through eight of its values may differ by
 # so many times the accuracy, and those of a gain, whose kinks no step meets, by this part of the
 # integral over all steps. Smaller: kinks are refused. Larger: pulses with this effect are missed.
@@ -70,6 +74,9 @@ def sudden(program: jex.Jaxpr) -> Iterator[tuple[str, Any]]:
         moves = [isinstance(x, jex.Var) and x in moving for x in equation.invars]
         if any(moves):
             moving.update(equation.outvars)
+            if equation.params.get("name") == "solve_positive":
+                yield "div", equation  # (it decides only whether the solution is NaN)
+                continue
             calls = jex.jaxprs_in_params(equation.params)
             yield from ((name, equation) for call in calls for name, _ in sudden(call))
             if not _is_smooth(equation, moves):
@@ -97,6 +104,8 @@ def _is_smooth(equation: Any, moves: list[bool]) -> bool:
             return not moves[0]
         case "integer_pow":
             return equation.params["y"] > 0
+        case "scatter-add":
+            return not moves[1]
         case name:
             # (JAX 0.11 leaves calls without results in a program.)
             real = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars)
@@ -124,7 +133,8 @@ def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np
     """Test which of the steps that begin at some rows, in chart a, pass over a pulse of each rate,
     gain and guard: over what a polynomial through eight of its values in the step lacks."""
     s, n, legendre = path.structure, path.structure.dims[a], np.polynomial.legendre
-    m, pieces = n * (1 + s.nu), 4 * _PIECES if linear else _PIECES
+    m, only_poles = n * (1 + s.nu), may_have_pulses(s, a) <= _POLES
+    pieces = _FEW if only_poles else 4 * _PIECES if linear else _PIECES
     (x, _), (y, w) = legendre.leggauss(8), legendre.leggauss(4)
     fine = 2 * (np.arange(pieces)[:, None] + (y + 1) / 2).ravel() / pieces - 1
     polynomial = legendre.legvander(fine, 7) @ np.linalg.inv(legendre.legvander(x, 7))
@@ -136,13 +146,14 @@ def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np
         h = np.diff(path.t)[k, None, None]
         q = interpolate(nodes, h, *(x[k, None, :n] for x in ends))
         points = np.concatenate([path.t[k, None, None] + h * nodes, q], axis=2)
-        values = values_at(s, a, points.reshape(-1, 1 + n), u).reshape(*points.shape[:2], -1)
+        values = values_at(s, a, points.reshape(-1, 1 + n), u, bool(may_be_sudden(s, a, _guards)))
+        values = values.reshape(*points.shape[:2], -1)
         rates, (guards, enabled) = values[:, 8:, :m], np.split(values[:, 8:, m:], 2, axis=2)
         beside = rates - polynomial @ values[:, :8, :m]
         low = guards < -_NEAR * np.abs(guards).max(axis=(0, 1))
         falls = (low & (np.maximum.accumulate(guards, 1) > 0) & (enabled > 0)).any(axis=1)
         moved, passed = h[:, 0] * (weights @ np.abs(rates)), h[:, 0] * np.abs(weights @ beside)
-        if linear and len(k) > 1:
+        if linear and len(k) > 1 and not only_poles:
             pairs = np.concatenate([rates[:-1, :, n:], rates[1:, :, n:]], axis=1)
             off = np.abs(np.einsum("pf,kfj->kpj", probes, pairs)).max(axis=1, initial=0.0)
             off = np.where(np.diff(k)[:, None] == 1, h[:-1, 0] * off, 0.0)
@@ -188,35 +199,37 @@ def column_name(s: Structure, a: int, j: int) -> str:
     return f"guard of '{s.transitions[s.guards(a)[j - n * (1 + s.nu)]].name}'"
 
 
-def values_at(s: Structure, a: int, points: Points, u: Float[np.ndarray, " nu"]):
-    """The field of chart a at points, its derivatives by the inputs, the guards, and whether their
-    predicates hold."""
-    calls = np.split(points, range(_POINTS, len(points), _POINTS))
-    fill = lambda x: np.pad(x, [(0, _POINTS - len(x)), (0, 0)], "edge")  # noqa: E731
-    return np.concatenate([np.asarray(_values(s, a, fill(x), u))[: len(x)] for x in calls])
+def values_at(s: Structure, a: int, points: Points, u: Float[np.ndarray, " nu"], guards=False):
+    """The field of chart a at points and its derivatives by the inputs; if so asked, the `guards`
+    and whether their predicates hold, too."""
 
-
-def may_have_pulses(s: Structure, a: int) -> bool:
-    """Test whether the field or a guard of chart a may jump or have pulses."""
-    return bool(may_be_sudden(s, a, _field_and_guards))
-
-
-def _field_and_guards(s: Structure, a: int, *point: Any) -> Any:
-    return stacked([s.field(a, *point), *s.guard_values(s.guard_kinds(a), *point)])
-
-
-@quick_jit
-def _values(s: Structure, a: int, points, u):
-    kinds = s.guard_kinds(a)
+    lanes = kernels.POINTS if may_have_pulses(s, a) <= _POLES else kernels.WIDE
 
     def at(x):
-        point, field = (x[0], x[1:], u), lambda u: s.field(a, x[0], x[1:], u)
-        holds = lambda kind: lambda k: s.enabled(Member(kind, k), *point) * 1.0  # noqa: E731
-        enabled = [jax.vmap(holds(kind))(np.arange(len(kind))) for kind in kinds]
-        gains = jnp.ravel(jax.jacfwd(field)(u))
-        return stacked([field(u), gains, *s.guard_values(kinds, *point), *enabled])
+        point, n = (x[:, 0], x[:, 1:].T, u[:, None]), s.dims[a]
+        by = kernels.field(s, a, *point, lanes=lanes)
+        rows = [by[:, 0], by[:, 2 + n :].reshape(-1, len(x))]
+        if guards:
+            members, first = map(s.member, s.guards(a)), np.zeros(1, int)
+            rows += [kernels.watched(s, a, None, *point, first, lanes=lanes)[:, 0]]
+            rows += [kernels.enabled(s, x, *point, lanes=lanes)[None] for x in members]
+        return np.concatenate(rows).T
 
-    return jax.vmap(at)(points)
+    return np.concatenate([at(x) for x in np.split(points, range(_POINTS, len(points), _POINTS))])
+
+
+def may_have_pulses(s: Structure, a: int) -> frozenset[str]:
+    """Names of the operations by which the field or a guard of chart a may jump or have pulses."""
+    return may_be_sudden(s, a, Structure.field) | may_be_sudden(s, a, _guards)
+
+
+def may_jump(s: Structure, a: int) -> bool:
+    """Test whether the field of chart a may jump."""
+    return bool(may_be_sudden(s, a, Structure.field) - _POLES)
+
+
+def _guards(s: Structure, a: int, *point: Any) -> Any:
+    return s.guard_values(s.guard_kinds(a), *point)
 
 
 def jumps(s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarray, " 1+n"]):

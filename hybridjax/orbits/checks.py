@@ -207,7 +207,7 @@ def check_jumps(cycle: LimitCycle) -> None:
     if path.event[-1] < 0:  # the cycle may begin where the field jumps
         t, chart, q = (np.concatenate([x, x[1:2]]) for x in (t, chart, q))
         t[-1] += period
-    for a in charts:
+    for a in (a for a in charts if unresolved.may_jump(s, a)):
         k = np.flatnonzero((chart[1:] == a) & (chart[:-1] == a) & (np.diff(t) > 0))
         points = np.column_stack([t, q[:, : s.dims[a]]])
         sizes = np.append(period, scale[a, : s.dims[a]])

@@ -60,7 +60,9 @@ def return_map_near(
     the flow does not lead from it to the section and back, or nothing moves.
     """
     system, period = s.system, s.system.period()
-    guess = system.guess() if guess is None else guess
+    # (JAX would compile each operation on numbers of its own.)
+    near = lambda x: np.asarray(x) if isinstance(x, jax.Array) and not x.ndim else x  # noqa: E731
+    guess = jax.tree_util.tree_map(near, system).guess() if guess is None else guess
     if guess is None:
         raise DefinitionError(f"{type(system).__name__} has no guess: pass `Guess(chart, state)`.")
     time, (a,), q, *_ = lanes = lane_at(s, guess.chart, guess.state, guess.time, "the guess")
