@@ -155,8 +155,9 @@ def to_harmonic_state_space(
     s, period = map.structure, map.expected
     z, _, columns = asked(s, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, 0.25 / (order or _ORDERS[-1]))
-    jumps = flow.jumps.by_state - np.eye(s.d), flow.jumps.by_input
-    if any(np.abs(x).max() > 1e-9 for x in jumps):
+    sizes = flow.size[:, None] / np.roll(flow.size, -1, axis=0)[:, :, None]
+    jumps = (flow.jumps.by_state - np.eye(s.d)) * sizes
+    if np.abs(jumps).max() > 1e-9 or flow.jumps.by_input.any():
         raise DefinitionError(
             f"{type(s.system).__name__} has events at which deviations jump, which no finite "
             "number of harmonics represents: use `cycle.htf`, which is exact."

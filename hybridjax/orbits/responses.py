@@ -106,18 +106,14 @@ class Coupling(eqx.Module):
         values = self([x.lead for x in self._slope._zeros()] or [0.0])
         return float(values.min()), float(values.max())
 
-    def locked(self, detuning: float = 0.0, mutual: bool = False) -> tuple[Locked, ...]:
-        """The leads at which the phases stay together.
+    def locked(self, mutual: bool = False) -> tuple[Locked, ...]:
+        """The leads at which the phases stay together, if the push has the frequency of the cycle.
 
-        **Arguments:**
-
-        - `detuning`: frequency of the push less that of the cycle, per strength. Default: 0.
-        - `mutual`: whether the push comes from an equal cycle that is pushed in return. Default:
-            False.
+        **Arguments:** `mutual`: whether the push comes from an equal cycle that is pushed in
+        return. Default: False.
         """
         c = to_host(self.coefficients)
-        c = np.conj(c) - c if mutual else -c
-        return Coupling(c + detuning * (np.arange(len(c)) == 0))._zeros()
+        return Coupling(np.conj(c) - c if mutual else -c)._zeros()
 
     @property
     def _slope(self) -> "Coupling":

@@ -1,6 +1,5 @@
 """Pictures of a trajectory: the shapes of `HybridSystem.draw`, where the motion has taken them."""
 
-import functools
 import math
 from typing import Any
 
@@ -54,10 +53,9 @@ class Pictures:
 
     def _seen(self, t, origin, drawings: list[Drawing]) -> list[Drawing]:
         ways = np.pad(origin - self.camera(t), ((0, 0), (0, 1)))  # (a radius stays)
-        moved = lambda x, by: x + by[: x.shape[-1]]  # noqa: E731
         return [
-            jax.tree_util.tree_map(functools.partial(moved, by=by), drawing)
-            for drawing, by in zip(drawings, ways, strict=True)
+            jax.tree_util.tree_map(lambda x, way=way: x + way[: x.shape[-1]], drawing)
+            for drawing, way in zip(drawings, ways, strict=True)
         ]
 
 

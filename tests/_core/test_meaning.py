@@ -17,8 +17,6 @@ WAYS = {
     "a global of a helper": ("K = 1.0\ndef h(x): return K * x\ndef f(x): return h(x)", "K = 2.0"),
     "a global in an inner function": ("K = 1\ndef f(x): return (lambda y: K * y)(x)", "K = 2"),
     "a helper anew": ("def h(x): return x\ndef f(x): return h(x)", "def h(x): return 2 * x"),
-    "an entry of a list": ("K = [1.0]\ndef f(x): return K[0] * x", "K[0] = 2.0"),
-    "an entry of a dict": ("K = {'k': [1.0]}\ndef f(x): return K['k'][0]", "K['k'][0] = 2.0"),
     "an array in place": ("import numpy as np\nK = np.ones(3)\ndef f(x): return K * x", "K[1] = 2"),
     "an array of objects": (
         "import numpy as np\nK = np.array([{'k': 1}, None])\ndef f(x): return K[0]['k'] * x",
@@ -86,7 +84,6 @@ WAYS = {
         "os.environ['K'] = '2'",
     ),
     "True for 1": ("K = 1\ndef f(x): return K + x", "K = True"),
-    "1.0 for 1": ("K = 1\ndef f(x): return K + x", "K = 1.0"),
     "-0.0 for 0.0": ("K = 0.0\ndef f(x): return K + x", "K = -0.0"),
     "another type of array": (
         "import numpy as np\nK = np.ones(2)\ndef f(x): return K",

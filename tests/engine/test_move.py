@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
@@ -54,79 +53,6 @@ def test_reverse_mode_and_second_derivatives_have_a_closed_form():
     slope, exact = jax.jit(lambda x: (jax.jacfwd(ball_exact)(x), jax.hessian(ball_exact)(x)))(X)
     np.testing.assert_allclose(first, slope, rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
-
-
-class Falling(hj.Chart):
-    states = "y", "v"
-    pull: jax.Array
-
-    def field(self, t, q, u):
-        return q[1], -self.pull
-
-
-class Juggler(hj.models.PaddleJuggler):
-    """A system whose charts hold values that `charts` computes."""
-
-    def charts(self):
-        return {"fall": Falling(2 * self.g / 2)}
-
-
-def juggler(x):
-    """Ball and paddle, x = (y0, v0, A, restitution, input, end): guard and reset change in time."""
-    system = Juggler(A=x[2], restitution=x[3])
-    return flow(system, "fall", x[:2], x[4:5], jnp.asarray(0.56), x[5])[0]
-
-
-def fall(y, v, t):
-    return y + v * t - 9.81 * t**2 / 2, v - 9.81 * t
-
-
-def impact(y, v, A, a, u, start):
-    """Time until the impact, height and speed after it."""
-    table = lambda t: A * jnp.sin(2 * jnp.pi * (t + start))  # noqa: E731
-    t = jnp.asarray(0.5)
-    for _ in range(10):
-        height, rate = jax.jvp(lambda t: fall(y, v, t)[0] - table(t), (t,), (1.0,))
-        t = t - height / rate
-    y, v = fall(y, v, t)
-    return t, y, -a * v + (1 + a) * (jax.grad(table)(t) + u)
-
-
-def juggler_exact(x):
-    t, y, v = impact(*x[:5], 0.56)
-    return jnp.stack(fall(y, v, x[5] - 0.56 - t))
-
-
-@pytest.mark.slow
-def test_reverse_mode_through_an_impact_on_a_moving_paddle():
-    x = jnp.array([1.3, 0.1, 0.15, 0.7, 0.05, 1.3])
-    found, value = jax.jit(jax.jacrev(lambda x: (juggler(x),) * 2, has_aux=True))(x)
-    np.testing.assert_allclose(value, juggler_exact(x), rtol=1e-12)
-    np.testing.assert_allclose(found, jax.jacfwd(juggler_exact)(x), rtol=1e-10, atol=1e-11)
-
-
-def hopper(x):
-    """Body of the lossy hopper after a touchdown; x = (q, input, retention, stiffness, end)."""
-    system = hj.models.VerticalHopper(retention=x[5], k=x[6])
-    return flow(system, "flight", x[:4], x[4:5], jnp.asarray(0.3), x[7])[0][:2]
-
-
-H = jnp.array([1.58, 1.2, 0.13, -4.1, 0.1, 0.8, 10.0, 0.45])
-
-
-def differences(f, x, e=1e-4):
-    """Derivative by central differences of fourth order."""
-    step = [(f(x + e * d) - f(x - e * d)) / (2 * e) for d in np.eye(len(x))]
-    wide = [(f(x + 2 * e * d) - f(x - 2 * e * d)) / (4 * e) for d in np.eye(len(x))]
-    return (4 * np.stack(step, -1) - np.stack(wide, -1)) / 3
-
-
-@pytest.mark.slow
-def test_second_derivatives_through_a_touchdown_that_loses_speed():
-    first = jax.jit(jax.jacfwd(hopper))
-    np.testing.assert_allclose(first(H), jax.jit(jax.jacrev(hopper))(H), rtol=1e-12, atol=1e-13)
-    hessian = jax.jit(jax.jacfwd(jax.jacfwd(hopper)))(H)
-    np.testing.assert_allclose(hessian, differences(first, H), atol=1e-7)
 
 
 def test_lanes_fail_one_by_one():

@@ -60,9 +60,6 @@ def is_refused(cycle, further):
     "further",
     [
         lambda x: 1e-6 * jnp.mod(x, 1.0),
-        pytest.param(  # a kink beside a jump
-            lambda x: jax.nn.relu(1e-3 * x) + jnp.where(x > 1e-6, 1e-5, 0.0), marks=SLOW
-        ),
         lambda x: jnp.where(jnp.abs(x - 0.5) < 3e-4, 1e-2, 0.0),  # a narrow pulse
         pytest.param(
             lambda x: jax.lax.cond(x > 0, lambda: jnp.where(x > 0.7, 1e-6, 0.0), lambda: 0.0),

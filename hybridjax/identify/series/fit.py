@@ -171,7 +171,6 @@ def fit_series(
     *,
     overhang: Index | None = None,
     start: Literal["free", "cycle"] = "free",
-    errors: Literal["residuals", "white"] = "residuals",
     check: bool = True,
     reference: SignalNames | None = None,
 ) -> SeriesFit:
@@ -192,16 +191,12 @@ def fit_series(
     - `overhang`: number of lags of the numerators beyond d N, with N sections. Default: N.
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
       no input before. Default: "free".
-    - `errors`: source of the covariance. "residuals": the residuals in blocks of successive cycles,
-      also for errors that are correlated (process noise) or depend on the inputs (nonlinear
-      distortion). "white": the variance of the residuals alone. Default: "residuals".
     - `check`: whether to raise an error for an order that the data do not support, and to emit
       `higher_order` as a `FindingWarning`. Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, by
-      instrumental variables, which are consistent for any noise and controller. `start` and
-      `errors` have no effect: the first cycles of each record are not used, and errors may be
-      correlated. Default: None.
+      instrumental variables, which are consistent for any noise and controller. `start` has no
+      effect: the first cycles of each record are not used. Default: None.
 
     **Raises:** `DefinitionError` for records that do not fit together, inputs that are zero, too
     few cycles (the message says how many are needed), or an order that the data do not support.
@@ -229,7 +224,7 @@ def fit_series(
     feedback = tuple(answering(grid, error, records.inputs))
     if check:
         refuse_order(delayed, noise * _noise(solution), feedback)
-    covariance = coefficient_covariance(problem, solution, errors)
+    covariance = coefficient_covariance(problem, solution)
     fit = assemble(problem, solution, covariance, converged)
     # One more multiplier, or a pair.
     more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
@@ -249,7 +244,7 @@ def _of_order(order: int, records: PreparedRecords, fit: SeriesFit, free_start: 
     start = np.pad(fit.coefficients, (0, order - d))
     solution, _ = minimize(problem, start, rough=True)
     _require_freedom(problem, solution)
-    return solution.c, partial(coefficient_covariance, problem, solution, "residuals")
+    return solution.c, partial(coefficient_covariance, problem, solution)
 
 
 def assemble(
@@ -378,10 +373,8 @@ def refuse_order(
 _WHITE_DRAWS, _FILTERED_DRAWS = 4, 16
 
 
-def coefficient_covariance(
-    problem: OutputErrorProblem, solution: Linearization, errors: Literal["residuals", "white"]
-) -> Covariance:
-    """Return the covariance of c; with "residuals" errors may depend on each other and on u."""
+def coefficient_covariance(problem: OutputErrorProblem, solution: Linearization) -> Covariance:
+    """Return the covariance of c, for errors that may depend on each other and on the inputs."""
 
     def draws(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         sampled = part.sampled[:, :, n, :, None]
@@ -390,7 +383,7 @@ def coefficient_covariance(
 
     noise = linearize(problem, solution.c, draws).curvature / _WHITE_DRAWS
     curvature, whole = (solution.curvature - noise).sum(axis=0), solution.curvature.sum(axis=0)
-    if errors == "white" or not np.linalg.eigvalsh(whole)[0] > 0:
+    if not np.linalg.eigvalsh(whole)[0] > 0:
         return sandwich(curvature, whole)
     lags = denominator.correlated_cycles(multipliers_of(solution.c), problem.records.cycles)
     gradient = gradient_covariance(problem, solution, lags + 1)

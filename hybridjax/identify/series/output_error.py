@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from ..._core.execution import on_all_cores
+from ..._core.text import listed
 from ...errors import DefinitionError
 from ..descent import ROUNDING, Coefficients
 from .records import CycleGrid, PreparedRecords, lagged_inputs, start_responses
@@ -118,7 +119,8 @@ class OutputErrorProblem(NamedTuple):
         """**Arguments:** `order`: d. `overhang`: lags of the numerators beyond d N. `free_start`:
         whether the state at the start of records is unknown, or zero.
 
-        **Raises:** `DefinitionError` for records too short for the lags.
+        **Raises:** `DefinitionError` for records too short for the lags, and for inputs that
+        depend on each other.
         """
         N, nu, ny = records.n_sections, len(records.inputs), len(records.outputs)
         lags = records.lead + order * N + overhang + 1
@@ -134,7 +136,14 @@ class OutputErrorProblem(NamedTuple):
                 equal[:, i] &= (grid.sampled == grid.sampled[..., [i]]).all(axis=(0, 1))
             triangles = _with_rows(triangles, grid, lags, records.lead, free)
         alike = [[np.flatnonzero(x).tolist() for x in np.unique(e, axis=0)[::-1]] for e in equal]
-        to_lags = on_all_cores(_independent, triangles)
+        to_lags = on_all_cores(lambda x: _independent(x, nu), triangles)
+        alone = [_independent(triangles[0][:, i::nu], 1).shape[1] for i in range(nu)]
+        # (Ranks of inputs in a narrow band are not exact.)
+        if to_lags[0].shape[1] < min(len(triangles[0]), sum(alone) - min(alone) / 2):
+            raise DefinitionError(
+                f"{listed(records.inputs)} cannot be told apart, because some are functions of the "
+                "others: leave these out."
+            )
         return cls(records, lags, free, to_lags, alike, records.scale)
 
     @property
@@ -178,10 +187,12 @@ def _with_rows(
     return on_all_cores(section, range(len(triangles)))
 
 
-def _independent(triangle: np.ndarray) -> np.ndarray:
-    _, s, vh = np.linalg.svd(triangle, full_matrices=False)
+def _independent(triangle: np.ndarray, nu: int) -> np.ndarray:
+    size = np.linalg.norm(triangle.reshape(-1, nu), axis=0)  # inputs have units of their own
+    size = np.tile(np.where(size > 0, size, 1.0), triangle.shape[1] // nu)
+    _, s, vh = np.linalg.svd(triangle / size, full_matrices=False)
     kept = s > RANK * s.max(initial=0)
-    return vh[kept].T / s[kept]
+    return vh[kept].T / s[kept] / size[:, None]
 
 
 def root_of(gram: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r k"]:

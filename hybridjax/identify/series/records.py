@@ -74,8 +74,8 @@ class PreparedRecords:
     """
 
     def __init__(self, data: RecordedData):
-        """**Raises:** `DefinitionError` as `uninterrupted_records`, and for signals that are zero
-        or missing at every sample."""
+        """**Raises:** `DefinitionError` as `uninterrupted_records`, and for inputs that are
+        zero and outputs that are constant at every sample, or missing."""
         self.records = uninterrupted_records(data)
         about = self.records[0]
         self.n_sections, self.lead = about.n_sections, about.lead
@@ -84,14 +84,18 @@ class PreparedRecords:
         self.cycles = 0
         self.sampled = np.zeros((self.n_sections, len(self.outputs)), int)
         excited, square = np.zeros(len(self.inputs), bool), np.zeros(len(self.outputs))
+        low, high = square + np.inf, square - np.inf
         for grid in self.grids:
             self.cycles = max(self.cycles, grid.y.shape[1])
             self.sampled += grid.sampled.sum(axis=(0, 1))
             excited |= grid.u.any(axis=(0, 1, 2))
             square += (grid.y**2).sum(axis=(0, 1, 2))
-        for name, size in zip(self.inputs + self.outputs, [*excited, *square], strict=True):
-            if not size:
-                raise DefinitionError(f"{name} is zero or missing at every sample: leave it out.")
+            low = np.minimum(low, np.where(grid.sampled, grid.y, np.inf).min(axis=(0, 1, 2)))
+            high = np.maximum(high, np.where(grid.sampled, grid.y, -np.inf).max(axis=(0, 1, 2)))
+        for name, moves in zip(self.inputs + self.outputs, [*excited, *(high > low)], strict=True):
+            if not moves:
+                what = "constant" if name in self.outputs else "zero"
+                raise DefinitionError(f"{name} is {what} or missing at every sample: leave it out.")
         self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / self.sampled.sum(axis=0))
 
     def whole(self) -> CycleGrid:

@@ -75,7 +75,8 @@ def independence_test(
             if count < FEWEST_SAMPLES or not r.any():
                 continue
             size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
-            z[n, :, i] = (U.T @ r / np.where(size > 0, size, 1.0)).reshape(lags, nu)
+            U = U / np.where(size > 0, size, 1.0)  # inputs have units of their own
+            z[n, :, i] = (U.T @ r).reshape(lags, nu)
             left, s, _ = np.linalg.svd(U, full_matrices=False)
             left = left[:, s > RANK * s[0]][:, : count // 2]
             # Explained against unexplained part: an F ratio, as its Gaussian deviate.
