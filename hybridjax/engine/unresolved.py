@@ -29,7 +29,7 @@ _SMOOTH = frozenset(
 _CALLS = frozenset("jit pjit closed_call core_call".split())
 # Operations that may have poles. Beside these, values fall as low powers of the distance, which few
 # points in a step see, unless the program has higher powers than this.
-_POLES, _POWER = frozenset(("div", "integer_pow")), 4
+_POLES, _POWER = frozenset(("div", "integer_pow")), 2
 # Pieces of a step, each with four points, and four times as many on cycles, but few if there may be
 # poles only. Fewer: short pulses are missed. More: time.
 _PIECES, _FEW = 64, 8
