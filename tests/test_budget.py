@@ -30,16 +30,16 @@ PRONOUNS = set(
 # with higher orders; of the tests, 1900 are those of all. (The thirteenth structure is that of
 # a trajectory of a simulator.)
 LIMITS = {
-    "code": 28_870,
+    "code": 28_860,
     "files": 244,
     "longest": 500,
-    "public_names": 186,
+    "public_names": 185,
     "many_parameters": 8,
     "thresholds": 305,
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_815,
+    "test_lines": 17_829,
     "doc_words": 40_878,
 }
 

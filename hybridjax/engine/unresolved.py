@@ -27,9 +27,9 @@ _SMOOTH = frozenset(
     "dynamic_slice squeeze stack unstack split transpose".split()
 )
 _CALLS = frozenset("jit pjit closed_call core_call".split())
-# Operations that may have poles. Beside these, values fall as low powers of the distance, which few
-# points in a step see, unless the program has higher powers than this.
-_POLES, _POWER = frozenset(("div", "integer_pow")), 2
+# Operations that may have poles. Beside these, values fall as the inverse or the inverse square of
+# the distance, which few points in a step see, unless the program has powers beyond squares.
+_POLES = frozenset(("div", "integer_pow"))
 # Pieces of a step, each with four points, and four times as many on cycles, but few if there may be
 # poles only. Fewer: short pulses are missed. More: time.
 _PIECES, _FEW = 64, 8
@@ -81,7 +81,7 @@ def sudden(program: jex.Jaxpr) -> Iterator[tuple[str, Any]]:
             yield from ((name, equation) for call in calls for name, _ in sudden(call))
             if not _is_smooth(equation, moves):
                 yield equation.primitive.name, equation
-            elif equation.params.get("y", 0) > _POWER:
+            if abs(equation.params.get("y", 0)) > 2:
                 yield "power", equation  # (in a denominator it makes pulses)
 
 

@@ -69,7 +69,7 @@ def is_refused(cycle, further):
         lambda x: 1e-4 * x / jnp.abs(x),
         lambda x: 1e-4 * jnp.tanh(1e11 * x),
         lambda x: 1e-3 * jnp.exp(-(((x - 0.5) / 1e-4) ** 2)),
-        lambda x: 1e-3 / (1 + ((x - 0.5) / 1e-4) ** 8),
+        lambda x: 1e-3 * (1 + ((x - 0.5) / 1e-4) ** 2) ** -4,
     ],
 )
 def test_a_jump_is_refused(smooth, further):
