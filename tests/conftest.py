@@ -5,6 +5,7 @@ import os
 import pathlib
 import subprocess
 import sys
+import threading
 
 
 # Said before NumPy and XLA are loaded, here and in the workers of pytest-xdist: threads of BLAS
@@ -142,11 +143,11 @@ def forget_programs():
 def no_compilation(after):
     """A context in which nothing may be compiled, once `after()` has run. Functions of few lanes
     stay on the host in both: by default the seconds that earlier tests have spent there decide."""
-    count, patience = 0, compilation.WORTH_COMPILING
+    threads, patience = [], compilation.WORTH_COMPILING
 
     def listen(event, duration, **_):
-        nonlocal count
-        count += "backend_compile" in event
+        if "backend_compile" in event:
+            threads.append(threading.current_thread().name)
 
     compilation.WORTH_COMPILING = np.inf
     try:
@@ -158,7 +159,7 @@ def no_compilation(after):
             jax.monitoring.unregister_event_duration_listener(listen)
     finally:
         compilation.WORTH_COMPILING = patience
-    assert not count, f"{count} programs were compiled"
+    assert not threads, f"programs were compiled in {threads}"
 
 
 @pytest.fixture(scope="session")

@@ -39,7 +39,7 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_829,
+    "test_lines": 17_830,
     "doc_words": 40_878,
 }
 

@@ -22,16 +22,12 @@ from ..engine import kernels
 from ..engine.target import until
 from ..errors import ComputationError
 from ..systems.structure import Structure
-from ..systems.transition import Scheduled
+from ..systems.transition import TOGETHER, Scheduled
 from .crossing import AtEvent
 from .cycle import LimitCycle
 from .return_map import ReturnMap, Turn
 
 
-# Events coincide if no more than this part of the period lies between them; a guard is due, in
-# another order, if it would be at zero within ten times as much. Smaller: rounding separates events
-# that coincide. Larger: events that are merely close are reported.
-TOGETHER = 1e-9
 # Two results of the flow are the same up to this relative difference: states and derivatives after
 # events in two orders, functions at two times, the period and the durations between sections.
 # Smaller: errors of the flow count as differences. Larger: small differences pass.

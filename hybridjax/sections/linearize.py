@@ -19,12 +19,12 @@ from ..engine import kernels
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.checks import check_outputs
-from ..orbits.coincidence import TOGETHER
 from ..orbits.cycle import LimitCycle
 from ..orbits.linear_flow import of_flow
 from ..orbits.return_map import with_derivatives
 from ..systems.structure import Structure
 from ..systems.system import Output, OutputNames
+from ..systems.transition import TOGETHER
 from .families import AbstractSections, BoundSections, ClockPhase, Orbit, as_family
 from .place import as_placed, place_along, place_sections
 from .placed import PlacedSections, SectionsLike

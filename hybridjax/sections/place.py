@@ -26,12 +26,13 @@ from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
 from ..orbits.checks import check_outputs
-from ..orbits.coincidence import SAME, TOGETHER
+from ..orbits.coincidence import SAME
 from ..orbits.crossing import Crossing, ListLevels, to_section
 from ..orbits.cycle import LimitCycle
 from ..orbits.linear_flow import beginning, of_flow
 from ..orbits.return_map import PATIENCE, ReturnMap
 from ..systems.structure import Structure
+from ..systems.transition import TOGETHER
 from . import families
 from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
 from .placed import PlacedSections, SectionsLike, observe

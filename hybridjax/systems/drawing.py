@@ -30,6 +30,10 @@ def _shapes(*shape: int | None, **options: Any) -> Any:
     return eqx.field(converter=arrays, default_factory=dict, **options)
 
 
+def _velocity(value: ArrayLike | Sequence[ArrayLike]) -> Any:
+    return _array("velocity", value, (2,))
+
+
 class Drawing(eqx.Module):
     """A system seen from the side in one state, as `HybridSystem.draw` returns it.
 
@@ -58,9 +62,7 @@ class Drawing(eqx.Module):
     circles: Mapping[str, Any] = _shapes(3, kw_only=True)
     points: Mapping[str, Any] = _shapes(2, kw_only=True)
     body: str | None = eqx.field(static=True, default=None, kw_only=True)
-    velocity: Any = eqx.field(
-        converter=lambda x: _array("velocity", x, (2,)), default=(0.0, 0.0), kw_only=True
-    )
+    velocity: Any = eqx.field(converter=_velocity, default=(0.0, 0.0), kw_only=True)
 
     def __check_init__(self):
         if self.body is not None and self.body not in {**self.circles, **self.points}:

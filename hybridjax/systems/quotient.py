@@ -18,7 +18,7 @@ from ..errors import DefinitionError
 from .chart import DerivedChart
 from .structure import as_vector
 from .system import Derived, Guess, HybridSystem, Output
-from .transition import Scheduled, Transition
+from .transition import TOGETHER, Scheduled, Transition
 
 
 @checked
@@ -126,7 +126,7 @@ class Quotient(Derived):
             raise DefinitionError(f"Quotient: `half_period` must be {sentence}.")
         for x in self.system.transitions():
             if isinstance(x.guard, Scheduled) and not is_traced(x.guard):
-                if abs(math.remainder(x.guard.offset / x.guard.period, 1.0)) < SAME_TIME:
+                if abs(math.remainder(x.guard.offset / x.guard.period, 1.0)) < TOGETHER:
                     raise DefinitionError(
                         f"Quotient: with `half_period`, '{x.name}' must not be scheduled at t = 0, "
                         "where halves begin: let the clock begin earlier."
@@ -312,11 +312,6 @@ class Quotient(Derived):
         order = [source.index(self._partner(name)) for name in target]
         names = target if back else map(self._partner, target)
         return q[np.array(order)] * np.array([-1.0 if x in self.flipped else 1.0 for x in names])
-
-
-# Distance from the begin of a half, in periods, at which a scheduled transition coincides with it.
-# Smaller: it is missed. Larger: ones that are distinct are refused.
-SAME_TIME = 1e-9
 
 
 def _same(kept: str, q: Any, back: bool = False):

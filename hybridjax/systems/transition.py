@@ -17,6 +17,10 @@ from ..errors import DefinitionError
 
 
 Direction = Literal["falling", "rising"]
+# Times coincide if no more than this part of the period lies between them; a guard is due, in
+# another order of events, if it would be at zero within ten times as much. Smaller: rounding
+# separates events that coincide. Larger: events that are merely close are reported.
+TOGETHER = 1e-9
 
 
 @checked
