@@ -108,7 +108,8 @@ def _svg(shapes: list[str]) -> str:
 
 
 def _line(name: str, frames: list, color: str, about: str = "") -> str:
-    paths = ["M" + " ".join(f"{x:.0f},{y:.0f}" for x, y in z) for z in frames]
+    digits = 0 if len(frames) > 1 else 1  # (many frames make large files)
+    paths = ["M" + " ".join(f"{x:.{digits}f},{y:.{digits}f}" for x, y in z) for z in frames]
     moves = _animated("d", paths, about)
     return f'<path d="{paths[0]}" fill="none" stroke="{color}" stroke-width="2">{moves}</path>'
 
