@@ -124,8 +124,7 @@ def test_bad_input(hopper_cycle, placed_isochrons, design, change, message):
 
 def test_new_values_of_parameters_do_not_compile_again(placed_isochrons, design):
     def run(k):
-        k = jnp.asarray(k, float)
-        placed = eqx.tree_at(lambda p: p.cycle.system.k, placed_isochrons, k)
+        placed = eqx.tree_at(lambda p: p.cycle.system.k, placed_isochrons, jnp.asarray(k))
         hj.run_experiments(placed.cycle, placed, design, OUTPUTS, **BATCH)
 
     # (What was computed for the fixture is kept, but its programs may be forgotten.)
