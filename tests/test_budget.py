@@ -39,7 +39,7 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_830,
+    "test_lines": 17_831,
     "doc_words": 40_878,
 }
 

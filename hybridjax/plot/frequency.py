@@ -139,9 +139,7 @@ def bode(
                 f, values, radius = _values(htf, harmonic, name, input)
                 size, line = np.abs(values), _line(htf, drawn, {"color": color}, label)
                 is_certain = np.full(len(f), True) if radius is None else radius < size
-                is_certain &= (
-                    np.convolve(is_certain, (1, 1, 1), "same") > 1
-                )  # single points: no line
+                is_certain &= np.convolve(is_certain, np.ones(3))[1:-1] > 1  # of a line, no points
                 phase = _phase(f, values, is_certain, reference)
                 reference = f[is_certain], phase[is_certain]
                 upper.plot(f, size, **line)

@@ -62,10 +62,10 @@ def sweep(
 
     If there are several pieces, a coarse pass first finds cycles at points all over the space. A
     piece of neighboring points then starts from these cycles, and continues from its own solved
-    points. A piece does not depend on
-    which process computes it, nor when: results are the same to the last bit for any number of
-    processes and interruptions (on machines of one kind). A point at which the search fails is
-    tried again from the nearest point that succeeded, and after a simulation of the transient.
+    points. A piece does not depend on which process computes it, nor when: results are the same to
+    the last bit for any number of processes and interruptions (on machines of one kind). A point at
+    which the search fails is tried again from the nearest point that succeeded, and after a
+    simulation of the transient.
 
     **Arguments:**
 

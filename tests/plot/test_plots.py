@@ -41,6 +41,7 @@ def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
             np.testing.assert_allclose(line, expected, rtol=1e-9)
     with pytest.raises(hj.DefinitionError, match="model alone"):
         hj.plot.bode(hopper)
+    hj.plot.bode(hopper.htf([0.3]))  # a single frequency
 
 
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):

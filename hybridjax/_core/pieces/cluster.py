@@ -21,7 +21,7 @@ from ...errors import ComputationError, DefinitionError, HybridJaxError
 from ..cache import enable_compilation_cache
 from ..meaning import is_packaged, meaning
 from ..progress import counted, say
-from .store import Memory, ZarrStore
+from .store import ArrayStore, ZarrStore
 
 
 _PACKAGES = ["hybridjax", "jax", "jaxlib", "numpy"]
@@ -33,7 +33,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # options of mallopt
 _lock = threading.Lock()
 
 
-def run_on(client: Any, job: Any, store: Memory | ZarrStore, missing: Sequence[int]) -> None:
+def run_on(client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]) -> None:
     """Compute pieces on the workers of a client.
 
     **Raises:** `DefinitionError` for a client whose workers cannot do it; `ComputationError` for a
@@ -59,7 +59,7 @@ def run_on(client: Any, job: Any, store: Memory | ZarrStore, missing: Sequence[i
         ) from error
 
 
-def _run(client: Client, job: Any, store: Memory | ZarrStore, missing: Sequence[int]) -> None:
+def _run(client: Client, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]) -> None:
     # (As bytes: arrays keep their digits only if the precision is set before they are made.)
     packed = _packed((job, store.address))
     x64 = bool(jax.config.read("jax_enable_x64"))

@@ -4,7 +4,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from ..arguments import package
 from ..progress import counted
-from .store import Memory, ZarrStore, absolute, make_store, open_store
+from .store import ArrayStore, ZarrStore, absolute, make_store, open_store
 
 
 @runtime_checkable
@@ -16,7 +16,7 @@ class DaskClient(Protocol):
     def wait_for_workers(self, n_workers: int) -> Any: ...
 
 
-def fill(job: Any, address: Any = None, client: DaskClient | None = None) -> Memory | ZarrStore:
+def fill(job: Any, address: Any = None, client: DaskClient | None = None) -> ArrayStore | ZarrStore:
     """Compute the pieces of a job that are missing, and return the results.
 
     **Arguments:**
@@ -40,7 +40,7 @@ def fill(job: Any, address: Any = None, client: DaskClient | None = None) -> Mem
         job = job.resume(store.layout, store.start)
     else:
         job, layout = job.begin()
-        store = make_store(address, layout, job.arrays()) if address else Memory(layout)
+        store = make_store(address, layout, job.arrays()) if address else ArrayStore(layout)
     missing = store.missing()
     if missing and client is not None:
         package("distributed")

@@ -109,7 +109,7 @@ class Layout(NamedTuple):
         return (*self.dims, *x.dims), (*self.blocks.shape, *x.shape)
 
 
-class Memory:
+class ArrayStore:
     """Results in memory. (To import Zarr takes a third of a second.)"""
 
     address = None
