@@ -74,6 +74,12 @@ def warn_of(findings: Iterable[Finding]) -> None:
         warnings.warn(repr(finding), FindingWarning, stacklevel=4)
 
 
+def untried_orders(order: int, obstacle: str) -> list[Finding]:
+    """Return a finding if an obstacle was met to trying larger orders than the chosen one."""
+    text = f"orders above {order} could not be tried, since {obstacle}"
+    return [Finding("order", text)] * bool(obstacle)
+
+
 def print_findings(findings: Iterable[Finding], indent: str = "") -> str:
     """Return the findings as text, wrapped at 100 columns."""
     return "\n".join(

@@ -15,6 +15,7 @@ from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validate import Validation, can_be_compared, simulate, validate
 from .data import SectionData
+from .findings import untried_orders, warn_of
 
 
 # Cycles from which orders are chosen and held-out fits are made. More: time. Fewer: weak
@@ -41,30 +42,34 @@ class Split(NamedTuple):
     early: PreparedRecords
     late: list[Record]
 
-    def best_order(self, most: int = 4) -> int:
-        """Choose an order; see `choose_order`."""
-        ends = uninterrupted_records(self.late)
+    def best_order(self, most: int = 4) -> tuple[int, str]:
+        """Choose an order; see `choose_order`. Return it and, if it is the largest that could be
+        tried, the obstacle to a larger one."""
+        ends, N, obstacle = uninterrupted_records(self.late), self.early.n_sections, ""
         fits: list[SeriesFit] = []
-        N = self.early.n_sections
         for d in range(1, most + 1):
             problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
             solution = linearize(problem, total_least_squares(late_outputs(problem, d)))
             if (solution.freedom <= 2 * d).any():
+                obstacle = f"{self.early.sampled.max()} cycles (a quarter is held out) are too few for order "
+                obstacle += f"{d} with {N} sections: record more, or take fewer sections."
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
             if not long:
+                obstacle = f"{max(len(r.u) for r in ends) / N:.3g} cycles, the longest held-out "
+                obstacle += f"record, are too few to test order {d}: record longer without gaps."
                 break
             fits, ends = [*fits, fit], long
         if not fits:
-            text = f"{self.early.cycles} cycles are too few for one multiplier with {N} sections"
-            raise DefinitionError(f"{text}: record more, or take fewer sections.")
+            raise DefinitionError(obstacle)
         grid, misfits = CycleGrid.from_records(ends), []
         for fit in fits:
             error = (simulate(fit, grid, free_start=True) - grid.y) * grid.sampled
             square = (error**2).sum(axis=(0, 1, 2)) / grid.sampled.sum(axis=(0, 1, 2))
             misfits.append(float(np.log(square).mean()) / 2)
-        return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
+        best = 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
+        return best, obstacle if best == len(fits) else ""
 
     def fit(self, order: int, reference: tuple[str, ...] | None = None) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
@@ -79,11 +84,13 @@ def choose_order(data: SectionData) -> int:
     For each number, the model is estimated by total least squares (which is consistent) without the
     held-out strides (see `hold_out`), and then simulates these strides. The result is the smallest
     number, up to four, whose misfit is within 2 % of the best. At most the first 1000 cycles of a
-    recording are used.
+    recording are used. If the data are too few to try a larger number, a warning gives the reason.
 
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
-    return split(data).best_order()
+    order, obstacle = split(data).best_order()
+    warn_of(untried_orders(order, obstacle))
+    return order
 
 
 @checked

@@ -14,7 +14,7 @@ from ..identify.series.fit import SeriesFit, fit_series
 from ..identify.series.in_loop import best_order
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
-from .findings import Finding, refuse
+from .findings import Finding, refuse, untried_orders
 from .fit_warnings import Advice, advise, undamped
 from .held_out import HeldOut, split
 from .impulse import ImpulseResponses, impulse_responses
@@ -115,9 +115,10 @@ def identify_recording(
     refuse(findings)
     say("order")
     data, parts, most = whole.of_inputs(inputs), split(whole), 4 if order is None else order + 2
-    best = best_order(whole, outside, most) if outside else parts.best_order(most)
-    order = best if order is None else order
-    if best > order:
+    best, obstacle = best_order(whole, outside, most) if outside else parts.best_order(most)
+    if order is None:
+        order, findings = best, (*findings, *untried_orders(best, obstacle))
+    elif best > order:
         text = f"held-out strides are predicted better with {best} multipliers than with {order}: "
         text = text if outside is None else f"the reference tells {best} multipliers, not {order}: "
         text += f"{order} may be biased, and their intervals too narrow. Compare order={best}."

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.identify.series.in_loop import best_order
 from hybridjax.identify.series.records import CycleGrid
 from hybridjax.identify.series.residuals import feedback_test
 from hybridjax.identify.validate import simulate
@@ -123,6 +124,8 @@ def test_instruments_of_series_hold_in_the_loop(plant):
     assert not fit.higher_order
     with pytest.raises(hj.DefinitionError, match="the reference tells 2 multipliers, not 3"):
         hj.fit_series(series(plant, 0, noise=0.7), 3, reference="r")
+    assert best_order(series(plant, 0), ("r",), 4) == (2, "")
+    assert "3 times too few" in best_order(series(plant, 0, 20, noise=0.1), ("r",), 4)[1]
 
 
 def test_an_order_that_is_too_low_is_noticed_in_the_loop():

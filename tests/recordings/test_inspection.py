@@ -116,6 +116,11 @@ def test_an_order_that_is_too_low_is_named():
         result = hj.identify_recording(recording, TOP, **names)
         order = [x for x in result.advice.warnings if "Compare order=2" in x.text]
         assert len(order) == named
+    names |= {"order": None, "n_sections": 32}
+    untried = hj.identify_recording(made_up(0), TOP, **names)
+    assert "orders above 1 could not be tried, since 129 cycles" in untried.advice.warnings[0].text
+    with pytest.warns(hj.errors.FindingWarning, match="orders above 1 could not be tried"):
+        hj.recordings.choose_order(untried.data)
 
 
 def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_cycle):

@@ -14,7 +14,6 @@ B is eliminated section by section, and the rest is linear in c.
 
 import dataclasses
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -97,13 +96,18 @@ class Solution(NamedTuple):
     """The number of multipliers that the references tell."""
 
 
-def best_order(data: RecordedData, reference: Sequence[str], most: int) -> int:
-    """Return the largest number of multipliers, up to `most`, all of which the references tell."""
+def best_order(data: RecordedData, reference: Sequence[str], most: int) -> tuple[int, str]:
+    """Return the largest number of multipliers, up to `most`, all of which the references tell, and
+    the obstacle to a larger number, if there was one."""
+    obstacle = ""
     for order in range(most, 1, -1):
-        with suppress(DefinitionError):  # too few cycles for so many
+        try:
             if LoopEquations(*in_loop(data, reference), order, None).solution.told >= order:
-                return order
-    return 1
+                return order, obstacle
+            obstacle = ""
+        except DefinitionError as error:  # too few cycles for so many
+            obstacle = str(error)
+    return 1, obstacle
 
 
 class LoopEquations:
