@@ -256,7 +256,7 @@ def _constant_input(system: HybridSystem, input) -> np.ndarray:
     """The constant part of an input of the right shape; zero for a function of time."""
     nu, value = len(system.inputs), np.asarray(0.0)
     if callable(input):
-        with evaluating("input"):
+        with evaluating("input, a function of t alone,"):
             shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), value).shape
     else:
         value = value if input is None else np.asarray(input, float)

@@ -57,8 +57,8 @@ class Crossing(Definition):
     def __str__(self):
         name = self.function
         if not isinstance(name, str):
-            name = getattr(name, "name", getattr(name, "__name__", "function"))
-        return f"{name} {self.direction}"
+            name = getattr(name, "name", getattr(name, "__name__", ""))
+        return f"{name if name.isidentifier() else 'function'} {self.direction}"
 
     __repr__ = fields
 
@@ -74,7 +74,7 @@ class Crossing(Definition):
         if not isinstance(output, Output):
             of_state = lambda t, q, u, f=output: f(t, q)  # noqa: E731
             output = Output(str(self), dict.fromkeys(self.charts or s.names, of_state))
-        list(check_output(s, output))
+        list(check_output(s, output, "section"))
 
     def in_chart(self, s: Structure, a: int) -> bool:
         """True if it can be crossed in chart a."""

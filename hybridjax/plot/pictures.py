@@ -84,7 +84,7 @@ def drawing_of(s: Structure, a: int) -> Any:
     **Raises:** `DefinitionError` if the system's `draw` raises an error.
     """
     point = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((s.dims[a],), float)
-    with evaluating(f"method `draw` of {type(s.system).__name__}"):
+    with evaluating(f"method `draw(self, chart, t, q)` of {type(s.system).__name__}"):
         shapes = lambda: jax.eval_shape(lambda t, q: s.drawing(a, t, q), *point)  # noqa: E731
         return s.once(("drawing", a), (), shapes)
 

@@ -51,8 +51,8 @@ class Split(NamedTuple):
             problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
             solution = linearize(problem, total_least_squares(late_outputs(problem, d)))
             if (solution.freedom <= 2 * d).any():
-                obstacle = f"{self.early.sampled.max()} cycles (a quarter is held out) are too few for order "
-                obstacle += f"{d} with {N} sections: record more, or take fewer sections."
+                obstacle = f"{self.early.sampled.max()} cycles (a quarter is held out) are too few "
+                obstacle += f"for order {d} with {N} sections: record more, or take fewer sections."
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]

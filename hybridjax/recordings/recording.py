@@ -225,7 +225,8 @@ class Recording(eqx.Module):
             longest = bridgeable(t, 0.5 / bandwidth)
             at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & (np.diff(t) <= longest))
             if not len(at):
-                text = f"{signal} is never seen to cross {level:g}, {crossing.direction}."
+                text = f"{signal} is never seen to cross {level:g}, {crossing.direction}: choose a "
+                text += f"`value` between {np.nanmin(x):.4g} and {np.nanmax(x):.4g}."
                 raise DefinitionError(f"trial '{trial.name}': {text}")
             crossed = find_root(lambda t, curve=curve: curve(t) - level, (t[at], t[at + 1])).x
             trials.append(replace(trial, events=trial.events | {event: crossed}))

@@ -343,25 +343,25 @@ def _check(placed: PlacedSections, first: int) -> None:
     """**Raises:** `ComputationError` for the first section that is missed, tangent, out of order,
     or crossed twice."""
     N, name, anchor = placed.n_sections, placed.family.describe, placed.family.anchor
-    again = "a section must be crossed once. Restrict it to a chart, or choose another phase."
+    again = "is crossed more than once in one period"
 
-    def reason(code: int) -> str:
-        hint = " Give them to the search for the cycle, or place more sections."
-        return f"{Result(code).message}.{hint if code == Result.STEP_LIMIT else ''}"
+    def reason(code: int, i: int) -> str:
+        hint = _remedy(placed, i) if code == Result.SECTION_MISSED else "."
+        if code == Result.STEP_LIMIT:
+            hint = ". Give them to the search for the cycle, or place more sections."
+        return f"{Result(code).message}{hint}"
 
     results = np.asarray(placed.result).tolist()
     if isinstance(placed.family, families.KinematicPhase) and any([first, *results]):
         _check_center(placed.family, placed.cycle)
     if first != Result.OK:
         place = f" at its anchor, {anchor}" if isinstance(anchor, Crossing) else ""
-        raise ComputationError(f"the cycle does not reach {name(0)}{place}: {reason(first)}")
+        raise ComputationError(f"the cycle does not reach {name(0)}{place}: {reason(first, 0)}")
     for i, code in enumerate(results):
         if code != Result.OK:
-            hint = " Does it lie on an event of the cycle? Then move it a little."
-            raise ComputationError(
-                f"{name((i + 1) % N)} is not reached from section {i} on the cycle: "
-                f"{reason(code)}{hint if code == Result.SECTION_MISSED else ''}"
-            )
+            k = (i + 1) % N
+            text = f"{name(k)} is not reached from section {i} on the cycle: {reason(code, k)}"
+            raise ComputationError(text)
     moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
     if not placed.cycle.clocked and len(moving):
         raise ComputationError(
@@ -371,7 +371,7 @@ def _check(placed: PlacedSections, first: int) -> None:
     period, duration = float(placed.cycle.period), np.asarray(placed.duration)
     rounds = float(duration.sum()) / period
     if rounds < 1 - SAME:
-        raise ComputationError(f"{name(0)} is crossed more than once in one period; {again}")
+        raise ComputationError(f"{name(0)} {again}{_remedy(placed, 0)}")
     if rounds > 1 + SAME:
         late = int(np.argmax(duration))
         raise ComputationError(
@@ -390,7 +390,36 @@ def _check(placed: PlacedSections, first: int) -> None:
                 f"{steepness:.1g} of its fastest rate. Choose another level."
             )
         if count > 1:
-            raise ComputationError(f"{name(i)} is crossed {count} times in one period; {again}")
+            raise ComputationError(f"{name(i)} {again}{_remedy(placed, i)}")
+
+
+def _remedy(placed: PlacedSections, i: int) -> str:
+    """Where the cycle crosses section i, the values through which the function of a `Crossing`
+    goes in its direction, and what to change."""
+    cycle, N, levels = placed.cycle, placed.n_sections, placed.bound.levels
+    items, hint = getattr(placed.family, "items", (placed.family.anchor,)), ""
+    section = items[i] if i < len(items) else None
+    if isinstance(section, Crossing):
+        i, N, levels = 0, 1, ListLevels((section,))
+    s, (t, chart, q) = cycle.structure, cycle.trajectory().dense()
+    level = np.full(len(t), np.nan)
+    for a in np.unique(chart).tolist():
+        if levels is not None and levels.present(s, a):
+            rows = chart == a
+            level[rows] = kernels.levels(s, a, levels, N, t[rows], q[rows, : s.dims[a]].T)[i, 0]
+    level[-1] = level[0]  # (the same point, but for rounding)
+    falls = (np.diff(level) < 0) & (np.diff(t) > 0)
+    crossed = np.flatnonzero(falls & (level[:-1] > 0) & (level[1:] <= 0))
+    if points := " and ".join(f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed):
+        hint = f", at {points}"
+    if not isinstance(section, Crossing):
+        return f"{hint}. Choose another phase, or fewer sections."
+    sign, span = 1 if section.direction == "falling" else -1, "nowhere"
+    if falls.any():
+        ends = level[:-1][falls].max(), level[1:][falls].min()
+        span = "from {:.4g} to {:.4g}".format(*(float(section.value) + sign * x for x in ends))
+    hint += f". The cycle has {section} {span}: choose another `value`, `direction` or `charts`, "
+    return f"{hint}not at an event."
 
 
 def _check_center(phase: families.KinematicPhase, cycle: LimitCycle) -> None:

@@ -26,6 +26,12 @@ from .transition import Scheduled, Transition
 _passed: dict[Hashable, tuple[str, ...]] = {}
 
 
+_ARGUMENTS = (
+    " (fields, guards, resets and outputs take (t, q, u), after `self` in a class; functions of "
+    "`Crossing`, `sliding` and `half_period` take (t, q))"
+)
+
+
 def check_system(system: HybridSystem) -> tuple[str, ...]:
     """Check that a system is well formed: names, shapes of every function, finite parameters.
 
@@ -101,13 +107,13 @@ def _check_functions(s: Structure) -> Iterator[str]:
         yield from check_output(s, output)
 
 
-def check_output(s: Structure, output: Output) -> Iterator[str]:
+def check_output(s: Structure, output: Output, kind: str = "output") -> Iterator[str]:
     """Check an output in each chart; yield its name in those where it uses the time."""
     for name in () if callable(output.function) else output.function:
         s.chart_index(name)
     for a, name in enumerate(s.names):
         if s.resolve_outputs(output).defined(a):
-            what = f"output '{output.name}' in chart '{name}'"
+            what = f"{kind} '{output.name}' in chart '{name}'"
             values = lambda s, *x, a=a: s.resolve_outputs(output)(a, *x)  # noqa: E731
             yield from _check_shape(s, a, what, values, (1,), "")
 
@@ -132,7 +138,7 @@ def _check_shape(
     """Check the shape of a function of a structure and (t, q, u) in chart a. `reason`: why it must
     be this one. Yield its name, `what`, if it uses t."""
     shapes = (), (s.dims[a],), (s.nu,)
-    with evaluating(what, " (t is a number, q and u are arrays: write `u[0]`)"):
+    with evaluating(what, " (`t`, `q[0]` and `u[0]` are numbers, q and u are arrays)"):
         points = [jax.ShapeDtypeStruct(x, jnp.result_type(float)) for x in shapes]
         program, *_ = eqx.filter_make_jaxpr(function)(s, *points)
         _check_indices(ft.partial(function, s), *(np.full(x, 0.5) for x in shapes))
@@ -167,6 +173,7 @@ def evaluating(what: str, takes: str = "") -> Iterator[None]:
     except DefinitionError:
         raise
     except Exception as error:
+        takes = _ARGUMENTS if takes and "positional argument" in str(error) else takes
         problem = f"{str(error).rstrip('.')}{takes}."
         if isinstance(error, jax.errors.JAXTypeError):
             problem = (
