@@ -51,8 +51,8 @@ class Split(NamedTuple):
             problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
             solution = linearize(problem, total_least_squares(late_outputs(problem, d)))
             if (solution.freedom <= 2 * d).any():
-                obstacle = f"{self.early.sampled.max()} cycles (a quarter is held out) are too few "
-                obstacle += f"for order {d} with {N} sections: record more, or take fewer sections."
+                obstacle = f"3/4 of the cycles, {self.early.sampled.max()}, are too few for order "
+                obstacle += f"{d} with {N} sections: record more, or take fewer sections."
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
@@ -73,7 +73,11 @@ class Split(NamedTuple):
 
     def fit(self, order: int, reference: tuple[str, ...] | None = None) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
-        fit = fit_series(self.early, order, check=False, reference=reference)
+        try:
+            fit = fit_series(self.early, order, check=False, reference=reference)
+        except DefinitionError as error:
+            hint = f"A quarter is held out: `fit_series(section_data(...), {order})` fits all"
+            raise DefinitionError(f"{error} ({hint}, without a test.)") from error
         return HeldOut(fit, validate(fit, self.late, reference=reference))
 
 
