@@ -75,26 +75,27 @@ def _multipliers(
                     "depends on it: add an input or an output."
                 )
             goal = dataclasses.replace(goal, which=int(np.argmin(apart)))
-        wanted, names = wanted_parts(goal, minimal, c)
-        return matrices.criterion(wanted @ slopes, names)
+        wanted, names, part = wanted_parts(goal, minimal, c)
+        return matrices.criterion(wanted @ slopes, names, part)
     c = np.poly(multipliers).real[1:]
     htfs = measured_htfs(model, cosines, goal.fitted_harmonics, noise)
     channels = [x for htf, each, _ in htfs for x in _channels(htf, each, c, goal.overhang)]
-    wanted, names = wanted_parts(goal, multipliers, c)
+    wanted, names, part = wanted_parts(goal, multipliers, c)
     unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
-    return LinearCriterion(names, unknowns, tuple(channels), wanted)
+    return LinearCriterion(names, unknowns, tuple(channels), wanted, part)
 
 
 def wanted_parts(
     goal: Multipliers, multipliers: Complex[np.ndarray, " d"], c: Float[np.ndarray, " d"]
-) -> tuple[Float[np.ndarray, "g d"], tuple[str, ...]]:
-    """Return derivatives of real and imaginary parts, or moduli, by c, and their names."""
+) -> tuple[Float[np.ndarray, "rows d"], tuple[str, ...], Int[np.ndarray, " rows"]]:
+    """Return derivatives of real and imaginary parts, or moduli, by c; the names of the multipliers
+    and moduli, and for each row the index of its name."""
     d = len(c)
     if d == 0:
         raise DefinitionError("all multipliers of the model are zero: choose another `goal`.")
     require_index("multiplier", goal.which or 0, d)
     slope = np.polyval(np.polyder(np.array([1.0, *c])), multipliers)
-    wanted, names = [], []
+    wanted, names, part = [], [], []
     for k in range(d) if goal.which is None else [goal.which]:
         z = multipliers[k]
         if goal.which is None and z.imag < 0:
@@ -106,16 +107,13 @@ def wanted_parts(
             )
         gradient = -(z ** np.arange(d - 1, -1, -1)) / slope[k]
         name = f"{z.real:.4g}" if z.imag == 0 else f"{z.real:.4g}{z.imag:+.4g}i"
+        rows = [gradient.real, gradient.imag][: 1 + (z.imag != 0)]
         if goal.part == "modulus":
-            wanted.append((z.conj() * gradient).real / abs(z))
-            names.append(f"|{name}|")
-        elif z.imag == 0:
-            wanted.append(gradient.real)
-            names.append(name)
-        else:
-            wanted += [gradient.real, gradient.imag]
-            names += [f"Re({name})", f"Im({name})"]
-    return np.array(wanted), tuple(names)
+            rows, name = [(z.conj() * gradient).real / abs(z)], f"|{name}|"
+        part += [len(names)] * len(rows)
+        wanted += rows
+        names.append(name)
+    return np.array(wanted), tuple(names), np.array(part)
 
 
 def _parameters(goal: Parameters, model: Model, lines: Candidates, noise: Noise) -> LinearCriterion:

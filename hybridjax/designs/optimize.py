@@ -13,6 +13,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Positive, Seed
 from .._core.execution import one_blas_thread
 from .._core.progress import working
+from .._core.text import columns
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
@@ -85,8 +86,16 @@ class OptimalDesign(eqx.Module):
     usual_rms: dict[str, float]
 
     @property
+    def usual_name(self) -> str:
+        """The name of the design that it improves, in prints and figures."""
+        size = self.usual.amplitude
+        # (They are larger in experiments with fewer lines.)
+        return "equal amplitudes" if np.ptp(size) < 0.2 * np.max(size) else "the given amplitudes"
+
+    @property
     def standard_errors(self) -> Float[np.ndarray, " g"]:
-        """Standard errors of the quantities of interest, with one run of `design`."""
+        """Standard errors of the quantities of interest, with one run of `design`. (Of a complex
+        multiplier: the root of the expected squared distance from it.)"""
         return np.sqrt(self.variances)
 
     @property
@@ -120,28 +129,24 @@ class OptimalDesign(eqx.Module):
         verdict = "" if self.saved > _WORTH_IT else ", which is nearly optimal"
         return (
             f"With the {limits} limited, one stride of this design replaces {self.saved:.3g} "
-            f"of the usual design{verdict}."
+            f"with {self.usual_name}{verdict}."
         )
 
     def __repr__(self) -> str:
-        width = max(map(len, self.names))
+        rows = [("", self.usual_name, "optimal")]
+        rows.append(("strides", str(self.usual.cycles(0)), str(self.strides)))
         errors = zip(self.names, self.usual_standard_errors, self.standard_errors, strict=True)
-        rows = [f"OptimalDesign({', '.join(self.names)})"]
-        rows.append(f"  {'standard error':>{width + 2}}  usual     optimal")
-        rows += [f"    {name:<{width}}  {a:.2e}  {b:.2e}" for name, a, b in errors]
-        rows.append(f"  {self.advice}")
+        rows += [(f"standard error of {name}", f"{a:.2e}", f"{b:.2e}") for name, a, b in errors]
+        rms = ((n, x) for n, x in self.usual_rms.items() if x > 0)
+        rows += [(f"rms of {n}", f"{x:.3g}", f"{self.rms[n]:.3g}") for n, x in rms]
         bounded = any(n.startswith("distortion of ") for n in self.rms)
-        rows.append(
-            f"  certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
+        certificate = (
+            f"certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
             f"{'(the convex bound of distortions) ' * bounded}"
             f"needs less than {1 / self.certificate:.1%} of these strides"
         )
-        rows += [
-            f"  rms of {name}: {self.rms[name]:.3g} ({self.rms[name] / old:.3g} times the usual)"
-            for name, old in self.usual_rms.items()
-            if old > 0
-        ]
-        return "\n".join([*rows, f"  {self.design!r}".replace("\n", "\n  ")])
+        below = "\n".join(["", self.advice, certificate, repr(self.design)]).replace("\n", "\n  ")
+        return f"OptimalDesign({', '.join(self.names)}){columns(rows)}{below}"
 
 
 class Rules(NamedTuple):

@@ -136,7 +136,7 @@ class Study(eqx.Module):
 
     @property
     def plan(self) -> OptimalDesign | None:
-        """The optimal design for the next block, or None if the next block has equal amplitudes."""
+        """The optimal design for the next block, or None if the next block is like the first."""
         return self._history.plan
 
     @property
@@ -269,10 +269,10 @@ class Study(eqx.Module):
     def _outlook(self, fit: StructuredFit) -> str:
         best, plan = self._history.estimate, self.plan
         if plan is None or best is None:
-            return f"next: equal amplitudes again, since {best.objection if best else ''}"
+            return f"next: the first design again, since {best.objection if best else ''}"
         usual = (plan.usual_standard_errors**2).sum() * plan.usual.cycles(0)
         equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
-        comparison = f"equal amplitudes would take about {equal:.3g} strides for the last errors"
+        comparison = f"{plan.usual_name} would take about {equal:.3g} strides for the last errors"
         if self.done:
             return comparison
         design = plan.design

@@ -17,11 +17,11 @@ from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, panels
 
 @checked
 def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -> Plot:
-    """The spectrum of an optimal design, and of the usual one, below |H_0| of all outputs.
+    """The spectrum of an optimal design, and of that which it improves, below |H_0| of all outputs.
 
-    Above: |H_0|, each relative to its largest value. Below: the amplitude of each line (the root of
-    twice its power over all experiments), of all inputs together, over three decades. Lines that no
-    experiment excites are not drawn.
+    Above: |H_0|, each relative to its largest value. Below: the amplitude of each line, of all
+    inputs together, over three decades: its rms over the experiments, most of which leave the line
+    out. Lines that no experiment excites are not drawn.
 
     **Raises:** `DefinitionError` for a model of other signals.
     """
@@ -39,7 +39,7 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
         above.set(yscale="log", ylabel="$|H_0|$ / largest")
         above.legend()
         for power, color, label in (
-            (plan.usual_power, COLORS["gray"], "usual"),
+            (plan.usual_power, COLORS["gray"], plan.usual_name),
             (plan.power, COLORS["red"], "optimal"),
         ):
             amplitude = np.sqrt(2 * np.array([power[plan.frequencies == x].sum() for x in f]))
@@ -47,7 +47,8 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
             style = dict(marker="o", ms=2, lw=0, color=color, label=label)
             below.plot(f[used], amplitude[used], **style)
         unit = unit_of(model.inputs[0])
-        below.set(yscale="log", xlabel=FREQUENCY, ylabel=with_unit("amplitude", unit))
+        label = with_unit("amplitude, rms\nover experiments", unit)
+        below.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
         below.set_xlim(0, f.max())
         top = np.sqrt(2 * max(plan.power.max(), plan.usual_power.max()))
         below.set_ylim(1e-3 * top, 2 * top)
@@ -65,9 +66,9 @@ def strides(
 ) -> Plot:
     """The standard error against the number of strides, on logarithmic axes.
 
-    Lines are bounds for the usual design (equal amplitudes) and for the optimal one. Points are
-    standard errors of studies after each block; the first block has equal amplitudes. For several
-    quantities, the root of the sum of squares is drawn.
+    Lines are bounds for the optimal design and that which it improves. Points are standard errors
+    of studies after each block, the first of which has that design. For several quantities, the
+    root of the sum of squares is drawn.
 
     **Arguments:** `studies`: by label, one study or several.
 
@@ -89,7 +90,7 @@ def strides(
         around = 1.5 if studies else 10.0
         low, high = min(reached) / around, max(reached) * around
         for errors, cycles, color, label in (
-            (plan.usual_standard_errors, plan.usual.cycles(0), COLORS["gray"], "equal amplitudes"),
+            (plan.usual_standard_errors, plan.usual.cycles(0), COLORS["gray"], plan.usual_name),
             (plan.standard_errors, plan.strides, COLORS["black"], "optimal, model known"),
         ):
             n = np.array([low, high])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def test_standard_errors_are_the_cramer_rao_bound(plan, isochron_ldtp):
     for design, said in ((plan.usual, plan.usual_variances), (plan.design, plan.variances)):
         htf = with_variance(isochron_ldtp, design)
         bound = hj.identify.multiplier_bound(isochron_ldtp, htf)
-        np.testing.assert_allclose(said, np.diag(bound.multiplier_covariances[0]), rtol=2e-3)
+        np.testing.assert_allclose(said, bound.standard_errors[:1] ** 2, rtol=2e-3)
         unequal = dataclasses.replace(htf, variance=(htf.variance.T * (1 + 1e-6 * np.arange(5))).T)
         other = hj.identify.multiplier_bound(isochron_ldtp, unequal)
         np.testing.assert_allclose(other.covariance, bound.covariance, rtol=2e-3)
@@ -46,7 +47,8 @@ def test_the_hopper_with_its_input_limited(isochron_ldtp):
     assert 1 <= plan.certificate < 1.03
     assert plan.rms["yM"] / plan.usual_rms["yM"] == pytest.approx(5.83, abs=0.05)
     assert plan.frequencies[np.argmax(plan.power)] == pytest.approx(0.3, abs=0.04)
-    assert f"one stride of this design replaces {plan.saved:.3g} of the usual design." in repr(plan)
+    assert f"stride of this design replaces {plan.saved:.3g} with equal amplitudes." in repr(plan)
+    assert re.search(r"strides +1280 +1280\n  standard error of -0.249\+0.6993i", repr(plan))
     np.testing.assert_allclose(plan.rms["u"], plan.usual_rms["u"])
 
 

@@ -25,8 +25,9 @@ def test_the_spectrum_of_a_design(plan):
     usual, optimal = below.get_lines()
     np.testing.assert_allclose(np.sum(np.square(optimal.get_ydata()) / 2), plan.power.sum())
     np.testing.assert_allclose(usual.get_ydata(), np.sqrt(2 * plan.usual_power))
-    assert below.get_ylabel() == "amplitude"
-    assert {x.get_text() for x in below.get_legend().get_texts()} == {"usual", "optimal"}
+    assert below.get_ylabel() == "amplitude, rms\nover experiments"
+    legend = [x.get_text() for x in below.get_legend().get_texts()]
+    assert legend == [plan.usual_name, "optimal"] == ["equal amplitudes", "optimal"]
     with pytest.raises(hj.DefinitionError, match="not the one that the plan was made for"):
         hj.plot.spectrum(plan, hj.testing.synthetic_ldtp())
 
