@@ -57,7 +57,7 @@ class Matrices(NamedTuple):
         shown, hidden = (np.bincount(row, ((wanted @ r) ** 2).sum(axis=1)) for r in self.spread)
         if (hidden > _MISSED * (shown + hidden)).any():
             raise DefinitionError(
-                "the usual design does not determine the `goal`: measure more harmonics or lines."
+                "`design` does not determine the `goal`: measure more harmonics or lines."
             )
         wanted = wanted @ self.spread.root
         unknowns = tuple(f"combination {k} of the matrices" for k in range(wanted.shape[1]))
