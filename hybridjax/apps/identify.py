@@ -28,7 +28,12 @@ from ..io import save
 from ..linear.htf import HTF
 from ..orbits.crossing import AtEvent, Crossing
 from ..plot import look
-from ..recordings.identification import Identification, identify_recording
+from ..recordings.identification import (
+    MULTIPLIER,
+    VALIDATION,
+    Identification,
+    identify_recording,
+)
 from ..recordings.read import read_recording
 from ..recordings.recording import Recording
 from ..sections.families import KinematicPhase
@@ -277,11 +282,8 @@ def _page(found: Identification, images: dict[str, str]) -> str:
                 [(str(n), *(f"{e:.1e}" for e in errors)) for n, errors in expected],
             ),
         ),
-        "<p>A multiplier is the factor by which a deviation from the average cycle changes in one "
-        "cycle. A modulus below 1 is stable; the smaller, the faster the return.</p>",
-        "<p>For the validation, a model of most strides is simulated on the strides that were held "
-        "out. Small p-values show that the model leaves something unexplained (process noise, "
-        "nonlinearity, smoothing), not that the multipliers are wrong.</p>",
+        f"<p>{MULTIPLIER}</p>",
+        f"<p>{VALIDATION}</p>",
         found.held_out.validation._repr_html_(),
         *(
             f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{image}">'

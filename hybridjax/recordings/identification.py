@@ -1,5 +1,6 @@
 """All steps from a recording to multipliers, in one call."""
 
+import textwrap
 from typing import Literal
 
 import equinox as eqx
@@ -26,6 +27,18 @@ from .sampling import DriftCycles, section_data, without_drift
 from .smoothing import Bandwidth
 
 
+# The meaning of the numbers, in prints and in the report.
+MULTIPLIER = (
+    "A multiplier is the factor by which a deviation from the average cycle changes in one cycle. "
+    "A modulus below 1 is stable; the smaller, the faster the return."
+)
+VALIDATION = (
+    "For the validation, a model of most strides is simulated on the strides that were held out. "
+    "Small p-values show that the model leaves something unexplained (process noise, nonlinearity, "
+    "smoothing), not that the multipliers are wrong."
+)
+
+
 class Identification(eqx.Module):
     """The results of `identify_recording`, step by step.
 
@@ -47,7 +60,9 @@ class Identification(eqx.Module):
 
     def __repr__(self) -> str:
         parts = (self.phase, self.data, self.fit, self.held_out.validation, self.advice)
-        return "\n".join(map(repr, parts))
+        prints = list(map(repr, parts))
+        prints[3:3] = (textwrap.fill(x, 100) for x in (MULTIPLIER, VALIDATION))
+        return "\n".join(prints)
 
 
 @checked
