@@ -95,7 +95,7 @@ def wanted_parts(
         raise DefinitionError("all multipliers of the model are zero: choose another `goal`.")
     require_index("multiplier", goal.which or 0, d)
     slope = np.polyval(np.polyder(np.array([1.0, *c])), multipliers)
-    wanted, names, part = [], [], []
+    wanted, names, part = list[np.ndarray](), list[str](), list[int]()
     for k in range(d) if goal.which is None else [goal.which]:
         z = multipliers[k]
         if goal.which is None and z.imag < 0:
