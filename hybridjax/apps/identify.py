@@ -28,12 +28,7 @@ from ..io import save
 from ..linear.htf import HTF
 from ..orbits.crossing import AtEvent, Crossing
 from ..plot import look
-from ..recordings.identification import (
-    MULTIPLIER,
-    VALIDATION,
-    Identification,
-    identify_recording,
-)
+from ..recordings.identification import MEANING, Identification, identify_recording
 from ..recordings.read import read_recording
 from ..recordings.recording import Recording
 from ..sections.families import KinematicPhase
@@ -282,8 +277,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
                 [(str(n), *(f"{e:.1e}" for e in errors)) for n, errors in expected],
             ),
         ),
-        f"<p>{MULTIPLIER}</p>",
-        f"<p>{VALIDATION}</p>",
+        *(f"<p>{text}</p>" for text in MEANING),
         found.held_out.validation._repr_html_(),
         *(
             f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{image}">'

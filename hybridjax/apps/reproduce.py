@@ -202,7 +202,7 @@ def _comparisons(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -
     estimates: dict[str, Any] = {}
     for name, family in families.items():
         estimates |= {f"2p1z, {name}": family.rational, f"structured, {name}": family.structured}
-    yield "fig3_harmonics", plot.harmonics(pairs)
+    yield "fig3_harmonics", plot.harmonics(pairs, (0, 1, -1, 2, -2))
     yield "fig4_bode", plot.bodes(pairs, fits=rational)
     yield "multipliers", plot.multipliers(cycle, estimates)
     yield "poles_zeros", plot.poles_zeros(rational)

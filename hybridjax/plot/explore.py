@@ -11,7 +11,7 @@ from .._core.arguments import Numbers, package, require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.values import Reals
 from .._core.results import Result
-from .._core.signal import Signal, with_unit
+from .._core.signal import Signal, ratio, with_unit
 from ..errors import DefinitionError
 from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle
@@ -19,6 +19,7 @@ from ..orbits.find import find_limit_cycle
 from ..systems.system import HybridSystem, unit_of_parameter
 from ..systems.varied import parameter_of, with_parameters
 from .film import PNG, Easel, png
+from .frequency import FREQUENCY
 from .look import COLORS, CYCLE, close_in_notebook, style
 from .motion import portrait, widened
 from .orbit import plane_of
@@ -26,7 +27,7 @@ from .orbit import plane_of
 
 Ranges = Mapping[str, Annotated[Numbers, Reals("2")]]
 # Input frequencies of the gain, in cycles per period. Fewer: resonances have corners. More: slow.
-_FREQUENCIES = np.linspace(0.02, 1.98, 50)
+_FREQUENCIES = np.linspace(0.02, 1.98, 197)
 # Sliders, and the picture that comes from Python. While one is on its way, only the last place of
 # the sliders is kept; once they rest, the gain is asked for.
 _PAGE = """
@@ -79,8 +80,9 @@ class Explorer:
             self._portrait = portrait(orbit, circle, s, plane)
             orbit.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4)
             (self._gain,) = gain.semilogy([], [], color=CYCLE[0])
-            pushed = f", {s.inputs[0]} to {plane[0]}" if s.nu else ""
-            gain.set(xlabel="input frequency (cycles/period)", ylabel=f"$|H_0|${pushed}")
+            pushed = s.inputs[0] if s.nu else ""
+            label = with_unit(f"$|H_0|$, {plane[0]}", ratio(plane[0], pushed))
+            gain.set(xlabel=FREQUENCY, ylabel=label)
             self._lost = self.figure.suptitle("", fontsize=8, color=COLORS["red"], wrap=True)
         self._easel: Easel | None = None
         self._draw()

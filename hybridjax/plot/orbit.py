@@ -41,9 +41,9 @@ def cycle(
 ) -> Plot:
     """The limit cycle in the plane of two states or outputs, colored by chart.
 
-    Events are marked by dots, resets that move the point by dashed lines, sections by short bars. A
-    bar lies along the section if this is a curve in the plane (its level depends on x and y only),
-    otherwise across the orbit.
+    An arrow shows the direction. Events are marked by dots, resets that move the point by dashed
+    lines, sections by short bars. A bar lies along the section if this is a curve in the plane (its
+    level depends on x and y only), otherwise across the orbit.
 
     **Arguments:**
 
@@ -69,8 +69,13 @@ def cycle(
         look = {"lw": 1.8, "zorder": 3, "solid_capstyle": "butt"}
         for a, line in by_chart(orbit, x, y).items():
             panel.plot(*line, color=CHARTS[a % len(CHARTS)], label=s.names[a], **look)
-        _, px, py = orbit(x, y)
+        t, px, py = orbit(x, y)
         center = np.array([(np.nanmin(v) + np.nanmax(v)) / 2 for v in (px, py)])
+        # An arrow of the direction, in the middle of the longest step.
+        longest = int(np.argmax(np.diff(orbit.t)))
+        k = int(np.searchsorted(t, orbit.t[longest : longest + 2].mean()))
+        arrow = {"arrowstyle": "-|>", "mutation_scale": 16, "color": "black", "lw": 0}
+        panel.annotate("", (px[k + 1], py[k + 1]), (px[k], py[k]), arrowprops=arrow, zorder=6)
         panel.margins(0.1)
         _events(panel, s, orbit, (x, y), center)
         panel.locator_params(axis="x", nbins=6)

@@ -85,15 +85,16 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
     """Poles (crosses) and zeros (circles) of rational fits in the z-plane, one column per output.
 
     The upper row shows them all, the lower one the surroundings of the poles. A family of
-    sections has one color, so that one sees whether another family moves poles or zeros.
+    sections has one color, so that one sees whether another family moves poles or zeros. The
+    multipliers are the N-th powers of the poles.
 
     **Arguments:** `fits`: by name of the section family, all with the same outputs.
 
     **Raises:** `DefinitionError` if there are none, or their outputs differ.
     """
-    if not fits or len({fit.outputs for fit in fits.values()}) != 1:
-        raise DefinitionError("`fits` must hold one or more fits with the same outputs.")
-    outputs = next(iter(fits.values())).outputs
+    if not fits or len({(fit.outputs, fit.n_sections) for fit in fits.values()}) != 1:
+        raise DefinitionError("`fits` must hold one or more fits with the same outputs and N.")
+    outputs, N = (first := next(iter(fits.values()))).outputs, first.n_sections
     width = COLUMN if len(outputs) == 1 else PAGE
     with panels(ax, 2, len(outputs), width=width, height=4.0) as axes:
         for i, output in enumerate(outputs):
@@ -118,6 +119,7 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
             lower.set_title("enlarged: around the poles")
             _complex_axes(lower, "z")
             _complex_axes(upper, "z")
+            lower.set_xlabel(rf"{lower.get_xlabel()}  (multipliers $\lambda = z^{{{N}}}$)")
         legend(axes[0, 0], "upper center", ncols=4 if len(outputs) > 1 else 2)
         letters(axes)
     return Plot(axes)

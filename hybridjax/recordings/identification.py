@@ -28,14 +28,12 @@ from .smoothing import Bandwidth
 
 
 # The meaning of the numbers, in prints and in the report.
-MULTIPLIER = (
+MEANING = (
     "A multiplier is the factor by which a deviation from the average cycle changes in one cycle. "
-    "A modulus below 1 is stable; the smaller, the faster the return."
-)
-VALIDATION = (
+    "A modulus below 1 is stable; the smaller, the faster the return.",
     "For the validation, a model of most strides is simulated on the strides that were held out. "
     "Small p-values show that the model leaves something unexplained (process noise, nonlinearity, "
-    "smoothing), not that the multipliers are wrong."
+    "smoothing), not that the multipliers are wrong.",
 )
 
 
@@ -61,7 +59,7 @@ class Identification(eqx.Module):
     def __repr__(self) -> str:
         parts = (self.phase, self.data, self.fit, self.held_out.validation, self.advice)
         prints = list(map(repr, parts))
-        prints[3:3] = (textwrap.fill(x, 100) for x in (MULTIPLIER, VALIDATION))
+        prints[3:3] = (textwrap.fill(x, 100) for x in MEANING)
         return "\n".join(prints)
 
 

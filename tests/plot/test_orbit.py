@@ -13,7 +13,9 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("yM (m)", "vM (m/s)")
     lines = labeled(ax)
     assert set(lines) == {"stance", "flight", "sections (32)", "perturbed"}
-    names = [t.get_text() for t in ax.texts]
+    arrow, *texts = ax.texts
+    assert (arrow.xy[0] - arrow.xyann[0]) * arrow.xy[1] > 0  # x moves as its velocity says
+    names = [t.get_text() for t in texts]
     assert names == ["liftoff", "touchdown", *map(str, range(0, 32, 4))]
 
     # Bars lie on their sections: rays from the center of the kinematic phase, in equal angles.
