@@ -372,9 +372,9 @@ def portrait(above: Axes, below: Axes, s: Structure, plane: tuple[str, str]) -> 
         curve = np.array(path(*plane)[1:])
         center = (np.nanmin(curve, axis=1) + np.nanmax(curve, axis=1)) / 2
         for g, end in zip(events, ends, strict=True):
-            x, y = center > end  # the name stands on the side of the center
-            notes[g].set(ha="left" if x else "right", va="bottom" if y else "top")
-            notes[g].set(position=(5 if x else -5, 5 if y else -5))
+            x, y = np.where(center > end, 5, -5)  # the name stands on the side of the center
+            sides = {"ha": "left" if x > 0 else "right", "va": "bottom" if y > 0 else "top"}
+            notes[g].set(position=(x, y), **sides)
             notes[g].xy = end
         points.set_data(cycle.multipliers.real, cycle.multipliers.imag)
         return [*orbits, marks, *notes, points]

@@ -359,9 +359,8 @@ def _check(placed: PlacedSections, first: int) -> None:
         raise ComputationError(f"the cycle does not reach {name(0)}{place}: {reason(first, 0)}")
     for i, code in enumerate(results):
         if code != Result.OK:
-            k = (i + 1) % N
-            text = f"{name(k)} is not reached from section {i} on the cycle: {reason(code, k)}"
-            raise ComputationError(text)
+            text = f"is not reached from section {i} on the cycle: {reason(code, (i + 1) % N)}"
+            raise ComputationError(f"{name((i + 1) % N)} {text}")
     moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
     if not placed.cycle.clocked and len(moving):
         raise ComputationError(
@@ -397,7 +396,7 @@ def _remedy(placed: PlacedSections, i: int) -> str:
     """Where the cycle crosses section i, the values through which the function of a `Crossing`
     goes in its direction, and what to change."""
     cycle, N, levels = placed.cycle, placed.n_sections, placed.bound.levels
-    items, hint = getattr(placed.family, "items", (placed.family.anchor,)), ""
+    items = getattr(placed.family, "items", (placed.family.anchor,))
     section = items[i] if i < len(items) else None
     if isinstance(section, Crossing):
         i, N, levels = 0, 1, ListLevels((section,))
@@ -410,16 +409,16 @@ def _remedy(placed: PlacedSections, i: int) -> str:
     level[-1] = level[0]  # (the same point, but for rounding)
     falls = (np.diff(level) < 0) & (np.diff(t) > 0)
     crossed = np.flatnonzero(falls & (level[:-1] > 0) & (level[1:] <= 0))
-    if points := " and ".join(f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed):
-        hint = f", at {points}"
+    points = " and ".join(f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed)
+    hint = f", at {points}" * bool(points)
     if not isinstance(section, Crossing):
         return f"{hint}. Choose another phase, or fewer sections."
     sign, span = 1 if section.direction == "falling" else -1, "nowhere"
     if falls.any():
         ends = level[:-1][falls].max(), level[1:][falls].min()
         span = "from {:.4g} to {:.4g}".format(*(float(section.value) + sign * x for x in ends))
-    hint += f". The cycle has {section} {span}: choose another `value`, `direction` or `charts`, "
-    return f"{hint}not at an event."
+    change = "choose another `value`, `direction` or `charts`, not at an event"
+    return f"{hint}. The cycle has {section} {span}: {change}."
 
 
 def _check_center(phase: families.KinematicPhase, cycle: LimitCycle) -> None:
@@ -429,13 +428,10 @@ def _check_center(phase: families.KinematicPhase, cycle: LimitCycle) -> None:
     p, v = (x[~np.isnan(x)] for x in cycle.trajectory()(*names)[1:])
     angle = np.unwrap(np.arctan2(v - center[1], p - center[0]))
     if abs(angle[-1] - angle[0]) < np.pi:
-        spans = (
-            f"{x} from {min(y):.4g} to {max(y):.4g}" for x, y in zip(names, (p, v), strict=True)
-        )
         raise ComputationError(
             f"the orbit does not turn about the `center` {center} of the KinematicPhase: it has "
-            f"{' and '.join(spans)}. Give a `center` inside of it, or another `position` and "
-            "`velocity`."
+            f"{names[0]} from {p.min():.4g} to {p.max():.4g} and {names[1]} from {v.min():.4g} to "
+            f"{v.max():.4g}. Give a `center` inside of it, or another `position` and `velocity`."
         )
 
 
