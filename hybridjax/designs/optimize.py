@@ -126,7 +126,7 @@ class OptimalDesign(eqx.Module):
         special = [n for n in self.limited if n.startswith(prefixes)]
         rms = " and ".join(n for n in self.limited if n not in special)
         limits = " and ".join([f"rms of {rms}"] * bool(rms) + special)
-        verdict = "" if self.saved > _WORTH_IT else ", which is nearly optimal"
+        verdict = "" if self.saved > _WORTH_IT else ", which are nearly optimal"
         return (
             f"With the {limits} limited, one stride of this design replaces {self.saved:.3g} "
             f"with {self.usual_name}{verdict}."
