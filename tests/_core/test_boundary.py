@@ -77,6 +77,7 @@ REFUSED = [
     (MATRIX, np.zeros((2, 2), complex), "must be real, not an array of complex128"),
     (MATRIX, "x", "must be an array of real numbers with shape (N, d), not 'x'"),
     (MATRIX, [[0, 1], [NAN, 0]], "must be finite, but is nan at index (1, 0)"),
+    (MATRIX, SimpleNamespace(columns=["b"]), "not a table: give `table[names].to_numpy()`"),
     (GAPS, [0, INF], "must be finite, but is inf at index 1"),
     (Annotated[Numbers, Reals("n", sign="positive")], [1, 0], "must be positive, but is 0 at"),
     (Annotated[Numbers, Reals("n", sign="nonnegative")], [1, -2], "must be zero or positive, but"),

@@ -294,6 +294,9 @@ class Reals(Kind):
         return array if self.form is None else self.form(array)
 
     def _array(self, value: Any) -> np.ndarray | jax.Array:
+        if hasattr(value, "columns"):
+            text = "must be an array, not a table: give `table[names].to_numpy()`, in their order"
+            raise Misfit(text, near=True)
         try:
             return unmasked(value)
         except jax.errors.TracerArrayConversionError:  # some of the numbers are traced
