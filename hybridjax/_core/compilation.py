@@ -384,10 +384,10 @@ def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=Non
     return np.concatenate(parts, axis=-1)[..., :L]
 
 
-def whole(function: Callable, static: tuple, trees: Any) -> Callable[..., Any]:
+def whole(function: Callable, static: tuple, trees: Any, at_once: bool) -> Callable[..., Any]:
     """`function(*static, *trees, *arguments)` of any arguments and results, with arrays of NumPy:
     on the host, until it has taken as many seconds of this thread as compiling takes (a third of
-    `WORTH_COMPILING`). Then a thread compiles it.
+    `WORTH_COMPILING`). Then a thread compiles it. For many calls it is compiled `at_once`.
 
     In interactive sessions there is time between calls: the thread starts earlier.
     """
@@ -397,8 +397,10 @@ def whole(function: Callable, static: tuple, trees: Any) -> Callable[..., Any]:
         return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
 
     def call(*arguments):
-        if program in _ready:
-            return compiled(*arguments)
+        if at_once or program in _ready:
+            _ready.add(program)
+            with uncollected():
+                return compiled(*arguments)
         begin, before = time.thread_time(), _spent.get(program)
         results = function(*static, *trees, *arguments)
         # (The first call compiles kernels.)

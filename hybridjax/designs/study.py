@@ -272,7 +272,7 @@ class Study(eqx.Module):
             return f"next: equal amplitudes again, since {best.objection if best else ''}"
         usual = (plan.usual_standard_errors**2).sum() * plan.usual.cycles(0)
         equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
-        comparison = f"equal amplitudes would take about {equal:.3g} strides"
+        comparison = f"equal amplitudes would take about {equal:.3g} strides for the last errors"
         if self.done:
             return comparison
         design = plan.design

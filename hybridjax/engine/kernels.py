@@ -112,6 +112,11 @@ def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
     return s.kernel(_due, _expanded, g)(t, q, u)
 
 
+def by_parameter_of_period(s: Structure) -> float:
+    """The derivative of the period of a clock by the only input, which is added to a parameter."""
+    return s.kernel(_period, _expanded)(*(np.zeros(x) for x in [1, (0, 1), (1, 1)]))[0, -1, 0]
+
+
 def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) -> Expanded:
     """Outputs in chart a, and their derivatives."""
     return linear(s, _outputs, a, t, q, u, items)
@@ -160,8 +165,13 @@ def _enabled(kind: Kind, s: Structure, t, q, u, place):
     return s.enabled(Member(kind, place), t, q, u)
 
 
+def _period(s: Structure, t, q, u):
+    return jnp.stack([jnp.asarray(s.under(u).system.period(), float)])
+
+
 def _outputs(a: int, s: Structure, items: Items, t, q, u):
-    return s.resolve_outputs(items)(a, t, q, u)
+    under = s.under(u)
+    return under.resolve_outputs(items)(a, t, q, u if under is s else jnp.zeros(under.nu))
 
 
 def _due(g: int, s: Structure, t, q, u):

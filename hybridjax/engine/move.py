@@ -87,10 +87,11 @@ def through(
     by = targets.missed, targets.event_sequence
     if not on_host(u) or s.by_system:
         return _pieces((move, options, *by), s, levels, settings, ends, begin, u, patience)
-    static = search, options._replace(tangents=bool(options.tangents)), *by
-    make = lambda: whole(_pieces, (static,), (s, levels, settings))  # noqa: E731
+    at_once, tangents = options.at_once, bool(options.tangents)
+    static = search, options._replace(tangents=tangents, at_once=False), *by
+    make = lambda: whole(_pieces, (static,), (s, levels, settings), at_once)  # noqa: E731
     arguments = ends, begin, u, np.float64(patience)
-    return s.once(("through", static), (levels, settings), make)(*arguments)
+    return s.once(("through", static, at_once), (levels, settings), make)(*arguments)
 
 
 def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):

@@ -23,6 +23,7 @@ from .._core.executor import namespace
 from .._core.host_derivatives import NotOnHostError
 from ..systems.structure import Member, Structure
 from ..systems.transition import Scheduled
+from ..systems.varied import Varied
 from . import kernels
 from .arrays import Array, Index, Inputs, Mask, Padded, Times
 from .events import apply_resets, scheduled_time
@@ -276,13 +277,14 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndar
     expanded = np.array(np.moveaxis(_linear_step(s, a, moves.t, moves.q[:n], u, h), -1, 0))
     q, dq, f = expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     t = np.where(on_time, goal, moves.t + h)
-    # By (t, q, u), with the length of the step as the last; that to a known time shrinks with t.
-    dt = np.zeros((M, 1, dq.shape[2]), dq.dtype)
-    dt[:, 0, [0, -1]] = 1.0
-    shrinks = (by_clock | on_time)[:, None]
-    dq[:, :, 0] -= shrinks * dq[:, :, -1]
-    dt[:, :, 0] -= shrinks
-    dq, dt = dq[:, :, :-1], dt[:, :, :-1]
+    # By (t, q, u). A step to a known time shrinks with t, and lasts until a schedule has come.
+    dt = np.zeros((M, 1, dq.shape[2] - 1), dq.dtype)
+    dt[:, 0, 0] = -1.0 * (by_clock | on_time)
+    for g in map(int, np.intersect1d(code, s.schedules(a) if isinstance(s, Varied) else [])):
+        now = np.flatnonzero(code == g)
+        dt[now, 0, 1 + n :] = kernels.due(s, g, t[now], q[:, now], u[:, now])[0, 2 + n :].T
+    dq = dq[:, :, :-1] + dq[:, :, -1:] * dt
+    dt[:, 0, 0] += 1.0
 
     which = np.where(code == ARRIVE_LEVEL, len(s.transitions), np.where(by_clock, -1, code))
     lands = np.flatnonzero(which >= 0)

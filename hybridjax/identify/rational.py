@@ -120,7 +120,7 @@ def fit_rational(
     **Arguments:**
 
     - `htf`: estimated or exact. (Other harmonics of a real system have complex coefficients, which
-      this form does not have.)
+      this form does not have: `fit_multipliers` fits all harmonics.)
     - `output`: name or index. Default: every output. `input`: name or index. Default: 0.
     - `poles`, `zeros`: their numbers. Default: 2 and 1, the paper's.
 

@@ -247,9 +247,9 @@ class _Trace(NamedTuple):
         low, high = self.values[0], self.values[-1]
         over = start.value == (high if start.tangent[-1] > 0 else low)
         while not over and len(points) < self.max_points:
-            last = points[-1]
+            last, before = points[-1], points[-2] if len(points) > 1 else None
             say(f"{self.curve.parameter} = {last.value:.5g}, {len(points)} cycles")
-            point = self.curve.step(last, length)
+            point = self.curve.step(before, last, length)
             if isinstance(point, Point) and not low <= point.value <= high:
                 over = True
                 point = self.curve.land(last, point, np.clip(point.value, low, high))

@@ -5,18 +5,16 @@ import functools as ft
 import itertools
 from collections.abc import Iterable
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from .._core.compilation import quick_jit
-from .._core.executor import to_host
+from .._core.compilation import at_ease
+from .._core.executor import on_the_cpu, to_host
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..systems.system import HybridSystem
-from ..systems.varied import parameter_of, with_parameters
+from ..systems.varied import Varied, parameter_of, with_parameters
 from .coincidence import SAME
 from .cycle import LimitCycle
 from .newton import FEW_STEPS, newton_steps
@@ -30,6 +28,9 @@ _SMALL, _ROUNDING = 1e-11, 1e-8
 # The least range over the cycle that counts, in sizes of the states. Smaller: states that hardly
 # move shorten the steps. Larger: steps are longer than the orbit.
 _LEAST_RANGE = 0.02
+# The part of a step by which two points must be apart to extrapolate from both. Smaller: rounding
+# errors grow. Larger: Newton's method begins further away.
+_APART = 0.1
 
 
 @dataclasses.dataclass
@@ -37,20 +38,23 @@ class Point:
     """A cycle on the curve.
 
     **Fields:** `anchor`, chart and phase (as the time of the first cycle's clock) at which it
-    begins; `departure`, the lane there; `z` (n,), state (padded) and parameter; `size` (n,), what
-    counts as 1 in each; `tangent` (n,) of the curve, a unit vector in these sizes; `turn` from
-    there, with derivatives with respect to `z`; `steps` of
-    Newton; `kind` of a change of stability there.
+    begins; `z` (n,), state (padded) and parameter; `size` (n,), what counts as 1 in each; `tangent`
+    (n,) of the curve, a unit vector in these sizes; `turn` from there, with derivatives with
+    respect to `z`; `steps` of Newton; `kind` of a change of stability there.
     """
 
     anchor: Lanes
-    departure: Lanes
     z: Float[np.ndarray, " n"]
     size: Float[np.ndarray, " n"]
     tangent: Float[np.ndarray, " n"]
     turn: Turn
     steps: int
     kind: str = ""
+
+    @property
+    def departure(self) -> Lanes:
+        """The lane at which it begins."""
+        return jax.tree_util.tree_map(lambda x: x[..., :1], self.turn.legs)
 
     @property
     def value(self) -> float:
@@ -104,28 +108,27 @@ class Curve:
 
     def __init__(self, cycle: LimitCycle, parameter: str, span: float):
         self.cycle, self.parameter, self.span = cycle, parameter, span
-        self.map, self.sequence = cycle.return_map, _rotated(cycle.event_sequence)
+        self.map, self.sequence = to_host(cycle.return_map), _rotated(cycle.event_sequence)
         self.value = float(parameter_of(cycle.system, parameter))
-        flat = jax.tree_util.tree_map(
-            lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else x, cycle.system
-        )
-        self.direction = with_parameters(flat, {parameter: 1.0})
 
     def system_at(self, value: float) -> HybridSystem:
         return with_parameters(self.cycle.system, {self.parameter: value})
 
     def first(self) -> Point | Result:
         """The cycle itself."""
-        z = np.append(np.asarray(self.cycle.anchor.q[:, 0]), self.value)
-        size = np.append(np.asarray(self.map.sizes), self.span)
-        return self._correct(z, self._by_value(size), size, self._by_value(), self.cycle.anchor)
+        anchor, size = self.map.anchor, np.append(self.map.sizes, self.span)
+        z = np.append(anchor.q, self.value)
+        return self._correct(z, self._by_value(size), size, self._by_value(), anchor)
 
-    def step(self, last: Point, length: float) -> Point | Result:
+    def step(self, before: Point | None, last: Point, length: float) -> Point | Result:
         """The next point, about `length` further along the tangent."""
-        ahead = length * last.tangent * last.size
-        point = self._correct(
-            last.z + ahead, last.tangent / last.size, last.size, last.tangent, last.anchor
-        )
+        ahead, row = length * last.tangent * last.size, last.tangent / last.size
+        guess = last.z + ahead
+        if before and before.anchor is last.anchor:
+            back = row @ (last.z - before.z)
+            if back > _APART * length:
+                guess = _cubic(before, last, row, 1 + length / back)
+        point = self._correct(last.z + ahead, row, last.size, last.tangent, last.anchor, guess)
         if isinstance(point, Result):
             return point
         astray = np.linalg.norm((point.z - last.z - ahead) / last.size)
@@ -135,7 +138,8 @@ class Curve:
         """The point over a place on the chord from a to b."""
         chord = (b.z - a.z) / a.size
         row = chord / np.linalg.norm(chord) / a.size
-        return self._correct(a.z + where * (b.z - a.z), row, a.size, chord, a.anchor)
+        z = a.z + where * (b.z - a.z)
+        return self._correct(z, row, a.size, chord, a.anchor, _cubic(a, b, row, where))
 
     def land(self, a: Point, b: Point, value: float) -> Point | Result:
         """The point between a and b where the parameter has a value."""
@@ -158,7 +162,7 @@ class Curve:
             return None
         k = far_from_events(legs.t, events, float(point.turn.period))
         phase = legs.t[k : k + 1] / point.turn.period * float(self.map.expected)
-        anchor = point.anchor._replace(t=jnp.asarray(phase), chart=jnp.asarray(legs.chart[[k]]))
+        anchor = point.anchor._replace(t=phase, chart=legs.chart[[k]])
         forward = self._by_value() * np.sign(point.tangent[-1])
         z, row = np.append(legs.q[:, k], point.value), self._by_value(point.size)
         moved = self._correct(z, row, point.size, forward, anchor)
@@ -168,16 +172,15 @@ class Curve:
         """The derivative of the parameter with respect to z, in sizes."""
         return np.append(np.zeros(self.map.structure.d), 1.0) / size
 
-    def _correct(self, z0, row, size, forward, anchor: Lanes) -> Point | Result:
-        """Newton's method for a point with row @ (z - z0) = 0."""
-        z, last, rounding = z0.copy(), np.inf, len(z0) * np.finfo(float).eps
+    def _correct(self, z0, row, size, forward, anchor: Lanes, guess=None) -> Point | Result:
+        """Newton's method for a point with row @ (z - z0) = 0, from a guess (default: z0)."""
+        z, last, rounding = z0 if guess is None else guess, np.inf, len(z0) * np.finfo(float).eps
         map = dataclasses.replace(self.map, anchor=anchor)
         for k in range(FEW_STEPS):
-            out = _turn_along(map, self.system_at(z[-1]), self.direction, jnp.asarray(z[:-1]))
-            departure, turn = jax.tree_util.tree_map(np.asarray, out)
+            turn = self._turn(map, z)
             if (failure := self._failure(turn)) is not None:
                 return failure
-            point = Point(anchor, departure, z, size, forward, turn, k)
+            point = Point(anchor, z, size, forward, turn, k)
             equations = np.vstack([point.scaled, row * size])
             residual = np.append(turn.residual / size[:-1], row @ (z - z0))
             (change,) = newton_steps(equations[None], residual[None], rounding)
@@ -188,6 +191,13 @@ class Curve:
                 break
             z, last = z + change * size, length
         return Result.NOT_CONVERGED
+
+    def _turn(self, map: ReturnMap, z: Float[np.ndarray, " n"]) -> Turn:
+        """One turn of the system there, at the same phase of its clock, with derivatives by z."""
+        varied = Varied(self.system_at(z[-1]), self.parameter)
+        with on_the_cpu(), at_ease():
+            map = to_host(map.at_phase_of(varied.system))
+            return map.turn_with_jacobian(z[:-1], varied=varied)._replace(tapes=None)
 
     def _failure(self, turn: Turn) -> Result | None:
         if int(turn.result) != Result.OK:
@@ -212,20 +222,16 @@ class Curve:
         return dataclasses.replace(point, tangent=tangent)
 
 
-@quick_jit
-def _turn_along(
-    map: ReturnMap, system: HybridSystem, direction: HybridSystem, q: Float[Array, " d"]
-) -> tuple[Lanes, Turn]:
-    """The lane at the beginning, and one turn with derivatives by the state and along `direction`
-    in the parameters, at the same phase of the clock: so one program serves all parameters."""
-    map = map.at_phase_of(system)
+def _cubic(a: Point, b: Point, row: Float[np.ndarray, " n"], x: float) -> Float[np.ndarray, " n"]:
+    """The polynomial through two points with their tangents, at a part of their distance along the
+    derivative `row`."""
+    chord = b.z - a.z
 
-    def along(step):
-        change = lambda x, v: x + step * v if eqx.is_inexact_array(x) else x  # noqa: E731
-        return map.at_phase_of(jax.tree_util.tree_map(change, system, direction))
+    def off(p):
+        along = p.tangent * p.size
+        return along * (row @ chord) / (row @ along) - chord
 
-    turn = map.turn_with_jacobian(q, along=along)
-    return map.departure(q), turn._replace(record=None)
+    return a.z + x * chord + x * (1 - x) * ((1 - x) * off(a) - x * off(b))
 
 
 def far_from_events(t: np.ndarray, events: np.ndarray, period: float) -> int:

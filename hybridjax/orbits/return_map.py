@@ -24,7 +24,7 @@ from ..engine import kernels
 from ..engine.events import arm
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
-from ..engine.replay import projections, replay
+from ..engine.replay import projections
 from ..engine.search.state import Recorded
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
@@ -32,6 +32,7 @@ from ..engine.watch import Watch, slopes, watch
 from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
+from ..systems.varied import Varied
 from .crossing import AtEvent, Crossing, to_section
 
 
@@ -208,14 +209,14 @@ class ReturnMap(eqx.Module):
         self,
         q: Float[Array, " d"],
         wanted: Bool[Array, ""] | bool = True,
-        along: "Callable[[Array], ReturnMap] | None" = None,
         record: Recorded | None = None,
+        varied: Varied | None = None,
     ) -> Turn:
         """One turn from a state on the section, with its derivatives.
 
         **Arguments:** `wanted`: whether derivatives with respect to the state are computed;
-        otherwise they are meaningless. `along`: the map after a step of the parameters. `record`:
-        see `turn`.
+        otherwise they are meaningless. `record`: see `turn`. `varied`: the system with a parameter
+        by which there are derivatives, too, at the same phase of the clock (on the host).
         """
         s, xp, settings, each = self.structure, namespace(q), self.settings, self.each
 
@@ -226,33 +227,26 @@ class ReturnMap(eqx.Module):
                 moved, tape = piece
                 jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
                 moved = moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:]))
-            moves = None
-            if along is not None:
-                other = along  # (known to be a function in the function below, too)
-                moves = derivative_at_zero(lambda step: self._end(other(step), lanes, target, tape))
             steps = Tape(tape.h, tape.code, tape.t, None, None, None)
-            return moved, (lanes, each(jacobian[:, 1:]), moves, tape, Recorded(moved, steps))
+            return moved, (lanes, each(jacobian[:, 1:]), tape, Recorded(moved, steps))
 
         if on_host(q):  # (all pieces are linearized together)
-            options = Options(True, new_input=False, tangents=wanted)
-            (end, (legs, _, tapes)), moves, recorded = self.travel(q, options), None, None
+            options = Options(True, new_input=False, tangents=wanted, at_once=varied is not None)
+            (end, (legs, _, tapes)), recorded = self.travel(q, options), None
         else:
-            end, (legs, factors, moves, tapes, recorded) = self.travel(q, flow, record)
+            end, (legs, factors, tapes, recorded) = self.travel(q, flow, record)
         (ends, levels), d = self.ends().split(), s.d
         lanes, tape, ends = side_by_side((legs, tapes, ends))
         if on_host(q):
-            many, ends = self._structure_of(lanes), ends.with_levels(levels)
-            factors = tape_jacobian(many, lanes, ends, tape, True, wanted)[0][:, 1:]
-            factors = factors.reshape(LEGS, *q.shape, d)
+            many, ends = varied or self._structure_of(lanes), ends.with_levels(levels)
+            by, at = tape_jacobian(many, lanes, ends, tape, varied is None, wanted)
+            factors = by[:, 1:, 1 : 1 + d] if varied else by[:, 1:].reshape(LEGS, *q.shape, d)
         codes, valid = each(xp.moveaxis(tapes.code, -1, 0)), self.valid
-        off, by_state = self.held(q)
-        returned = xp.where(valid[..., None], monodromy(factors), 0.0)
-        jacobian = returned - np.eye(d) - by_state
-        if along is not None:
-            add = lambda total, leg: (leg[0] @ total + leg[1], None)  # noqa: E731
-            total, _ = scan(add, jnp.zeros_like(q), (factors, moves))
-            held = derivative_at_zero(lambda step: along(step).held(q)[0])
-            jacobian = jnp.column_stack([jacobian, jnp.where(valid, total, 0.0) - held])
+        off, held = self.held(q, varied)
+        returned = monodromy(factors)
+        if varied is not None:
+            returned = np.column_stack([returned, self._by_parameter(varied, by[:, 1:], at)])
+        jacobian = xp.where(valid[..., None], returned, 0.0) - np.eye(*held.shape[-2:]) - held
         if self.base is not None:
             f, scale = self.slopes(lanes).T, self.scale[lanes.chart]
             factors = across(f.reshape(LEGS, *q.shape), scale.reshape(LEGS, *q.shape), factors)
@@ -264,13 +258,18 @@ class ReturnMap(eqx.Module):
             xp.max(defect / self.sizes, axis=-1), end.result, meetings, recorded, tapes,
         )  # fmt: skip
 
-    def _end(self, other: "ReturnMap", lanes: Lanes, target: Target, tape) -> Float[Array, " d"]:
-        """The end of a recorded piece of a turn, by another map at the same phases of its clock."""
-        grown = other.expected / self.expected
-        time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
-        begin, to = lanes._replace(t=lanes.t * grown), dataclasses.replace(target, time=time)
-        u = jnp.zeros((self.structure.nu, 1))
-        return replay(other.structure, begin, u, to, tape)[1][:, 0]
+    def _by_parameter(
+        self, varied: Varied, by: Float[np.ndarray, "K d m"], ends: Float[np.ndarray, "n K"]
+    ) -> Float[np.ndarray, " d"]:
+        """Derivative of the end of a turn by a parameter, from those of its pieces by (t, q, u)."""
+        later, t0 = 0.0, self.anchor.t[0]
+        if self.base is None:
+            later = kernels.by_parameter_of_period(varied) * self.multiplicity / self.expected
+        column = later * t0 * by[0, :, 0] + by[0, :, -1]
+        for piece in by[1:]:
+            column = piece[:, 1:-1] @ column + piece[:, -1]
+        end = self.anchor._replace(t=ends[:1, -1], q=ends[1:, -1:])
+        return column + later * (t0 + self.expected) * self.slopes(end)[:, 0]
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
@@ -293,19 +292,22 @@ class ReturnMap(eqx.Module):
             code = xp.where(turn.closed & still, Result.EQUILIBRIUM, code)
         return code.astype(np.int32)
 
-    def held(self, q: Float[Array, " d"]) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+    def held(
+        self, q: Float[Array, " d"], varied: Varied | None = None
+    ) -> tuple[Float[Array, " d"], Float[Array, "d n"]]:
         """The step of the state that takes conserved quantities away from their values, as far as
-        they are away, and its derivative (with the direction of the step held fixed).
+        they are away, and its derivative (with the direction of the step held fixed) by the state,
+        and the parameter of `varied`.
 
         Conserved quantities do not change along P(q) - q. So P(q) - q and this step can add up to
         zero only if both are zero; and J - I is regular once the derivative is subtracted from it.
         """
         xp, sizes = namespace(q), self.sizes
         if not self.conserved:
-            return xp.zeros_like(q), xp.zeros((*q.shape, q.shape[-1]))
-        values, gradient = self.outputs(q, tuple(self.conserved))
+            return xp.zeros_like(q), xp.zeros((*q.shape, q.shape[-1] + (varied is not None)))
+        values, gradient = self.outputs(q, tuple(self.conserved), varied)
         excess = values - xp.stack(list(self.conserved.values()))
-        scaled = gradient * sizes[..., None, :]
+        scaled = gradient[..., : q.shape[-1]] * sizes[..., None, :]
         steep = xp.linalg.norm(scaled, axis=-1, keepdims=True)
         steep = xp.where(steep > 0, steep, 1.0)
         back = sizes[..., None] * xp.linalg.pinv(scaled / steep) / xp.swapaxes(steep, -1, -2)
@@ -313,14 +315,15 @@ class ReturnMap(eqx.Module):
         return (back @ excess[..., None])[..., 0], back @ gradient
 
     def outputs(
-        self, q: Float[Array, " d"], names: tuple[str, ...]
-    ) -> tuple[Float[Array, " c"], Float[Array, "c d"]]:
-        """Outputs at the anchor's time in its chart, and their derivatives by the state."""
-        s, (t, chart, *_) = self.structure, self.anchor
+        self, q: Float[Array, " d"], names: tuple[str, ...], varied: Varied | None = None
+    ) -> tuple[Float[Array, " c"], Float[Array, "c n"]]:
+        """Outputs at the anchor's time in its chart, and their derivatives by the state, and the
+        parameter of `varied`."""
+        s, (t, chart, *_) = varied or self.structure, self.anchor
         outputs = lambda a, *point: kernels.outputs(s, a, names, *point)  # noqa: E731
         q = namespace(q).atleast_2d(q).T
         by = self.each(with_derivatives(s, outputs, chart, t, q, len(names)).transpose(2, 0, 1))
-        return by[..., 0], by[..., 2 : 2 + s.d]
+        return by[..., 0], by[..., 2 : 2 + s.d + (varied is not None)]
 
     def travel(
         self, q: Float[Array, " d"], flow: Any, record: Recorded | None = None

@@ -57,7 +57,7 @@ class Split(NamedTuple):
                 break
             fits, ends = [*fits, fit], long
         if not fits:
-            text = f"{self.early.cycles} cycles are too few for one multiplier with {N} sections"
+            text = f"3/4 of the cycles, {self.early.cycles}, are too few to fit {N} sections"
             raise DefinitionError(f"{text}: record more, or take fewer sections.")
         grid, misfits = CycleGrid.from_records(ends), []
         for fit in fits:
@@ -68,7 +68,11 @@ class Split(NamedTuple):
 
     def fit(self, order: int, reference: tuple[str, ...] | None = None) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
-        fit = fit_series(self.early, order, check=False, reference=reference)
+        try:
+            fit = fit_series(self.early, order, check=False, reference=reference)
+        except DefinitionError as error:
+            hint = f"A quarter is held out: `fit_series(section_data(...), {order})` fits all"
+            raise DefinitionError(f"{error} ({hint}, without a test.)") from error
         return HeldOut(fit, validate(fit, self.late, reference=reference))
 
 

@@ -38,6 +38,8 @@ class Options(NamedTuple):
     """Arm the guards for the input u, which may have jumped; otherwise they stay as they are."""
     tangents: Bool[Array, ""] | bool = False
     """Make steps also short enough for the derivatives of a replay."""
+    at_once: bool = False
+    """On the host: compile a turn before the first one."""
 
 
 class Moved(NamedTuple):

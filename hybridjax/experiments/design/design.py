@@ -315,7 +315,7 @@ class Design(eqx.Module):
             f"  each         {_count(_span(sizes), 'cosine')} of amplitude {_span(self.amplitude)}"
             f", crest factor {_span(crest)}",
             f"  cost         {self.cycles(0)} cycles, without those discarded",
-            f"  noise        of std s in an output gives H_m a std of {_span(np.sqrt(per))} s",
+            f"  noise        of std 1 in an output gives H_m a std of {_span(np.sqrt(per))}",
         ]
         return "\n".join(rows)
 

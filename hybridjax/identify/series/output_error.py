@@ -142,7 +142,7 @@ class OutputErrorProblem(NamedTuple):
         if to_lags[0].shape[1] < min(len(triangles[0]), sum(alone) - min(alone) / 2):
             raise DefinitionError(
                 f"{listed(records.inputs)} cannot be told apart, because some are functions of the "
-                "others: leave these out."
+                "others: keep only inputs that are not."
             )
         return cls(records, lags, free, to_lags, alike, records.scale)
 
