@@ -35,7 +35,9 @@ def table_of(table: Columns, rows: int) -> Any:
     frame = package("pandas").DataFrame(columns)
     labels = ["subject", *factors_of(frame)]
     for row, name in zip(*np.nonzero(frame[labels].isna().to_numpy()), strict=True):
-        raise DefinitionError(f"row {row} of `table` has no {labels[name]}: name it, or leave it out.")
+        raise DefinitionError(
+            f"row {row} of `table` has no {labels[name]}: name it, or leave it out."
+        )
     frame = frame.astype(dict.fromkeys(labels, str))
     for subject, groups in frame.groupby("subject")["group"] if "group" in frame else ():
         if len(groups.unique()) > 1:
