@@ -102,10 +102,9 @@ class LimitCycle(eqx.Module):
     def require_current(self) -> None:
         """**Raises:** `DefinitionError` if the system's code, or a parameter, has changed since the
         cycle was found."""
-        call = whole_call()
-        if call.compared is not self:
+        if whole_call().compared is not self:
             require_unchanged(self.system, self.numbers)
-        call.compared = self
+        whole_call().compared = self
 
     @property
     def structure(self) -> Structure:
@@ -332,8 +331,7 @@ class LimitCycle(eqx.Module):
         return card("LimitCycle", self._title(), facts(self._facts()), orbit, *multipliers)
 
     def _title(self) -> str:
-        change = what_changed(self.system, self.numbers)
-        message = f"{change} changed: find it again" if change else Result(int(self.result)).message
+        message = what_changed(self.system, self.numbers) or Result(int(self.result)).message
         return f"{type(self.system).__name__}: {message}"
 
     def _facts(self, multipliers: Mapping[str, str] = {}) -> dict[str, str]:  # noqa: B006
@@ -370,28 +368,24 @@ def _require_values(cycle: LimitCycle, name: str) -> None:
 
 
 def what_changed(system: HybridSystem, numbers: Mapping[str, Any]) -> str:
-    """What of a system has changed since its cycle was found; "" if nothing has."""
-    now, name = arrays_of(system), type(system).__name__
-    for key in sorted(now.keys() | numbers.keys()):
+    """A sentence on what of a system has changed since its cycle was found, if anything has."""
+    now, name, changed = arrays_of(system), type(system).__name__, ""
+    if system.code_digest != code_digest(system):
+        changed = f"the functions of {name}, or values that they read, have"
+    for key in now.keys() | numbers.keys():
         if _differ(now.get(key), numbers.get(key)):
-            return f"`{key}` of {name} has"
-    if system.code_digest == code_digest(system):
-        return ""
-    return f"the functions of {name}, or values that they read, have"
+            changed = f"`{key}` of {name} has"
+    return changed and f"{changed} changed since this limit cycle was found: find it again"
 
 
 def require_unchanged(system: HybridSystem, numbers: Mapping[str, Any]) -> None:
     """**Raises:** `DefinitionError` if something of the system has changed."""
     if change := what_changed(system, numbers):
-        raise DefinitionError(
-            f"{change} changed since this limit cycle was found: find it again, "
-            "`hj.find_limit_cycle(cycle.system, cycle)`."
-        )
+        raise DefinitionError(f"{change}, `hj.find_limit_cycle(cycle.system, cycle)`.")
 
 
 def _differ(x: Any, y: Any) -> bool:
-    # (Inside of a transformation a parameter alone is traced only if it was replaced there.)
-    if is_tracer(x) or is_tracer(y):
+    if is_tracer(x) or is_tracer(y):  # (a parameter alone is, if it was replaced in there)
         return is_tracer(x) != is_tracer(y)
     return x is not y and np.asarray(x).tobytes() != np.asarray(y).tobytes()
 

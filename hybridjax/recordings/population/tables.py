@@ -34,10 +34,9 @@ def table_of(table: Columns, rows: int) -> Any:
             )
     frame = package("pandas").DataFrame(columns)
     labels = ["subject", *factors_of(frame)]
-    for row, name in zip(*np.nonzero(frame[labels].isna().to_numpy()), strict=True):
-        raise DefinitionError(
-            f"row {row} of `table` has no {labels[name]}: name it, or leave it out."
-        )
+    if len(rows_without := np.flatnonzero(frame[labels].isna().any(axis=1))):
+        text = f"row {rows_without[0]} of `table` has no {' or no '.join(labels)}"
+        raise DefinitionError(f"{text}: name it, or leave the row out.")
     frame = frame.astype(dict.fromkeys(labels, str))
     for subject, groups in frame.groupby("subject")["group"] if "group" in frame else ():
         if len(groups.unique()) > 1:
