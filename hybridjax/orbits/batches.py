@@ -2,6 +2,7 @@
 compiled calls if there are many."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -35,9 +36,9 @@ from .scale import ROUNDING
 SMALL = 8000
 # Systems per compiled call. More: their arrays leave the cache. Fewer: calls cost more.
 BATCH = 250
-# Periods for which a system is simulated before Newton's method tries again. Fewer: slow transients
-# remain. More: each failure takes longer.
-_SETTLE = 40
+# Periods for which a system is simulated from its guess before Newton's method tries again, and at
+# last. Fewer: slow transients remain. More: each failure takes longer.
+_SETTLE = 8, 40
 # Largest step, in sizes of the states, that is taken with a guessed Jacobian. Larger: steps lead
 # astray. Smaller: few are taken.
 _NEAR = 0.06
@@ -66,13 +67,13 @@ def _verdict(map: ReturnMap, turn: Turn):
     return _apart(map, map.departure(q)), period, map.judge(q, turn)
 
 
-def _settle(map: ReturnMap):
-    """The ends of a simulation, at the guess's phase or section (NaN for systems that do not get
-    there), and expected periods."""
-    patient = Settings(TRANSIENT, TRANSIENT, 512 * _SETTLE, map.settings.scale)
+def _settle(map: ReturnMap, periods: int):
+    """The ends of a simulation of some periods, at the guess's phase or section (NaN for systems
+    that do not get there), and expected periods."""
+    patient = Settings(TRANSIENT, TRANSIENT, 512 * periods, map.settings.scale)
     s, anchor, expected = map.structure, map.anchor, map.expected
     u = np.zeros((s.nu, len(expected)))
-    moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient).moved
+    moved = move(s, anchor, u, until(anchor.t + periods * expected), patient).moved
     if map.base is not None:
         target = toward(np.full_like(expected, np.inf), -1, moved.lanes.t + 3 * expected)
         target = to_section(target, map.base, map.event)
@@ -170,8 +171,8 @@ class Tiles(NamedTuple):
             if self.known is None:
                 call.done, rows = 0, order[: min(self.size, WIDE)]
                 with uncollected():  # the programs are compiled during this call
-                    out = self._newton(rows, *self._given(len(rows)), FEW_STEPS)
-                    out = self._settle(rows, out)
+                    out = self._newton(rows, *self._given(rows), FEW_STEPS)
+                    out = self._again(rows, out, self._given, _SETTLE)
             else:
                 out = None
             while (done := 0 if out is None else len(out.result)) < S:
@@ -186,31 +187,30 @@ class Tiles(NamedTuple):
                 part = part._replace(steps=part.steps + 1)
                 out = part if out is None else _join(out, part)
         assert out is not None
-        failed = np.flatnonzero(out.result != Result.OK)
-        if len(failed) and (self.known is not None or len(failed) < S):
-            anchor, period, _ = neighbors(order[failed], out, moved=False)
-            part = self._newton(order[failed], anchor, period, FEW_STEPS)
-            better = part.result == Result.OK
-            part = part._replace(steps=part.steps + out.steps[failed])
-            out = _replace(out, failed[better], _pick(part, better))
-        return _pick(self._settle(order, out), np.argsort(order))
+        nearest = ft.partial(neighbors, out=out, moved=False)
+        return _pick(self._again(order, out, nearest, (0, *_SETTLE)), np.argsort(order))
 
-    def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
+    def _given(self, rows) -> tuple[Lanes, Float[np.ndarray, " S"]]:
         given = self.map.anchor, self.map.expected
-        return jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], count, 0), given)
+        return jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], len(rows), 0), given)
 
-    def _settle(self, rows, out: Rounds) -> Rounds:
-        """Another attempt for the systems that failed, from the end of a simulation."""
-        failed = np.flatnonzero(out.result != Result.OK)
-        if not len(failed):
-            return out
-        begin = self._in_tiles(_settle, rows[failed], *self._given(len(failed)))
-        arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
-        if not arrived.any():
-            return out
-        failed, begin = failed[arrived], _pick(begin, arrived)
-        anchor, period = begin
-        return _replace(out, failed, self._newton(rows[failed], anchor, period, FEW_STEPS))
+    def _again(self, rows, out: Rounds, guesses: Callable, settle: tuple[int, ...]) -> Rounds:
+        """More attempts for the systems that failed: from guesses, or from the ends of simulations
+        of so many periods."""
+        for periods in settle:
+            failed = np.flatnonzero(out.result != Result.OK)
+            if not len(failed):
+                break
+            begin = guesses(rows[failed])[:2]
+            if periods:
+                begin = self._in_tiles(_settle, rows[failed], *begin, options=(periods,))
+            arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
+            if arrived.any():
+                failed, begin = failed[arrived], _pick(begin, arrived)
+                part = self._newton(rows[failed], *begin, FEW_STEPS)
+                part = part._replace(steps=part.steps + out.steps[failed])
+                out = _replace(out, failed, part)
+        return out
 
     def _by_neighbors(self, parameters, cycles: Known, wanted, moved: bool):
         """The cycle of the nearest system, `moved` as the cycles around it in the same chart
@@ -219,7 +219,7 @@ class Tiles(NamedTuple):
         ok = np.flatnonzero(cycles.result == Result.OK)
         if not len(ok):
             blank = np.full((len(wanted), *cycles.jacobian.shape[1:]), np.nan)
-            return *self._given(len(wanted)), blank
+            return *self._given(wanted), blank
         parameters = parameters[ok]
         terms = _powers(parameters[:1]).shape[1]
         _, near = _tree(parameters).query(wanted, min(2 * terms + 3, len(ok)))

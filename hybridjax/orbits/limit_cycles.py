@@ -130,7 +130,7 @@ def find_limit_cycles(
 
     Newton's method first finds the cycles of a few systems in parallel, from the guess. Each
     further round solves four times as many systems, with the cycles of neighboring systems as
-    guesses. If Newton's method fails for a system, the system is simulated for 40 periods, and
+    guesses. If Newton's method fails for a system, the system is simulated for 8 or 40 periods, and
     Newton's method starts again from the final state.
 
     **Arguments:**
