@@ -92,5 +92,5 @@ def many(cycle, n):
     c, codes = eqx.combine(arrays, rest), np.tile(cycle.event_sequence, (n, 1))
     return LimitCycles(
         c.system, cycle.base, c.period, c.anchor, c.legs, c.factors, c.residual, c.iterations,
-        c.result, codes, cycle.settings, c.conserved, c.multiplicity,
+        c.result, codes, cycle.settings, c.conserved, c.multiplicity, c.numbers,
     )  # fmt: skip

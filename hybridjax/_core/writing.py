@@ -1,12 +1,10 @@
 """Files and folders that appear complete or not at all, and folders of results.
 
-A folder of results has a list `.hybridjax-KIND.json`
-with the name and the digest of each result.
-Only a file that is on the list, and has not changed since, may be replaced or removed.
+A folder of results has a list `.hybridjax-KIND.json` with the names of all results.
+Only a file that is on the list may be replaced or removed.
 """
 
 import contextlib
-import hashlib
 import json
 import os
 import shutil
@@ -61,7 +59,7 @@ def results_folder(folder: Path, kind: str, names: Iterable[str] = ()) -> Iterat
     **Arguments:** `names`: of results to come, with slashes, so that a refusal comes early.
 
     **Raises:** `DefinitionError` if `folder` cannot be written, or holds a file of one of the names
-    of the results that is a link, not on the list, or changed since.
+    of the results that is a link, or not on the list.
     """
     _refuse_link(folder)
     made = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
@@ -82,65 +80,56 @@ def results_folder(folder: Path, kind: str, names: Iterable[str] = ()) -> Iterat
 
 
 def _put(new: Path, folder: Path, kind: str) -> None:
-    files = (path for path in new.rglob("*") if path.is_file())
-    digests = {path.relative_to(new).as_posix(): [_digest(path)] for path in files}
+    names = {path.relative_to(new).as_posix() for path in new.rglob("*") if path.is_file()}
     before = _listed(folder, kind)
-    _refuse_others(folder, digests, before)
+    _refuse_others(folder, names, before)
     # First a list of both, so that all of them are on it after an interruption.
-    either = {name: before.get(name, []) + digests.get(name, []) for name in before | digests}
-    _write_list(folder, kind, either)
-    for name in digests:
+    _write_list(folder, kind, before | names)
+    for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(new / name, folder / name)
-    for name in before.keys() - digests.keys():
-        if _is_result(folder, name, before):
+    for name in before - names:
+        if _is_direct(folder, name):
             (folder / name).unlink()
-    _write_list(folder, kind, digests)
+    _write_list(folder, kind, names)
 
 
-def _refuse_others(folder: Path, names: Iterable[str], listed: dict[str, list[str]]) -> None:
+def _refuse_others(folder: Path, names: Iterable[str], listed: set[str]) -> None:
     for name in names:
         path = folder / name
         if path.parent.resolve() != folder.resolve() / Path(name).parent:
             raise _in_the_way(path.parent)
-        if os.path.lexists(path) and not _is_result(folder, name, listed):
+        if os.path.lexists(path) and not (name in listed and _is_direct(folder, name)):
             raise _in_the_way(path)
 
 
 def _in_the_way(path: Path) -> DefinitionError:
     return DefinitionError(
-        f"'{path}' is in the way, and was not written by hybridjax or was changed since: choose "
-        "another folder, or take it away."
+        f"'{path}' is in the way, and was not written by hybridjax: choose another folder, or "
+        "take it away."
     )
 
 
-def _is_result(folder: Path, name: str, listed: dict[str, list[str]]) -> bool:
-    """Return whether a file in the folder has a digest of the list, and no link leads to it."""
+def _is_direct(folder: Path, name: str) -> bool:
+    """Return whether the name is that of a file in the folder, to which no link leads."""
     root = folder.resolve()
     path = root / name
-    direct = root in path.parents and path.resolve() == path and path.is_file()
-    return direct and _digest(path) in listed.get(name, ())
+    return root in path.parents and path.resolve() == path and path.is_file()
 
 
-def _listed(folder: Path, kind: str) -> dict[str, list[str]]:
-    """Return the digests by name that results have if nobody has changed them."""
+def _listed(folder: Path, kind: str) -> set[str]:
+    """Return the names of earlier results."""
     path = folder / f".hybridjax-{kind}.json"
     if not os.path.lexists(path):
-        return {}
+        return set()
     try:
         if path.is_symlink() or not path.is_file() or path.stat().st_size > limits.TEXT:
             raise ValueError
-        listed = json.loads(path.read_text())
-        return {str(name): list(map(str, digests)) for name, digests in listed.items()}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        return set(map(str, json.loads(path.read_text())))
+    except (OSError, ValueError, TypeError, RecursionError):
         raise _in_the_way(path) from None
 
 
-def _write_list(folder: Path, kind: str, digests: dict[str, list[str]]) -> None:
+def _write_list(folder: Path, kind: str, names: set[str]) -> None:
     with replacing(folder / f".hybridjax-{kind}.json") as path:
-        path.write_text(json.dumps(digests, indent=1))
-
-
-def _digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        path.write_text(json.dumps(sorted(names), indent=1))

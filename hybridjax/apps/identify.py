@@ -105,8 +105,8 @@ def write_report(
     - `htf.npz`, `fit.npz`: transfer functions and fit, for `hj.load`. `summary.json`: the numbers.
     - `figures/`: in each of the `formats` of `hj.plot.save`, and as PNG for the page.
 
-    Other files in the folder stay as they are. Results of an earlier report are replaced, unless
-    they were changed since; a hidden list in the folder holds their names and digests.
+    Other files in the folder stay as they are. Results of an earlier report are replaced; a hidden
+    list in the folder holds their names.
 
     **Returns:** the path of the page.
 

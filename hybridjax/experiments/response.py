@@ -26,7 +26,7 @@ from ..sections.families import BoundSections
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike, observe, section_target
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem, Output, OutputNames
+from ..systems.system import HybridSystem, Output, OutputNames, arrays_of
 from .plan import ROUNDING, Accuracy, Plan, Stepping, plan_flow
 
 
@@ -205,7 +205,8 @@ class ResponseFunction(eqx.Module):
         if system is None:
             placed.cycle.require_current()
         else:
-            placed = eqx.tree_at(lambda x: x.cycle.system, placed, system)
+            both = lambda x: (x.cycle.system, x.cycle.numbers)  # noqa: E731
+            placed = eqx.tree_at(both, placed, (system, arrays_of(system)))
         if start is None:
             start = jnp.tile(placed.section_zero[:, None], len(u))
         return flow_batch(

@@ -18,7 +18,7 @@ from ..errors import DefinitionError
 from ..identify.weights import estimated_noise
 from ..orbits.cycle import LimitCycle
 from ..orbits.newton import MAX_STEPS as NEWTON_STEPS, root, solve
-from ..systems.system import HybridSystem
+from ..systems.system import HybridSystem, arrays_of
 from ..systems.varied import parameter_of, with_parameters
 from .observations import AbstractObservation, ObservedHTF
 
@@ -168,6 +168,7 @@ def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
     return dataclasses.replace(
         guess,
         system=system,
+        numbers=arrays_of(system),
         period=period,
         anchor=anchor,
         legs=guess.legs._replace(q=jnp.full_like(guess.legs.q, jnp.nan)),

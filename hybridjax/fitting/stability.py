@@ -38,6 +38,8 @@ def spectral_radius(model: LDTP | LimitCycle, smoothing: Probability = 1e-3) -> 
     **Arguments:** `model`: result of `linearize` or `find_limit_cycle`; for a batch use `jax.vmap`.
     `smoothing`: $\epsilon$, between 0 and 1; the larger, the smoother.
     """
+    if isinstance(model, LimitCycle):
+        model.require_current()
     power = monodromy(model.A if isinstance(model, LDTP) else model.factors)
     return _smooth_radius(power, jnp.asarray(smoothing, float))
 

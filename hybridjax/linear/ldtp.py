@@ -215,7 +215,7 @@ class LDTP(eqx.Module):
         """
         harmonics = check_harmonics(harmonics, self.n_sections)
         f = jnp.atleast_1d(f)
-        require_x64(self)
+        require_x64(self, f)
         self._refuse_resonance(f)
         H = harmonic_transfer(self.A, self.B, self.C, self.D, f)
         chosen = np.asarray(harmonics) % self.n_sections

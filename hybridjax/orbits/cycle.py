@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers, Positive, SignalNames
 from .._core.boundary.values import Reals
-from .._core.executor import is_traced, to_host
+from .._core.executor import is_traced, is_tracer, to_host
 from .._core.html import CHARTS, Curve, card, facts, multiplier_table, picture, unit_circle
 from .._core.meaning import code_digest
 from .._core.memo import Memory, remembered
@@ -29,7 +29,7 @@ from ..linear.frequency_response import Frequencies, Harmonics
 from ..linear.htf import HTF
 from ..linear.multipliers import product_eigenvalues
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem, OutputNames
+from ..systems.system import HybridSystem, OutputNames, arrays_of
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
@@ -73,6 +73,7 @@ class LimitCycle(eqx.Module):
     - `conserved`: requested values of conserved quantities, by name.
     - `multiplicity`: periods of the clock, or crossings of the section, in one period of the
         cycle.
+    - `numbers`: the arrays of the system for which the cycle was found, by name.
     """
 
     system: HybridSystem
@@ -88,6 +89,7 @@ class LimitCycle(eqx.Module):
     settings: Settings
     conserved: dict[str, Float[Array, ""]]
     multiplicity: int = eqx.field(static=True)
+    numbers: dict[str, Array]
 
     @property
     def return_map(self) -> ReturnMap:
@@ -98,18 +100,11 @@ class LimitCycle(eqx.Module):
         )  # fmt: skip
 
     def require_current(self) -> None:
-        """**Raises:** `DefinitionError` if the system's code has changed since the cycle was
-        found."""
-        call = whole_call()
-        if call.compared is not self and not self._is_current():
-            raise DefinitionError(
-                f"the functions of {type(self.system).__name__}, or values that they read, have "
-                "changed since this limit cycle was found: find it again."
-            )
-        call.compared = self
-
-    def _is_current(self) -> bool:
-        return self.system.code_digest == code_digest(self.system)
+        """**Raises:** `DefinitionError` if the system's code, or a parameter, has changed since the
+        cycle was found."""
+        if whole_call().compared is not self:
+            require_unchanged(self.system, self.numbers)
+        whole_call().compared = self
 
     @property
     def structure(self) -> Structure:
@@ -147,6 +142,7 @@ class LimitCycle(eqx.Module):
         exactly 1.
         """
         _require_values(self, "multipliers")
+        self.require_current()
         # The factors in sizes of the states, without padding.
         dims, scale = self.dims, np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
         after = np.roll(np.arange(len(dims)), -1)
@@ -312,6 +308,8 @@ class LimitCycle(eqx.Module):
     def __repr__(self):
         if is_traced(self):
             return f"LimitCycle({type(self.system).__name__}, traced)"
+        if what_changed(self.system, self.numbers):
+            return f"LimitCycle({self._title()})"
         least = "1e-10" if has_implicit(self.structure) else "1e-308"
         shown = (number(z, 9) if z else f"below {least}" for z in self.multipliers)
         multipliers = ", ".join(shown) or "none but zero"
@@ -326,14 +324,15 @@ class LimitCycle(eqx.Module):
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
-        if self.result != Result.OK or not self._is_current():
+        if what_changed(self.system, self.numbers) or self.result != Result.OK:
             return card("LimitCycle", self._title(), facts(self._facts()))
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
         orbit = orbit_picture(self.trajectory())
         return card("LimitCycle", self._title(), facts(self._facts()), orbit, *multipliers)
 
     def _title(self) -> str:
-        return f"{type(self.system).__name__}: {Result(int(self.result)).message}"
+        message = what_changed(self.system, self.numbers) or Result(int(self.result)).message
+        return f"{type(self.system).__name__}: {message}"
 
     def _facts(self, multipliers: Mapping[str, str] = {}) -> dict[str, str]:  # noqa: B006
         """The printed lines, by their headings."""
@@ -366,6 +365,29 @@ def _require_values(cycle: LimitCycle, name: str) -> None:
             f"`{name}` of a limit cycle needs its values, which a JAX transformation hides: use "
             "its arrays (`anchor`, `period`, `factors`) there, or `linearize(...).monodromy()`."
         )
+
+
+def what_changed(system: HybridSystem, numbers: Mapping[str, Any]) -> str:
+    """A sentence on what of a system has changed since its cycle was found, if anything has."""
+    now, name, changed = arrays_of(system), type(system).__name__, ""
+    if system.code_digest != code_digest(system):
+        changed = f"the functions of {name}, or values that they read, have"
+    for key in now.keys() | numbers.keys():
+        if _differ(now.get(key), numbers.get(key)):
+            changed = f"`{key}` of {name} has"
+    return changed and f"{changed} changed since this limit cycle was found: find it again"
+
+
+def require_unchanged(system: HybridSystem, numbers: Mapping[str, Any]) -> None:
+    """**Raises:** `DefinitionError` if something of the system has changed."""
+    if change := what_changed(system, numbers):
+        raise DefinitionError(f"{change}, `hj.find_limit_cycle(cycle.system, cycle)`.")
+
+
+def _differ(x: Any, y: Any) -> bool:
+    if is_tracer(x) or is_tracer(y):  # (a parameter alone is, if it was replaced in there)
+        return is_tracer(x) != is_tracer(y)
+    return x is not y and np.asarray(x).tobytes() != np.asarray(y).tobytes()
 
 
 def rough(cycle: LimitCycle) -> dict[str, Any]:

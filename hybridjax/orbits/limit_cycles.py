@@ -20,12 +20,12 @@ from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
-from ..systems.system import HybridSystem
+from ..systems.system import HybridSystem, arrays_of
 from .batches import Rounds, Tiles, tiles_of
 from .checks import check_jumps, check_periodic, closes_early
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
-from .cycle import LimitCycle
+from .cycle import LimitCycle, require_unchanged
 from .return_map import ReturnMap, turn_product
 
 
@@ -62,6 +62,7 @@ class LimitCycles(eqx.Module):
     settings: Settings
     conserved: dict[str, Float[Array, ""]]
     multiplicity: int = eqx.field(static=True)
+    numbers: dict[str, Array]
 
     def __len__(self) -> int:
         return len(self.result)
@@ -76,7 +77,7 @@ class LimitCycles(eqx.Module):
             pick(self.legs), pick(self.factors), pick(self.residual), pick(self.iterations),
             pick(self.result),
             tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
-            self.conserved, self.multiplicity,
+            self.conserved, self.multiplicity, pick(self.numbers),
         )  # fmt: skip
 
     @property
@@ -101,6 +102,7 @@ class LimitCycles(eqx.Module):
         Eigenvalues of the product of the factors, padded with zeros: those far below the largest
         are lost in rounding. `cycles[i].multipliers` has them.
         """
+        require_unchanged(self.systems, self.numbers)
         return _multipliers(np.asarray(self.factors), self.ok)
 
     def summary(self, limit: Index = 5) -> str:
@@ -173,7 +175,7 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
     cycles = LimitCycles(
         tiles.systems, map.base, rounds.period, rounds.anchor, turn.legs, turn.factors,
         turn.distance, rounds.steps, rounds.result, rounds.codes, map.settings, map.conserved,
-        map.multiplicity,
+        map.multiplicity, arrays_of(tiles.systems),
     )  # fmt: skip
     cycles = examined(cycles, rounds.together)
     if map.multiplicity == 1:

@@ -234,8 +234,11 @@ class SettledCycle:
             yield from counted(many or starmap(self.drive.run, items), "experiments", len(rows))
 
         with working("run_experiments"):
-            # (A plant is described by the cycle that was measured.)
-            about = digest_of(self.outputs, self.cycle_outputs, self.sections, u, self.seed)
+            about = ""
+            if store is not None:
+                self.drive.reset(self.seed)  # (its state would be another one at each call)
+                cycle = self.outputs, self.cycle_outputs, self.sections, self.seed
+                about = digest_of(self.drive.plant, *cycle, u)
             trials = resume(store, about, len(u), run)
         # (Rows are as long as the inputs, and NaN from the end of an experiment on.)
         rows = np.full((*u.shape[:2], len(self.outputs) + 1), np.nan)

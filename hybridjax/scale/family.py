@@ -14,6 +14,7 @@ from .._core.arguments import Numbers, require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed
 from .._core.boundary.values import Reals
+from .._core.meaning import current
 from .._core.pieces.description import digest_of
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
@@ -130,7 +131,8 @@ class Family:
 
     def systems(self, values: Mapping[str, np.ndarray]) -> HybridSystem:
         """Return the systems at several points as one, whose arrays have a leading axis."""
-        return eqx.filter_vmap(self.system)({name: jnp.asarray(x) for name, x in values.items()})
+        arrays = {name: jnp.asarray(x) for name, x in values.items()}
+        return current(eqx.filter_vmap(self.system)(arrays))
 
     def check(self, values: Mapping[str, float]) -> HybridSystem:
         """Return the system at one point.

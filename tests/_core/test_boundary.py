@@ -5,6 +5,7 @@ import dataclasses
 import inspect
 import pickle
 from collections.abc import Iterable, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Annotated, Literal, NamedTuple
 
 import equinox as eqx
@@ -43,7 +44,8 @@ TAKEN = [
     (SignalNames, ["a", "b"], ("a", "b")),
     (Annotated[SignalNames, Names(empty=True)], (), ()),
     (Annotated[Numbers, Reals()], [1, 2], np.array([1.0, 2.0])),
-    (Annotated[Numbers, Reals("n 2")], np.ones((3, 2), np.float32), np.ones((3, 2), np.float32)),
+    (Annotated[Numbers, Reals("n 2")], np.ones((3, 2), np.float32), np.ones((3, 2))),
+    (GAPS, np.ma.masked_less([1, 2], 2), np.array([NAN, 2.0])),
     (GAPS, [1, NAN], np.array([1, NAN])),
     (Annotated[Numbers, Reals("n", missing=True, infinite=True)], [INF, NAN], np.array([INF, NAN])),
     (Annotated[Numbers, Reals("n")], jnp.arange(2), jnp.arange(2.0)),
@@ -76,6 +78,7 @@ REFUSED = [
     (MATRIX, np.zeros((2, 2), complex), "must be real, not an array of complex128"),
     (MATRIX, "x", "must be an array of real numbers with shape (N, d), not 'x'"),
     (MATRIX, [[0, 1], [NAN, 0]], "must be finite, but is nan at index (1, 0)"),
+    (MATRIX, SimpleNamespace(columns=["b"]), "not a table: give `table[names].to_numpy()`"),
     (GAPS, [0, INF], "must be finite, but is inf at index 1"),
     (Annotated[Numbers, Reals("n", sign="positive")], [1, 0], "must be positive, but is 0 at"),
     (Annotated[Numbers, Reals("n", sign="nonnegative")], [1, -2], "must be zero or positive, but"),

@@ -124,7 +124,8 @@ def test_bad_input(hopper_cycle, placed_isochrons, design, change, message):
 
 def test_new_values_of_parameters_do_not_compile_again(placed_isochrons, design):
     def run(k):
-        placed = eqx.tree_at(lambda p: p.cycle.system.k, placed_isochrons, jnp.asarray(k))
+        where = lambda p: (p.cycle.system.k, p.cycle.numbers["k"])  # noqa: E731
+        placed = eqx.tree_at(where, placed_isochrons, (jnp.asarray(k),) * 2)
         hj.run_experiments(placed.cycle, placed, design, OUTPUTS, **BATCH)
 
     # (What was computed for the fixture is kept, but its programs may be forgotten.)

@@ -145,7 +145,8 @@ def test_a_store_without_what_it_began_with_is_refused(lost, stored, tmp_path):
 
 def test_other_experiments_are_refused(made, arguments):
     cycle, placed, _, _ = arguments
-    other = eqx.tree_at(lambda p: p.cycle.system.damping, placed, jnp.asarray(0.11, float))
+    where = lambda p: (p.cycle.system.damping, p.cycle.numbers["damping"])  # noqa: E731
+    other = eqx.tree_at(where, placed, (jnp.asarray(0.11),) * 2)
     velocity = hj.Output("v", lambda t, q, u: -q[1], "m/s")
     cases = (
         (dict(design=hj.multisine(8, 8, (0, 4.0), experiments=COUNT, seed=1)), "`design"),

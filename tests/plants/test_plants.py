@@ -136,6 +136,8 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
     assert np.array_equal(data.y, whole.y) and data.simulated.causes == 10 * ("",)
     other = circle.run_experiments(2 * u[:1], **options)
     assert not np.array_equal(other.y, data.y[:1])
+    monkeypatch.setattr(circle.drive.plant, "rate", 0.4)  # around the same cycle
+    assert np.abs(circle.run_experiments(u, **options).y - data.y).max() > 1e-3
     hj.save(tmp_path / "data.npz", data)
     assert np.array_equal(hj.load(tmp_path / "data.npz").y, data.y)
 

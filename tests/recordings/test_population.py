@@ -211,6 +211,7 @@ def test_the_band_holds_the_mean_and_draws_repeat():
 
 @pytest.mark.parametrize("sentence, call", {
     "'a' is in the groups 'x'": lambda: study([1.0, 2], [1.0, 1], subject=["a", "a"], group="xy"),
+    "row 1 of `table` has no subj": lambda: study([1.0, 2], [1.0, 1], subject=["a", None]),
     "'x' has too few": lambda: study([1.0, 2, 3], np.ones(3), condition="xyy").mean("gain"),
     "has no covariance": lambda: fitted(fit_of([0.5], scale=np.inf)),
     "of x, but that of 'a' of y": lambda: fitted(fit_of([0.5]), fit_of([0.5], outputs=["x"])),

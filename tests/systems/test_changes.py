@@ -1,5 +1,6 @@
 """Answers follow the code that a notebook has now, and a function that uses the time is found."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,14 +76,33 @@ def test_functions_that_are_made_anew_have_traces_of_their_own(monkeypatch):
         lambda cycle: hj.continuation(cycle, "wind", (0.0, 0.1)),
         lambda cycle: hj.response_function(cycle, SECTIONS, "x"),
         lambda cycle: cycle.trajectory(),
+        lambda cycle: cycle.multipliers,
+        lambda cycle: hj.spectral_radius(cycle),
     ],
 )
 def test_a_cycle_belongs_to_the_code_as_it_was(use, monkeypatch):
     cycle = hj.find_limit_cycle(Slowed())
+    blown = eqx.tree_at(lambda x: x.system.wind, cycle, jnp.asarray(0.5))
+    assert "find it again" in repr(blown)
+    with pytest.raises(hj.DefinitionError, match="`wind` of Slowed has changed since this limit"):
+        use(blown)
     monkeypatch.setitem(globals(), "DRAG", 1.3)
     with pytest.raises(hj.DefinitionError, match="have changed since this limit cycle was found"):
         use(cycle)
     assert hj.find_limit_cycle(Slowed(), cycle).stable  # (as a guess it will do)
+
+
+def test_a_parameter_inside_of_a_cycle_is_not_differentiated():
+    cycle = hj.find_limit_cycle(Slowed())
+
+    def decay(wind):
+        return hj.linearize(eqx.tree_at(lambda x: x.system.wind, cycle, wind), SECTIONS).A[0, 0, 0]
+
+    for transform in (jax.jit, jax.grad, jax.vmap):
+        with pytest.raises(hj.DefinitionError, match="find it again"):
+            transform(decay)(jnp.zeros(1 if transform is jax.vmap else ()))
+    model = eqx.filter_jit(hj.linearize)(hj.find_limit_cycle(Slowed()), SECTIONS)
+    np.testing.assert_allclose(model.A[:, 0, 0], np.exp(-DRAG / 2), rtol=1e-9)
 
 
 def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):

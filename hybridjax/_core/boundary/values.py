@@ -224,6 +224,13 @@ def _plain(value: Any, allowed: str) -> Any:
     return value.item() if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0 else value
 
 
+def unmasked(values: Any) -> np.ndarray:
+    """An array of NumPy, NaN where it was masked (as readers of netCDF mask what is missing)."""
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(np.result_type(values, float)), np.nan)
+    return np.asarray(values)
+
+
 def refuse_traced(value: Any, allowed: str) -> None:
     if is_tracer(value):
         raise Misfit(
@@ -236,9 +243,9 @@ def refuse_traced(value: Any, allowed: str) -> None:
 class Reals(Kind):
     """An array of real numbers with a shape, given as such, or as numbers in nested sequences.
 
-    Arrays stay what they are, NumPy's or JAX's; everything else becomes one of NumPy. Numbers are
-    floating-point numbers afterwards. Of a traced array the shape and the type are checked, since
-    its values are not known.
+    Arrays stay NumPy's or JAX's; everything else becomes one of NumPy. Numbers are floating-point
+    numbers of double precision afterwards, NaN where they were masked. Of a traced array the shape
+    and the type are checked, since its values are not known.
 
     **Arguments:**
 
@@ -273,7 +280,7 @@ class Reals(Kind):
             self.allowed = f"an array of {self.items} with shape {self._written()}"
 
     def take(self, value):
-        array = value if isinstance(value, np.ndarray | jax.Array) else self._array(value)
+        array = value if isinstance(value, jax.Array) else self._array(value)
         if array.dtype.kind not in self.types:
             raise self._wrong_type(value, array)
         if not self._fits(array.shape):
@@ -281,13 +288,17 @@ class Reals(Kind):
             raise Misfit(f"must be {what}, not of shape {array.shape}", near=True)
         if not is_tracer(array):
             self._check_values(array)
-        if array.dtype.kind != self.types[0]:
-            array = array.astype(self.dtype)
+        # (Arrays of JAX in single precision have lost digits, and are refused by `require_x64`.)
+        if isinstance(array, np.ndarray) or array.dtype.kind != self.types[0]:
+            array = array.astype(self.dtype, copy=False)
         return array if self.form is None else self.form(array)
 
     def _array(self, value: Any) -> np.ndarray | jax.Array:
+        if hasattr(value, "columns"):
+            text = "must be an array, not a table: give `table[names].to_numpy()`, in their order"
+            raise Misfit(text, near=True)
         try:
-            return np.asarray(value)
+            return unmasked(value)
         except jax.errors.TracerArrayConversionError:  # some of the numbers are traced
             with contextlib.suppress(ValueError, TypeError):
                 return jnp.asarray(value)

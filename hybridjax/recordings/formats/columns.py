@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from ..._core import limits
 from ..._core.archive import damaged
+from ..._core.boundary.values import unmasked
 from ...errors import DefinitionError, FileFormatError, HybridJaxError
 
 
@@ -105,7 +106,7 @@ def numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
     **Raises:** `DefinitionError` for other values.
     """
     try:
-        values = np.asarray(values)
+        values = unmasked(values)
     except ValueError:  # rows of different lengths
         values = np.empty((0, 0), object)
     if values.dtype.kind not in "fiub" or values.ndim != 1:

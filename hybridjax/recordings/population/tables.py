@@ -20,8 +20,8 @@ class Columns(Protocol):
 def table_of(table: Columns, rows: int) -> Any:
     """Return a data frame whose subjects, groups and conditions are strings.
 
-    **Raises:** `DefinitionError` for a table without subjects or of another length, and for a
-    subject in two groups.
+    **Raises:** `DefinitionError` for a table without subjects or of another length, for a label
+    that is missing, and for a subject in two groups.
     """
     columns = {str(name): np.asarray(values) for name, values in table.items()}
     if "subject" not in columns:
@@ -33,7 +33,11 @@ def table_of(table: Columns, rows: int) -> Any:
                 f"but has shape {values.shape}."
             )
     frame = package("pandas").DataFrame(columns)
-    frame = frame.astype(dict.fromkeys(["subject", *factors_of(frame)], str))
+    labels = ["subject", *factors_of(frame)]
+    if len(rows_without := np.flatnonzero(frame[labels].isna().any(axis=1))):
+        text = f"row {rows_without[0]} of `table` has no {' or no '.join(labels)}"
+        raise DefinitionError(f"{text}: name it, or leave the row out.")
+    frame = frame.astype(dict.fromkeys(labels, str))
     for subject, groups in frame.groupby("subject")["group"] if "group" in frame else ():
         if len(groups.unique()) > 1:
             raise DefinitionError(
