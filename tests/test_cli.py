@@ -1,7 +1,6 @@
 """The command line: fast help, the short form of the main job, bad input."""
 
 import json
-from concurrent.futures import Executor, Future
 
 import numpy as np
 import pytest
@@ -61,22 +60,9 @@ def test_reproduce_writes_its_results(results):
         assert hj.load(results / f"rational_{family}.npz").multipliers.shape == (2, 2)
 
 
-class AtOnce(Executor):
-    """In place of a second process, which takes seconds."""
-
-    def submit(self, function, *arguments):
-        done = Future()
-        done.set_result(function(*arguments))
-        return done
-
-
-def alone(*_):
-    return AtOnce()
-
-
 @pytest.mark.slow  # (`.ci/run` draws them)
 def test_reproduce_draws_its_figures(tmp_path):
-    reproduce(tmp_path, Protocol(20, 28, 8), ("png",), alone())
+    reproduce(tmp_path, Protocol(20, 28, 8), ("png",))
     names = ["fig1_cycle_isochron", "fig1_cycle_kinematic", "fig3_harmonics", "fig4_bode"]
     for name in (*names, "multipliers", "poles_zeros"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
@@ -84,11 +70,7 @@ def test_reproduce_draws_its_figures(tmp_path):
     assert files == {".json", ".npz", ".png"}
 
 
-SECOND_PROCESS = "hybridjax.apps.second_process.second_process"
-
-
-def test_bad_input_is_one_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr(SECOND_PROCESS, alone)
+def test_bad_input_is_one_sentence():
     with pytest.raises(SystemExit, match="^hybridjax: cannot write to '/dev/null/x'.*") as error:
         main(["reproduce", "--out", "/dev/null/x"])
     assert "\n" not in str(error.value)
@@ -137,9 +119,8 @@ def test_wrong_options(tmp_path, monkeypatch, capsys, command, options, message)
 def protocols(monkeypatch):
     """What `reproduce` would be asked for; it does nothing, and converges."""
     asked = []
-    monkeypatch.setattr(SECOND_PROCESS, alone)
 
-    def reproduce(out, protocol, formats, process):
+    def reproduce(out, protocol, formats):
         assert formats == ("png",)
         asked.append(protocol)
         return {"families": {"isochron": {"converged": protocol.seed == 0}}}
@@ -161,7 +142,6 @@ def test_an_interruption_is_one_line(tmp_path, monkeypatch, capsys):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(SECOND_PROCESS, alone)
     monkeypatch.setattr("hybridjax.apps.reproduce._reproduce", interrupted)
     with pytest.raises(SystemExit) as error:
         main(["reproduce", "--out", str(tmp_path / "new")])

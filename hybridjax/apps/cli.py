@@ -236,14 +236,10 @@ def _identify(options) -> int:
 
 
 def _reproduce(options) -> int:
-    from .second_process import second_process
+    from .reproduce import Protocol, reproduce
 
-    with second_process("hybridjax.apps.reproduce", "hybridjax.plot.plane") as process:
-        from .reproduce import Protocol, reproduce
-
-        sizes = (20, 36, 16) if options.quick else (80, 84, 64)
-        protocol = Protocol(*sizes, options.seed)
-        summary = reproduce(options.out, protocol, options.formats, process)
+    sizes = (20, 36, 16) if options.quick else (80, 84, 64)
+    summary = reproduce(options.out, Protocol(*sizes, options.seed), options.formats)
     return _status(all(family["converged"] for family in summary["families"].values()))
 
 

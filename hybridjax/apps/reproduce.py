@@ -8,7 +8,6 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -69,20 +68,17 @@ class Family(NamedTuple):
 
 
 def _log(begin: float, text: str) -> None:
-    """Print a finished step with the seconds since `begin`, which is the same in all processes."""
+    """Print a finished step with the seconds since `begin`."""
     print(f"[{time.time() - begin:6.1f} s] {text}", flush=True)
 
 
-def reproduce(
-    out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format], process: Executor
-) -> dict:
+def reproduce(out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format]) -> dict:
     """Run the protocol and write figures, `summary.json` and files for `hj.load` into a folder.
 
     They appear when all of them are ready, and replace those of an earlier run. Other files in the
     folder stay as they are.
 
-    **Arguments:** `formats`: of the figures, as in `hj.plot.save`. `process`: an executor, which
-    does half of the work.
+    **Arguments:** `formats`: of the figures, as in `hj.plot.save`.
 
     **Returns:** what `summary.json` holds.
 
@@ -91,7 +87,7 @@ def reproduce(
     """
     names = _names(formats)
     with results_folder(Path(out), "reproduce", names) as folder:
-        return _reproduce(folder, protocol, formats, process)
+        return _reproduce(folder, protocol, formats)
 
 
 def _names(formats: Sequence[Format]) -> list[str]:
@@ -103,8 +99,9 @@ def _names(formats: Sequence[Format]) -> list[str]:
     return ["summary.json", *saved, *files]
 
 
-def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process: Executor) -> dict:
-    _set_up()
+def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict:
+    enable_x64()
+    enable_compilation_cache()
     begin = time.time()
     # Lines without second-order products on them need many experiments.
     division: Literal["random", "sum-free"] = "sum-free" if protocol.experiments >= 80 else "random"
@@ -117,30 +114,19 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process
     multipliers = ", ".join(f"{z:.9f}" for z in cycle.multipliers)
     _log(begin, f"limit cycle: period {float(cycle.period):.6g}, multipliers {multipliers}")
 
-    # The second process identifies the second family, and then draws the figures that take longer.
     discard = protocol.cycles - protocol.keep
-    first, second = _FAMILIES
-    task = process.submit(_identify, second, cycle, design, discard, begin)
-    families = {first: _identify(first, cycle, design, discard, begin)}
-    perturbed = _perturbed(cycle)
-    families[second] = task.result()
-    drawing = process.submit(_draw, _comparisons, (cycle, families), out, formats, begin)
+    families = {name: _identify(name, cycle, design, discard, begin) for name in _FAMILIES}
     placed = {name: family.placed for name, family in families.items()}
-    _draw(_cycles, (placed, perturbed), out, formats, begin)
+    _draw(_cycles, (placed, _perturbed(cycle)), out, formats, begin)
+    _draw(_comparisons, (cycle, families), out, formats, begin)
     summary = summarize(protocol, cycle, families)
     for name, family in families.items():
         for result in _SAVED:
             write_module(out / f"{result}_{name}.npz", getattr(family, result))
-    drawing.result()
     summary["seconds"] = time.time() - begin
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     print(table(summary))
     return summary
-
-
-def _set_up() -> None:
-    enable_x64()
-    enable_compilation_cache()
 
 
 def _sections(name: str, count: int) -> AbstractSections:
@@ -154,7 +140,6 @@ def _sections(name: str, count: int) -> AbstractSections:
 
 def _identify(name: str, cycle: LimitCycle, design: Design, discard: int, begin: float) -> Family:
     """Return all results with one family of sections."""
-    _set_up()
     placed = place_sections(cycle, _sections(name, design.n_sections))
     ldtp = linearize(cycle, placed, OUTPUTS)
     exact = ldtp.htf(design.frequencies)
@@ -181,7 +166,6 @@ def _draw(
 
     from .. import plot
 
-    _set_up()
     for name, drawn in figures(plot, *results):
         plot.save(out / name, drawn, formats)
         pyplot.close(drawn.figure)
