@@ -206,8 +206,8 @@ class Tiles(NamedTuple):
                 begin = self._in_tiles(_settle, rows[failed], *begin, options=(periods,))
             arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
             if arrived.any():
-                failed, begin = failed[arrived], _pick(begin, arrived)
-                part = self._newton(rows[failed], *begin, FEW_STEPS)
+                failed, (anchor, period) = failed[arrived], _pick(begin, arrived)
+                part = self._newton(rows[failed], anchor, period, FEW_STEPS)
                 part = part._replace(steps=part.steps + out.steps[failed])
                 out = _replace(out, failed, part)
         return out
