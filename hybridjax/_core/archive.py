@@ -147,9 +147,8 @@ def options_of(hint: Any) -> tuple[Any, ...]:
 
 def _module_in(hint: Any) -> type | None:
     """The kind of module that a field of this type may hold."""
-    return next(
-        (x for x in options_of(hint) if isinstance(x, type) and issubclass(x, eqx.Module)), None
-    )
+    classes = (x for x in options_of(hint) if isinstance(x, type))
+    return next((x for x in classes if issubclass(x, eqx.Module)), None)
 
 
 def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]) -> dict[str, Any]:

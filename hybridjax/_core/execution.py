@@ -50,8 +50,15 @@ def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -
     if workers == 1:
         yield from map(work, items)
         return
+    device = default_device()  # which other threads would not know
+
+    def configured(item):
+        require_x64()
+        with jax.default_device(device):
+            return work(item)
+
     with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(_configured(work), items)
+        yield from pool.map(configured, items)
 
 
 def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
@@ -65,17 +72,6 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
     with one_blas_thread(), ThreadPoolExecutor(core_count() if alone else 1) as pool:
         running = [pool.submit(copy_context().run, work, item) for item in items]
         return [future.result() for future in running]
-
-
-def _configured(work):
-    device = default_device()  # which other threads would not know
-
-    def configured(*arguments):
-        require_x64()
-        with jax.default_device(device):
-            return work(*arguments)
-
-    return configured
 
 
 def core_count() -> int:

@@ -57,16 +57,17 @@ def by_columns(
     arrays (P, ...), and `None` for what does not move; so is the second result. Values are
     concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
     raises `NotOnHostError`, or more than `most` numbers move, derivatives are compiled, as inside
-    of programs. `relevant` replaces tangents that make no difference by `None`.
+    of programs. `relevant` replaces those tangents of the first argument by `None` that make no
+    difference.
     """
     derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
 
     @derived.def_jvp
     def rule(arguments, tangents):
-        moving = jax.tree_util.tree_map(
-            lambda t, x: None if t is None else x,
-            relevant(tangents), arguments, is_leaf=lambda t: t is None,
-        )  # fmt: skip
+        moved = relevant(tangents[0]), *tangents[1:]
+        still = lambda t: t is None  # noqa: E731
+        values = lambda t, x: None if still(t) else x  # noqa: E731
+        moving = jax.tree_util.tree_map(values, moved, arguments, is_leaf=still)
         leaves, structure = jax.tree_util.tree_flatten(moving)
         ends = np.cumsum([x.size for x in leaves])
         is_small = len(leaves) and ends[-1] <= most
@@ -81,7 +82,7 @@ def by_columns(
         except NotOnHostError:
             require_program()
             return eqx.filter_jvp(compiled, arguments, tangents)
-        weights = jax.tree_util.tree_leaves(relevant(tangents))
+        weights = jax.tree_util.tree_leaves(moved)
         return from_host(result), _combined(from_host(columns), weights)
 
     return derived

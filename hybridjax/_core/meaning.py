@@ -257,9 +257,8 @@ class _Walk:
             self._refuse_hidden(x, (), pathlib.Path.read_text)
         for path in (*paths, *((name, "") for name in imported)):
             value = modules[path[0]] if path[0] in modules else x.__globals__.get(path[0])
-            self._refuse_hidden(
-                x, path, getattr(builtins, path[0], None) if value is None else value
-            )
+            builtin = getattr(builtins, path[0], None)
+            self._refuse_hidden(x, path, builtin if value is None else value)
             if value is None:
                 continue
             self.note(path[0])

@@ -61,9 +61,7 @@ _two_names = _option("two names with a comma in between", "([^,]*,[^,]*)", _diff
 _two_numbers = _option("two numbers as in 1.5,0", "([^,]*),([^,]*)", _FINITE, _FINITE)
 _two_positive = _option("two positive numbers as in 1.5,2", "([^,]*),([^,]*)", _POSITIVE, _POSITIVE)
 _model = _option("FILE.py:NAME", r"(.*\.py):([^\W\d]\w*)", str, str)
-_axis = _option(
-    "NAME=LOW:HIGH:COUNT", "([^=]+)=([^:]*):([^:]*):([^:]*)", str, _FINITE, _FINITE, _COUNT
-)
+_axis = _option("NAME=LOW:HIGH:COUNT", "([^=]+)=(.*):(.*):(.*)", str, _FINITE, _FINITE, _COUNT)
 _crossing = _option(
     "a signal, a direction and a value, as in x:falling:0.2",
     r"\s*([^:]*[^:\s])\s*(?::(rising|falling)(?::(.*))?)?",

@@ -158,11 +158,10 @@ def write_results(folder: Path, found: Identification, formats: Sequence[Format]
     save(folder / "htf.npz", htf)
     save(folder / "fit.npz", found.fit)
     header = [f"{n} ({u})" if u else n for n, u in zip(data.signals, data.units, strict=True)]
+    records = zip(data.records, data.times, data.trials, strict=True)
     rows = (
         (recording.trials[trial].name, k, *divmod(record.first_section + i, data.n_sections), *row)
-        for k, (record, times, trial) in enumerate(
-            zip(data.records, data.times, data.trials, strict=True)
-        )
+        for k, (record, times, trial) in enumerate(records)
         for i, row in enumerate(_written(times[:, None], record.u, record.y))
     )
     first = ["trial", "record", "cycle", "section", "time (s)"]
@@ -300,9 +299,7 @@ def _left_out(found: Identification) -> dict[str, Any]:
         "cycles whose beginning or end is unknown (a missed event, a gap)": found.phase.missed,
         "fraction of the samples at sections (gaps longer than a section)": found.data.missing,
         "fraction of the samples whose phase ran backwards (replaced)": found.phase.backwards,
-        "stretches too short for the validation (they count in the fit)": (
-            found.held_out.validation.left_out
-        ),
+        "stretches too short to validate (used in the fit)": found.held_out.validation.left_out,
     }
 
 

@@ -161,9 +161,8 @@ def identify_subjects(
     failures = {name: text for name, text in causes.items() if text}
     frame = rows[~rows["report"].isin(failures)].drop_duplicates("report", ignore_index=True)
     if not len(frame):
-        raise ComputationError(
-            f"all subjects failed: {'; '.join(map(': '.join, failures.items()))}"
-        )
+        text = "; ".join(map(": ".join, failures.items()))
+        raise ComputationError(f"all subjects failed: {text}")
     fits: Any = tuple(load(root / name / "fit.npz") for name in frame["report"])
     texts = [(root / name / "summary.json").read_text() for name in frame["report"]]
     for name, key in _COLUMNS.items():

@@ -56,9 +56,7 @@ class Matrices(NamedTuple):
         row = np.arange(len(wanted)) if part is None else part
         shown, hidden = (np.bincount(row, ((wanted @ r) ** 2).sum(axis=1)) for r in self.spread)
         if (hidden > _MISSED * (shown + hidden)).any():
-            raise DefinitionError(
-                "`design` does not determine the `goal`: measure more harmonics or lines."
-            )
+            raise DefinitionError("`design` does not determine the `goal`: add harmonics or lines.")
         wanted = wanted @ self.spread.root
         unknowns = tuple(f"combination {k} of the matrices" for k in range(wanted.shape[1]))
         return LinearCriterion(names, unknowns, (self.channel,), wanted, part)

@@ -242,7 +242,7 @@ class Study(eqx.Module):
             rows = ["  strides  standard errors"]
             rows += [f"  {n:>7}  {errors}" for n, errors in self._rows()]
             rows.append(f"  {self.fit.show_multipliers()}")
-            rows += [f"  {x}" for x in self._outlook(self.fit).splitlines()]
+            rows += [f"  {x}" for x in self._outlook().splitlines()]
         return "\n".join([f"Study({self._state()})", *rows])
 
     def _repr_html_(self) -> str:
@@ -250,7 +250,7 @@ class Study(eqx.Module):
             return card("Study", self._state())
         multipliers = multiplier_table(self.fit.multipliers, self.fit.standard_errors)
         strides = table(("strides", "standard errors"), self._rows())
-        return card("Study", self._state(), multipliers, strides, text(self._outlook(self.fit)))
+        return card("Study", self._state(), multipliers, strides, text(self._outlook()))
 
     def _state(self) -> str:
         if self.fit is None:
@@ -266,7 +266,7 @@ class Study(eqx.Module):
             rows.append((f"{n:.0f}", numbers if np.isfinite(errors).all() else lost))
         return rows
 
-    def _outlook(self, fit: StructuredFit) -> str:
+    def _outlook(self) -> str:
         best, plan = self._history.estimate, self.plan
         if plan is None or best is None:
             return f"next: the first design again, since {best.objection if best else ''}"

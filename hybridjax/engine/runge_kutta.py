@@ -215,12 +215,10 @@ def _increments(method, field, t, q, h):
         going = (now > small * size) & ((now < 0.5 * last) | (i < 2))
         return w, now, going.any(), i + 1
 
-    def unsettled(carry):
-        *_, going, i = carry
-        return going & (i < 12)  # a step that needs more is rejected for its error
-
     w = jnp.zeros((len(c), *q.shape), q.dtype).at[0].set(h * field(t, q))
     begin = w, jnp.full(q.shape, jnp.inf, q.dtype), jnp.array(True), 0
+    # A step that needs more iterations is rejected for its error.
+    unsettled = lambda carry: carry[2] & (carry[3] < 12)  # noqa: E731
     w, last, *_ = jax.lax.while_loop(unsettled, iterate, begin)
     return w, last, J
 

@@ -246,9 +246,8 @@ def jumps(s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarr
     rounding = np.nanquantile(np.abs(at(shifted) - first), 0.9, axis=0)  # (not at a jump)
     limit = np.maximum(np.nanmax(np.abs(first), axis=0), rounding / _JUMP)
     limit[:n] = np.maximum(limit[:n], sizes[1:] / sizes[0])
-    limit[n:] = (
-        np.maximum(limit[n:], _SAME_GAIN * limit[n:].max(initial=0.0)) + np.finfo(float).tiny
-    )
+    limit[n:] = np.maximum(limit[n:], _SAME_GAIN * limit[n:].max(initial=0.0))
+    limit[n:] += np.finfo(float).tiny
     for _ in range(_QUARTERS):
         points = np.stack([low, *(low + parts * (high - low)), high])
         inside = at(np.concatenate(points[1:-1])).reshape(3, *first.shape)

@@ -302,8 +302,7 @@ class Campaign:
         finite = np.isfinite(y)
         if finite.all() or (finite.all(axis=(1, 2)) | (result != Result.OK)).all():
             return
-        for a in np.unique(self.placed.lanes.chart):
-            self.at_sections.outputs.require(int(a))
+        self.at_sections.outputs.require(*np.unique(self.placed.lanes.chart).tolist())
         raise DefinitionError(
             "an output is NaN where experiments go: define it there, or make the inputs smaller."
         )

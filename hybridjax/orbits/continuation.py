@@ -243,11 +243,11 @@ class _Trace(NamedTuple):
 
     def run(self, start: Point) -> tuple[list[Point], BranchEnd]:
         """The points along a tangent, those of changes of stability among them, and the end."""
-        points, length, moved = [start], self.step, None
+        points, length, moved, before = [start], self.step, None, None
         low, high = self.values[0], self.values[-1]
         over = start.value == (high if start.tangent[-1] > 0 else low)
         while not over and len(points) < self.max_points:
-            last, before = points[-1], points[-2] if len(points) > 1 else None
+            last = points[-1]
             say(f"{self.curve.parameter} = {last.value:.5g}, {len(points)} cycles")
             point = self.curve.step(before, last, length)
             if isinstance(point, Point) and not low <= point.value <= high:
@@ -256,7 +256,7 @@ class _Trace(NamedTuple):
             if isinstance(point, Point) and point.cosine(last) < _STRAIGHT:
                 point = Result.NOT_CONVERGED
             if isinstance(point, Point):
-                points += self.between(last, point)
+                points, before = points + self.between(last, point), last
                 length = min(self.step, length * (1.5 if point.steps <= USUAL_STEPS else 1.0))
                 continue
             length, over = length / 2, False
@@ -268,11 +268,10 @@ class _Trace(NamedTuple):
                     points[-1], length = moved, self.step
                     continue
             return points, BranchEnd(last.value, point, point.message)
-        value = points[-1].value
+        end = Result.STEP_LIMIT, f"{self.max_points} cycles; `max_points` raises it"
         if over:
-            return points, BranchEnd(value, Result.OK, "end of the parameter range")
-        message = f"{self.max_points} cycles; `max_points` raises it"
-        return points, BranchEnd(value, Result.STEP_LIMIT, message)
+            end = Result.OK, "end of the parameter range"
+        return points, BranchEnd(points[-1].value, *end)
 
     def between(self, a: Point, b: Point) -> list[Point]:
         """Changes of stability and values after a point until its neighbor, which comes last."""

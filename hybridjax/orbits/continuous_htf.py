@@ -75,8 +75,7 @@ def asked(
     z = s.resolve_outputs(s.states_everywhere() if outputs is None else outputs)
     for x in (x for x in z.items if isinstance(x, Output)):
         list(check_output(s, x))
-    for name in {s.transitions[g].source for g in events} or s.names:
-        z.require(s.chart_index(name))
+    z.require(*map(s.chart_index, {s.transitions[g].source for g in events} or s.names))
     return z, *s.inputs_among(inputs)
 
 

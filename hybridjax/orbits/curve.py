@@ -28,9 +28,6 @@ _SMALL, _ROUNDING = 1e-11, 1e-8
 # The least range over the cycle that counts, in sizes of the states. Smaller: states that hardly
 # move shorten the steps. Larger: steps are longer than the orbit.
 _LEAST_RANGE = 0.02
-# The part of a step by which two points must be apart to extrapolate from both. Smaller: rounding
-# errors grow. Larger: Newton's method begins further away.
-_APART = 0.1
 
 
 @dataclasses.dataclass
@@ -121,13 +118,12 @@ class Curve:
         return self._correct(z, self._by_value(size), size, self._by_value(), anchor)
 
     def step(self, before: Point | None, last: Point, length: float) -> Point | Result:
-        """The next point, about `length` further along the tangent."""
+        """The next point, about `length` further along the tangent. `before`: the point a step
+        before the last one, if any."""
         ahead, row = length * last.tangent * last.size, last.tangent / last.size
         guess = last.z + ahead
         if before and before.anchor is last.anchor:
-            back = row @ (last.z - before.z)
-            if back > _APART * length:
-                guess = _cubic(before, last, row, 1 + length / back)
+            guess = _cubic(before, last, row, 1 + length / (row @ (last.z - before.z)))
         point = self._correct(last.z + ahead, row, last.size, last.tangent, last.anchor, guess)
         if isinstance(point, Result):
             return point

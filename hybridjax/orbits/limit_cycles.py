@@ -103,7 +103,12 @@ class LimitCycles(eqx.Module):
         are lost in rounding. `cycles[i].multipliers` has them.
         """
         require_unchanged(self.systems, self.numbers)
-        return _multipliers(np.asarray(self.factors), self.ok)
+        products = turn_product(np.asarray(self.factors))
+        values = np.linalg.eigvals(np.where(self.ok[:, None, None], products, 0.0))
+        order = np.lexsort((-np.imag(values), -np.round(np.abs(values), 12)), axis=-1)
+        values = np.take_along_axis(values.astype(complex), order, axis=-1)
+        values[~self.ok] = np.nan
+        return values
 
     def summary(self, limit: Index = 5) -> str:
         """`10000/10000 found`, or the reasons of the first `limit` failures. Default: 5."""
@@ -206,17 +211,6 @@ def _marked(
     result = cycles.result.copy()
     result[[i for i in rows if fails(cycles[i])]] = code
     return dataclasses.replace(cycles, result=result)
-
-
-def _multipliers(
-    factors: Float[np.ndarray, "S K d d"], ok: Bool[np.ndarray, " S"]
-) -> Complex[np.ndarray, "S d"]:
-    """See `LimitCycles.multipliers`."""
-    values = np.linalg.eigvals(np.where(ok[:, None, None], turn_product(factors), 0.0))
-    order = np.lexsort((-np.imag(values), -np.round(np.abs(values), 12)), axis=-1)
-    values = np.take_along_axis(values.astype(complex), order, axis=-1)
-    values[~ok] = np.nan
-    return values
 
 
 def _stacked(systems) -> HybridSystem:

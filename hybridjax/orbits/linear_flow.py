@@ -358,9 +358,7 @@ def _flow_along(arguments: tuple, by: tuple) -> tuple[LinearFlow, LinearFlow]:
     return flow, _linear_flow(cycle, longest, parameter, by[0])
 
 
-_of_cycle = by_columns(
-    _linear_flow, _flow_along, lambda tangents: (of_flow(tangents[0]), *tangents[1:]), np.inf
-)
+_of_cycle = by_columns(_linear_flow, _flow_along, of_flow, np.inf)
 
 
 def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:

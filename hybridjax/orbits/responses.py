@@ -312,9 +312,7 @@ def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
     _, Z = loop(map, whole, flow.field[0, 0])
     whole = whole - flow.field[0, 0, :, None] * Z
     if modes is None and not host:
-        raise DefinitionError(
-            "inside of `grad` and `jvp`, `responses` needs the number of `modes`."
-        )
+        raise DefinitionError("`responses` needs the number of `modes` inside of `grad` and `jvp`.")
     values, right, left = _modes(whole, map.sizes, modes)
     exponents = xp.log(values + 0j) / period
     phase = None if clocked else flow.covectors(Z[:, None])[..., 0]

@@ -80,9 +80,7 @@ class Motion(FuncAnimation):
         """
         path = Path(path)
         if path.suffix not in (".gif", ".html", ".mp4"):
-            raise DefinitionError(
-                f"cannot write '{path}': an animation is written as .gif, .html or .mp4."
-            )
+            raise DefinitionError(f"cannot write '{path}': name it .gif, .html or .mp4.")
         if path.suffix == ".mp4" and not writers.is_available("ffmpeg"):
             raise DefinitionError("an .mp4 needs the program ffmpeg: write a .gif or .html.")
         with replacing(path) as new:

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -210,9 +210,7 @@ class SweepJob:
         tiles = self._tiles(index, None)
         rounds = tiles.solve(len(index[0]))
         jacobian, result = np.asarray(rounds.turn.jacobian), np.asarray(rounds.result)
-        return Known(cast(Any, None), rounds.anchor, rounds.period, jacobian, result), as_cycles(
-            tiles, rounds
-        )
+        return Known(None, rounds.anchor, rounds.period, jacobian, result), as_cycles(tiles, rounds)
 
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
         assert self.begun is not None
@@ -233,7 +231,7 @@ class SweepJob:
         index = self._points(0) if len(self.blocks) == 1 else index
         n, d = len(index[0]), map.anchor.q.shape[0]
         anchor = jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor)
-        blank = Known(cast(Any, None), anchor, np.zeros(n), np.zeros((n, d, d)), np.zeros(n, int))
+        blank = Known(None, anchor, np.zeros(n), np.zeros((n, d, d)), np.zeros(n, int))
         return Begun(map, index, blank)
 
     def _guess(self) -> LimitCycle:
@@ -243,10 +241,8 @@ class SweepJob:
         try:
             return find_limit_cycle(self.system, settings=Settings(SWEEP, SWEEP))
         except (ComputationError, DefinitionError) as error:
-            raise type(error)(
-                "no limit cycle was found in the middle of the axes, so give one by `guess=`: "
-                f"{error}"
-            ) from error
+            text = "no limit cycle was found in the middle of the axes, so give one by `guess=`: "
+            raise type(error)(f"{text}{error}") from error
 
 
 def _rounded(map: ReturnMap) -> ReturnMap:

@@ -190,8 +190,7 @@ class ArcLength(_Anchored):
 
     def check(self, s: Structure) -> None:
         super().check(s)
-        for a in range(len(s.charts)):
-            s.resolve_outputs(self.signals).require(a)
+        s.resolve_outputs(self.signals).require(*range(len(s.charts)))
 
     def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
         signals = s.resolve_outputs(self.signals)

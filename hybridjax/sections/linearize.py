@@ -75,8 +75,7 @@ def linearize(
     of_family = traced and not isinstance(sections, PlacedSections)
     placed: Any = sections if of_family else as_placed(cycle, sections)
     z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
-    for a in range(len(s.charts)) if traced else np.unique(placed.lanes.chart):
-        z.require(int(a))
+    z.require(*(range(len(s.charts)) if traced else np.unique(placed.lanes.chart).tolist()))
     (names, columns), d = s.inputs_among(inputs), s.d + 1
     if of_family:
         A, B, C, D, dims = _of_family(cycle, as_family(placed), tuple(z.items))
@@ -118,9 +117,7 @@ def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     return _matrices_of(placed, outputs), (*columns, None)
 
 
-_of_family = by_columns(
-    _matrices, _matrices_along, lambda tangents: (of_flow(tangents[0]), *tangents[1:])
-)
+_of_family = by_columns(_matrices, _matrices_along, of_flow)
 
 
 @host_first

@@ -249,9 +249,7 @@ def _observed_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     return values, jax.tree_util.tree_map(tangents, by)
 
 
-observed_at = by_columns(
-    _observed, _observed_along, lambda tangents: (of_flow(tangents[0]), *tangents[1:])
-)
+observed_at = by_columns(_observed, _observed_along, of_flow)
 """Times (N,) at which a cycle crosses a family's sections, and outputs (N, ny) there."""
 
 
@@ -344,23 +342,18 @@ def _check(placed: PlacedSections, first: int) -> None:
     or crossed twice."""
     N, name, anchor = placed.n_sections, placed.family.describe, placed.family.anchor
     again = "is crossed more than once in one period"
-
-    def reason(code: int, i: int) -> str:
-        hint = _remedy(placed, i) if code == Result.SECTION_MISSED else "."
-        if code == Result.STEP_LIMIT:
-            hint = ". Give them to the search for the cycle, or place more sections."
-        return f"{Result(code).message}{hint}"
-
-    results = np.asarray(placed.result).tolist()
-    if isinstance(placed.family, families.KinematicPhase) and any([first, *results]):
+    results = [first, *np.asarray(placed.result).tolist()]
+    if isinstance(placed.family, families.KinematicPhase) and any(results):
         _check_center(placed.family, placed.cycle)
-    if first != Result.OK:
-        place = f" at its anchor, {anchor}" if isinstance(anchor, Crossing) else ""
-        raise ComputationError(f"the cycle does not reach {name(0)}{place}: {reason(first, 0)}")
+    place = f" at its anchor, {anchor}" if isinstance(anchor, Crossing) else ""
     for i, code in enumerate(results):
         if code != Result.OK:
-            text = f"is not reached from section {i} on the cycle: {reason(code, (i + 1) % N)}"
-            raise ComputationError(f"{name((i + 1) % N)} {text}")
+            text = f"{name(i % N)} is not reached from section {i - 1} on the cycle"
+            text = text if i else f"the cycle does not reach {name(0)}{place}"
+            hint = _remedy(placed, i % N) if code == Result.SECTION_MISSED else "."
+            if code == Result.STEP_LIMIT:
+                hint = ". Give them to the search for the cycle, or place more sections."
+            raise ComputationError(f"{text}: {Result(code).message}{hint}")
     moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
     if not placed.cycle.clocked and len(moving):
         raise ComputationError(
@@ -402,10 +395,8 @@ def _remedy(placed: PlacedSections, i: int) -> str:
         i, N, levels = 0, 1, ListLevels((section,))
     s, (t, chart, q) = cycle.structure, cycle.trajectory().dense()
     level = np.full(len(t), np.nan)
-    for a in np.unique(chart).tolist():
-        if levels is not None and levels.present(s, a):
-            rows = chart == a
-            level[rows] = kernels.levels(s, a, levels, N, t[rows], q[rows, : s.dims[a]].T)[i, 0]
+    if levels is not None:
+        level = _levels_at(s, levels, N, t, chart, q.T)[0, i]
     level[-1] = level[0]  # (the same point, but for rounding)
     falls = (np.diff(level) < 0) & (np.diff(t) > 0)
     crossed = np.flatnonzero(falls & (level[:-1] > 0) & (level[1:] <= 0))
@@ -464,12 +455,7 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     x = np.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
     q = interpolate(x, h, q[:, None], after[:, None], f0[:, None], f1[:, None])
     t, chart, q = (t + h * x).ravel(), np.tile(chart, len(x)), q.reshape(s.d, -1)
-    value, rate = np.ones((N, len(t))), np.zeros((N, len(t)))
-    for a in np.unique(chart):
-        if levels.present(s, int(a)):
-            rows = np.flatnonzero(chart == a)
-            both = kernels.levels(s, int(a), levels, N, t[rows], q[: s.dims[a], rows])
-            value[:, rows], rate[:, rows] = both[:, 0], both[:, 1]
+    value, rate = _levels_at(s, levels, N, t, chart, q)
     level = value.reshape(N, len(x), -1)
     falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & (h > 0)
     # Around the section itself, rounding decides the signs.
@@ -478,4 +464,16 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     falls[:, -1] &= ~np.roll(itself, -1, axis=1)
     f = slopes(s, lanes.t, lanes.chart, lanes.q, still)
     on_section = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * f.T, axis=1)
-    return np.sum(falls, axis=(1, 2)), np.max(np.abs(rate), axis=1), on_section
+    return np.sum(falls, axis=(1, 2)), np.max(np.nan_to_num(np.abs(rate)), axis=1), on_section
+
+
+def _levels_at(s: Structure, levels: AbstractLevels, N: int, t, chart, q) -> np.ndarray:
+    """The levels of N sections at K points of a cycle, and their rates (2, N, K); NaN in charts
+    that have none."""
+    out = np.full((2, N, len(t)), np.nan)
+    for a in np.unique(chart).tolist():
+        if levels.present(s, a):
+            rows = np.flatnonzero(chart == a)
+            both = kernels.levels(s, a, levels, N, t[rows], q[: s.dims[a], rows])
+            out[:, :, rows] = both.swapaxes(0, 1)
+    return out

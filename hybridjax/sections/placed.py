@@ -82,14 +82,13 @@ class PlacedSections(eqx.Module):
         names, unit = self.cycle.structure.names, self.cycle.system.time_unit
         t, charts, *_ = to_host(self.lanes)
         durations, dims = np.asarray(self.duration), np.asarray(self.dims)
+        shortest, longest = np.min(durations), np.max(durations)
         inside = (f"{np.sum(charts == a)} in {names[a]}" for a in dict.fromkeys(charts.tolist()))
         return {
             "sections": ", ".join(inside),
             "dimension": " to ".join(str(n) for n in np.unique([np.min(dims), np.max(dims)])),
             "section 0 at t": number(t[0], unit=unit),
-            "from one to the next": (
-                f"{np.min(durations):.4g} to {number(np.max(durations), 4, unit)}"
-            ),
+            "from one to the next": f"{shortest:.4g} to {number(longest, 4, unit)}",
         }
 
     def structure(self) -> Structure:

@@ -171,8 +171,7 @@ def second_order(
     placed = as_placed(cycle, sections)
     s = placed.structure()
     z = s.resolve_outputs(outputs)
-    for a in np.unique(placed.lanes.chart):
-        z.require(int(a))
+    z.require(*np.unique(placed.lanes.chart).tolist())
     _, columns = s.inputs_among(inputs)
     first, second = to_host(_derivatives(from_host(placed), tuple(z.items)))
     n = 1 + s.d

@@ -123,9 +123,8 @@ def _check_transition(s: Structure, g: int) -> Iterator[str]:
     a, b = s.chart_index(tr.source), s.chart_index(tr.target)
     of = f"of transition '{tr.name}' ({tr.source} -> {tr.target})"
     if not isinstance(tr.guard, Scheduled):
-        yield from _check_shape(
-            s, a, f"guard {of}", lambda s, *x: s.guard(g, *x), (), "it must be one number"
-        )
+        guard = lambda s, *x: s.guard(g, *x)  # noqa: E731
+        yield from _check_shape(s, a, f"guard {of}", guard, (), "it must be one number")
     holds = lambda s, *x: s.enabled(g, *x)  # noqa: E731
     yield from _check_shape(s, a, f"`enabled` {of}", holds, (), "it must be one truth value")
     states = f"chart '{tr.target}' has the states {quoted(s.charts[b].states)}: return one for each"

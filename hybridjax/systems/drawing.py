@@ -66,9 +66,7 @@ class Drawing(eqx.Module):
 
     def __check_init__(self):
         if self.body is not None and self.body not in {**self.circles, **self.points}:
-            raise DefinitionError(
-                f"Drawing: `body` must be a circle or a point, not '{self.body}'."
-            )
+            raise DefinitionError(f"Drawing: `body` must be a circle or point, not '{self.body}'.")
 
     @property
     def place(self) -> Float[Array, "2"]:

@@ -11,6 +11,7 @@ one.
 
 import dataclasses
 import functools as ft
+import itertools
 import operator
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, NamedTuple
@@ -447,9 +448,10 @@ class Outputs:
         """Test whether all outputs are defined in chart a."""
         return all(self._function(item, a) is not None for item in self.items)
 
-    def require(self, a: int) -> None:
-        """Raise if some output is not defined in chart a."""
-        for item, name in zip(self.items, self.names, strict=True):
+    def require(self, *charts: int) -> None:
+        """Raise if some output is not defined in one of the charts."""
+        outputs = list(zip(self.items, self.names, strict=True))
+        for a, (item, name) in itertools.product(charts, outputs):
             if self._function(item, a) is None:
                 raise DefinitionError(
                     f"output '{name}' is not defined in chart '{self.structure.names[a]}': give "

@@ -74,7 +74,7 @@ REFUSED = [
     (hj.Output, 3, "must be an Output, not 3"),
     (hj.HybridSystem, hj.models.VerticalHopper, "not the class itself: write VerticalHopper(...)"),
     (MATRIX, [1.0], "must be of shape (N, d), not of shape (1,)"),
-    (MATRIX, [[1], [1, 2]], "must be a rectangular array, but its rows differ in length"),
+    (MATRIX, [[1], [1, 2]], "must be rectangular: its rows differ in length"),
     (MATRIX, np.zeros((2, 2), complex), "must be real, not an array of complex128"),
     (MATRIX, "x", "must be an array of real numbers with shape (N, d), not 'x'"),
     (MATRIX, [[0, 1], [NAN, 0]], "must be finite, but is nan at index (1, 0)"),

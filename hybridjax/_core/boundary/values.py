@@ -304,9 +304,7 @@ class Reals(Kind):
                 return jnp.asarray(value)
         except (ValueError, TypeError):
             if isinstance(value, list | tuple):
-                raise Misfit(
-                    "must be a rectangular array, but its rows differ in length", near=True
-                ) from None
+                raise Misfit("must be rectangular: its rows differ in length", near=True) from None
         raise self.refused(value) from None
 
     def _wrong_type(self, value: Any, x: Any) -> Misfit:

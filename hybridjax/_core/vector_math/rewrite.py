@@ -76,12 +76,9 @@ def _number(eqn: jex.JaxprEqn) -> int:
     """Return the number of our trigonometric functions in an equation."""
     if eqn.primitive in _TRIGONOMETRY:
         return 1
-    return sum(map(_number, _inner(eqn))) if eqn.primitive.name in _OUTER else 0
-
-
-def _inner(eqn: jex.JaxprEqn) -> list[jex.JaxprEqn]:
-    """The equations of the programs in an equation."""
-    return [inner for program in jaxprs(eqn.params) for inner in program.eqns]
+    if eqn.primitive.name not in _OUTER:
+        return 0
+    return sum(_number(inner) for program in jaxprs(eqn.params) for inner in program.eqns)
 
 
 def jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:

@@ -110,32 +110,19 @@ def _arctan2(y, x):
     return jax.lax.select(jnp.signbit(y), -angle, angle)
 
 
-def _arctan(x):
-    return _arctan2(x, jnp.ones_like(x))
-
-
-def _arcsin(x):
-    return _arctan2(x, _leg(x))
-
-
-def _arccos(x):
-    return _arctan2(_leg(x), x)
-
-
 def _leg(x):
     """sqrt(1 - x^2)"""
     return jnp.sqrt((1 - x) * (1 + x))
 
 
-def _with_derivatives(kernel: Callable, *rules: Callable) -> Callable:
-    """`kernel` with one rule (tangent, value, *arguments) for each argument."""
-    function = jax.custom_jvp(kernel)
-    function.defjvps(*rules)
-    return function
+def _function(name: str, function: Callable, *rules: Callable) -> Callable:
+    """Return a function that is traced once: every further use costs one equation.
 
-
-def _function(name: str, function: Callable) -> Callable:
-    """Return a function that is traced once: every further use costs one equation."""
+    **Arguments:** `rules`: (tangent, value, *arguments) for each argument. Default: derived.
+    """
+    if rules:
+        function = jax.custom_jvp(function)
+        function.defjvps(*rules)
     function.__name__ = name
     return jax.jit(function)
 
@@ -145,12 +132,11 @@ cos = _function("cos", lambda x: _sincos(x)[1])
 tan = _function("tan", _tan)
 arctan2 = _function(
     "arctan2",
-    _with_derivatives(
-        _arctan2,
-        lambda dy, _, y, x: dy * (x / (x**2 + y**2)),
-        lambda dx, _, y, x: dx * (-y / (x**2 + y**2)),
-    ),
+    _arctan2,
+    lambda dy, _, y, x: dy * (x / (x**2 + y**2)),
+    lambda dx, _, y, x: dx * (-y / (x**2 + y**2)),
 )
-arctan = _function("arctan", _with_derivatives(_arctan, lambda dx, _, x: dx / (1 + x**2)))
-arcsin = _function("arcsin", _with_derivatives(_arcsin, lambda dx, _, x: dx / _leg(x)))
-arccos = _function("arccos", _with_derivatives(_arccos, lambda dx, _, x: -dx / _leg(x)))
+_from_one = lambda x: _arctan2(x, jnp.ones_like(x))  # noqa: E731
+arctan = _function("arctan", _from_one, lambda dx, _, x: dx / (1 + x**2))
+arcsin = _function("arcsin", lambda x: _arctan2(x, _leg(x)), lambda dx, _, x: dx / _leg(x))
+arccos = _function("arccos", lambda x: _arctan2(_leg(x), x), lambda dx, _, x: -dx / _leg(x))

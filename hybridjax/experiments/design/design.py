@@ -131,9 +131,7 @@ class Design(eqx.Module):
             shapes = self.experiment.shape, getattr(self, name).shape
             require_equal(f"`experiment` and `{name}`", "shapes", *shapes)
         if not np.array_equal(np.unique(self.experiment), np.arange(max(1, self.experiments))):
-            raise DefinitionError(
-                "every experiment needs a frequency: `frequencies` has none for some."
-            )
+            raise DefinitionError("every experiment needs a frequency: `frequencies` skips some.")
         self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)
         self._refuse(~good, "has an amplitude that is not a positive number")
@@ -286,9 +284,8 @@ class Design(eqx.Module):
         """
         lines, place = np.unique(self.line, return_inverse=True)
         power = np.zeros((len(lines), len(self.input_names)))
-        real = np.where(
-            is_real(self.line, self.periods, self.n_sections), 2 * np.cos(self.phase), 1
-        )
+        alone = is_real(self.line, self.periods, self.n_sections)
+        real = np.where(alone, 2 * np.cos(self.phase), 1)
         np.add.at(power, (place, self.channel), (self.amplitude * real) ** 2)
         samples = self.n_sections * self.periods * repeats
         with np.errstate(divide="ignore"):

@@ -177,10 +177,8 @@ def _from_htf(htf: HTF, dims: Any, order: int) -> LDTP:
     D = [np.zeros((ny, nu))] * N
     B, K = ([np.zeros((len(a), columns)) for a in A] for columns in (nu, 0))
     model = PeriodicModel(A, B, C, D, K)
-    unit = scale[:, None]
-    problem = FrequencyProblem(
-        f, tuple(m.tolist()), H / unit, np.broadcast_to(weight * unit, H.shape)
-    )
+    unit, harmonics = scale[:, None], tuple(m.tolist())
+    problem = FrequencyProblem(f, harmonics, H / unit, np.broadcast_to(weight * unit, H.shape))
     for _ in range(2):  # the second time removes rounding errors
         model = model.refined(True, problem.linearize)
     return model.to_ldtp(scale, htf.inputs, htf.outputs)

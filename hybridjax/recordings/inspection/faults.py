@@ -138,9 +138,8 @@ def silent_inputs(recording: Recording, names: Iterable[str]) -> Iterator[Findin
     """Find inputs that are constant in some trials only."""
     for name in names:
         samples = recording.samples(name)
-        width: list[Any] = [
-            np.ptp(x[np.isfinite(x)]) if np.isfinite(x).any() else 0.0 for _, x in samples
-        ]
+        finite = [x[np.isfinite(x)] for _, x in samples]
+        width: list[Any] = [np.ptp(x) if len(x) else 0.0 for x in finite]
         silent = [f"'{t.name}'" for (t, _), w in zip(samples, width, strict=True) if not w]
         if silent and max(width):
             text = f"{name} does not change in trial {listed(silent)}: if it acted there and was "
@@ -302,10 +301,8 @@ def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
 
 def _average_cycles(recording: Recording, phase: Phase, name: str) -> Float[np.ndarray, "S P"]:
     """Return the mean of a signal at each phase, without the mean of all, for each trial."""
-    cycles = []
-    for (_, x), (trial, parts) in zip(
-        recording.samples(name), phase.by_trial(recording), strict=True
-    ):
+    cycles, trials = [], phase.by_trial(recording)
+    for (_, x), (trial, parts) in zip(recording.samples(name), trials, strict=True):
         at = np.full(len(x), np.nan)
         for part in parts:
             at = np.fmax(at, part.at(trial.time))
@@ -344,10 +341,8 @@ def _difference(mean: Cycles, usual: Cycles, name: str, outputs: list[str]) -> I
 def slow_changes(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -> Iterator[Finding]:
     """Find means over cycles that change much more slowly than they scatter."""
     for name in outputs:
-        power = np.zeros(_COSINES)
-        for (_, x), (trial, parts) in zip(
-            recording.samples(name), phase.by_trial(recording), strict=True
-        ):
+        power, trials = np.zeros(_COSINES), phase.by_trial(recording)
+        for (_, x), (trial, parts) in zip(recording.samples(name), trials, strict=True):
             for part in parts:
                 level = cycle_means(trial, x, [part], phase.period)[1]
                 if len(level) >= 2 * _COSINES:

@@ -319,9 +319,7 @@ def feedback(data: SectionData) -> Iterator[Finding]:
             mean = np.nan_to_num(data.cycle_inputs[:, i] - np.nanmean(data.cycle_inputs[:, i]))
             left = mean - shapes @ np.linalg.lstsq(shapes, mean)[0]
             if left @ left < 0.1 * (mean @ mean):
-                text = (
-                    f"{name} contains the outputs ({100 * share:.0f} % of its variance repeats as "
-                )
-                text += "they do), as by feedback or crosstalk: fits are biased. Remove these from "
-                text += "the input, or name the perturbation as the input."
+                text = f"{name} contains the outputs ({100 * share:.0f} % of its variance repeats "
+                text += "as they do), as by feedback or crosstalk: fits are biased. Remove these "
+                text += "from the input, or name the perturbation as the input."
                 yield Finding("feedback", text)
