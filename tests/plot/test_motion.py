@@ -55,7 +55,7 @@ def test_files_and_refusals(walk, tmp_path):
     assert len(shown) == len(motion.times) and first == shown[0]
     for frame, over in zip(motion._frames(107), shown, strict=True):
         assert Image.alpha_composite(still, over) == frame.convert("RGBA")
-    with pytest.raises(hj.DefinitionError, match="written as .gif, .html or .mp4"):
+    with pytest.raises(hj.DefinitionError, match="name it .gif, .html or .mp4"):
         motion.save(tmp_path / "walk.avi")
     with pytest.raises(hj.DefinitionError, match="animate the cycle"):
         hj.plot.animate(walk.trajectory(), perturbed=walk.trajectory())
