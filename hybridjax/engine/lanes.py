@@ -84,9 +84,8 @@ def only(mask: Mask, x: Array) -> Array:
 
 def fixed(tree):
     """The same numbers without derivatives."""
-    return jax.tree_util.tree_map(
-        lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, tree
-    )
+    moving, others = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(moving), others)
 
 
 def needed(mask: Mask, tree):

@@ -34,12 +34,10 @@ def can_be_compared(model: LDTP | SeriesFit | Predictor, record: Record, free_st
     """Test whether a record has samples beyond those that fit its initial condition and drift."""
     N, ny = record.n_sections, record.y.shape[1]
     unknown = N * ny * drift_waves(record).shape[1]
-    if free_start:
-        unknown += (
-            N * ny * model.free_cycles
-            if isinstance(model, SeriesFit)
-            else int(model.dims[record.first_section])
-        )
+    if free_start and isinstance(model, SeriesFit):
+        unknown += N * ny * model.free_cycles
+    elif free_start:
+        unknown += int(model.dims[record.first_section])
     return int(np.isfinite(record.y).sum()) > _SAMPLES_PER_UNKNOWN * unknown
 
 
@@ -138,9 +136,8 @@ class Validation(eqx.Module):
         )
         if self.left_out:
             rows.append(f"records too short to be compared, left out: {self.left_out}")
-        visible = ", ".join(
-            f"{100 * x:.2g} % of {name}" for x, name in zip(self.visible, self.outputs, strict=True)
-        )
+        pairs = zip(self.visible, self.outputs, strict=True)
+        visible = ", ".join(f"{100 * x:.2g} % of {name}" for x, name in pairs)
         rows.append(f"misfits that would be noticed in four of five such data: {visible}")
         return "\n".join(rows)
 

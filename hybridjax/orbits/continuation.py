@@ -5,7 +5,7 @@ Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 1
 """
 
 import dataclasses
-from typing import Annotated, Literal, NamedTuple, SupportsIndex, cast, get_args
+from typing import Annotated, Any, Literal, NamedTuple, SupportsIndex, get_args
 
 import equinox as eqx
 import jax
@@ -314,8 +314,7 @@ class _Trace(NamedTuple):
             return points[where].tests[kind]
 
         try:
-            root = brentq(test, 0.0, 1.0, xtol=1e-13, rtol=np.float64(1e-14), maxiter=60)
-            where = cast(float, root)
+            where: Any = brentq(test, 0.0, 1.0, xtol=1e-13, rtol=np.float64(1e-14), maxiter=60)
             test(where)
         except (KeyError, RuntimeError):
             return None

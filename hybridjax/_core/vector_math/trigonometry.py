@@ -136,7 +136,8 @@ arctan2 = _function(
     lambda dy, _, y, x: dy * (x / (x**2 + y**2)),
     lambda dx, _, y, x: dx * (-y / (x**2 + y**2)),
 )
-_from_one = lambda x: _arctan2(x, jnp.ones_like(x))  # noqa: E731
-arctan = _function("arctan", _from_one, lambda dx, _, x: dx / (1 + x**2))
+arctan = _function(
+    "arctan", lambda x: _arctan2(x, jnp.ones_like(x)), lambda dx, _, x: dx / (1 + x**2)
+)
 arcsin = _function("arcsin", lambda x: _arctan2(x, _leg(x)), lambda dx, _, x: dx / _leg(x))
 arccos = _function("arccos", lambda x: _arctan2(_leg(x), x), lambda dx, _, x: -dx / _leg(x))
