@@ -34,8 +34,8 @@ def can_be_compared(model: LDTP | SeriesFit | Predictor, record: Record, free_st
     """Test whether a record has samples beyond those that fit its initial condition and drift."""
     N, ny = record.n_sections, record.y.shape[1]
     unknown = N * ny * drift_waves(record).shape[1]
-    if free_start and isinstance(model, SeriesFit):
-        unknown += N * ny * model.free_cycles
+    if isinstance(model, SeriesFit):
+        unknown += N * ny * model.free_cycles * free_start
     elif free_start:
         unknown += int(model.dims[record.first_section])
     return int(np.isfinite(record.y).sum()) > _SAMPLES_PER_UNKNOWN * unknown
