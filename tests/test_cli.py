@@ -7,7 +7,6 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
-from hybridjax.apps.reproduce import Protocol, reproduce
 
 from .sessions import run_python
 
@@ -58,16 +57,6 @@ def test_reproduce_writes_its_results(results):
         np.testing.assert_allclose(model.htf(exact.f).H, exact.H, atol=1e-12)
         assert fit.compare(model.multipliers).max_error < 5e-3
         assert hj.load(results / f"rational_{family}.npz").multipliers.shape == (2, 2)
-
-
-@pytest.mark.slow  # (`.ci/run` draws them)
-def test_reproduce_draws_its_figures(tmp_path):
-    reproduce(tmp_path, Protocol(20, 28, 8), ("png",))
-    names = ["fig1_cycle_isochron", "fig1_cycle_kinematic", "fig3_harmonics", "fig4_bode"]
-    for name in (*names, "multipliers", "poles_zeros"):
-        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
-    files = {path.suffix for path in tmp_path.iterdir() if not path.name.startswith(".")}
-    assert files == {".json", ".npz", ".png"}
 
 
 def test_bad_input_is_one_sentence():
