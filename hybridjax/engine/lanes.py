@@ -84,8 +84,8 @@ def only(mask: Mask, x: Array) -> Array:
 
 def fixed(tree):
     """The same numbers without derivatives."""
-    moving, others = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.lax.stop_gradient(moving), others)
+    arrays, static = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(arrays), static)
 
 
 def needed(mask: Mask, tree):
