@@ -88,9 +88,10 @@ class OptimalDesign(eqx.Module):
     @property
     def usual_name(self) -> str:
         """The name of the design that it improves, in prints and figures."""
-        size = self.usual.amplitude
-        # (They are larger in experiments with fewer lines.)
-        return "equal amplitudes" if np.ptp(size) < 0.2 * np.max(size) else "the given amplitudes"
+        size, channel = self.usual.amplitude, self.usual.channel
+        relative = size / (np.bincount(channel, size) / np.bincount(channel))[channel]
+        # (Amplitudes are larger in experiments with fewer lines.)
+        return "equal amplitudes" if np.ptp(relative) < 0.2 else "the given amplitudes"
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " g"]:

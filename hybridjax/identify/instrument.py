@@ -54,7 +54,7 @@ class Roles(NamedTuple):
         references = [list(names).index(name) for name in reference]
         inputs = [i for i in range(len(names)) if i not in references]
         if not inputs:
-            raise DefinitionError("all inputs are references: name the controller's, too.")
+            raise DefinitionError("all inputs are references: name those of the controller, too.")
         if len(references) < (len(inputs) if fewest is None else fewest):
             raise DefinitionError(
                 f"{len(inputs)} inputs of the plant need as many references, which move each of "

@@ -385,7 +385,7 @@ def numerator_size(htf: HTF, order: int, overhang: int | None) -> int:
         raise DefinitionError(
             f"{len(htf.f)} frequencies are too few for numerators of {size} coefficients and "
             f"{order} multipliers: {next(filter(enough, count()))} or more are needed. Measure "
-            "more, or lower `order` or `overhang`."
+            "more, take fewer sections, or lower `order`."
         )
     return size
 

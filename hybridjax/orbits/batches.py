@@ -36,8 +36,8 @@ from .scale import ROUNDING
 SMALL = 8000
 # Systems per compiled call. More: their arrays leave the cache. Fewer: calls cost more.
 BATCH = 250
-# Periods for which a system is simulated from its guess before Newton's method tries again, and at
-# last. Fewer: slow transients remain. More: each failure takes longer.
+# Periods for which a system is simulated before Newton's method tries again, first and at last.
+# Fewer: slow transients remain. More: each failure takes longer.
 _SETTLE = 8, 40
 # Largest step, in sizes of the states, that is taken with a guessed Jacobian. Larger: steps lead
 # astray. Smaller: few are taken.
@@ -172,7 +172,9 @@ class Tiles(NamedTuple):
                 call.done, rows = 0, order[: min(self.size, WIDE)]
                 with uncollected():  # the programs are compiled during this call
                     out = self._newton(rows, *self._given(rows), FEW_STEPS)
-                    out = self._again(rows, out, self._given, _SETTLE)
+                    out = self._again(rows, out, self._given, _SETTLE[:1])
+                    if not (out.result == Result.OK).any():
+                        out = self._again(rows, out, self._given, _SETTLE[1:])
             else:
                 out = None
             while (done := 0 if out is None else len(out.result)) < S:
@@ -188,7 +190,9 @@ class Tiles(NamedTuple):
                 out = part if out is None else _join(out, part)
         assert out is not None
         nearest = ft.partial(neighbors, out=out, moved=False)
-        return _pick(self._again(order, out, nearest, (0, *_SETTLE)), np.argsort(order))
+        near = self.known is not None or (out.result == Result.OK).any()
+        out = self._again(order, out, nearest, (0, *_SETTLE) if near else _SETTLE[1:])
+        return _pick(out, np.argsort(order))
 
     def _given(self, rows) -> tuple[Lanes, Float[np.ndarray, " S"]]:
         given = self.map.anchor, self.map.expected
@@ -207,7 +211,8 @@ class Tiles(NamedTuple):
             arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
             if arrived.any():
                 failed, (anchor, period) = failed[arrived], _pick(begin, arrived)
-                part = self._newton(rows[failed], anchor, period, FEW_STEPS)
+                steps = USUAL_STEPS if periods == _SETTLE[0] else FEW_STEPS
+                part = self._newton(rows[failed], anchor, period, steps)
                 part = part._replace(steps=part.steps + out.steps[failed])
                 out = _replace(out, failed, part)
         return out

@@ -296,14 +296,11 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
         reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
         if cycle.conserved:
             reason += f"; perhaps not all of {', '.join(cycle.conserved)} are conserved"
-    advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn)
+    advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn, expected)
     if code in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
         advice += _about_decisions(s)
     if not advice:
-        advice = (
-            " Try a better guess, or let it settle first if the cycle is stable, e.g. "
-            "`settle=60 * period`."
-        )
+        advice = _better_guess(expected)
     return f"no limit cycle of {name} was found: {reason}.{advice}"
 
 
@@ -343,7 +340,15 @@ def _about_decisions(s: Structure) -> str:
     )
 
 
-def _about_guards(s: Structure, turn: Turn) -> str:
+def _better_guess(expected: float) -> str:
+    """What else to try."""
+    return (
+        " Try a better guess, or if the cycle is stable let it settle first, e.g. "
+        f"`settle={60 * expected:.3g}` (with a `Guess`, not a cycle)."
+    )
+
+
+def _about_guards(s: Structure, turn: Turn, expected: float) -> str:
     """The values of the guards, if none of them led to an event."""
     if events_of(turn) or not s.transitions:
         return ""
@@ -359,4 +364,5 @@ def _about_guards(s: Structure, turn: Turn) -> str:
         f"went from {x[0]:.3g} to {x[-1]:.3g} (between {min(x):.3g} and {max(x):.3g})"
         for g, x in values.items()
     )
-    return f" No event happened: {text}. Check its direction, and the guess." if text else ""
+    hint = f" No event happened: {text}. Check its direction.{_better_guess(expected)}"
+    return hint if text else ""

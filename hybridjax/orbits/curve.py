@@ -16,7 +16,7 @@ from ..engine.lanes import Lanes
 from ..systems.system import HybridSystem
 from ..systems.varied import Varied, parameter_of, with_parameters
 from .coincidence import SAME
-from .cycle import LimitCycle
+from .cycle import LimitCycle, as_found, what_changed
 from .newton import FEW_STEPS, newton_steps
 from .return_map import ReturnMap, Turn, turn_product
 
@@ -173,7 +173,7 @@ class Curve:
         z, last, rounding = z0 if guess is None else guess, np.inf, len(z0) * np.finfo(float).eps
         map = dataclasses.replace(self.map, anchor=anchor)
         for k in range(FEW_STEPS):
-            turn = self._turn(map, z)
+            turn = self.turn(map, z)
             if (failure := self._failure(turn)) is not None:
                 return failure
             point = Point(anchor, z, size, forward, turn, k)
@@ -188,7 +188,7 @@ class Curve:
             z, last = z + change * size, length
         return Result.NOT_CONVERGED
 
-    def _turn(self, map: ReturnMap, z: Float[np.ndarray, " n"]) -> Turn:
+    def turn(self, map: ReturnMap, z: Float[np.ndarray, " n"]) -> Turn:
         """One turn of the system there, at the same phase of its clock, with derivatives by z."""
         varied = Varied(self.system_at(z[-1]), self.parameter)
         with on_the_cpu(), at_ease():
@@ -239,9 +239,11 @@ def far_from_events(t: np.ndarray, events: np.ndarray, period: float) -> int:
 def away_from_events(cycle: LimitCycle) -> LimitCycle:
     """A guess for neighbors of a clocked cycle, which begins far from all events: one that moves
     across the phase of the begin changes the chart there."""
+    cycle = as_found(cycle)
+    if not cycle.clocked or what_changed(cycle.system, cycle.numbers):
+        return cycle
     path, legs, anchor = cycle.trajectory(), to_host(cycle.legs), cycle.anchor
-    events = path.t[path.event >= 0]
-    if not cycle.clocked or not len(events):
+    if not len(events := path.t[path.event >= 0]):
         return cycle
     k = far_from_events(legs.t, events, float(cycle.period))
     at = anchor._replace(t=legs.t[[k]], chart=legs.chart[[k]], q=legs.q[:, [k]])

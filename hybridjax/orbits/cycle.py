@@ -1,9 +1,11 @@
 """Limit cycles: fixed points of the return map, with their multipliers."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
@@ -375,13 +377,22 @@ def what_changed(system: HybridSystem, numbers: Mapping[str, Any]) -> str:
     for key in now.keys() | numbers.keys():
         if _differ(now.get(key), numbers.get(key)):
             changed = f"`{key}` of {name} has"
-    return changed and f"{changed} changed since this limit cycle was found: find it again"
+    hint = "changed since this limit cycle was found: find it again, with this one as the guess"
+    return changed and f"{changed} {hint}"
+
+
+def as_found(cycle: LimitCycle) -> LimitCycle:
+    """The cycle with the numbers for which it was found."""
+    arrays, static = eqx.partition(cycle.system, eqx.is_array)
+    before = [cycle.numbers.get(name, x) for name, x in arrays_of(cycle.system).items()]
+    arrays = jax.tree_util.tree_structure(arrays).unflatten(before)
+    return dataclasses.replace(cycle, system=eqx.combine(arrays, static))
 
 
 def require_unchanged(system: HybridSystem, numbers: Mapping[str, Any]) -> None:
     """**Raises:** `DefinitionError` if something of the system has changed."""
     if change := what_changed(system, numbers):
-        raise DefinitionError(f"{change}, `hj.find_limit_cycle(cycle.system, cycle)`.")
+        raise DefinitionError(f"{change}.")
 
 
 def _differ(x: Any, y: Any) -> bool:

@@ -213,7 +213,7 @@ class SettledCycle:
         - `limit`: time in seconds after which a process that has not finished an experiment is
             ended. Default: 600.
         - `store`: file of SQLite that keeps finished experiments. After an interruption, repeat the
-            call. Default: none.
+            call, with a plant that has the same attributes after `reset`. Default: none.
 
         **Returns:** `ExperimentData`. Failures are listed by `summary()`: missed sections, errors
         that the plant raised (a fall), NaN, other signals, no answer within the limit, random

@@ -9,7 +9,14 @@ from .._core.boundary.kinds import Order
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Covariance
-from ..identify.series.fit import SeriesFit, assemble, fit_series, late_outputs, total_least_squares
+from ..identify.series.fit import (
+    SeriesFit,
+    assemble,
+    fit_series,
+    late_outputs,
+    missing_cycles,
+    total_least_squares,
+)
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
@@ -50,9 +57,10 @@ class Split(NamedTuple):
         for d in range(1, most + 1):
             problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
             solution = linearize(problem, total_least_squares(late_outputs(problem, d)))
-            if (solution.freedom <= 2 * d).any():
-                obstacle = f"3/4 of the cycles, {self.early.sampled.max()}, are too few for order "
-                obstacle += f"{d} with {N} sections: record more, or take fewer sections."
+            if missing := missing_cycles(problem, solution, 2 * d + 1):
+                obstacle = f"{self.early.sampled.max()} cycles (a quarter is held out) are too few "
+                obstacle += f"for order {d} with {N} sections: record {4 * missing / 3:.0f} more, "
+                obstacle += "or take fewer sections."
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
@@ -76,8 +84,8 @@ class Split(NamedTuple):
         try:
             fit = fit_series(self.early, order, check=False, reference=reference)
         except DefinitionError as error:
-            hint = f"A quarter is held out: `fit_series(section_data(...), {order})` fits all"
-            raise DefinitionError(f"{error} ({hint}, without a test.)") from error
+            hint = "A quarter is held out: `fit_series` fits all, without a test."
+            raise DefinitionError(f"{error} ({hint})") from error
         return HeldOut(fit, validate(fit, self.late, reference=reference))
 
 

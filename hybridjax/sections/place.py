@@ -403,13 +403,13 @@ def _remedy(placed: PlacedSections, i: int) -> str:
     points = " and ".join(f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed)
     hint = f", at {points}" * bool(points)
     if not isinstance(section, Crossing):
-        return f"{hint}. Choose another phase, or fewer sections."
+        return f"{hint}. Choose a phase that rises through each section once in a period."
     sign, span = 1 if section.direction == "falling" else -1, "nowhere"
     if falls.any():
         ends = level[:-1][falls].max(), level[1:][falls].min()
         span = "from {:.4g} to {:.4g}".format(*(float(section.value) + sign * x for x in ends))
-    change = "choose another `value`, `direction` or `charts`, not at an event"
-    return f"{hint}. The cycle has {section} {span}: {change}."
+    change = "choose another function, `value`, `direction` or `charts`, not at an event"
+    return f"{hint}. Values of {section} on the cycle: {span}; {change}."
 
 
 def _check_center(phase: families.KinematicPhase, cycle: LimitCycle) -> None:

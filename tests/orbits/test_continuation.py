@@ -11,8 +11,9 @@ import pytest
 from hypothesis import Phase, given, settings, strategies as st
 
 import hybridjax as hj
+from hybridjax.orbits.curve import Curve
 
-from ..toys import Field
+from ..toys import Field, Switched
 
 
 m = hj.models
@@ -98,6 +99,20 @@ def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
         trace = 1 + a**2 - (1 + a) ** 2 * (2 * np.pi / T) ** 2 * bounce.before["y"] / g
         np.testing.assert_allclose(np.sum(multipliers), trace, atol=1e-7)
         np.testing.assert_allclose(np.prod(multipliers), a**2, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("system", "parameter"),
+    [(m.PaddleJuggler(), "T"), (m.BuckConverter(), "T"), (Switched(), "duty")],
+    ids=["clock", "clock and schedule", "schedule"],
+)
+def test_derivatives_of_a_turn_by_a_parameter_are_differences(system, parameter):
+    curve = Curve(hj.find_limit_cycle(system), parameter, 1.0)
+    z = np.append(curve.map.anchor.q, curve.value)
+    step = 1e-5 * curve.value * np.eye(len(z))[-1]
+    ends = [curve.turn(curve.map, z + x).residual for x in (step, -step)]
+    by = curve.turn(curve.map, z).jacobian[:, -1]
+    np.testing.assert_allclose(by, (ends[0] - ends[1]) / (2 * step[-1]), rtol=1e-6)
 
 
 def test_bad_input(juggling):

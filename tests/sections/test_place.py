@@ -84,7 +84,7 @@ TOP = Crossing("v", "falling")
         ([Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / 6.6633), "falling")], "depends on time"),
         (
             hj.ClockPhase(4, anchor=Crossing("x", "rising", value=9.0)),
-            "x rising from -2.009 to 2.009",
+            "x rising on the cycle: from -2.009 to 2.009",
         ),
         (hj.KinematicPhase(8, "x", "v", (5.0, 0.0)), r"turn about the `center` \(5.0, 0.0\)"),
     ],

@@ -105,6 +105,14 @@ def test_a_parameter_inside_of_a_cycle_is_not_differentiated():
     np.testing.assert_allclose(model.A[:, 0, 0], np.exp(-DRAG / 2), rtol=1e-9)
 
 
+def test_the_advice_to_find_a_changed_cycle_again_holds(hopper_cycle):
+    changed = eqx.tree_at(lambda x: x.system.k, hopper_cycle, jnp.asarray(20.0))
+    with pytest.raises(hj.DefinitionError, match="with this one as the guess"):
+        changed.trajectory()
+    again, other = (hj.find_limit_cycle(changed.system, x) for x in (changed, hopper_cycle))
+    np.testing.assert_allclose(again.multipliers, other.multipliers, rtol=1e-9)
+
+
 def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
     cycle = hj.find_limit_cycle(Slowed(), settings=hj.Settings(solver=hj.Radau()))
     assert len(cycle.trajectory().t) > 2  # another solver is no other code

@@ -226,8 +226,8 @@ def _plain(value: Any, allowed: str) -> Any:
 
 def unmasked(values: Any) -> np.ndarray:
     """An array of NumPy, NaN where it was masked (as readers of netCDF mask what is missing)."""
-    if isinstance(values, np.ma.MaskedArray):
-        values = np.ma.filled(values.astype(np.result_type(values, float)), np.nan)
+    if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "fiub" and values.mask.any():
+        values = values.astype(float).filled(np.nan)
     return np.asarray(values)
 
 

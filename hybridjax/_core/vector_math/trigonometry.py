@@ -118,7 +118,7 @@ def _leg(x):
 def _function(name: str, function: Callable, *rules: Callable) -> Callable:
     """Return a function that is traced once: every further use costs one equation.
 
-    **Arguments:** `rules`: (tangent, value, *arguments) for each argument. Default: derived.
+    **Arguments:** `rules`: one (tangent, value, *arguments) for each argument. Default: derived.
     """
     if rules:
         function = jax.custom_jvp(function)

@@ -285,20 +285,25 @@ def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
     return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), SMALLEST_ERROR)
 
 
-def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:
-    order = len(solution.c)
-    if (solution.freedom > order).all():
-        return
-    n, i = np.argwhere(solution.freedom <= order)[0]
+def missing_cycles(problem: OutputErrorProblem, solution: Linearization, least: int) -> int:
+    """Return how many more cycles would leave this number of degrees of freedom, about."""
+    n, i = np.unravel_index(np.argmin(solution.freedom), solution.freedom.shape)
     left = int(solution.freedom[n, i])
     if not left:  # more lags than samples would use up more of them
         starts = (len(g.y) * (problem.free + g.drift.shape[-1]) for g in problem.records.grids)
         left = int(problem.records.sampled[n, i]) - problem.lags * problem.shape[1] - sum(starts)
-    missing = order + 1 - left
+    return max(least - left, 0)
+
+
+def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:
+    order = len(solution.c)
+    if not (missing := missing_cycles(problem, solution, order + 1)):
+        return
+    n, i = np.argwhere(solution.freedom <= order)[0]
     raise DefinitionError(
         f"section {n} was sampled {problem.records.sampled[n, i]} times, too few for numerators of "
         f"{problem.lags} lags and {problem.free} unknown cycles at the start of each record: "
-        f"{missing} or more cycles are missing. Record more, or lower `order` or `overhang`."
+        f"{missing} or more cycles are missing. Record more, take fewer sections, or lower `order`."
     )
 
 

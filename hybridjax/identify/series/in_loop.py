@@ -196,7 +196,7 @@ class LoopEquations:
         if (least := min(x.freedom for x in sections)) <= d:
             raise DefinitionError(
                 f"a section was sampled {d + 1 - least} times too few for numerators of "
-                f"{self.lags} lags: record more, or lower `order` or `overhang`."
+                f"{self.lags} lags: record more, take fewer sections, or lower `order`."
             )
         freedom = sum(x.freedom for x in sections)
         for _ in range(2):  # the second time with the weights that the errors suggest

@@ -128,7 +128,7 @@ class OutputErrorProblem(NamedTuple):
         if lags > records.cycles * N:
             raise DefinitionError(
                 f"numerators of {lags} lags reach beyond the longest record, of "
-                f"{records.cycles * N} samples: lower `order` or `overhang`."
+                f"{records.cycles * N} samples: take fewer sections, or lower `order`."
             )
         triangles, equal = [np.zeros((0, lags * nu))] * N, np.ones((N, ny, ny), bool)
         for grid in records.grids:

@@ -107,7 +107,7 @@ def numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
     """
     try:
         values = unmasked(values)
-    except ValueError:  # rows of different lengths
+    except (ValueError, TypeError):  # rows of different lengths, a dataset
         values = np.empty((0, 0), object)
     if values.dtype.kind not in "fiub" or values.ndim != 1:
         raise DefinitionError(
