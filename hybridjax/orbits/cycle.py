@@ -334,7 +334,8 @@ class LimitCycle(eqx.Module):
 
     def _title(self) -> str:
         message = what_changed(self.system, self.numbers) or Result(int(self.result)).message
-        return f"{type(self.system).__name__}: {message}"
+        unstable = message == Result.OK.message and not self.stable
+        return f"{type(self.system).__name__}: {message}{', unstable' * unstable}"
 
     def _facts(self, multipliers: Mapping[str, str] = {}) -> dict[str, str]:  # noqa: B006
         """The printed lines, by their headings."""

@@ -150,3 +150,4 @@ def test_damped_steps_reach_a_cycle_that_newtons_method_misses():
     traces = sum(np.sum(x.multipliers) for x in (cycle, stable))
     np.testing.assert_allclose(traces, 2 * (1 + e**2), rtol=1e-9)
     assert stable.stable and not cycle.stable
+    assert ": ok, unstable)" in str(cycle) and ": ok)" in str(stable)
