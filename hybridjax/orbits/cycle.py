@@ -386,7 +386,7 @@ def as_found(cycle: LimitCycle) -> LimitCycle:
     """The cycle with the numbers for which it was found."""
     arrays, static = eqx.partition(cycle.system, eqx.is_array)
     before = [cycle.numbers.get(name, x) for name, x in arrays_of(cycle.system).items()]
-    arrays = jax.tree_util.tree_structure(arrays).unflatten(before)
+    arrays = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(arrays), before)
     return dataclasses.replace(cycle, system=eqx.combine(arrays, static))
 
 
