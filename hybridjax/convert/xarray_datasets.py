@@ -123,12 +123,12 @@ def _from_module(module: eqx.Module) -> Any:
     variables = {name: (_axes(type(module), name), array) for name, array in arrays.items()}
     coordinates |= {name: variables.pop(name) for name in {"f"} & set(variables)}
     units = {str(name): name.unit for name in signals_in(static)}
-    sizes = {x: n for axes, array in variables.values() for x, n in zip(axes, array.shape)}
-    sizes = {x: n for x, n in sizes.items() if x in _ORDERED}
-    coordinates |= {x: np.arange(n) for x, n in sizes.items()}
+    dataset = package("xarray").Dataset(variables, coordinates)
+    sizes = {x: n for x, n in dataset.sizes.items() if x in _ORDERED}
     header = {"kind": type(module).__name__, "static": static, "units": units, "sizes": sizes}
     text = json.dumps(header, default=lambda x: x.item())
-    return package("xarray").Dataset(variables, coordinates, {_HEADER: text})
+    order = {x: np.arange(n) for x, n in sizes.items()}
+    return dataset.assign_coords(order).assign_attrs({_HEADER: text})
 
 
 def _axes(kind: type, name: str) -> tuple[str, ...]:
