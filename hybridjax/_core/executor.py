@@ -58,6 +58,25 @@ def at_most(seconds: float) -> Iterator[None]:
         _deadline.reset(before)
 
 
+_quick = contextvars.ContextVar("quick", default=False)
+
+
+@contextlib.contextmanager
+def quickly() -> Iterator[None]:
+    """A context in which JAX traces for programs with few optimizations."""
+    before = _quick.set(True)
+    try:
+        yield
+    finally:
+        _quick.reset(before)
+
+
+def is_quick() -> bool:
+    """Return whether JAX traces for a program with few optimizations. (JAX keeps the program of an
+    inner `jit` for all outer ones: say it by a static argument there.)"""
+    return _quick.get()
+
+
 def on_host(x: Any) -> bool:
     """Return whether x is an array of the host."""
     return isinstance(x, np.ndarray | np.generic)

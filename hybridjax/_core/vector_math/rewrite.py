@@ -9,13 +9,14 @@ slow as it would be without.
 """
 
 import functools as ft
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import primitives
 
 from ..executor import on_cpu
@@ -63,13 +64,49 @@ def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
         # A new function every time: a program of earlier parameters is never taken for this one.
         trace = jax.make_jaxpr(lambda *arguments: function(*arguments), return_shape=True)
         program, shapes = trace(*arguments)
-        jaxpr = _row_by_row(program.jaxpr) if trigonometry else program.jaxpr
+        jaxpr = _without_repetitions(program.jaxpr)
+        jaxpr = _row_by_row(jaxpr) if trigonometry else jaxpr
         program = program.replace(jaxpr=_replaced(jaxpr, trigonometry))
         values = jex.jaxpr_as_fun(program)(*jax.tree_util.tree_leaves(arguments))
         values = [v if isinstance(v, jax.Array) else jnp.asarray(v) for v in values]
         return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(shapes), values)
 
     return call
+
+
+def _without_repetitions(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
+    """A program without equations that repeat earlier ones, as those of derivatives do. (XLA merges
+    them too, but only after it has written out our functions wherever they are called.)"""
+    first: dict[jex.Var, jex.Var] = {}
+    before: dict[Hashable, jex.Var] = {}
+    eqns = []
+    for eqn in jaxpr.eqns:
+        eqn = eqn.replace(invars=[_first(v, first) for v in eqn.invars])
+        key = eqn.primitive, *map(_identity, eqn.invars), *sorted(eqn.params.items())
+        if len(eqn.outvars) > 1 or eqn.effects or not _is_hashable(key):
+            eqns.append(eqn)
+        elif key in before:
+            first[eqn.outvars[0]] = before[key]
+        elif not isinstance(eqn.outvars[0], jex.DropVar):
+            before[key] = eqn.outvars[0]
+            eqns.append(eqn)
+    return jaxpr.replace(eqns=eqns, outvars=[_first(v, first) for v in jaxpr.outvars])
+
+
+def _first(v, first):
+    return first.get(v, v) if isinstance(v, jex.Var) else v
+
+
+def _identity(v: Any) -> Hashable:
+    return v if isinstance(v, jex.Var) else (v.aval, np.asarray(v.val).tobytes())
+
+
+def _is_hashable(key: tuple) -> bool:
+    try:
+        hash(key)
+    except TypeError:
+        return False
+    return True
 
 
 def _number(eqn: jex.JaxprEqn) -> int:
