@@ -99,6 +99,18 @@ def test_datasets_know_names_and_units(model):
     dims = {name: x.dims for name, x in convert.to_xarray(model).data_vars.items()}
     assert dims["A"] == ("section", "next_state", "state")
     assert dims["B"] == ("section", "next_state", "input")
+    u = np.zeros((2, 4 * N, 2))
+    data = hj.ExperimentData(u, u + np.arange(4 * N)[:, None], n_sections=N, periods=2)
+    dataset, whole = convert.to_xarray(data), convert.to_xarray(model)
+    later = convert.from_xarray(dataset.isel(sample=slice(N, None)))
+    np.testing.assert_array_equal(later.y, data.y[:, N:])
+    backwards, late = slice(None, None, -1), slice(1, None)
+    for part in (dataset.isel(sample=x) for x in (backwards, late)):
+        with pytest.raises(hj.DefinitionError, match="`sample` must be in order, from section 0"):
+            convert.from_xarray(part)
+    for part in (whole.isel(section=slice(2)), whole.roll(section=1, roll_coords=True)):
+        with pytest.raises(hj.DefinitionError, match="`section` must be in order"):
+            convert.from_xarray(part)
 
 
 def test_section_data(wave):

@@ -429,7 +429,7 @@ def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:
     """The program of a kernel, and the arrays of its trees."""
     leaves, structure = jax.tree_util.tree_flatten(trees)
     # (Arrays of an accelerator are copied once, by way of NumPy, and not in each call.)
-    is_near = lambda x: isinstance(x, jax.Array) and getattr(x.device, "platform", "") == "cpu"  # noqa: E731
+    is_near = lambda x: getattr(getattr(x, "device", None), "platform", "") == "cpu"  # noqa: E731
     arrays = [x if is_near(x) else jax.device_put(np.asarray(x)) for x in leaves if _is_array(x)]
     # (1, 1.0 and True are equal, and not the same.)
     static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)

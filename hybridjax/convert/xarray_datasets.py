@@ -39,6 +39,8 @@ _STATES = {
     "B": ("section", "next_state", "input"),
     "C": ("section", "output", "state"),
 }
+# Dimensions with an order in time.
+_ORDERED = {"section", "sample"}
 # Dimensions whose coordinates are a field beside the arrays.
 _COORDINATES = {"input": "inputs", "output": "outputs", "harmonic": "harmonics"}
 
@@ -74,7 +76,7 @@ def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> 
 def from_xarray(dataset: Any) -> Saved:
     """Return the object from which `to_xarray` made a dataset, with the same numbers bit by bit. It
     must be an object that `hj.save` can write. The dataset may be a selection of harmonics,
-    frequencies, experiments, samples or signals.
+    frequencies, experiments, signals, or samples that follow each other from section 0 on.
 
     **Raises:** `DefinitionError` for other datasets; `PrecisionError` in single precision.
     """
@@ -88,6 +90,11 @@ def from_xarray(dataset: Any) -> Saved:
         ) from None
     static = restored(header["static"], header["units"])
     try:
+        for dimension, size in header["sizes"].items():
+            order, whole = dataset[dimension].values, dimension == "section"
+            late = order[0] % (size if whole else static["n_sections"])
+            if late or (np.diff(order) != 1).any() or (whole and len(order) < size):
+                raise DefinitionError(f"`{dimension}` must be in order, from section 0 on.")
         for dimension, field in _COORDINATES.items():
             if dimension in dataset.coords:
                 static[field] = tuple(x.item() for x in dataset[dimension].values)
@@ -116,9 +123,12 @@ def _from_module(module: eqx.Module) -> Any:
     variables = {name: (_axes(type(module), name), array) for name, array in arrays.items()}
     coordinates |= {name: variables.pop(name) for name in {"f"} & set(variables)}
     units = {str(name): name.unit for name in signals_in(static)}
-    header = {"kind": type(module).__name__, "static": static, "units": units}
+    dataset = package("xarray").Dataset(variables, coordinates)
+    sizes = {x: n for x, n in dataset.sizes.items() if x in _ORDERED}
+    header = {"kind": type(module).__name__, "static": static, "units": units, "sizes": sizes}
     text = json.dumps(header, default=lambda x: x.item())
-    return package("xarray").Dataset(variables, coordinates, {_HEADER: text})
+    order = {x: np.arange(n) for x, n in sizes.items()}
+    return dataset.assign_coords(order).assign_attrs({_HEADER: text})
 
 
 def _axes(kind: type, name: str) -> tuple[str, ...]:

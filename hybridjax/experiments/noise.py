@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import require_axes, require_equal
+from .._core.arguments import require_axes
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, NonNegative, Numbers, SectionCount, Seed
 from .._core.boundary.values import Reals
@@ -105,12 +105,10 @@ def simulate_experiments(
 
     **Returns:** `ExperimentData` with `discard + P` cycles.
 
-    **Raises:** `DefinitionError` if N (also of the process noise) or the number of inputs differ,
+    **Raises:** `DefinitionError` if N (also of the process noise) or the inputs differ,
     or if a periodic response does not exist (a multiplier that is a P-th root of one).
     """
-    require_equal("design and model", "n_sections", design.n_sections, ldtp.n_sections)
-    numbers = len(design.input_names), len(ldtp.inputs)
-    require_equal("design and model", "numbers of inputs", *numbers)
+    design.require("model", ldtp.n_sections, ldtp.inputs)
     if discard is None:
         discard = DISCARD if start == "cycle" else 0
     u = applied = design.inputs(design.periods + discard)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import names, require_equal
+from .._core.arguments import names
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index
 from .._core.boundary.values import Reals
@@ -329,8 +329,8 @@ def prepare(
     feedback = None if options.feedback is None else _controller(placed, items, options)
     _require_return(cycle, placed, feedback is not None)
     discard = (DISCARD if start == "cycle" else 0) if options.discard is None else options.discard
-    N, nu = placed.n_sections, len(cycle.system.inputs)
-    inputs = check_inputs(design, discard, N, nu)
+    N = placed.n_sections
+    inputs = check_inputs(design, discard, N, cycle.system.inputs)
     if noise is not None:
         noise.require(N)
     if start != "cycle" and inputs.cycles % inputs.periods:
@@ -377,18 +377,19 @@ def _controller(
     return to_host(static_gain(from_host(F), model.n_sections, shape))
 
 
-def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> Inputs:
-    """Return the inputs for N sections and nu inputs, with the first `discard` cycles not for
-    estimation.
+def check_inputs(
+    design: DesignLike, discard: int, n_sections: int, names: tuple[str, ...]
+) -> Inputs:
+    """Return the inputs for N sections and the inputs of these names, with the first `discard`
+    cycles not for estimation.
 
     **Raises:** `DefinitionError` if they do not fit, or hold NaN.
     """
     if isinstance(design, Design):
-        require_equal("design and `sections`", "n_sections", design.n_sections, n_sections)
-        require_equal("design and system", "numbers of inputs", len(design.input_names), nu)
+        design.require("system", n_sections, names)
         return Inputs(design, discard + design.periods, design.periods)
     u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
-    require_shape(u.shape, n_sections, nu)
+    require_shape(u.shape, n_sections, len(names))
     for k in range(0, len(u), CHUNK):
         finite = np.isfinite(np.asarray(u[k : k + CHUNK], float)).all(axis=(1, 2))
         if not finite.all():

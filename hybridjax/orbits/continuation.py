@@ -22,7 +22,7 @@ from .._core.progress import say, working
 from .._core.results import Result
 from .._core.text import number
 from ..errors import DefinitionError
-from ..systems.system import arrays_of
+from ..systems.system import copies_of
 from .batches import front
 from .coincidence import SAME, coincident
 from .curve import Curve, Point
@@ -334,7 +334,7 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
         systems, cycle.base, turn.period, anchor, turn.legs, turn.factors, turn.distance,
         np.array([p.steps for p in points]), np.zeros(len(points), np.int32),
         front(turn.codes.reshape(len(points), -1)), cycle.settings, cycle.conserved,
-        cycle.multiplicity, arrays_of(systems),
+        cycle.multiplicity, copies_of(systems),
     )  # fmt: skip
     together = [coincident(cycle.return_map, p.turn) is not None for p in points]
     return examined(cycles, np.array(together))

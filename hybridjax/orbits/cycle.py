@@ -334,7 +334,8 @@ class LimitCycle(eqx.Module):
 
     def _title(self) -> str:
         message = what_changed(self.system, self.numbers) or Result(int(self.result)).message
-        return f"{type(self.system).__name__}: {message}"
+        unstable = message == Result.OK.message and not self.stable
+        return f"{type(self.system).__name__}: {message}{', unstable' * unstable}"
 
     def _facts(self, multipliers: Mapping[str, str] = {}) -> dict[str, str]:  # noqa: B006
         """The printed lines, by their headings."""
@@ -385,7 +386,7 @@ def as_found(cycle: LimitCycle) -> LimitCycle:
     """The cycle with the numbers for which it was found."""
     arrays, static = eqx.partition(cycle.system, eqx.is_array)
     before = [cycle.numbers.get(name, x) for name, x in arrays_of(cycle.system).items()]
-    arrays = jax.tree_util.tree_structure(arrays).unflatten(before)
+    arrays = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(arrays), before)
     return dataclasses.replace(cycle, system=eqx.combine(arrays, static))
 
 

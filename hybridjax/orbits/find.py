@@ -21,7 +21,7 @@ from ..engine.unresolved import has_kinks
 from ..errors import ComputationError, DefinitionError
 from ..systems.solver import Radau
 from ..systems.structure import Structure
-from ..systems.system import Guess, HybridSystem, arrays_of, integrated
+from ..systems.system import Guess, HybridSystem, copies_of, integrated
 from . import checks
 from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
@@ -241,7 +241,7 @@ def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) 
     return LimitCycle(
         map.system, map.base, period, solution.anchor, turn.legs, turn.factors, turn.distance,
         solution.steps, solution.result, event_sequence, map.settings, map.conserved,
-        map.multiplicity, arrays_of(map.system),
+        map.multiplicity, copies_of(map.system),
     )  # fmt: skip
 
 

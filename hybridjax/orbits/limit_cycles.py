@@ -20,7 +20,7 @@ from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
-from ..systems.system import HybridSystem, arrays_of
+from ..systems.system import HybridSystem, copies_of
 from .batches import Rounds, Tiles, tiles_of
 from .checks import check_jumps, check_periodic, closes_early
 from .coincidence import commutes
@@ -180,7 +180,7 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
     cycles = LimitCycles(
         tiles.systems, map.base, rounds.period, rounds.anchor, turn.legs, turn.factors,
         turn.distance, rounds.steps, rounds.result, rounds.codes, map.settings, map.conserved,
-        map.multiplicity, arrays_of(tiles.systems),
+        map.multiplicity, copies_of(tiles.systems),
     )  # fmt: skip
     cycles = examined(cycles, rounds.together)
     if map.multiplicity == 1:

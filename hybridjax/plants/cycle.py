@@ -224,7 +224,7 @@ class SettledCycle:
         made in other processes; `ComputationError` if the cycle has not settled.
         """
         N = self.sections.n_sections
-        inputs = check_inputs(design, discard, N, len(self.inputs))
+        inputs = check_inputs(design, discard, N, self.inputs)
         count = min(core_count() if processes is None else processes, len(inputs))
         u = inputs.part(slice(0, len(inputs)))
 

@@ -51,17 +51,17 @@ def magnitude(
     """
     if not harmonics:
         raise DefinitionError("`harmonics` must hold one harmonic or more.")
-    drawn = _exact_first(htfs)
+    first, *_ = drawn = _exact_first(htfs)
+    name, pushed = _pick("output", output, first.outputs), _pick("input", input, first.inputs)
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
         for htf in drawn:
             for m in harmonics:
-                f, values, radius = _values(htf, m, output, input)
+                f, values, radius = _values(htf, m, name, pushed)
                 size, style = np.abs(values), _harmonic_style(m, harmonics)
                 line = _line(htf, drawn, style, _name(m))
                 panel.plot(f, size, **line)
                 _band(panel, f, size, radius, line["color"], 0.3 * np.min(size))
-        name, pushed = _pick("output", output, htf.outputs), _pick("input", input, htf.inputs)
         label = with_unit(f"$|H_m|$, {name}", ratio(name, pushed))
         panel.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
         _frequency_limits(panel, f)
@@ -136,7 +136,7 @@ def bode(
             color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
             label = with_unit(name, "" if same else unit)
             for htf in drawn:
-                f, values, radius = _values(htf, harmonic, name, input)
+                f, values, radius = _values(htf, harmonic, name, pushed)
                 size, line = np.abs(values), _line(htf, drawn, {"color": color}, label)
                 is_certain = np.full(len(f), True) if radius is None else radius < size
                 is_certain &= np.convolve(is_certain, np.ones(3))[1:-1] > 1  # of a line, no points
@@ -149,7 +149,7 @@ def bode(
                     turn = np.degrees(np.arcsin(np.where(is_certain, radius, np.nan) / size))
                     _band(lower, f, phase, turn, color)
             for fit in fits:
-                values = _evaluate(fit, f, harmonic, name, input)
+                values = _values(fit.htf(f), harmonic, name, pushed)[1]
                 phase = _phase(f, values, np.full(len(f), True), reference)
                 upper.plot(f, np.abs(values), **_FIT_STYLE, zorder=5)
                 lower.plot(f, phase, **_FIT_STYLE, zorder=5)
@@ -226,7 +226,7 @@ def _pick(kind: str, which: str | int, names: Sequence[str]) -> str:
 
 
 def _values(
-    htf: HTF, m: int, output: str | int, input: str | int
+    htf: HTF, m: int, output: str, input: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
     hold the true values; None without a variance."""
@@ -277,16 +277,6 @@ def _phase(f, values, known, reference: tuple | None) -> np.ndarray:
         turns = np.median(np.interp(f[known], *reference) - phase[known]) / 360
         phase += 360 * np.round(turns)
     return phase
-
-
-def _evaluate(fit: Fit, f, harmonic: int, output: str, input: str | int) -> np.ndarray:
-    i = channel_index("output", output, fit.outputs)
-    if isinstance(fit, StructuredFit):
-        k = channel_index("input", input, fit.inputs)
-        return np.asarray(fit.htf(f, harmonic).H)[0, :, i, k]
-    if harmonic != 0:
-        raise DefinitionError(f"the rational fit is of H_0, not of H_{harmonic}.")
-    return np.asarray(fit.htf(f).H)[0, :, i, 0]
 
 
 def _legend(ax: Axes, htfs: Sequence[HTF]) -> None:

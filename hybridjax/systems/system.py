@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import Scalar, Vector
-from .._core.executor import Definition
+from .._core.executor import Definition, is_tracer
 from .._core.meaning import code_digest, current
 from .._core.pieces.description import digest_of
 from .._core.precision import real
@@ -81,6 +81,12 @@ def arrays_of(system: "HybridSystem") -> dict[str, Array]:
     """The arrays of a system by name, those of its parts by a path with dots."""
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array))
     return {".".join(str(getattr(x, "name", x)) for x in path): leaf for path, leaf in leaves}
+
+
+def copies_of(system: "HybridSystem") -> dict[str, Array]:
+    """Copies of `arrays_of`. (A buffer that a tree holds twice cannot be donated.)"""
+    copied = lambda x: x if is_tracer(x) else jax.device_put(np.array(x))  # noqa: E731
+    return {name: copied(x) for name, x in arrays_of(system).items()}
 
 
 def parameters_of(system: "HybridSystem") -> dict[str, Array]:

@@ -47,7 +47,7 @@ def test_the_hopper_with_its_input_limited(isochron_ldtp):
     assert 1 <= plan.certificate < 1.03
     assert plan.rms["yM"] / plan.usual_rms["yM"] == pytest.approx(5.83, abs=0.05)
     assert plan.frequencies[np.argmax(plan.power)] == pytest.approx(0.3, abs=0.04)
-    assert f"stride of this design replaces {plan.saved:.3g} with equal amplitudes." in repr(plan)
+    assert f"stride of this design replaces {plan.saved:.2g} with equal amplitudes." in repr(plan)
     assert re.search(r"strides +1280 +1280\n  standard error of -0.249\+0.6993i", repr(plan))
     np.testing.assert_allclose(plan.rms["u"], plan.usual_rms["u"])
 

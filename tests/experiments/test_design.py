@@ -212,3 +212,13 @@ def test_expected_variance_is_that_of_the_estimate():
     estimate = hj.estimate_htf(hj.ExperimentData(u, y, n_sections=4, periods=8), 0)
     expected = design.expected_variance()[:, 0] / 400
     np.testing.assert_allclose(np.mean(estimate.variance), expected.mean(), rtol=0.02)
+
+
+def test_inputs_in_another_order_are_refused():
+    """By position, the amplitudes of one input would be those of another one."""
+    model, inputs = hj.testing.synthetic_ldtp(), ("u1", "u0")
+    design = hj.multisine(model.n_sections, periods=4, inputs=inputs)
+    with pytest.raises(hj.DefinitionError, match="different orders of inputs: .'u1', 'u0'. and"):
+        hj.experiments.simulate_experiments(model, design)
+    other = hj.multisine(model.n_sections, periods=4, inputs=("force", "torque"))
+    assert hj.experiments.simulate_experiments(model, other).inputs == model.inputs

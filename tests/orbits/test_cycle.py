@@ -1,5 +1,6 @@
 """Limit cycles: stable and unstable, clocked and autonomous, and none."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -40,6 +41,13 @@ def test_the_hopper_and_its_events(reference, hopper_cycle):
         np.testing.assert_allclose(list(found.values()), data[name], atol=1e-10)
     text = repr(hopper_cycle)
     assert "liftoff, touchdown" in text and "-0.248983335+0.699333252j" in text
+
+
+def test_a_cycle_can_be_donated(hopper_cycle):
+    """No buffer is in it twice: XLA refuses to write over one twice."""
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    moved = eqx.filter_jit(lambda c: eqx.tree_at(lambda c: c.period, c, 1.0), donate="all")(cycle)
+    np.testing.assert_array_equal(moved.multipliers, hopper_cycle.multipliers)
 
 
 def test_the_lossy_hopper(lossy_cycle):
@@ -142,3 +150,4 @@ def test_damped_steps_reach_a_cycle_that_newtons_method_misses():
     traces = sum(np.sum(x.multipliers) for x in (cycle, stable))
     np.testing.assert_allclose(traces, 2 * (1 + e**2), rtol=1e-9)
     assert stable.stable and not cycle.stable
+    assert ": ok, unstable)" in str(cycle) and ": ok)" in str(stable)

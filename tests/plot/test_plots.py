@@ -69,6 +69,19 @@ def test_bode_with_fits(estimate, exact, rational, structured):
     np.testing.assert_allclose(phases[1], phases[0], atol=2)
 
 
+def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
+    """Indices are those of the first HTF, and a fit is drawn over its own input."""
+    exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
+    names = exact.inputs[::-1], exact.outputs[::-1]
+    swapped = hj.HTF(exact.f, exact.H[..., ::-1, ::-1], 0, exact.n_sections, *names, "exact")
+    for draw, shown in ((hj.plot.magnitude, {"harmonics": [0]}), (hj.plot.bode, {})):
+        first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
+        np.testing.assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
+        np.testing.assert_array_equal(first.get_ydata(), second.get_ydata())
+    with pytest.raises(hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"):
+        hj.plot.bode(exact, fits=hj.fit_rational(exact, input=1))
+
+
 def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
     figure = hj.plot.bodes(families, fits={"b": rational}).figure

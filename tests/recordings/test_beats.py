@@ -1,5 +1,7 @@
 """Phase response curves of rhythms of which only the events are known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,11 @@ def test_a_rhythm_without_noise_is_found_exactly():
     np.testing.assert_allclose(exact.values, CURVE, atol=0.02)
     np.testing.assert_allclose(exact.rates, 10, atol=5e-3)
     assert exact.left_out > 0.9999 and exact.result == 0 and exact.miscounted == 0
+    # With an offset of the sensor, or under a constant current, the curve is the same.
+    r = beats(0.0, trials=3)
+    u = [dataclasses.replace(t, values=t.values + 100 * k) for k, t in enumerate(r.trials)]
+    shifted = hj.recordings.phase_response(r.with_trials(u), BEAT, input="u")
+    np.testing.assert_allclose(shifted.values, exact.values, rtol=1e-6)
 
 
 def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):

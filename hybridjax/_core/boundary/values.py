@@ -227,7 +227,7 @@ def _plain(value: Any, allowed: str) -> Any:
 def unmasked(values: Any) -> np.ndarray:
     """An array of NumPy, NaN where it was masked (as readers of netCDF mask what is missing)."""
     if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "fiub" and values.mask.any():
-        values = values.astype(float).filled(np.nan)
+        values = np.ma.filled(values.astype(float), np.nan)
     return np.asarray(values)
 
 

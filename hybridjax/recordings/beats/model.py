@@ -55,7 +55,7 @@ class Intervals(NamedTuple):
     step: Float[np.ndarray, " L"]
     """Step of integration, in s."""
     inputs: Float[np.ndarray, "nodes L"]
-    """Inputs at half steps since the start of each interval."""
+    """Inputs without their mean, at half steps since the start of each interval."""
 
     def sums(self, values: Float[np.ndarray, " L"]) -> Float[np.ndarray, " trials"]:
         """Return sums over each trial."""
@@ -70,7 +70,8 @@ class Intervals(NamedTuple):
 
 
 def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
-    """Return the intervals between events, with the input of that name, linear between samples.
+    """Return the intervals between events, with the input of that name, linear between samples,
+    without its mean in each trial.
 
     **Raises:** `DefinitionError` for a phase that is an angle or has other trials, an input that is
     missing or constant, and too few intervals during which it is finite.
@@ -93,7 +94,8 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
         start, duration = start[used], duration[used]
         step = float(np.median(duration)) / _STEPS
         nodes = np.arange(2 * int(np.ceil(1.5 * duration.max() / step)) + 1) / 2
-        inputs.append(np.interp(start + nodes[:, None] * step, trial.time[finite], x[finite]))
+        x = x[finite] - x[finite].mean()  # (under which the phase advances evenly)
+        inputs.append(np.interp(start + nodes[:, None] * step, trial.time[finite], x))
         starts.append(start)
         durations.append(duration)
         steps.append(np.full(len(start), step))

@@ -130,7 +130,7 @@ def phase_response(
     - `phase`: the event at which each cycle begins, or a `Phase` estimated from events or
       crossings.
     - `input`: the name of the signal that acted; linear between its samples. It must not depend on
-      the rhythm (no feedback).
+      the rhythm (no feedback). The curve and the rates are those at its mean in each trial.
 
     **Raises:** `DefinitionError` for an input that is missing or constant, a phase that is an
     angle, and too few intervals.

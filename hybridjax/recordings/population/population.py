@@ -263,7 +263,8 @@ class Population:
 
         **Arguments:** costs in the same unit. Default: 1, 0.1 and 0.01.
 
-        **Raises:** `DefinitionError` without a column `strides`, and as `mean`.
+        **Raises:** `DefinitionError` without a column `strides` or a spread between subjects, and
+        as `mean`.
         """
         cells = [data[["y", "v"]].to_numpy().T for _, data in self._cells(quantity, 3)]
         between = np.mean([meta(y, v, np.ones((len(y), 1))).between for y, v in cells])
@@ -272,7 +273,12 @@ class Population:
         count = by["y"].count()
         scatter = (count - 1) * (by["y"].var().fillna(0.0) - by["v"].mean())
         trial = max(scatter.sum() / max((count - 1).sum(), 1), 0.0)
-        between = max(between - trial * np.mean(1 / count) * (trial > 0), 1e-300)
+        between -= trial * np.mean(1 / count) * (trial > 0)
+        if not between > 0:
+            raise DefinitionError(
+                f"subjects differ in '{quantity}' by no more than their errors, and then one with "
+                "many strides is the cheapest: find their spread from more subjects."
+            )
         stride = np.mean(trials["v"] * trials["strides"])
         k = max(round(np.sqrt(trial / between * subject_cost / trial_cost)), 1)
         cost = (subject_cost + k * trial_cost) / stride_cost
