@@ -270,12 +270,10 @@ def _lowered(key: tuple, run: Callable, leaves: list, large: bool) -> "_Program"
             _by_kind.clear()
             _by_text.clear()
         shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
-        lower = lambda large: jax.jit(run if large else quickly()(run)).lower(shapes)  # noqa: E731
-        lowered = lower(large)
-        text = lowered.as_text()
+        lower = ft.cache(lambda large: jax.jit(run if large else quickly()(run)).lower(shapes))
+        text = lower(large).as_text()
         digest = key[0], large, hashlib.sha256(text.encode()).digest()
-        program = _Program({large: lowered}, lower, "@lapack_" in text)
-        _by_kind[key] = _by_text.setdefault(digest, program)
+        _by_kind[key] = _by_text.setdefault(digest, _Program(lower, "@lapack_" in text))
     return _by_kind[key]
 
 
@@ -286,11 +284,10 @@ def one_tier(function: Callable, large: bool) -> Callable:
 
 
 class _Program:
-    """A program that is lowered for one tier, and that `lower` lowers for the other one, and its
-    executables."""
+    """A program, and its executables; `lower(large)` lowers it for one of the tiers."""
 
-    def __init__(self, lowered: dict[bool, jax.stages.Lowered], lower: Callable, alone: bool):
-        self._lowered, self._lower, self._alone = lowered, lower, alone
+    def __init__(self, lower: Callable[[bool], jax.stages.Lowered], alone: bool):
+        self._lower, self._alone = lower, alone
         self._quick: jax.stages.Compiled | None = None
         self._full: jax.stages.Compiled | None = None
         self._seconds, self._lock = 0.0, threading.Lock()
@@ -302,13 +299,11 @@ class _Program:
         if large or self._full is not None:
             return self._optimize()
         if self._quick is None:
-            self._quick = self._lowered[False].compile(compiler_options=compiler_options())
+            self._quick = self._lower(False).compile(compiler_options=compiler_options())
         return self._quick
 
     def _optimize(self) -> jax.stages.Compiled:
-        if self._full is None:
-            lowered = self._lowered.get(True) or self._lower(True)
-            self._full = lowered.compile()
+        self._full = self._full or self._lower(True).compile()
         return self._full
 
     def run(self, executable: jax.stages.Compiled, leaves: list) -> Any:

@@ -58,23 +58,19 @@ def at_most(seconds: float) -> Iterator[None]:
         _deadline.reset(before)
 
 
-_quick = contextvars.ContextVar("quick", default=False)
+# Whether JAX traces for a program with few optimizations. (JAX keeps the program of an inner `jit`
+# for all outer ones, so there a static argument must say so.)
+is_quick = contextvars.ContextVar("is_quick", default=False)
 
 
 @contextlib.contextmanager
 def quickly() -> Iterator[None]:
     """A context in which JAX traces for programs with few optimizations."""
-    before = _quick.set(True)
+    before = is_quick.set(True)
     try:
         yield
     finally:
-        _quick.reset(before)
-
-
-def is_quick() -> bool:
-    """Return whether JAX traces for a program with few optimizations. (JAX keeps the program of an
-    inner `jit` for all outer ones: say it by a static argument there.)"""
-    return _quick.get()
+        is_quick.reset(before)
 
 
 def on_host(x: Any) -> bool:

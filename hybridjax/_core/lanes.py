@@ -80,7 +80,7 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
         lanes = max(x.shape[-1] for x in arguments)
         common = tuple(x.shape[-1] < lanes for x in arguments)
         arguments = [x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)]
-        return program(common, lanes >= _VECTOR_LANES and not is_quick())(arrays, *arguments)
+        return program(common, lanes >= _VECTOR_LANES and not is_quick.get())(arrays, *arguments)
 
     return call
 

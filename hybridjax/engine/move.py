@@ -58,7 +58,7 @@ def move(
         return Recorded(*jax.tree_util.tree_map(lambda x: x[0], row))
     if on_host(lanes.t):
         return search(s, lanes, u, target, settings, setout, result, options)
-    options = options._replace(quick=is_quick())
+    options = options._replace(quick=is_quick.get())
     return _move(s, lanes, u, target, fixed(setout), result, settings, options)
 
 

@@ -79,34 +79,21 @@ def _without_repetitions(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
     them too, but only after it has written out our functions wherever they are called.)"""
     first: dict[jex.Var, jex.Var] = {}
     before: dict[Hashable, jex.Var] = {}
+    now: Any = lambda v: first.get(v, v) if isinstance(v, jex.Var) else v  # noqa: E731
+    same = lambda v: v if isinstance(v, jex.Var) else (v.aval, np.asarray(v.val).tobytes())  # noqa: E731
     eqns = []
     for eqn in jaxpr.eqns:
-        eqn = eqn.replace(invars=[_first(v, first) for v in eqn.invars])
-        key = eqn.primitive, *map(_identity, eqn.invars), *sorted(eqn.params.items())
-        if len(eqn.outvars) > 1 or eqn.effects or not _is_hashable(key):
+        eqn = eqn.replace(invars=[now(v) for v in eqn.invars])
+        out, *others = eqn.outvars or [None]
+        key = eqn.primitive, str(eqn.params), *map(same, eqn.invars)
+        if out is None or others or eqn.effects or jaxprs(eqn.params):
             eqns.append(eqn)
         elif key in before:
-            first[eqn.outvars[0]] = before[key]
-        elif not isinstance(eqn.outvars[0], jex.DropVar):
-            before[key] = eqn.outvars[0]
+            first[out] = before[key]
+        elif not isinstance(out, jex.DropVar):
+            before[key] = out
             eqns.append(eqn)
-    return jaxpr.replace(eqns=eqns, outvars=[_first(v, first) for v in jaxpr.outvars])
-
-
-def _first(v, first):
-    return first.get(v, v) if isinstance(v, jex.Var) else v
-
-
-def _identity(v: Any) -> Hashable:
-    return v if isinstance(v, jex.Var) else (v.aval, np.asarray(v.val).tobytes())
-
-
-def _is_hashable(key: tuple) -> bool:
-    try:
-        hash(key)
-    except TypeError:
-        return False
-    return True
+    return jaxpr.replace(eqns=eqns, outvars=[now(v) for v in jaxpr.outvars])
 
 
 def _number(eqn: jex.JaxprEqn) -> int:
