@@ -118,17 +118,17 @@ def _add_reproduce(commands) -> None:
         "hopper: figures, numbers, and models for hj.load, laid over the exact answer.",
     )
     add = reproduce.add_argument
-    add("--out", required=True, type=_place, metavar="DIR",
-        help="folder for the results; made if needed")  # fmt: skip
     add("--seed", type=_seed, default=0,
         help="of the random subsets and phases (default: %(default)s)")  # fmt: skip
     add("--quick", action="store_true", help="a short form: 20 experiments of 36 cycles, of which "
         "16 are used, in place of 80 experiments of 84, of which 64 are used")  # fmt: skip
-    _add_formats(reproduce)
+    _add_results(reproduce)
     reproduce.set_defaults(run=_reproduce)
 
 
-def _add_formats(command) -> None:
+def _add_results(command) -> None:
+    command.add_argument("--out", required=True, type=_place, metavar="DIR",
+        help="folder for the results; made if needed")  # fmt: skip
     command.add_argument("--formats", type=_formats, default=("png",), metavar="NAMES",
         help="of the figures: png, pdf, svg, or several with commas (default: png)")  # fmt: skip
 
@@ -162,8 +162,6 @@ def _add_identify(commands) -> None:
         help="of the angle of --phase; estimated by default")  # fmt: skip
     add("--scale", type=_two_positive, metavar="X,V",
         help="of the angle of --phase; estimated by default")  # fmt: skip
-    add("--out", required=True, type=_place, metavar="DIR",
-        help="folder for the results; made if needed")  # fmt: skip
     add("--sections", type=_count, default=32, metavar="N",
         help="sections in each cycle (default: %(default)s)")  # fmt: skip
     add("--order", type=_count, metavar="D", help="number of multipliers; found by default")
@@ -175,7 +173,7 @@ def _add_identify(commands) -> None:
         "sections are crossed: for systems with a clock, or without")  # fmt: skip
     add("--drift", type=_positive, metavar="CYCLES", help="remove changes of the cycle that take "
         "longer than this")  # fmt: skip
-    _add_formats(identify)
+    _add_results(identify)
     identify.set_defaults(run=_identify, parser=identify)
 
 

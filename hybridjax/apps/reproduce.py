@@ -7,7 +7,7 @@ import dataclasses
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -29,7 +29,7 @@ from ..models.hoppers import VerticalHopper
 from ..orbits.crossing import Crossing
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
-from ..sections.families import AbstractSections, ClockPhase, KinematicPhase
+from ..sections.families import ClockPhase, KinematicPhase
 from ..sections.linearize import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
@@ -116,9 +116,7 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict
 
     discard = protocol.cycles - protocol.keep
     families = {name: _identify(name, cycle, design, discard, begin) for name in _FAMILIES}
-    placed = {name: family.placed for name, family in families.items()}
-    _draw(_cycles, (placed, _perturbed(cycle)), out, formats, begin)
-    _draw(_comparisons, (cycle, families), out, formats, begin)
+    _draw(cycle, families, out, formats, begin)
     summary = summarize(protocol, cycle, families)
     for name, family in families.items():
         for result in _SAVED:
@@ -129,18 +127,14 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict
     return summary
 
 
-def _sections(name: str, count: int) -> AbstractSections:
-    apex = Crossing("vM", "falling")
-    if name == "isochron":
-        return ClockPhase(count, anchor=apex)
-    return KinematicPhase(
-        count, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=apex
-    )
-
-
 def _identify(name: str, cycle: LimitCycle, design: Design, discard: int, begin: float) -> Family:
     """Return all results with one family of sections."""
-    placed = place_sections(cycle, _sections(name, design.n_sections))
+    apex, N = Crossing("vM", "falling"), design.n_sections
+    sections: Any = ClockPhase(N, anchor=apex)
+    if name == "kinematic":
+        plane: Any = {"position": "yM", "velocity": "vM", "center": (1.9, 0.0), "scale": (0.3, 1.9)}
+        sections = KinematicPhase(N, **plane, anchor=apex)
+    placed = place_sections(cycle, sections)
     ldtp = linearize(cycle, placed, OUTPUTS)
     exact = ldtp.htf(design.frequencies)
     _log(begin, f"{name}: sections, exact A, B, C, D and HTF")
@@ -155,10 +149,8 @@ def _identify(name: str, cycle: LimitCycle, design: Design, discard: int, begin:
     return Family(placed, ldtp, exact, experiments, estimate, rational, rational_exact, structured)
 
 
-def _draw(
-    figures: Callable, results: tuple, out: Path, formats: Sequence[Format], begin: float
-) -> None:
-    """Write the figures that a generator yields with their names."""
+def _draw(cycle: LimitCycle, families: Mapping[str, Family], out: Path, formats, begin) -> None:
+    """Write the figures."""
     import matplotlib  # here, since it is heavy
 
     matplotlib.use("Agg")  # files only: no window is opened, and none is needed
@@ -166,26 +158,21 @@ def _draw(
 
     from .. import plot
 
-    for name, drawn in figures(plot, *results):
+    for name, drawn in _figures(plot, cycle, families):
         plot.save(out / name, drawn, formats)
         pyplot.close(drawn.figure)
         _log(begin, name)
 
 
-def _cycles(plot: Any, placed: Mapping[str, PlacedSections], perturbed: Trajectory) -> Iterator:
-    """Fig. 1, for each family of sections."""
-    for name, sections in placed.items():
-        drawn = plot.cycle(sections.cycle, *OUTPUTS, sections=sections, perturbed=perturbed)
+def _figures(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -> Iterator:
+    """Fig. 1 for each family of sections; Figs. 3 and 4, multipliers, poles and zeros with all."""
+    perturbed, estimates = _perturbed(cycle), dict[str, Any]()
+    for name, family in families.items():
+        drawn = plot.cycle(cycle, *OUTPUTS, sections=family.placed, perturbed=perturbed)
         yield f"fig1_cycle_{name}", drawn
-
-
-def _comparisons(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -> Iterator:
-    """Figs. 3 and 4, multipliers, poles and zeros: all families in each."""
+        estimates |= {f"2p1z, {name}": family.rational, f"structured, {name}": family.structured}
     pairs = {name: (family.estimate, family.exact) for name, family in families.items()}
     rational = {name: family.rational for name, family in families.items()}
-    estimates: dict[str, Any] = {}
-    for name, family in families.items():
-        estimates |= {f"2p1z, {name}": family.rational, f"structured, {name}": family.structured}
     yield "fig3_harmonics", plot.harmonics(pairs, (0, 1, -1, 2, -2))
     yield "fig4_bode", plot.bodes(pairs, fits=rational)
     yield "multipliers", plot.multipliers(cycle, estimates)

@@ -154,20 +154,18 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
 
     def spectrum(f: np.ndarray, harmonics: tuple[int, ...]) -> np.ndarray:
         folded = np.abs((f + np.array(harmonics)[:, None] + N / 2) % N - N / 2)
-        return np.stack([_level(*item, folded) for item in measured.items()], axis=2) ** 2
+        levels = np.empty((*folded.shape, len(measured)))
+        for k, (name, level) in enumerate(measured.items()):
+            value = np.asarray(level(folded) if callable(level) else level)
+            if value.dtype.kind not in "fiu" or value.shape not in ((), folded.shape):
+                text = f"`noise` of {name} must return a real number for each frequency."
+                raise DefinitionError(text)
+            if not ((value > 0) & np.isfinite(value)).all():
+                raise DefinitionError(f"`noise` of {name} must be positive at all frequencies.")
+            levels[..., k] = value
+        return levels**2
 
     return Noise(np.array([outputs.index(name) for name in measured]), spectrum)
-
-
-def _level(
-    name: str, level: float | Callable[[np.ndarray], np.ndarray], f: Float[np.ndarray, "M F"]
-) -> Float[np.ndarray, "M F"]:
-    value = np.asarray(level(f) if callable(level) else level)
-    if value.dtype.kind not in "fiu" or value.shape not in ((), f.shape):
-        raise DefinitionError(f"`noise` of {name} must return a real number for each frequency.")
-    if not ((value > 0) & np.isfinite(value)).all():
-        raise DefinitionError(f"`noise` of {name} must be positive at all frequencies.")
-    return np.broadcast_to(value, f.shape).astype(float)
 
 
 class Measured(NamedTuple):

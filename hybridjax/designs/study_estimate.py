@@ -103,7 +103,14 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     for _ in range(_SWEEPS):
         _, groups = weighted()
         c, _ = maximum_likelihood(groups, order, c)
-        change = _relative_noise(groups, c, member, noise.shape)
+        # The rms residual of each block and output, in units of the supposed noise.
+        left, freedom = np.zeros(noise.shape), np.zeros(noise.shape)
+        for group in groups:
+            misfit, block = misfit_of(group, c), member[group.line]
+            for k, output in enumerate(group.channel[:, 0]):
+                np.add.at(left[:, output], block, (misfit.residual[:, :, k] ** 2).sum(axis=0))
+                np.add.at(freedom[:, output], block, (1 - misfit.leverage).sum(axis=0))
+        change = np.sqrt(left / freedom)
         noise = noise * change
         if np.abs(np.log(change)).max() < ENOUGH:
             break
@@ -117,19 +124,6 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     except DefinitionError as error:
         objection = str(error)
     return Estimate(fit, by_level, noise, objection)
-
-
-def _relative_noise(
-    groups: list[HTFGroup], c: Float[np.ndarray, " d"], member: np.ndarray, shape: tuple[int, ...]
-) -> Float[np.ndarray, "B ny"]:
-    """Return the rms residual of each block and output, in units of the supposed noise."""
-    square, freedom = np.zeros(shape), np.zeros(shape)
-    for group in groups:
-        misfit, block = misfit_of(group, c), member[group.line]
-        for k, output in enumerate(group.channel[:, 0]):
-            np.add.at(square[:, output], block, (misfit.residual[:, :, k] ** 2).sum(axis=0))
-            np.add.at(freedom[:, output], block, (1 - misfit.leverage).sum(axis=0))
-    return np.sqrt(square / freedom)
 
 
 def refuse_transient(

@@ -98,7 +98,9 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     if everything:
         free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(good)
     else:
-        free = [_free(_classes(data, s), P, cycles) for s in good]
+        size_of = np.abs(np.fft.rfft(data.u[good][:, data.window], axis=1)).max(axis=2)
+        excited = map(np.flatnonzero, size_of > SILENT_LINE * size_of.max(axis=1, keepdims=True))
+        free = [_free(np.unique(np.append(line_class(x, P), 0)), P, cycles) for x in excited]
     left = [Q @ record for Q, record in zip(free, y, strict=True)]
     least = min(map(len, free))
     if least <= (order or 1):
@@ -128,13 +130,6 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     simulated = None if data.simulated is None else Simulated(failed_at, data.error)
     data = dataclasses.replace(data, u=data.u[:, N:], y=clean, simulated=simulated)
     return TransientFit(data, multipliers_of(c), removed)
-
-
-def _classes(data: ExperimentData, s: int) -> np.ndarray:
-    """Return the classes of lines that an experiment excites, and 0."""
-    size = np.abs(np.fft.rfft(data.u[s, data.window], axis=0)).max(axis=1)
-    lines = np.flatnonzero(size > SILENT_LINE * size.max())
-    return np.unique(np.append(line_class(lines, data.periods), 0))
 
 
 def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows cycles"]:

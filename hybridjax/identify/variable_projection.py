@@ -412,7 +412,12 @@ def error_spectrum(
         parts = _components(group.period_delay, c) * group.weight**2 * relative[group.line, 0]
         size = group.scale**2 / 2 * relative[0] / relative[0, 0]
         residual = (misfit_of(group, c).residual ** 2).sum(axis=0)
-        products = _expected_products(group, c, parts)
+        # tr(G_k R G_l R), where R subtracts the best numerators: the mean of `parts[k]` times the
+        # squares of the residuals, for errors with the variances `parts[l]`.
+        q, _ = group.numerator_space(c)
+        rows = np.concatenate([parts, parts], axis=1)
+        along = np.stack([q.T @ (row[:, None] * q) for row in rows]).reshape(2, -1)
+        products = rows * (1 - 2 * (q**2).sum(axis=1)) @ rows.T + along @ along.T
         for k, i in enumerate(group.channel[:, 0]):
             square[i] += size[k] * (parts @ residual[:, k])
             expected[i] += size[k] ** 2 * products
@@ -423,20 +428,6 @@ def error_spectrum(
 def _components(delay: Complex[np.ndarray, " E"], c: Coefficients) -> Float[np.ndarray, "2 E"]:
     """Return the spectra of white noise and of noise that passes the system."""
     return np.stack([np.ones(len(delay)), 1 / np.abs(chi(delay, c)) ** 2])
-
-
-def _expected_products(
-    group: HTFGroup, c: Coefficients, parts: Float[np.ndarray, "2 E"]
-) -> Float[np.ndarray, "2 2"]:
-    """Return tr(G_k R G_l R), where R subtracts the best numerators.
-
-    It is the mean of `parts[k]` times the squares of the residuals, for errors with the variances
-    `parts[l]`.
-    """
-    q, _ = group.numerator_space(c)
-    rows = np.concatenate([parts, parts], axis=1)
-    along = np.stack([q.T @ (row[:, None] * q) for row in rows]).reshape(2, -1)
-    return rows * (1 - 2 * (q**2).sum(axis=1)) @ rows.T + along @ along.T
 
 
 def amounts(

@@ -4,7 +4,7 @@ Experiments that measure the same lines are weighted by their power, in `spectra
 """
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 
 from ..errors import DefinitionError
 from ..linear.htf import HTF
@@ -54,9 +54,15 @@ def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, 
     if htf.variance is None:
         return np.broadcast_to(1 / (rms[:, None] * np.sqrt(line_variances(htf))), htf.H.shape)
     variance = np.asarray(htf.variance)
-    if htf.scatter is not None:
-        freedom = np.asarray(htf.scatter.freedom)
-        variance = _product_of_factors(variance, np.asarray(htf.harmonics), freedom)
+    if htf.scatter is not None and variance.all():
+        _, same = np.unique(np.abs(htf.harmonics), return_inverse=True)
+        share = np.asarray(htf.scatter.freedom) / np.sum(htf.scatter.freedom)
+        size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
+        for _ in range(20):  # more sweeps change nothing in 6 digits
+            by_line = (variance / size[same]).mean(axis=0)
+            mean = np.tensordot(share, variance / by_line, axes=(0, 1))
+            size = np.stack([mean[same == k].mean(axis=0) for k in range(len(size))])[:, None]
+        variance = size[same] * by_line
     return weights_of(variance, rms)
 
 
@@ -73,24 +79,6 @@ def weights_of(
 ) -> Float[np.ndarray, "... ny _"]:
     """Return one over the standard deviation of real and imaginary part."""
     return np.sqrt(2 / np.maximum(variance, (SMALLEST_ERROR * rms[:, None]) ** 2))
-
-
-def _product_of_factors(
-    variance: Float[np.ndarray, "M F ny nu"],
-    harmonics: Int[np.ndarray, " M"],
-    freedom: Float[np.ndarray, " F"],
-) -> Float[np.ndarray, "M F ny nu"]:
-    """Return the product of factors of frequency and harmonic with the same sums."""
-    if not variance.all():
-        return variance
-    _, same = np.unique(np.abs(harmonics), return_inverse=True)
-    share = freedom / freedom.sum()
-    size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
-    for _ in range(20):  # more sweeps change nothing in 6 digits
-        by_line = (variance / size[same]).mean(axis=0)
-        by_harmonic = np.tensordot(share, variance / by_line, axes=(0, 1))
-        size = np.stack([by_harmonic[same == k].mean(axis=0) for k in range(len(size))])[:, None]
-    return size[same] * by_line
 
 
 def estimated_noise(most: float, misfit: float) -> tuple[float, float]:

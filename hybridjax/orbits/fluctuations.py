@@ -150,7 +150,11 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
     last = xp.eye(n) + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
     across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
     step, Q = last @ M, last @ Q @ last.T
-    joint = _pad(_stationary(step[:d, :d], Q[:d, :d]), n)
+    among, growth = step[:d, :d], Q[:d, :d]
+    if on_host(step) and not np.abs(np.linalg.eigvals(among)).max(initial=0.0) < 1 - SINGULAR:
+        raise ComputationError("noise drives deviations away, because the cycle is not stable.")
+    joint = xp.linalg.solve(np.eye(d * d) - xp.kron(among, among), growth.ravel())
+    joint = _pad(joint.reshape(d, d), n)
     for _ in range(2):  # durations follow from the states of this turn and from the last
         joint = step @ joint @ step.T + Q
     _, (_, C, after) = scan(turn, (xp.eye(n), joint), pieces)
@@ -172,13 +176,6 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
 def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:
     more = n - x.shape[-1]
     return namespace(x).pad(x, [(0, 0)] * (x.ndim - 2) + [(0, more), (0, more)])
-
-
-def _stationary(step: Float[Array, "d d"], noise: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    xp, d = namespace(step), len(step)
-    if on_host(step) and not np.abs(np.linalg.eigvals(step)).max(initial=0.0) < 1 - SINGULAR:
-        raise ComputationError("noise drives deviations away, because the cycle is not stable.")
-    return xp.linalg.solve(np.eye(d * d) - xp.kron(step, step), noise.ravel()).reshape(d, d)
 
 
 def _columns(s: Structure, flow: LinearFlow, white: Strengths) -> Float[Array, "P K d r"]:

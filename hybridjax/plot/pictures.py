@@ -37,7 +37,12 @@ class Pictures:
         self.stride = self._origin[-1] + self._velocity[-1] * after
         if np.isinf(period):
             self.stride += place[-1] - place[0]
-        corners = np.vstack([_corners(x) for x in self._seen(t, self._origin, drawings)])
+        places: list[Any] = []  # between which pictures lie, without their ground
+        for x in self._seen(t, self._origin, drawings):
+            places += [line for name, line in x.lines.items() if name != "ground"]
+            places += [z[:2] + side * z[2] for z in x.circles.values() for side in (-1, 1)]
+            places += x.points.values()
+        corners = np.vstack(places)
         self.low, self.high = corners.min(axis=0), corners.max(axis=0)
 
     def at(self, t: Float[np.ndarray, " n"]) -> list[Drawing]:
@@ -91,10 +96,3 @@ def drawing_of(s: Structure, a: int) -> Any:
 
 def _flat(a: int, s: Structure, t, q):
     return jnp.concatenate([jnp.ravel(x) for x in jax.tree_util.tree_leaves(s.drawing(a, t, q))])
-
-
-def _corners(picture: Drawing) -> Float[np.ndarray, "_ 2"]:
-    """Points between which a picture lies, without its ground."""
-    lines = [x for name, x in picture.lines.items() if name != "ground"]
-    circles = [x[:2] + side * x[2] for x in picture.circles.values() for side in (-1, 1)]
-    return np.vstack([*lines, *circles, *picture.points.values()])

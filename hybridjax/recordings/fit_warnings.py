@@ -119,7 +119,14 @@ def advise(
             warnings.append(Finding("stability", text))
     if fit.result != Result.OK:
         warnings.append(Finding("no convergence", f"{Result(fit.result).message}."))
-    warnings += () if validation is None else _about_residuals(validation)
+    # Correlation in time is no reason to doubt: smoothing and disturbances of the state cause it,
+    # and standard errors allow for it. Nor are residuals below a hundredth of the output, in which
+    # the test sees the distortion of small pushes if there is little noise.
+    p = np.ones(1) if validation is None else validation.independence
+    if validation and not validation.independent and validation.fit[p.argmin()] < 99:
+        text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}), as "
+        text += "with few strides or pushes beyond the linear range: record more, or push less; if "
+        warnings.append(Finding("left over", f"{text}it remains, raise the `order`."))
     if data.missing > _FEW:
         warnings.append(Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing."))
     for name, count in zip(data.signals, data.spikes, strict=True):
@@ -176,17 +183,6 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
             text = f"where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} carry the "
             text += "same information, as signals are whose angle is the phase: cycles from "
             yield Finding("outputs", f"{text}crossing to crossing may have smaller errors.")
-
-
-def _about_residuals(validation: Validation) -> Iterator[Finding]:
-    # Correlation in time is no reason to doubt: smoothing and disturbances of the state cause it,
-    # and standard errors allow for it. Nor are residuals below a hundredth of the output, in which
-    # the test sees the distortion of small pushes if there is little noise.
-    if not validation.independent and validation.fit[validation.independence.argmin()] < 99:
-        text = "residuals of the held-out strides depend on the input "
-        text += f"({p_value(validation.independence.min())}), as with few strides or pushes beyond "
-        text += "the linear range: record more, or push less; if it remains, raise the `order`."
-        yield Finding("left over", text)
 
 
 def about_natural_multipliers(result: Any) -> Iterator[Finding]:

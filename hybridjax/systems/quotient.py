@@ -226,7 +226,9 @@ class Quotient(Derived):
 
         values = both(rng.normal(size=(3, d)), rng.normal(size=3))
         for (sentence, *_), pair in zip(claims, values, strict=True):
-            if not _equal(*pair):
+            size = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
+            x, y = (values / size for values in pair)
+            if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
                 raise DefinitionError(
                     f"{type(self.system).__name__} does not have the symmetry of its Quotient: "
                     f"{sentence}."
@@ -357,8 +359,3 @@ class _Reduced(DerivedChart):
     def field(self, t, q, u):
         rates = self.less(as_vector(self.lifted(self.chart.field)(t, q, u)))
         return jnp.append(rates, 1.0) if self.clocked else rates
-
-
-def _equal(x, y):
-    size = np.nanmax(np.abs(x), initial=0.0) or 1.0
-    return x.shape == y.shape and np.allclose(x / size, y / size, rtol=0, equal_nan=True)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy import signal
 
 from .._core.arguments import Numbers
@@ -17,7 +17,7 @@ from .._core.boundary.values import Reals
 from .._core.limits import PERIODS, SECTIONS
 from .._core.signal import unit_of
 from ..errors import DefinitionError
-from ..experiments.response import ResponseFunction, response_function
+from ..experiments.response import response_function
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording
@@ -124,9 +124,7 @@ def simulate_recording(
     return Recording.join(trials)
 
 
-@eqx.filter_jit
-def _respond(response: ResponseFunction, u: Float[Array, "S n nu"]) -> Float[Array, "S n ny"]:
-    return response(u).y
+_respond = eqx.filter_jit(lambda response, u: response(u).y)
 
 
 @checked

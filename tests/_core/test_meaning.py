@@ -13,7 +13,6 @@ from hybridjax.errors import DefinitionError
 
 # What a function computes, before and after one statement.
 WAYS = {
-    "a global": ("K = 1.0\ndef f(x): return K * x", "K = 2.0"),
     "a global of a helper": ("K = 1.0\ndef h(x): return K * x\ndef f(x): return h(x)", "K = 2.0"),
     "a global in an inner function": ("K = 1\ndef f(x): return (lambda y: K * y)(x)", "K = 2"),
     "a helper anew": ("def h(x): return x\ndef f(x): return h(x)", "def h(x): return 2 * x"),
@@ -22,12 +21,7 @@ WAYS = {
         "import numpy as np\nK = np.array([{'k': 1}, None])\ndef f(x): return K[0]['k'] * x",
         "K[0]['k'] = 2",
     ),
-    "a deque": (
-        "import collections\nK = collections.deque([1])\ndef f(x): return K[0]",
-        "K[0] = 2",
-    ),
     "a set": ("K = {1}\ndef f(x): return x in K", "K.add(2)"),
-    "a bytearray": ("K = bytearray(2)\ndef f(x): return K[0]", "K[0] = 2"),
     "the cell of a closure": (
         "def make():\n    k = 1\n    def f(x): return k * x\n    def set(y):\n        nonlocal k\n"
         "        k = y\n    return f, set\nf, set = make()",
@@ -53,10 +47,6 @@ WAYS = {
         "class A:\n    @property\n    def k(self): return 1\na = A()\ndef f(x): return a.k * x",
         "A.k = property(lambda self: 2)",
     ),
-    "a static method": (
-        "class A:\n    @staticmethod\n    def h(x): return x\ndef f(x): return A.h(x)",
-        "A.h = staticmethod(lambda x: 2 * x)",
-    ),
     "a class method": (
         "class A:\n    k = 1\n    @classmethod\n    def h(cls, x): return cls.k\nf = A.h",
         "A.k = 2",
@@ -64,10 +54,6 @@ WAYS = {
     "what is called as a function": (
         "class A:\n    def __call__(self, x): return x\nf = A()",
         "A.__call__ = lambda self, x: 2 * x",
-    ),
-    "an attribute of an object": (
-        "class A:\n    pass\na = A()\na.k = 1\ndef f(x): return a.k * x",
-        "a.k = 2",
     ),
     "a slot": (
         "class A:\n    __slots__ = ('k',)\na = A()\na.k = 1\ndef f(x): return a.k * x",
@@ -95,10 +81,6 @@ WAYS = {
         "K = 2",
     ),
     "a function of jax.jit": ("import jax\nK = 1\n@jax.jit\ndef f(x): return K * x", "K = 2"),
-    "a function with a memory": (
-        "import functools\nK = 1\n@functools.lru_cache\ndef f(x): return K * x",
-        "K = 2",
-    ),
     "a random key": (
         "import jax\nK = jax.random.key(1)\ndef f(x): return K",
         "K = jax.random.key(2)",
@@ -108,11 +90,6 @@ WAYS = {
         "f.defjvps(lambda dx, _, x: K * dx)",
         "K = 2",
     ),
-    "a module that a function imports": (
-        "import sys\nsys.modules['users_third'] = other.inner\n"
-        "def f(x):\n    import users_third as third\n    return third.K",
-        "other.inner.K = 2",
-    ),
     "a name of a module that a function imports": (
         "import sys\nsys.modules['users_third'] = other.inner\n"
         "def f(x):\n    from users_third import K\n    return K",
@@ -121,7 +98,6 @@ WAYS = {
     "an attribute of a module": ("def f(x): return other.K * x", "other.K = 2"),
     "an attribute of a module, by a word": ("def f(x): return getattr(other, 'K')", "other.K = 2"),
     "a function of a module": ("def f(x): return other.h(x)", "other.h = lambda x: 3 * x"),
-    "a module in a list": ("K = [other]\ndef f(x): return K[0].h(x)", "other.h = lambda x: 3 * x"),
     "a module as an argument": (
         "def g(m, x): return m.h(x)\ndef f(x): return g(other, x)",
         "other.h = lambda x: 3 * x",

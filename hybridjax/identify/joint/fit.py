@@ -268,7 +268,9 @@ def fit_ldtp(
         if drive is not None:
             return fit
         feedback = _UNSEEN * (innovations and direct)
-        if answers := _answering(fit, records, start == "free"):
+        grid, predictor = records.whole(), cast(Predictor, fit.predictor)
+        error = np.where(grid.sampled, grid.y - predictor.predict(grid, start == "free"), 0.0)
+        if answers := answering(grid, error, records.inputs):
             if innovations and direct and not isinstance(guess, LDTP):
                 fit, direct = _fit_to_series(records, guess, *how, False), False
             remedy = _REMEDIES[innovations + (innovations and not direct)]
@@ -284,12 +286,6 @@ def fit_ldtp(
     if start == "cycle":
         raise DefinitionError("HTFs are of periodic responses, without a start: leave `start` out.")
     return _fit_to_htf(data, guess, check)
-
-
-def _answering(fit: LDTPFit, records: PreparedRecords, free_start: bool) -> dict[str, float]:
-    grid, predictor = records.whole(), cast(Predictor, fit.predictor)
-    error = np.where(grid.sampled, grid.y - predictor.predict(grid, free_start), 0.0)
-    return answering(grid, error, records.inputs)
 
 
 def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
