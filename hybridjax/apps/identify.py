@@ -257,7 +257,8 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         method = f"instrumental variables of {escape(listed(loop))}"
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(found).items() if amount}
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
-    expected = zip(found.advice.strides, found.advice.expected, strict=True)
+    pairs = zip(found.advice.strides, found.advice.expected, strict=True)
+    expected = (pair for pair in pairs if np.isfinite(pair[1]).all())
     parts = [
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",

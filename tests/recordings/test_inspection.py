@@ -9,6 +9,7 @@ import pytest
 from scipy import signal
 
 import hybridjax as hj
+from hybridjax.apps.identify import _page
 
 from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle, signals
 
@@ -135,6 +136,10 @@ def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_c
     worse = eqx.tree_at(lambda x: x.fit, validation, np.array([70.0, 70.0]))
     advice = hj.recordings.advise(result.data, result.fit, worse)
     assert "left over" in [x.cause for x in advice.warnings]
+    # So many strides as give no finite standard error are left out of the report.
+    few = eqx.tree_at(lambda x: x.advice.expected, result, result.advice.expected.copy())
+    few.advice.expected[0] = np.inf
+    assert "<td>300</td>" in _page(few, {}) and "<td>inf" not in _page(few, {})
 
 
 APEX = hj.Crossing("vM", "falling")
