@@ -123,15 +123,15 @@ def tolerance(
     """The error that a step over tau from states `q` of chart a may have.
 
     Where the usual sizes are not known, a state is taken to be as large as it is at the ends of the
-    step, or as it would become at the rates there if that is more. Rounding errors are allowed: its
+    step, or as it would become at the rates at its start if that is more. Rounding errors are allowed: its
     own, and the `rounding` errors of its rate.
     """
     if settings.scale is not None:
         return settings.rtol * size(settings, a, q, step.q)
     xp = namespace(q)
     largest = xp.maximum(xp.abs(q), xp.abs(step.q))
-    change = xp.abs(tau) * xp.maximum(xp.abs(step.f0), xp.abs(step.f1))
-    # Rounding errors of the rate may be ten times as large at the stages as at the end of the step.
+    change = xp.abs(tau) * xp.abs(step.f0)  # (a step that is far too long may end anywhere)
+    # Rounding errors of the rate may be ten times as large at the stages as at the start.
     rounding = ROUNDING * largest + 10.0 * xp.abs(tau) * rounding
     allowed = settings.rtol * largest + settings.atol * xp.maximum(largest, change) + rounding
     return xp.maximum(allowed, xp.finfo(largest.dtype).tiny)  # where all is at rest at zero

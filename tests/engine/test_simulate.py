@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
+from scipy.integrate import solve_ivp
 
 import hybridjax as hj
 
@@ -235,3 +236,17 @@ def test_an_event_at_a_tick():
     run = hj.simulate(toy(charts, (fall, tick)), "a", (1.0, 0.0, 0.0), 3.5)
     np.testing.assert_allclose(run.after[-1], [0.5, 3.0, 3.0], atol=1e-12)
     np.testing.assert_allclose(times(run), [1.0, 1.0, 2.0, 2.0, 3.0, 3.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("duration", [80.0, 500.0])
+def test_a_first_step_that_is_far_too_long_is_rejected(duration):
+    """From rest, a tenth of the time is tried: a cubic field then makes 1e34 of 1, and more of its
+    own rounding errors than of its error."""
+
+    def rates(t, q, u=None, cos=jnp.cos):
+        return q[1], -0.3 * q[1] - q[0] - q[0] ** 3 + 0.3 * cos(1.2 * t)
+
+    run = hj.simulate(toy({"all": Field(("x", "v"), rates)}), "all", (1.0, 0.0), duration)
+    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13, "args": (None, np.cos)}
+    path = solve_ivp(rates, (0, duration), [1.0, 0.0], **options)
+    np.testing.assert_allclose(run.after[-1], path.y[:, -1], rtol=0, atol=1e-9)

@@ -195,7 +195,7 @@ def _errors(
     assert settings.rtol is not None
     rounding = xp.zeros_like(q)
     if settings.scale is None:
-        rounding = rounding_error(flow.field, t + tau, step.q, step.f1)
+        rounding = rounding_error(flow.field, t, q, step.f0)  # (a bad step may end anywhere)
     allowed = tolerance(settings, a, q, tau, step, rounding)
     motion = step.error if change is None else step.estimate
     error = xp.max(xp.abs(motion) / allowed, axis=0, initial=0.0)
