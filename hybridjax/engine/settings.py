@@ -123,8 +123,8 @@ def tolerance(
     """The error that a step over tau from states `q` of chart a may have.
 
     Where the usual sizes are not known, a state is taken to be as large as it is at the ends of the
-    step, or as it would become at the rates at its start if that is more. Rounding errors are allowed: its
-    own, and the `rounding` errors of its rate.
+    step, or as it would become at the rates at its start if that is more. Rounding errors are
+    allowed: its own, and the `rounding` errors of its rate.
     """
     if settings.scale is not None:
         return settings.rtol * size(settings, a, q, step.q)

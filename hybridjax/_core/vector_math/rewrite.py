@@ -84,9 +84,9 @@ def _without_repetitions(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
     eqns = []
     for eqn in jaxpr.eqns:
         eqn = eqn.replace(invars=[now(v) for v in eqn.invars])
-        out, *others = eqn.outvars or [None]
+        out, *further = eqn.outvars or [None]
         key = eqn.primitive, str(eqn.params), *map(same, eqn.invars)
-        if out is None or others or eqn.effects or jaxprs(eqn.params):
+        if out is None or further or eqn.effects or jaxprs(eqn.params):
             eqns.append(eqn)
         elif key in before:
             first[out] = before[key]
