@@ -16,7 +16,7 @@ from .._core.boundary.values import Reals
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from .data import ExperimentData
-from .design.design import DISCARD, Design
+from .design.design import DISCARD, Design, require_inputs
 
 
 @checked
@@ -108,7 +108,7 @@ def simulate_experiments(
     **Raises:** `DefinitionError` if N (also of the process noise) or the inputs differ,
     or if a periodic response does not exist (a multiplier that is a P-th root of one).
     """
-    design.require("model", ldtp.n_sections, ldtp.inputs)
+    require_inputs(design, "model", ldtp.n_sections, ldtp.inputs)
     if discard is None:
         discard = DISCARD if start == "cycle" else 0
     u = applied = design.inputs(design.periods + discard)

@@ -31,7 +31,7 @@ from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.structure import Outputs
 from ..systems.system import Output, OutputNames
 from .data import ExperimentData, Simulated
-from .design.design import DISCARD, Design
+from .design.design import DISCARD, Design, require_inputs
 from .noise import ProcessNoise
 from .plan import Accuracy, Stepping, plan_flow
 from .response import Course, Feedback, course, flow_batch, require_shape
@@ -386,7 +386,7 @@ def check_inputs(
     **Raises:** `DefinitionError` if they do not fit, or hold NaN.
     """
     if isinstance(design, Design):
-        design.require("system", n_sections, names)
+        require_inputs(design, "system", n_sections, names)
         return Inputs(design, discard + design.periods, design.periods)
     u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
     require_shape(u.shape, n_sections, len(names))

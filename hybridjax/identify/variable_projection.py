@@ -219,7 +219,8 @@ def summarize(
         cost += float((misfit.residual**2).sum())
         freedom += group.freedom * group.size
         # A residual is smaller than the error, by the share of its equation in the numerators.
-        error = misfit.residual / np.sqrt(1 - misfit.leverage)[..., None]
+        left = np.maximum(1 - misfit.leverage, np.finfo(float).eps)
+        error = misfit.residual / np.sqrt(left)[..., None]
         np.add.at(score, group.line, np.einsum("jaek,aek->ej", misfit.jacobian, error))
         np.add.at(shares, group.line, np.einsum("iaek,jaek->eij", misfit.jacobian, misfit.jacobian))
     square = shares.sum(axis=0)

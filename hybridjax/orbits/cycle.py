@@ -398,7 +398,7 @@ def require_unchanged(system: HybridSystem, numbers: Mapping[str, Any]) -> None:
 
 def _differ(x: Any, y: Any) -> bool:
     if is_tracer(x) or is_tracer(y):  # (a parameter alone is, if it was replaced in there)
-        return is_tracer(x) != is_tracer(y)
+        return not is_tracer(y)
     return x is not y and np.asarray(x).tobytes() != np.asarray(y).tobytes()
 
 

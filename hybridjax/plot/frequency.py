@@ -57,7 +57,8 @@ def magnitude(
         panel = axes[0, 0]
         for htf in drawn:
             for m in harmonics:
-                f, values, radius = _values(htf, m, name, pushed)
+                at = _same(name, output, htf.outputs), _same(pushed, input, htf.inputs)
+                f, values, radius = _values(htf, m, *at)
                 size, style = np.abs(values), _harmonic_style(m, harmonics)
                 line = _line(htf, drawn, style, _name(m))
                 panel.plot(f, size, **line)
@@ -136,7 +137,7 @@ def bode(
             color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
             label = with_unit(name, "" if same else unit)
             for htf in drawn:
-                f, values, radius = _values(htf, harmonic, name, pushed)
+                f, values, radius = _values(htf, harmonic, name, _same(pushed, input, htf.inputs))
                 size, line = np.abs(values), _line(htf, drawn, {"color": color}, label)
                 is_certain = np.full(len(f), True) if radius is None else radius < size
                 is_certain &= np.convolve(is_certain, np.ones(3))[1:-1] > 1  # of a line, no points
@@ -225,8 +226,13 @@ def _pick(kind: str, which: str | int, names: Sequence[str]) -> str:
     return names[channel_index(kind, which, names)]
 
 
+def _same(name: str, which: str | int, names: Sequence[str]) -> str | int:
+    """The signal of this name, or else `which` (a loop's input is its reference)."""
+    return name if name in names else which
+
+
 def _values(
-    htf: HTF, m: int, output: str, input: str
+    htf: HTF, m: int, output: str | int, input: str | int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
     hold the true values; None without a variance."""

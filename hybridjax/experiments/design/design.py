@@ -232,15 +232,6 @@ class Design(eqx.Module):
         now = np.sqrt(np.mean(self.inputs() ** 2, axis=1))[self.experiment, self.channel]
         return eqx.tree_at(lambda d: d.amplitude, self, self.amplitude * rms / now)
 
-    def require(self, other: str, n_sections: int, inputs: tuple[str, ...]) -> None:
-        """**Raises:** `DefinitionError` if sections or inputs differ from those of a system, or a
-        name of one input is that of another one there."""
-        what, names = f"design and {other}", self.input_names
-        require_equal(what, "n_sections", self.n_sections, n_sections)
-        require_equal(what, "numbers of inputs", len(names), len(inputs))
-        if any(x in inputs and x != y for x, y in zip(names, inputs, strict=True)):
-            require_equal(what, "orders of inputs", names, inputs)
-
     def realizations(self, count: Count, seed: kinds.Seed = 0) -> "Design":
         """Return the design `count` times over, each time with new random phases.
 
@@ -333,6 +324,16 @@ def _span(values: np.ndarray) -> str:
 
 def _count(number: int | str, noun: str) -> str:
     return f"{number} {noun}" if str(number) == "1" else f"{number} {noun}s"
+
+
+def require_inputs(design: Design, other: str, n_sections: int, inputs: tuple[str, ...]) -> None:
+    """**Raises:** `DefinitionError` if sections or inputs differ from those of a system, or a name
+    of one input is that of another one there."""
+    what, names = f"design and {other}", design.input_names
+    require_equal(what, "n_sections", design.n_sections, n_sections)
+    require_equal(what, "numbers of inputs", len(names), len(inputs))
+    if any(x in inputs and x != y for x, y in zip(names, inputs, strict=True)):
+        require_equal(what, "orders of inputs", names, inputs)
 
 
 def check_window(n_sections: int, periods: int) -> None:
