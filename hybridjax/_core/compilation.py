@@ -28,7 +28,7 @@ from jax.core import eval_context
 
 from ..errors import ComputationError
 from . import executor
-from .executor import from_host, is_hidden, on_cpu, on_the_cpu, quickly, to_host
+from .executor import from_host, is_hidden, on_cpu, on_the_cpu, to_host
 from .progress import say_compiling
 
 
@@ -141,7 +141,7 @@ def quick_jit(function: Callable) -> Callable:
     @ft.cache
     def quick() -> Any:
         options: Any = {"compiler_options": compiler_options()}  # handed on to `jax.jit`
-        return eqx.filter_jit(quickly()(traced), **options)
+        return eqx.filter_jit(traced, **options)
 
     @ft.wraps(function)
     def call(*arguments):
@@ -249,7 +249,7 @@ class TwoTiers:
             with _choosing, uncollected():
                 if key not in self._chosen:  # by another thread in the meantime
                     say_compiling(True)
-                    program = _lowered(key, run, leaves, self.large)
+                    program = _lowered(key, run, leaves)
                     self._chosen[key] = program, program.choose(self.large)
                     say_compiling(False)
         program, executable = self._chosen[key]
@@ -261,7 +261,7 @@ _by_kind: dict[tuple, "_Program"] = {}
 _by_text: dict[Hashable, "_Program"] = {}
 
 
-def _lowered(key: tuple, run: Callable, leaves: list, large: bool) -> "_Program":
+def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
     """The program for arguments of this kind. Objects that hold the same functions written anew
     (an `Output` with a `lambda`) are of other kinds, but have the same text and share executables.
     """
@@ -269,11 +269,10 @@ def _lowered(key: tuple, run: Callable, leaves: list, large: bool) -> "_Program"
         if len(_by_kind) >= _KEPT:
             _by_kind.clear()
             _by_text.clear()
-        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
-        lower = ft.cache(lambda large: jax.jit(run if large else quickly()(run)).lower(shapes))
-        text = lower(large).as_text()
-        digest = key[0], large, hashlib.sha256(text.encode()).digest()
-        _by_kind[key] = _by_text.setdefault(digest, _Program(lower, "@lapack_" in text))
+        lowered = jax.jit(run).lower(leaves)
+        text = lowered.as_text()
+        digest = key[0], hashlib.sha256(text.encode()).digest()
+        _by_kind[key] = _by_text.setdefault(digest, _Program(lowered, "@lapack_" in text))
     return _by_kind[key]
 
 
@@ -284,10 +283,10 @@ def one_tier(function: Callable, large: bool) -> Callable:
 
 
 class _Program:
-    """A program, and its executables; `lower(large)` lowers it for one of the tiers."""
+    """A program that is lowered, and its executables."""
 
-    def __init__(self, lower: Callable[[bool], jax.stages.Lowered], alone: bool):
-        self._lower, self._alone = lower, alone
+    def __init__(self, lowered: jax.stages.Lowered, alone: bool):
+        self._lowered, self._alone = lowered, alone
         self._quick: jax.stages.Compiled | None = None
         self._full: jax.stages.Compiled | None = None
         self._seconds, self._lock = 0.0, threading.Lock()
@@ -299,11 +298,11 @@ class _Program:
         if large or self._full is not None:
             return self._optimize()
         if self._quick is None:
-            self._quick = self._lower(False).compile(compiler_options=compiler_options())
+            self._quick = self._lowered.compile(compiler_options=compiler_options())
         return self._quick
 
     def _optimize(self) -> jax.stages.Compiled:
-        self._full = self._full or self._lower(True).compile()
+        self._full = self._full or self._lowered.compile()
         return self._full
 
     def run(self, executable: jax.stages.Compiled, leaves: list) -> Any:
@@ -437,8 +436,7 @@ def _kernel_program(function, form, static, structure, static_leaves, lanes):
         arrays = iter(arrays)
         leaves = [next(arrays) if x is None else x[1] for x in static_leaves]
         trees = jax.tree_util.tree_unflatten(structure, leaves)
-        with quickly():
-            return form(ft.partial(function, *static), *trees)(*arguments)
+        return form(ft.partial(function, *static), *trees)(*arguments)
 
     # (One for each number of lanes, as it is for arrays of one shape.)
     return jax.jit(run, compiler_options=compiler_options(small=True))

@@ -58,21 +58,6 @@ def at_most(seconds: float) -> Iterator[None]:
         _deadline.reset(before)
 
 
-# Whether JAX traces for a program with few optimizations. (JAX keeps the program of an inner `jit`
-# for all outer ones, so there a static argument must say so.)
-is_quick = contextvars.ContextVar("is_quick", default=False)
-
-
-@contextlib.contextmanager
-def quickly() -> Iterator[None]:
-    """A context in which JAX traces for programs with few optimizations."""
-    before = is_quick.set(True)
-    try:
-        yield
-    finally:
-        is_quick.reset(before)
-
-
 def on_host(x: Any) -> bool:
     """Return whether x is an array of the host."""
     return isinstance(x, np.ndarray | np.generic)

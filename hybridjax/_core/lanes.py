@@ -16,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Int
 
-from .executor import Array, is_quick, namespace, on_host
+from .executor import Array, namespace, on_host
 from .vector_math.rewrite import vectorized
 
 
@@ -55,13 +55,12 @@ def one_lane(tree: Any) -> Any:
     return eqx.combine(jax.tree_util.tree_unflatten(structure, shapes), static)
 
 
-def by_lane(function: Callable, *trees: Any) -> Callable:
+def by_lane(function: Callable, *trees: Any, quick: bool = False) -> Callable:
     """Vectorize `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 
     Of a tree that is a `PerLane`, each lane gets its own part. An argument with a single lane where
     others have more is the same for all of them, and what depends on nothing else is computed once.
-    Trigonometric functions of many lanes are left out of `quick` programs, where they would take as
-    long as the C library's, and most of the time of compiling.
+    `quick`: to compile, instead of to run: without trigonometric functions of many lanes.
     """
     arrays, static = eqx.partition([shared(x) for x in trees], eqx.is_array)
     axes = [x.axes() if isinstance(x, PerLane) else None for x in trees]
@@ -80,7 +79,7 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
         lanes = max(x.shape[-1] for x in arguments)
         common = tuple(x.shape[-1] < lanes for x in arguments)
         arguments = [x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)]
-        return program(common, lanes >= _VECTOR_LANES and not is_quick.get())(arrays, *arguments)
+        return program(common, lanes >= _VECTOR_LANES and not quick)(arrays, *arguments)
 
     return call
 

@@ -194,7 +194,7 @@ def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q)
 
 def _expanded(function: Callable, *trees: Any) -> Callable:
     """Lanes of a vector function of (t, q, u) and its derivatives, as columns of one array."""
-    return by_lane(_columns(function, len(trees)), *trees)
+    return by_lane(_columns(function, len(trees)), *trees, quick=True)
 
 
 def _columns(function: Callable, trees: int = 2) -> Callable:
@@ -339,7 +339,7 @@ class _ByMethod(NamedTuple):
     method: Method
 
     def __call__(self, function: Callable, *trees: Any) -> Callable:
-        field = by_lane(function, *trees)
+        field = by_lane(function, *trees, quick=True)
         return lambda t, q, u, h, *others: self.compute(self.method, field, t, q, u, h, *others)
 
 

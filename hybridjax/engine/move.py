@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._core.compilation import whole
-from .._core.executor import is_quick, namespace, on_host, scan
+from .._core.executor import namespace, on_host, scan
 from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
@@ -58,7 +58,6 @@ def move(
         return Recorded(*jax.tree_util.tree_map(lambda x: x[0], row))
     if on_host(lanes.t):
         return search(s, lanes, u, target, settings, setout, result, options)
-    options = options._replace(quick=is_quick.get())
     return _move(s, lanes, u, target, fixed(setout), result, settings, options)
 
 

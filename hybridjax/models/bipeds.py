@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -33,24 +34,18 @@ def chain(
     """A chain of n links in a plane, by their angles and the place (x, y) of its foot, or by their
     angles alone, with its foot at the origin; `drawn` as lines from point to point."""
     n = arms.shape[1]
-    # Of the masses, by sines and cosines of the angles and by the foot: energies without the places
-    # themselves have short programs. (Inertias count like masses, since sin^2 + cos^2 = 1.)
-    wide = jnp.concatenate([arms, jnp.ones((len(arms), 1))], axis=1)
-    M = (wide.T * masses) @ wide + jnp.diag(jnp.append(inertias * jnp.ones(n), 0.0))
 
     def links(q):
         return {name: tips(line, q[:n]).T for name, line in drawn.items()}
 
+    def places(q):
+        return tips(arms, q[:n]) + (q[n:, None] if len(q) > n else 0.0)
+
     def kinetic(q, v):
-        speeds = jnp.stack([jnp.cos(q[:n]), jnp.sin(q[:n])]) * v[:n]
-        if floats := len(q) > n:
-            speeds = jnp.concatenate([speeds, v[n:, None] * np.array([[1], [-1]])], axis=1)
-        return 0.5 * jnp.sum((speeds @ M[: n + floats, : n + floats]) * speeds)
+        speeds = jax.jvp(places, (q,), (v,))[1]
+        return 0.5 * jnp.sum(masses * speeds**2) + 0.5 * jnp.sum(inertias * v[:n] ** 2)
 
-    def potential(q):
-        return g * (jnp.sum(M[n, :n] * jnp.cos(q[:n])) + M[n, n] * jnp.sum(q[n + 1 :]))
-
-    return Mechanism(kinetic, potential, links)
+    return Mechanism(kinetic, lambda q: g * jnp.sum(masses * places(q)[1]), links)
 
 
 _GROUND = np.array([(-1.0, 0.0), (1.0, 0.0)])

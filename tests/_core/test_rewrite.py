@@ -83,20 +83,6 @@ def test_every_call_sees_the_present_parameters_and_traces_once():
     assert function(0.5) == 2 * first and len(traces) == 2
 
 
-def test_equations_that_repeat_others_are_merged():
-    """Those of equal operations on equal numbers, and of nothing else."""
-
-    def function(x):
-        y = jnp.stack([x * 2.0, x * 2.0, x * 3.0, x.astype(jnp.float32).astype(x.dtype)])
-        return y, jnp.sin(x) + jnp.sin(x) * jnp.cos(x)
-
-    x = jnp.linspace(0.1, 1.0, 5)
-    program = str(jax.make_jaxpr(vectorized(function, trigonometry=False))(x))
-    assert program.count("sin ") == 1 and len(re.findall(r"mul \w+ 2\.0", program)) == 1
-    for values, true in zip(vectorized(function)(x), function(x), strict=True):
-        np.testing.assert_allclose(values, true, rtol=1e-15)
-
-
 def test_off_away_from_cpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert left(vectorized(looped), 0.3, 0.7) == left(looped, 0.3, 0.7)

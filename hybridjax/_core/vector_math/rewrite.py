@@ -9,14 +9,13 @@ slow as it would be without.
 """
 
 import functools as ft
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
-import numpy as np
 from jax.extend.core import primitives
 
 from ..executor import on_cpu
@@ -64,36 +63,13 @@ def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
         # A new function every time: a program of earlier parameters is never taken for this one.
         trace = jax.make_jaxpr(lambda *arguments: function(*arguments), return_shape=True)
         program, shapes = trace(*arguments)
-        jaxpr = _without_repetitions(program.jaxpr)
-        jaxpr = _row_by_row(jaxpr) if trigonometry else jaxpr
+        jaxpr = _row_by_row(program.jaxpr) if trigonometry else program.jaxpr
         program = program.replace(jaxpr=_replaced(jaxpr, trigonometry))
         values = jex.jaxpr_as_fun(program)(*jax.tree_util.tree_leaves(arguments))
         values = [v if isinstance(v, jax.Array) else jnp.asarray(v) for v in values]
         return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(shapes), values)
 
     return call
-
-
-def _without_repetitions(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
-    """A program without equations that repeat earlier ones, as those of derivatives do. (XLA merges
-    them too, but only after it has written out our functions wherever they are called.)"""
-    first: dict[jex.Var, jex.Var] = {}
-    before: dict[Hashable, jex.Var] = {}
-    now: Any = lambda v: first.get(v, v) if isinstance(v, jex.Var) else v  # noqa: E731
-    same = lambda v: v if isinstance(v, jex.Var) else (v.aval, np.asarray(v.val).tobytes())  # noqa: E731
-    eqns = []
-    for eqn in jaxpr.eqns:
-        eqn = eqn.replace(invars=[now(v) for v in eqn.invars])
-        out, *further = eqn.outvars or [None]
-        key = eqn.primitive, str(eqn.params), *map(same, eqn.invars)
-        if out is None or further or eqn.effects or jaxprs(eqn.params):
-            eqns.append(eqn)
-        elif key in before:
-            first[out] = before[key]
-        elif not isinstance(out, jex.DropVar):
-            before[key] = out
-            eqns.append(eqn)
-    return jaxpr.replace(eqns=eqns, outvars=[now(v) for v in jaxpr.outvars])
 
 
 def _number(eqn: jex.JaxprEqn) -> int:

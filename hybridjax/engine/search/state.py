@@ -40,8 +40,6 @@ class Options(NamedTuple):
     """Make steps also short enough for the derivatives of a replay."""
     at_once: bool = False
     """On the host: compile a turn before the first one."""
-    quick: bool = False
-    """Traced for a program with few optimizations."""
 
 
 class Moved(NamedTuple):
