@@ -27,8 +27,8 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 1150 lines are the algebra of HTFs, loops and
 # delays, 1160 the responses of cycles with noise, coupling and symmetry in time, 770 populations of
 # subjects, 980 motion and sliders, 610 simulators of others, 70 sweeps on the host, 60 comparisons
-# with higher orders; of the tests, 1900 are those of all, 70 of orders of names and samples. (The thirteenth structure is that of
-# a trajectory of a simulator.)
+# with higher orders; of the tests, 1900 are those of all, 70 of orders of names and samples. (The
+# thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
     "code": 28_860,
     "files": 244,
