@@ -393,22 +393,23 @@ def whole(function: Callable, static: tuple, trees: Any, at_once: bool) -> Calla
     """
     program, arrays = _bound(function, ft.partial, static, trees, 1)
 
-    def compiled(*arguments):
+    def compiled(arrays, *arguments):
         return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
 
     def call(*arguments):
         if at_once or program in _ready:
             _ready.add(program)
             with uncollected():
-                return compiled(*arguments)
+                return compiled(arrays, *arguments)
         begin, before = time.thread_time(), _spent.get(program)
         results = function(*static, *trees, *arguments)
         # (The first call compiles kernels.)
         after = _spent[program] = 0.0 if before is None else before + time.thread_time() - begin
         worth = WORTH_COMPILING / (9 if hasattr(sys, "ps1") else 3)
         if before is not None and before <= worth < after:
-            compile_ = lambda: (compiled(*arguments), _ready.add(program))  # noqa: E731
-            threading.Thread(target=compile_).start()
+            copied = jax.device_put([np.array(x) for x in arrays])  # (users may donate theirs)
+            make = lambda: (compiled(copied, *arguments), _ready.add(program))  # noqa: E731
+            threading.Thread(target=make).start()
         return results
 
     return call

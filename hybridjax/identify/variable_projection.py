@@ -218,9 +218,9 @@ def summarize(
         noise += misfit.noise * group.size
         cost += float((misfit.residual**2).sum())
         freedom += group.freedom * group.size
-        # A residual is smaller than the error, by the share of its equation in the numerators.
-        left = np.maximum(1 - misfit.leverage, np.finfo(float).eps)
-        error = misfit.residual / np.sqrt(left)[..., None]
+        # A residual is smaller than the error, by the share of its equation in the numerators (to
+        # rounding, at most all of it).
+        error = misfit.residual / np.sqrt(1 - np.minimum(misfit.leverage, 1 - 1e-15))[..., None]
         np.add.at(score, group.line, np.einsum("jaek,aek->ej", misfit.jacobian, error))
         np.add.at(shares, group.line, np.einsum("iaek,jaek->eij", misfit.jacobian, misfit.jacobian))
     square = shares.sum(axis=0)
