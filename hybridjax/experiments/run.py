@@ -377,19 +377,17 @@ def _controller(
     return to_host(static_gain(from_host(F), model.n_sections, shape))
 
 
-def check_inputs(
-    design: DesignLike, discard: int, n_sections: int, names: tuple[str, ...]
-) -> Inputs:
+def check_inputs(design: DesignLike, discard: int, n_sections: int, inputs: tuple) -> Inputs:
     """Return the inputs for N sections and the inputs of these names, with the first `discard`
     cycles not for estimation.
 
     **Raises:** `DefinitionError` if they do not fit, or hold NaN.
     """
     if isinstance(design, Design):
-        require_inputs(design, "system", n_sections, names)
+        require_inputs(design, "system", n_sections, inputs)
         return Inputs(design, discard + design.periods, design.periods)
     u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
-    require_shape(u.shape, n_sections, len(names))
+    require_shape(u.shape, n_sections, len(inputs))
     for k in range(0, len(u), CHUNK):
         finite = np.isfinite(np.asarray(u[k : k + CHUNK], float)).all(axis=(1, 2))
         if not finite.all():

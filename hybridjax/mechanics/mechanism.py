@@ -45,6 +45,10 @@ class Impact(NamedTuple):
     """Of the contacts on the mechanism, along the k coordinates of the contacts."""
 
 
+def _no_potential(q):
+    return 0.0
+
+
 @checked
 class Mechanism(eqx.Module):
     """A mechanism with n coordinates q and velocities v = dq/dt, given by its energies.
@@ -72,7 +76,7 @@ class Mechanism(eqx.Module):
     """
 
     kinetic: Callable[[Any, Any], Any]
-    potential: Callable[[Any], Any] = lambda q: 0.0  # noqa: E731
+    potential: Callable[[Any], Any] = _no_potential  # (which can be pickled)
     links: Callable[[Any], Mapping[str, Any]] | None = None
 
     def draw(

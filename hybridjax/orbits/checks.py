@@ -364,5 +364,4 @@ def _about_guards(s: Structure, turn: Turn, expected: float) -> str:
         f"went from {x[0]:.3g} to {x[-1]:.3g} (between {min(x):.3g} and {max(x):.3g})"
         for g, x in values.items()
     )
-    hint = f" No event happened: {text}. Check its direction.{_better_guess(expected)}"
-    return hint if text else ""
+    return f" No event happened: {text}. Check its direction.{_better_guess(expected)}" * bool(text)

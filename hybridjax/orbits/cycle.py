@@ -1,6 +1,5 @@
 """Limit cycles: fixed points of the return map, with their multipliers."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -334,8 +333,9 @@ class LimitCycle(eqx.Module):
 
     def _title(self) -> str:
         message = what_changed(self.system, self.numbers) or Result(int(self.result)).message
-        unstable = message == Result.OK.message and not self.stable
-        return f"{type(self.system).__name__}: {message}{', unstable' * unstable}"
+        # (By rounding, those of neutral cycles are a little larger than 1.)
+        grows = message == Result.OK.message and np.abs(self.multipliers).max(initial=0) > 1 + 1e-6
+        return f"{type(self.system).__name__}: {message}{', unstable' if grows else ''}"
 
     def _facts(self, multipliers: Mapping[str, str] = {}) -> dict[str, str]:  # noqa: B006
         """The printed lines, by their headings."""
@@ -387,7 +387,7 @@ def as_found(cycle: LimitCycle) -> LimitCycle:
     arrays, static = eqx.partition(cycle.system, eqx.is_array)
     before = [cycle.numbers.get(name, x) for name, x in arrays_of(cycle.system).items()]
     arrays = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(arrays), before)
-    return dataclasses.replace(cycle, system=eqx.combine(arrays, static))
+    return eqx.tree_at(lambda x: x.system, cycle, eqx.combine(arrays, static))
 
 
 def require_unchanged(system: HybridSystem, numbers: Mapping[str, Any]) -> None:

@@ -150,10 +150,10 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
     last = xp.eye(n) + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
     across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
     step, Q = last @ M, last @ Q @ last.T
-    among, growth = step[:d, :d], Q[:d, :d]
-    if on_host(step) and not np.abs(np.linalg.eigvals(among)).max(initial=0.0) < 1 - SINGULAR:
+    states, noise = step[:d, :d], Q[:d, :d]
+    if on_host(step) and not np.abs(np.linalg.eigvals(states)).max(initial=0.0) < 1 - SINGULAR:
         raise ComputationError("noise drives deviations away, because the cycle is not stable.")
-    joint = xp.linalg.solve(np.eye(d * d) - xp.kron(among, among), growth.ravel())
+    joint = xp.linalg.solve(np.eye(d * d) - xp.kron(states, states), noise.ravel())
     joint = _pad(joint.reshape(d, d), n)
     for _ in range(2):  # durations follow from the states of this turn and from the last
         joint = step @ joint @ step.T + Q

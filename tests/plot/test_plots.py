@@ -74,8 +74,10 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
     names = exact.inputs[::-1], exact.outputs[::-1]
     swapped = hj.HTF(exact.f, exact.H[..., ::-1, ::-1], 0, exact.n_sections, *names, "exact")
+    renamed = hj.HTF(exact.f, exact.H, 0, exact.n_sections, ("r", "s"), exact.outputs, "exact")
     for draw, shown in ((hj.plot.magnitude, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
+        draw(exact, renamed, input=1, **shown)
         np.testing.assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
         np.testing.assert_array_equal(first.get_ydata(), second.get_ydata())
     with pytest.raises(hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"):

@@ -144,6 +144,8 @@ def test_quantities_of_fits():
 def test_plans_agree_with_closed_forms():
     y = 1 + 0.2 * RNG.normal(size=12)
     people = study(y, np.full(12, 0.1), strides=np.full(12, 100))
+    with pytest.raises(hj.DefinitionError, match="subjects differ in 'gain' by no more than"):
+        study(y, np.ones(12), strides=np.full(12, 100)).allocation("gain")
     between = np.sqrt(y.var(ddof=1) - 0.01)
     plan = people.allocation("gain", subject_cost=4, trial_cost=1e-9, stride_cost=0.01)
     assert plan["strides"][0] == pytest.approx(np.sqrt(400) / between, rel=1e-4)
