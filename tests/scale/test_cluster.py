@@ -166,8 +166,8 @@ def test_a_killed_worker_takes_nothing_with_it(client, whole, tmp_path):
     draws = hj.monte_carlo(walk, DRAWS, seed=7, chunk=2, client=client, store=store)
     killer.join()
     assert draws.load().identical(whole)
-    times = {path: path.stat().st_mtime_ns for path in store.glob("far/c/*")}
-    assert len(times) == DRAWS // 2
+    times = {path: path.stat().st_mtime_ns for path in store.glob("far/c/*[0-9]")}
+    assert len(times) == DRAWS // 2  # (beside them, the victim may leave a `.partial`)
     (store / "end/c/3/0").unlink()
     again = hj.monte_carlo(walk, DRAWS, seed=7, chunk=2, store=store)  # goes on without a cluster
     assert again.load().identical(whole)
