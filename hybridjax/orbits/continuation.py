@@ -99,10 +99,6 @@ class Branch(eqx.Module):
     def __getitem__(self, k: SupportsIndex) -> LimitCycle:
         return self.cycles[k]
 
-    def find(self, kind: Kind) -> tuple[BranchPoint, ...]:
-        """The points of a kind: "fold", "branch point", "flip" or "Neimark-Sacker"."""
-        return tuple(p for p in self.points if p.kind == kind)
-
     @remembered
     def multipliers(self) -> Complex[np.ndarray, "K r"]:
         """Floquet multipliers of every cycle, by decreasing modulus, padded with zeros."""

@@ -130,42 +130,22 @@ def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any,
     def to(carry, k, bound):
         i = k % N
         time, event = bound.time[i] + (k // N) * period, bound.event[i]
-        if isinstance(bound.levels, _FromAnchor):  # at first to the anchor
-            first = k == 0
-            time, i = xp.where(first, np.inf, time), xp.where(first, N, i)
-            event = xp.where(first, np.int32(-1), event)
         never = xp.full(k.shape, np.inf)
         targets = Target(time, i, event, never, None, bound.levels, Result.SECTION_MISSED)
         return go(carry, targets, 1.5 * period)
 
-    def onwards(carry, k):
-        carry, anchor = carry
-        bound = _bind(s, map, family, anchor, go)
-        assert isinstance(family.anchor, Crossing)
-        levels = _FromAnchor(bound.levels, family.anchor, N)
-        carry, flow = to(carry, k[None], dataclasses.replace(bound, levels=levels))
-        anchor = jax.tree_util.tree_map(lambda x, y: jnp.where(k == 0, x, y), carry[0], anchor)
-        return (carry, anchor), flow
-
     carry = begin, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)
     at_anchor = isinstance(family.anchor, Crossing) and family.at_anchor
-    if at_anchor and family.points == 1 and not on_host(period):
-        # (One loop to the anchor and on to all sections: a search of its own would take a third of
-        # the time of compilation.)
-        (_, anchor), pieces = scan(onwards, (carry, begin), xp.arange(N + 1))
-        bound = _bind(s, map, family, anchor, go)
-        pieces = jax.tree_util.tree_map(lambda x: x[:, 0], pieces)
+    if isinstance(family.anchor, Crossing):
+        target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
+        carry, before = go(carry, to_section(target, family.anchor))
+        bound = _bind(s, map, family, carry[0], go)
+        _, pieces = to(carry, xp.arange(int(at_anchor), N + 1), bound)
+        if at_anchor:
+            pieces = jax.tree_util.tree_map(lambda *x: xp.concatenate(x), before, pieces)
     else:
-        if isinstance(family.anchor, Crossing):
-            target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
-            carry, before = go(carry, to_section(target, family.anchor))
-            bound = _bind(s, map, family, carry[0], go)
-            _, pieces = to(carry, xp.arange(int(at_anchor), N + 1), bound)
-            if at_anchor:
-                pieces = jax.tree_util.tree_map(lambda *x: xp.concatenate(x), before, pieces)
-        else:
-            bound = _bind(s, map, family, begin, go)
-            _, pieces = to(carry, xp.arange(N + 1), bound)
+        bound = _bind(s, map, family, begin, go)
+        _, pieces = to(carry, xp.arange(N + 1), bound)
     first = pieces[1].result[0, 0]
     pieces = jax.tree_util.tree_map(lambda x: x[1:], pieces)
     lanes, moved, tape = side_by_side(pieces)
@@ -262,26 +242,6 @@ def _bind_along(s: Structure, family: AbstractSections, orbit: Orbit, directions
     begin = s, family, (orbit.period, orbit.t, orbit.q)
     push = lambda tangents: eqx.filter_jvp(bind, begin, tangents)  # noqa: E731
     return eqx.filter_vmap(push, out_axes=(None, 0))(directions)
-
-
-class _FromAnchor(AbstractLevels):
-    """The level functions of N sections, and that of their anchor with the index N."""
-
-    levels: AbstractLevels | None
-    anchor: Crossing
-    n_sections: int = eqx.field(static=True)
-
-    def present(self, s, a):
-        later = self.levels is not None and self.levels.present(s, a)
-        return later or self.anchor.in_chart(s, a)
-
-    def level(self, s, a, i, t, q):
-        N, never = self.n_sections, jnp.ones(())
-        first = self.anchor.level(s, a, t, q) if self.anchor.in_chart(s, a) else never
-        if self.levels is None or not self.levels.present(s, a):
-            return jnp.where(i == N, first, never)
-        later = self.levels.level(s, a, jnp.minimum(i, N - 1), t, q)
-        return jnp.where(i == N, first, later)
 
 
 def _bind(
