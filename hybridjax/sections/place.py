@@ -12,7 +12,7 @@ from jaxtyping import Int
 
 from .._core.boundary.checked import checked
 from .._core.compilation import at_ease, host_first, quick_jit
-from .._core.executor import Array, is_traced, namespace, on_host, put, scan, stop_gradient, to_host
+from .._core.executor import Array, is_traced, namespace, on_host, put, stop_gradient, to_host
 from .._core.host_derivatives import NotOnHostError, by_columns, require_program
 from .._core.lanes import by_lane
 from .._core.precision import require_x64
