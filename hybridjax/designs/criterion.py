@@ -19,14 +19,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import DefinitionError
+from ..identify.descent import ROUNDING
 from ..identify.variable_projection import powers_basis
 from .candidates import Kept, Powers
-
-
-# An unknown is lost where an eigenvalue of the scaled information is below this (relative to the
-# largest, for combinations of matrices). Larger: goals with a large but finite variance are
-# rejected. Smaller: variances are rounding errors.
-SINGULAR = 1e-12
 
 
 class Bound(NamedTuple):
@@ -145,7 +140,7 @@ def _root(matrix: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]) -> Float[
         text = f"no response depends on {unknowns[lost[0]]}: leave it out, or add an output."
         raise DefinitionError(text)
     values, vectors = np.linalg.eigh(matrix / size / size[:, None])
-    if not values[0] > SINGULAR:
+    if not values[0] > ROUNDING:  # relative to the largest, for combinations of matrices
         direction = vectors[:, 0] / size
         largest = np.abs(direction).max()
         named = zip(direction, unknowns, strict=True)

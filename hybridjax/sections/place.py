@@ -127,25 +127,19 @@ def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any,
         flows.append((flow[0], targets, flow[2]))
         return carry, flow
 
-    def to(carry, k, bound):
-        i = k % N
-        time, event = bound.time[i] + (k // N) * period, bound.event[i]
-        never = xp.full(k.shape, np.inf)
-        targets = Target(time, i, event, never, None, bound.levels, Result.SECTION_MISSED)
-        return go(carry, targets, 1.5 * period)
-
-    carry = begin, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)
-    at_anchor = isinstance(family.anchor, Crossing) and family.at_anchor
+    carry, before = (begin, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)), None
     if isinstance(family.anchor, Crossing):
         target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
         carry, before = go(carry, to_section(target, family.anchor))
-        bound = _bind(s, map, family, carry[0], go)
-        _, pieces = to(carry, xp.arange(int(at_anchor), N + 1), bound)
-        if at_anchor:
-            pieces = jax.tree_util.tree_map(lambda *x: xp.concatenate(x), before, pieces)
-    else:
-        bound = _bind(s, map, family, begin, go)
-        _, pieces = to(carry, xp.arange(N + 1), bound)
+        before = before if family.at_anchor else None
+    bound = _bind(s, map, family, carry[0], go)
+    k = xp.arange(int(before is not None), N + 1)
+    i = k % N
+    time, never = bound.time[i] + (k // N) * period, xp.full(k.shape, np.inf)
+    targets = Target(time, i, bound.event[i], never, None, bound.levels, Result.SECTION_MISSED)
+    _, pieces = go(carry, targets, 1.5 * period)
+    if before is not None:
+        pieces = jax.tree_util.tree_map(lambda *x: xp.concatenate(x), before, pieces)
     first = pieces[1].result[0, 0]
     pieces = jax.tree_util.tree_map(lambda x: x[1:], pieces)
     lanes, moved, tape = side_by_side(pieces)

@@ -28,7 +28,6 @@ _PACKAGES = ["hybridjax", "jax", "jaxlib", "numpy"]
 # Bytes of freed memory that a worker keeps. With less, the system clears every page again: a fifth
 # of the time of a sweep. With more, a worker holds memory that it does not use.
 _KEPT = 2**28
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # options of mallopt
 
 _lock = threading.Lock()
 
@@ -143,8 +142,8 @@ def _unpacked(packed: bytes, x64: bool) -> tuple[Any, ZarrStore | None]:
     # Dask's nanny starts workers with MALLOC_TRIM_THRESHOLD_ = 65536.
     with contextlib.suppress(AttributeError, OSError):  # (glibc only)
         library = ctypes.CDLL(None)
-        library.mallopt(_MMAP_THRESHOLD, _KEPT)
-        library.mallopt(_TRIM_THRESHOLD, _KEPT)
+        library.mallopt(-3, _KEPT)  # M_MMAP_THRESHOLD
+        library.mallopt(-1, _KEPT)  # M_TRIM_THRESHOLD
     imported, packed = cloudpickle.loads(packed)
     for x, digest in imported:
         if meaning(x) != digest:
