@@ -5,7 +5,7 @@
 - `TwoTiers` compiles experiments twice: a quick executable for the first answer, and the
   fully optimized one in a thread beside it.
 - `kernel` compiles single functions of users for code that runs on the host; `whole` programs that
-  do more at once, when the host has spent as much time.
+  do more at once.
 """
 
 import collections
@@ -37,9 +37,8 @@ from .progress import say_compiling
 _QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 # XLA divides a program among its threads: dividing a small one takes a fifth longer.
 _UNDIVIDED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
-# Seconds of host time after which a function is compiled, which takes about as long (a single turn
-# of a cycle: a third of it). Less: programs are compiled that are not used again. More: repeated
-# calls stay slow for longer.
+# Seconds of host time after which a function is compiled, which takes about as long. Less: programs
+# are compiled that are not used again. More: repeated calls stay slow for longer.
 WORTH_COMPILING = 6.0
 # Seconds in a quick executable after which a script compiles the optimized one, in about as much
 # time. Less: it waits at its end for the compiling thread longer than it has computed. More:
@@ -384,40 +383,16 @@ def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=Non
     return np.concatenate(parts, axis=-1)[..., :L]
 
 
-def whole(function: Callable, static: tuple, trees: Any, at_once: bool) -> Callable[..., Any]:
-    """`function(*static, *trees, *arguments)` of any arguments and results, with arrays of NumPy:
-    on the host, until it has taken as many seconds of this thread as compiling takes (a third of
-    `WORTH_COMPILING`). Then a thread compiles it. For many calls it is compiled `at_once`.
-
-    In interactive sessions there is time between calls: the thread starts earlier.
-    """
+def whole(function: Callable, static: tuple, trees: Any) -> Callable[..., Any]:
+    """`function(*static, *trees, *arguments)` of any arguments and results as one program, with
+    arrays of NumPy."""
     program, arrays = _bound(function, ft.partial, static, trees, 1)
 
-    def compiled(arrays, *arguments):
-        return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
-
     def call(*arguments):
-        if at_once or program in _ready:
-            _ready.add(program)
-            with uncollected():
-                return compiled(arrays, *arguments)
-        begin, before = time.thread_time(), _spent.get(program)
-        results = function(*static, *trees, *arguments)
-        # (The first call compiles kernels.)
-        after = _spent[program] = 0.0 if before is None else before + time.thread_time() - begin
-        worth = WORTH_COMPILING / (9 if hasattr(sys, "ps1") else 3)
-        if before is not None and before <= worth < after:
-            copied = jax.device_put([np.array(x) for x in arrays])  # (users may donate theirs)
-            make = lambda: (compiled(copied, *arguments), _ready.add(program))  # noqa: E731
-            threading.Thread(target=make).start()
-        return results
+        with uncollected():
+            return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
 
     return call
-
-
-# Seconds that the host has taken for each such program, and those that are compiled.
-_spent: dict[Callable, float] = {}
-_ready: set[Callable] = set()
 
 
 def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:

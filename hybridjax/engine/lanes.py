@@ -141,6 +141,17 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
     return Tape(times(), code, times(), states(), states(), chart)
 
 
+def regrouped(tape: Tape, group: Int[np.ndarray, " L"], lanes: Lanes) -> Tape:
+    """The tape of fewer `lanes`, each of which makes the moves of a group, one after the other."""
+    lane, row = np.nonzero(tape.code.T != IDLE)
+    group = group[lane]
+    order = np.arange(len(group)) - np.searchsorted(group, group)
+    out = blank_tape(order.max() + 1, lanes)
+    for x, y in zip(out, tape, strict=True):
+        x[order, ..., group] = y[row, ..., lane]
+    return out
+
+
 def stack_rows(parts: tuple[np.ndarray, ...]) -> np.ndarray:
     """Arrays of several tapes, the shorter ones with further rows without moves."""
     rows, blank = max(map(len, parts)), IDLE if parts[0].dtype.kind == "i" else 0

@@ -77,7 +77,7 @@ def through(
 ) -> tuple[tuple[Lanes, Stride, Index], tuple[Lanes, Moved, Tape | None]]:
     """Flow a single lane, or lanes with systems of their own, to one of the `targets` after the
     other, waiting for each no longer than `patience`. On the host these are many calls of small
-    programs, until the whole is compiled for a single lane.
+    programs, or a single one, if `options.at_once`.
 
     **Arguments:** `begin`: the lanes, their strides and their results.
 
@@ -87,11 +87,12 @@ def through(
     by = targets.missed, targets.event_sequence
     if not on_host(u) or s.by_system:
         return _pieces((move, options, *by), s, levels, settings, ends, begin, u, patience)
-    at_once, tangents = options.at_once, bool(options.tangents)
-    static = search, options._replace(tangents=tangents, at_once=False), *by
-    make = lambda: whole(_pieces, (static,), (s, levels, settings), at_once)  # noqa: E731
+    static = search, options._replace(tangents=bool(options.tangents), at_once=False), *by
+    if not options.at_once:
+        return _pieces(static, s, levels, settings, ends, begin, u, patience)
+    make = lambda: whole(_pieces, (static,), (s, levels, settings))  # noqa: E731
     arguments = ends, begin, u, np.float64(patience)
-    return s.once(("through", static, at_once), (levels, settings), make)(*arguments)
+    return s.once(("through", static), (levels, settings), make)(*arguments)
 
 
 def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):

@@ -7,7 +7,7 @@ attempt of another kind, such as a restart from a random state, is added there.
 import dataclasses
 import functools as ft
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Lanes, side_by_side
-from ..engine.replay import Variation
+from ..engine.replay import Variation, linear_moves, recorded_moves
 from ..engine.watch import slopes
 from .crossing import ListLevels
 from .return_map import SINGULAR, ReturnMap, Turn, across
@@ -172,15 +172,52 @@ def root(
 
 def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Newton's method with the steps and the test of optimistix."""
-    sizes, x, steps = map.sizes, map.anchor.q[:, 0] / map.sizes, 0
+    sizes, x, steps, moves = map.sizes, map.anchor.q[:, 0] / map.sizes, 0, None
     while True:
-        turn = map.turn_with_jacobian(x * sizes)
+        turn = map.turn_with_jacobian(x * sizes, moves=moves)
         residual = turn.residual / sizes
         (step,) = newton_steps((turn.jacobian * sizes / sizes[:, None])[None], residual[None])
         x, steps = x + step, steps + 1
-        done = excess(x[None], step[None])[0] < 1 and np.max(np.abs(residual)) < _ATOL
+        done = excess(x[None], step[None])[0] < 1 and turn.distance < _ATOL
         if done or steps == max_steps or not np.isfinite(x).all():
             return x * sizes, turn, np.asarray(steps)
+        x, moves = _by_moves(map, turn, x, step)
+
+
+def _by_moves(map: ReturnMap, turn: Turn, x: np.ndarray, step: np.ndarray) -> tuple[Any, Any]:
+    """The fixed point, in sizes, of a turn that makes the recorded moves again, whatever happens on
+    the way, and these moves. Newton's method on the starts of all moves, which are computed
+    together (multiple shooting). Only x, where the first `step` has led, if the next ones do not
+    halve each time.
+    """
+    s, sizes, target, n = map.structure, map.sizes, map.ends(), 1 + map.structure.d
+    moves, first, last = recorded_moves(turn.legs, side_by_side(turn.tapes)), x, np.inf
+    x, begins = x - step, moves.order == 0
+    while True:
+        end, by = linear_moves(s, moves, target)
+        starts = np.concatenate([moves.t[None], moves.q]).T
+        # Defects, and the start of the turn, move the starts of later moves.
+        moved, columns = [np.zeros(n)], [np.eye(n, n - 1, -1)]
+        for k, by_start in enumerate(by[:, :, :n]):
+            defect = end[k] - starts[k + 1] if k + 1 < len(starts) else end[k]
+            moved.append(by_start @ moved[-1] + defect)
+            columns.append(by_start @ columns[-1])
+        off, held = map.held(x * sizes)
+        residual = np.where(map.valid, moved[-1][1:], 0.0) - x * sizes - off
+        jacobian = np.where(map.valid[:, None], columns[-1][1:], 0.0) - np.eye(n - 1) - held
+        jacobian = jacobian * sizes / sizes[:, None]
+        (step,) = newton_steps(jacobian[None], (residual / sizes)[None])
+        if not np.max(np.abs(step)) <= 0.5 * last or begins.sum() < len(target.time):
+            return first, None
+        x, last = x + step, np.max(np.abs(step))
+        shift = np.stack(moved[:-1]) + np.stack(columns[:-1]) @ (step * sizes)
+        h = (end + (by[:, :, :n] @ shift[:, :, None])[:, :, 0] - starts - shift)[:, 0]
+        if not (h > 0).all():
+            return first, None
+        starts = starts + shift
+        moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
+        if excess(x[None], step[None])[0] < 1:
+            return x, (moves, by)
 
 
 def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:

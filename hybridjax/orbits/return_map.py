@@ -22,9 +22,20 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.events import arm
-from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
-from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
-from ..engine.replay import projections
+from ..engine.lanes import (
+    ARRIVE_TIME,
+    MOVE,
+    Lanes,
+    Tape,
+    for_each_chart,
+    only,
+    regrouped,
+    side_by_side,
+    start_lanes,
+)  # fmt: skip
+from ..engine.move import Options, flow_jacobian, follow, move, stride, tape_jacobian, through
+from ..engine.replay import Moves, projections
+from ..engine.search.attempt import deviation
 from ..engine.search.state import Recorded
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
@@ -211,12 +222,14 @@ class ReturnMap(eqx.Module):
         wanted: Bool[Array, ""] | bool = True,
         record: Recorded | None = None,
         varied: Varied | None = None,
+        moves: tuple[Moves, Array] | None = None,
     ) -> Turn:
         """One turn from a state on the section, with its derivatives.
 
         **Arguments:** `wanted`: whether derivatives with respect to the state are computed;
         otherwise they are meaningless. `record`: see `turn`. `varied`: the system with a parameter
         by which there are derivatives, too, at the same phase of the clock (on the host).
+        `moves`: those that are expected, and their derivatives; they are made side by side.
         """
         s, xp, settings, each = self.structure, namespace(q), self.settings, self.each
 
@@ -232,9 +245,11 @@ class ReturnMap(eqx.Module):
 
         if on_host(q):  # (all pieces are linearized together)
             options = Options(True, new_input=False, tangents=wanted, at_once=varied is not None)
-            (end, (legs, _, tapes)), recorded = self.travel(q, options), None
+            turn = None if moves is None else self._side_by_side(q, *moves, options)
+            end, (legs, _, tapes), *gap = turn or self.travel(q, options)
+            recorded = None
         else:
-            end, (legs, factors, tapes, recorded) = self.travel(q, flow, record)
+            (end, (legs, factors, tapes, recorded)), gap = self.travel(q, flow, record), []
         (ends, levels), d = self.ends().split(), s.d
         lanes, tape, ends = side_by_side((legs, tapes, ends))
         if on_host(q):
@@ -255,7 +270,7 @@ class ReturnMap(eqx.Module):
         legs = jax.tree_util.tree_map(lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs)
         return Turn(
             end.residual, jacobian, legs, xp.moveaxis(factors, 0, -3), codes, times, end.period,
-            xp.max(defect / self.sizes, axis=-1), end.result, meetings, recorded, tapes,
+            xp.max(defect / self.sizes, axis=-1) + sum(gap), end.result, meetings, recorded, tapes,
         )  # fmt: skip
 
     def _by_parameter(
@@ -355,6 +370,56 @@ class ReturnMap(eqx.Module):
         residual = xp.where(self.valid, each(end.q.T), 0.0) - q - self.held(q)[0]
         residual = xp.where(same[..., None], residual, np.nan)
         return Return(residual, each(end.t - self.anchor.t), each(result)), extra
+
+    def _side_by_side(self, q: Array, moves: Moves, by: Array, options: Options) -> Any:
+        """A turn as by `travel`, with all of its expected moves side by side; None if they do not
+        follow each other: if one does not end as the next one begins. Also returns the largest gap
+        between them, in sizes of the states."""
+        s, ends, code, piece = self.structure, self.ends(), moves.code, moves.lane
+        later = np.append(moves.t[1:], np.inf)
+        time = np.where(
+            code == MOVE, later, np.where(code == ARRIVE_TIME, ends.time[piece], np.inf)
+        )
+        limit = np.where(np.isfinite(time), np.nextafter(time, np.inf), moves.t + 2 * moves.h)
+        index, event = (np.broadcast_to(x, LEGS)[piece] for x in (ends.index, ends.event))
+        event = np.where(code >= 0, code, event).astype(np.int32)
+        target = dataclasses.replace(ends, time=time, limit=limit, index=index, event=event)
+        lanes = start_lanes(s, moves.t, moves.chart.astype(np.int32), moves.q)
+        count = np.cumsum(code >= 0) - (code >= 0)
+        lanes = arm(s, lanes, self.watch(lanes, until(lanes.t)), self.expected)
+        lanes = lanes._replace(events=count.astype(np.int32))
+        lanes.armed[:, :1] = self.departure(q).armed
+        u = np.zeros((s.nu, len(code)))
+        # (Longer steps: rounding might divide those to a known time, and crossings have to lie within
+        # the step.)
+        setout = stride(np.where(np.isfinite(time), 2.0, 1.01) * moves.h)._replace(lead=0 * moves.h)
+        if any(s.method(a).implicit for a in range(len(s.charts))):
+            along = deviation(s, lanes, self.settings)
+            for k in np.flatnonzero(code[:-1] < 0):
+                along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
+            setout = setout._replace(along=along)
+        for _ in range(2):
+            moved, tape = move(s, lanes, u, target, self.settings, setout, None, options)
+            end = moved.lanes
+            if same := bool((end.armed[:, :-1] == lanes.armed[:, 1:]).all()):
+                break
+            lanes.armed[:, 1:] = end.armed[:, :-1]
+        pairs = (end.chart, lanes.chart), (end.events, lanes.events)
+        same = same and all((x[:-1] == y[1:]).all() for x, y in pairs)
+        gaps = np.abs(end.q[:, :-1] - lanes.q[:, 1:]).T / self.scale[lanes.chart[1:]]
+        gap = max(gaps.max(), np.abs(end.t[:-1] - lanes.t[1:]).max() / self.expected)
+        if not (same and (moved.result == Result.OK).all() and gap <= _CLOSED):
+            return None
+        begins = moves.order == 0
+        legs = jax.tree_util.tree_map(lambda x: x[..., begins], lanes)
+        stacked = lambda x: np.moveaxis(x, -1, 0)[..., None]  # noqa: E731
+        residual = np.where(self.valid, end.q[:, -1], 0.0) - q - self.held(q)[0]
+        residual = np.where(end.chart[-1] == self.anchor.chart, residual, np.nan)
+        turn = Return(residual, end.t[-1] - self.anchor.t[0], np.asarray(moved.result[-1]))
+        on_the_way = (tape.code == ARRIVE_TIME) & (code == MOVE)
+        tape = tape._replace(code=np.where(on_the_way, MOVE, tape.code))
+        tape = regrouped(tape, piece, legs)
+        return turn, jax.tree_util.tree_map(stacked, (legs, None, tape)), gap
 
     def pieces(self, tangents: bool = False) -> tuple[Lanes, Tape]:
         """The starts and tapes of the pieces of one turn."""

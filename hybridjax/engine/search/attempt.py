@@ -8,12 +8,13 @@ from jaxtyping import Bool, Float
 
 from ..._core.executor import cond, namespace, put
 from ..._core.lanes import pick, take_rows
+from ...systems.structure import Structure
 from ..arrays import AnyTimes, Array, Mask, Padded, States, Times
 from ..cubic import NEAR, control_points, root_near_end
 from ..events import INSTANT, width
 from ..lanes import Lanes, for_each_chart, only
 from ..runge_kutta import Step, rounding_error
-from ..settings import size, tolerance
+from ..settings import Settings, size, tolerance
 from ..watch import ChartFlow, Watch, chart_flow, no_events, write
 from .state import Aim, Attempt, State, Task
 
@@ -244,13 +245,12 @@ def _clearance(
     return far, slow
 
 
-def deviation(lanes: Lanes, task: Task) -> Padded:
+def deviation(s: Structure, lanes: Lanes, settings: Settings) -> Padded:
     """A deviation of every lane, as large as its states."""
-    s = task.s
 
     def work(a, here, out):
         n = s.dims[a]
-        scaled = size(task.settings, a, only(here, lanes.q[:n])) * _direction(n)
+        scaled = size(settings, a, only(here, lanes.q[:n])) * _direction(n)
         return put(out, slice(n), xp.where(here, scaled, out[:n]))
 
     xp = namespace(lanes.q)

@@ -77,7 +77,9 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
         result = update_result(result, failed, code)
     along = new.along
     if along is not None:
-        fresh = cond((fired >= 0).any(), lambda: deviation(after, task), lambda: along)
+        fresh = cond(
+            (fired >= 0).any(), lambda: deviation(task.s, after, task.settings), lambda: along
+        )
         along = xp.where(fired >= 0, fresh, xp.where(accepted, along, state.along))
     end = State(
         after,

@@ -24,6 +24,8 @@ class Stride(NamedTuple):
     not known."""
     slack: Times
     """A step's error estimate may be this many times the tolerance."""
+    along: Padded | None = None
+    """See `State`. Default: a deviation as large as the states."""
 
 
 class Options(NamedTuple):
@@ -39,7 +41,7 @@ class Options(NamedTuple):
     tangents: Bool[Array, ""] | bool = False
     """Make steps also short enough for the derivatives of a replay."""
     at_once: bool = False
-    """On the host: compile a turn before the first one."""
+    """On the host: one program for all pieces of a turn."""
 
 
 class Moved(NamedTuple):
