@@ -212,7 +212,7 @@ def _by_moves(map: ReturnMap, turn: Turn, x: np.ndarray, step: np.ndarray) -> tu
         x, last = x + step, np.max(np.abs(step))
         shift = np.stack(moved[:-1]) + np.stack(columns[:-1]) @ (step * sizes)
         h = (end + (by[:, :, :n] @ shift[:, :, None])[:, :, 0] - starts - shift)[:, 0]
-        if not (h > 0).all():
+        if not (h >= 0).all():
             return first, None
         starts = starts + shift
         moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)

@@ -390,18 +390,19 @@ class ReturnMap(eqx.Module):
         lanes = lanes._replace(events=count.astype(np.int32))
         lanes.armed[:, :1] = self.departure(q).armed
         u = np.zeros((s.nu, len(code)))
-        # (Longer steps: rounding might divide those to a known time, and crossings have to lie within
-        # the step.)
+        # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
         setout = stride(np.where(np.isfinite(time), 2.0, 1.01) * moves.h)._replace(lead=0 * moves.h)
         if any(s.method(a).implicit for a in range(len(s.charts))):
             along = deviation(s, lanes, self.settings)
             for k in np.flatnonzero(code[:-1] < 0):
                 along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
             setout = setout._replace(along=along)
+        source = np.array([s.chart_index(transition.source) for transition in s.transitions], int)
+        elsewhere = source[:, None] != lanes.chart[1:]  # (guards that no lane there meets)
         for _ in range(2):
             moved, tape = move(s, lanes, u, target, self.settings, setout, None, options)
             end = moved.lanes
-            if same := bool((end.armed[:, :-1] == lanes.armed[:, 1:]).all()):
+            if same := ((end.armed[:, :-1] == lanes.armed[:, 1:]) | elsewhere).all():
                 break
             lanes.armed[:, 1:] = end.armed[:, :-1]
         pairs = (end.chart, lanes.chart), (end.events, lanes.events)

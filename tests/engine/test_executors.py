@@ -1,6 +1,5 @@
 """One source, two executors: the host and XLA agree, and the host compiles users' functions."""
 
-import contextlib
 import threading
 
 import jax
@@ -15,6 +14,7 @@ from hybridjax.engine.lanes import IDLE, start_lanes
 from hybridjax.engine.move import Options, move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
+from hybridjax.orbits.newton import _by_moves
 from hybridjax.systems.structure import Structure
 
 from ..conftest import unchecked_host
@@ -31,11 +31,11 @@ def slow_but(names, few):
     return [n if n in few else pytest.param(n, marks=pytest.mark.slow) for n in sorted(names)]
 
 
-def flow(system, t, chart, q, u, end, settings):
+def flow(system, t, chart, q, u, end, settings, at_once=False):
     """A recorded flow of one lane (of either executor's arrays)."""
     s = Structure(system)
     lanes = start_lanes(s, t, chart, q)
-    return move(s, lanes, u, until(end), settings, options=Options(tape=True))
+    return move(s, lanes, u, until(end), settings, options=Options(tape=True, at_once=at_once))
 
 
 compiled_flow = quick_jit(flow)
@@ -46,21 +46,6 @@ class AtOnce(threading.Thread):
 
     def start(self):
         self.run()
-
-
-@contextlib.contextmanager
-def whole_turns():
-    """A context in which all that the host may compile whole is compiled."""
-
-    class All(set):
-        def __contains__(self, program):
-            self.add(program)
-            return True
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compilation, "_ready", programs := All())
-        yield
-        assert len(programs) > 0
 
 
 def agree(system, chart, state, u, begin, duration):
@@ -74,8 +59,8 @@ def agree(system, chart, state, u, begin, duration):
     with unchecked_host():
         host = flow(system, *to_host(arguments))
     assert all(on_host(x) for x in jax.tree_util.tree_leaves(host))
-    with unchecked_host(), whole_turns():
-        whole = flow(system, *to_host(arguments))
+    with unchecked_host():
+        whole = flow(system, *to_host(arguments), at_once=True)
     xla = compiled_flow(system, *from_host(arguments))
     assert np.sum(host.tape.code != IDLE) > 2
     # Steps amplify the rounding errors of their error estimates.
@@ -115,13 +100,32 @@ def test_both_agree_on_random_systems(name):
         agree(system, 0, start.q, start.u, start.t, 2.0)
 
 
-def test_a_derivative_of_a_flow_by_whole_turns(hopper_cycle):
-    """Newton's method finds the same cycle with whole turns: steps are also short enough for
-    derivatives, and land on the anchor's time."""
-    with whole_turns():
-        cycle = hj.find_limit_cycle(hopper_cycle.system)
-    np.testing.assert_allclose(cycle.anchor.q, hopper_cycle.anchor.q, atol=1e-12)
-    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, atol=1e-11)
+@pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("BuckConverter", "FitzHughNagumo")))
+def test_a_turn_with_its_moves_side_by_side(name):
+    """The same moves, with the same derivatives, as one after the other."""
+    system = getattr(hj.models, name)()
+    if system.guess() is None or name in ("SLIPRunner", "TrottingQuadruped"):
+        pytest.skip("has no guess of its own, a family of cycles, or events at one instant")
+    with unchecked_host():
+        map = to_host(hj.find_limit_cycle(system).return_map)
+        q, sizes, s = map.anchor.q[:, 0], map.sizes, map.structure
+        turn = map.turn_with_jacobian(q)
+        x, moves = _by_moves(map, turn, q / sizes, 0 * q)
+        side = map._side_by_side(x * sizes, *moves, Options(True, new_input=False, tangents=True))
+        again = map.turn_with_jacobian(x * sizes, moves=moves)
+    assert side is not None
+    assert [x for x in np.ravel(again.codes) if x >= 0] == [
+        x for x in np.ravel(turn.codes) if x >= 0
+    ]
+    guards = [s.chart_index(transition.source) for transition in s.transitions]
+    for legs in (again.legs, turn.legs):
+        legs.armed[np.array(guards, int)[:, None] != legs.chart] = False  # (of other charts)
+    for field in ("armed", "chart", "events"):
+        np.testing.assert_array_equal(getattr(again.legs, field), getattr(turn.legs, field))
+    apart = (again.legs.q - turn.legs.q) / map.scale[turn.legs.chart].T
+    assert np.abs(apart).max() < 1e-9 and abs(again.period / turn.period - 1) < 1e-11
+    size = np.abs(turn.factors).max(axis=0)
+    assert (np.abs(again.factors - turn.factors) / size).max() < 1e-6
 
 
 def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
