@@ -37,7 +37,7 @@ def shown(thing):
 @pytest.fixture(scope="module")
 def hopper_data(kinematic_ldtp):
     design = hj.multisine(periods=16, band=(0, 4.0))
-    return hj.experiments.simulate_experiments(kinematic_ldtp, design, start="periodic")
+    return hj.experiments.simulate_experiments(kinematic_ldtp, design)
 
 
 @pytest.mark.parametrize("name", hj.models.__all__)

@@ -166,8 +166,8 @@ class ObservedSeries(AbstractObservation):
         """**Arguments:** `data`: from experiments with `start="cycle"`. `sections`: their family.
         `std`: standard deviation of the measurement noise, one number or one for each output.
 
-        **Raises:** `DefinitionError` if no experiment ran well, for another number of sections, or
-        an `std` that is not one for each output.
+        **Raises:** `DefinitionError` if no experiment ran well, for another number of sections,
+        an `std` that is not one for each output, or experiments that do not begin on the cycle.
         """
         self.sections = as_family(sections)
         require_same("data and `sections`", data, self.sections, ("n_sections",))
@@ -176,6 +176,13 @@ class ObservedSeries(AbstractObservation):
         y = data.y[data.ok]
         self.scale = _scale("outputs", std, jnp.asarray(y.reshape(-1, y.shape[2])))
         self.weighted = jnp.asarray(std is not None)
+        noise = 0.0 if std is None else 3.0 * np.asarray(std)
+        most = np.maximum(np.sqrt((y**2).mean(axis=(0, 1))) / 2, noise)
+        if ((y[:, 0] / most) ** 2).mean() > 1:
+            raise DefinitionError(
+                "the experiments do not begin on the cycle: their outputs deviate as much at "
+                'sample 0 as later. Apply them with `start="cycle"`, and keep the first cycle.'
+            )
         self.absolute = data.cycle_outputs is not None
         if data.cycle_outputs is not None:
             y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.n_sections, 1))

@@ -41,6 +41,7 @@ F = np.array([0.1, 0.2, 0.3])
 
 def records(**options):
     y = np.random.default_rng(0).normal(size=(2, 16, 1))
+    y[:, 0] = options.pop("begin", 0.0)
     return hj.ExperimentData(
         np.zeros((2, 16, 1)), options.pop("y", y), n_sections=8, periods=2, **options
     )
@@ -55,6 +56,8 @@ def records(**options):
         (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran to"),
         (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), r"of shape \(1 outputs\)"),
         (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "zero throughout"),
+        (lambda: hj.ObservedSeries(records(begin=0.8), SECTIONS), "do not begin on the cycle"),
+        (lambda: hj.ObservedSeries(records(begin=0.8), SECTIONS, 0.1), "do not begin on the cycle"),
         (lambda: hj.ObservedCycle(SECTIONS), "`times`, or a `period`"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM"), "`outputs` with their `values`"),
         (
