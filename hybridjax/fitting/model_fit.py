@@ -228,7 +228,12 @@ class ModelFit(eqx.Module):
         return "\n".join(lines)
 
     def _cost(self) -> str:
-        expected = f", expected {self.freedom}" if self.weighted else ""
+        misfit = 100 * np.sqrt(np.mean(self.residuals**2))
+        expected = (
+            f", expected {self.freedom}"
+            if self.weighted
+            else f", residuals {misfit:.2g} % of the data"
+        )
         good = sum(guess.result == Result.OK for guess in self.guesses)
         steps = sum(guess.steps for guess in self.guesses)
         return (
