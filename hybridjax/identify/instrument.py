@@ -153,7 +153,9 @@ def htf_by_reference(
     return solve(total, total.setup.outputs, inputs, references, (repeats, variance), threshold)
 
 
-def excited_classes(sums: Sums, r: Int[np.ndarray, " c"], threshold: float) -> Int[np.ndarray, " k"]:
+def excited_classes(
+    sums: Sums, r: Int[np.ndarray, " c"], threshold: float
+) -> Int[np.ndarray, " k"]:
     """Return the classes in which all lines of all references, of the rows r, are excited.
 
     **Raises:** `DefinitionError` if there is none.

@@ -116,6 +116,14 @@ def test_a_drift_is_found_where_samples_are_missing(small):
     assert fit.freedom == samples - 8 - fit.unknowns
 
 
+def test_too_few_dimensions_are_named(small):
+    """Of plants with strong noise, and of exact ones, whose residuals are rounding."""
+    for noise, dims, named in ((0.3, 3, False), (0.3, 2, True), (0.0, 3, False), (0.0, 2, True)):
+        fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
+        assert bool(fit.misfit) == named == ("depend on the inputs" in repr(fit))
+        assert named or fit.compare(small.multipliers).max_error < 4 * fit.standard_errors.max()
+
+
 def test_outputs_that_do_not_answer_are_refused(small):
     data = record(small, 4 * 60, 0)
     noise = hj.Record(data.u, np.random.default_rng(0).normal(size=data.y.shape), n_sections=4)

@@ -1,6 +1,7 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
 import dataclasses
+import warnings
 from contextlib import suppress
 from functools import cached_property
 from typing import Annotated, Literal, cast
@@ -16,7 +17,7 @@ from ..._core.boundary.values import Integers
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ..._core.text import signal_values
-from ...errors import DefinitionError
+from ...errors import DefinitionError, FindingWarning
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, all_harmonics, check_harmonics
 from ...linear.htf import HTF
@@ -28,8 +29,8 @@ from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
-from ..series.records import PreparedRecords
-from ..series.residuals import about_answering, answering
+from ..series.records import CycleGrid, PreparedRecords
+from ..series.residuals import about_answering, about_misfit, answering
 from ..series.subspace import answers_at_once, default_horizon, subspace_model
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
@@ -91,6 +92,9 @@ class LDTPFit(MultiplierEstimate):
       the outputs; None for HTFs.
     - `feedback`: a sentence about inputs of time series that a controller makes, or may make; empty
       if nothing speaks for a controller, or a `reference` was given.
+    - `misfit`: a sentence if residuals of time series depend on the inputs: the dimensions are too
+      few, or the iteration found a local minimum, and multipliers may be wrong by more than their
+      standard errors; empty if not, and for HTFs.
     """
 
     model: LDTP
@@ -101,6 +105,7 @@ class LDTPFit(MultiplierEstimate):
     harmonics: tuple[int, ...] = eqx.field(static=True)
     noise: LDTP | None
     feedback: str = eqx.field(static=True)
+    misfit: str = eqx.field(static=True)
     _coordinates: LocalCoordinates
     _root: Float[np.ndarray, "P r"]
     _hidden: Float[np.ndarray, "P h"]
@@ -185,7 +190,7 @@ class LDTPFit(MultiplierEstimate):
             size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
             about = f"errors one step ahead {signal_values(self.outputs, size)}"
         about = f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
-        return "; ".join(filter(None, [about, self.feedback]))
+        return "; ".join(filter(None, [about, self.misfit, self.feedback]))
 
 
 @checked
@@ -233,14 +238,15 @@ def fit_ldtp(
     - `guess`: dimensions of the state at each section (or one for all): the fit starts from
       `hj.identify.realize` for HTFs, and from a subspace method for time series. Alternatively, an
       observable initial model with these dimensions; if its D is zero, D stays zero. Too few
-      dimensions bias the multipliers: compare `cost` with `freedom` where variances are known, and
-      use `hj.validate` for time series. The iteration finds a local minimum; the same checks reveal
-      a poor one.
+      dimensions bias the multipliers: compare `cost` with `freedom` where variances are known;
+      for time series, see `misfit`. The iteration finds a local minimum; the same checks reveal a
+      poor one.
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
-    - `check`: whether to raise an error if outputs do not respond to the inputs. It has no effect
-      with "innovations". Default: True.
+    - `check`: whether to raise an error if outputs do not respond to the inputs (not with
+      "innovations"), and to test whether residuals of time series depend on them; then `misfit`
+      says so, in a `FindingWarning`, too. Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, always
       with innovations. The fit is consistent if D is zero at sections where the controller responds
@@ -265,17 +271,19 @@ def fit_ldtp(
             direct = answers_at_once(records, outside)
         how = (innovations, start == "free", check)
         fit = _fit_to_series(records, guess, *how, direct)
+        outside = grid = records.whole()
+        feedback = _UNSEEN * (innovations and direct and drive is None)
         if drive is not None:
-            return fit
-        feedback = _UNSEEN * (innovations and direct)
-        grid, predictor = records.whole(), cast(Predictor, fit.predictor)
-        error = np.where(grid.sampled, grid.y - predictor.predict(grid, start == "free"), 0.0)
-        if answers := answering(grid, error, records.inputs):
+            outside = PreparedRecords(drive).whole()
+        elif answers := answering(grid, _errors(fit, grid, start), records.inputs):
             if innovations and direct and not isinstance(guess, LDTP):
                 fit, direct = _fit_to_series(records, guess, *how, False), False
             remedy = _REMEDIES[innovations + (innovations and not direct)]
             feedback = about_answering(answers, remedy)
-        return dataclasses.replace(fit, feedback=feedback)
+        misfit = about_misfit(outside, grid, _errors(fit, grid, start)) if check else ""
+        if misfit:
+            warnings.warn(f"Fit: {misfit}.", FindingWarning, stacklevel=3)
+        return dataclasses.replace(fit, feedback=feedback, misfit=misfit)
     if reference is not None:
         raise DefinitionError(
             "`reference` is for time series: estimate the HTFs by "
@@ -286,6 +294,12 @@ def fit_ldtp(
     if start == "cycle":
         raise DefinitionError("HTFs are of periodic responses, without a start: leave `start` out.")
     return _fit_to_htf(data, guess, check)
+
+
+def _errors(fit: LDTPFit, grid: CycleGrid, start: str) -> Float[np.ndarray, "S T N ny"]:
+    """Return the errors one step ahead; NaN where an output was not sampled."""
+    expected = cast(Predictor, fit.predictor).predict(grid, start == "free")
+    return np.where(grid.sampled, grid.y - expected, np.nan)
 
 
 def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
@@ -458,6 +472,7 @@ def _finished(
         harmonics=harmonics,
         noise=noise,
         feedback="",
+        misfit="",
         _coordinates=point.coordinates,
         _root=spread.root,
         _hidden=spread.hidden,

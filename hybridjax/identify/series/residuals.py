@@ -20,6 +20,9 @@ _POWER = 0.8
 # reference at the same section. Smaller: controllers and weak feed-through pass. Larger: open loops
 # are refused.
 ANSWER = 1e-3
+# Residuals, relative to the outputs, that iterations leave of exact data. Smaller: such residuals
+# are taken for those of a wrong model. Larger: wrong models of nearly exact data pass.
+_ITERATED = 1e-9
 
 
 def whiteness_test(
@@ -89,6 +92,25 @@ def independence_test(
     p = stats.norm.sf(deviates / np.sqrt(np.maximum(tested, 1)))
     shift = special.ncfdtrinc(*degrees, 1 - _POWER, special.fdtri(*degrees, 1 - level))
     return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
+
+
+def about_misfit(outside: CycleGrid, grid: CycleGrid, error: Float[np.ndarray, "S T N ny"]) -> str:
+    """Return a sentence about residuals that depend on inputs of the period before them; empty if
+    there are none.
+
+    **Arguments:** `outside`: the inputs that do not respond to outputs. `error`: the residuals of
+    `grid`, NaN where an output was not sampled.
+    """
+    S, T, N, ny = error.shape
+    late = np.cumsum(grid.inside.reshape(S, -1), axis=1).reshape(S, T, N) > N
+    p = independence_test(outside.u, np.where(late[..., None], error, np.nan), N, ANSWER)[1]
+    left = np.sqrt(np.nansum(error**2, axis=(0, 1, 2)) / (grid.y**2).sum(axis=(0, 1, 2)))
+    if not ((p < ANSWER / ny) & (left > _ITERATED)).any():
+        return ""
+    return (
+        "residuals depend on the inputs, so multipliers may be wrong by more than their "
+        "standard errors: give more dimensions or, if these do not help, another guess"
+    )
 
 
 def answering(
