@@ -118,10 +118,10 @@ def test_a_drift_is_found_where_samples_are_missing(small):
 
 def test_too_few_dimensions_are_named(small):
     """Of plants with strong noise, and of exact ones, whose residuals are rounding."""
-    for noise, dims, named in ((0.3, 3, False), (0.3, 2, True), (0.0, 3, False), (0.0, 2, True)):
-        fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
-        assert bool(fit.misfit) == named == ("depend on the inputs" in repr(fit))
-        assert named or fit.compare(small.multipliers).max_error < 4 * fit.standard_errors.max()
+    for noise in (0.3, 0.0):
+        for dims, named in ((small.dims, False), (2, True)):
+            fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
+            assert bool(fit.misfit) == named == ("depend on the inputs" in repr(fit))
 
 
 def test_outputs_that_do_not_answer_are_refused(small):
