@@ -129,4 +129,4 @@ def neighbor_correlation(
 
 def are_alike(correlation: float, freedom: float) -> bool:
     """Test for a correlation of errors that is not chance, and large: the model is too simple."""
-    return correlation > max(1 / 3, 5 / np.sqrt(freedom))
+    return correlation > max(0.1, 5 / np.sqrt(freedom))
