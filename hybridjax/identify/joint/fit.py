@@ -30,7 +30,7 @@ from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from ..series.records import CycleGrid, PreparedRecords
-from ..series.residuals import about_answering, about_misfit, answering
+from ..series.residuals import about_answering, answering, depends_on_inputs
 from ..series.subspace import answers_at_once, default_horizon, subspace_model
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
@@ -64,6 +64,10 @@ _REMEDIES = (
 _UNSEEN = (
     "outputs are correlated with inputs at the same section, so D was fitted: if a controller "
     "causes the correlation, D is biased (then name its `reference`, or give a guess with D = 0)"
+)
+_MISFIT = (
+    "residuals depend on the inputs, so multipliers may be wrong by more than their standard "
+    "errors: give more dimensions{}, or another guess"
 )
 
 
@@ -280,8 +284,9 @@ def fit_ldtp(
                 fit, direct = _fit_to_series(records, guess, *how, False), False
             remedy = _REMEDIES[innovations + (innovations and not direct)]
             feedback = about_answering(answers, remedy)
-        misfit = about_misfit(outside, grid, _errors(fit, grid, start)) if check else ""
-        if misfit:
+        misfit = ""
+        if check and depends_on_inputs(outside, grid, _errors(fit, grid, start)):
+            misfit = _MISFIT.format("" if innovations else ", noise='innovations'")
             warnings.warn(f"Fit: {misfit}.", FindingWarning, stacklevel=3)
         return dataclasses.replace(fit, feedback=feedback, misfit=misfit)
     if reference is not None:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import special, stats
 
 from .output_error import RANK
@@ -94,9 +94,16 @@ def independence_test(
     return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
 
 
-def about_misfit(outside: CycleGrid, grid: CycleGrid, error: Float[np.ndarray, "S T N ny"]) -> str:
-    """Return a sentence about residuals that depend on inputs of the period before them; empty if
-    there are none.
+def is_exact(grid: CycleGrid, error: Float[np.ndarray, "S T N ny"]) -> Bool[np.ndarray, " ny"]:
+    """Return whether the residuals of each output are only rounding, and tell nothing."""
+    left = np.sqrt(np.nansum(error**2, axis=(0, 1, 2)) / (grid.y**2).sum(axis=(0, 1, 2)))
+    return left <= _ITERATED
+
+
+def depends_on_inputs(
+    outside: CycleGrid, grid: CycleGrid, error: Float[np.ndarray, "S T N ny"]
+) -> bool:
+    """Test whether residuals depend on inputs of the period before them.
 
     **Arguments:** `outside`: the inputs that do not respond to outputs. `error`: the residuals of
     `grid`, NaN where an output was not sampled.
@@ -104,19 +111,15 @@ def about_misfit(outside: CycleGrid, grid: CycleGrid, error: Float[np.ndarray, "
     S, T, N, ny = error.shape
     late = np.cumsum(grid.inside.reshape(S, -1), axis=1).reshape(S, T, N) > N
     p = independence_test(outside.u, np.where(late[..., None], error, np.nan), N, ANSWER)[1]
-    left = np.sqrt(np.nansum(error**2, axis=(0, 1, 2)) / (grid.y**2).sum(axis=(0, 1, 2)))
-    if not ((p < ANSWER / ny) & (left > _ITERATED)).any():
-        return ""
-    return (
-        "residuals depend on the inputs, so multipliers may be wrong by more than their "
-        "standard errors: give more dimensions or, if these do not help, another guess"
-    )
+    return bool(((p < ANSWER / ny) & ~is_exact(grid, error)).any())
 
 
 def answering(
     grid: CycleGrid, error: Float[np.ndarray, "S T N ny"], inputs: tuple[str, ...]
 ) -> dict[str, float]:
     """Return the inputs that answer earlier residuals, as by a controller, with their p-values."""
+    if is_exact(grid, error).all():
+        return {}
     p = feedback_test(grid, error)
     return {name: float(x) for name, x in zip(inputs, p, strict=True) if x < ANSWER}
 
