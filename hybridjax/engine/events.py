@@ -50,10 +50,10 @@ def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
     """
     zero = width(lanes.t, span, watched.rate)
     armed = (lanes.armed & (watched.value >= -zero)[:-1]) | (watched.value > zero)[:-1]
-    return lanes._replace(armed=armed & _belongs(s, lanes.chart)[:-1])
+    return lanes._replace(armed=armed & belongs(s, lanes.chart)[:-1])
 
 
-def _belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
+def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
     """Test whether rows of a `Watch` belong to the chart of each lane (the target's row does)."""
     source = np.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
     return (source == chart) | (source == -1)
@@ -81,7 +81,7 @@ def rearm(
     zero = width(lanes.t, span, rate) + _noise(s, lanes, u, fired >= 0)
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
     due = together & other & (xp.abs(value) <= zero) & (rate < 0)
-    armed = ((value > zero) | due) & _belongs(s, lanes.chart)[:-1]
+    armed = ((value > zero) | due) & belongs(s, lanes.chart)[:-1]
     return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
 
 

@@ -79,7 +79,7 @@ def estimate_htf(
         )
     require_x64()
     if reference is not None:
-        htf = htf_by_reference(data, reference, repeats, variance, threshold)
+        htf = htf_by_reference(data, reference, repeats=repeats, variance=variance)
         return htf if harmonics is None else htf.select(harmonics)
     sums = spectral_sums(data, harmonics, repeats=repeats)
     rows = np.flatnonzero(sums.solvable())

@@ -26,9 +26,10 @@ from ..engine.target import toward, until
 from ..systems.system import HybridSystem
 from .coincidence import together
 from .crossing import AtEvent, to_section
-from .newton import FEW_STEPS, USUAL_STEPS, excess, newton_steps
+from .newton import FEW_STEPS, USUAL_STEPS
 from .return_map import ReturnMap, Turn
 from .scale import ROUNDING
+from .shooting import excess, newton_steps
 
 
 # Largest number of systems whose turns are computed on the host. Larger: that takes longer than

@@ -17,8 +17,9 @@ from ..systems.system import HybridSystem
 from ..systems.varied import Varied, parameter_of, with_parameters
 from .coincidence import SAME
 from .cycle import LimitCycle, as_found, what_changed
-from .newton import FEW_STEPS, newton_steps
+from .newton import FEW_STEPS
 from .return_map import ReturnMap, Turn, turn_product
+from .shooting import newton_steps
 
 
 # Newton's method ends with a step this small, in sizes of the states; from the second number on,

@@ -7,7 +7,7 @@ attempt of another kind, such as a restart from a random state, is added there.
 import dataclasses
 import functools as ft
 import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,15 +22,13 @@ from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Lanes, side_by_side
-from ..engine.replay import Variation, linear_moves, recorded_moves
+from ..engine.replay import Variation
 from ..engine.watch import slopes
 from .crossing import ListLevels
 from .return_map import SINGULAR, ReturnMap, Turn, across
+from .shooting import ATOL, RTOL, excess, fixed_point, newton_steps, travel
 
 
-# Newton's method ends with a step below this, in sizes of the states and relative to the state.
-# Larger: it ends one step too early. Smaller: rounding keeps it from ending.
-_ATOL, _RTOL = 1e-12, 1e-11
 # Steps that a good guess needs: a continuation then takes longer steps, and a system of a sweep
 # that needs more waits for others. More: a continuation steps too far, and calls of a sweep run for
 # few of their systems. Fewer: steps stay short, and most systems wait.
@@ -139,25 +137,6 @@ def _solve_damped(map: ReturnMap) -> Solution:
     return Solution(map.departure(q), turn._replace(record=None), steps, map.judge(q, turn))
 
 
-def newton_steps(
-    jacobian: Float[np.ndarray, "S n n"],
-    residual: Float[np.ndarray, "S n"],
-    rcond: float = SINGULAR,
-) -> Float[np.ndarray, "S n"]:
-    """Newton steps of S systems of equations, on the host: the shortest ones for singular systems,
-    NaN for systems that are not finite."""
-    step = np.full(residual.shape, np.nan)
-    good = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
-    inverse = np.linalg.pinv(jacobian[good], rcond=rcond)
-    step[good] = -(inverse @ residual[good, :, None])[..., 0]
-    return step
-
-
-def excess(q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]) -> Float[np.ndarray, " S"]:
-    """The largest part of each step relative to the tolerance of `solve`, all in sizes."""
-    return np.max(np.abs(step) / (_ATOL + _RTOL * np.abs(q)), axis=1)
-
-
 def root(
     map: ReturnMap, damped: bool, max_steps: int
 ) -> tuple[Float[Array, " d"], Turn, Int[Array, ""]]:
@@ -172,52 +151,17 @@ def root(
 
 def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Newton's method with the steps and the test of optimistix."""
-    sizes, x, steps, moves = map.sizes, map.anchor.q[:, 0] / map.sizes, 0, None
+    sizes, x, steps, way = map.sizes, map.anchor.q[:, 0] / map.sizes, 0, None
     while True:
-        turn = map.turn_with_jacobian(x * sizes, moves=moves)
+        travelled = None if way is None else travel(map, x * sizes, way)
+        turn = map.turn_with_jacobian(x * sizes, travelled=travelled)
         residual = turn.residual / sizes
         (step,) = newton_steps((turn.jacobian * sizes / sizes[:, None])[None], residual[None])
         x, steps = x + step, steps + 1
-        done = excess(x[None], step[None])[0] < 1 and turn.distance < _ATOL
+        done = excess(x[None], step[None])[0] < 1 and turn.distance < ATOL
         if done or steps == max_steps or not np.isfinite(x).all():
             return x * sizes, turn, np.asarray(steps)
-        x, moves = _by_moves(map, turn, x, step)
-
-
-def _by_moves(map: ReturnMap, turn: Turn, x: np.ndarray, step: np.ndarray) -> tuple[Any, Any]:
-    """The fixed point, in sizes, of a turn that makes the recorded moves again, whatever happens on
-    the way, and these moves. Newton's method on the starts of all moves, which are computed
-    together (multiple shooting). Only x, where the first `step` has led, if the next ones do not
-    halve each time.
-    """
-    s, sizes, target, n = map.structure, map.sizes, map.ends(), 1 + map.structure.d
-    moves, first, last = recorded_moves(turn.legs, side_by_side(turn.tapes)), x, np.inf
-    x, begins = x - step, moves.order == 0
-    while True:
-        end, by = linear_moves(s, moves, target)
-        starts = np.concatenate([moves.t[None], moves.q]).T
-        # Defects, and the start of the turn, move the starts of later moves.
-        moved, columns = [np.zeros(n)], [np.eye(n, n - 1, -1)]
-        for k, by_start in enumerate(by[:, :, :n]):
-            defect = end[k] - starts[k + 1] if k + 1 < len(starts) else end[k]
-            moved.append(by_start @ moved[-1] + defect)
-            columns.append(by_start @ columns[-1])
-        off, held = map.held(x * sizes)
-        residual = np.where(map.valid, moved[-1][1:], 0.0) - x * sizes - off
-        jacobian = np.where(map.valid[:, None], columns[-1][1:], 0.0) - np.eye(n - 1) - held
-        jacobian = jacobian * sizes / sizes[:, None]
-        (step,) = newton_steps(jacobian[None], (residual / sizes)[None])
-        if not np.max(np.abs(step)) <= 0.5 * last or begins.sum() < len(target.time):
-            return first, None
-        x, last = x + step, np.max(np.abs(step))
-        shift = np.stack(moved[:-1]) + np.stack(columns[:-1]) @ (step * sizes)
-        h = (end + (by[:, :, :n] @ shift[:, :, None])[:, :, 0] - starts - shift)[:, 0]
-        if not (h >= 0).all():
-            return first, None
-        starts = starts + shift
-        moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
-        if excess(x[None], step[None])[0] < 1:
-            return x, (moves, by)
+        x, way = fixed_point(map, turn, x, step)
 
 
 def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
@@ -248,9 +192,9 @@ def _root(map, damped, max_steps):
     import optimistix as optx  # (a fifth of a second, as lineax below)
 
     if damped:
-        solver = optx.LevenbergMarquardt(rtol=_RTOL, atol=_ATOL)
+        solver = optx.LevenbergMarquardt(rtol=RTOL, atol=ATOL)
     else:
-        solver = optx.Newton(rtol=_RTOL, atol=_ATOL, linear_solver=_linear_solver())
+        solver = optx.Newton(rtol=RTOL, atol=ATOL, linear_solver=_linear_solver())
     solution = optx.root_find(
         _residual, solver, map.anchor.q[:, 0] / map.sizes, map,
         has_aux=True, max_steps=max_steps, throw=False,

@@ -22,20 +22,9 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.events import arm
-from ..engine.lanes import (
-    ARRIVE_TIME,
-    MOVE,
-    Lanes,
-    Tape,
-    for_each_chart,
-    only,
-    regrouped,
-    side_by_side,
-    start_lanes,
-)  # fmt: skip
-from ..engine.move import Options, flow_jacobian, follow, move, stride, tape_jacobian, through
-from ..engine.replay import Moves, projections
-from ..engine.search.attempt import deviation
+from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
+from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
+from ..engine.replay import projections
 from ..engine.search.state import Recorded
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
@@ -62,7 +51,7 @@ _FREE = 0.75
 SINGULAR = 1e-7
 # Largest distance, in sizes of the states, at which a turn closes. Smaller: rounding rejects cycles
 # of sweeps. Larger: turns that Newton's method has not finished are accepted.
-_CLOSED = 2e-8
+CLOSED = 2e-8
 # Multiple of the accuracy by which no state of an equilibrium moves. Smaller: an equilibrium passes
 # for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e3
@@ -110,7 +99,7 @@ class Turn(NamedTuple):
     @property
     def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
         """True if the turn ends at its beginning (also of many turns at once, on the host)."""
-        return self.distance <= _CLOSED
+        return self.distance <= CLOSED
 
 
 class ReturnMap(eqx.Module):
@@ -222,14 +211,14 @@ class ReturnMap(eqx.Module):
         wanted: Bool[Array, ""] | bool = True,
         record: Recorded | None = None,
         varied: Varied | None = None,
-        moves: tuple[Moves, Array] | None = None,
+        travelled: tuple | None = None,
     ) -> Turn:
         """One turn from a state on the section, with its derivatives.
 
         **Arguments:** `wanted`: whether derivatives with respect to the state are computed;
         otherwise they are meaningless. `record`: see `turn`. `varied`: the system with a parameter
         by which there are derivatives, too, at the same phase of the clock (on the host).
-        `moves`: those that are expected, and their derivatives; they are made side by side.
+        `travelled`: the turn, as by `travel`, and the largest gap in it (on the host).
         """
         s, xp, settings, each = self.structure, namespace(q), self.settings, self.each
 
@@ -245,8 +234,7 @@ class ReturnMap(eqx.Module):
 
         if on_host(q):  # (all pieces are linearized together)
             options = Options(True, new_input=False, tangents=wanted, at_once=varied is not None)
-            turn = None if moves is None else self._side_by_side(q, *moves, options)
-            end, (legs, _, tapes), *gap = turn or self.travel(q, options)
+            end, (legs, _, tapes), *gap = travelled or self.travel(q, options)
             recorded = None
         else:
             (end, (legs, factors, tapes, recorded)), gap = self.travel(q, flow, record), []
@@ -370,57 +358,6 @@ class ReturnMap(eqx.Module):
         residual = xp.where(self.valid, each(end.q.T), 0.0) - q - self.held(q)[0]
         residual = xp.where(same[..., None], residual, np.nan)
         return Return(residual, each(end.t - self.anchor.t), each(result)), extra
-
-    def _side_by_side(self, q: Array, moves: Moves, by: Array, options: Options) -> Any:
-        """A turn as by `travel`, with all of its expected moves side by side; None if they do not
-        follow each other: if one does not end as the next one begins. Also returns the largest gap
-        between them, in sizes of the states."""
-        s, ends, code, piece = self.structure, self.ends(), moves.code, moves.lane
-        later = np.append(moves.t[1:], np.inf)
-        time = np.where(
-            code == MOVE, later, np.where(code == ARRIVE_TIME, ends.time[piece], np.inf)
-        )
-        limit = np.where(np.isfinite(time), np.nextafter(time, np.inf), moves.t + 2 * moves.h)
-        index, event = (np.broadcast_to(x, LEGS)[piece] for x in (ends.index, ends.event))
-        event = np.where(code >= 0, code, event).astype(np.int32)
-        target = dataclasses.replace(ends, time=time, limit=limit, index=index, event=event)
-        lanes = start_lanes(s, moves.t, moves.chart.astype(np.int32), moves.q)
-        count = np.cumsum(code >= 0) - (code >= 0)
-        lanes = arm(s, lanes, self.watch(lanes, until(lanes.t)), self.expected)
-        lanes = lanes._replace(events=count.astype(np.int32))
-        lanes.armed[:, :1] = self.departure(q).armed
-        u = np.zeros((s.nu, len(code)))
-        # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
-        setout = stride(np.where(np.isfinite(time), 2.0, 1.01) * moves.h)._replace(lead=0 * moves.h)
-        if any(s.method(a).implicit for a in range(len(s.charts))):
-            along = deviation(s, lanes, self.settings)
-            for k in np.flatnonzero(code[:-1] < 0):
-                along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
-            setout = setout._replace(along=along)
-        source = np.array([s.chart_index(transition.source) for transition in s.transitions], int)
-        elsewhere = source[:, None] != lanes.chart[1:]  # (guards that no lane there meets)
-        for _ in range(2):
-            moved, tape = move(s, lanes, u, target, self.settings, setout, None, options)
-            end = moved.lanes
-            if same := ((end.armed[:, :-1] == lanes.armed[:, 1:]) | elsewhere).all():
-                break
-            lanes.armed[:, 1:] = end.armed[:, :-1]
-        pairs = (end.chart, lanes.chart), (end.events, lanes.events)
-        same = same and all((x[:-1] == y[1:]).all() for x, y in pairs)
-        gaps = np.abs(end.q[:, :-1] - lanes.q[:, 1:]).T / self.scale[lanes.chart[1:]]
-        gap = max(gaps.max(), np.abs(end.t[:-1] - lanes.t[1:]).max() / self.expected)
-        if not (same and (moved.result == Result.OK).all() and gap <= _CLOSED):
-            return None
-        begins = moves.order == 0
-        legs = jax.tree_util.tree_map(lambda x: x[..., begins], lanes)
-        stacked = lambda x: np.moveaxis(x, -1, 0)[..., None]  # noqa: E731
-        residual = np.where(self.valid, end.q[:, -1], 0.0) - q - self.held(q)[0]
-        residual = np.where(end.chart[-1] == self.anchor.chart, residual, np.nan)
-        turn = Return(residual, end.t[-1] - self.anchor.t[0], np.asarray(moved.result[-1]))
-        on_the_way = (tape.code == ARRIVE_TIME) & (code == MOVE)
-        tape = tape._replace(code=np.where(on_the_way, MOVE, tape.code))
-        tape = regrouped(tape, piece, legs)
-        return turn, jax.tree_util.tree_map(stacked, (legs, None, tape)), gap
 
     def pieces(self, tangents: bool = False) -> tuple[Lanes, Tape]:
         """The starts and tapes of the pieces of one turn."""

@@ -14,7 +14,7 @@ from hybridjax.engine.lanes import IDLE, start_lanes
 from hybridjax.engine.move import Options, move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
-from hybridjax.orbits.newton import _by_moves
+from hybridjax.orbits.shooting import fixed_point, travel
 from hybridjax.systems.structure import Structure
 
 from ..conftest import unchecked_host
@@ -110,10 +110,9 @@ def test_a_turn_with_its_moves_side_by_side(name):
         map = to_host(hj.find_limit_cycle(system).return_map)
         q, sizes, s = map.anchor.q[:, 0], map.sizes, map.structure
         turn = map.turn_with_jacobian(q)
-        x, moves = _by_moves(map, turn, q / sizes, 0 * q)
-        side = map._side_by_side(x * sizes, *moves, Options(True, new_input=False, tangents=True))
-        again = map.turn_with_jacobian(x * sizes, moves=moves)
-    assert side is not None
+        x, way = fixed_point(map, turn, q / sizes, 0 * q)
+        assert (travelled := travel(map, x * sizes, way)) is not None
+        again = map.turn_with_jacobian(x * sizes, travelled=travelled)
     assert [x for x in np.ravel(again.codes) if x >= 0] == [
         x for x in np.ravel(turn.codes) if x >= 0
     ]

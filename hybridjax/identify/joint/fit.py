@@ -29,8 +29,8 @@ from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
-from ..series.records import CycleGrid, PreparedRecords
-from ..series.residuals import about_answering, answering, depends_on_inputs
+from ..series.records import PreparedRecords
+from ..series.residuals import REMEDIES, UNSEEN, about_answering, about_misfit, answering
 from ..series.subspace import answers_at_once, default_horizon, subspace_model
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
@@ -54,21 +54,6 @@ _STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
 # errors are white and nothing answers). Smaller: multipliers of noise that is filtered by the
 # system, which looks like a response. Larger: weak responses are refused.
 _ANSWERED = 5.0
-# Advice where inputs answer residuals: for white noise, for innovations with D, and without.
-_REMEDIES = (
-    "the fit is biased; name their `reference`, or pass noise='innovations'",
-    "D is biased by a controller that answers at once; name their `reference`, or give a guess "
-    "with D = 0",
-    "D = 0 was taken; if outputs answer inputs at the same section, name their `reference`",
-)
-_UNSEEN = (
-    "outputs are correlated with inputs at the same section, so D was fitted: if a controller "
-    "causes the correlation, D is biased (then name its `reference`, or give a guess with D = 0)"
-)
-_MISFIT = (
-    "residuals depend on the inputs, so multipliers may be wrong by more than their standard "
-    "errors: give more dimensions{}, or another guess"
-)
 
 
 class LDTPFit(MultiplierEstimate):
@@ -276,17 +261,17 @@ def fit_ldtp(
         how = (innovations, start == "free", check)
         fit = _fit_to_series(records, guess, *how, direct)
         outside = grid = records.whole()
-        feedback = _UNSEEN * (innovations and direct and drive is None)
+        errors = lambda: cast(Predictor, fit.predictor).errors(grid, start == "free")  # noqa: E731
+        feedback = UNSEEN * (innovations and direct and drive is None)
         if drive is not None:
             outside = PreparedRecords(drive).whole()
-        elif answers := answering(grid, _errors(fit, grid, start), records.inputs):
+        elif answers := answering(grid, errors(), records.inputs):
             if innovations and direct and not isinstance(guess, LDTP):
                 fit, direct = _fit_to_series(records, guess, *how, False), False
-            remedy = _REMEDIES[innovations + (innovations and not direct)]
+            remedy = REMEDIES[innovations + (innovations and not direct)]
             feedback = about_answering(answers, remedy)
-        misfit = ""
-        if check and depends_on_inputs(outside, grid, _errors(fit, grid, start)):
-            misfit = _MISFIT.format("" if innovations else ", noise='innovations'")
+        misfit = about_misfit(outside, grid, errors(), innovations) if check else ""
+        if misfit:
             warnings.warn(f"Fit: {misfit}.", FindingWarning, stacklevel=3)
         return dataclasses.replace(fit, feedback=feedback, misfit=misfit)
     if reference is not None:
@@ -299,12 +284,6 @@ def fit_ldtp(
     if start == "cycle":
         raise DefinitionError("HTFs are of periodic responses, without a start: leave `start` out.")
     return _fit_to_htf(data, guess, check)
-
-
-def _errors(fit: LDTPFit, grid: CycleGrid, start: str) -> Float[np.ndarray, "S T N ny"]:
-    """Return the errors one step ahead; NaN where an output was not sampled."""
-    expected = cast(Predictor, fit.predictor).predict(grid, start == "free")
-    return np.where(grid.sampled, grid.y - expected, np.nan)
 
 
 def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:

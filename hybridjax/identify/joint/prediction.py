@@ -371,3 +371,7 @@ class Predictor(NamedTuple):
         ]
         expected = np.where(part.sampled, part.y - np.stack(path.error), np.stack(expected))
         return np.moveaxis(expected, 0, 2)
+
+    def errors(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "R T N ny"]:
+        """Return the errors of `predict`; NaN where an output was not sampled."""
+        return np.where(grid.sampled, grid.y - self.predict(grid, free_start), np.nan)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import special, stats
 
+from ..descent import ROUNDING
 from .output_error import RANK
 from .records import CycleGrid, lagged_inputs
 
@@ -20,9 +21,17 @@ _POWER = 0.8
 # reference at the same section. Smaller: controllers and weak feed-through pass. Larger: open loops
 # are refused.
 ANSWER = 1e-3
-# Residuals, relative to the outputs, that iterations leave of exact data. Smaller: such residuals
-# are taken for those of a wrong model. Larger: wrong models of nearly exact data pass.
-_ITERATED = 1e-9
+# Advice where inputs answer residuals: for white noise, for innovations with D, and without.
+REMEDIES = (
+    "the fit is biased; name their `reference`, or pass noise='innovations'",
+    "D is biased by a controller that answers at once; name their `reference`, or give a guess "
+    "with D = 0",
+    "D = 0 was taken; if outputs answer inputs at the same section, name their `reference`",
+)
+UNSEEN = (
+    "outputs are correlated with inputs at the same section, so D was fitted: if a controller "
+    "causes the correlation, D is biased (then name its `reference`, or give a guess with D = 0)"
+)
 
 
 def whiteness_test(
@@ -97,13 +106,14 @@ def independence_test(
 def is_exact(grid: CycleGrid, error: Float[np.ndarray, "S T N ny"]) -> Bool[np.ndarray, " ny"]:
     """Return whether the residuals of each output are only rounding, and tell nothing."""
     left = np.sqrt(np.nansum(error**2, axis=(0, 1, 2)) / (grid.y**2).sum(axis=(0, 1, 2)))
-    return left <= _ITERATED
+    return left <= 1e3 * ROUNDING  # (iterations leave as much of exact data)
 
 
-def depends_on_inputs(
-    outside: CycleGrid, grid: CycleGrid, error: Float[np.ndarray, "S T N ny"]
-) -> bool:
-    """Test whether residuals depend on inputs of the period before them.
+def about_misfit(
+    outside: CycleGrid, grid: CycleGrid, error: Float[np.ndarray, "S T N ny"], innovations: bool
+) -> str:
+    """Return a sentence about residuals that depend on inputs of the period before them; empty if
+    there are none.
 
     **Arguments:** `outside`: the inputs that do not respond to outputs. `error`: the residuals of
     `grid`, NaN where an output was not sampled.
@@ -111,7 +121,13 @@ def depends_on_inputs(
     S, T, N, ny = error.shape
     late = np.cumsum(grid.inside.reshape(S, -1), axis=1).reshape(S, T, N) > N
     p = independence_test(outside.u, np.where(late[..., None], error, np.nan), N, ANSWER)[1]
-    return bool(((p < ANSWER / ny) & ~is_exact(grid, error)).any())
+    if not ((p < ANSWER / ny) & ~is_exact(grid, error)).any():
+        return ""
+    remedies = "more dimensions" if innovations else "more dimensions, noise='innovations'"
+    return (
+        "residuals depend on the inputs, so multipliers may be wrong by more than their standard "
+        f"errors: give {remedies}, or another guess"
+    )
 
 
 def answering(
