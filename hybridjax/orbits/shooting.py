@@ -1,0 +1,138 @@
+"""Newton's method on the starts of all moves of a turn (multiple shooting), on the host.
+
+Near a turn that was recorded, all moves of the next one are computed side by side: first without
+decisions (`fixed_point`), then as the search would make them (`travel`). This takes a few calls of
+the kernels instead of one after the other for every step.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from .._core.results import Result
+from ..engine.events import arm, belongs
+from ..engine.lanes import ARRIVE_TIME, MOVE, regrouped, side_by_side, start_lanes
+from ..engine.move import Options, move, stride
+from ..engine.replay import Moves, linear_moves, recorded_moves
+from ..engine.search.attempt import deviation
+from ..engine.target import until
+from .return_map import CLOSED, LEGS, SINGULAR, Return, ReturnMap, Turn
+
+
+# Newton's method ends with a step below this, in sizes of the states and relative to the state.
+# Larger: it ends one step too early. Smaller: rounding keeps it from ending.
+ATOL, RTOL = 1e-12, 1e-11
+
+
+class Way(NamedTuple):
+    """A turn as it is expected."""
+
+    moves: Moves
+    by: Float[np.ndarray, "M n m"]
+    """Derivatives of (t, q) after each move by (t, q, u) before it."""
+
+
+def newton_steps(
+    jacobian: Float[np.ndarray, "S n n"],
+    residual: Float[np.ndarray, "S n"],
+    rcond: float = SINGULAR,
+) -> Float[np.ndarray, "S n"]:
+    """Newton steps of S systems of equations, on the host: the shortest ones for singular systems,
+    NaN for systems that are not finite."""
+    step = np.full(residual.shape, np.nan)
+    good = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
+    inverse = np.linalg.pinv(jacobian[good], rcond=rcond)
+    step[good] = -(inverse @ residual[good, :, None])[..., 0]
+    return step
+
+
+def excess(q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]) -> Float[np.ndarray, " S"]:
+    """The largest part of each step relative to the tolerance of `solve`, all in sizes."""
+    return np.max(np.abs(step) / (ATOL + RTOL * np.abs(q)), axis=1)
+
+
+def fixed_point(
+    map: ReturnMap, turn: Turn, x: Float[np.ndarray, " d"], step: Float[np.ndarray, " d"]
+) -> tuple[Float[np.ndarray, " d"], Way | None]:
+    """The state, in sizes, from which a turn with the recorded moves returns to itself, and these
+    moves; only x, to which the first `step` has led, if later steps do not halve each time.
+
+    Each move does what it did, whatever happens on the way: `travel` tells whether that is right.
+    """
+    s, sizes, target, n = map.structure, map.sizes, map.ends(), 1 + map.structure.d
+    moves, first, last = recorded_moves(turn.legs, side_by_side(turn.tapes)), x, np.inf
+    x, unit = x - step, np.eye(n - 1)
+    while True:
+        end, by = linear_moves(s, moves, target)
+        starts = np.concatenate([moves.t[None], moves.q]).T
+        gaps = np.concatenate([end[:-1] - starts[1:], end[-1:]])
+        # Changes of later starts by the state at the first one, and in the last column by the gaps.
+        changes = [np.eye(n, k=-1)]
+        for of_move, gap in zip(by[:, :, :n], gaps, strict=True):
+            changes.append(of_move @ changes[-1])
+            changes[-1][:, -1] += gap
+        off, held = map.held(x * sizes)
+        residual = np.where(map.valid, changes[-1][1:, -1], 0.0) - x * sizes - off
+        jacobian = np.where(map.valid[:, None], changes[-1][1:, :-1], 0.0) - unit - held
+        jacobian = jacobian * sizes / sizes[:, None]
+        (step,) = newton_steps(jacobian[None], (residual / sizes)[None])
+        shift = np.stack(changes[:-1]) @ np.append(step * sizes, 1.0)
+        h = (end + (by[:, :, :n] @ shift[:, :, None])[:, :, 0] - starts - shift)[:, 0]
+        halves = np.max(np.abs(step)) <= 0.5 * last
+        if not (halves and (h >= 0).all() and (moves.order == 0).sum() == LEGS):
+            return first, None
+        x, last, starts = x + step, np.max(np.abs(step)), starts + shift
+        moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
+        if excess(x[None], step[None])[0] < 1:
+            return x, Way(moves, by)
+
+
+def travel(map: ReturnMap, q: Float[np.ndarray, " d"], way: Way) -> tuple | None:
+    """A turn, as by `ReturnMap.travel`, and the largest gap between its moves, in sizes of the
+    states. Each move is a lane of one search; None if one does not end as the next one begins."""
+    s, ends, moves = map.structure, map.ends(), way.moves
+    code, piece, later = moves.code, moves.lane, np.append(moves.t[1:], np.inf)
+    time = np.where(code == ARRIVE_TIME, ends.time[piece], np.where(code == MOVE, later, np.inf))
+    timed = np.isfinite(time)
+    index, event = (np.broadcast_to(x, LEGS)[piece] for x in (ends.index, ends.event))
+    target = dataclasses.replace(
+        ends, time=time, index=index, event=np.where(code >= 0, code, event).astype(np.int32),
+        limit=np.where(timed, np.nextafter(time, np.inf), moves.t + 2 * moves.h),
+    )  # fmt: skip
+    lanes = start_lanes(s, moves.t, moves.chart.astype(np.int32), moves.q)
+    lanes = arm(s, lanes, map.watch(lanes, until(lanes.t)), map.expected)
+    lanes = lanes._replace(events=(np.cumsum(code >= 0) - (code >= 0)).astype(np.int32))
+    lanes.armed[:, :1] = map.departure(q).armed
+    # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
+    setout = stride(np.where(timed, 2.0, 1.01) * moves.h)._replace(lead=0 * moves.h)
+    if any(s.method(a).implicit for a in range(len(s.charts))):
+        along = deviation(s, lanes, map.settings)
+        for k in np.flatnonzero(code[:-1] < 0):
+            along[:, k + 1] = way.by[k, 1:, 1 : 1 + s.d] @ along[:, k]
+        setout = setout._replace(along=along)
+    u, options = np.zeros((s.nu, len(code))), Options(True, new_input=False, tangents=True)
+    for _ in range(2):
+        moved, tape = move(s, lanes, u, target, map.settings, setout, None, options)
+        end, in_chart = moved.lanes, belongs(s, lanes.chart)[:-1, 1:]
+        same = (end.armed[:, :-1] == lanes.armed[:, 1:])[in_chart].all()
+        if same:
+            break
+        lanes.armed[:, 1:] = end.armed[:, :-1]
+    for ended, begun in ((end.chart, lanes.chart), (end.events, lanes.events)):
+        same = same and (ended[:-1] == begun[1:]).all()
+    gaps = np.abs(end.q[:, :-1] - lanes.q[:, 1:]).T / map.scale[lanes.chart[1:]]
+    gap = max(gaps.max(), np.abs(end.t[:-1] - lanes.t[1:]).max() / map.expected)
+    if not (same and (moved.result == Result.OK).all() and gap <= CLOSED):
+        return None
+    residual = np.where(map.valid, end.q[:, -1], 0.0) - q - map.held(q)[0]
+    residual = np.where(end.chart[-1] == map.anchor.chart, residual, np.nan)
+    assert tape is not None
+    turn = Return(residual, end.t[-1] - map.anchor.t[0], np.asarray(moved.result[-1]))
+    legs = jax.tree_util.tree_map(lambda x: x[..., moves.order == 0], lanes)
+    on_the_way = (tape.code == ARRIVE_TIME) & (code == MOVE)
+    tape = regrouped(tape._replace(code=np.where(on_the_way, MOVE, tape.code)), piece, legs)
+    stacked: Any = lambda x: np.moveaxis(x, -1, 0)[..., None]  # noqa: E731
+    return turn, jax.tree_util.tree_map(stacked, (legs, None, tape)), gap
