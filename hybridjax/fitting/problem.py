@@ -17,6 +17,7 @@ from .._core.results import Result
 from ..errors import DefinitionError
 from ..identify.weights import estimated_noise
 from ..orbits.cycle import LimitCycle
+from ..orbits.linear_flow import last_turn
 from ..orbits.newton import MAX_STEPS as NEWTON_STEPS, root, solve
 from ..systems.system import HybridSystem, arrays_of
 from ..systems.varied import parameter_of, with_parameters
@@ -161,7 +162,7 @@ def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
         q, turn, steps = root(map, False, NEWTON_STEPS)
         period, anchor = map.turn(q, turn.record).period, map.departure(q)
     else:
-        anchor, turn, steps, _ = solve(map, True, False)
+        anchor, turn, steps, _ = solve(map, True, False, last_turn(guess))
         period = turn.period
     period = map.expected if map.base is None else period
     code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
-from .._core.executor import is_traced, to_host
+from .._core.executor import is_hidden, is_traced, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
@@ -28,7 +28,7 @@ from .crossing import AtEvent, Crossing
 from .curve import away_from_events
 from .cycle import LimitCycle
 from .guess import return_map_near
-from .linear_flow import keep_turn
+from .linear_flow import keep_turn, last_turn
 from .newton import Solution, search, solve
 from .return_map import PATIENCE, ReturnMap
 from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_on, stiff_charts
@@ -150,12 +150,13 @@ def find_limit_cycle(
             s, guess, section, multiplicity or 1, settle, max_period, settings, given
         )
     map = dataclasses.replace(map, conserved={k: real(v) for k, v in (conserved or {}).items()})
+    near = last_turn(guess) if isinstance(guess, LimitCycle) and not is_hidden(guess) else None
     if isinstance(guess, LimitCycle) and traced:
-        return _cycle(map, solve(map, True), guess.event_sequence)
+        return _cycle(map, solve(map, True, True, near), guess.event_sequence)
     s.resolve_outputs(tuple(map.conserved)).require(int(np.asarray(map.anchor.chart)[0]))
     if isinstance(map.base, AtEvent) and not isinstance(guess, LimitCycle):
         check_begin(map)
-    solution = search(map, patient)
+    solution = search(map, patient, near)
     if int(solution.result) == Result.NOT_CONVERGED and isinstance(guess, LimitCycle):
         distant = away_from_events(guess).return_map.at_phase_of(system)
         if float(distant.anchor.t[0]) != float(map.anchor.t[0]):

@@ -7,7 +7,7 @@ attempt of another kind, such as a restart from a random state, is added there.
 import dataclasses
 import functools as ft
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -58,11 +58,12 @@ class Solution(NamedTuple):
         return int(self.result) in (Result.OK, Result.SINGULAR)
 
 
-def search(map: ReturnMap, patient: bool = False) -> Solution:
+def search(map: ReturnMap, patient: bool = False, near: Any = None) -> Solution:
     """Newton's method from the anchor's state; where it fails, with another period, then with the
-    smaller steps of Levenberg and Marquardt. If `patient`, it ends at the limit on steps."""
+    smaller steps of Levenberg and Marquardt. If `patient`, it ends at the limit on steps. `near`:
+    see `solve`."""
     say("Newton's method")
-    solution = solve(map)
+    solution = solve(map, False, True, near)
     if int(solution.result) == Result.EXTRA_TURNS:
         turn = solution.turn
         expected = turn.period * map.multiplicity / turn.meetings
@@ -76,8 +77,8 @@ def search(map: ReturnMap, patient: bool = False) -> Solution:
     return solution
 
 
-def _solve(map: ReturnMap, once_more: bool = False, factors: bool = True) -> Solution:
-    q, turn, steps = root(map, False, MAX_STEPS)
+def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
+    q, turn, steps = root(map, False, MAX_STEPS, near)
     if once_more and not on_host(q):  # (where the host's last turn begins, a step is rounding)
         turn = map.turn_with_jacobian(q, record=turn.record)
     return Solution(map.departure(q), turn._replace(record=None), steps, map.judge(q, turn))
@@ -86,7 +87,7 @@ def _solve(map: ReturnMap, once_more: bool = False, factors: bool = True) -> Sol
 def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solution]:
     """`solve` on the host, and its derivatives: implicit ones of the state, then those of the
     recorded turn."""
-    (map, *_, factors), (by, *_), solution = arguments, directions, _solve(*arguments)
+    (map, _, factors, _), (by, *_), solution = arguments, directions, _solve(*arguments)
     turn, ends, sizes = solution.turn, map.ends(), map.sizes
     if map.conserved or not solution.is_fixed_point:
         raise NotOnHostError
@@ -122,13 +123,17 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
 
 
 @ft.partial(host_first, derived=ft.partial(by_columns, along=_solve_along))
-def solve(map: ReturnMap, once_more: bool = False, factors: bool = True) -> Solution:
+def solve(
+    map: ReturnMap, once_more: bool = False, factors: bool = True, near: Any = None
+) -> Solution:
     """Newton's method from the anchor's state.
 
-    **Arguments:** `once_more`: whether to compute one more turn on the cycle, so that the result
-    has the derivatives of the cycle. `factors`: whether its pieces have them, too.
+    **Arguments:** (All of them are needed for derivatives.) `once_more`: whether to compute one
+    more turn on the cycle, so that the result has the derivatives of the cycle. `factors`: whether
+    its pieces have them, too. `near`: the pieces of a similar cycle's turn and their tapes, side by
+    side, with which the host begins.
     """
-    return _solve(map, once_more)
+    return _solve(map, once_more, factors, near)
 
 
 @host_first
@@ -138,7 +143,7 @@ def _solve_damped(map: ReturnMap) -> Solution:
 
 
 def root(
-    map: ReturnMap, damped: bool, max_steps: int
+    map: ReturnMap, damped: bool, max_steps: int, near: Any = None
 ) -> tuple[Float[Array, " d"], Turn, Int[Array, ""]]:
     """The fixed point of the return map, the turn from it, and the number of steps.
 
@@ -146,12 +151,14 @@ def root(
     """
     if not on_host(map.expected):
         return _root(map, damped, max_steps)
-    return (_damped_on_host if damped else _root_on_host)(map, max_steps)
+    return _damped_on_host(map, max_steps) if damped else _root_on_host(map, max_steps, near)
 
 
-def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
+def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Newton's method with the steps and the test of optimistix."""
     sizes, x, steps, way = map.sizes, map.anchor.q[:, 0] / map.sizes, 0, None
+    if near is not None:
+        x, way = fixed_point(map, near, x)
     while True:
         travelled = None if way is None else travel(map, x * sizes, way)
         turn = map.turn_with_jacobian(x * sizes, travelled=travelled)
@@ -161,7 +168,7 @@ def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.
         done = excess(x[None], step[None])[0] < 1 and turn.distance < ATOL
         if done or steps == max_steps or not np.isfinite(x).all():
             return x * sizes, turn, np.asarray(steps)
-        x, way = fixed_point(map, turn, x, step)
+        x, way = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), x)
 
 
 def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:

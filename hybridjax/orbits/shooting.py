@@ -14,12 +14,12 @@ from jaxtyping import Float
 
 from .._core.results import Result
 from ..engine.events import arm, belongs
-from ..engine.lanes import ARRIVE_TIME, MOVE, regrouped, side_by_side, start_lanes
+from ..engine.lanes import ARRIVE_TIME, MOVE, Lanes, Tape, regrouped, start_lanes
 from ..engine.move import Options, move, stride
 from ..engine.replay import Moves, linear_moves, recorded_moves
 from ..engine.search.attempt import deviation
 from ..engine.target import until
-from .return_map import CLOSED, LEGS, SINGULAR, Return, ReturnMap, Turn
+from .return_map import CLOSED, LEGS, SINGULAR, Return, ReturnMap
 
 
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
@@ -55,22 +55,25 @@ def excess(q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]) -> Float
 
 
 def fixed_point(
-    map: ReturnMap, turn: Turn, x: Float[np.ndarray, " d"], step: Float[np.ndarray, " d"]
+    map: ReturnMap, turn: tuple[Lanes, Tape], otherwise: Float[np.ndarray, " d"]
 ) -> tuple[Float[np.ndarray, " d"], Way | None]:
     """The state, in sizes, from which a turn with the recorded moves returns to itself, and these
-    moves; only x, to which the first `step` has led, if later steps do not halve each time.
+    moves; `otherwise` and no moves, if steps do not halve each time.
+
+    **Arguments:** `turn`: the pieces of a turn and their tapes, side by side.
 
     Each move does what it did, whatever happens on the way: `travel` tells whether that is right.
     """
     s, sizes, target, n = map.structure, map.sizes, map.ends(), 1 + map.structure.d
-    moves, first, last = recorded_moves(turn.legs, side_by_side(turn.tapes)), x, np.inf
-    x, unit = x - step, np.eye(n - 1)
+    moves, last, unit = recorded_moves(*turn), np.inf, np.eye(n - 1)
+    x = moves.q[:, 0] / sizes
     while True:
         end, by = linear_moves(s, moves, target)
         starts = np.concatenate([moves.t[None], moves.q]).T
         gaps = np.concatenate([end[:-1] - starts[1:], end[-1:]])
         # Changes of later starts by the state at the first one, and in the last column by the gaps.
         changes = [np.eye(n, k=-1)]
+        changes[0][0, -1] = map.anchor.t[0] - starts[0, 0]
         for of_move, gap in zip(by[:, :, :n], gaps, strict=True):
             changes.append(of_move @ changes[-1])
             changes[-1][:, -1] += gap
@@ -83,7 +86,7 @@ def fixed_point(
         h = (end + (by[:, :, :n] @ shift[:, :, None])[:, :, 0] - starts - shift)[:, 0]
         halves = np.max(np.abs(step)) <= 0.5 * last
         if not (halves and (h >= 0).all() and (moves.order == 0).sum() == LEGS):
-            return first, None
+            return otherwise, None
         x, last, starts = x + step, np.max(np.abs(step)), starts + shift
         moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
         if excess(x[None], step[None])[0] < 1:
@@ -123,8 +126,9 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], way: Way) -> tuple | None
         lanes.armed[:, 1:] = end.armed[:, :-1]
     for ended, begun in ((end.chart, lanes.chart), (end.events, lanes.events)):
         same = same and (ended[:-1] == begun[1:]).all()
-    gaps = np.abs(end.q[:, :-1] - lanes.q[:, 1:]).T / map.scale[lanes.chart[1:]]
-    gap = max(gaps.max(), np.abs(end.t[:-1] - lanes.t[1:]).max() / map.expected)
+    late = np.append(map.anchor.t, end.t[:-1]) - lanes.t
+    apart = np.column_stack([q, end.q[:, :-1]]) - lanes.q
+    gap = max(np.abs(late / map.expected).max(), np.abs(apart.T / map.scale[lanes.chart]).max())
     if not (same and (moved.result == Result.OK).all() and gap <= CLOSED):
         return None
     residual = np.where(map.valid, end.q[:, -1], 0.0) - q - map.held(q)[0]

@@ -10,7 +10,7 @@ import hybridjax as hj
 from hybridjax._core import compilation
 from hybridjax._core.compilation import quick_jit
 from hybridjax._core.executor import from_host, on_host, to_host
-from hybridjax.engine.lanes import IDLE, start_lanes
+from hybridjax.engine.lanes import IDLE, side_by_side, start_lanes
 from hybridjax.engine.move import Options, move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
@@ -110,7 +110,7 @@ def test_a_turn_with_its_moves_side_by_side(name):
         map = to_host(hj.find_limit_cycle(system).return_map)
         q, sizes, s = map.anchor.q[:, 0], map.sizes, map.structure
         turn = map.turn_with_jacobian(q)
-        x, way = fixed_point(map, turn, q / sizes, 0 * q)
+        x, way = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), q / sizes)
         assert (travelled := travel(map, x * sizes, way)) is not None
         again = map.turn_with_jacobian(x * sizes, travelled=travelled)
     assert [x for x in np.ravel(again.codes) if x >= 0] == [
