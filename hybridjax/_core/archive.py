@@ -169,6 +169,7 @@ def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
     kind = header.get("kind")
     if not isinstance(kind, str) or kind not in kinds:
         raise FileFormatError(f"'{path}' holds a {kind!r}; `load` reads {', '.join(kinds)} only.")
+    header.setdefault("units", {})  # (files written before units were kept)
     if not all(isinstance(header.get(part), dict) for part in ("static", "arrays", "units")):
         raise damaged(path, "its header is incomplete")
     return header

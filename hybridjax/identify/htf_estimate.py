@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, SignalNames
+from .._core.boundary.kinds import Count, Probability, SignalNames
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
@@ -31,6 +31,7 @@ def estimate_htf(
     *,
     repeats: Count = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
+    threshold: Probability = SILENT_LINE,
     reference: SignalNames | None = None,
 ) -> HTF:
     """Estimate all harmonic transfer functions at all frequencies that the inputs excite.
@@ -59,6 +60,8 @@ def estimate_htf(
     - `variance`: "noise" is computed from the repeats, "total" from the realizations; each raises
       an error if it is not available. "auto" is "total" if available, else "noise". Default:
       "auto".
+    - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
+      Raise it where the recorded input is noisy. Default: 1e-6.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the HTFs are those of the plant from these to the outputs, and noise that
       the controller feeds back does not bias them (`identify/instrument.py`). References have to
@@ -79,9 +82,9 @@ def estimate_htf(
         )
     require_x64()
     if reference is not None:
-        htf = htf_by_reference(data, reference, repeats=repeats, variance=variance)
+        htf = htf_by_reference(data, reference, repeats, variance, threshold)
         return htf if harmonics is None else htf.select(harmonics)
-    sums = spectral_sums(data, harmonics, repeats=repeats)
+    sums = spectral_sums(data, harmonics, threshold=threshold, repeats=repeats)
     rows = np.flatnonzero(sums.solvable())
     setup, (tried, ran) = sums.setup, sums.experiments
     if len(rows) == 0:

@@ -128,9 +128,9 @@ def spectral_products(data: ExperimentData, repeats: int) -> Sums:
 def htf_by_reference(
     data: Experiments,
     reference: Sequence[str],
-    *,
-    repeats: int = 1,
-    variance: Literal["auto", "noise", "total"] = "auto",
+    repeats: int,
+    variance: Literal["auto", "noise", "total"],
+    threshold: float,
 ) -> HTF:
     """Return the HTFs of the plant, with all harmonics; see `estimate_htf`.
 
@@ -150,17 +150,19 @@ def htf_by_reference(
     if total is None or not total.experiments:
         raise DefinitionError("`data` holds no experiment that ran well: see `data.summary()`.")
     inputs, references = (tuple(total.setup.inputs[i] for i in part) for part in roles)
-    return solve(total, total.setup.outputs, inputs, references, (repeats, variance))
+    return solve(total, total.setup.outputs, inputs, references, (repeats, variance), threshold)
 
 
-def excited_classes(sums: Sums, r: Int[np.ndarray, " c"]) -> Int[np.ndarray, " k"]:
+def excited_classes(
+    sums: Sums, r: Int[np.ndarray, " c"], threshold: float
+) -> Int[np.ndarray, " k"]:
     """Return the classes in which all lines of all references, of the rows r, are excited.
 
     **Raises:** `DefinitionError` if there is none.
     """
     power = sums.total[:, r[:, None], r]
     size = np.sqrt(np.einsum("kii->ki", power).real)
-    strong = size > SILENT_LINE * size.max()
+    strong = size > threshold * size.max()
     scale = np.where(strong, size, 1)
     least = np.linalg.eigvalsh(power / scale[:, :, None] / scale[:, None])[:, 0]
     whole = strong.all(axis=1) & (least > SILENT_LINE)
@@ -181,13 +183,14 @@ def solve(
     inputs: tuple[str, ...],
     references: Sequence[str],
     how: tuple[int, str],
+    threshold: float = SILENT_LINE,
 ) -> HTF:
     """Return the HTFs from the inputs to the outputs in the classes that the references excite.
 
     **Raises:** `DefinitionError` if there are none, or the inputs do not answer the references.
     """
     y, u, r = map(sums.rows, (outputs, inputs, references))
-    classes, (N, P, *_) = excited_classes(sums, r), sums.setup
+    classes, (N, P, *_) = excited_classes(sums, r, threshold), sums.setup
     G, (repeats, kind) = sums.total[classes], how
 
     def block(rows, columns, G=G):

@@ -25,7 +25,7 @@ Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(Experi
 # Largest change of a line of the input from one window to the next, relative to the largest line.
 # Smaller: recorded inputs with noise are refused; larger: inputs of another period pass.
 _REPEATS = 1e-2
-# Part of the largest line of an input below which a line is not excited.
+# Part of the largest line of an input below which a line is not excited, where nobody chose it.
 # Smaller: rounding counts as a line; larger: weak lines are missed.
 SILENT_LINE = 1e-6
 # Signals whose crest factors are tested, at most, redraws of the phases of each, and its fewest
@@ -89,7 +89,11 @@ class SpectralSums(NamedTuple):
 
 
 def spectral_sums(
-    data: Experiments, harmonics: Harmonics | None, *, repeats: int = 1
+    data: Experiments,
+    harmonics: Harmonics | None,
+    *,
+    threshold: float = SILENT_LINE,
+    repeats: int = 1,
 ) -> SpectralSums:
     """Return the sums over all experiments, which may come in parts.
 
@@ -107,7 +111,7 @@ def spectral_sums(
                 f"{total.setup}, {setup}."
             )
         chosen = () if harmonics == () else check_harmonics(harmonics, part.n_sections)
-        sums = _sums_of_part(part, setup, chosen, repeats, count)
+        sums = _sums_of_part(part, setup, chosen, threshold, repeats, count)
         total = sums if total is None else _add(total, sums)
         count += len(part.ok)
     if total is None:
@@ -121,12 +125,13 @@ def _sums_of_part(
     data: ExperimentData,
     setup: Setup,
     harmonics: tuple[int, ...],
+    threshold: float,
     repeats: int,
     first: int,
 ) -> SpectralSums:
     """Return the sums over one part, whose first experiment has the number `first`."""
     windows = data.windows(repeats)
-    experiment, line, U = _excited(data, windows, first)
+    experiment, line, U = _excited(data, windows, threshold, first)
     lines, index = np.unique(line, return_inverse=True)
     good = data.ok[experiment]
 
@@ -174,7 +179,7 @@ def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmo
     return mean, spread / max(len(Y) - 1, 1) / len(Y)
 
 
-def _excited(data: ExperimentData, windows: list[slice], first: int):
+def _excited(data: ExperimentData, windows: list[slice], threshold: float, first: int):
     """Return experiment, line and U of every excited line, checked that they do not meet."""
     u = np.where(np.isfinite(data.u).all(axis=(1, 2), keepdims=True), data.u, 0.0)
     spectra = np.stack([np.fft.rfft(u[:, window], axis=1) for window in windows])
@@ -182,13 +187,13 @@ def _excited(data: ExperimentData, windows: list[slice], first: int):
     size = np.abs(U)
     peak = size.max(axis=(1, 2), keepdims=True)
     worst = float(np.max(np.abs(spectra - U) / np.where(peak > 0, peak, 1)))
-    if worst > _REPEATS:
+    if worst > max(threshold, _REPEATS):
         raise DefinitionError(
             f"the input does not repeat: its last {len(windows)} windows of P = {data.periods} "
             f"periods differ by {worst:.2g} of the largest line. Take fewer `repeats`, or the "
             "right number of periods."
         )
-    excited = ((size > SILENT_LINE * peak) & (size > ROUNDING * peak.max())).any(axis=2)
+    excited = ((size > threshold * peak) & (size > ROUNDING * peak.max())).any(axis=2)
     experiment, line = np.nonzero(excited)
     check_sharing(experiment + first, line, data.periods)
     return experiment, line, U[experiment, line]

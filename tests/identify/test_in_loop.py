@@ -88,6 +88,19 @@ def test_plant_and_controller_of_exact_data(plant):
     assert one.controller is None and "controller is not estimated" in repr(one)
 
 
+def test_faint_lines_of_a_reference_are_left_out(plant):
+    design = hj.multisine(N, 8, band=(0, N / 2), amplitude=1.0).realizations(6, 0)
+    r, faint = design.inputs(208)[..., 0], np.ones(8 * N)
+    faint[3::8] = faint[5::8] = 1e-3  # (the class 3/8 + integers)
+    u, y = run(plant, r, 0 * r, np.random.default_rng(0))
+    u, r, y = (np.fft.ifft(faint * np.fft.fft(z[:, -8 * N :])).real for z in (u, r, y))
+    inputs = np.stack([u, r], axis=2)
+    data = hj.ExperimentData(inputs, y[..., None], n_sections=N, periods=8, inputs=("u", "r"))
+    for lines, threshold in ((12, 1e-4), (8, 1e-2)):
+        htf = hj.estimate_htf(data, reference="r", threshold=threshold)
+        assert len(htf.f) == lines and htf.error(plant.htf(htf.f)) < 1e-9
+
+
 def test_discs_and_multipliers_of_transfer_functions_hold(plant):
     truth, held, regions = None, [], []
     for seed in range(20):

@@ -182,8 +182,8 @@ def check_sharing(
         if count > most:
             hint = (
                 f" ({count} lines are excited, and no experiment can hold more than {most}: a "
-                f"recorded input must repeat after P = {periods} periods, with little "
-                "noise, and one that a controller makes needs its `reference`)"
+                f"recorded input must repeat after P = {periods} periods, with noise below "
+                "`threshold`, and one that a controller makes needs its `reference`)"
             )
         raise DefinitionError(
             f"experiment {number}: {reason}, so their responses fall on the same frequencies; "
