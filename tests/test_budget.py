@@ -27,11 +27,12 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 1150 lines are the algebra of HTFs, loops and
 # delays, 1160 the responses of cycles with noise, coupling and symmetry in time, 770 populations of
 # subjects, 980 motion and sliders, 610 simulators of others, 70 sweeps on the host, 60 comparisons
-# with higher orders; of the tests, 1900 are those of all, 70 of orders of names and samples. (The
+# with higher orders, 105 turns with all moves side by side and fits that doubt themselves; of the
+# tests, 1900 are those of all, 70 of orders of names and samples. (The
 # thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 28_812,
-    "files": 243,
+    "code": 28_963,
+    "files": 244,
     "longest": 500,
     "public_names": 185,
     "many_parameters": 8,
@@ -39,8 +40,8 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_895,
-    "doc_words": 40_876,
+    "test_lines": 17_923,
+    "doc_words": 40_878,
 }
 
 
