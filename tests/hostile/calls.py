@@ -78,7 +78,6 @@ def cycles(t):
     yield t.cycle.fluctuations, dict(white={"v": 0.1}, guards={}, resets={})
     yield t.cycle.sensitivity("mu").shape, dict(phase=np.array([0.3]))
     yield t.branch.__getitem__, dict(k=0)
-    yield t.branch.find, dict(kind="fold")
     yield t.branch.largest, dict(output="x")
 
 
