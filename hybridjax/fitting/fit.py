@@ -16,6 +16,7 @@ from ..errors import ComputationError, DefinitionError
 from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
+from ..orbits.guess import require_similar
 from ..systems.system import Guess, HybridSystem
 from .model_fit import Identifiability, ModelFit, ParameterGuess, diagnose
 from .observations import AbstractObservation
@@ -134,6 +135,7 @@ def _prepare(
         raise DefinitionError("`data` must be one observation or more, not an empty list.")
     parameters = free_parameters(system, free, observations)
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
+    require_similar(near.return_map, system)
     moved = away_from_events(near)
     if moved is not near:
         near = find_limit_cycle(near.system, moved, settings=near.settings)

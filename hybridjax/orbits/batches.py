@@ -26,6 +26,7 @@ from ..engine.target import toward, until
 from ..systems.system import HybridSystem
 from .coincidence import together
 from .crossing import AtEvent, to_section
+from .guess import require_similar
 from .newton import FEW_STEPS, USUAL_STEPS
 from .return_map import ReturnMap, Turn
 from .scale import ROUNDING
@@ -339,6 +340,9 @@ def tiles_of(
     systems: HybridSystem, map: ReturnMap, size: int | None, workers: int, total: int
 ) -> Tiles:
     """Systems, of so many in `total`, and how they are solved."""
+    arrays, static = eqx.partition(systems, eqx.is_array)
+    first = eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static)
+    require_similar(map, first)
     large, periods = total > SMALL, None
     if map.base is None:
         of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731

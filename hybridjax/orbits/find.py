@@ -27,7 +27,7 @@ from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
 from .curve import away_from_events
 from .cycle import LimitCycle
-from .guess import return_map_near
+from .guess import require_similar, return_map_near
 from .linear_flow import keep_turn, last_turn
 from .newton import Solution, search, solve
 from .return_map import PATIENCE, ReturnMap
@@ -248,6 +248,7 @@ def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) 
 
 def _check_fits(guess: LimitCycle, s: Structure, multiplicity: int | None, waits: bool) -> None:
     """**Raises:** `DefinitionError` for arguments that contradict a cycle as the guess."""
+    require_similar(guess.return_map, s.system)
     if multiplicity not in (None, guess.multiplicity):
         raise DefinitionError(
             f"the guess has multiplicity {guess.multiplicity}, not {multiplicity}: give a Guess."

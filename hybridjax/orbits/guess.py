@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._core.arguments import require_equal
 from .._core.compilation import host_first
 from .._core.executor import from_host, namespace, to_host
 from .._core.precision import real
@@ -21,7 +22,7 @@ from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
 from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure
-from ..systems.system import Guess
+from ..systems.system import Guess, HybridSystem
 from .checks import check_times
 from .coincidence import SAME
 from .crossing import AtEvent, Crossing, to_section
@@ -188,3 +189,10 @@ def _moved(map: ReturnMap, lanes: Lanes, target: Target) -> Moved:
     settings = dataclasses.replace(map.settings, max_steps=1_000_000)
     u = namespace(lanes.t).zeros((map.structure.nu, 1))
     return move(map.structure, lanes, u, target, settings).moved
+
+
+def require_similar(guess: ReturnMap, system: HybridSystem) -> None:
+    """**Raises:** `DefinitionError` if the cycle of a map cannot be a guess for another system."""
+    maps = guess, dataclasses.replace(guess, system=system)
+    sizes = [(len(x.structure.charts), x.structure.d) for x in maps]
+    require_equal("`guess` (a cycle) and the system", "numbers of charts and states", *sizes)

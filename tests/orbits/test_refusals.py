@@ -54,6 +54,18 @@ def test_a_ball_does_not_fall_through_the_floor():
     assert path.result == hj.Result.GUARD_PASSED and len(path.events) == 1
 
 
+def test_a_cycle_of_another_kind_is_no_guess(hopper_cycle):
+    refused = pytest.raises(hj.DefinitionError, match=r"charts and states: \(2, 4\) and \(1, 2\)")
+    juggler = hj.models.PaddleJuggler()
+    with refused:
+        hj.find_limit_cycle(juggler, hopper_cycle)
+    with refused:
+        hj.sweep(juggler, {"restitution": [0.7, 0.8]}, guess=hopper_cycle)
+    with refused:
+        data = hj.ObservedCycle(hj.ClockPhase(1), period=1.0)
+        hj.fit_model(juggler, data, "g", guess=hopper_cycle)
+
+
 def test_a_cycle_as_the_guess_begins_at_the_same_phase(hopper_cycle):
     """Of the clock of the other system."""
     slower = hj.models.VerticalHopper(omega=2 * jnp.pi / 1.05)
