@@ -160,7 +160,7 @@ def test_vicon(tmp_path, separator):
         ("time,a\n0,1\n1,x\n", "line 3: column 'a' holds 'x', which is not a number"),
         ("time,a\n0,1\n1\n", "line 3: 1 fields, but the header names 2"),
         ("time,a,a\n0,1,1\n1,2,2\n", "two columns 'a'"),
-        ("t,a\n0,1\n1,2\n", "no column 'time'; its columns are t, a"),
+        ("t,a\n0,1\n1,2\n", "no column 'time': choose `time` from t, a"),
         ("time,a\n0,5,1,2\n1,5,1,3\n", "line 2: 4 fields, .* another separator"),
         ("time;a\n0,5;1\n1.5;2\n", "line 3: there are points beside"),
         ("Subject 3\ntime,a\n0,1\n1,2\n", "fields, but the header names 1|is not a number"),

@@ -71,7 +71,7 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
         raise FileFormatError(f"{where} has two columns '{time}'.")
     if not clocks:
         names = ", ".join(name for name, _ in headers.values())
-        raise DefinitionError(f"{where} has no column '{time}'; its columns are {names}.")
+        raise DefinitionError(f"{where} has no column '{time}': choose `time` from {names}.")
     clock = clocks[0]
     unit = time_unit(clock) or "s"
     if unit not in _SECONDS:
