@@ -188,7 +188,8 @@ def simulate(
 
     **Arguments:**
 
-    - `chart`, `state`, `time`: the start. A guard that is zero there is not an event.
+    - `chart`, `state`, `time`: the start. A guard that is zero or negative there is not an
+        event: a ball that starts below the floor falls on.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of

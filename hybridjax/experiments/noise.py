@@ -105,12 +105,18 @@ def simulate_experiments(
 
     **Returns:** `ExperimentData` with `discard + P` cycles.
 
-    **Raises:** `DefinitionError` if N (also of the process noise) or the inputs differ,
-    or if a periodic response does not exist (a multiplier that is a P-th root of one).
+    **Raises:** `DefinitionError` if N (also of the process noise) or the inputs differ, if cycles
+    of an unstable model are discarded, or if a periodic response does not exist (a multiplier that
+    is a P-th root of one).
     """
     require_inputs(design, "model", ldtp.n_sections, ldtp.inputs)
     if discard is None:
         discard = DISCARD if start == "cycle" else 0
+    if start == "cycle" and discard and np.abs(ldtp.multipliers[:1]).max(initial=0) >= 1:
+        raise DefinitionError(
+            "the model is unstable: its transient grows, and no window is periodic. Use "
+            'start="periodic", or discard=0 for the transient itself.'
+        )
     u = applied = design.inputs(design.periods + discard)
     x0 = ldtp.periodic_states(design.inputs(), design.periods) if start == "periodic" else None
     if process_noise is not None:

@@ -28,6 +28,11 @@ def test_simulation_from_the_cycle_is_the_definition(model):
     for start, cycles in (("cycle", 25), ("periodic", 5)):
         data = hj.experiments.simulate_experiments(model, DESIGN, start=start)
         assert data.u.shape[1] == cycles * 4
+    unstable = hj.LDTP(
+        2 * np.ones((4, 1, 1)), np.ones((4, 1, 2)), np.ones((4, 2, 1)), inputs=("a", "b")
+    )
+    with pytest.raises(hj.DefinitionError, match="the model is unstable"):
+        hj.experiments.simulate_experiments(unstable, DESIGN)
 
 
 def test_failed_experiments_are_named():
