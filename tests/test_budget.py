@@ -40,7 +40,7 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_941,
+    "test_lines": 17_994,
     "doc_words": 40_878,
 }
 

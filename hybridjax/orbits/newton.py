@@ -128,8 +128,8 @@ def solve(
 ) -> Solution:
     """Newton's method from the anchor's state.
 
-    **Arguments:** (All of them are needed for derivatives.) `once_more`: whether to compute one
-    more turn on the cycle, so that the result has the derivatives of the cycle. `factors`: whether
+    **Arguments:** (Pass all where there are derivatives.) `once_more`: whether to compute one more
+    turn on the cycle, so that the result has the derivatives of the cycle. `factors`: whether
     its pieces have them, too. `near`: the pieces of a similar cycle's turn and their tapes, side by
     side, with which the host begins.
     """
@@ -156,12 +156,12 @@ def root(
 
 def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Newton's method with the steps and the test of optimistix."""
-    sizes, x, steps, way = map.sizes, map.anchor.q[:, 0] / map.sizes, 0, None
+    sizes, x, steps, expected = map.sizes, map.anchor.q[:, 0] / map.sizes, 0, None
     assert map.settings.rtol is not None
     if near is not None:
-        x, way = fixed_point(map, near, x)
+        x, expected = fixed_point(map, near, x)
     while True:
-        travelled = None if way is None else travel(map, x * sizes, way)
+        travelled = None if expected is None else travel(map, x * sizes, expected)
         turn = map.turn_with_jacobian(x * sizes, travelled=travelled)
         residual = turn.residual / sizes
         (step,) = newton_steps((turn.jacobian * sizes / sizes[:, None])[None], residual[None])
@@ -172,9 +172,9 @@ def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray
         done = excess(x[None], step[None])[0] < 1 and close
         if done or steps == max_steps or not np.isfinite(x).all():
             return x * sizes, turn, np.asarray(steps)
-        way = None
-        if steps < FEW_STEPS:  # (then it was in vain)
-            x, way = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), x)
+        expected = None
+        if steps < FEW_STEPS:  # (Later ones have not helped before.)
+            x, expected = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), x)
 
 
 def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:

@@ -1,8 +1,9 @@
-"""Newton's method on the starts of all moves of a turn (multiple shooting), on the host.
+"""Newton's method on the starts of all moves (steps and events) of a turn, on the host.
 
 Near a turn that was recorded, all moves of the next one are computed side by side: first without
 decisions (`fixed_point`), then as the search would make them (`travel`). This takes a few calls of
-the kernels instead of one after the other for every step.
+the kernels instead of one after the other for every step. (Multiple shooting: H. G. Bock and K. J.
+Plitt, IFAC Proceedings 17, 1984.)
 """
 
 import dataclasses
@@ -27,10 +28,11 @@ from .return_map import CLOSED, LEGS, SINGULAR, Return, ReturnMap
 ATOL, RTOL = 1e-12, 1e-11
 
 
-class Way(NamedTuple):
-    """A turn as it is expected."""
+class ExpectedTurn(NamedTuple):
+    """A turn that was not searched for yet."""
 
     moves: Moves
+    """The steps and events that it should have."""
     by: Float[np.ndarray, "M n m"]
     """Derivatives of (t, q) after each move by (t, q, u) before it."""
 
@@ -56,13 +58,13 @@ def excess(q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]) -> Float
 
 def fixed_point(
     map: ReturnMap, turn: tuple[Lanes, Tape], otherwise: Float[np.ndarray, " d"]
-) -> tuple[Float[np.ndarray, " d"], Way | None]:
+) -> tuple[Float[np.ndarray, " d"], ExpectedTurn | None]:
     """The state, in sizes, from which a turn with the recorded moves returns to itself, and these
     moves; `otherwise` and no moves, if steps do not halve each time.
 
     **Arguments:** `turn`: the pieces of a turn and their tapes, side by side.
 
-    Each move does what it did, whatever happens on the way: `travel` tells whether that is right.
+    Guards are not watched here: `travel` tests whether the moves are still right.
     """
     s, sizes, target, n = map.structure, map.sizes, map.ends(), 1 + map.structure.d
     moves, last, unit = recorded_moves(*turn), np.inf, np.eye(n - 1)
@@ -90,13 +92,13 @@ def fixed_point(
         x, last, starts = x + step, np.max(np.abs(step)), starts + shift
         moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
         if excess(x[None], step[None])[0] < 1:
-            return x, Way(moves, by)
+            return x, ExpectedTurn(moves, by)
 
 
-def travel(map: ReturnMap, q: Float[np.ndarray, " d"], way: Way) -> tuple | None:
+def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: ExpectedTurn) -> tuple | None:
     """A turn, as by `ReturnMap.travel`, and the largest gap between its moves, in sizes of the
     states. Each move is a lane of one search; None if one does not end as the next one begins."""
-    s, ends, moves = map.structure, map.ends(), way.moves
+    s, ends, moves = map.structure, map.ends(), expected.moves
     code, piece, later = moves.code, moves.lane, np.append(moves.t[1:], np.inf)
     time = np.where(code == ARRIVE_TIME, ends.time[piece], np.where(code == MOVE, later, np.inf))
     timed = np.isfinite(time)
@@ -114,7 +116,7 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], way: Way) -> tuple | None
     if any(s.method(a).implicit for a in range(len(s.charts))):
         along = deviation(s, lanes, map.settings)
         for k in np.flatnonzero(code[:-1] < 0):
-            along[:, k + 1] = way.by[k, 1:, 1 : 1 + s.d] @ along[:, k]
+            along[:, k + 1] = expected.by[k, 1:, 1 : 1 + s.d] @ along[:, k]
         setout = setout._replace(along=along)
     u, options = np.zeros((s.nu, len(code))), Options(True, new_input=False, tangents=True)
     for _ in range(2):

@@ -117,6 +117,16 @@ def test_exact_htfs_give_the_exact_model(model, exact, variance):
     np.testing.assert_allclose(fit.htf(F).H, fit.model.htf(F, fit.harmonics).H, atol=1e-12)
 
 
+def test_too_few_dimensions_are_named_in_strong_noise(hopper_cycle):
+    """20 dB, at which the misfit is 1.6 times the expected one."""
+    model = hj.linearize(hopper_cycle, hj.ClockPhase(8), ("yM", "vM"))
+    design = hj.multisine(8, periods=16, band=(0, 4)).scaled(rms=0.05).realizations(4)
+    data = hj.experiments.simulate_experiments(model, design, start="periodic")
+    htf = hj.estimate_htf(hj.experiments.add_noise(data, snr=20, seed=0))
+    for dims, named in ((2, True), (model.dims, False)):
+        assert ("too few dimensions" in repr(hj.fit_ldtp(htf, dims))) == named
+
+
 def test_undetermined_responses_have_infinite_variance():
     """Harmonics -1, 0 and 1 of four leave the last one free in part, and the multipliers known."""
     small = scaled(3, (2, 3, 4, 2), 2, 1)

@@ -9,6 +9,7 @@ import hybridjax as hj
 from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem, noise_spectrum
 from hybridjax.identify.periodic import PeriodicModel, local_coordinates
 from hybridjax.identify.series.records import CycleGrid
+from hybridjax.identify.series.residuals import about_misfit, answering
 
 from .test_series import record
 from .test_uncertainty import covered
@@ -122,6 +123,17 @@ def test_too_few_dimensions_are_named(small):
         for dims, named in ((small.dims, False), (2, True)):
             fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
             assert bool(fit.misfit) == named == ("depend on the inputs" in repr(fit))
+
+
+def test_residuals_of_exact_data_tell_nothing(small):
+    """What depends on the input, but is rounding."""
+    grid = CycleGrid.from_records([record(small, 4 * 100, 0)])
+    response = grid.u[..., :1] + 0.1 * np.random.default_rng(0).normal(size=grid.y.shape)
+    for size, told in ((1e-3, True), (1e-13, False)):
+        text = about_misfit(grid, grid, size * response, innovations=False)
+        assert bool(text) == told == bool("noise='innovations'" in text)
+    feedback = np.roll(response.reshape(1, -1, 2), 1, axis=1).reshape(response.shape)
+    assert not answering(grid, 1e-13 * feedback, ("u",))
 
 
 def test_outputs_that_do_not_answer_are_refused(small):
