@@ -120,7 +120,7 @@ series = hj.fit_series(hj.Record(noisy.u[0], y, n_sections=32, outputs=outputs),
 series
 
 # %%
-print("error", np.max(np.abs(series.multipliers - truth)))
+print(f"error {np.max(np.abs(series.multipliers - truth)):.2g}")
 
 # %% [markdown]
 # ## Is the model good?

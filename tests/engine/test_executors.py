@@ -116,7 +116,7 @@ def test_a_turn_with_its_moves_side_by_side(name):
         x, expected = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), q / sizes)
         assert (travelled := travel(map, x * sizes, expected)) is not None
         again = map.turn_with_jacobian(x * sizes, travelled=travelled)
-        # Refused: a gap before a move, another time at the start, an event (not the last) overlooked.
+        # Refused: a gap before a move, another first time, an event (not the last) overlooked.
         moves = expected.moves
         third, event = np.arange(len(moves.t)) == 2, moves.code >= 0
         gap = 1e-6 * third * map.scale[moves.chart].T
@@ -148,7 +148,10 @@ def test_searches_with_moves_side_by_side_end_at_the_same_cycle(name, monkeypatc
     if system.guess() is None or name == "SLIPRunner":
         pytest.skip("has no guess of its own, or a family of cycles")
     rng = np.random.default_rng(5)
-    move = lambda x: x * (1 + 0.01 * rng.uniform(-1, 1)) if eqx.is_inexact_array(x) else x  # noqa: E731
+
+    def move(x):
+        return x * (1 + 0.01 * rng.uniform(-1, 1)) if eqx.is_inexact_array(x) else x
+
     guess = hj.find_limit_cycle(system)
     moved = jax.tree_util.tree_map(move, system)
     cycles = [hj.find_limit_cycle(moved), hj.find_limit_cycle(moved, guess)]
