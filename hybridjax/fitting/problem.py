@@ -17,8 +17,9 @@ from .._core.results import Result
 from ..errors import DefinitionError
 from ..identify.weights import estimated_noise
 from ..orbits.cycle import LimitCycle
-from ..orbits.linear_flow import last_turn
+from ..orbits.linear_flow import keep_turn, last_turn
 from ..orbits.newton import MAX_STEPS as NEWTON_STEPS, root, solve
+from ..orbits.return_map import Turn
 from ..systems.system import HybridSystem, arrays_of
 from ..systems.varied import parameter_of, with_parameters
 from .observations import AbstractObservation, ObservedHTF
@@ -151,22 +152,23 @@ def free_parameters(
     return Parameters(names, jnp.array(low), jnp.array(high), jnp.array(size))
 
 
-def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
-    """Return the cycle of a system near the `guess`, as `find_limit_cycle`, under a transformation.
+def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> tuple[LimitCycle, Turn | None]:
+    """Return the cycle of a system near the `guess`, as `find_limit_cycle`, under a transformation;
+    and its last turn outside of programs.
 
     `factors` and `legs` are NaN: derivatives of a cycle's factors are second derivatives of the
     flow, and take two thirds of the time of compilation.
     """
-    map = guess.return_map.at_phase_of(system)
+    map, last = guess.return_map.at_phase_of(system), None
     if is_inside_program():
         q, turn, steps = root(map, False, NEWTON_STEPS)
         period, anchor = map.turn(q, turn.record).period, map.departure(q)
     else:
         anchor, turn, steps, _ = solve(map, True, False, last_turn(guess))
-        period = turn.period
+        period, last = turn.period, turn
     period = map.expected if map.base is None else period
     code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)
-    return dataclasses.replace(
+    cycle = dataclasses.replace(
         guess,
         system=system,
         numbers=arrays_of(system),
@@ -178,6 +180,7 @@ def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
         iterations=steps,
         result=jnp.where(turn.result == Result.OK, code, turn.result),
     )
+    return cycle, last
 
 
 class FitProblem(eqx.Module):
@@ -201,12 +204,12 @@ class FitProblem(eqx.Module):
 
     def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> tuple[Array, tuple]:
         """Return the residuals (r,), infinite where there is no limit cycle, or no observation on
-        it; and the anchor and the period of the cycle."""
+        it; and the anchor, the period and the last turn of the cycle."""
         values = self.parameters.decode(x)
-        cycle = candidate_cycle(self.parameters.insert(guess.system, values), guess)
+        cycle, turn = candidate_cycle(self.parameters.insert(guess.system, values), guess)
         observations = self.parameters.observed(self.observations, values)
         parts = [observation.residuals(cycle) for observation in observations]
-        return _joined(parts, cycle.result), (cycle.anchor, cycle.period)
+        return _joined(parts, cycle.result), (cycle.anchor, cycle.period, turn)
 
 
 @jax.jit
@@ -217,7 +220,7 @@ def _joined(parts, result):
 
 def _with_jacobian(problem: FitProblem, x, guess):
     """Return residuals (r,), their Jacobian (r, p) with all columns in one pass, in forward mode,
-    and the anchor and the period."""
+    and the anchor, the period and the last turn."""
     at = lambda x: problem.residuals(x, guess)  # noqa: E731
     push = lambda t: jax.jvp(at, (x,), (t,), has_aux=True)  # noqa: E731
     return jax.vmap(push, out_axes=(None, -1, None))(jnp.eye(x.shape[0]))
@@ -241,8 +244,11 @@ def evaluate(
                     values = _with_jacobian(*arguments)
             except NotOnHostError:
                 _not_on_host.add(key)
-        r, J, (anchor, period) = values or _compiled(*arguments)
-    return *jax.device_get((r, J)), dataclasses.replace(guess, anchor=anchor, period=period)
+        r, J, (anchor, period, turn) = values or _compiled(*arguments)
+    near = dataclasses.replace(guess, anchor=anchor, period=period)
+    if turn is not None:
+        keep_turn(near, turn)
+    return *jax.device_get((r, J)), near
 
 
 def descend(

@@ -486,7 +486,7 @@ def log_determinant(cycle: LimitCycle) -> float:
 
 def orbit(cycle: LimitCycle) -> Trajectory:
     """One turn from the anchor, in the steps by which it is linearized."""
-    map, (_, tape) = to_host(cycle.return_map), last_turn(hosted(cycle))
+    map, (_, tape) = to_host(cycle.return_map), last_turn(cycle)
     pieces = [Tape(*(x[..., k, None] for x in tape)) for k in range(tape.t.shape[-1])]
     begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
     make = lambda: recorded(map.structure, begin, pieces, u, Result.OK)  # noqa: E731

@@ -223,7 +223,7 @@ _hosted, _flows, _turns = Memory(), Memory(), Memory()
 
 
 def keep_turn(cycle: Any, turn: Turn) -> None:
-    """Keep the steps of a cycle's last turn for its linearization."""
+    """Keep the steps of a cycle's last turn, if the host took them: `last_turn` returns them."""
     if turn.tapes is not None:
         record = to_host((turn.legs, turn.tapes))
         _turns.recall(hosted(cycle), None, lambda: (record[0], side_by_side(record[1])))
@@ -238,6 +238,7 @@ def hosted(cycle: Any) -> Any:
 
 def last_turn(cycle: Any) -> tuple[Lanes, Tape]:
     """The starts and the steps of the pieces of a cycle's last turn, side by side."""
+    cycle = hosted(cycle)
     make = lambda: side_by_side(to_host(cycle.return_map).pieces(tangents=True))  # noqa: E731
     return _turns.recall(cycle, None, make)
 
