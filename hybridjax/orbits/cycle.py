@@ -34,7 +34,7 @@ from ..systems.system import HybridSystem, OutputNames, arrays_of
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
-from .linear_flow import hosted, last_turn, linear_flow, rule
+from .linear_flow import hosted, last_turn, linear_flow, recorded_ends, rule
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
@@ -449,7 +449,7 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     """
     map, record = hosted(cycle).return_map, last_turn(cycle)
     structure, moves = map.structure, recorded_moves(*record)
-    by = linear_moves(structure, moves, map.ends())[1]
+    by = linear_moves(structure, moves, recorded_ends(map, record[0]))[1]
     fields = slopes(structure, moves.t, moves.chart, moves.q, np.zeros((structure.nu, 1))).T
     frames: list[tuple[int, np.ndarray, Matrix]] = []
     for chart, f in zip(moves.chart, fields, strict=True):

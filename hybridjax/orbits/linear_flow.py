@@ -24,6 +24,7 @@ from .._core.memo import Memory, remembered
 from ..engine import kernels
 from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, Lanes, Tape, for_each_chart, side_by_side
 from ..engine.replay import Variation, recorded_moves
+from ..engine.target import Target
 from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
@@ -243,6 +244,13 @@ def last_turn(cycle: Any) -> tuple[Lanes, Tape]:
     return _turns.recall(cycle, None, make)
 
 
+def recorded_ends(map: ReturnMap, lanes: Lanes) -> Target:
+    """The ends of pieces that begin as recorded. (The search may have expected another period.)"""
+    ends = map.ends()
+    time = np.append(lanes.t[1:], ends.time[-1])
+    return dataclasses.replace(ends, time=np.where(np.isfinite(ends.time), time, ends.time))
+
+
 def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = None) -> LinearFlow:
     """Linearize the flow along a cycle, in pieces no longer than this part of the period. Inputs
     are those of the system, or a change of a parameter.
@@ -327,7 +335,7 @@ def _along(
     s: kernels.Tangents, map: ReturnMap, lanes: Lanes, tape: Tape, by: Any
 ) -> Float[np.ndarray, "M n D"]:
     """Tangents of times and states at the starts of recorded moves and at the end of the turn."""
-    ends, (begin, longer) = map.ends(), beginning(by, s.d, s.directions)
+    ends, (begin, longer) = recorded_ends(map, lanes), beginning(by, s.d, s.directions)
     # A turn that ends on a section ends at a time, too.
     start, full = map.anchor.t[0], map.expected
     time = np.where(np.isfinite(ends.time), ends.time, start + full)
