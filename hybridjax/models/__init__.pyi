@@ -10,11 +10,7 @@ from .hoppers import (
     HopperPair as HopperPair,
     VerticalHopper as VerticalHopper,
 )
-from .neurons import (
-    AdExNeuron as AdExNeuron,
-    FitzHughNagumo as FitzHughNagumo,
-    IzhikevichNeuron as IzhikevichNeuron,
-)
+from .neurons import FitzHughNagumo as FitzHughNagumo
 from .oscillators import (
     BeltOscillator as BeltOscillator,
     ChuaCircuit as ChuaCircuit,
