@@ -4,16 +4,14 @@ from .balls import (
     PaddleJuggler as PaddleJuggler,
 )
 from .bipeds import FiveLinkBiped as FiveLinkBiped, TorsoWalker as TorsoWalker
-from .converters import BuckConverter as BuckConverter, CukConverter as CukConverter
+from .converters import BuckConverter as BuckConverter
 from .hoppers import (
     CompliantHopper as CompliantHopper,
-    HopperPair as HopperPair,
     VerticalHopper as VerticalHopper,
 )
 from .neurons import FitzHughNagumo as FitzHughNagumo
 from .oscillators import (
     BeltOscillator as BeltOscillator,
-    ChuaCircuit as ChuaCircuit,
     Duffing as Duffing,
     HopfOscillator as HopfOscillator,
     Mathieu as Mathieu,
