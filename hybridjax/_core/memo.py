@@ -24,6 +24,10 @@ class Memory:
     def __len__(self) -> int:
         return len(self._values)
 
+    def known(self, owner: Any, key: Hashable) -> Any:
+        """Return the value that is kept for this owner and key, or None."""
+        return self._values.get(id(owner), {}).get(key)
+
     def recall(self, owner: Any, key: Hashable, make: Callable[[], Value]) -> Value:
         """Return the value that `make` returned at the first call for this owner and key.
 

@@ -36,8 +36,8 @@ Items = tuple[str | Output, ...]
 # Lanes of programs that are called for many points at once. Higher: single points wait for lanes
 # that nobody needs. Lower: many points take more calls.
 POINTS = 16
-# Lanes of programs for systems side by side. More: the last call has more empty lanes. Fewer: calls
-# cost more than they compute.
+# Lanes of programs for systems or directions side by side. More: the last call has more empty
+# lanes. Fewer: calls cost more than they compute.
 WIDE = 256
 
 
@@ -237,7 +237,7 @@ class Tangents(Structure):
             still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
             along = [self._along[1] if x is self._levels else still(x) for x in trees]
             every, along = (self._plain, *trees), (self._along[0], *along)
-            return kernel(function, _Tangent(form, moving), static, (every, along), 4 * POINTS)
+            return kernel(function, _Tangent(form, moving), static, (every, along), WIDE)
 
         of_lanes = self.once((function, form, static), trees, make)
 

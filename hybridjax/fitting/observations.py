@@ -24,6 +24,7 @@ from ..experiments.response import course, flow_batch, response_function
 from ..identify.weights import check_values, error_weights, largest_misfit
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
+from ..orbits.linear_flow import last_turn
 from ..sections.families import AbstractSections, FamilyLike, as_family
 from ..sections.linearize import Delayed, Delays, linearize
 from ..sections.place import observed_at, place_sections
@@ -283,7 +284,7 @@ class ObservedCycle(AbstractObservation):
         return cls(placed.family, outputs, values, times=times, period=cycle.period)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
-        t, y = observed_at(cycle, self.sections, self.outputs)
+        t, y = observed_at(cycle, self.sections, self.outputs, last_turn(cycle))
         parts = []
         for name, measured, scale in zip(self.which, self.measured, self.scales, strict=True):
             if name == "values":

@@ -180,6 +180,8 @@ def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> tuple[LimitCycle
         iterations=steps,
         result=jnp.where(turn.result == Result.OK, code, turn.result),
     )
+    if last is not None:
+        keep_turn(cycle, last)
     return cycle, last
 
 

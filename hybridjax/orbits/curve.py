@@ -240,13 +240,16 @@ def far_from_events(t: np.ndarray, events: np.ndarray, period: float) -> int:
 def away_from_events(cycle: LimitCycle) -> LimitCycle:
     """A guess for neighbors of a clocked cycle, which begins far from all events: one that moves
     across the phase of the begin changes the chart there."""
-    cycle = as_found(cycle)
+    # (A copy has no recorded turn.)
+    cycle = as_found(cycle) if what_changed(cycle.system, cycle.numbers) else cycle
     if not cycle.clocked or what_changed(cycle.system, cycle.numbers):
         return cycle
     path, legs, anchor = cycle.trajectory(), to_host(cycle.legs), cycle.anchor
     if not len(events := path.t[path.event >= 0]):
         return cycle
     k = far_from_events(legs.t, events, float(cycle.period))
+    if k == 0:
+        return cycle
     at = anchor._replace(t=legs.t[[k]], chart=legs.chart[[k]], q=legs.q[:, [k]])
     return dataclasses.replace(cycle, anchor=at)
 

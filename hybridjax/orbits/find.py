@@ -12,7 +12,7 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
-from .._core.executor import is_hidden, is_traced, to_host
+from .._core.executor import is_traced, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
@@ -150,9 +150,12 @@ def find_limit_cycle(
             s, guess, section, multiplicity or 1, settle, max_period, settings, given
         )
     map = dataclasses.replace(map, conserved={k: real(v) for k, v in (conserved or {}).items()})
-    near = last_turn(guess) if isinstance(guess, LimitCycle) and not is_hidden(guess) else None
+    near = last_turn(guess) if isinstance(guess, LimitCycle) else None
     if isinstance(guess, LimitCycle) and traced:
-        return _cycle(map, solve(map, True, True, near), guess.event_sequence)
+        solution = solve(map, True, True, near)
+        cycle = _cycle(map, solution, guess.event_sequence)
+        keep_turn(cycle, solution.turn)
+        return cycle
     s.resolve_outputs(tuple(map.conserved)).require(int(np.asarray(map.anchor.chart)[0]))
     if isinstance(map.base, AtEvent) and not isinstance(guess, LimitCycle):
         check_begin(map)

@@ -22,7 +22,15 @@ from .._core.executor import Array, is_hidden, namespace, on_host, scan, solve, 
 from .._core.host_derivatives import by_columns
 from .._core.memo import Memory, remembered
 from ..engine import kernels
-from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, Lanes, Tape, for_each_chart, side_by_side
+from ..engine.lanes import (
+    ARRIVE_LEVEL,
+    ARRIVE_TIME,
+    Lanes,
+    Tape,
+    fixed,
+    for_each_chart,
+    side_by_side,
+)
 from ..engine.replay import Variation, recorded_moves
 from ..engine.target import Target
 from ..linear.time_response import monodromy
@@ -225,9 +233,10 @@ _hosted, _flows, _turns = Memory(), Memory(), Memory()
 
 def keep_turn(cycle: Any, turn: Turn) -> None:
     """Keep the steps of a cycle's last turn, if the host took them: `last_turn` returns them."""
-    if turn.tapes is not None:
-        record = to_host((turn.legs, turn.tapes))
-        _turns.recall(hosted(cycle), None, lambda: (record[0], side_by_side(record[1])))
+    record = fixed((turn.legs, turn.tapes))
+    if turn.tapes is not None and not is_hidden(record):
+        legs, tapes = to_host(record)
+        _turns.recall(hosted(cycle), None, lambda: (legs, side_by_side(tapes)))
 
 
 def hosted(cycle: Any) -> Any:
@@ -237,11 +246,12 @@ def hosted(cycle: Any) -> Any:
     return _hosted.recall(cycle, None, lambda: to_host(cycle))
 
 
-def last_turn(cycle: Any) -> tuple[Lanes, Tape]:
-    """The starts and the steps of the pieces of a cycle's last turn, side by side."""
+def last_turn(cycle: Any) -> tuple[Lanes, Tape] | None:
+    """The starts and the steps of the pieces of a cycle's last turn, side by side; None where JAX
+    traces the cycle, and the host did not take them."""
     cycle = hosted(cycle)
     make = lambda: side_by_side(to_host(cycle.return_map).pieces(tangents=True))  # noqa: E731
-    return _turns.recall(cycle, None, make)
+    return _turns.known(cycle, None) if is_hidden(cycle) else _turns.recall(cycle, None, make)
 
 
 def recorded_ends(map: ReturnMap, lanes: Lanes) -> Target:

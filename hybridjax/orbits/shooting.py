@@ -7,7 +7,6 @@ Plitt, IFAC Proceedings 17, 1984.)
 """
 
 import dataclasses
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,22 +18,13 @@ from ..engine.lanes import ARRIVE_TIME, MOVE, Lanes, Tape, regrouped, start_lane
 from ..engine.move import Options, move, stride
 from ..engine.replay import Moves, linear_moves, recorded_moves
 from ..engine.search.attempt import deviation
-from ..engine.target import until
+from ..engine.target import Target, until
 from .return_map import CLOSED, LEGS, SINGULAR, Return, ReturnMap
 
 
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
 # Larger: it ends one step too early. Smaller: rounding keeps it from ending.
 ATOL, RTOL = 1e-12, 1e-11
-
-
-class ExpectedTurn(NamedTuple):
-    """A turn that was not searched for yet."""
-
-    moves: Moves
-    """The steps and events that it should have."""
-    by: Float[np.ndarray, "M n m"]
-    """Derivatives of (t, q) after each move by (t, q, u) before it."""
 
 
 def newton_steps(
@@ -58,7 +48,7 @@ def excess(q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]) -> Float
 
 def fixed_point(
     map: ReturnMap, turn: tuple[Lanes, Tape], otherwise: Float[np.ndarray, " d"]
-) -> tuple[Float[np.ndarray, " d"], ExpectedTurn | None]:
+) -> tuple[Float[np.ndarray, " d"], Moves | None]:
     """The state, in sizes, from which a turn with the recorded moves returns to itself, and these
     moves; `otherwise` and no moves, if steps do not halve each time.
 
@@ -92,17 +82,42 @@ def fixed_point(
         x, last, starts = x + step, np.max(np.abs(step)), starts + shift
         moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
         if excess(x[None], step[None])[0] < 1:
-            return x, ExpectedTurn(moves, by)
+            return x, moves
 
 
-def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: ExpectedTurn) -> tuple | None:
+def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple | None:
     """A turn, as by `ReturnMap.travel`, and the largest gap between its moves, in sizes of the
-    states. Each move is a lane of one search; None if one does not end as the next one begins."""
-    s, ends, moves = map.structure, map.ends(), expected.moves
+    states; None if it has other moves than expected."""
+    begin = map.departure(q)
+    if (pieces := follow_moves(map, begin, map.ends(), expected)) is None:
+        return None
+    legs, moved, tape, gap = pieces
+    end = jax.tree_util.tree_map(lambda x: x[..., -1], moved.lanes)
+    residual = np.where(map.valid, end.q, 0.0) - q - map.held(q)[0]
+    residual = np.where(end.chart == map.anchor.chart, residual, np.nan)
+    turn = Return(residual, end.t - map.anchor.t[0], np.asarray(moved.result[-1]))
+    return turn, jax.tree_util.tree_map(one_by_one, (legs, None, tape)), gap
+
+
+def one_by_one(x: np.ndarray) -> np.ndarray:
+    """Lanes as pieces of the flow of one (as `engine.lanes.side_by_side` takes them)."""
+    return np.moveaxis(x, -1, 0)[..., None]
+
+
+def follow_moves(map: ReturnMap, begin: Lanes, ends: Target, expected: Moves) -> tuple | None:
+    """The flow to one of the `ends` after the other, where its moves are known but for rounding:
+    each is a lane of one search. None if one does not end as the next one begins.
+
+    **Arguments:** `expected`: moves whose `lane` is the piece.
+
+    **Returns:** by piece the lanes before, their ends, and the tape; and the largest gap between
+    moves, in sizes of the states.
+    """
+    s, moves, settings = map.structure, expected, map.settings
     code, piece, later = moves.code, moves.lane, np.append(moves.t[1:], np.inf)
     time = np.where(code == ARRIVE_TIME, ends.time[piece], np.where(code == MOVE, later, np.inf))
     timed = np.isfinite(time)
-    index, event = (np.broadcast_to(x, LEGS)[piece] for x in (ends.index, ends.event))
+    index, event = (np.broadcast_to(x, ends.time.shape)[piece] for x in (ends.index, ends.event))
     target = dataclasses.replace(
         ends, time=time, index=index, event=np.where(code >= 0, code, event).astype(np.int32),
         limit=np.where(timed, np.nextafter(time, np.inf), moves.t + 2 * moves.h),
@@ -110,17 +125,19 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: ExpectedTurn) -
     lanes = start_lanes(s, moves.t, moves.chart.astype(np.int32), moves.q)
     lanes = arm(s, lanes, map.watch(lanes, until(lanes.t)), map.expected)
     lanes = lanes._replace(events=(np.cumsum(code >= 0) - (code >= 0)).astype(np.int32))
-    lanes.armed[:, :1] = map.departure(q).armed
+    lanes = lanes._replace(events=lanes.events + begin.events)
+    lanes.armed[:, :1] = begin.armed
     # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
-    setout = stride(np.where(timed, 2.0, 1.01) * moves.h)._replace(lead=0 * moves.h)
+    h = np.where(timed, np.where(moves.h > 0, 2 * moves.h, map.expected), 1.01 * moves.h)
+    setout = stride(h)._replace(lead=0 * h)
     if any(s.method(a).implicit for a in range(len(s.charts))):
-        along = deviation(s, lanes, map.settings)
+        along, (_, by) = deviation(s, lanes, settings), linear_moves(s, moves, ends)
         for k in np.flatnonzero(code[:-1] < 0):
-            along[:, k + 1] = expected.by[k, 1:, 1 : 1 + s.d] @ along[:, k]
+            along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
         setout = setout._replace(along=along)
     u, options = np.zeros((s.nu, len(code))), Options(True, new_input=False, tangents=True)
     for _ in range(2):
-        moved, tape = move(s, lanes, u, target, map.settings, setout, None, options)
+        moved, tape = move(s, lanes, u, target, settings, setout, None, options)
         end, in_chart = moved.lanes, belongs(s, lanes.chart)[:-1, 1:]
         same = (end.armed[:, :-1] == lanes.armed[:, 1:])[in_chart].all()
         if same:
@@ -128,17 +145,18 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: ExpectedTurn) -
         lanes.armed[:, 1:] = end.armed[:, :-1]
     for ended, begun in ((end.chart, lanes.chart), (end.events, lanes.events)):
         same = same and (ended[:-1] == begun[1:]).all()
-    late = np.append(map.anchor.t, end.t[:-1]) - lanes.t
-    apart = np.column_stack([q, end.q[:, :-1]]) - lanes.q
+    late = np.append(begin.t, end.t[:-1]) - lanes.t
+    apart = np.column_stack([begin.q, end.q[:, :-1]]) - lanes.q
     gap = max(np.abs(late / map.expected).max(), np.abs(apart.T / map.scale[lanes.chart]).max())
     if not (same and (moved.result == Result.OK).all() and gap <= CLOSED):
         return None
-    residual = np.where(map.valid, end.q[:, -1], 0.0) - q - map.held(q)[0]
-    residual = np.where(end.chart[-1] == map.anchor.chart, residual, np.nan)
     assert tape is not None
-    turn = Return(residual, end.t[-1] - map.anchor.t[0], np.asarray(moved.result[-1]))
-    legs = jax.tree_util.tree_map(lambda x: x[..., moves.order == 0], lanes)
+    first, last = (
+        np.flatnonzero(np.diff(piece, prepend=-1)),
+        np.flatnonzero(np.diff(piece, append=-1)),
+    )
+    legs = jax.tree_util.tree_map(lambda x: x[..., first], lanes)
+    moved = jax.tree_util.tree_map(lambda x: x[..., last], moved)
     on_the_way = (tape.code == ARRIVE_TIME) & (code == MOVE)
     tape = regrouped(tape._replace(code=np.where(on_the_way, MOVE, tape.code)), piece, legs)
-    stacked: Any = lambda x: np.moveaxis(x, -1, 0)[..., None]  # noqa: E731
-    return turn, jax.tree_util.tree_map(stacked, (legs, None, tape)), gap
+    return legs, moved, tape, gap

@@ -20,7 +20,7 @@ from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
-from ..orbits.linear_flow import of_flow
+from ..orbits.linear_flow import last_turn, of_flow
 from ..orbits.return_map import with_derivatives
 from ..systems.structure import Structure
 from ..systems.system import Output, OutputNames
@@ -78,7 +78,7 @@ def linearize(
     z.require(*(range(len(s.charts)) if traced else np.unique(placed.lanes.chart).tolist()))
     (names, columns), d = s.inputs_among(inputs), s.d + 1
     if of_family:
-        A, B, C, D, dims = _of_family(cycle, as_family(placed), tuple(z.items))
+        A, B, C, D, dims = _of_family(cycle, as_family(placed), tuple(z.items), last_turn(cycle))
     else:
         A, B, C, D, dims = _matrices_of(placed, tuple(z.items))
     if not traced:
@@ -95,14 +95,16 @@ def _matrices_of(placed: PlacedSections, outputs: tuple[str | Output, ...]) -> t
     return *placed.flow_jacobians, *_output_jacobians(placed, outputs), placed.dims
 
 
-def _matrices(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str | Output, ...]):
+def _matrices(
+    cycle: LimitCycle, family: AbstractSections, outputs: tuple[str | Output, ...], _: Any
+):
     return _matrices_of(place_sections(cycle, family), outputs)
 
 
 def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     """`_matrices` on the host, and its derivatives."""
-    (cycle, family, outputs), (by_cycle, by_family, _) = arguments, directions
-    placed, moved, s, jacobians = place_along(cycle, family, by_cycle, by_family)
+    (cycle, family, outputs, turn), (by_cycle, by_family, *_) = arguments, directions
+    placed, moved, s, jacobians = place_along(cycle, family, turn, by_cycle, by_family)
     (N, P, n, _), lanes = jacobians.shape, moved.lanes
     embed, select = moved.frames()
     after = np.roll(select.reshape(N, P, *select.shape[1:]), -1, axis=0)

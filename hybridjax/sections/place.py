@@ -29,11 +29,12 @@ from ..orbits.checks import check_outputs
 from ..orbits.coincidence import SAME
 from ..orbits.crossing import Crossing, ListLevels, to_section
 from ..orbits.cycle import LimitCycle
-from ..orbits.linear_flow import beginning, of_flow
+from ..orbits.linear_flow import beginning, last_turn, of_flow
 from ..orbits.return_map import PATIENCE, ReturnMap
 from ..systems.structure import Structure
 from ..systems.transition import TOGETHER
 from . import families
+from .along import flow_along, levels_at
 from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
 from .placed import PlacedSections, SectionsLike, observe
 
@@ -69,11 +70,12 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
         if placed.cycle is cycle and eqx.tree_equal(*jax.device_get((placed.family, family))):
             return placed
     family.check(cycle.structure)
-    if is_traced((cycle, family)):
+    traced = is_traced((cycle, family))
+    if traced:
         require_program()
-    first, fields = _place(_patient(cycle), family)
+    first, fields = _place(_patient(cycle), family, None if traced else last_turn(cycle))
     placed = PlacedSections(cycle, family, *fields)
-    if not is_traced((cycle, family)):
+    if not traced:
         _check(placed, int(first))
         _recent.append(placed)
     return placed
@@ -109,21 +111,28 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
 
 
 @host_first
-def _place(map: ReturnMap, family: AbstractSections) -> tuple[Int[Array, ""], tuple]:
+def _place(map: ReturnMap, family: AbstractSections, turn: Any) -> tuple[Int[Array, ""], tuple]:
     """The `Result` of the flow to section 0, which lies at the anchor if that is a crossing, and
-    the fields of `PlacedSections` from `bound` on."""
-    return _locate(map, family, [])
+    the fields of `PlacedSections` from `bound` on. The host begins with the last `turn`."""
+    return _locate(map, family, turn, [])
 
 
-def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any, Any]:
+def _locate(map: ReturnMap, family: AbstractSections, turn: Any, flows: list) -> tuple[Any, Any]:
     """Do as `_place`; on the host `flows` gets the start, target and tape of every flow."""
     s, N = Structure(map.system), family.n_sections
     period, begin, xp = map.expected, map.anchor, namespace(map.expected)
     u = xp.zeros((s.nu, 1))
 
     def go(carry, targets, patience=np.inf):
-        options = Options(tape=True, tangents=True)
-        carry, flow = through(s, carry, u, targets, map.settings, options, patience)
+        flow = None
+        if turn is not None and on_host(period):
+            flow = flow_along(map, turn, carry[0], targets)
+        if flow is None:
+            options = Options(tape=True, tangents=True)
+            carry, flow = through(s, carry, u, targets, map.settings, options, patience)
+        else:
+            end, flow = flow
+            carry = end, *carry[1:]
         flows.append((flow[0], targets, flow[2]))
         return carry, flow
 
@@ -138,10 +147,10 @@ def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any,
     time, never = bound.time[i] + (k // N) * period, xp.full(k.shape, np.inf)
     targets = Target(time, i, bound.event[i], never, None, bound.levels, Result.SECTION_MISSED)
     _, pieces = go(carry, targets, 1.5 * period)
-    if before is not None:
-        pieces = jax.tree_util.tree_map(lambda *x: xp.concatenate(x), before, pieces)
-    first = pieces[1].result[0, 0]
-    pieces = jax.tree_util.tree_map(lambda x: x[1:], pieces)
+    if before is None:
+        before = pieces
+        pieces = jax.tree_util.tree_map(lambda x: x[1:], pieces)
+    first = before[1].result[0, 0]
     lanes, moved, tape = side_by_side(pieces)
     end, result = moved.lanes.t, moved.result
     normal = _normals(s, bound, lanes, xp.arange(N), u)
@@ -154,13 +163,17 @@ def _locate(map: ReturnMap, family: AbstractSections, flows: list) -> tuple[Any,
 
 
 def place_along(
-    cycle: LimitCycle, family: AbstractSections, by_cycle: LimitCycle, by_family: AbstractSections
+    cycle: LimitCycle,
+    family: AbstractSections,
+    turn: Any,
+    by_cycle: LimitCycle,
+    by_family: AbstractSections,
 ) -> tuple[PlacedSections, PlacedSections, kernels.Tangents, np.ndarray]:
     """Sections placed on the host; and in P directions, as complex numbers of N P sections (see
     `kernels.Tangents`): the same, the structure, and the Jacobians (N, P, n, m) of the flow."""
     flows: list[Any] = []
     map, N, M = _patient(cycle), family.n_sections, family.points
-    placed = PlacedSections(cycle, family, *_locate(map, family, flows)[1])
+    placed = PlacedSections(cycle, family, *_locate(map, family, turn, flows)[1])
     if np.any(placed.result):
         raise NotOnHostError
     P = len(jax.tree_util.tree_leaves((by_cycle, by_family))[0])
@@ -203,15 +216,15 @@ def place_along(
     return placed, moved, along, flow.jacobians(tangents)[-N:]
 
 
-def _observed(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str, ...]):
+def _observed(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str, ...], _: Any):
     placed = place_sections(cycle, family)
     return placed.lanes.t, placed.observe(outputs) if outputs else None
 
 
 def _observed_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     """`_observed` on the host, and its derivatives."""
-    (cycle, family, outputs), (by_cycle, by_family, _) = arguments, directions
-    placed, moved, s, _ = place_along(cycle, family, by_cycle, by_family)
+    (cycle, family, outputs, turn), (by_cycle, by_family, *_) = arguments, directions
+    placed, moved, s, _ = place_along(cycle, family, turn, by_cycle, by_family)
     lanes, P = moved.lanes, len(moved.lanes.t) // family.n_sections
     values, by = (placed.lanes.t, None), (lanes.t, None)
     if outputs:
@@ -350,7 +363,7 @@ def _remedy(placed: PlacedSections, i: int) -> str:
     s, (t, chart, q) = cycle.structure, cycle.trajectory().dense()
     level = np.full(len(t), np.nan)
     if levels is not None:
-        level = _levels_at(s, levels, N, t, chart, q.T)[0, i]
+        level = levels_at(s, levels, N, t, chart, q.T)[0, i]
     level[-1] = level[0]  # (the same point, but for rounding)
     falls = (np.diff(level) < 0) & (np.diff(t) > 0)
     crossed = np.flatnonzero(falls & (level[:-1] > 0) & (level[1:] <= 0))
@@ -409,7 +422,7 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     x = np.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
     q = interpolate(x, h, q[:, None], after[:, None], f0[:, None], f1[:, None])
     t, chart, q = (t + h * x).ravel(), np.tile(chart, len(x)), q.reshape(s.d, -1)
-    value, rate = _levels_at(s, levels, N, t, chart, q)
+    value, rate = levels_at(s, levels, N, t, chart, q)
     level = value.reshape(N, len(x), -1)
     falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & (h > 0)
     # Around the section itself, rounding decides the signs.
@@ -419,15 +432,3 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     f = slopes(s, lanes.t, lanes.chart, lanes.q, still)
     on_section = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * f.T, axis=1)
     return np.sum(falls, axis=(1, 2)), np.max(np.nan_to_num(np.abs(rate)), axis=1), on_section
-
-
-def _levels_at(s: Structure, levels: AbstractLevels, N: int, t, chart, q) -> np.ndarray:
-    """The levels of N sections at K points of a cycle, and their rates (2, N, K); NaN in charts
-    that have none."""
-    out = np.full((2, N, len(t)), np.nan)
-    for a in np.unique(chart).tolist():
-        if levels.present(s, a):
-            rows = np.flatnonzero(chart == a)
-            both = kernels.levels(s, a, levels, N, t[rows], q[: s.dims[a], rows])
-            out[:, :, rows] = both.swapaxes(0, 1)
-    return out

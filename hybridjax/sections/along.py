@@ -1,0 +1,136 @@
+"""The flow along a cycle to one section after the other, from a recorded turn on the host.
+
+The moves of the turn are cut where a section lies within them. One search then makes all of them
+side by side, in place of one after the other.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..engine import kernels
+from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Lanes, Tape
+from ..engine.replay import Moves, linear_moves, recorded_moves
+from ..engine.target import AbstractLevels, Target
+from ..orbits.return_map import ReturnMap
+from ..orbits.scale import has_implicit
+from ..orbits.shooting import ATOL, follow_moves, one_by_one
+from ..systems.structure import Structure
+from ..systems.transition import TOGETHER
+
+
+# Newton steps along a move to the level of a section. Fewer: sections are placed one after the
+# other. More: nothing.
+_STEPS = 5
+
+
+def flow_along(
+    map: ReturnMap, turn: tuple[Lanes, Tape], begin: Lanes, targets: Target
+) -> tuple[Lanes, Any] | None:
+    """The flow along a cycle from a lane on it to one of the `targets` after the other, all at
+    known times or all at states: the lane at the end, and the pieces, as by `through`. None if a
+    target is not reached once in a turn, if the search makes other moves than the recorded `turn`,
+    and for implicit methods, whose steps have errors that decay before the turn ends."""
+    s, period, t0, late = map.structure, map.expected, map.anchor.t[0], TOGETHER * map.expected
+    once, K = recorded_moves(*turn), len(targets.time)
+    once, M = once._replace(code=np.where(once.code < 0, MOVE, once.code)), len(once.t)
+    if has_implicit(s):
+        return None
+    event, clock = np.broadcast_to(targets.event, K), np.isfinite(targets.time[0])
+
+    def place(time):
+        """Numbers of the moves in which times lie: those of the second turn begin with M."""
+        turns, rest = np.divmod(time - t0 + late, period)
+        return (turns * M + np.searchsorted(once.t, t0 + rest, side="right") - 1).astype(int)
+
+    # The moves of the recorded turn in which targets lie, and how far.
+    if clock:
+        turns, move = np.divmod(place(targets.time), M)
+        h = targets.time - turns * period - once.t[move]
+    else:
+        level = _levels_on(s, once, turn[1], targets)
+        falls = (level[0] > 0) & (level[1] <= 0)
+        reached = np.where(event[:, None] < 0, falls, once.code == event[:, None])
+        if (reached.sum(axis=1) != 1).any():
+            return None
+        move = np.argmax(reached, axis=1)
+        start, end = level[:, np.arange(K), move]
+        h = np.where(event < 0, start / (start - end), 1.0)
+        h *= np.append(once.t[1:], t0 + period)[move] - once.t[move]
+    cut = np.flatnonzero(event < 0)
+    start = Moves(*(x[..., move[cut]] for x in once))
+    start = start._replace(code=np.full(len(cut), ARRIVE_TIME if clock else ARRIVE_LEVEL), lane=cut)
+    for _ in range(1 if clock else _STEPS):
+        goal = dataclasses.replace(targets, time=once.t[move] + h)
+        end, _ = linear_moves(s, start._replace(h=h[cut]), goal)
+        h[cut] = end[:, 0] - start.t
+    # Times and moves on the way: each target follows the one before it.
+    time = once.t[move] + h
+    if not clock:
+        turns = np.ceil((begin.t[0] + late - time[0]) / period)
+        turns = turns + np.cumsum(np.append(False, time[1:] <= time[:-1] + late))
+    time = time + turns * period
+    key = np.where(event < 0, place(time), turns * M + move + 1).astype(int)
+    # A target takes the place of a recorded move that begins there.
+    (first,), at = place(begin.t), lambda key: once.t[key % M] + key // M * period
+    replaced = time - at(key) <= late
+    between = np.setdiff1d(np.arange(first + 1, key[-1] + 1), key[replaced])
+    if (once.code[(key - 1) % M] >= 0)[replaced & (event < 0)].any():
+        return None
+    q = once.q[:, key % M]
+    q[:, cut] = end[:, 1:].T
+    keys = np.concatenate([[first], between, key])
+    times = np.concatenate([begin.t, at(between), time])
+    states = np.concatenate([begin.q, once.q[:, between % M], q], axis=1)
+    order = np.lexsort((times, keys))
+    keys, times, states = keys[order], times[order], states[:, order]
+    is_target = order > len(between)
+    piece = np.cumsum(is_target)[:-1]
+    arrives = is_target[1:] & (event[np.minimum(piece, K - 1)] < 0)
+    code = np.where(arrives, ARRIVE_TIME if clock else ARRIVE_LEVEL, once.code[keys[:-1] % M])
+    chart = np.append(begin.chart, once.chart[keys[1:-1] % M])
+    moves = Moves(times[:-1], chart, states[:, :-1], np.diff(times), code, piece, order)
+    at_once = ((moves.h == 0) & (code >= 0)).any()
+    flow = None if at_once else follow_moves(map, begin, targets, moves)
+    if flow is None or flow[-1] > 10 * (ATOL + map.settings.rtol):
+        return None
+    legs, moved, tape, _ = flow
+    end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
+    return end, jax.tree_util.tree_map(one_by_one, (legs, moved, tape))
+
+
+def _levels_on(
+    s: Structure, once: Moves, tape: Tape, targets: Target
+) -> Float[np.ndarray, "2 K M"]:
+    """Levels of targets at the starts and the ends of moves; the same where a move follows another
+    without an event, so that each crossing lies in one of them."""
+    after = tape.before.transpose(2, 0, 1)[tape.code.T != IDLE].T
+    index = np.broadcast_to(targets.index, targets.time.shape)
+    if targets.levels is None:
+        return np.full((2, len(index), len(once.t)), np.nan)
+    N, ends = 1 + max(index), (once.q, after)
+    start, end = (levels_at(s, targets.levels, N, once.t, once.chart, q)[0] for q in ends)
+    start = np.where(np.roll(once.code, 1) < 0, np.roll(end, 1, axis=1), start)
+    return np.stack([start, end])[:, index]
+
+
+def levels_at(
+    s: Structure,
+    levels: AbstractLevels,
+    N: int,
+    t: Float[np.ndarray, " K"],
+    chart: Int[np.ndarray, " K"],
+    q: Float[np.ndarray, "d K"],
+) -> Float[np.ndarray, "2 N K"]:
+    """The levels of N sections at K points of a cycle, and their rates; NaN in charts that have
+    none."""
+    out = np.full((2, N, len(t)), np.nan)
+    for a in np.unique(chart).tolist():
+        if levels.present(s, a):
+            rows = np.flatnonzero(chart == a)
+            both = kernels.levels(s, a, levels, N, t[rows], q[: s.dims[a], rows])
+            out[:, :, rows] = both.swapaxes(0, 1)
+    return out
