@@ -246,7 +246,7 @@ def hosted(cycle: Any) -> Any:
     return _hosted.recall(cycle, None, lambda: to_host(cycle))
 
 
-def last_turn(cycle: Any) -> tuple[Lanes, Tape] | None:
+def last_turn(cycle: Any) -> Any:
     """The starts and the steps of the pieces of a cycle's last turn, side by side; None where JAX
     traces the cycle, and the host did not take them."""
     cycle = hosted(cycle)

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from ..engine import kernels
 from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Lanes, Tape
 from ..engine.replay import Moves, linear_moves, recorded_moves
-from ..engine.target import AbstractLevels, Target
+from ..engine.target import Target
 from ..orbits.return_map import ReturnMap
 from ..orbits.scale import has_implicit
 from ..orbits.shooting import ATOL, follow_moves, one_by_one
@@ -95,7 +95,9 @@ def flow_along(
     moves = Moves(times[:-1], chart, states[:, :-1], np.diff(times), code, piece, order)
     at_once = ((moves.h == 0) & (code >= 0)).any()
     flow = None if at_once else follow_moves(map, begin, targets, moves)
-    if flow is None or flow[-1] > 10 * (ATOL + map.settings.rtol):
+    assert map.settings.rtol is not None
+    # (As for a turn of Newton's method.)
+    if flow is None or flow[-1] >= ATOL + map.settings.rtol:
         return None
     legs, moved, tape, _ = flow
     end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
@@ -119,7 +121,7 @@ def _levels_on(
 
 def levels_at(
     s: Structure,
-    levels: AbstractLevels,
+    levels: Any,
     N: int,
     t: Float[np.ndarray, " K"],
     chart: Int[np.ndarray, " K"],

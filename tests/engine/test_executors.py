@@ -117,15 +117,14 @@ def test_a_turn_with_its_moves_side_by_side(name):
         assert (travelled := travel(map, x * sizes, expected)) is not None
         again = map.turn_with_jacobian(x * sizes, travelled=travelled)
         # Refused: a gap before a move, another first time, an event (not the last) overlooked.
-        moves = expected.moves
-        third, event = np.arange(len(moves.t)) == 2, moves.code >= 0
-        gap = 1e-6 * third * map.scale[moves.chart].T
-        early = moves.t - 1e-6 * map.expected * (moves.order + moves.lane == 0)
-        blind = np.where(event & (np.cumsum(event) == 1), MOVE, moves.code)
-        wrong = [moves._replace(q=moves.q + gap), moves._replace(t=early)]
-        wrong += [moves._replace(code=blind)] * bool(event[:-1].any())
+        third, event = np.arange(len(expected.t)) == 2, expected.code >= 0
+        gap = 1e-6 * third * map.scale[expected.chart].T
+        early = expected.t - 1e-6 * map.expected * (expected.order + expected.lane == 0)
+        blind = np.where(event & (np.cumsum(event) == 1), MOVE, expected.code)
+        wrong = [expected._replace(q=expected.q + gap), expected._replace(t=early)]
+        wrong += [expected._replace(code=blind)] * bool(event[:-1].any())
         for other in wrong:
-            assert travel(map, x * sizes, expected._replace(moves=other)) is None
+            assert travel(map, x * sizes, other) is None
     assert int(cycle.iterations) < 8  # (gaps between moves do not keep a search from ending)
     assert [x for x in np.ravel(again.codes) if x >= 0] == [
         x for x in np.ravel(turn.codes) if x >= 0

@@ -2,13 +2,16 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.sections import place
 
 from ..conftest import APEX
+from ..engine.test_executors import slow_but
 
 
 AtEvent, Crossing = hj.AtEvent, hj.Crossing
@@ -142,3 +145,56 @@ def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
     cycle = dataclasses.replace(hopper_cycle, settings=settings)
     with pytest.raises(hj.ComputationError, match="max_steps.* Give them to the search for the cy"):
         hj.place_sections(cycle, hj.ClockPhase(2))
+
+
+@pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("BuckConverter", "VerticalHopper")))
+def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch):
+    """The same places, steps and errors as one section after the other."""
+    system = getattr(hj.models, name)()
+    if system.guess() is None or name == "SLIPRunner":
+        pytest.skip("has no guess of its own, or a family of cycles")
+    cycle = hj.find_limit_cycle(system)
+    s, (_, _, q) = cycle.structure, cycle.trajectory().dense()
+    names, side_by_side = s.states_everywhere()[:2], []
+    range_of = lambda x: (q[:, k].min(), q[:, k].max())  # noqa: E731
+    families = [hj.ClockPhase(7)]
+    families += [[AtEvent(s.transitions[g].name)] for g in sorted(set(cycle.event_sequence))]
+    for name in names:
+        k = s.charts[0].states.index(name)
+        level = np.sum(np.array(range_of(name)) * (0.53, 0.47))
+        crossings = [Crossing(name, way, level) for way in ("rising", "falling")]
+        families += [crossings, hj.ClockPhase(5, crossings[1])]
+        families.append(hj.ArcLength(5, names[:1], crossings[0]))
+    if len(names) == 2:
+        families.append(hj.KinematicPhase(9, *names, center=q[:, :2].mean(axis=0)))
+
+    def spy(*arguments, plain=place.flow_along):
+        side_by_side.append(flow := plain(*arguments))
+        return flow
+
+    def attempt(family):
+        place._recent.clear()
+        try:
+            return hj.place_sections(cycle, family)
+        except hj.ComputationError as error:
+            return str(error)
+
+    monkeypatch.setattr(place, "flow_along", spy)
+    from_turn = list(map(attempt, families))
+    monkeypatch.setattr(place, "last_turn", lambda cycle: None)
+    for family, placed in zip(families, from_turn, strict=True):
+        if isinstance(other := attempt(family), str) or isinstance(placed, str):
+            assert placed == other
+            continue
+        pairs = ((x.lanes, x.flow_jacobians) for x in (placed, other))
+        (own, A), (their, B) = map(jax.device_get, pairs)
+        scale = np.asarray(cycle.settings.scale)[their.chart].T
+        assert np.abs((own.q - their.q) / scale).max() < 1e-12
+        np.testing.assert_allclose(own.t, their.t, rtol=1e-12)
+        for field in ("chart", "events"):
+            np.testing.assert_array_equal(getattr(own, field), getattr(their, field))
+        for x, y in zip(A, B, strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-10 * np.abs(y).max(initial=1e-300))
+        np.testing.assert_array_equal(placed.drop, other.drop)
+    implicit = any(s.method(a).implicit for a in range(len(s.charts)))
+    assert implicit or sum(x is not None for x in side_by_side) > 1
