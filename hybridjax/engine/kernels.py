@@ -83,7 +83,7 @@ def watched(
     if not on_host(q):
         return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(t, q, u, index)
     # (A program for many points is worth its compilation from so many calls on.)
-    lanes = lanes or (1 if q.shape[-1] < 4 * POINTS else POINTS)
+    lanes = lanes or (1 if q.shape[-1] < WIDE else POINTS)
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
