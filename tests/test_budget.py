@@ -27,12 +27,13 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 1150 lines are the algebra of HTFs, loops and
 # delays, 1160 the responses of cycles with noise, coupling and symmetry in time, 770 populations of
 # subjects, 980 motion and sliders, 610 simulators of others, 70 sweeps on the host, 60 comparisons
-# with higher orders, 110 turns whose moves are computed side by side, 65 warnings and refusals of
-# fits; of the tests, 1900 are those of all, 70 of orders of names and samples, 95 of the last two.
+# with higher orders, 260 turns and sections whose moves are computed side by side, 65 warnings and
+# refusals of fits; of the tests, 1900 are those of all, 70 of orders of names and samples, 150 of
+# the last two.
 # (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 28_985,
-    "files": 244,
+    "code": 29_141,
+    "files": 245,
     "longest": 500,
     "public_names": 185,
     "many_parameters": 8,
@@ -40,7 +41,7 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 20,
-    "test_lines": 17_997,
+    "test_lines": 18_052,
     "doc_words": 40_878,
 }
 

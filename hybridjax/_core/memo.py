@@ -24,7 +24,7 @@ class Memory:
     def __len__(self) -> int:
         return len(self._values)
 
-    def known(self, owner: Any, key: Hashable) -> Any:
+    def get(self, owner: Any, key: Hashable) -> Any:
         """Return the value that is kept for this owner and key, or None."""
         return self._values.get(id(owner), {}).get(key)
 

@@ -251,7 +251,7 @@ def last_turn(cycle: Any) -> Any:
     traces the cycle, and the host did not take them."""
     cycle = hosted(cycle)
     make = lambda: side_by_side(to_host(cycle.return_map).pieces(tangents=True))  # noqa: E731
-    return _turns.known(cycle, None) if is_hidden(cycle) else _turns.recall(cycle, None, make)
+    return _turns.get(cycle, None) if is_hidden(cycle) else _turns.recall(cycle, None, make)
 
 
 def recorded_ends(map: ReturnMap, lanes: Lanes) -> Target:

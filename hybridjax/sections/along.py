@@ -22,11 +22,6 @@ from ..systems.structure import Structure
 from ..systems.transition import TOGETHER
 
 
-# Newton steps along a move to the level of a section. Fewer: sections are placed one after the
-# other. More: nothing.
-_STEPS = 5
-
-
 def flow_along(
     map: ReturnMap, turn: tuple[Lanes, Tape], begin: Lanes, targets: Target
 ) -> tuple[Lanes, Any] | None:
@@ -43,8 +38,8 @@ def flow_along(
 
     def place(time):
         """Numbers of the moves in which times lie: those of the second turn begin with M."""
-        turns, rest = np.divmod(time - t0 + late, period)
-        return (turns * M + np.searchsorted(once.t, t0 + rest, side="right") - 1).astype(int)
+        turns, since = np.divmod(time - t0 + late, period)
+        return (turns * M + np.searchsorted(once.t, t0 + since, side="right") - 1).astype(int)
 
     # The moves of the recorded turn in which targets lie, and how far.
     if clock:
@@ -63,9 +58,13 @@ def flow_along(
     cut = np.flatnonzero(event < 0)
     start = Moves(*(x[..., move[cut]] for x in once))
     start = start._replace(code=np.full(len(cut), ARRIVE_TIME if clock else ARRIVE_LEVEL), lane=cut)
-    for _ in range(1 if clock else _STEPS):
+    change = period
+    while change > late:  # (Newton's method finds levels.)
         goal = dataclasses.replace(targets, time=once.t[move] + h)
         end, _ = linear_moves(s, start._replace(h=h[cut]), goal)
+        last, change = change, np.abs(end[:, 0] - start.t - h[cut]).max(initial=0.0)
+        if not change <= last:
+            return None
         h[cut] = end[:, 0] - start.t
     # Times and moves on the way: each target follows the one before it.
     time = once.t[move] + h
