@@ -196,6 +196,10 @@ CASES: dict[str, Callable[[], Case]] = {
         "v", "current", 0.0, [1.9834880445450845e-134], _STIFF, ("v", "w"),
         section=hj.Crossing("v", "rising"),
     ),
+    "rotor flap": lambda: Case(
+        "rotor flap", m.RotorFlap(), hj.ClockPhase(16), "b", "moment", 1e-2,
+        [-0.0215994758114450, -0.00373617944596341], _MPMATH, None,
+    ),
     "Mathieu": lambda: Case(
         "damped Mathieu (0.25, 0.1)", m.Mathieu(delta=0.25, epsilon=0.1), hj.ClockPhase(16), "x",
         "force", 1e-2, [-0.728150761133001, -0.390866230632208], _MPMATH, None,

@@ -15,6 +15,7 @@ from .oscillators import (
     Duffing as Duffing,
     HopfOscillator as HopfOscillator,
     Mathieu as Mathieu,
+    RotorFlap as RotorFlap,
     VanDerPol as VanDerPol,
 )
 from .runners import (

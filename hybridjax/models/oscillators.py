@@ -90,6 +90,36 @@ class Mathieu(HybridSystem):
         return Guess("line", (0.0, 0.0))
 
 
+class RotorFlap(HybridSystem):
+    """The flapping angle `b` of a rigid blade; time in radians of its rotation.
+
+    Input `u` is a flapping moment, such as one due to pitch, divided by the moment of inertia.
+
+    D. A. Peters, K. H. Hohenemser, Application of the Floquet transition matrix to problems of
+    lifting rotor stability, J. American Helicopter Society 16(2), 1971; here without the region of
+    reversed flow.
+    """
+
+    lock: Parameter = parameter(12.0, doc="Lock number, aerodynamic over inertial forces")
+    p: Parameter = parameter(1.0, doc="natural frequency over the rotor's")
+    mu: Parameter = parameter(0.3, doc="advance ratio")
+
+    def charts(self):
+        return {"blade": FieldChart(self._blade, ("b", "vb"), ("rad", ""))}
+
+    def _blade(self, t, q, u):
+        (b, vb), lock, mu = q, self.lock / 8, self.mu
+        damping = lock * (1 + 4 / 3 * mu * jnp.sin(t))
+        stiffness = self.p**2 + lock * (4 / 3 * mu * jnp.cos(t) + mu**2 * jnp.sin(2 * t))
+        return vb, u[0] - damping * vb - stiffness * b
+
+    def period(self):
+        return jnp.asarray(2 * jnp.pi)
+
+    def guess(self):
+        return Guess("blade", (0.0, 0.0))
+
+
 class HopfOscillator(HybridSystem):
     """A smooth oscillator with a circular cycle of radius sqrt(mu) and multiplier exp(-2 mu T).
 

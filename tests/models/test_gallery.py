@@ -63,6 +63,8 @@ CASES = {
     "trot": lambda: Case(m.TrottingQuadruped(), None, {"y": 0.376873156491, "v": -0.971912849051},
         1.0, [*pair(-0.08768800113731487 + 0.4750481690903344j),
         *pair(0.18391330048481577 + 0.35828647799688856j)], accuracy=1e-7),
+    "flap, 12": lambda: Case(m.RotorFlap(), None, {}, 2 * np.pi, [-0.0215994758114450,
+        -0.00373617944596341]),
     "Mathieu, 0.25": lambda: Case(m.Mathieu(delta=0.25, epsilon=0.1), None, {"x": 0.0}, 2 * np.pi,
         [-0.728150761133001, -0.390866230632208]),
 }  # fmt: skip
