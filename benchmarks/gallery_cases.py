@@ -86,6 +86,14 @@ CASES: dict[str, Callable[[], Case]] = {
         [*_pair(-0.24885118328047069434 + 0.69922500780850327787j), 1.6159409134125691e-4],
         _MPMATH, ("yM", "vM"),
     ),
+    "two hoppers": lambda: Case(
+        "two coupled hoppers", m.HopperPair(), hj.ClockPhase(16, anchor=0.5), "yM1",
+        "both forces", 5e-4,
+        [*_pair(-0.439196992225001708 + 0.611321029449368104j),
+         *_pair(-0.248558676124545596 + 0.697949554160020074j),
+         2.05187165619280217e-9, 1.16996080957107642e-15],
+        _MPMATH, ("yM1", "yM2"),
+    ),
     "bar": lambda: Case(
         "two-legged bar", m.TwoLeggedBar(), hj.ClockPhase(16), "y", "force", 1e-4,
         [*_pair(-0.153520955429110 + 0.361043052961495j),
@@ -155,6 +163,22 @@ CASES: dict[str, Callable[[], Case]] = {
         "buck converter, 25 V, period 2", m.BuckConverter(Vin=25.0), hj.ClockPhase(16, anchor=0.03),
         "v", "reference voltage", 2e-6, _pair(0.613891423607179 + 0.290590765487630j), _MPMATH,
         _BUCK, guess=hj.Guess("open", (12.04, 0.627, 3.8)), multiplicity=2,
+    ),
+    "Cuk": lambda: Case(
+        "Ćuk converter", m.CukConverter(), hj.ClockPhase(8, anchor=5e-6), "v2", "reference current",
+        1e-5,
+        [*_pair(0.847302228159268509 + 0.427350687398246989j), -0.694479389634475538,
+         0.643345392432610566],
+        _MPMATH, ("v2", "i2"),
+    ),
+    "Chua": lambda: Case(
+        "Chua's circuit, alpha = 8", m.ChuaCircuit(),
+        hj.KinematicPhase(
+            16, position="x", velocity="z", center=(1.3, -1.5), scale=(0.9, 1.3),
+            anchor=hj.Crossing("x", "falling", 1.5),
+        ),
+        "x", "added to x'", 1e-4, [-0.677312642613658609, -0.0195673404468831832], _MPMATH,
+        ("x", "z"), section=hj.AtEvent("in from the right"),
     ),
     "belt": lambda: Case(
         "block on a belt", m.BeltOscillator(),

@@ -22,7 +22,7 @@ from gallery_cases import CASES, Case
 import hybridjax as hj
 
 
-SLOW = {"biped", "torso walker", "compass gait", "short gait"}
+SLOW = {"biped", "torso walker", "two hoppers", "compass gait", "short gait"}
 NAMES = [*(x for x in CASES if x not in SLOW), "FitzHugh-Nagumo, 0.001"]
 
 

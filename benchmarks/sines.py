@@ -133,6 +133,7 @@ if __name__ == "__main__":
         (hj.models.PaddleJuggler(), ("v", "y"), 1e-3),
         (hj.models.VerticalHopper(), ("yM", "vM"), 1e-2),
         (hj.models.BuckConverter(), ("v", "i"), 1e-3),
+        (hj.models.CukConverter(), ("v2", "i1"), 1e-3),
         (Boost(), ("v", "i"), 1e-4),
     ]
     for system, outputs, size in cases:

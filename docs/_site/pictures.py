@@ -62,7 +62,7 @@ def thumbnail(cycle: hj.LimitCycle, plane: list[str]) -> str:
     path, period = cycle.trajectory(), float(cycle.period)
     times = path.t[0] + np.linspace(0, period, FRAMES, endpoint=False)
     about = f'dur="{max(motion.interval * len(motion.times), 1.0):.3g}s"'
-    is_circuit = isinstance(cycle.system, hj.models.BuckConverter)
+    is_circuit = isinstance(cycle.system, hj.models.BuckConverter | hj.models.CukConverter)
     if is_circuit or drawing_of(cycle.structure, 0) is None:
         names = plane or cycle.structure.states_everywhere()[:2]
         points = np.array(path(*names)[1:]).T

@@ -4,14 +4,16 @@ from .balls import (
     PaddleJuggler as PaddleJuggler,
 )
 from .bipeds import FiveLinkBiped as FiveLinkBiped, TorsoWalker as TorsoWalker
-from .converters import BuckConverter as BuckConverter
+from .converters import BuckConverter as BuckConverter, CukConverter as CukConverter
 from .hoppers import (
     CompliantHopper as CompliantHopper,
+    HopperPair as HopperPair,
     VerticalHopper as VerticalHopper,
 )
 from .neurons import FitzHughNagumo as FitzHughNagumo
 from .oscillators import (
     BeltOscillator as BeltOscillator,
+    ChuaCircuit as ChuaCircuit,
     Duffing as Duffing,
     HopfOscillator as HopfOscillator,
     Mathieu as Mathieu,

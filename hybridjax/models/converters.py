@@ -1,6 +1,8 @@
-"""A DC-DC converter with a switch that a controller closes and opens."""
+"""DC-DC converters with a switch that a controller closes and opens."""
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +25,13 @@ def _plates(charge: ArrayLike) -> tuple[Array, Array]:
     half = jnp.array([0, 0.45, 0.45 - 0.25j, 0.45 + 0.25j])
     half -= 0.1 * jnp.clip(charge, 0, 1) * np.array([0, 1, 1, 1])
     return half, 1 - half
+
+
+def _circuit(begin: float, x: float, lines: Mapping[str, Any]) -> Drawing:
+    """Lines in the complex plane, a load at x with wires from `begin`, and poles of the supply."""
+    drawn = {name: jnp.stack([jnp.real(z), jnp.imag(z)], -1) for name, z in lines.items()}
+    load = [(begin, 1.0), *Drawing.spring((x, 1.0), (x, 0.0)), (0.0, 0.0)]
+    return Drawing(drawn | {"load": load}, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
 
 class BuckConverter(HybridSystem):
@@ -87,9 +96,76 @@ class BuckConverter(HybridSystem):
             "upper plate": 2 + 1j - 1j * above,
             "lower plate": 2 + 1j - 1j * below,
         }
-        drawn = {name: jnp.stack([jnp.real(z), jnp.imag(z)], -1) for name, z in lines.items()}
-        load = [(2.0, 1.0), *Drawing.spring((3.0, 1.0), (3.0, 0.0)), (0.0, 0.0)]
-        return Drawing(drawn | {"load": load}, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
+        return _circuit(2.0, 3.0, lines)
 
     def guess(self):
         return Guess("open", (12.0, 0.6, self.lower))
+
+
+class CukConverter(HybridSystem):
+    """A clock closes the switch, and the sum of both coils' currents opens it at a reference.
+
+    States: current `i1` of the coil at the supply, voltage `v1` of the capacitor that transfers the
+    energy, current `i2` of the coil at the load, and the load's voltage `v2` (of opposite sign to
+    the supply, here counted as positive). While the switch is open, the diode conducts all the time
+    (continuous conduction). Input `u` is added to the reference current.
+
+    S. Ćuk, R. D. Middlebrook, A new optimum topology switching dc-to-dc converter, IEEE Power
+    Electronics Specialists Conference, 1977; under such control, beyond its stable cycle: C. K.
+    Tse, W. C. Y. Chan, Chaos from a current-programmed Ćuk converter, Int. J. Circuit Theory and
+    Applications 23, 1995. The parameters have typical values, which are from neither source.
+    """
+
+    input_units = ("A",)
+    time_unit = "s"
+
+    E: Parameter = parameter(15.0, unit="V", doc="supply")
+    L1: Parameter = parameter(2e-3, unit="H", doc="coil at the supply")
+    L2: Parameter = parameter(2e-3, unit="H", doc="coil at the load")
+    C1: Parameter = parameter(20e-6, unit="F", doc="capacitor between the coils")
+    C2: Parameter = parameter(20e-6, unit="F", doc="capacitor at the load")
+    R: Parameter = parameter(10.0, unit="ohm", doc="load")
+    Iref: Parameter = parameter(2.0, unit="A", doc="reference for i1 + i2")
+    T: Parameter = parameter(100e-6, unit="s", doc="period of the clock")
+
+    def charts(self):
+        return {"open": self._circuit(False), "closed": self._circuit(True)}
+
+    def _circuit(self, closed: bool) -> FieldChart:
+        def field(t, q, u):
+            i1, v1, i2, v2 = q
+            # The capacitor between the coils stands in the loop of one or the other.
+            first, charge, second = (0.0, -i2, v1) if closed else (v1, i1, 0.0)
+            rates = (self.E - first) / self.L1, charge / self.C1, (second - v2) / self.L2
+            return *rates, (i2 - v2 / self.R) / self.C2
+
+        return FieldChart(field, ("i1", "v1", "i2", "v2"), ("A", "V", "A", "V"))
+
+    def transitions(self):
+        tick = Scheduled(self.T)
+        left = lambda t, q, u: self.Iref + u[0] - q[0] - q[2]  # noqa: E731
+        return (
+            Transition("switch off", "closed", "open", left),
+            Transition("switch on", "open", "closed", tick),
+            Transition("stays on", "closed", "closed", tick),
+        )
+
+    def period(self):
+        return self.T
+
+    def draw(self, chart, t, q):
+        """The circuit: supply, first coil, switch, capacitor, diode, second coil, load."""
+        left, right = _plates(q["v1"] / (4 * self.E))
+        above, below = _plates(q["v2"] / (2 * self.E))
+        lines = {
+            "switch": 1 + np.array([1j, 0.8j, 0.2j if chart == "closed" else 0.35 + 0.3j]),
+            "contact": np.array([1 + 0.2j, 1]),
+            **{"first coil": 1j + _COIL, "second coil": 2 + 1j + _COIL},
+            **{"left plate": 1 + 1j + left, "right plate": 1 + 1j + right},
+            "diode": 2 + 1j - 1j * _DIODE,
+            **{"upper plate": 3 + 1j - 1j * above, "lower plate": 3 + 1j - 1j * below},
+        }
+        return _circuit(3.0, 3.7, lines)
+
+    def guess(self):
+        return Guess("open", (0.55, 25.0, 0.85, 10.0), 0.9 * self.T)

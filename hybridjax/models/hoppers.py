@@ -1,8 +1,10 @@
-"""The vertical hopper of the paper, and the same on compliant ground."""
+"""The vertical hopper of the paper, the same on compliant ground, and a coupled pair of them."""
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -14,6 +16,13 @@ from ..systems.transition import Transition
 
 
 _MASSES = ("yM", "vM", "ym", "vm"), ("m", "m/s", "m", "m/s")
+
+
+def _hopper(i: int, yM: Array, ym: Array) -> tuple[dict, dict]:
+    """Lines and circles of hopper i. (Its foot has a radius of 0.1 m.)"""
+    x, tag = 1.5 * i, f" {i + 1}" if i else ""
+    circles = {f"body{tag}": (x, yM, 0.3), f"foot{tag}": (x, ym + 0.1, 0.1)}
+    return {f"leg{tag}": Drawing.spring((x, ym + 0.2), (x, yM - 0.3))}, circles
 
 
 class HopperStance(Chart):
@@ -87,10 +96,8 @@ class VerticalHopper(HybridSystem):
         return 2 * jnp.pi / self.omega
 
     def draw(self, chart, t, q):
-        yM, ym = q["yM"], q["ym"]
-        leg = Drawing.spring((0.0, ym + 0.2), (0.0, yM - 0.3))
-        circles = {"body": (0.0, yM, 0.3), "foot": (0.0, ym + 0.1, 0.1)}
-        return Drawing({"ground": [(-1.0, 0.0), (1.0, 0.0)], "leg": leg}, circles=circles)
+        lines, circles = _hopper(0, q["yM"], q["ym"])
+        return Drawing({"ground": [(-1.0, 0.0), (1.0, 0.0)], **lines}, circles=circles)
 
     def guess(self):
         return Guess("stance", (2.0, 1.9), 0.5)
@@ -127,3 +134,99 @@ class CompliantHopper(VerticalHopper):
     def guess(self):
         """The guess of `VerticalHopper`, with the foot where the ground carries it."""
         return Guess("contact", (2.0, 1.9, -1e-4, 0.0), 0.5)
+
+
+_BODIES, _FEET = (("yM1", "vM1"), ("yM2", "vM2")), (("ym1", "vm1"), ("ym2", "vm2"))
+_STATES = sum(_BODIES + _FEET, ())
+# Chart by the feet that stand on the ground.
+_PAIR_CHARTS = {(): "air", (0,): "first", (1,): "second", (0, 1): "both"}
+
+
+class PairStanding(Chart):
+    pair: "HopperPair"
+    down: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def absent(self) -> dict[str, float]:  # type: ignore[override]
+        return {name: 0.0 for i in self.down for name in _FEET[i]}
+
+    @property
+    def states(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(name for name in _STATES if name not in self.absent)
+
+    @property
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("m", "m/s") * (len(self.states) // 2)
+
+    def whole(self, q: Array) -> list[Array]:
+        """All eight states: feet on the ground rest."""
+        return [q[self.states.index(x)] if x in self.states else jnp.zeros(()) for x in _STATES]
+
+    def part(self, whole: Sequence) -> list:
+        return [x for name, x in zip(_STATES, whole, strict=True) if name in self.states]
+
+    def field(self, t, q, u):
+        p, whole = self.pair, self.whole(q)
+        pull = p.coupling * (whole[2] - whole[0])
+        bodies, feet = [], []
+        for i, between in enumerate((pull, -pull)):
+            (y, v), (ym, vm) = whole[2 * i : 2 * i + 2], whole[2 * i + 4 : 2 * i + 6]
+            leg = p.leg(t - i * p.lag, y, ym)
+            bodies += [v, (leg + between + u[i]) / p.M - p.g]
+            feet += [vm, -(leg + p.b * vm) / p.m - p.g]
+        return self.part(bodies + feet)
+
+
+class HopperPair(VerticalHopper):
+    """Two equal hoppers whose bodies are joined by a spring; the second actuator lags behind.
+
+    Inputs are a force on each body. A touchdown multiplies the speed of the body above it by
+    `retention`.
+
+    The hoppers are `VerticalHopper`; the coupling is not from the literature.
+    """
+
+    inputs = ("u1", "u2")
+    input_units = ("N", "N")
+
+    coupling: Parameter = parameter(1.0, unit="N/m", doc="stiffness of the spring between bodies")
+    lag: Parameter = parameter(0.3, unit="s", doc="by which the second actuator runs behind")
+
+    def charts(self):
+        return {name: PairStanding(self, down) for down, name in _PAIR_CHARTS.items()}
+
+    def transitions(self):
+        return tuple(self._step(i, down) for down in _PAIR_CHARTS for i in (0, 1))
+
+    def _step(self, i: int, down: tuple[int, ...]) -> Transition:
+        """Touchdown or liftoff of hopper i, while these feet are down."""
+        lifts = i in down
+        after = tuple(k for k in (0, 1) if (k in down) != (k == i))
+        before, landed = PairStanding(self, down), PairStanding(self, after)
+
+        def guard(t, q, u):
+            whole = before.whole(q)
+            force = self.leg(t - i * self.lag, whole[2 * i], 0.0) + self.m * self.g
+            return force if lifts else whole[2 * i + 4]
+
+        def reset(t, q, u):
+            whole = before.whole(q)
+            if not lifts:
+                whole[2 * i + 1] = self.retention * whole[2 * i + 1]
+            return landed.part(whole)
+
+        name = f"{'liftoff' if lifts else 'touchdown'} {i + 1} ({_PAIR_CHARTS[down]})"
+        return Transition(name, _PAIR_CHARTS[down], _PAIR_CHARTS[after], guard, reset=reset)
+
+    def draw(self, chart, t, q):
+        (lines, circles), (second, more) = (
+            _hopper(i, q[f"yM{i + 1}"], q[f"ym{i + 1}"]) for i in (0, 1)
+        )
+        between = Drawing.spring((0.3, q["yM1"]), (1.2, q["yM2"]))
+        lines = {"ground": [(-1.0, 0.0), (2.5, 0.0)], **lines, **second, "coupling": between}
+        return Drawing(lines, circles={**circles, **more})
+
+    def guess(self):
+        """The states of two uncoupled hoppers: the first is about to lift off, the second is
+        falling."""
+        return Guess("first", (2.0, 1.9, 1.6, -0.2, 0.55, -2.7), 0.5)

@@ -7,6 +7,7 @@ from ..systems.chart import FieldChart
 from ..systems.drawing import Drawing
 from ..systems.sliding import Sliding, sliding
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Transition
 
 
 def _block(x: Array, reach: Parameter | float, speed: Parameter | float = 0.0) -> Drawing:
@@ -208,3 +209,45 @@ class BeltOscillator(HybridSystem):
 
     def guess(self):
         return Guess("sticks", jnp.stack([0.5 * self.friction / self.k, self.belt]))
+
+
+class ChuaCircuit(HybridSystem):
+    """x' = alpha (y - h(x)) + u, y' = x - y + z, z' = -beta y, with a resistor h of slope `inner`
+    where |x| < 1 (chart "middle"), and `outer` beyond (charts "left" and "right").
+
+    The field is continuous across x = 1 and x = -1; its derivative jumps. States: voltages `x` and
+    `y` of both capacitors, and current `z` of the coil, without dimensions.
+
+    T. Matsumoto, L. O. Chua, M. Komuro, The double scroll, IEEE Trans. Circuits and Systems 32,
+    1985, the source of this dimensionless form. Their double scroll is at alpha = 9; at alpha = 8,
+    before its periods double, there is a cycle around either of two equilibria.
+    """
+
+    alpha: Parameter = parameter(8.0, doc="ratio of the capacitors")
+    beta: Parameter = parameter(100 / 7, doc="of a capacitor to the coil")
+    inner: Parameter = parameter(-1 / 7, doc="slope of h for small voltages")
+    outer: Parameter = parameter(2 / 7, doc="the same for large ones")
+
+    def charts(self):
+        sides = {"left": -1.0, "middle": 0.0, "right": 1.0}
+        return {name: self._slab(side) for name, side in sides.items()}
+
+    def _slab(self, side: float) -> FieldChart:
+        def field(t, q, u):
+            x, y, z = q
+            resistor = self.outer * (x - side) + self.inner * side if side else self.inner * x
+            return self.alpha * (y - resistor) + u[0], x - y + z, -self.beta * y
+
+        return FieldChart(field, ("x", "y", "z"))
+
+    def transitions(self):
+        right, left = (lambda t, q, u, x=x: q[0] - x for x in (1.0, -1.0))
+        return (
+            Transition("in from the right", "right", "middle", right),
+            Transition("out to the right", "middle", "right", right, "rising"),
+            Transition("in from the left", "left", "middle", left, "rising"),
+            Transition("out to the left", "middle", "left", left),
+        )
+
+    def guess(self):
+        return Guess("right", (2.1, 0.1, -3.0))

@@ -244,7 +244,7 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
 
 # All of `hj.models` without a clock, except a family of cycles (SLIPRunner).
 AUTONOMOUS = """
-    BeltOscillator CompassGait FitzHughNagumo FiveLinkBiped HopfOscillator RimlessWheel
+    BeltOscillator ChuaCircuit CompassGait FitzHughNagumo FiveLinkBiped HopfOscillator RimlessWheel
     SimplestWalker TorsoWalker VanDerPol
 """.split()
 
