@@ -31,6 +31,7 @@ CASES = {
     "boundary": ("boundary.py", 1, "the cost of checking arguments"),
     "truth-chain": ("chain_truth.py", 1, "ground truth, independent of the package"),
     "truth-circuits": ("circuits_truth.py", 1, "ground truth"),
+    "truth-neurons": ("neurons_truth.py", 1, "ground truth"),
     "truth-stiff": ("stiff_truth.py", 1, "ground truth"),
     "truth-trot": ("trot_truth.py", 1, "ground truth"),
     "truth-walkers": ("walkers_truth.py", 2, "ground truth"),

@@ -186,6 +186,14 @@ CASES: dict[str, Callable[[], Case]] = {
          hj.AtEvent("behind to sticks"), hj.Crossing("x", "rising", charts=("sticks",))],
         "x", "force", 1e-4, [], _CLOSED, ("v", "x"), section=hj.AtEvent("sticks to behind"),
     ),
+    "Izhikevich": lambda: Case(
+        "Izhikevich's neuron", m.IzhikevichNeuron(), hj.ClockPhase(16), "w", "current", 1e-3,
+        [0.48958210923116263, -1.5695975926619675e-11], "heyoka", ("v", "w"),
+    ),
+    "AdEx": lambda: Case(
+        "adaptive exponential neuron", m.AdExNeuron(), hj.ClockPhase(16), "w", "current", 1e-2,
+        [0.7474603512727481, 0.17911718353685366], "heyoka", ("v", "w"),
+    ),
     "Hopf": lambda: Case(
         "Hopf normal form", m.HopfOscillator(),
         hj.KinematicPhase(16, position="x", velocity="y", anchor=hj.Crossing("y", "rising")),

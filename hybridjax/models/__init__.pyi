@@ -10,7 +10,11 @@ from .hoppers import (
     HopperPair as HopperPair,
     VerticalHopper as VerticalHopper,
 )
-from .neurons import FitzHughNagumo as FitzHughNagumo
+from .neurons import (
+    AdExNeuron as AdExNeuron,
+    FitzHughNagumo as FitzHughNagumo,
+    IzhikevichNeuron as IzhikevichNeuron,
+)
 from .oscillators import (
     BeltOscillator as BeltOscillator,
     ChuaCircuit as ChuaCircuit,
