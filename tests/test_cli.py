@@ -140,6 +140,6 @@ def test_an_interruption_is_one_line(tmp_path, monkeypatch, capsys):
 
 def test_the_main_job_imports_what_it_needs():
     """And nothing else that takes long."""
-    heavy = "optimistix", "lineax", "scipy.linalg", "scipy.special", "matplotlib"
+    heavy = "diffrax", "optimistix", "lineax", "scipy.linalg", "scipy.special", "matplotlib"
     code = f"import sys, hybridjax.apps.reproduce\nprint([m for m in {heavy} if m in sys.modules])"
     assert run_python("-c", code) == "[]\n"

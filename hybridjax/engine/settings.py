@@ -15,7 +15,7 @@ from .._core.executor import namespace
 from .._core.precision import real
 from .._core.text import fields
 from ..errors import DefinitionError
-from ..systems.solver import Radau, solvers
+from ..systems.solver import Solver, solvers
 from ..systems.system import HybridSystem, integrated
 from .arrays import AnyTimes, Array, States
 from .runge_kutta import Step
@@ -62,9 +62,9 @@ class Settings(eqx.Module):
     """Characteristic magnitudes of states, by chart, padded with positive numbers to the largest
     dimension. `None`: magnitudes in the current step, which do not suffice for derivatives."""
     solver: Any = eqx.field(static=True)
-    """Method for the charts, which overrides that of the system: `hj.Radau()`, a mapping from names
-    of charts to methods, or "auto" (in `find_limit_cycle`), an implicit method in charts that are
-    stiff on the cycle."""
+    """Method for the charts, which overrides that of the system: a Runge-Kutta method of diffrax
+    with an error estimate, `hj.Radau()`, a mapping from names of charts to methods, or "auto" (in
+    `find_limit_cycle`), an implicit method in charts that are stiff on the cycle."""
 
     def __repr__(self):
         return fields(self)
@@ -77,7 +77,7 @@ class Settings(eqx.Module):
         atol: PositiveScalar | None = None,
         max_steps: StepCount = 256,
         scale: Annotated[Numbers, Reals("charts states", sign="nonnegative")] | None = None,
-        solver: Radau | Mapping[str, Radau] | Literal["auto"] | None = None,
+        solver: Solver | Mapping[str, Solver] | Literal["auto"] | None = None,
     ):
         self.rtol, self.atol, self.scale = _kept(rtol), _kept(atol), _kept(scale)
         self.max_steps = max_steps

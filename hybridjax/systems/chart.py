@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._core.signal import signals
 from .._core.text import listed
-from .solver import Method, Radau
+from .solver import Method, Solver
 
 
 if TYPE_CHECKING:
@@ -44,8 +44,9 @@ class Chart(eqx.Module):
         one for each.
     - `inputs`: the names of the system's inputs that this chart uses, in the order in which they
         stand in `u` (the map g_a of the paper: the others are ignored). `None` means all.
-    - `solver`: how the chart is integrated: `hj.Radau()` if it is stiff. `None` means the explicit
-        pair of order 7. A `solver` of the system overrides it.
+    - `solver`: how the chart is integrated: a Runge-Kutta method of diffrax with an error estimate,
+        or `hj.Radau()`. `None` means the explicit pair of order 7, for charts that are not stiff. A
+        `solver` of the system overrides it.
     - `absent`: values of states that this chart lacks but outputs and sections may use, e.g.
         `{"ym": 0.0, "vm": 0.0}` for a foot at rest on the ground.
     """
@@ -54,7 +55,7 @@ class Chart(eqx.Module):
     units: ClassVar[tuple[str, ...]] = ()
     inputs: ClassVar[tuple[str, ...] | None] = None
     absent: ClassVar[Mapping[str, float]] = {}
-    solver: ClassVar[Radau | Method | None] = None
+    solver: ClassVar[Solver | Method | None] = None
 
     @abc.abstractmethod
     def field(self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " l"]) -> Any:

@@ -1,8 +1,8 @@
-"""How a chart is integrated: Runge-Kutta methods."""
+"""How a chart is integrated: Runge-Kutta methods, of diffrax or of this package."""
 
 import functools as ft
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -12,6 +12,9 @@ from .._core.boundary.checked import checked
 from .._core.boundary.values import show
 from ..errors import DefinitionError
 
+
+if TYPE_CHECKING:
+    import diffrax
 
 Row = tuple[float, ...]
 
@@ -55,6 +58,12 @@ class Radau(eqx.Module):
     stages: Literal[3, 5, 7] = eqx.field(static=True, default=5)
 
 
+if TYPE_CHECKING:
+    Solver = diffrax.AbstractSolver | Radau
+else:  # diffrax takes a third of a second to import; `as_method` looks at what is given.
+    Solver = Any
+
+
 class ByChart(NamedTuple):
     """Solvers of some charts, by name."""
 
@@ -69,32 +78,66 @@ class ByChart(NamedTuple):
 
 
 def solvers(
-    given: Radau | Method | ByChart | Mapping[str, Radau] | None,
-) -> Radau | Method | ByChart | None:
+    given: Solver | Method | ByChart | Mapping[str, Solver] | None,
+) -> Solver | Method | ByChart | None:
     """A solver as it is, and solvers by the names of charts in a form that can be compared.
 
     **Raises:** `DefinitionError` for what is no solver.
     """
     for solver in given.values() if isinstance(given, Mapping) else (given,):
-        if not isinstance(solver, Radau | Method | ByChart | None):
-            raise DefinitionError(f"a solver must be `hj.Radau()`, not {show(solver)}.")
+        if not isinstance(solver, Method | eqx.Module | ByChart | None):
+            raise _no_solver(solver)
     return ByChart(tuple(given), tuple(given.values())) if isinstance(given, Mapping) else given
 
 
-def as_method(solver: Radau | Method) -> Method:
+@ft.lru_cache
+def as_method(solver: Any) -> Method:
     """The Runge-Kutta method of a solver.
 
-    **Raises:** `DefinitionError` for what is no solver.
+    **Raises:** `DefinitionError` for what is none with an error estimate.
     """
-    solvers(solver)
-    return _radau(solver.stages) if isinstance(solver, Radau) else solver
+    if isinstance(solver, Method):
+        return solver
+    if isinstance(solver, Radau):
+        return _radau(solver.stages)
+    import diffrax
+
+    name = type(solver).__name__
+    if isinstance(solver, diffrax.ImplicitEuler):
+        return Method(name, ((0.0, 0.0), (0.0, 1.0)), (0.0, 1.0), (0.0, 1.0), (-0.5, 0.5), 2.0)
+    tableau = getattr(solver, "tableau", None)
+    single = getattr(solver, "term_structure", None) in (diffrax.AbstractTerm, diffrax.ODETerm)
+    adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver)
+    if not (single and adaptive and isinstance(tableau, diffrax.ButcherTableau)):
+        raise _no_solver(solver)
+    return _from_tableau(name, tableau, float(solver.order(None)))  # pyright: ignore
 
 
-def _row(x: Float[np.ndarray, " s"]) -> Row:
-    return tuple(map(float, x))
+def _no_solver(given: Any) -> DefinitionError:
+    return DefinitionError(
+        "a solver must be `hj.Radau()` or a Runge-Kutta method of diffrax with an error estimate, "
+        "an explicit first stage and one vector field, such as `diffrax.Kvaerno5()` (stiff) or "
+        f"`diffrax.Tsit5()`, not {show(given)}."
+    )
 
 
-@ft.lru_cache
+def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) -> Method:
+    a = np.zeros((tableau.num_stages, tableau.num_stages))
+    for k, row in enumerate(tableau.a_lower):
+        a[k + 1, : k + 1] = row
+    if tableau.a_diagonal is not None:
+        a += np.diag(tableau.a_diagonal)
+    if a[0, 0] != 0 or tableau.c1 != 0:
+        raise _no_solver(name)
+    return _method(name, a, tableau.b_sol, np.array((0.0, *tableau.c)), tableau.b_error, order)
+
+
+def _method(name: str, a, b, c, error, order: float, **controls: Any) -> Method:
+    rows = tuple(tuple(map(float, row)) for row in a)
+    b, c, error = (tuple(map(float, x)) for x in (b, c, error))
+    return Method(name, rows, b, c, error, order, **controls)
+
+
 def _radau(s: int) -> Method:
     from scipy import special
 
@@ -109,9 +152,9 @@ def _radau(s: int) -> Method:
     error = np.concatenate([[gamma], np.linalg.solve(powers, moments) - a[-1]])
     full = np.zeros((s + 1, s + 1))
     full[1:, 1:] = a
-    return Method(
-        f"Radau({s})", tuple(map(_row, full)), _row(full[-1]), _row(np.append(0.0, c)), _row(error),
-        2.0 * s, gain=2 * s / (s + 1), rough=_row(-_lagrange(c, 0.0) @ full[1:]), filter=gamma,
+    return _method(
+        f"Radau({s})", full, full[-1], np.concatenate([[0.0], c]), error, 2.0 * s,
+        gain=2 * s / (s + 1), filter=gamma, rough=tuple(-_lagrange(c, 0.0) @ full[1:]),
     )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from .._core.text import columns, fields, value
 from ..errors import DefinitionError
 from .chart import Chart, attribute_of
 from .drawing import Drawing
-from .solver import ByChart, Method, Radau, solvers
+from .solver import ByChart, Method, Solver, solvers
 from .transition import Transition
 
 
@@ -160,7 +160,7 @@ class HybridSystem(Definition):
     input_units: ClassVar[tuple[str, ...]] = ()
     time_unit: ClassVar[str] = ""
 
-    solver: Radau | Method | ByChart | None = eqx.field(
+    solver: Solver | Method | ByChart | None = eqx.field(
         static=True, default=None, kw_only=True, converter=solvers
     )
 

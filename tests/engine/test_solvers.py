@@ -2,6 +2,7 @@
 
 import functools as ft
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,7 +84,7 @@ def test_a_landing_is_as_stiff_as_its_chart():
     np.testing.assert_allclose(moved.moved.lanes.q, [[1.0], [0.0]], atol=1e-7)
 
 
-@pytest.mark.parametrize("solver", [hj.Radau(3), hj.Radau(5)])
+@pytest.mark.parametrize("solver", [hj.Radau(3), hj.Radau(5), diffrax.Kvaerno3()])
 def test_estimates_are_of_the_size_of_errors(solver):
     """Of a step whose end is known, one of its modes stiff."""
     method, h = as_method(solver), 0.4
@@ -104,9 +105,12 @@ def test_inverses_of_many_matrices():
     np.testing.assert_allclose(found, np.linalg.inv(np.moveaxis(matrix, -1, 0)), atol=1e-12)
 
 
-def test_derivatives_of_implicit_steps():
+@pytest.mark.parametrize(
+    "solver", [hj.Radau(3), pytest.param(diffrax.Kvaerno5(), marks=pytest.mark.slow)]
+)
+def test_derivatives_of_implicit_steps(solver):
     """First and second, by the implicit function theorem, against differences of long steps."""
-    method, h = as_method(hj.Radau(3)), jnp.array([0.1])
+    method, h = as_method(solver), jnp.array([0.1])
 
     def end(x):
         def field(t, q, x=x):
