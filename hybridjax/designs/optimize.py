@@ -261,7 +261,8 @@ def optimal_design(
       (approximately: a power mean with exponent 16). Default: `"mean"`.
 
     **Raises:** `DefinitionError` for limits that nothing satisfies, goals that the data do not
-    identify, multipliers that are not simple, and arguments that do not fit together.
+    identify, multipliers that are not simple, unstable models, and arguments that do not fit
+    together.
     """
     models = [model] if isinstance(model, Model) else list(model)
     if not models:
@@ -323,9 +324,15 @@ def optimal_design(
 
 
 def _check_alike(models: list[Model], design: Design) -> None:
-    """**Raises:** `DefinitionError` for models and a design that do not fit together."""
+    """**Raises:** `DefinitionError` for models and a design that do not fit together, and for
+    models without a steady state."""
     first = models[0]
     for k, model in enumerate(models):
         require_same(f"model {k} and model 0", model, first)
+        if (np.abs(model.multipliers) >= 1).any():
+            raise DefinitionError(
+                f"model {k} is unstable: experiments diverge from its cycle and reach no periodic "
+                "response. Give the model of a stable loop (`model.feedback(controller)`)."
+            )
     require_equal("design and model", "n_sections", design.n_sections, first.n_sections)
     require_equal("design and model", "inputs", design.input_names, first.inputs)

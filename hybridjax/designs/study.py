@@ -61,8 +61,8 @@ class Study(eqx.Module):
     The first block is applied unchanged, also if it exceeds `limit`. Each later block has the
     `optimal_design` for the model fitted to all blocks before it, with the noise estimated from
     these, and as many experiments as the standard error still requires, but at most twice the
-    strides so far. While the data do not support `order` multipliers, the first block is repeated
-    with new phases. No prior knowledge is used except the number of multipliers.
+    strides so far. While the data do not support `order` multipliers, or the estimate is unstable, the
+    first block is repeated with new phases. No prior knowledge is used except the number of multipliers.
 
     *Why intervals are valid.* The final estimate is the maximum-likelihood estimate from all
     blocks. Inputs and the time of stopping depend on earlier data only, and therefore do not change
@@ -146,8 +146,8 @@ class Study(eqx.Module):
 
     @property
     def standard_errors(self) -> Float[np.ndarray, "B g"]:
-        """Standard errors of the multipliers of `goal` after each block. NaN where the data did not
-        support as many multipliers."""
+        """Standard errors of the multipliers of `goal` after each block. NaN where an estimate was
+        rejected."""
         return self._history.standard_errors
 
     @property
@@ -262,8 +262,7 @@ class Study(eqx.Module):
         rows = []
         for n, errors in zip(self.strides, self.standard_errors, strict=True):
             numbers = ", ".join(f"{x:.2e}" for x in errors)
-            lost = "too few data for so many multipliers"
-            rows.append((f"{n:.0f}", numbers if np.isfinite(errors).all() else lost))
+            rows.append((f"{n:.0f}", numbers if np.isfinite(errors).all() else "estimate rejected"))
         return rows
 
     def _outlook(self) -> str:

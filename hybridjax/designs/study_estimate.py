@@ -64,7 +64,7 @@ class Estimate(NamedTuple):
     noise: Float[np.ndarray, "B ny"]
     """Standard deviation of each output's noise in each block."""
     objection: str
-    """The reason to reject the order; empty if the data support it."""
+    """The reason to reject the fit; empty if the data support it."""
 
     @property
     def last_noise(self) -> dict[str, float]:
@@ -123,6 +123,8 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
         require_order(groups, htf, order, fit.cost / fit.freedom, fit.residual)
     except DefinitionError as error:
         objection = str(error)
+    if not objection and (np.abs(fit.multipliers) >= 1).any():
+        objection = "the estimate is unstable, and an unstable system has no periodic response"
     return Estimate(fit, by_level, noise, objection)
 
 

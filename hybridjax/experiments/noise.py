@@ -112,7 +112,7 @@ def simulate_experiments(
     require_inputs(design, "model", ldtp.n_sections, ldtp.inputs)
     if discard is None:
         discard = DISCARD if start == "cycle" else 0
-    if start == "cycle" and discard and np.abs(ldtp.multipliers[:1]).max(initial=0) >= 1:
+    if start == "cycle" and discard and (np.abs(ldtp.multipliers) >= 1).any():
         raise DefinitionError(
             "the model is unstable: its transient grows, and no window is periodic. Use "
             'start="periodic", or discard=0 for the transient itself.'

@@ -200,7 +200,7 @@ def validate(
     records, drive = uninterrupted_records(data), None
     if reference is not None:
         records, drive = in_loop(data, reference)
-        if not isinstance(tested, Predictor) and np.abs(model.multipliers[:1]).max(initial=0) >= 1:
+        if not isinstance(tested, Predictor) and (np.abs(model.multipliers) >= 1).any():
             raise DefinitionError(
                 "the simulation of an unstable plant grows without bound: validate a fit of "
                 "`fit_ldtp` with `reference`, which predicts one step ahead."

@@ -1,5 +1,7 @@
 """Quantities of interest, against fits, bounds, closed forms and another optimizer."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -125,6 +127,8 @@ def test_several_models(robust, exponent):
     assert max(np.sqrt(np.mean(y**2)) for y in data) == pytest.approx(0.1, rel=1e-2)
     with pytest.raises(hj.DefinitionError, match="model 1 and model 0 have different n_sections"):
         hj.optimal_design([models[0], hj.testing.synthetic_ldtp()], usual)
+    with pytest.raises(hj.DefinitionError, match="model 1 is unstable"):
+        hj.optimal_design([models[0], dataclasses.replace(models[1], A=1.1 * models[1].A)], usual)
     with pytest.raises(hj.DefinitionError, match="not an empty list"):
         hj.optimal_design([], usual)
 

@@ -72,6 +72,8 @@ def test_too_much_noise_to_begin_with(model, first):
     assert (lost.design.phase != first.phase).all()
     found = lost.add(measured(model, lost.design))
     assert np.isnan(found.standard_errors[0]).all() and found.plan is not None
+    unstable = dataclasses.replace(model, A=1.05 * model.A)
+    assert "again, since the estimate is unstable" in repr(study.add(measured(unstable, first)))
 
 
 @pytest.mark.parametrize("goal", [dict(which=0), dict(part="modulus", harmonics=(-1, 0, 1))])
