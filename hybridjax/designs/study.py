@@ -61,8 +61,9 @@ class Study(eqx.Module):
     The first block is applied unchanged, also if it exceeds `limit`. Each later block has the
     `optimal_design` for the model fitted to all blocks before it, with the noise estimated from
     these, and as many experiments as the standard error still requires, but at most twice the
-    strides so far. While the data do not support `order` multipliers, or the estimate is unstable, the
-    first block is repeated with new phases. No prior knowledge is used except the number of multipliers.
+    strides so far. While the data do not support `order` multipliers, or the estimate is unstable,
+    the first block is repeated with new phases. No prior knowledge is used except the number of
+    multipliers.
 
     *Why intervals are valid.* The final estimate is the maximum-likelihood estimate from all
     blocks. Inputs and the time of stopping depend on earlier data only, and therefore do not change

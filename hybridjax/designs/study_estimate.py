@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float
 
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
+from ..experiments.record import require_deviations
 from ..identify.multipliers import StructuredFit, fit_multipliers, require_order
 from ..identify.spectral_sums import spectral_sums
 from ..identify.variable_projection import HTFGroup, grouped, maximum_likelihood, misfit_of
@@ -39,6 +40,7 @@ class Block(NamedTuple):
 def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     """**Raises:** `DefinitionError` as `estimate_htf`, and if no experiment ran to its end."""
     data.require_ok()
+    require_deviations(data.records)
     each = []
     for s in np.flatnonzero(data.ok):
         u, y = data.u[s : s + 1], data.y[s : s + 1]

@@ -20,6 +20,7 @@ from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.plan import Plan
+from ..experiments.record import require_deviations
 from ..experiments.response import course, flow_batch, response_function
 from ..identify.weights import check_values, error_weights, largest_misfit
 from ..linear.htf import HTF
@@ -168,11 +169,13 @@ class ObservedSeries(AbstractObservation):
         `std`: standard deviation of the measurement noise, one number or one for each output.
 
         **Raises:** `DefinitionError` if no experiment ran well, for another number of sections,
-        an `std` that is not one for each output, or experiments that do not begin on the cycle.
+        an `std` that is not one for each output, outputs that are no deviations from the cycle,
+        or experiments that do not begin on it.
         """
         self.sections = as_family(sections)
         require_same("data and `sections`", data, self.sections, ("n_sections",))
         data.require_ok()
+        require_deviations(data.records)
         self.inputs, self.outputs = data.inputs, data.outputs
         y = data.y[data.ok]
         self.scale = _scale("outputs", std, jnp.asarray(y.reshape(-1, y.shape[2])))

@@ -14,6 +14,7 @@ from .._core.boundary.containers import Stream
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.partition import check_sharing, needs_two_phases, regular
+from ..experiments.record import require_deviations
 from ..linear.frequency_response import Harmonics, check_harmonics
 from .descent import ROUNDING
 
@@ -133,6 +134,9 @@ def _sums_of_part(
     windows = data.windows(repeats)
     experiment, line, U = _excited(data, windows, threshold, first)
     lines, index = np.unique(line, return_inverse=True)
+    mirrored = needs_two_phases(lines, setup.periods, setup.n_sections)
+    if mirrored.any() and data.ok.any():  # the limit cycle has power at multiples of f = 1
+        require_deviations(data.records)
     good = data.ok[experiment]
 
     def total(values):
@@ -154,7 +158,7 @@ def _sums_of_part(
         setup,
         harmonics,
         lines,
-        needs_two_phases(lines, setup.periods, setup.n_sections),
+        mirrored,
         gram=total(products),
         count=total(np.ones(len(U), int)),
         along=total(X.conj()[:, :, None, None] * Y[:, None]),

@@ -194,6 +194,25 @@ def test_bad_records(small):
             hj.fit_series(data, 2)
 
 
+def test_absolute_outputs_are_refused(small):
+    """At each door where they would spoil the result; HTFs only at multiples of f = 1."""
+    lines = dict(frequencies=[[0.25, 1.0]] * 2, phases=[[0.0, 0.0], [0.0, np.pi / 2]])
+    design = hj.Design.from_lines(**lines, amplitudes=0.1, n_sections=4, periods=8)
+    good = hj.experiments.simulate_experiments(small, design, start="periodic")
+    data = dataclasses.replace(good, y=good.y + 1e2 * np.tile([[0], [1], [2], [1]], (8, 1)))
+    for door, *arguments in (
+        (hj.fit_series, data, 2),
+        (hj.fit_ldtp, data, 2),
+        (hj.validate, small, data),
+        (hj.estimate_htf, data),
+        (hj.ObservedSeries, data, hj.ClockPhase(4)),
+        (hj.designs.Study(hj.multisine(4, 8), 2, 0.1).add, data),
+    ):
+        with pytest.raises(hj.DefinitionError, match="outputs must be deviations from the limit"):
+            door(*arguments)
+    assert hj.estimate_htf(good).error(small.htf([0.25, 1.0])).max() < 1e-9
+
+
 @pytest.mark.parametrize("unit", [1e-12, 1e9])
 def test_inputs_have_units_of_their_own(unit):
     """The HTFs are those of the same data in other units. Inputs that are equal are refused."""
