@@ -1,14 +1,15 @@
 """Numbers and names, as users give them, and whether things belong together."""
 
 import importlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import DefinitionError
+from ..errors import ComputationError, DefinitionError
 
 
 if TYPE_CHECKING:
@@ -99,6 +100,18 @@ def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
     if not isinstance(wanted, str) and 0 <= wanted < len(names):
         return int(wanted)
     raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")
+
+
+@contextmanager
+def searching(place: str, *others: type[DefinitionError]) -> Iterator[None]:
+    """Search for a limit cycle on behalf of a function that does not take all arguments of
+    `find_limit_cycle`, which its errors name. It takes a cycle in a `place`. `others`: other
+    classes of errors, of a function that takes no guess."""
+    try:
+        yield
+    except (ComputationError, *others) as error:
+        text = "These arguments are those of `find_limit_cycle`: call it, and give its cycle"
+        raise type(error)(f"{error} ({text} {place}.)") from error
 
 
 def package(name: str) -> ModuleType:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arguments import searching
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Seed
 from .._core.progress import counted, working
@@ -117,7 +118,9 @@ def identifiability(
     **Raises:** as `fit_model`; `ComputationError` if `system` cannot produce such data.
     """
     problem, near = _prepare(system, data, free, guess)
-    parameters, cycle = problem.parameters, find_limit_cycle(system, near)
+    parameters = problem.parameters
+    with searching("as `guess`"):
+        cycle = find_limit_cycle(system, near)
     x = parameters.encode(parameters.read(system, problem.observations))
     residuals, jacobian, _ = evaluate(problem, x, cycle)
     if not np.isfinite(residuals).all():
@@ -134,7 +137,8 @@ def _prepare(
     if not observations:
         raise DefinitionError("`data` must be one observation or more, not an empty list.")
     parameters = free_parameters(system, free, observations)
-    near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
+    with searching("as `guess`"):
+        near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
     require_similar(near.return_map, system)
     moved = away_from_events(near)
     if moved is not near:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib import pyplot
 from matplotlib.widgets import Slider
 
-from .._core.arguments import Numbers, package, require_among
+from .._core.arguments import Numbers, package, require_among, searching
 from .._core.boundary.checked import checked
 from .._core.boundary.values import Reals
 from .._core.results import Result
@@ -206,7 +206,8 @@ def explore(
     **Raises:** `DefinitionError` for a parameter that does not exist, a range without its present
     value, and as `find_limit_cycle`; `ComputationError` if there is no cycle to begin with.
     """
-    cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)
+    with searching("as `system`", DefinitionError):
+        cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)
     if cycle.result != Result.OK:
         raise DefinitionError("`system` is a cycle that was not found: explore another one.")
     sliders = []

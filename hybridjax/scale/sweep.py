@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from .._core.arguments import searching
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, FilePath
 from .._core.execution import Execution
@@ -18,7 +19,7 @@ from .._core.pieces.store import Blocks, Layout, Variable, near_cube
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..engine.settings import SWEEP, Settings
-from ..errors import ComputationError, DefinitionError
+from ..errors import DefinitionError
 from ..orbits.batches import BATCH, SMALL, Known, Tiles, tiles_of
 from ..orbits.cycle import LimitCycle, rough
 from ..orbits.find import find_limit_cycle
@@ -238,11 +239,8 @@ class SweepJob:
         if self.guess is not None:
             return self.guess
         say("a cycle in the middle")
-        try:
+        with searching("as `guess`", DefinitionError):
             return find_limit_cycle(self.system, settings=Settings(SWEEP, SWEEP))
-        except (ComputationError, DefinitionError) as error:
-            text = "no limit cycle was found in the middle of the axes, so give one by `guess=`: "
-            raise type(error)(f"{text}{error}") from error
 
 
 def _rounded(map: ReturnMap) -> ReturnMap:

@@ -63,6 +63,19 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
         hj.fit_model(oscillation.system, unseen, ("p", "q", "w"), guess=oscillation)
 
 
+def test_advice_about_searches_names_their_function(oscillation):
+    still, data = Oscillator(w=0.0), observed(oscillation)
+    far, free = hj.Guess("charge", (9e9, 0.0)), ("p",)
+    for call in (
+        lambda: hj.fit_model(still, data, free, guess=far),
+        lambda: hj.identifiability(still, data, free, guess=oscillation),
+        lambda: hj.sweep(still, {"p": [1.0, 2.0]}),
+        lambda: hj.explore(still, "p"),
+    ):
+        with pytest.raises(hj.ComputationError, match=r"\(These arguments .*`find_limit_cycle`: "):
+            call()
+
+
 @pytest.mark.slow
 def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     nothing_fits = hj.ObservedCycle(
