@@ -18,7 +18,7 @@ from ..identify.series.fit import (
     total_least_squares,
 )
 from ..identify.series.linearization import linearize
-from ..identify.series.output_error import OutputErrorProblem
+from ..identify.series.output_error import OutputErrorProblem, TooFewCycles
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validate import Validation, can_be_compared, simulate, validate
 from .data import SectionData
@@ -55,12 +55,18 @@ class Split(NamedTuple):
         ends, N, obstacle = uninterrupted_records(self.late), self.early.n_sections, ""
         fits: list[SeriesFit] = []
         for d in range(1, most + 1):
-            problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
-            solution = linearize(problem, total_least_squares(late_outputs(problem, d)))
-            if missing := missing_cycles(problem, solution, 2 * d + 1):
+            try:
+                problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
+                solution = linearize(problem, total_least_squares(late_outputs(problem, d)))
+                missing = missing_cycles(problem, solution, 2 * d + 1)
+            except TooFewCycles as error:
+                missing = error.missing + d
+            if missing:
+                each = len(self.early.inputs) * (d + 1 + self.early.lead / N)
                 obstacle = f"{self.early.sampled.max()} cycles (a quarter is held out) are too few "
-                obstacle += f"for order {d} with {N} sections: record {4 * missing / 3:.0f} more, "
-                obstacle += "or take fewer sections."
+                obstacle += f"for order {d} with {N} sections: record {4 * missing / 3:.0f} more"
+                fewer = int(N - missing / each)
+                obstacle += f", or take {fewer} sections or fewer." if fewer > 1 else "."
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]

@@ -118,8 +118,10 @@ def test_an_order_that_is_too_low_is_named():
         assert len(order) == named
     names |= {"order": None, "n_sections": 32}
     untried = hj.identify_recording(made_up(0), TOP, **names)
-    for words in ("tried, since 129 cycles (a quarter is held out)", ": record 24 more,"):
-        assert words in untried.advice.warnings[0].text
+    text = (
+        "tried, since 129 cycles (a quarter is held out) are too few for order 2 with 32 sections: "
+    )
+    assert f"{text}record 28 more, or take 26 sections or fewer" in untried.advice.warnings[0].text
     with pytest.warns(hj.errors.FindingWarning, match="orders above 1 could not be tried"):
         hj.recordings.choose_order(untried.data)
 

@@ -15,7 +15,6 @@ from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ..._core.text import signal_values
-from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
@@ -30,7 +29,7 @@ from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
 from .in_loop import LoopEquations
 from .linearization import Linearization, each_fit, linearize, measured_outputs, minimize, sum_up
-from .output_error import OutputErrorProblem, SectionRegression
+from .output_error import OutputErrorProblem, SectionRegression, TooFewCycles
 from .records import (
     CycleGrid,
     PreparedRecords,
@@ -290,21 +289,15 @@ def missing_cycles(problem: OutputErrorProblem, solution: Linearization, least: 
     n, i = np.unravel_index(np.argmin(solution.freedom), solution.freedom.shape)
     left = int(solution.freedom[n, i])
     if not left:  # more lags than samples would use up more of them
-        starts = (len(g.y) * (problem.free + g.drift.shape[-1]) for g in problem.records.grids)
-        left = int(problem.records.sampled[n, i]) - problem.lags * problem.shape[1] - sum(starts)
+        left = problem.freedom_left(int(n), int(i))
     return max(least - left, 0)
 
 
 def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:
     order = len(solution.c)
-    if not (missing := missing_cycles(problem, solution, order + 1)):
-        return
-    n, i = np.argwhere(solution.freedom <= order)[0]
-    raise DefinitionError(
-        f"section {n} was sampled {problem.records.sampled[n, i]} times, too few for numerators of "
-        f"{problem.lags} lags and {problem.free} unknown cycles at the start of each record: "
-        f"{missing} or more cycles are missing. Record more, take fewer sections, or lower `order`."
-    )
+    if missing := missing_cycles(problem, solution, order + 1):
+        n, i = np.argwhere(solution.freedom <= order)[0]
+        raise TooFewCycles(problem, n, i, missing)
 
 
 class DelayedOutputs(NamedTuple):

@@ -8,7 +8,7 @@ where g is free in the first cycles of each record: it represents inputs and out
 record. For given c every section is a linear regression of its own, in b and g.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -23,6 +23,19 @@ from .records import CycleGrid, PreparedRecords, lagged_inputs, start_responses
 # Singular values of regressors, relative to the largest, below which they are rounding errors.
 # Larger: weakly excited combinations are dropped; smaller: rounding errors are fitted.
 RANK = 1e-10
+
+
+class TooFewCycles(DefinitionError):
+    """Nothing is left of the samples of an output at section n; so many cycles are missing."""
+
+    def __init__(self, problem: Any, n: int, i: int, missing: int):
+        self.missing = missing
+        super().__init__(
+            f"section {n} was sampled {problem.records.sampled[n, i]} times, too few for "
+            f"numerators of {problem.lags} lags and {problem.free} unknown cycles at the start of "
+            f"each record: {missing} or more cycles are missing. Record more, take fewer sections, "
+            "or lower `order`."
+        )
 
 
 class SectionRegression(NamedTuple):
@@ -119,8 +132,7 @@ class OutputErrorProblem(NamedTuple):
         """**Arguments:** `order`: d. `overhang`: lags of the numerators beyond d N. `free_start`:
         whether the state at the start of records is unknown, or zero.
 
-        **Raises:** `DefinitionError` for records too short for the lags, and for inputs that
-        depend on each other.
+        **Raises:** `DefinitionError` for too few cycles, and for inputs that depend on each other.
         """
         N, nu, ny = records.n_sections, len(records.inputs), len(records.outputs)
         lags = records.lead + order * N + overhang + 1
@@ -130,11 +142,25 @@ class OutputErrorProblem(NamedTuple):
                 f"numerators of {lags} lags reach beyond the longest record, of "
                 f"{records.cycles * N} samples: take fewer sections, or lower `order`."
             )
-        triangles, equal = [np.zeros((0, lags * nu))] * N, np.ones((N, ny, ny), bool)
+
+        def triangle(n: int) -> Float[np.ndarray, "r columns"]:
+            rows = np.zeros((0, lags * nu))
+            for grid in records.grids:
+                more = _later_rows(grid, n, lags, records.lead, free)
+                rows = np.linalg.qr(np.concatenate([rows, more]), mode="r")
+            return rows
+
+        # One section tells, before the work on all, that nothing is left of its samples.
+        n, i = map(int, np.unravel_index(np.argmin(records.sampled), records.sampled.shape))
+        if records.sampled[n, i] <= lags * nu:
+            rows = triangle(n)
+            if _independent(rows, nu).shape[1] == len(rows):
+                problem = cls(records, lags, free, [], [], records.scale)
+                raise TooFewCycles(problem, n, i, order + 1 - problem.freedom_left(n, i))
+        triangles, equal = on_all_cores(triangle, range(N)), np.ones((N, ny, ny), bool)
         for grid in records.grids:
             for i in range(ny):
                 equal[:, i] &= (grid.sampled == grid.sampled[..., [i]]).all(axis=(0, 1))
-            triangles = _with_rows(triangles, grid, lags, records.lead, free)
         alike = [[np.flatnonzero(x).tolist() for x in np.unique(e, axis=0)[::-1]] for e in equal]
         to_lags = on_all_cores(lambda x: _independent(x, nu), triangles)
         alone = [_independent(triangles[0][:, i::nu], 1).shape[1] for i in range(nu)]
@@ -150,6 +176,11 @@ class OutputErrorProblem(NamedTuple):
     def shape(self) -> tuple[int, int, int]:
         """N, and the numbers of inputs and outputs."""
         return self.records.n_sections, len(self.records.inputs), len(self.records.outputs)
+
+    def freedom_left(self, n: int, i: int) -> int:
+        """Return the samples of an output at a section less all unknowns."""
+        starts = (len(g.y) * (self.free + g.drift.shape[-1]) for g in self.records.grids)
+        return int(self.records.sampled[n, i]) - self.lags * self.shape[1] - sum(starts)
 
     def parts(self) -> list[CycleGrid]:
         """Return all grids, with the outputs in units of `scale`."""
@@ -173,18 +204,12 @@ class OutputErrorProblem(NamedTuple):
         return SectionRegression.make(inputs, starts, part.drift, part.sampled[:, :, n, output])
 
 
-def _with_rows(
-    triangles: list[np.ndarray], grid: CycleGrid, lags: int, lead: int, free: int
-) -> list[np.ndarray]:
-    """Return the triangular factors of the lagged inputs of each section with those of a grid."""
-    later = np.arange(grid.y.shape[1])[:, None] >= grid.first[:, None] + free
-    used = grid.sampled.any(axis=3) & later
-
-    def section(n: int):
-        rows = lagged_inputs(grid.u, n, lags, lead)[used[:, :, n]]
-        return np.linalg.qr(np.concatenate([triangles[n], rows]), mode="r")
-
-    return on_all_cores(section, range(len(triangles)))
+def _later_rows(
+    grid: CycleGrid, n: int, lags: int, lead: int, free: int
+) -> Float[np.ndarray, "rows columns"]:
+    """Return the lagged inputs of a section where it was sampled, after the `free` cycles."""
+    later = np.arange(grid.y.shape[1]) >= grid.first[:, n, None] + free
+    return lagged_inputs(grid.u, n, lags, lead)[grid.sampled[:, :, n].any(axis=2) & later]
 
 
 def _independent(triangle: np.ndarray, nu: int) -> np.ndarray:
