@@ -163,9 +163,18 @@ def drawn(name: str) -> list[dict]:
 def of_page() -> pyplot.Figure:
     """The figure that the page on responses draws."""
     text = (IMAGES.parent / "how-to" / "responses.md").read_text()
-    page: dict = {}
-    exec("".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), page)
-    return page["figure"]
+    return _figure("".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)))
+
+
+def of_notebook() -> pyplot.Figure:
+    """The figure that the notebook on loops draws."""
+    return _figure((IMAGES.parents[1] / "notebooks/in_the_loop.py").read_text())
+
+
+def _figure(code: str) -> pyplot.Figure:
+    scope: dict = {}
+    exec(code, scope)
+    return scope["figure"]
 
 
 if __name__ == "__main__":
@@ -175,7 +184,8 @@ if __name__ == "__main__":
         for name in sys.argv[2:] or codes():
             (IMAGES / f"gallery/{name}.svg").write_text(thumbnail(*run(name)))
         sys.exit()
-    of_page().savefig(IMAGES / "converter.png", metadata={"Software": None})
+    for name, figure in (("converter", of_page()), ("loop", of_notebook())):
+        figure.savefig(IMAGES / f"{name}.png", metadata={"Software": None})
     walk().save(IMAGES / "walk.gif")
     for name, plot in draw().items():
         about = {"Comment": json.dumps(numbers(plot)), "Software": None}

@@ -42,9 +42,15 @@ def input_and_output_names(
     **Raises:** `DefinitionError` as `names`, and for an output that is an input.
     """
     u, y = names("inputs", inputs, nu), names("outputs", outputs, ny)
-    if shared := [name for name in y if name in u]:
-        raise DefinitionError(f"'{shared[0]}' is in `inputs` and in `outputs`: rename one of them.")
+    require_apart(u, y)
     return u, y
+
+
+def require_apart(inputs: Collection[str], outputs: Collection[str]) -> None:
+    """**Raises:** `DefinitionError` for an output that is an input."""
+    if shared := [name for name in outputs if name in inputs]:
+        text = "take it from one of them, or rename it."
+        raise DefinitionError(f"'{shared[0]}' is in `inputs` and in `outputs`: {text}")
 
 
 def require_same(

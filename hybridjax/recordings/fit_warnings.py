@@ -138,7 +138,7 @@ def advise(
     later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
     with np.errstate(divide="ignore"):
         expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
-    warn_of(warnings)
+    warn_of(warnings[len(findings) :])
     return Advice(tuple(warnings), plain, tuple(band), strides, expected)
 
 

@@ -15,7 +15,7 @@ from ..identify.series.fit import SeriesFit, fit_series
 from ..identify.series.in_loop import best_order
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
-from .findings import Finding, refuse, untried_orders
+from .findings import Finding, refuse, untried_orders, warn_of
 from .fit_warnings import Advice, advise, undamped
 from .held_out import HeldOut, split
 from .impulse import ImpulseResponses, impulse_responses
@@ -147,5 +147,6 @@ def identify_recording(
         curve = phase_response(recording, phase, input=data.inputs[0])
         findings = (*findings, *curve.warnings)
     responses = impulse_responses(fit, data)
+    warn_of(findings[len(inspection.findings) :])
     advice = advise(data, fit, held.validation, findings)
     return Identification(recording, findings, phase, data, fit, held, responses, curve, advice)

@@ -1,6 +1,7 @@
 """Recordings from files."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +19,12 @@ from .recording import Recording, check_events
 
 @checked
 def read_recording(
-    *paths: FilePath,
+    *paths: FilePath | Sequence[FilePath],
     time: str = "time",
     signals: SignalNames | None = None,
     units: Mapping[str, str] | None = None,
 ) -> Recording:
-    """Read a recording from files, one trial in each.
+    """Read a recording from files, given one by one or in a list, one trial in each.
 
     - *Text* (`.csv`, `.txt`, `.tsv`): a first line with the names of the columns, separated by
       commas, semicolons, tabs or blanks, and numbers below. A unit may follow a name in parentheses
@@ -59,10 +60,11 @@ def read_recording(
     the recording, packages that are not installed, and as `Recording`; `FileFormatError` for files
     that cannot be read, with the line.
     """
-    if not paths:
+    files = [x for y in paths for x in ([y] if isinstance(y, str | os.PathLike) else y)]
+    if not files:
         raise DefinitionError("`read_recording` needs the name of one file or more.")
     wanted = Wanted(time, None if signals is None else tuple(signals))
-    return Recording.join([_recording(x, wanted, dict(units or {})) for x in map(Path, paths)])
+    return Recording.join([_recording(x, wanted, dict(units or {})) for x in map(Path, files)])
 
 
 _READERS = {

@@ -15,7 +15,7 @@ from .._core.boundary.checked import checked
 from .._core.signal import with_unit
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
-from .formats.columns import Columns, numbers, parse_table
+from .formats.columns import Columns, numbers, parse_table, require_one_index
 from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
@@ -67,7 +67,8 @@ class Recording(eqx.Module):
         **Arguments:**
 
         - `time` (n,): times of the samples, in seconds; strictly increasing.
-        - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing.
+        - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing. Series
+          of pandas must have the same index, and their samples the same order.
         - `events`: times of events by name, such as foot strikes.
         - `units`: units by name. `name`: name of the trial. `notes`: remarks on the data.
 
@@ -75,6 +76,7 @@ class Recording(eqx.Module):
         backwards, and infinite values, with the sample.
         """
         where, units = f"trial '{name}'", dict(units or {})
+        require_one_index(where, {**signals, "time": time})
         time = numbers(where, "time", time)
         if not signals:
             raise DefinitionError(f"{where} has no signals.")
@@ -129,6 +131,7 @@ class Recording(eqx.Module):
         """
         keys = getattr(frame, "column_names", None) or getattr(frame, "keys", list)()
         columns = Columns({str(key): frame[key] for key in keys})
+        require_one_index(f"trial '{name}'", columns.values)
         table = parse_table(f"trial '{name}'", columns, time)
         events, units = table.events | dict(events or {}), table.units | dict(units or {})
         return cls(table.time, table.signals, events=events, units=units, name=name)

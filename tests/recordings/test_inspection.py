@@ -2,6 +2,7 @@
 
 import functools
 import warnings
+from collections import Counter
 
 import equinox as eqx
 import numpy as np
@@ -117,11 +118,17 @@ def test_an_order_that_is_too_low_is_named():
         order = [x for x in result.advice.warnings if "Compare order=2" in x.text]
         assert len(order) == named
     names |= {"order": None, "n_sections": 32}
-    untried = hj.identify_recording(made_up(0), TOP, **names)
+    with pytest.warns(hj.errors.FindingWarning) as seen:
+        twice = hj.Recording.join([made_up(0), made_up(0).with_trials(made_up(0).trials[:1])])
+        untried = hj.identify_recording(twice, TOP, **names)
+    told = Counter(str(x.message) for x in seen)
+    assert set(told.values()) == {1} and set(told) >= {repr(x) for x in untried.findings}
+    with pytest.raises(hj.DefinitionError, match="'f' is in `inputs` and in `outputs`"):
+        hj.identify_recording(twice, TOP, inputs="f", outputs=("f", "x"))
     text = (
         "tried, since 129 cycles (a quarter is held out) are too few for order 2 with 32 sections: "
     )
-    assert f"{text}record 28 more, or take 26 sections or fewer" in untried.advice.warnings[0].text
+    assert f"{text}record 28 more, or take 26 sections or fewer" in untried.advice.warnings[1].text
     with pytest.warns(hj.errors.FindingWarning, match="orders above 1 could not be tried"):
         hj.recordings.choose_order(untried.data)
 

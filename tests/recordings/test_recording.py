@@ -52,7 +52,7 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
     np.testing.assert_array_equal(found.trials[0].events["strike"], [1.0])
     assert found.trials[0].name == "x"
     np.savez(tmp_path / "x.npz", time=np.arange(4.0), force=np.ones(4), **{"event strike": [1.5]})
-    both = hj.read_recording(path, tmp_path / "x.npz", units={"force": "kN"})
+    both = hj.read_recording([path, tmp_path / "x.npz"], units={"force": "kN"})
     assert both.units == ("kN",) and both.trials[1].events["strike"] == [1.5]
 
 

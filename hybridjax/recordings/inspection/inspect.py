@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..._core.arguments import require_apart
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import OptionalNames, SignalNames
 from ..data import SectionData
@@ -60,9 +61,10 @@ def inspect(
     phase and data at the sections, of this recording or of the one that an inspection returned.
     Default: None.
 
-    **Raises:** `DefinitionError` for unknown names.
+    **Raises:** `DefinitionError` for unknown names, and for an output that is an input.
     """
     inputs, outputs = tuple(inputs), tuple(outputs)
+    require_apart(inputs, outputs)
     names = [
         name
         for name in (*inputs, *outputs)
