@@ -144,19 +144,19 @@ class OutputErrorProblem(NamedTuple):
             )
 
         def triangle(n: int) -> Float[np.ndarray, "r columns"]:
-            rows = np.zeros((0, lags * nu))
+            rows = []
             for grid in records.grids:
-                more = _later_rows(grid, n, lags, records.lead, free)
-                rows = np.linalg.qr(np.concatenate([rows, more]), mode="r")
-            return rows
+                later = np.arange(grid.y.shape[1]) >= grid.first[:, n, None] + free
+                used = grid.sampled[:, :, n].any(axis=2) & later
+                rows.append(lagged_inputs(grid.u, n, lags, records.lead)[used])
+            return np.linalg.qr(np.concatenate(rows), mode="r")
 
         # One section tells, before the work on all, that nothing is left of its samples.
         n, i = map(int, np.unravel_index(np.argmin(records.sampled), records.sampled.shape))
-        if records.sampled[n, i] <= lags * nu:
-            rows = triangle(n)
-            if _independent(rows, nu).shape[1] == len(rows):
-                problem = cls(records, lags, free, [], [], records.scale)
-                raise TooFewCycles(problem, n, i, order + 1 - problem.freedom_left(n, i))
+        rows = triangle(n)
+        if records.sampled[n, i] <= lags * nu and _independent(rows, nu).shape[1] == len(rows):
+            problem = cls(records, lags, free, [], [], records.scale)
+            raise TooFewCycles(problem, n, i, order + 1 - problem.freedom_left(n, i))
         triangles, equal = on_all_cores(triangle, range(N)), np.ones((N, ny, ny), bool)
         for grid in records.grids:
             for i in range(ny):
@@ -202,14 +202,6 @@ class OutputErrorProblem(NamedTuple):
         T = part.y.shape[1]
         starts = start_responses(c, part.first[:, n], T, min(self.free, T))
         return SectionRegression.make(inputs, starts, part.drift, part.sampled[:, :, n, output])
-
-
-def _later_rows(
-    grid: CycleGrid, n: int, lags: int, lead: int, free: int
-) -> Float[np.ndarray, "rows columns"]:
-    """Return the lagged inputs of a section where it was sampled, after the `free` cycles."""
-    later = np.arange(grid.y.shape[1]) >= grid.first[:, n, None] + free
-    return lagged_inputs(grid.u, n, lags, lead)[grid.sampled[:, :, n].any(axis=2) & later]
 
 
 def _independent(triangle: np.ndarray, nu: int) -> np.ndarray:
