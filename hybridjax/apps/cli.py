@@ -232,6 +232,7 @@ def _identify(options) -> int:
 
 
 def _reproduce(options) -> int:
+    _begin(cache=True)
     from .reproduce import Protocol, reproduce
 
     sizes = (20, 36, 16) if options.quick else (80, 84, 64)

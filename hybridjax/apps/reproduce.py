@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from .._core.archive import write_module
-from .._core.cache import enable_compilation_cache
-from .._core.precision import enable_x64
 from .._core.writing import Format, results_folder
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
@@ -100,8 +98,6 @@ def _names(formats: Sequence[Format]) -> list[str]:
 
 
 def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict:
-    enable_x64()
-    enable_compilation_cache()
     begin = time.time()
     # Lines without second-order products on them need many experiments.
     division: Literal["random", "sum-free"] = "sum-free" if protocol.experiments >= 80 else "random"
@@ -151,10 +147,7 @@ def _identify(name: str, cycle: LimitCycle, design: Design, discard: int, begin:
 
 def _draw(cycle: LimitCycle, families: Mapping[str, Family], out: Path, formats, begin) -> None:
     """Write the figures."""
-    import matplotlib  # here, since it is heavy
-
-    matplotlib.use("Agg")  # files only: no window is opened, and none is needed
-    from matplotlib import pyplot
+    from matplotlib import pyplot  # here, since it is heavy
 
     from .. import plot
 

@@ -6,7 +6,7 @@ from typing import Annotated, Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core.arguments import Numbers, input_and_output_names
 from .._core.boundary.checked import checked
@@ -116,8 +116,7 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     The output at an unknown input is not used, as it may depend on it directly, nor are those up to
     `lead` samples earlier.
 
-    **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift,
-    and as `require_deviations`.
+    **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift.
     """
     parts = [data] if isinstance(data, HasRecords) else data
     records = [record for part in parts for record in part.records]
@@ -138,29 +137,36 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     usable = [part for record in records for part in _with_known_inputs(record)]
     if not usable:
         raise DefinitionError("an input is NaN at every sample: give the input that acted.")
-    require_deviations(usable)
     return usable
+
+
+def average_cycle(
+    section: Int[np.ndarray, " n"], values: Float[np.ndarray, "n k"], n_sections: int
+) -> Float[np.ndarray, "N k"]:
+    """Return the average values at each section; NaN where nothing was sampled."""
+    total, count = np.zeros((2, n_sections, values.shape[1]))
+    np.add.at(total, section, np.nan_to_num(values))
+    np.add.at(count, section, np.isfinite(values))
+    with np.errstate(invalid="ignore"):
+        return total / count
 
 
 def require_deviations(records: Sequence[Record]) -> None:
     """**Raises:** `DefinitionError` if an output is nearly the same in all cycles, though no drift
     was declared and inputs change: it holds the limit cycle itself."""
-    N, nu, share = records[0].n_sections, len(records[0].inputs), []
+    N, nu = records[0].n_sections, len(records[0].inputs)
+    x = np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in records])
     section = np.concatenate([r.first_section + np.arange(len(r.u)) for r in records]) % N
-    for x in np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in records]).T:
-        at, x = section[np.isfinite(x)], x[np.isfinite(x)]
-        count = np.maximum(np.bincount(at, minlength=N), 1)
-        mean = np.bincount(at, x, N) / count
-        several = len(x) > 3 * N and np.ptp(x) > 0
-        share.append(several * (mean**2 @ count) / max(x @ x, 1e-300))
+    left = x - average_cycle(section, x, N)[section]
+    with np.errstate(invalid="ignore"):
+        changes = np.nansum(left**2, axis=0) / np.nansum(x**2, axis=0)
     # (A response to inputs that nearly repeat may nearly repeat itself.)
-    least = 0.01 * (1 - max(share[:nu])) ** 2
-    for name, repeated in zip(records[0].outputs, share[nu:], strict=True):
-        if records[0].drift is None and 1 - repeated < least:
-            raise DefinitionError(
-                f"{name} is nearly the same in all cycles: outputs must be deviations from the "
-                "limit cycle. Subtract it."
-            )
+    fixed = changes[nu:] < 0.01 * changes[:nu].min() ** 2
+    if fixed.any() and records[0].drift is None and len(x) > 3 * N:
+        raise DefinitionError(
+            f"{records[0].outputs[int(np.argmax(fixed))]} is nearly the same in all cycles: "
+            "outputs must be deviations from the limit cycle. Subtract it."
+        )
 
 
 def _with_known_inputs(record: Record) -> Iterator[Record]:

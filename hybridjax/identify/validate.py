@@ -14,7 +14,7 @@ from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import p_value
 from ..errors import DefinitionError
-from ..experiments.record import Record, RecordedData, uninterrupted_records
+from ..experiments.record import Record, RecordedData, require_deviations, uninterrupted_records
 from ..linear.ldtp import LDTP
 from .instrument import in_loop
 from .joint.fit import LDTPFit
@@ -229,6 +229,7 @@ def validate(
     for name, size in zip(records[0].inputs + outputs, sizes, strict=True):
         if not size:
             raise DefinitionError(f"{name} is constant or missing at every sample: leave it out.")
+    require_deviations(records)
     if (few := int(sampled.min())) < FEWEST_SAMPLES:
         raise DefinitionError(f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles.")
     # One period, less for few cycles.

@@ -15,7 +15,7 @@ from .._core.boundary.checked import checked
 from .._core.signal import with_unit
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
-from .formats.columns import Columns, numbers, parse_table, require_one_index
+from .formats.columns import Columns, numbers, parse_table
 from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
@@ -76,7 +76,9 @@ class Recording(eqx.Module):
         backwards, and infinite values, with the sample.
         """
         where, units = f"trial '{name}'", dict(units or {})
-        require_one_index(where, {**signals, "time": time})
+        series = [x.index for x in (time, *signals.values()) if hasattr(x, "iloc")]
+        if not all(index.equals(series[0]) for index in series):
+            raise DefinitionError(f"{where}: series of pandas have different indices: align them.")
         time = numbers(where, "time", time)
         if not signals:
             raise DefinitionError(f"{where} has no signals.")
@@ -131,7 +133,6 @@ class Recording(eqx.Module):
         """
         keys = getattr(frame, "column_names", None) or getattr(frame, "keys", list)()
         columns = Columns({str(key): frame[key] for key in keys})
-        require_one_index(f"trial '{name}'", columns.values)
         table = parse_table(f"trial '{name}'", columns, time)
         events, units = table.events | dict(events or {}), table.units | dict(units or {})
         return cls(table.time, table.signals, events=events, units=units, name=name)

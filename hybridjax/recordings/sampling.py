@@ -13,7 +13,7 @@ from .._core.boundary.kinds import OptionalNames, SectionCount, SignalNames
 from .._core.boundary.values import Number
 from .._core.signal import Signal
 from ..errors import DefinitionError
-from ..experiments.record import Record
+from ..experiments.record import Record, average_cycle
 from . import smoothing
 from .data import SectionData
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
@@ -99,7 +99,10 @@ def section_data(
         sections = _sample(trial.time, signals, nu, stretches, N, phase.period, bandwidth, sampled)
         if timing is not None:
             sections = _with_times(sections, N, phase.period, timing)
-        mean = _average(sections, N)
+        if not sections:
+            continue
+        k = np.concatenate([x.k for x in sections]) % N
+        mean = average_cycle(k, np.concatenate([x.values for x in sections]), N)
         parts += [x._replace(values=x.values - mean[x.k % N]) for x in sections]
         trials += [number] * len(sections)
         cycles += [mean] * len(sections)
@@ -234,16 +237,6 @@ def _with_times(
             hidden |= np.insert(hidden, 0, True)[:-1]
         sections.append(p._replace(values=np.column_stack([p.values, np.where(hidden, np.nan, z)])))
     return sections
-
-
-def _average(parts: list[_Sections], N: int) -> Float[np.ndarray, "N nuy"]:
-    """Return the average cycle of a trial; NaN where nothing was sampled."""
-    total, count = np.zeros((2, N, max((p.values.shape[1] for p in parts), default=0)))
-    for p in parts:
-        np.add.at(total, p.k % N, np.nan_to_num(p.values))
-        np.add.at(count, p.k % N, np.isfinite(p.values))
-    with np.errstate(invalid="ignore"):
-        return total / count
 
 
 @checked

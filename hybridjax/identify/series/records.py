@@ -8,7 +8,12 @@ from jaxtyping import Bool, Float, Int, Shaped
 from scipy.signal import lfilter
 
 from ...errors import DefinitionError
-from ...experiments.record import Record, RecordedData, uninterrupted_records
+from ...experiments.record import (
+    Record,
+    RecordedData,
+    require_deviations,
+    uninterrupted_records,
+)
 
 
 class CycleGrid(NamedTuple):
@@ -75,7 +80,7 @@ class PreparedRecords:
 
     def __init__(self, data: RecordedData):
         """**Raises:** `DefinitionError` as `uninterrupted_records`, and for inputs that are
-        zero and outputs that are constant at every sample, or missing."""
+        zero and outputs that are constant at every sample, missing, or no deviations."""
         self.records = uninterrupted_records(data)
         about = self.records[0]
         self.n_sections, self.lead = about.n_sections, about.lead
@@ -96,6 +101,7 @@ class PreparedRecords:
             if not moves:
                 what = "constant" if name in self.outputs else "zero"
                 raise DefinitionError(f"{name} is {what} or missing at every sample: leave it out.")
+        require_deviations(self.records)
         self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / self.sampled.sum(axis=0))
 
     def whole(self) -> CycleGrid:

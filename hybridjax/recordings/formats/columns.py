@@ -2,7 +2,7 @@
 
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -115,17 +115,6 @@ def numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
             f"{values.shape}."
         )
     return values.astype(float)
-
-
-def require_one_index(where: str, columns: Mapping[str, Any]) -> None:
-    """**Raises:** `DefinitionError` for series of pandas with different indices."""
-    series = [(name, x.index) for name, x in columns.items() if hasattr(x, "iloc")]
-    for name, index in series[1:]:
-        if not index.equals(series[0][1]):
-            raise DefinitionError(
-                f"{where}: {name} and {series[0][0]} have different indices, but are taken by "
-                "position: align them, or give `.to_numpy()`."
-            )
 
 
 class Wanted(NamedTuple):
