@@ -109,13 +109,12 @@ def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
 
 
 @contextmanager
-def searching(place: str, *others: type[DefinitionError]) -> Iterator[None]:
-    """Search for a limit cycle on behalf of a function that does not take all arguments of
-    `find_limit_cycle`, which its errors name. It takes a cycle in a `place`. `others`: other
-    classes of errors, of a function that takes no guess."""
+def searching(place: str, errors: tuple = (ComputationError,)) -> Iterator[None]:
+    """Search for a limit cycle on behalf of a function that takes a cycle in a `place`, but not all
+    arguments of `find_limit_cycle`, which these `errors` name."""
     try:
         yield
-    except (ComputationError, *others) as error:
+    except errors as error:
         text = "These arguments are those of `find_limit_cycle`: call it, and give its cycle"
         raise type(error)(f"{error} ({text} {place}.)") from error
 

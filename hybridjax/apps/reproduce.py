@@ -83,18 +83,12 @@ def reproduce(out: str | os.PathLike, protocol: Protocol, formats: Sequence[Form
     **Raises:** `DefinitionError` for a folder that cannot be written, or one in which another file
     has the name of a result; `ComputationError` if a step fails.
     """
-    names = _names(formats)
-    with results_folder(Path(out), "reproduce", names) as folder:
-        return _reproduce(folder, protocol, formats)
-
-
-def _names(formats: Sequence[Format]) -> list[str]:
-    """Return the names of all files that are written."""
     cycles = [f"fig1_cycle_{family}" for family in _FAMILIES]
     figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
     files = [f"{figure}.{format}" for figure in figures for format in formats]
     saved = [f"{result}_{family}.npz" for family in _FAMILIES for result in _SAVED]
-    return ["summary.json", *saved, *files]
+    with results_folder(Path(out), "reproduce", ["summary.json", *saved, *files]) as folder:
+        return _reproduce(folder, protocol, formats)
 
 
 def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict:

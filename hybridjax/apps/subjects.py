@@ -213,10 +213,8 @@ def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) ->
     ]
     with results_folder(study.folder, "population", _FILES) as new:
         with off_screen(), contextlib.suppress(DefinitionError):  # for too few subjects
-            drawn = plot.forest(population, "modulus")
-            plot.save(new / "forest", drawn, with_png(formats))
+            plot.save(new / "forest", plot.forest(population, "modulus"), with_png(formats))
             parts.append('<img alt="Modulus of the leading multiplier" src="forest.png">')
         population.table.assign(**population.values, **errors).to_csv(new / _FILES[0], index=False)
         results.to_csv(new / _FILES[1], index=False)
-        page = page_of(f"{len(study.fits)} reports", parts)
-        (new / _FILES[2]).write_text(page, encoding="utf-8")
+        (new / _FILES[2]).write_text(page_of(f"{len(study.fits)} reports", parts), encoding="utf-8")

@@ -24,12 +24,10 @@ def run(options: Any) -> int:
     file, name = options.model
     maps = sweep(_load(file, name), over, options.want, store=options.out)
     print(maps)
-    converged = int((maps.result == 0).sum())
-    print(f"{converged} of {maps.result.size} points have a limit cycle")
+    print(f"{int((maps.result == 0).sum())} of {maps.result.size} points have a limit cycle")
     for name in options.want:
         if maps[name].dims == tuple(over) and len(over) <= 2:
-            picture = f"{Path(options.out).with_suffix('')}-{name}"
-            print(*save(picture, plot_sweep(maps, name)))
+            print(*save(f"{Path(options.out).with_suffix('')}-{name}", plot_sweep(maps, name)))
     return 0
 
 

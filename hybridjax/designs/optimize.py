@@ -112,8 +112,7 @@ class OptimalDesign(eqx.Module):
     @property
     def saved(self) -> float:
         """Number of strides of `usual` that one stride of `design` replaces."""
-        ratio = self.usual.cycles(0) / self.strides
-        return self.usual_criterion / self.criterion * ratio
+        return self.usual_criterion * self.usual.cycles(0) / (self.criterion * self.strides)
 
     def strides_for(self, standard_error: Positive) -> int:
         """Return the strides, with repeats of `design`, after which no quantity has a larger
@@ -330,9 +329,7 @@ def _check_alike(models: list[Model], design: Design) -> None:
     for k, model in enumerate(models):
         require_same(f"model {k} and model 0", model, first)
         if (np.abs(model.multipliers) >= 1).any():
-            raise DefinitionError(
-                f"model {k} is unstable: experiments diverge from its cycle and reach no periodic "
-                "response. Give the model of a stable loop (`model.feedback(controller)`)."
-            )
+            text = "has no periodic response: give a stable loop, `model.feedback(controller)`."
+            raise DefinitionError(f"model {k} is unstable, so that it {text}")
     require_equal("design and model", "n_sections", design.n_sections, first.n_sections)
     require_equal("design and model", "inputs", design.input_names, first.inputs)

@@ -98,8 +98,7 @@ class ExperimentData(eqx.Module):
         if any(0 in s for s in shapes) or shapes[0][:2] != shapes[1][:2]:
             text = "the same experiments and samples (their first two axes)"
             raise DefinitionError(f"`u` {shapes[0]} and `y` {shapes[1]} must have {text}.")
-        S = len(self.u)
-        self.result = np.zeros(S, int) if result is None else np.asarray(result, int)
+        self.result = np.zeros(len(self.u), int) if result is None else np.asarray(result, int)
         if not np.isin(self.result, list(Result)).all():
             raise DefinitionError("`result` must hold codes of `Result`, such as 0 for OK.")
         self.simulated = simulated

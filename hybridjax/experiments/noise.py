@@ -61,8 +61,7 @@ class ProcessNoise:
             return np.zeros(shape)
         each = (np.random.default_rng((self.seed, first + s)) for s in range(shape[0]))
         white = np.stack([rng.normal(size=shape[1:]) for rng in each])
-        std = np.resize(self.std, shape[1])[:, None]
-        return std * with_memory(white, self.memory, n_sections)
+        return np.resize(self.std, shape[1])[:, None] * with_memory(white, self.memory, n_sections)
 
     def require(self, n_sections: SectionCount) -> None:
         """**Raises:** `DefinitionError` if `std` has entries for another number of sections."""
@@ -110,8 +109,7 @@ def simulate_experiments(
     is a P-th root of one).
     """
     require_inputs(design, "model", ldtp.n_sections, ldtp.inputs)
-    if discard is None:
-        discard = DISCARD if start == "cycle" else 0
+    discard = (DISCARD if start == "cycle" else 0) if discard is None else discard
     if start == "cycle" and discard and (np.abs(ldtp.multipliers) >= 1).any():
         raise DefinitionError(
             "the model is unstable: its transient grows, and no window is periodic. Use "

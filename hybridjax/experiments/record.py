@@ -163,10 +163,8 @@ def require_deviations(records: Sequence[Record]) -> None:
     # (A response to inputs that nearly repeat may nearly repeat itself.)
     fixed = changes[nu:] < 0.01 * changes[:nu].min() ** 2
     if fixed.any() and records[0].drift is None and len(x) > 3 * N:
-        raise DefinitionError(
-            f"{records[0].outputs[int(np.argmax(fixed))]} is nearly the same in all cycles: "
-            "outputs must be deviations from the limit cycle. Subtract it."
-        )
+        text = "is nearly the same in all cycles: subtract the limit cycle from the outputs."
+        raise DefinitionError(f"{records[0].outputs[int(np.argmax(fixed))]} {text}")
 
 
 def _with_known_inputs(record: Record) -> Iterator[Record]:

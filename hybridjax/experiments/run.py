@@ -293,8 +293,7 @@ class Campaign:
         def arguments(rows):
             # (Nobody changes them before the program is done, so they may share memory.)
             x, held = jax.device_put((start[:, rows], u[rows]))
-            course = self.at_sections.course
-            return course, stepping.plan, x, held, stepping.settings, loop
+            return self.at_sections.course, stepping.plan, x, held, stepping.settings, loop
 
         return in_batches(self._program, arguments, len(u), execution, name)
 

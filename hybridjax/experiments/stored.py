@@ -210,8 +210,7 @@ class ExperimentJob:
             "cycle_outputs": (("section", "output"), values.on_cycle, {}),
         }
         coordinates = "input", "output"
-        layout = Layout(("experiment",), self.blocks, variables, constants, coordinates, text)
-        return self, layout
+        return self, Layout(("experiment",), self.blocks, variables, constants, coordinates, text)
 
     def arrays(self) -> list[np.ndarray]:
         """Return the arrays that records depend on beside inputs and parameters: those of the

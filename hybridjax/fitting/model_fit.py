@@ -204,10 +204,8 @@ class ModelFit(eqx.Module):
         if missing:
             raise DefinitionError(f"`true` must have a value of '{missing[0]}', which was fitted.")
         values = jnp.array([float(true[name]) for name in self.names])
-        x = self.problem.parameters.encode(values)
-        r, *_ = evaluate(self.problem, x, self.cycle)
-        misfit = self.cost / max(self.freedom, 1)
-        return (float(r @ r) - self.cost) / self.problem.unit(misfit)
+        r, *_ = evaluate(self.problem, self.problem.parameters.encode(values), self.cycle)
+        return (float(r @ r) - self.cost) / self.problem.unit(self.cost / max(self.freedom, 1))
 
     @checked
     def contains(self, true: HybridSystem | Mapping[str, float], level: Probability = 0.95) -> bool:

@@ -91,21 +91,16 @@ def loop(
     if d:
         controller = estimate(u, y, d)
         controller = eqx.tree_at(lambda x: x.H, controller, -controller.H)
-    missing = []
-    if not r:
-        missing.append(
-            "The plant is not estimated: this needs experiments with a reference that is added to "
-            "its input (a push, an injected current)."
-        )
-    if not d:
-        missing.append(
-            "The controller is not estimated: this needs experiments with a reference that is "
-            "added to its measured signal y (a moved scene, an offset)."
-        )
+    text = "The {} is not estimated: this needs experiments with a reference that is added to its "
+    whole = (
+        (r, "plant", "input (a push, an injected current)."),
+        (d, "controller", "measured signal y (a moved scene, an offset)."),
+    )
+    missing = tuple(text.format(name) + signal for given, name, signal in whole if not given)
     first = r or d
     answer, entered = (y, u) if r else (u, y)
     closed, sensitivity = (estimate(x, first, first) for x in (answer, entered))
-    return Loop(plant, controller, closed, sensitivity, tuple(missing))
+    return Loop(plant, controller, closed, sensitivity, missing)
 
 
 def _without(sums: Sums, known: np.ndarray) -> Sums:

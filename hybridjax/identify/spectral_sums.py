@@ -179,8 +179,7 @@ def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmo
     output = (line[:, None] + P * np.asarray(harmonics, int)) % (N * P)
     Y = np.stack([np.fft.fft(data.y[:, w], axis=1)[experiment[:, None], output] for w in windows])
     mean = Y.sum(axis=0) / len(Y)
-    spread = (np.abs(Y - mean) ** 2).sum(axis=0)
-    return mean, spread / max(len(Y) - 1, 1) / len(Y)
+    return mean, (np.abs(Y - mean) ** 2).sum(axis=0) / max(len(Y) - 1, 1) / len(Y)
 
 
 def _excited(data: ExperimentData, windows: list[slice], threshold: float, first: int):

@@ -108,12 +108,6 @@ def largest_misfit(htf: HTF) -> float:
     return freedom / (freedom - 1) if freedom > 1 else np.inf
 
 
-def covariance_unit(htf: HTF, misfit: float) -> float:
-    """Return the factor of covariances of a fit to HTFs: the misfit, if they have no variances."""
-    known = htf.variance is not None
-    return estimated_noise(largest_misfit(htf), misfit)[1] ** 2 if known else misfit
-
-
 def neighbor_correlation(
     error: Complex[np.ndarray, "M F ny nu"],
     values: Complex[np.ndarray, "M F ny nu"],

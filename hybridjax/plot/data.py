@@ -41,9 +41,8 @@ def phase(found: Phase, *, ax: AxesLike | None = None) -> Plot:
         right.hist(
             np.concatenate(found.periods), bins=30, orientation="horizontal", color=COLORS["gray"]
         )
-        right.set_ylim(left.get_ylim())
         right.tick_params(labelleft=False)
-        right.set(xlabel="cycles")
+        right.set(xlabel="cycles", ylim=left.get_ylim())
         letters(axes)
     return Plot(axes)
 
@@ -108,7 +107,6 @@ def impulse_responses(
     marked left, with bands of 95 %; dashed, those of a model with the same sections."""
     ny, N = len(found.outputs), len(found.phase)
     pushing = channel_index("input", input, found.inputs)
-    chosen = [0, N // 4, N // 2, 3 * N // 4]
     theory = None if model is None else found.of_model(model)
     with panels(ax, ny, 2, width=PAGE, height=0.4 + 1.9 * ny) as axes:
         for i, name in enumerate(found.outputs):
@@ -124,7 +122,7 @@ def impulse_responses(
             label = with_unit(f"{name} / impulse\n", ratio(name, impulse))
             plane.get_figure().colorbar(image, ax=plane, label=label)
             plane.set_ylabel("phase of the push")
-            for k, m in enumerate(dict.fromkeys(chosen)):
+            for k, m in enumerate(dict.fromkeys([0, N // 4, N // 2, 3 * N // 4])):
                 band = 1.96 * found.errors[m, :, i, pushing]
                 line = {"color": CYCLE[k % len(CYCLE)]}
                 arrow = {"marker": 9, "clip_on": False, "transform": plane.get_yaxis_transform()}

@@ -12,7 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.values import Reals
 from .._core.results import Result
 from .._core.signal import Signal, ratio, with_unit
-from ..errors import DefinitionError
+from ..errors import ComputationError, DefinitionError
 from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
@@ -206,7 +206,7 @@ def explore(
     **Raises:** `DefinitionError` for a parameter that does not exist, a range without its present
     value, and as `find_limit_cycle`; `ComputationError` if there is no cycle to begin with.
     """
-    with searching("as `system`", DefinitionError):
+    with searching("as `system`", (ComputationError, DefinitionError)):
         cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)
     if cycle.result != Result.OK:
         raise DefinitionError("`system` is a cycle that was not found: explore another one.")

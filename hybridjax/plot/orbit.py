@@ -83,8 +83,7 @@ def cycle(
             _sections(panel, s, sections, (x, y), center)
         if perturbed is not None:
             panel.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
-        panel.set_xlabel(axis_of(x))
-        panel.set_ylabel(axis_of(y))
+        panel.set(xlabel=axis_of(x), ylabel=axis_of(y))
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return Plot(axes)
 

@@ -52,9 +52,8 @@ def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = N
                     mew=1.2, zorder=5, label=None if p.kind in shown else p.kind,
                 )  # fmt: skip
                 shown.add(p.kind)
-        gray = COLORS["gray"]
-        panel.plot([], [], "-", color=gray, label="stable")
-        panel.plot([], [], "--", color=gray, label="unstable")
+        for line, label in (("-", "stable"), ("--", "unstable")):
+            panel.plot([], [], line, color=COLORS["gray"], label=label)
         parameter = Signal(b.parameter, unit_of_parameter(branches[0][0].system, b.parameter))
         (output_name,) = branches[0][0].structure.resolve_outputs(name).names
         panel.set(xlabel=axis_of(parameter), ylabel=f"largest {axis_of(output_name)}")

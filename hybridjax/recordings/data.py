@@ -48,17 +48,9 @@ class SectionData(eqx.Module):
     bandwidth: float = eqx.field(static=True)
     spikes: tuple[int, ...] = eqx.field(static=True)
 
-    @property
-    def n_sections(self) -> int:
-        return self.records[0].n_sections
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        return self.records[0].inputs
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return self.records[0].outputs
+    n_sections = property(lambda self: self.records[0].n_sections)
+    inputs = property(lambda self: self.records[0].inputs)
+    outputs = property(lambda self: self.records[0].outputs)
 
     @property
     def signals(self) -> tuple[str, ...]:

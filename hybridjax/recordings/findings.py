@@ -103,5 +103,4 @@ def place(trial: str, time: Float[np.ndarray, " n"]) -> str:
 
 def listed(texts: Sequence[str]) -> str:
     """Return the first three texts, and the number of further ones."""
-    more = f"; and {len(texts) - 3} more" if len(texts) > 3 else ""
-    return "; ".join(texts[:3]) + more
+    return "; ".join(texts[:3]) + (f"; and {len(texts) - 3} more" if len(texts) > 3 else "")

@@ -62,10 +62,9 @@ class Split(NamedTuple):
             except TooFewCycles as error:
                 missing = error.missing + d
             if missing:
-                each = len(self.early.inputs) * (d + 1 + self.early.lead / N)
                 obstacle = f"{self.early.sampled.max()} cycles (a quarter is held out) are too few "
                 obstacle += f"for order {d} with {N} sections: record {4 * missing / 3:.0f} more"
-                fewer = int(N - missing / each)
+                fewer = int(N - missing / len(self.early.inputs) / (d + 1 + self.early.lead / N))
                 obstacle += f", or take {fewer} sections or fewer." if fewer > 1 else "."
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)
@@ -125,8 +124,7 @@ def hold_out(data: SectionData, order: Order) -> HeldOut:
 
 def split(data: SectionData) -> Split:
     """Split the records into a part to be fitted, and a quarter to be held out."""
-    enough = min(1.0, _ENOUGH / data.cycles)
-    ends = [round(len(r.u) * enough) for r in data.records]
+    ends = [round(len(r.u) * min(1.0, _ENOUGH / data.cycles)) for r in data.records]
     short = [k for k, n in enumerate(ends) if n / 4 < _SHORTEST_END * data.n_sections]
     held_out = short[3::4]
     fitted = short if held_out or len(short) < len(ends) else []

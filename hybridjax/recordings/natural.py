@@ -228,8 +228,7 @@ def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Draws:
     for k in range(values.shape[2]):
         later = np.pad(c, ((0, 0), (0, 0), (1, 0))) * values[..., k, None]
         c = np.pad(c, ((0, 0), (0, 0), (0, 1))) - later
-    roots = [np.roots(x) for x in np.real(c).mean(axis=1)]
-    return _largest_first(np.array(roots, complex))
+    return _largest_first(np.array([np.roots(x) for x in np.real(c).mean(axis=1)], complex))
 
 
 def _largest_first(z: Draws) -> Draws:

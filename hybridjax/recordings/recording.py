@@ -250,8 +250,7 @@ class Recording(eqx.Module):
 
     def samples(self, name: str) -> list[tuple[Trial, Series]]:
         """Return each trial with the samples of a signal."""
-        column = self.column(name)
-        return [(trial, trial.values[:, column]) for trial in self.trials]
+        return [(trial, trial.values[:, self.column(name)]) for trial in self.trials]
 
     def unit(self, name: str) -> str:
         """Return the unit of a signal, "" where none was given."""

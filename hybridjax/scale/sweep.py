@@ -19,7 +19,7 @@ from .._core.pieces.store import Blocks, Layout, Variable, near_cube
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..engine.settings import SWEEP, Settings
-from ..errors import DefinitionError
+from ..errors import ComputationError, DefinitionError
 from ..orbits.batches import BATCH, SMALL, Known, Tiles, tiles_of
 from ..orbits.cycle import LimitCycle, rough
 from ..orbits.find import find_limit_cycle
@@ -218,8 +218,7 @@ class SweepJob:
         systems, total = self.family.systems(self.space.at(index)), math.prod(self.blocks.shape)
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
         size = min(BATCH, math.prod(self.blocks.block)) if total > SMALL else None
-        threads = Execution(workers=workers).threads
-        return tiles_of(systems, self.begun.map, size, threads, total)
+        return tiles_of(systems, self.begun.map, size, Execution(workers=workers).threads, total)
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""
@@ -239,7 +238,7 @@ class SweepJob:
         if self.guess is not None:
             return self.guess
         say("a cycle in the middle")
-        with searching("as `guess`", DefinitionError):
+        with searching("as `guess`", (ComputationError, DefinitionError)):
             return find_limit_cycle(self.system, settings=Settings(SWEEP, SWEEP))
 
 

@@ -170,8 +170,7 @@ class PlacedSections(eqx.Module):
 
     def onwards(self) -> tuple[Int[Array, " N"], Int[Array, " N"], Target]:
         """The section after each, the turns until it, and the target on it."""
-        xp = namespace(self.lanes.t)
-        following = (xp.arange(self.n_sections) + 1) % self.n_sections
+        following = (namespace(self.lanes.t).arange(self.n_sections) + 1) % self.n_sections
         turns = (following == 0).astype(np.int32)
         return following, turns, self.target(following, self.lanes.t, turns)
 

@@ -102,8 +102,7 @@ class Quadratic(NamedTuple):
             forcing = _pairs(self.bend, w[:, :, first], second)
             f_first, f_second = f[first][:, None], f[begin:]
             sums = np.concatenate([f_first + f_second, f_first - f_second], axis=1)
-            x = self._steady(forcing.reshape(N, n, -1), sums.ravel())
-            y = self.show[:, :, :n] @ x
+            y = self.show[:, :, :n] @ self._steady(forcing.reshape(N, n, -1), sums.ravel())
             y = y.reshape(N, ny, *sums.shape) + _pairs(self.show_bend, w[:, :, first], second)
             both = y.reshape(N, ny, len(first), 2, -1)
             mean[:, :, first] = np.moveaxis(np.real(both), 0, 1)[

@@ -210,7 +210,7 @@ def test_absolute_outputs_are_refused(small):
         (hj.ObservedSeries, data, hj.ClockPhase(4)),
         (hj.designs.Study(hj.multisine(4, 8), 2, 0.1).add, data),
     ):
-        with pytest.raises(hj.DefinitionError, match="outputs must be deviations from the limit"):
+        with pytest.raises(hj.DefinitionError, match="subtract the limit cycle"):
             door(*arguments)
     assert hj.estimate_htf(good).error(small.htf([0.25, 1.0])).max() < 1e-9
 

@@ -133,9 +133,7 @@ def _of_class(cls: type) -> Kind:
         return _array(cls)
     if cls.__module__.startswith("numpy._typing"):
         raise TypeError("an array is annotated as `Annotated[Numbers, Reals(shape)]`.")
-    if getattr(cls, "_is_protocol", False):
-        return Having(cls)
-    return Instance(cls)
+    return Having(cls) if getattr(cls, "_is_protocol", False) else Instance(cls)
 
 
 def _array(hint: Any) -> Kind:

@@ -247,8 +247,7 @@ class ZarrStore:
 
     def _chunks(self, k: int) -> list[str]:
         """Return the keys of the chunks of piece k, one along all axes but those of the points."""
-        place = self.layout.blocks.place(k)
-        return [_key(x, place) for x in self._arrays.values()]
+        return [_key(x, self.layout.blocks.place(k)) for x in self._arrays.values()]
 
 
 def _key(array: Any, place: tuple[int, ...] = ()) -> str:

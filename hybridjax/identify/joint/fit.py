@@ -436,7 +436,8 @@ def _finished(
     if isinstance(data, HTF):
         known, harmonics = data.variance is not None, data.harmonics
         problem = cast(FrequencyProblem, point.problem)
-        unit = weights.covariance_unit(data, unit)
+        if known:
+            unit = weights.estimated_noise(weights.largest_misfit(data), unit)[1] ** 2
         size = problem.weight * problem.target
         correlation = weights.neighbor_correlation(problem.errors(model), size, np.asarray(data.f))
     else:
@@ -483,8 +484,7 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
     """
     exact = exact_htf(model, htf)
-    lags = 2 * default_horizon(model.n_sections) + 1
-    minimal = realize(np.asarray(model.impulse_response(lags)))
+    minimal = realize(np.asarray(model.impulse_response(2 * default_horizon(model.n_sections) + 1)))
     scale = weights.check_values(exact)
     problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
     coordinates = local_coordinates(PeriodicModel.of(minimal, scale), _is_direct(model))

@@ -223,8 +223,7 @@ def fit_series(
     feedback = tuple(answering(grid, error, records.inputs))
     if check:
         refuse_order(delayed, noise * _noise(solution), feedback)
-    covariance = coefficient_covariance(problem, solution)
-    fit = assemble(problem, solution, covariance, converged)
+    fit = assemble(problem, solution, coefficient_covariance(problem, solution), converged)
     # One more multiplier, or a pair.
     more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
     return dataclasses.replace(fit, feedback=feedback, higher_order=fit.contradiction(more, check))
@@ -240,8 +239,7 @@ def _of_order(order: int, records: PreparedRecords, fit: SeriesFit, free_start: 
     overhang = max(R - 1 - fit.lead - order * N, 0)
     problem = OutputErrorProblem.from_data(records, order, overhang, free_start)
     problem = problem._replace(scale=fit.noise)
-    start = np.pad(fit.coefficients, (0, order - d))
-    solution, _ = minimize(problem, start, rough=True)
+    solution, _ = minimize(problem, np.pad(fit.coefficients, (0, order - d)), rough=True)
     _require_freedom(problem, solution)
     return solution.c, partial(coefficient_covariance, problem, solution)
 
@@ -333,8 +331,7 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
     for section in sum_up(problem, np.zeros(0), past, regress):
         for each in section:
             gram[each.fit.outputs] += each.products
-            rows = round(each.freedom) - each.fit.root.shape[1]
-            freedom += max(rows, 0) * len(each.fit.outputs)
+            freedom += max(round(each.freedom) - each.fit.root.shape[1], 0) * len(each.fit.outputs)
     return DelayedOutputs(gram, freedom)
 
 

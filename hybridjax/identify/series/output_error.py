@@ -143,7 +143,7 @@ class OutputErrorProblem(NamedTuple):
                 f"{records.cycles * N} samples: take fewer sections, or lower `order`."
             )
 
-        def triangle(n: int) -> Float[np.ndarray, "r columns"]:
+        def triangle(n: int):
             rows = []
             for grid in records.grids:
                 later = np.arange(grid.y.shape[1]) >= grid.first[:, n, None] + free

@@ -8,12 +8,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from scipy.signal import lfilter
 
 from ...errors import DefinitionError
-from ...experiments.record import (
-    Record,
-    RecordedData,
-    require_deviations,
-    uninterrupted_records,
-)
+from ...experiments.record import Record, RecordedData, require_deviations, uninterrupted_records
 
 
 class CycleGrid(NamedTuple):
@@ -146,8 +141,7 @@ def divide_by_chi(
     c: Float[np.ndarray, " d"], x: Float[np.ndarray, "S T *columns"], delay: int = 0
 ) -> Float[np.ndarray, "S T *columns"]:
     """Filter x by 1 / chi from cycle to cycle, and delay it by a number of cycles."""
-    filtered = np.asarray(lfilter([1.0], np.concatenate([[1.0], c]), x, axis=1))
-    return delay_cycles(filtered, delay)
+    return delay_cycles(np.asarray(lfilter([1.0], np.concatenate([[1.0], c]), x, axis=1)), delay)
 
 
 def start_responses(

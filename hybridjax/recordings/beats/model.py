@@ -160,8 +160,7 @@ def _integrate(inputs: Nodes, h: Lanes, w: Lanes, curve: Curve, table: Table) ->
 
     def force(phase, u):
         """Return derivatives of the rate with respect to each coefficient, and to w."""
-        x = np.clip(phase, 0.0, 1.5 - 1e-6) * _POINTS
-        nearest = np.ceil(x - 0.5).astype(np.int64)
+        nearest = np.ceil(np.clip(phase, 0.0, 1.5 - 1e-6) * _POINTS - 0.5).astype(np.int64)
         return np.concatenate([table[nearest] * u[:, None], np.ones((len(u), 1))], axis=1)
 
     phase, drift, u0 = np.zeros(L), np.zeros((L, p)), inputs[0]

@@ -321,8 +321,7 @@ class Population:
         return data.assign(y=data["wy"] / data["w"], v=1 / data["w"])
 
     def _cells(self, quantity: str, needed: int, covariates: Sequence[str] = ()) -> Any:
-        data = self._merged(quantity, covariates)
-        cells = dict(list(data.groupby("cell", sort=False)))
+        cells = dict(list(self._merged(quantity, covariates).groupby("cell", sort=False)))
         require({c: x["subject"] for c, x in cells.items()} or {"all": ()}, needed)
         return cells.items()
 
