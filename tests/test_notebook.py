@@ -68,8 +68,7 @@ def play(found):
 
 
 def sweep(found):
-    radius = np.abs(found.best.multipliers).max()
-    assert abs(radius - found.winner[2]) < 1e-3
+    assert abs(np.abs(found.best.multipliers).max() - found.winner[2]) < 1e-3
 
 
 def recording(found):

@@ -126,8 +126,7 @@ def advise(
     if validation and not validation.independent and validation.fit[p.argmin()] < 99:
         text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}), as by "
         text += f"errors of {unknowns} unknowns from {sampled} strides: record more, or take fewer "
-        text += "sections. If it remains, push less, to stay linear, or raise the `order`."
-        warnings.append(Finding("left over", text))
+        warnings.append(Finding("left over", f"{text}sections; then push less, or raise `order`."))
     if data.missing > _FEW:
         warnings.append(Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing."))
     for name, count in zip(data.signals, data.spikes, strict=True):

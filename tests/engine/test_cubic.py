@@ -52,8 +52,7 @@ def test_a_dip_within_the_step_is_found():
 
 
 def test_touching_and_nearly_touching():
-    touching = crossing(0.16, 0.36, -0.8, 1.2)
-    assert touching.touch[0]
+    assert crossing(0.16, 0.36, -0.8, 1.2).touch[0]
     near = crossing(0.16 + 1e-4, 0.36 + 1e-4, -0.8, 1.2)
     assert near.near[0] and not near.touch[0] and np.isinf(near.position[0])
     clear = crossing(0.16 + 0.1, 0.36 + 0.1, -0.8, 1.2)

@@ -185,8 +185,7 @@ def test_an_input_that_varies_in_time():
 
 def test_feet_that_land_together():
     """The bar dropped flat: both feet touch the table at the same instant, and both land."""
-    bar = hj.models.TwoLeggedBar(A=0.0)
-    found = hj.simulate(bar, "air", (1.5, 0.0, 0.0, 0.0), 0.4)
+    found = hj.simulate(hj.models.TwoLeggedBar(A=0.0), "air", (1.5, 0.0, 0.0, 0.0), 0.4)
     assert [e.name for e in found.events] == ["hind lands (air)", "front lands (hind)"]
     fall = np.sqrt(2 * 0.5 / 10.0)
     np.testing.assert_allclose(times(found), [fall, fall], rtol=1e-14)

@@ -87,8 +87,7 @@ def period(cycle):
 
 @pytest.mark.slow
 def test_derivatives_under_all_transformations(cycle):
-    slow = jnp.array([5.0, 5.5])
-    first = jax.jit(jax.vmap(jax.jacfwd(period(cycle))))(slow)
+    first = jax.jit(jax.vmap(jax.jacfwd(period(cycle))))(jnp.array([5.0, 5.5]))
     np.testing.assert_allclose(first[0], by_differences(1), rtol=1e-6)
     backwards = jax.jit(jax.grad(period(cycle)))(5.5)
     np.testing.assert_allclose(backwards, first[1], rtol=1e-8)
@@ -99,8 +98,7 @@ def test_derivatives_under_all_transformations(cycle):
 @pytest.mark.slow
 @pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
 def test_experiments(cycle, start):
-    sections = [hj.AtEvent("on"), hj.AtEvent("off")]
-    placed = hj.place_sections(cycle, sections)
+    placed = hj.place_sections(cycle, [hj.AtEvent("on"), hj.AtEvent("off")])
     model = hj.linearize(cycle, placed, outputs="x")
     u = 1e-5 * np.random.default_rng(0).normal(size=(4, 16, 1))
     data = hj.run_experiments(cycle, placed, u, outputs="x", start=start, discard=0, accuracy=1e-12)

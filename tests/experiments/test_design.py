@@ -47,8 +47,7 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(band, seed, lines,
     # All lines that disturb j disturb each other: so many experiments are needed at least.
     needed = max(sum(phases[i] for i in wanted if disturb(i, j, P)) for j in wanted)
 
-    smallest = hj.multisine(**arguments, seed=seed)
-    assert smallest.experiments == nu * needed
+    assert hj.multisine(**arguments, seed=seed).experiments == nu * needed
     if nu * needed > 1:
         with pytest.raises(hj.DefinitionError, match=f"need at least {nu * needed}"):
             hj.multisine(**arguments, seed=seed, experiments=nu * needed - 1)
@@ -206,8 +205,7 @@ def test_realizations_pairs_and_scales():
 def test_expected_variance_is_that_of_the_estimate():
     """Noise of unit variance as output, many realizations."""
     design = hj.multisine(4, 8, (0, 2.0), 0.5)
-    many = design.realizations(400)
-    u = many.inputs()
+    u = design.realizations(400).inputs()
     y = np.random.default_rng(0).normal(size=(*u.shape[:2], 1))
     estimate = hj.estimate_htf(hj.ExperimentData(u, y, n_sections=4, periods=8), 0)
     expected = design.expected_variance()[:, 0] / 400

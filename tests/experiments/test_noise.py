@@ -22,8 +22,7 @@ def require_color(x, std, memory):
     """Of series (S, n, k): the variance at every section (from the first cycle on), and the
     correlation from each section to later ones, against the closed form."""
     std = np.broadcast_to(std, (N, x.shape[2]))
-    by_cycle = x.reshape(len(x), -1, *std.shape)
-    require_mean((by_cycle**2).mean(axis=1), std**2)
+    require_mean((x.reshape(len(x), -1, *std.shape) ** 2).mean(axis=1), std**2)
     require_mean(x[:, 0] ** 2, std[0] ** 2)
     later = x / np.resize(std, x.shape[1:])
     for lag in (1, 3, N, 4 * N):
@@ -35,8 +34,7 @@ def require_color(x, std, memory):
 @pytest.mark.parametrize("memory", [0.0, 0.2, 3.0])
 @pytest.mark.parametrize("std", [0.7, STD])
 def test_process_noise_has_the_color_that_it_says(std, memory):
-    noise = ProcessNoise(std, seed=1, memory=memory)
-    x = noise.draw((COUNT, N * CYCLES, 2), N)
+    x = ProcessNoise(std, seed=1, memory=memory).draw((COUNT, N * CYCLES, 2), N)
     require_color(x, np.broadcast_to(std, N)[:, None], memory)
 
 

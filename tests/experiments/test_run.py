@@ -63,8 +63,7 @@ def test_records_agree_with_scipy(family, design):
     angle = np.arctan2(*hopper_scipy.plane(apex)[::-1])
     point, y = apex, []
     for n in range(40):  # a cycle and a quarter: liftoff, touchdown, liftoff
-        on_cycle = np.asarray(data.cycle_outputs)[n % N]
-        y.append(point[1:3] - on_cycle)
+        y.append(point[1:3] - np.asarray(data.cycle_outputs)[n % N])
         if name == "isochron":
             section = ("clock", apex[0] + (n + 1) / N)
         else:
@@ -97,8 +96,7 @@ def test_large_inputs_that_change_the_order_of_events_are_reported(
     u = design.inputs(CYCLES) * 100
     data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20, **BATCH)
     assert 0 < data.ok.sum() < 80
-    codes = {hj.Result(int(r)) for r in data.result[~data.ok]}
-    assert codes == {hj.Result.EVENT_ORDER}
+    assert {hj.Result(int(r)) for r in data.result[~data.ok]} == {hj.Result.EVENT_ORDER}
 
 
 def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):

@@ -11,8 +11,6 @@ from .conftest import HOPPER, SECTIONS, Oscillator
 
 
 PHASES = hj.ClockPhase(4, anchor=hj.Crossing("v", "falling"))
-
-
 STD = {"std": 1e-3, "period_std": 1e-3}
 
 

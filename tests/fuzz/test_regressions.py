@@ -74,6 +74,5 @@ def across(x, time, duration):
     level = -0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit))
     s = Structure(Toys(rounded, [level]))
     lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
-    u = jnp.zeros((1, 1))
-    moved = move(s, lanes, u, until(t + duration), SETTINGS).moved
+    moved = move(s, lanes, jnp.zeros((1, 1)), until(t + duration), SETTINGS).moved
     return moved.result[0], moved.lanes.events[0]

@@ -28,8 +28,7 @@ def scale(t):
     yield hj.sweep, dict(model=t.system, over={"nope": [1.0]}, guess=t.cycle)
     yield hj.monte_carlo, dict(function=lambda rng: "no number", draws=3)
     yield hj.Points, dict(values={"x": [1.0]})
-    good = dict(ranges={"x": (0.0, 1.0)}, count=4)
-    yield hj.Points.sobol, good
+    yield hj.Points.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
 
 
 def systems(t):
@@ -83,8 +82,7 @@ def cycles(t):
 
 def linear(t):
     A, B, C, D = (np.asarray(x) for x in (t.model.A, t.model.B, t.model.C, t.model.D))
-    matrices = dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
-    yield hj.LDTP, matrices
+    yield hj.LDTP, dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
     square = [np.eye(2)] * 3
     yield hj.LDTP.from_blocks, dict(A=square, B=square, C=square, D=square)
     u = np.ones((12, 2))
@@ -136,8 +134,7 @@ def experiments(t):
     yield hj.experiments.stream_experiments, to_run
     yield hj.experiments.StoredExperiments, dict(store="nope")
     yield hj.response_function, {name: to_run[name] for name in ("cycle", "sections", "outputs")}
-    u = np.zeros((1, 8, 1))
-    yield t.response, dict(u=u)
+    yield t.response, dict(u=np.zeros((1, 8, 1)))
     yield hj.experiments.simulate_experiments, dict(ldtp=t.model, design=t.design)
     yield hj.experiments.ProcessNoise, dict(std=0.1)
     yield hj.experiments.add_noise, dict(data=t.data, std=0.1)
@@ -212,8 +209,7 @@ def designs_data(t):
 def recordings(t):
     x = np.arange(5.0)
     yield hj.Recording, dict(time=x, signals={"x": x})
-    frame = {"time": x, "x": x}
-    yield hj.Recording.from_frame, dict(frame=frame)
+    yield hj.Recording.from_frame, dict(frame={"time": x, "x": x})
     yield t.recording.with_trials, dict(trials=t.recording.trials)
     yield hj.Recording.join, dict(recordings=[t.recording])
     yield hj.Recording.beside, dict(recordings=[t.recording])

@@ -186,8 +186,7 @@ def test_a_plant_that_is_stable_in_its_loop_only():
     # x[n + 1] = 1.2 x + u, u = r - 0.9 y
     one = np.ones((N, 1, 1))
     plant = hj.LDTP(1.2 * one, one, one)
-    rng = np.random.default_rng(0)
-    r, e = rng.normal(size=(2, N * 400))
+    r, e = np.random.default_rng(0).normal(size=(2, N * 400))
     x, u, y = 0.0, np.zeros(N * 400), np.zeros(N * 400)
     for i in range(N * 400):
         y[i] = x + 0.3 * e[i]

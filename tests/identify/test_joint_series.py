@@ -87,8 +87,7 @@ def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
     coordinates = local_coordinates(in_innovation_form(small), True)
     step = np.random.default_rng(1).normal(size=coordinates.size)
     ahead, back = (problem.cost(coordinates.moved(h * step)) for h in (1e-6, -1e-6))
-    equations = problem.linearize(coordinates)
-    gradient = equations.gradient
+    gradient = problem.linearize(coordinates).gradient
     assert (ahead - back) / 2e-6 == pytest.approx(-2 * gradient @ step, rel=1e-5)
 
 
@@ -113,8 +112,7 @@ def test_a_drift_is_found_where_samples_are_missing(small):
     fit = hj.fit_ldtp(data, shaken, start="cycle")
     assert fit.compare(small.multipliers).max_error < 1e-9
     # As many numbers less as there are constants.
-    samples = np.isfinite(data.y).sum()
-    assert fit.freedom == samples - 8 - fit.unknowns
+    assert fit.freedom == np.isfinite(data.y).sum() - 8 - fit.unknowns
 
 
 def test_too_few_dimensions_are_named(small):

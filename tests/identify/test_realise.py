@@ -49,8 +49,7 @@ def test_from_a_fit_to_a_noisy_record(hopper, multipliers):
     assert np.all((np.asarray(model.dims) >= 2) & (np.asarray(model.dims) <= 4))
     assert model.htf(F).error(hopper.htf(F)).max() < 2e-3
     assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3
-    small = hj.identify.realize(fit, 2)
-    np.testing.assert_array_equal(small.dims, 2)
+    np.testing.assert_array_equal(hj.identify.realize(fit, 2).dims, 2)
 
 
 def test_from_noisy_htfs(exact, hopper, multipliers):

@@ -32,7 +32,6 @@ def test_random_systems(shape, seed):
     htf = model.htf(np.linspace(0.01, N / 2 - 0.01, 12 * N))
     fit = hj.fit_multipliers(htf, model)
     true = model.multipliers
-    polynomial = np.poly(true).real
-    np.testing.assert_allclose(fit.coefficients, polynomial[1:], atol=1e-8)
+    np.testing.assert_allclose(fit.coefficients, np.poly(true).real[1:], atol=1e-8)
     assert fit.htf(htf.f).error(htf).max() < 1e-8
     assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)

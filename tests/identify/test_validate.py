@@ -78,8 +78,7 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     np.testing.assert_allclose(moved.whiteness, still.whiteness, rtol=0.05)
     assert moved.white and moved.independent
     np.testing.assert_allclose(still.noise, 0.3, rtol=0.1)
-    silent = dict(about, drift=None)
-    unsaid = hj.Record(plain.u, plain.y + wave[:, None], **silent)
+    unsaid = hj.Record(plain.u, plain.y + wave[:, None], **dict(about, drift=None))
     assert not hj.validate(small, unsaid, start=start).white
 
 

@@ -138,8 +138,7 @@ def test_products_that_leave_the_range_of_numbers():
 def test_defective_and_cyclic_products():
     jordan = [np.array([[0.9, 0.3], [0.0, 0.9]])] * 8
     np.testing.assert_allclose(product_eigenvalues(jordan, RTOL), 0.9**8, rtol=1e-6)
-    permutation = [np.roll(np.eye(6), 1, axis=0)]
-    roots = product_eigenvalues(permutation, RTOL)
+    roots = product_eigenvalues([np.roll(np.eye(6), 1, axis=0)], RTOL)
     np.testing.assert_allclose(roots**6, 1, atol=1e-13)
     assert_conjugate_and_sorted(roots)
     np.testing.assert_array_equal(product_eigenvalues([np.eye(3)] * 4, RTOL), np.ones(3))

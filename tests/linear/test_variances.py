@@ -12,8 +12,7 @@ F = np.arange(1, 20) / 20
 
 
 def an_htf(**more):
-    rng = np.random.default_rng(0)
-    H = rng.normal(size=(3, len(F), 2, 1, 2)) @ [1, 1j]
+    H = np.random.default_rng(0).normal(size=(3, len(F), 2, 1, 2)) @ [1, 1j]
     return hj.HTF(F, H, (-1, 0, 1), 4, **more)
 
 

@@ -102,8 +102,7 @@ def test_multipliers(hopper, rational, structured):
     z = hopper.multipliers
     np.testing.assert_array_equal(lines["exact"].get_xydata(), np.stack([z.real, z.imag], 1))
     assert len({(x.get_marker(), x.get_color()) for x in lines.values()}) == 4
-    error = structured.compare(z).max_error
-    assert f"{error:.1e}".split("e")[0] in list(lines)[-1]
+    assert f"{structured.compare(z).max_error:.1e}".split("e")[0] in list(lines)[-1]
     (inset,) = ax.child_axes
     (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
     for points in (z, *rational.multipliers, structured.multipliers):
@@ -184,8 +183,7 @@ def found(hopper):
 
 
 def test_validation_draws_signals_and_correlations(found):
-    figure = hj.plot.validation(found, cycles=2).figure
-    grid = np.reshape(figure.axes, (2, 3))
+    grid = np.reshape(hj.plot.validation(found, cycles=2).figure.axes, (2, 3))
     simulated, measured = grid[1, 0].get_lines()
     np.testing.assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
     np.testing.assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
@@ -229,8 +227,7 @@ def test_regions_are_drawn_around_estimates(hopper):
     true = hopper.multipliers
     c = np.poly(true).real[1:]
     estimate = MultiplierEstimate(true * 1.01, c, 1e-4 * np.eye(2), np.inf)
-    ax = hj.plot.multipliers(hopper, {"fit": estimate}).ax
-    (inset,) = ax.child_axes
+    (inset,) = hj.plot.multipliers(hopper, {"fit": estimate}).ax.child_axes
     drawn = [line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100]
     np.testing.assert_array_equal(drawn[0] @ [1, 1j], estimate.ellipse(0))
     (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()

@@ -75,8 +75,7 @@ def test_slopes_are_derivatives(noisy):
 
 def test_intervals_of_all_lengths_are_no_missed_events():
     """A slow current makes some intervals three times as long as others."""
-    t = np.arange(0, 20.0005, 1e-3)
-    slow = 5 * np.sin(np.pi * t)[None]
+    slow = 5 * np.sin(np.pi * np.arange(0, 20.0005, 1e-3))[None]
     slow = hj.testing.simulate_beats([1.0], slow, rate=1000, rhythm=10.0, jitter=0.03)
     (periods,) = hj.recordings.estimate_phase(slow, BEAT).periods
     assert periods.max() > 1.8 * np.median(periods)

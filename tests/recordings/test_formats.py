@@ -41,8 +41,7 @@ def refused(says, *paths, kind=FileFormatError, **how):
 
 
 def write_v5(path, variables, **how):
-    scipy_io = pytest.importorskip("scipy.io")
-    scipy_io.savemat(path, variables, **how)
+    pytest.importorskip("scipy.io").savemat(path, variables, **how)
 
 
 def write_v73(path, variables):
@@ -157,8 +156,7 @@ def test_feather(tmp_path):
 
 
 def test_excel(tmp_path):
-    openpyxl = pytest.importorskip("openpyxl")
-    path, book = tmp_path / "x.xlsx", openpyxl.Workbook()
+    path, book = tmp_path / "x.xlsx", pytest.importorskip("openpyxl").Workbook()
     book.active.title = "walk"
     for row in (["# subject, 3"], ["time", "x"], ["ms", None], *zip(1000 * SLOW, X, strict=True)):
         book.active.append([float(v) if isinstance(v, np.floating) else v for v in row])
@@ -207,8 +205,7 @@ def test_trc(tmp_path):
 
 
 def write_c3d(path, *, first=0, events=((0.05, "Left", "Strike"), (0.1, "Left", "Strike"))):
-    ezc3d = pytest.importorskip("ezc3d")
-    file = ezc3d.c3d()
+    file = pytest.importorskip("ezc3d").c3d()
     points = np.ones((4, 2, len(SLOW)))
     points[0, 0], points[1, 0], points[2, 1, 3] = X, 2 * X, np.nan
     file["parameters"]["POINT"]["RATE"]["value"] = [100.0]

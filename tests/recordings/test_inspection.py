@@ -32,8 +32,7 @@ def made_up(seed, force=0.1, noise=1e-3):
         angle = 2 * np.pi * time
         x = 2.0 + np.cos(angle) + w + noise * rng.normal(size=len(f))
         v = -6 * np.sin(angle) + 4 * w * np.cos(angle) + noise * rng.normal(size=len(f))
-        one = hj.Recording(time, {"f": f, "x": x, "v": v}, name=f"trial {k}")
-        trials.append(one)
+        trials.append(hj.Recording(time, {"f": f, "x": x, "v": v}, name=f"trial {k}"))
     return hj.Recording.join(trials).mark("top", TOP, bandwidth=16)
 
 
@@ -125,10 +124,8 @@ def test_an_order_that_is_too_low_is_named():
     assert set(told.values()) == {1} and set(told) >= {repr(x) for x in untried.findings}
     with pytest.raises(hj.DefinitionError, match="'f' is in `inputs` and in `outputs`"):
         hj.identify_recording(twice, TOP, inputs="f", outputs=("f", "x"))
-    text = (
-        "tried, since 129 cycles (a quarter is held out) are too few for order 2 with 32 sections: "
-    )
-    assert f"{text}record 28 more, or take 26 sections or fewer" in untried.advice.warnings[1].text
+    text = "129 cycles (a quarter is held out) are too few for order 2 with 32 sections: record 28"
+    assert f"since {text} more, or take 26 sections or fewer" in untried.advice.warnings[1].text
     with pytest.warns(hj.errors.FindingWarning, match="orders above 1 could not be tried"):
         hj.recordings.choose_order(untried.data)
 

@@ -75,8 +75,7 @@ def test_complete_pairs_give_the_paired_t_test():
     labels = np.repeat(["a", "b"], N)
     table = {"subject": np.tile(np.arange(N), 2), "condition": labels}
     row = Population(table, {"q": y}, {"q": error}).difference("q", "a", "b")
-    paired = stats.ttest_rel(y[:N], y[N:])
-    assert row["p"][0] == pytest.approx(paired.pvalue, rel=1e-3)
+    assert row["p"][0] == pytest.approx(stats.ttest_rel(y[:N], y[N:]).pvalue, rel=1e-3)
     assert row["freedom"][0] == pytest.approx(N - 1, rel=1e-3)
     y[N:] *= 3
     row = study(y, error, group=labels).difference("gain", "a", "b")
@@ -238,8 +237,7 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     """Each subject has a report, failures are named, and a second call computes nothing anew."""
     rows = ["file,subject,group,age"]
     for k in range(4):
-        dirty = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3, seed=k)
-        (trial,) = dirty.trials
+        (trial,) = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3, seed=k).trials
         table = np.column_stack([trial.time, trial.values])
         np.savetxt(tmp_path / f"{k}.csv", table, "%.6g", delimiter=",", comments="",
                    header="time (s),force (N),x (m),v (m/s)")  # fmt: skip

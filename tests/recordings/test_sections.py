@@ -152,8 +152,7 @@ def test_designs_as_tables(tmp_path, wave):
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, rhythm):
     folder = tmp_path_factory.mktemp("trials")
-    dirty = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3)
-    (trial,) = dirty.trials
+    (trial,) = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3).trials
     half = len(trial.time) // 2
     for k, rows in enumerate((slice(0, half), slice(half, None))):
         table = np.column_stack([trial.time[rows], trial.values[rows]])

@@ -71,8 +71,7 @@ def test_pulses_are_the_input_and_spikes_are_not():
     assert (input_spikes(noisy(WAVE) + single) != 0)[single > 0].all()
     assert not input_spikes(single).any()
     assert not input_spikes(noisy(single, 0.1)).any()
-    force = hj.testing.random_force(40, 500, 8)[:, 0]
-    assert not input_spikes(force).any()
+    assert not input_spikes(hj.testing.random_force(40, 500, 8)[:, 0]).any()
     assert not input_spikes(np.repeat(np.random.default_rng(0).normal(size=5000), 4)).any()
 
 

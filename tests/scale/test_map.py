@@ -43,8 +43,7 @@ def whole(wheel, options):
 
 def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     """That of the rimless wheel is cos^2 of the angle between spokes (McGeer 1990)."""
-    exact = np.cos(2 * np.pi / OVER["spokes"]) ** 2
-    expected = np.broadcast_to(exact, (3, 3))
+    expected = np.broadcast_to(np.cos(2 * np.pi / OVER["spokes"]) ** 2, (3, 3))
     np.testing.assert_allclose(whole.spectral_radius, expected, rtol=1e-7)
     assert whole.spectral_radius.dims == ("slope", "spokes")
     assert (whole.result == 0).all() and (whole.residual < 1e-8).all()
@@ -193,8 +192,7 @@ def test_systems_that_are_alike_or_undefined(wheel):
     np.testing.assert_array_equal(found.failed, [9])
     assert np.isnan(found.multipliers[9]).all() and np.isfinite(found.multipliers[:9]).all()
     assert found.summary().startswith("10/11 found; #9: ")
-    alike = hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR)
-    assert alike.ok.all()
+    assert hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR).ok.all()
 
 
 @pytest.mark.slow

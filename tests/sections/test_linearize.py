@@ -47,8 +47,7 @@ def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, reque
     np.testing.assert_allclose(hopper_cycle.multipliers, truth, atol=1e-9)
     np.testing.assert_allclose(ldtp.multipliers, truth, atol=1e-9)
     for i in range(32):
-        monodromy = np.asarray(ldtp.monodromy(i))
-        found = sorted(np.linalg.eigvals(monodromy), key=abs)
+        found = sorted(np.linalg.eigvals(np.asarray(ldtp.monodromy(i))), key=abs)
         np.testing.assert_allclose(sorted(found[-2:], key=np.imag), truth[::-1], atol=1e-9)
         assert ldtp.rank(i) == 2
 

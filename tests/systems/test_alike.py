@@ -81,8 +81,7 @@ def run(system):
 
 def test_kinds_are_found():
     assert Structure(Circle()).kinds == [(0, 2, 4), (1, 3, 5)]
-    one_by_one = [(g,) for g in range(6)]
-    assert Structure(Circle(apart=True)).kinds == one_by_one
+    assert Structure(Circle(apart=True)).kinds == [(g,) for g in range(6)]
     assert Structure(hj.models.BouncingChain(n=3)).kinds == [(0, 1, 2)]
     assert Structure(hj.models.TwoLeggedBar()).kinds == [(g,) for g in range(8)]
 

@@ -82,8 +82,7 @@ MIRROR = {
 
 def test_a_step_modulo_the_symmetry():
     walker = hj.Quotient(Full(), **MIRROR, translation=("x",))
-    lands = hj.AtEvent("right lands")
-    step = hj.find_limit_cycle(walker, section=lands)
+    step = hj.find_limit_cycle(walker, section=hj.AtEvent("right lands"))
     expected = [LONG_GAIT, np.conj(LONG_GAIT)]
     np.testing.assert_allclose(step.multipliers, expected, rtol=1e-9)
     np.testing.assert_allclose(step.period, 3.88246375285137, rtol=1e-10)

@@ -32,9 +32,8 @@ class TooFewCycles(DefinitionError):
         self.missing = missing
         super().__init__(
             f"section {n} was sampled {problem.records.sampled[n, i]} times, too few for "
-            f"numerators of {problem.lags} lags and {problem.free} unknown cycles at the start of "
-            f"each record: {missing} or more cycles are missing. Record more, take fewer sections, "
-            "or lower `order`."
+            f"{problem.lags} lags and {problem.free} unknown cycles at the start of each record: "
+            f"add {missing} or more cycles, take fewer sections, or lower `order`."
         )
 
 
