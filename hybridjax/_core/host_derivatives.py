@@ -82,8 +82,7 @@ def by_columns(
         except NotOnHostError:
             require_program()
             return eqx.filter_jvp(compiled, arguments, tangents)
-        weights = jax.tree_util.tree_leaves(moved)
-        return from_host(result), _combined(from_host(columns), weights)
+        return from_host(result), _combined(from_host(columns), jax.tree_util.tree_leaves(moved))
 
     return derived
 

@@ -106,9 +106,6 @@ class ExperimentData(eqx.Module):
         self.n_sections, self.periods = n_sections, periods
         sizes = self.u.shape[2], self.y.shape[2]
         self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
-        self._check()
-
-    def _check(self) -> None:
         (S, n, ny), N, P = self.y.shape, self.n_sections, self.periods
         if n % N:
             raise DefinitionError(

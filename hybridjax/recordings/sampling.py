@@ -205,8 +205,7 @@ def _sample(
                 values[:, i] = means(time, x, t)
             else:
                 at = time[finite]
-                nearest = np.searchsorted((at[:-1] + at[1:]) / 2, (start + end) / 2)
-                values[:, i] = x[finite][nearest]
+                values[:, i] = x[finite][np.searchsorted((at[:-1] + at[1:]) / 2, (start + end) / 2)]
             values[lost, i] = np.nan
         sections.append(_Sections(k[:-1], start, observed, values))
     return sections
