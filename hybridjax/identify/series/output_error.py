@@ -148,7 +148,7 @@ class OutputErrorProblem(NamedTuple):
                 later = np.arange(grid.y.shape[1]) >= grid.first[:, n, None] + free
                 used = grid.sampled[:, :, n].any(axis=2) & later
                 rows.append(lagged_inputs(grid.u, n, lags, records.lead)[used])
-            return np.linalg.qr(np.concatenate(rows), mode="r")
+            return np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
 
         # One section tells, before the work on all, that nothing is left of its samples.
         n, i = map(int, np.unravel_index(np.argmin(records.sampled), records.sampled.shape))
