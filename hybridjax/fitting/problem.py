@@ -270,9 +270,10 @@ def descend(
             r_new, J_new, nearer = evaluate(problem, trial, near)
             predicted = (J @ change) @ (J @ change + 2 * r)
             gain = (r_new - r) @ (r_new + r)
+            is_better = gain <= _ACCEPTED * predicted
             # (Rounding decides whether a step of this size is accepted.)
-            done = _small(change, trial) and _small(r_new - r, r_new)
-            if gain <= _ACCEPTED * predicted:
+            done = _small(change, trial) and (_small(r_new - r, r_new) or not is_better)
+            if is_better:
                 damping /= _LESS if gain < _GOOD * predicted < 0 else 1.0
                 x, r, J, near = trial, r_new, J_new, nearer
             else:

@@ -26,6 +26,7 @@ from ..engine.replay import Variation
 from ..engine.watch import slopes
 from .crossing import ListLevels
 from .return_map import SINGULAR, ReturnMap, Turn, across
+from .scale import has_implicit
 from .shooting import ATOL, RTOL, excess, fixed_point, newton_steps, travel
 
 
@@ -160,13 +161,17 @@ def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray
     assert map.settings.rtol is not None
     if near is not None:
         x, expected = fixed_point(map, near, x)
+    # (Implicit steps have errors that decay before the turn ends, and leave gaps between moves.)
+    explicit = not has_implicit(map.structure)
     while True:
-        travelled = None if expected is None else travel(map, x * sizes, expected)
+        travelled = None
+        if expected is not None and explicit:
+            travelled = travel(map, x * sizes, expected)
         turn = map.turn_with_jacobian(x * sizes, travelled=travelled)
         residual = turn.residual / sizes
         (step,) = newton_steps((turn.jacobian * sizes / sizes[:, None])[None], residual[None])
         x, steps = x + step, steps + 1
-        # (Gaps may be as large as errors of steps: implicit ones differ from their replay by such.)
+        # (Gaps may be as large as errors of steps.)
         gap = travelled[2] if travelled else 0.0
         close = np.max(np.abs(residual)) < ATOL and gap < ATOL + map.settings.rtol
         done = excess(x[None], step[None])[0] < 1 and close

@@ -17,7 +17,6 @@ from ..engine.events import arm, belongs
 from ..engine.lanes import ARRIVE_TIME, MOVE, Lanes, Tape, regrouped, start_lanes
 from ..engine.move import Options, move, stride
 from ..engine.replay import Moves, linear_moves, recorded_moves
-from ..engine.search.attempt import deviation
 from ..engine.target import Target, until
 from .return_map import CLOSED, LEGS, SINGULAR, Return, ReturnMap
 
@@ -50,7 +49,7 @@ def fixed_point(
     map: ReturnMap, turn: tuple[Lanes, Tape], otherwise: Float[np.ndarray, " d"]
 ) -> tuple[Float[np.ndarray, " d"], Moves | None]:
     """The state, in sizes, from which a turn with the recorded moves returns to itself, and these
-    moves; `otherwise` and no moves, if steps do not halve each time.
+    moves, if all last forwards; `otherwise` and no moves, if steps do not halve each time.
 
     **Arguments:** `turn`: the pieces of a turn and their tapes, side by side.
 
@@ -76,13 +75,27 @@ def fixed_point(
         (step,) = newton_steps(jacobian[None], (residual / sizes)[None])
         shift = np.stack(changes[:-1]) @ np.append(step * sizes, 1.0)
         h = (end + (by[:, :, :n] @ shift[:, :, None])[:, :, 0] - starts - shift)[:, 0]
-        halves = np.max(np.abs(step)) <= 0.5 * last
-        if not (halves and (h >= 0).all() and (moves.order == 0).sum() == LEGS):
-            return otherwise, None
-        x, last, starts = x + step, np.max(np.abs(step)), starts + shift
+        length = np.max(np.abs(shift[:, 1:] / map.scale[moves.chart]))
+        if not (length <= 0.5 * last and (moves.order == 0).sum() == LEGS):
+            # (Of short steps no more than rounding is left.)
+            return (x, _forwards(moves)) if last <= CLOSED else (otherwise, None)
+        x, last, starts = x + step, length, starts + shift
         moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
-        if excess(x[None], step[None])[0] < 1:
-            return x, moves
+        if length < ATOL + RTOL:
+            return x, _forwards(moves)
+
+
+def _forwards(moves: Moves) -> Moves | None:
+    """The moves without those that end before they start, in whose places the moves before them
+    end; None where an event or another piece comes before."""
+    back = np.flatnonzero(moves.h < 0)
+    if (moves.order[back] == 0).any() or (moves.code[back - 1] != MOVE).any():
+        return None
+    h, code = moves.h.copy(), moves.code.copy()
+    h[back - 1], code[back - 1] = h[back - 1] + h[back], code[back]
+    kept = moves.h >= 0
+    moves = Moves(*(x[..., kept] for x in moves._replace(h=h, code=code)))
+    return moves if (moves.h >= 0).all() else None
 
 
 def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple | None:
@@ -130,11 +143,6 @@ def follow_moves(map: ReturnMap, begin: Lanes, ends: Target, expected: Moves) ->
     # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
     h = np.where(timed, np.where(moves.h > 0, 2 * moves.h, map.expected), 1.01 * moves.h)
     setout = stride(h)._replace(lead=0 * h)
-    if any(s.method(a).implicit for a in range(len(s.charts))):
-        along, (_, by) = deviation(s, lanes, settings), linear_moves(s, moves, ends)
-        for k in np.flatnonzero(code[:-1] < 0):
-            along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
-        setout = setout._replace(along=along)
     u, options = np.zeros((s.nu, len(code))), Options(True, new_input=False, tangents=True)
     for _ in range(2):
         moved, tape = move(s, lanes, u, target, settings, setout, None, options)

@@ -93,9 +93,6 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
     watched = watch(s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK)
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
     follows = implicit and task.tangents is not False
-    along = task.stride.along
-    if follows and along is None:
-        along = deviation(s, lanes, task.settings)
     none, zero, no = xp.zeros(L, xp.int32), xp.zeros(L), xp.zeros(L, bool)
     return State(
         arm(s, lanes, watched, task.span) if new_input else lanes,
@@ -103,7 +100,7 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
         level_counts(watched, task.span),
         Approach(no, none, zero, zero, zero, none),
         task.stride.h,
-        along,
+        deviation(s, lanes, task.settings) if follows else None,
         zero,
         result,
         no,

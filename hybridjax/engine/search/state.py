@@ -24,8 +24,6 @@ class Stride(NamedTuple):
     not known."""
     slack: Times
     """A step's error estimate may be this many times the tolerance."""
-    along: Padded | None = None
-    """See `State`. Default: a deviation as large as the states."""
 
 
 class Options(NamedTuple):
