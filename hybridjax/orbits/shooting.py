@@ -159,10 +159,8 @@ def follow_moves(map: ReturnMap, begin: Lanes, ends: Target, expected: Moves) ->
     if not (same and (moved.result == Result.OK).all() and gap <= CLOSED):
         return None
     assert tape is not None
-    first, last = (
-        np.flatnonzero(np.diff(piece, prepend=-1)),
-        np.flatnonzero(np.diff(piece, append=-1)),
-    )
+    first = np.flatnonzero(np.diff(piece, prepend=-1))
+    last = np.append(first[1:], len(piece)) - 1
     legs = jax.tree_util.tree_map(lambda x: x[..., first], lanes)
     moved = jax.tree_util.tree_map(lambda x: x[..., last], moved)
     on_the_way = (tape.code == ARRIVE_TIME) & (code == MOVE)

@@ -23,42 +23,80 @@ from ..systems.transition import TOGETHER
 
 
 def flow_along(
-    map: ReturnMap, turn: tuple[Lanes, Tape], begin: Lanes, targets: Target
-) -> tuple[Lanes, Any] | None:
+    map: ReturnMap, turn: tuple[Lanes, Tape], carry: tuple[Lanes, Any, Any], targets: Target
+) -> tuple[tuple[Lanes, Any, Any], Any] | None:
     """The flow along a cycle from a lane on it to one of the `targets` after the other, all at
-    known times or all at states: the lane at the end, and the pieces, as by `through`. None if a
-    target is not reached once in a turn, if the search makes other moves than the recorded `turn`,
-    and for implicit methods, whose steps have errors that decay before the turn ends."""
-    s, period, t0, late = map.structure, map.expected, map.anchor.t[0], TOGETHER * map.expected
-    once, K = recorded_moves(*turn), len(targets.time)
-    once, M = once._replace(code=np.where(once.code < 0, MOVE, once.code)), len(once.t)
-    if has_implicit(s):
+    known times or all at states: what `through` returns. None if a target is not reached once in a
+    turn, if the search makes other moves than the recorded `turn`, and for implicit methods, whose
+    steps have errors that decay before the turn ends."""
+    if has_implicit(map.structure):
         return None
-    event, clock = np.broadcast_to(targets.event, K), np.isfinite(targets.time[0])
+    begin, period, late = carry[0], map.expected, TOGETHER * map.expected
+    once = recorded_moves(*turn)
+    once, M = once._replace(code=np.where(once.code < 0, MOVE, once.code)), len(once.t)
+    places = _places_on(map, once, turn[1], begin, targets)
+    if places is None:
+        return None
+    # Moves start at the beginning, where recorded moves do, and at targets, which take the place of
+    # a recorded start at the same time.
+    key, time, state = places
+    (first,), at = _place(map, once, begin.t), lambda key: once.t[key % M] + key // M * period
+    replaced = time - at(key) <= late
+    between = np.setdiff1d(np.arange(first + 1, key[-1] + 1), key[replaced])
+    keys = np.concatenate([[first], between, key])
+    times = np.concatenate([begin.t, at(between), time])
+    order = np.lexsort((times, keys))
+    keys, times, is_target = keys[order], times[order], order > len(between)
+    q = np.concatenate([begin.q, once.q[:, between % M], state], axis=1)[:, order]
+    piece, event = np.cumsum(is_target)[:-1], np.broadcast_to(targets.event, key.shape)
+    h, ends_in, new = np.diff(times), once.code[keys[:-1] % M], np.diff(keys) > 0
+    arrives = is_target[1:] & (event[np.minimum(piece, len(key) - 1)] < 0)
+    code = np.where(arrives, ARRIVE_TIME if np.isfinite(targets.time[0]) else ARRIVE_LEVEL, ends_in)
+    # (Where events and sections coincide, the search decides which comes first.)
+    if (arrives & new & (ends_in >= 0) | (code >= 0) & (h == 0) | (h < 0)).any():
+        return None
+    chart = np.append(begin.chart, once.chart[keys[1:-1] % M])
+    flow = follow_moves(
+        map, begin, targets, Moves(times[:-1], chart, q[:, :-1], h, code, piece, order)
+    )
+    assert map.settings.rtol is not None
+    # (As for a turn of Newton's method.)
+    if flow is None or flow[-1] >= ATOL + map.settings.rtol:
+        return None
+    legs, moved, tape, _ = flow
+    end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
+    return (end, *carry[1:]), jax.tree_util.tree_map(one_by_one, (legs, moved, tape))
 
-    def place(time):
-        """Numbers of the moves in which times lie: those of the second turn begin with M."""
-        turns, since = np.divmod(time - t0 + late, period)
-        return (turns * M + np.searchsorted(once.t, t0 + since, side="right") - 1).astype(int)
 
-    # The moves of the recorded turn in which targets lie, and how far.
+def _place(map: ReturnMap, once: Moves, time: Float[np.ndarray, " K"]) -> Int[np.ndarray, " K"]:
+    """Numbers of the moves of a turn in which times lie, those of the second turn after them."""
+    t0, period = map.anchor.t[0], map.expected
+    turns, since = np.divmod(time - t0 + TOGETHER * period, period)
+    return (turns * len(once.t) + np.searchsorted(once.t, t0 + since, side="right") - 1).astype(int)
+
+
+def _places_on(map: ReturnMap, once: Moves, tape: Tape, begin: Lanes, targets: Target):
+    """Of targets that follow each other, the numbers of the moves that start there, or in which
+    they lie, their times and states (d, K)."""
+    s, period, late = map.structure, map.expected, TOGETHER * map.expected
+    M, K, clock = len(once.t), len(targets.time), np.isfinite(targets.time[0])
+    event = np.broadcast_to(targets.event, K)
     if clock:
-        turns, move = np.divmod(place(targets.time), M)
+        turns, move = np.divmod(_place(map, once, targets.time), M)
         h = targets.time - turns * period - once.t[move]
     else:
-        level = _levels_on(s, once, turn[1], targets)
+        level = _levels_on(s, once, tape, targets)
         falls = (level[0] > 0) & (level[1] <= 0)
         reached = np.where(event[:, None] < 0, falls, once.code == event[:, None])
         if (reached.sum(axis=1) != 1).any():
             return None
         move = np.argmax(reached, axis=1)
         start, end = level[:, np.arange(K), move]
-        h = np.where(event < 0, start / (start - end), 1.0)
-        h *= np.append(once.t[1:], t0 + period)[move] - once.t[move]
-    cut = np.flatnonzero(event < 0)
+        part = np.where(event < 0, start / (start - end), 1.0)
+        h = part * (np.append(once.t[1:], map.anchor.t[0] + period)[move] - once.t[move])
+    cut, change = np.flatnonzero(event < 0), period
     start = Moves(*(x[..., move[cut]] for x in once))
     start = start._replace(code=np.full(len(cut), ARRIVE_TIME if clock else ARRIVE_LEVEL), lane=cut)
-    change = period
     while change > late:  # (Newton's method finds levels.)
         goal = dataclasses.replace(targets, time=once.t[move] + h)
         end, _ = linear_moves(s, start._replace(h=h[cut]), goal)
@@ -66,41 +104,15 @@ def flow_along(
         if not change <= last:
             return None
         h[cut] = end[:, 0] - start.t
-    # Times and moves on the way: each target follows the one before it.
     time = once.t[move] + h
     if not clock:
         turns = np.ceil((begin.t[0] + late - time[0]) / period)
         turns = turns + np.cumsum(np.append(False, time[1:] <= time[:-1] + late))
     time = time + turns * period
-    key = np.where(event < 0, place(time), turns * M + move + 1).astype(int)
-    # A target takes the place of a recorded move that begins there.
-    (first,), at = place(begin.t), lambda key: once.t[key % M] + key // M * period
-    replaced = time - at(key) <= late
-    between = np.setdiff1d(np.arange(first + 1, key[-1] + 1), key[replaced])
-    if (once.code[(key - 1) % M] >= 0)[replaced & (event < 0)].any():
-        return None
-    q = once.q[:, key % M]
-    q[:, cut] = end[:, 1:].T
-    keys = np.concatenate([[first], between, key])
-    times = np.concatenate([begin.t, at(between), time])
-    states = np.concatenate([begin.q, once.q[:, between % M], q], axis=1)
-    order = np.lexsort((times, keys))
-    keys, times, states = keys[order], times[order], states[:, order]
-    is_target = order > len(between)
-    piece = np.cumsum(is_target)[:-1]
-    arrives = is_target[1:] & (event[np.minimum(piece, K - 1)] < 0)
-    code = np.where(arrives, ARRIVE_TIME if clock else ARRIVE_LEVEL, once.code[keys[:-1] % M])
-    chart = np.append(begin.chart, once.chart[keys[1:-1] % M])
-    moves = Moves(times[:-1], chart, states[:, :-1], np.diff(times), code, piece, order)
-    at_once = ((moves.h == 0) & (code >= 0)).any()
-    flow = None if at_once else follow_moves(map, begin, targets, moves)
-    assert map.settings.rtol is not None
-    # (As for a turn of Newton's method.)
-    if flow is None or flow[-1] >= ATOL + map.settings.rtol:
-        return None
-    legs, moved, tape, _ = flow
-    end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
-    return end, jax.tree_util.tree_map(one_by_one, (legs, moved, tape))
+    key = np.where(event < 0, _place(map, once, time), turns * M + move + 1).astype(int)
+    state = once.q[:, key % M]
+    state[:, cut] = end[:, 1:].T
+    return key, time, state
 
 
 def _levels_on(

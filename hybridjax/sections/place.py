@@ -124,15 +124,9 @@ def _locate(map: ReturnMap, family: AbstractSections, turn: Any, flows: list) ->
     u = xp.zeros((s.nu, 1))
 
     def go(carry, targets, patience=np.inf):
-        flow = None
-        if turn is not None and on_host(period):
-            flow = flow_along(map, turn, carry[0], targets)
-        if flow is None:
-            options = Options(tape=True, tangents=True)
-            carry, flow = through(s, carry, u, targets, map.settings, options, patience)
-        else:
-            end, flow = flow
-            carry = end, *carry[1:]
+        options = Options(tape=True, tangents=True)
+        beside = turn is not None and on_host(period) and flow_along(map, turn, carry, targets)
+        carry, flow = beside or through(s, carry, u, targets, map.settings, options, patience)
         flows.append((flow[0], targets, flow[2]))
         return carry, flow
 
