@@ -25,7 +25,7 @@ from ..engine.lanes import Lanes, side_by_side
 from ..engine.replay import Variation
 from ..engine.watch import slopes
 from .crossing import ListLevels
-from .return_map import SINGULAR, ReturnMap, Turn, across
+from .return_map import CLOSED, SINGULAR, ReturnMap, Turn, across
 from .scale import has_implicit
 from .shooting import ATOL, RTOL, excess, fixed_point, newton_steps, travel
 
@@ -178,7 +178,8 @@ def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray
         if done or steps == max_steps or not np.isfinite(x).all():
             return x * sizes, turn, np.asarray(steps)
         expected = None
-        if steps < FEW_STEPS:  # (Later ones have not helped before.)
+        # (Later ones have not helped before, and short steps need none.)
+        if steps < FEW_STEPS and (explicit or np.abs(step).max() > CLOSED):
             x, expected = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), x)
 
 
