@@ -76,8 +76,8 @@ def _place(map: ReturnMap, once: Moves, time: Float[np.ndarray, " K"]) -> Int[np
 
 
 def _places_on(map: ReturnMap, once: Moves, tape: Tape, begin: Lanes, targets: Target):
-    """Of targets that follow each other, the numbers of the moves that start there, or in which
-    they lie, their times and states (d, K)."""
+    """The numbers of the moves that start at targets, or in which these lie, and the times and
+    states (d, K) of the targets, which follow each other."""
     s, period, late = map.structure, map.expected, TOGETHER * map.expected
     M, K, clock = len(once.t), len(targets.time), np.isfinite(targets.time[0])
     event = np.broadcast_to(targets.event, K)
