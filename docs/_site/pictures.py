@@ -55,15 +55,14 @@ def walk() -> Motion:
 
 
 def thumbnail(cycle: hj.LimitCycle, plane: list[str]) -> str:
-    """An SVG of 160 x 120 in which the mechanism moves; or, of systems without a picture and of
-    circuits, the orbit with a dot that moves along it."""
+    """An SVG of 160 x 120 in which the mechanism moves; or, of systems without a picture, the
+    orbit with a dot that moves along it."""
     motion = hj.plot.animate(cycle)
     pyplot.close(motion.figure)
     path, period = cycle.trajectory(), float(cycle.period)
     times = path.t[0] + np.linspace(0, period, FRAMES, endpoint=False)
     about = f'dur="{max(motion.interval * len(motion.times), 1.0):.3g}s"'
-    is_circuit = isinstance(cycle.system, hj.models.BuckConverter | hj.models.CukConverter)
-    if is_circuit or drawing_of(cycle.structure, 0) is None:
+    if drawing_of(cycle.structure, 0) is None:
         names = plane or cycle.structure.states_everywhere()[:2]
         points = np.array(path(*names)[1:]).T
         now = observed(cycle.structure, names, times, *path.at(times)).T

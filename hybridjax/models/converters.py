@@ -1,37 +1,11 @@
 """DC-DC converters with a switch that a controller closes and opens."""
 
-import math
-from collections.abc import Mapping
-from typing import Any
-
-import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..systems.chart import FieldChart
-from ..systems.drawing import Drawing
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Scheduled, Transition
-
-
-# Symbols of a circuit, of length 1, in the complex plane.
-_COIL = np.array([k / 48 + 0.1j * math.sin(math.pi * (k % 12) / 12) for k in range(49)])
-_DIODE = np.array([0, 35, 35 + 15j, 65, 35 - 15j, 35, 65, 65 + 15j, 65 - 15j, 65, 100]) / 100
-
-
-def _plates(charge: ArrayLike) -> tuple[Array, Array]:
-    """Both halves of a capacitor, the gap of which shows the charge, from 0 to 1."""
-    half = jnp.array([0, 0.45, 0.45 - 0.25j, 0.45 + 0.25j])
-    half -= 0.1 * jnp.clip(charge, 0, 1) * np.array([0, 1, 1, 1])
-    return half, 1 - half
-
-
-def _circuit(begin: float, x: float, lines: Mapping[str, Any]) -> Drawing:
-    """Lines in the complex plane, a load at x with wires from `begin`, and poles of the supply."""
-    drawn = {name: jnp.stack([jnp.real(z), jnp.imag(z)], -1) for name, z in lines.items()}
-    load = [(begin, 1.0), *Drawing.spring((x, 1.0), (x, 0.0)), (0.0, 0.0)]
-    return Drawing(drawn | {"load": load}, points={"plus": (0.0, 1.0), "minus": (0.0, 0.0)})
 
 
 class BuckConverter(HybridSystem):
@@ -85,18 +59,6 @@ class BuckConverter(HybridSystem):
 
     def period(self):
         return self.T
-
-    def draw(self, chart, t, q):
-        """The circuit: supply, switch (or diode), coil, capacitor, load."""
-        above, below = _plates(q["v"] / self.Vin)
-        lines = {
-            "switch": np.array([1j, 0.2 + 1j, 0.9 + 1j if chart == "closed" else 0.7 + 1.4j]),
-            "coil": np.append(0.9 + 1j, 1 + 1j + _COIL),
-            "diode": 1 + 1j * _DIODE,
-            "upper plate": 2 + 1j - 1j * above,
-            "lower plate": 2 + 1j - 1j * below,
-        }
-        return _circuit(2.0, 3.0, lines)
 
     def guess(self):
         return Guess("open", (12.0, 0.6, self.lower))
@@ -152,20 +114,6 @@ class CukConverter(HybridSystem):
 
     def period(self):
         return self.T
-
-    def draw(self, chart, t, q):
-        """The circuit: supply, first coil, switch, capacitor, diode, second coil, load."""
-        left, right = _plates(q["v1"] / (4 * self.E))
-        above, below = _plates(q["v2"] / (2 * self.E))
-        lines = {
-            "switch": 1 + np.array([1j, 0.8j, 0.2j if chart == "closed" else 0.35 + 0.3j]),
-            "contact": np.array([1 + 0.2j, 1]),
-            **{"first coil": 1j + _COIL, "second coil": 2 + 1j + _COIL},
-            **{"left plate": 1 + 1j + left, "right plate": 1 + 1j + right},
-            "diode": 2 + 1j - 1j * _DIODE,
-            **{"upper plate": 3 + 1j - 1j * above, "lower plate": 3 + 1j - 1j * below},
-        }
-        return _circuit(3.0, 3.7, lines)
 
     def guess(self):
         return Guess("open", (0.55, 25.0, 0.85, 10.0), 0.9 * self.T)
