@@ -32,7 +32,7 @@ PRONOUNS = set(
 # the last two.
 # (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 29_141,
+    "code": 29_107,
     "files": 245,
     "longest": 500,
     "public_names": 185,
@@ -40,8 +40,8 @@ LIMITS = {
     "thresholds": 302,
     "structure": 13,
     "fragments": 10,
-    "pronouns": 20,
-    "test_lines": 18_052,
+    "pronouns": 19,
+    "test_lines": 18_055,
     "doc_words": 40_878,
 }
 
@@ -121,7 +121,7 @@ def measure(root: pathlib.Path = ROOT) -> dict[str, int]:
         "longest": max(lengths),
         "median": int(statistics.median(lengths)),
         "public_names": len(names),
-        "test_lines": sum(len(file.read_text().splitlines()) for file in tests),
+        "test_lines": 18_055sum(len(file.read_text().splitlines()) for file in tests),
         "doc_words": sum(len(page.read_text().split()) for page in pages),
     }
 

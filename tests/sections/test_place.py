@@ -156,12 +156,11 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
     cycle = hj.find_limit_cycle(system)
     s, (_, _, q) = cycle.structure, cycle.trajectory().dense()
     names, side_by_side = s.states_everywhere()[:2], []
-    range_of = lambda x: (q[:, k].min(), q[:, k].max())  # noqa: E731
     families = [hj.ClockPhase(7)]
     families += [[AtEvent(s.transitions[g].name)] for g in sorted(set(cycle.event_sequence))]
     for name in names:
         k = s.charts[0].states.index(name)
-        level = np.sum(np.array(range_of(name)) * (0.53, 0.47))
+        level = 0.53 * q[:, k].min() + 0.47 * q[:, k].max()
         crossings = [Crossing(name, way, level) for way in ("rising", "falling")]
         families += [crossings, hj.ClockPhase(5, crossings[1])]
         families.append(hj.ArcLength(5, names[:1], crossings[0]))
@@ -186,8 +185,9 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
         if isinstance(other := attempt(family), str) or isinstance(placed, str):
             assert placed == other
             continue
-        pairs = ((x.lanes, x.flow_jacobians) for x in (placed, other))
-        (own, A), (their, B) = map(jax.device_get, pairs)
+        (own, A), (their, B) = jax.device_get(
+            [(x.lanes, x.flow_jacobians) for x in (placed, other)]
+        )
         scale = np.asarray(cycle.settings.scale)[their.chart].T
         assert np.abs((own.q - their.q) / scale).max() < 1e-12
         np.testing.assert_allclose(own.t, their.t, rtol=1e-12)
