@@ -279,7 +279,9 @@ def descend(
             else:
                 damping *= _MORE
             if done:
-                return x, r, J, near, steps, True
+                # (Steps become short, too, where none helps: beside parameters without a cycle.)
+                gain = r @ J @ np.linalg.lstsq(J, r, rcond=_RCOND)[0]
+                return x, r, J, near, steps, bool(gain <= _TOLERANCE * (1 + r @ r))
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
             break
         damped = np.concatenate([J, np.sqrt(damping) * np.eye(len(x))])

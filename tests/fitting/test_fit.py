@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.fitting import problem
 
 from ..conftest import OUTPUTS, no_compilation
 from .conftest import HOPPER, SECTIONS, Oscillator
@@ -20,6 +21,17 @@ def observed(cycle, noise=0.0):
     drawn = noise * np.random.default_rng(0).normal(size=9)
     values = values + drawn[:8].reshape(4, 2)
     return hj.ObservedCycle(PHASES, ("x", "v"), values, period=period + drawn[8], **STD)
+
+
+def test_a_fit_that_stops_where_cycles_end_has_not_converged(monkeypatch):
+    """Steps toward 3 are rejected beyond 1, where there is no cycle, until they are tiny."""
+
+    def evaluate(problem, x, guess):
+        return np.where(x < 1, x - 3, np.inf), np.eye(1), guess
+
+    monkeypatch.setattr(problem, "evaluate", evaluate)
+    *_, steps, converged = problem.descend(None, np.zeros(1), None)
+    assert steps < problem.MAX_STEPS and not converged
 
 
 @pytest.mark.slow
