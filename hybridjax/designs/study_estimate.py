@@ -123,7 +123,7 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     objection = ""
     try:
         require_order(groups, htf, order, fit.cost / fit.freedom, fit.residual)
-    except DefinitionError as error:
+    except DefinitionError as error:  # (its text is for the user, and nothing reads it)
         objection = str(error)
     if not objection and (np.abs(fit.multipliers) >= 1).any():
         objection = "the estimate is unstable, and an unstable system has no periodic response"

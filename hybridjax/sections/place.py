@@ -31,6 +31,7 @@ from ..orbits.crossing import Crossing, ListLevels, to_section
 from ..orbits.cycle import LimitCycle
 from ..orbits.linear_flow import beginning, last_turn, of_flow
 from ..orbits.return_map import PATIENCE, ReturnMap
+from ..orbits.scale import has_implicit
 from ..systems.structure import Structure
 from ..systems.transition import TOGETHER
 from . import families
@@ -73,7 +74,9 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     traced = is_traced((cycle, family))
     if traced:
         require_program()
-    first, fields = _place(_patient(cycle), family, None if traced else last_turn(cycle))
+    # (Programs of `_place` are for one number of moves: none are given where they do not help.)
+    turn = None if traced or has_implicit(cycle.structure) else last_turn(cycle)
+    first, fields = _place(_patient(cycle), family, turn)
     placed = PlacedSections(cycle, family, *fields)
     if not traced:
         _check(placed, int(first))

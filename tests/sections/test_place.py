@@ -158,10 +158,10 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
     names, side_by_side = s.states_everywhere()[:2], []
     families = [hj.ClockPhase(7)]
     families += [[AtEvent(s.transitions[g].name)] for g in sorted(set(cycle.event_sequence))]
-    for name in names:
-        k = s.charts[0].states.index(name)
+    for state in names:
+        k = s.charts[0].states.index(state)
         level = 0.53 * q[:, k].min() + 0.47 * q[:, k].max()
-        crossings = [Crossing(name, way, level) for way in ("rising", "falling")]
+        crossings = [Crossing(state, way, level) for way in ("rising", "falling")]
         families += [crossings, hj.ClockPhase(5, crossings[1])]
         families.append(hj.ArcLength(5, names[:1], crossings[0]))
     if len(names) == 2:
@@ -197,4 +197,5 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
             np.testing.assert_allclose(x, y, atol=1e-10 * np.abs(y).max(initial=1e-300))
         np.testing.assert_array_equal(placed.drop, other.drop)
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
-    assert implicit or sum(x is not None for x in side_by_side) > 1
+    kept = [x is not None for x in side_by_side]
+    assert implicit or (all(kept) if name == "VerticalHopper" else sum(kept) > 1)
