@@ -32,7 +32,7 @@ PRONOUNS = set(
 # the last two.
 # (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 29_108,
+    "code": 29_113,
     "files": 245,
     "longest": 500,
     "public_names": 185,
@@ -41,7 +41,7 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 19,
-    "test_lines": 18_068,
+    "test_lines": 18_069,
     "doc_words": 40_878,
 }
 

@@ -229,7 +229,11 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
             expected=map.expected if map.base is None else period,
         )
         if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # accurate enough
-            distance = real(np.max(np.abs(solution.turn.residual) / to_host(fine).sizes))
+            residual, before = np.abs(solution.turn.residual), to_host(map).sizes
+            after = to_host(fine).sizes
+            # (Gaps between moves are part of the distance, too.)
+            gap = np.asarray(solution.turn.distance) - np.max(residual / before)
+            distance = real(np.max(residual / after) + gap * np.max(before / after))
             return fine, solution._replace(turn=solution.turn._replace(distance=distance))
         say("Newton's method, in the sizes of the cycle")
         again = solve(fine)

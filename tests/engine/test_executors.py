@@ -129,6 +129,7 @@ def test_a_turn_with_its_moves_side_by_side(name):
         for other in wrong:
             assert travel(map, x * sizes, other) is None
     assert int(cycle.iterations) < 8  # (gaps between moves do not keep a search from ending)
+    assert name != "VerticalHopper" or cycle.residual > 0  # (where only gaps are left, they count)
     assert [x for x in np.ravel(again.codes) if x >= 0] == [
         x for x in np.ravel(turn.codes) if x >= 0
     ]
