@@ -200,8 +200,6 @@ def _descend(
         none = np.zeros(0), np.zeros((0, len(start)))
         return End(start, start, np.inf, *none, cycle, 0, int(cycle.result))
     x, r, J, near, steps, converged = descend(problem, start, cycle)
-    if not np.isfinite(r).all():  # there is a cycle, but no observation on it
-        return End(start, start, np.inf, r, J, cycle, steps, int(Result.NOT_CONVERGED))
     result = Result.OK if converged else Result.NOT_CONVERGED
     return End(start, x, float(r @ r), r, J, near, steps, int(result))
 

@@ -91,15 +91,11 @@ def _readable(basis: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
     k, p = basis.shape
     if k == 0:
         return basis
-
-    def echelon(pivots):
+    forms = []
+    for pivots in itertools.combinations(range(p), k):
         block = basis[:, pivots]
-        if np.linalg.svd(block, compute_uv=False)[-1] < _CLOSE:
-            return None
-        return _rounded(np.linalg.solve(block, basis))
-
-    forms = (echelon(list(pivots)) for pivots in itertools.combinations(range(p), k))
-    forms = [form for form in forms if form is not None]
+        if np.linalg.svd(block, compute_uv=False)[-1] >= _CLOSE:
+            forms.append(_rounded(np.linalg.solve(block, basis)))
     return min(forms, key=lambda form: (np.count_nonzero(form), np.sum(form < 0)))
 
 

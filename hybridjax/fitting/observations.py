@@ -1,7 +1,6 @@
 """Data to which systems are fitted: each type converts a limit cycle to weighted residuals."""
 
 import abc
-from collections.abc import Sequence
 from typing import Annotated
 
 import equinox as eqx
@@ -12,8 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from .._core.arguments import Numbers, require_axes, require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.containers import Names
-from .._core.boundary.kinds import PositiveScalar
+from .._core.boundary.kinds import OptionalNames, PositiveScalar
 from .._core.boundary.values import Reals
 from .._core.text import fields
 from ..engine.settings import Settings
@@ -31,7 +29,6 @@ from ..sections.linearize import Delayed, Delays, linearize
 from ..sections.place import observed_at, place_sections
 
 
-AnyNames = Annotated[str | Sequence[str], Names(empty=True)]
 Deviations = Annotated[Numbers, Reals("...", sign="positive")]
 
 
@@ -232,7 +229,7 @@ class ObservedCycle(AbstractObservation):
     def __init__(
         self,
         sections: FamilyLike,
-        outputs: AnyNames = (),
+        outputs: OptionalNames = (),
         values: Annotated[Numbers, Reals("sections outputs")] | None = None,
         *,
         times: Annotated[Numbers, Reals("sections")] | None = None,
@@ -253,7 +250,7 @@ class ObservedCycle(AbstractObservation):
         standard deviations that are not positive, or none for something that is zero throughout.
         """
         self.sections = as_family(sections)
-        self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+        self.outputs = tuple(outputs)
         N, ny = self.sections.n_sections, len(self.outputs)
         given = {
             "values": (values, std, {"sections": N, "outputs": ny}),
@@ -274,13 +271,14 @@ class ObservedCycle(AbstractObservation):
         self.weighted = jnp.asarray(all(std is not None for _, std, _ in given.values()))
 
     @classmethod
-    def of(cls, cycle: LimitCycle, sections: FamilyLike, outputs: AnyNames = ()) -> "ObservedCycle":
+    def of(
+        cls, cycle: LimitCycle, sections: FamilyLike, outputs: OptionalNames = ()
+    ) -> "ObservedCycle":
         """Return the error-free measurement of a given cycle.
 
         **Raises:** as `place_sections`; `DefinitionError` for an output that is zero throughout.
         """
         placed = place_sections(cycle, sections)
-        outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         values = placed.observe(outputs) if outputs else None
         times = _times(cycle, placed.lanes.t)
         times = times if np.any(times) else None

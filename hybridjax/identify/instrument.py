@@ -245,12 +245,12 @@ def solve(
     lines = Lines.of(f, N)
 
     def entries(x):
-        return None if x is None else lines.entries(x, N // 2).real
+        return None if x is None else lines.entries(x).real
 
     by_line = np.zeros(len(f))
     by_line[lines.row] = freedom[:, None]
     scatter = None if total is None else Scatter(by_line, shared=True)
     return HTF(
-        f, lines.entries(H, N // 2), check_harmonics(None, N), N, inputs, outputs, "estimate",
+        f, lines.entries(H), check_harmonics(None, N), N, inputs, outputs, "estimate",
         variance=entries(total), noise_variance=entries(noise), scatter=scatter,
     )  # fmt: skip

@@ -162,8 +162,7 @@ def fit_multipliers(
             groups = group_htf(htf, weights, size)
             c, converged = maximum_likelihood(groups, order, c)
     covariance, cost, freedom = varpro.summarize(groups, c, errors)
-    b = [varpro.numerators_of(group, c) for group in groups]
-    B = varpro.unfold(htf, groups, b, [x.conj() for x in b])
+    B = varpro.unfold(htf, groups, [varpro.numerators_of(group, c) for group in groups])
     misfit, scale = _evaluate(B, c, f, htf.n_sections) - H, rms[:, None]
     residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
     if check:

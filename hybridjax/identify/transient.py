@@ -137,8 +137,6 @@ def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows c
     angle = 2 * np.pi / P * np.arange(cycles)[:, None] * classes
     inner = (classes > 0) & (2 * classes < P)
     signals = np.concatenate([np.cos(angle), np.sin(angle[:, inner])], axis=1)
-    if signals.shape[1] >= cycles:
-        return np.zeros((0, cycles))
     return np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
 
 

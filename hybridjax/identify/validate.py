@@ -14,14 +14,14 @@ from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import p_value
 from ..errors import DefinitionError
-from ..experiments.record import Record, RecordedData, require_deviations, uninterrupted_records
+from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
 from .instrument import in_loop
 from .joint.fit import LDTPFit
 from .joint.prediction import Predictor
 from .periodic import PeriodicModel
 from .series.fit import SeriesFit
-from .series.records import CycleGrid, drift_waves
+from .series.records import CycleGrid, PreparedRecords, drift_waves
 from .series.residuals import FEWEST_SAMPLES, independence_test, whiteness_test
 
 
@@ -215,21 +215,17 @@ def validate(
             f"{max(len(r.u) for r in records) / N:.3g} cycles, too few for an unknown initial "
             "state: record longer without gaps, or use start='cycle'."
         )
-    grid = CycleGrid.from_records(compared)
+    prepared = PreparedRecords(compared)
+    grid, sampled = prepared.whole(), prepared.sampled
     first = np.array([r.first_section for r in compared])
     before = np.arange(grid.inside[0].size).reshape(-1, N) - first[:, None, None]  # in the record
     y = np.where(grid.sampled, grid.y, np.nan)
-    spread = np.ma.masked_invalid(y).std(axis=(0, 1, 2)).filled(0.0)
+    spread = np.nanstd(y, axis=(0, 1, 2))
 
     def count(lags: int) -> Int[np.ndarray, "N ny"]:
         """Return how often each section was sampled with so many samples before it."""
         return (grid.sampled & (before >= lags)[..., None]).sum(axis=(0, 1))
 
-    sampled, sizes = count(0), [*np.abs(grid.u).max(axis=(0, 1, 2)), *spread]
-    for name, size in zip(records[0].inputs + outputs, sizes, strict=True):
-        if not size:
-            raise DefinitionError(f"{name} is constant or missing at every sample: leave it out.")
-    require_deviations(records)
     if (few := int(sampled.min())) < FEWEST_SAMPLES:
         raise DefinitionError(f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles.")
     # One period, less for few cycles.

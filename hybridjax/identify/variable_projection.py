@@ -104,7 +104,7 @@ def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     d, E = len(c), len(group.period_delay)
     q, _ = group.numerator_space(c)
     below = chi(group.period_delay, c)[:, None]
-    target = split((group.weight[:, None] / np.abs(below)) * below * group.data)
+    target = group.weighted(c, below * group.data)
     explained = q @ (q.T @ target)
     # The delays divided by chi (up to its phase, which all rows share).
     delays = group.period_delay[:, None] ** np.arange(1, d + 1)[:, None, None] / below
@@ -244,25 +244,17 @@ def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"
 
 
 def unfold(
-    htf: HTF,
-    groups: list[HTFGroup],
-    values: Sequence[Inexact[np.ndarray, "n _"]],
-    opposite: Sequence[Inexact[np.ndarray, "n _"]],
-) -> Complex[np.ndarray, "M n ny nu"]:
-    """Return numbers of the HTFs from those of the responses of each group.
-
-    **Arguments:** `opposite`: numbers of the same responses for the opposite harmonic.
-    """
+    htf: HTF, groups: list[HTFGroup], numerators: Sequence[Inexact[np.ndarray, "R K"]]
+) -> Complex[np.ndarray, "M R ny nu"]:
+    """Return the numerators of the HTFs from those of the responses of each group."""
     _, _, ny, nu = htf.H.shape
-    out = np.zeros((len(htf.harmonics), len(values[0]), ny, nu), complex)
-    for group, here, there in zip(groups, values, opposite, strict=True):
-        i, j = group.channel.T
+    out = np.zeros((len(htf.harmonics), len(numerators[0]), ny, nu), complex)
+    for group, b in zip(groups, numerators, strict=True):
+        (i, j), two, entries = group.channel.T, group.mirror >= 0, (group.share * b).T
         at: Any = (group.harmonic, slice(None), i, j)
-        np.add.at(out, at, (group.share * here).T)
-        two = group.mirror >= 0
-        mirrored = (group.share.conj() * there).T[two]
+        np.add.at(out, at, entries)
         at = (group.mirror[two], slice(None), i[two], j[two])
-        np.add.at(out, at, mirrored)
+        np.add.at(out, at, entries[two].conj())
     return out
 
 

@@ -126,22 +126,22 @@ class Lines(NamedTuple):
             )
         return cls(np.where(there, size.argmin(axis=2), opposite.argmin(axis=2)), ~there)
 
-    def matrices(self, x: Array, zero: int) -> Complex[Array, "K Nny Nnu"]:
-        """Return the harmonic matrices of values (N, F, ny, nu) with harmonic 0 at `zero`."""
+    def matrices(self, x: Array) -> Complex[Array, "K Nny Nnu"]:
+        """Return the harmonic matrices of values (N, F, ny, nu), in the order of all harmonics."""
         (K, N), xp = self.row.shape, namespace(x)
         m = np.arange(N)[:, None] - np.arange(N)
         sign = np.where(self.mirrored, -1, 1)[:, None]
-        values = x[(sign * m + zero) % N, self.row[:, None]]  # (K, a, b, ny, nu)
+        values = x[(sign * m + N // 2) % N, self.row[:, None]]  # (K, a, b, ny, nu)
         values = xp.where(self.mirrored[:, None, :, None, None], xp.conj(values), values)
         return values.swapaxes(2, 3).reshape(K, N * x.shape[2], N * x.shape[3])
 
-    def entries(self, matrices: Array, zero: int) -> Complex[Array, "N F ny nu"]:
+    def entries(self, matrices: Array) -> Complex[Array, "N F ny nu"]:
         """Return the values of all lines, whose harmonic matrices these are."""
         (K, N), xp = self.row.shape, namespace(matrices)
         values = matrices.reshape(K, N, matrices.shape[1] // N, N, -1).swapaxes(2, 3)
         _, first = np.unique(self.row, return_index=True)
         k, b = np.unravel_index(first, self.row.shape)
-        mirrored, m = self.mirrored[k, b], np.arange(N)[:, None] - zero
+        mirrored, m = self.mirrored[k, b], np.arange(N)[:, None] - N // 2
         values = values[k, (b + np.where(mirrored, -m, m)) % N, b]
         return xp.where(mirrored[:, None, None], xp.conj(values), values)
 

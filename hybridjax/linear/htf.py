@@ -419,8 +419,7 @@ def _combined(
         if x.harmonics != every:
             raise DefinitionError(f"algebra needs all {N} harmonics: leave `harmonics` out.")
     lines = algebra.Lines.of(np.asarray(first.f), N)
-    to_matrices = lambda x: lines.matrices(x, N // 2)  # noqa: E731
-    result, pairs = operation(*(to_matrices(x.H) for x in terms))
+    result, pairs = operation(*(lines.matrices(x.H) for x in terms))
 
     def variance(name: str) -> Array | None:
         given = [getattr(x, name) for x in terms]
@@ -428,7 +427,7 @@ def _combined(
         if all(exact) or any(v is None and not e for v, e in zip(given, exact, strict=True)):
             return None
         full = [jnp.zeros(x.H.shape) if v is None else v for x, v in zip(terms, given, strict=True)]
-        return lines.entries(algebra.variance_of(pairs, [*map(to_matrices, full)]), N // 2).real
+        return lines.entries(algebra.variance_of(pairs, [*map(lines.matrices, full)])).real
 
     freedoms = [x.scatter.freedom for x in terms if x.scatter is not None]
     scatter = None
@@ -439,7 +438,7 @@ def _combined(
         scatter = Scatter(least[rows], shared=True)
     source = "exact" if all(x.source == "exact" for x in terms) else "estimate"
     return HTF(
-        first.f, lines.entries(result, N // 2), every, N, inputs, outputs, source,
+        first.f, lines.entries(result), every, N, inputs, outputs, source,
         variance=variance("variance"), noise_variance=variance("noise_variance"), scatter=scatter,
     )  # fmt: skip
 

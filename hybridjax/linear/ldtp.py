@@ -178,16 +178,13 @@ class LDTP(eqx.Module):
 
         **Returns:** (n + 1, d), padded with zeros, `x0` first.
         """
-        u, x0 = self._input(u), self._state(x0, first_section)
-        return time_response.states(self.A, self.B, u, x0, self._sections_from(first_section, u))
+        return self._response(u, x0, first_section)[0]
 
     def simulate(
         self, u: Signals, x0: Vector | None = None, first_section: int = 0
     ) -> Float[Array, "time ny"]:
         """The outputs (n, ny) that an input leads to; arguments as in `states`."""
-        u = self._input(u)
-        x = self.states(u, x0, first_section)[:-1]
-        return time_response.outputs(self.C, self.D, u, x, self._sections_from(first_section, u))
+        return self._response(u, x0, first_section)[1]
 
     def impulse_response(self, n_lags: Count) -> Float[Array, "N lags ny nu"]:
         """The time-periodic impulse response (Markov parameters).
@@ -355,8 +352,10 @@ class LDTP(eqx.Module):
         by_period = u.reshape(len(u), periods, self.n_sections, -1)
         return time_response.periodic_states(self.A, self.B, by_period)
 
-    def _sections_from(self, first_section, u):
-        return (first_section + jnp.arange(u.shape[0])) % self.n_sections
+    def _response(self, u, x0, first_section):
+        u, x0 = self._input(u), self._state(x0, first_section)
+        sections = (first_section + jnp.arange(len(u))) % self.n_sections
+        return time_response.response(self.A, self.B, self.C, self.D, u, x0, sections)
 
     def _input(self, u):
         require_x64()

@@ -29,34 +29,24 @@ def _multiplied(product, factor):
 
 
 @jax.jit
-def states(
+def response(
     A: Float[Array, "N d d"],
     B: Float[Array, "N d nu"],
-    u: Float[Array, "n nu"],
-    x0: Float[Array, " d"],
-    sections: Int[Array, " n"],
-) -> Float[Array, "time d"]:
-    """`x0` and the states after each input; `sections`, where each input acts."""
-
-    def advance(x, step):
-        n, u = step
-        x = A[n] @ x + B[n] @ u
-        return x, x
-
-    _, later = jax.lax.scan(advance, x0, (sections, u))
-    return jnp.concatenate([x0[None], later])
-
-
-@jax.jit
-def outputs(
     C: Float[Array, "N ny d"],
     D: Float[Array, "N ny nu"],
     u: Float[Array, "n nu"],
-    x: Float[Array, "n d"],
+    x0: Float[Array, " d"],
     sections: Int[Array, " n"],
-) -> Float[Array, "n ny"]:
-    """`C x + D u` at each section."""
-    return jnp.einsum("nij,nj->ni", C[sections], x) + jnp.einsum("nij,nj->ni", D[sections], u)
+) -> tuple[Float[Array, "time d"], Float[Array, "n ny"]]:
+    """`x0` and the states after each input, and the outputs; `sections`, where each input acts."""
+
+    def advance(x, step):
+        n, u = step
+        return A[n] @ x + B[n] @ u, x
+
+    last, x = jax.lax.scan(advance, x0, (sections, u))
+    y = jnp.einsum("nij,nj->ni", C[sections], x) + jnp.einsum("nij,nj->ni", D[sections], u)
+    return jnp.concatenate([x, last[None]]), y
 
 
 @functools.partial(jax.jit, static_argnames="n_lags")

@@ -255,22 +255,20 @@ def fit_ldtp(
             data, drive = in_loop(data, reference)
         innovations = noise == "innovations" or drive is not None
         records, direct = PreparedRecords(data), _is_direct(guess)
+        outside = records if drive is None else PreparedRecords(drive)
         if innovations and not isinstance(guess, LDTP):
-            outside = records if drive is None else PreparedRecords(drive)
             direct = answers_at_once(records, outside)
         how = (innovations, start == "free", check)
         fit = _fit_to_series(records, guess, *how, direct)
-        outside = grid = records.whole()
+        grid = records.whole()
         errors = lambda: cast(Predictor, fit.predictor).errors(grid, start == "free")  # noqa: E731
         feedback = UNSEEN * (innovations and direct and drive is None)
-        if drive is not None:
-            outside = PreparedRecords(drive).whole()
-        elif answers := answering(grid, errors(), records.inputs):
+        if drive is None and (answers := answering(grid, errors(), records.inputs)):
             if innovations and direct and not isinstance(guess, LDTP):
                 fit, direct = _fit_to_series(records, guess, *how, False), False
             remedy = REMEDIES[innovations + (innovations and not direct)]
             feedback = about_answering(answers, remedy)
-        misfit = about_misfit(outside, grid, errors(), innovations) if check else ""
+        misfit = about_misfit(outside.whole(), grid, errors(), innovations) if check else ""
         if misfit:
             warnings.warn(f"Fit: {misfit}.", FindingWarning, stacklevel=3)
         return dataclasses.replace(fit, feedback=feedback, misfit=misfit)

@@ -60,13 +60,12 @@ class FrequencyProblem(NamedTuple):
         return self.weight * (self.target - transfer(model, self.f, self.harmonics))
 
     def cost(self, model: PeriodicModel) -> float:
-        """Return the sum of squares; infinite for a model that is resonant or overflows."""
+        """Return the sum of squares; infinite or NaN for a model that is resonant or overflows."""
         try:
             with np.errstate(all="ignore"):
-                cost = float((np.abs(self.errors(model)) ** 2).sum())
+                return float((np.abs(self.errors(model)) ** 2).sum())
         except np.linalg.LinAlgError:
             return np.inf
-        return cost if np.isfinite(cost) else np.inf
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P, error = coordinates.size, self.errors(coordinates.model)

@@ -16,14 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ...errors import DefinitionError
-from ...linear.frequency_response import Harmonics, check_harmonics
+from ...linear.frequency_response import Harmonics, check_harmonics, harmonic_transfer
 from ...linear.ldtp import LDTP
 from ..descent import NormalEquations
 from ..periodic import LocalCoordinates, PeriodicModel
 from ..series.output_error import RANK
 from ..series.records import CycleGrid
 from ..weights import SMALLEST_ERROR
-from .frequency import transfer
 
 
 Columns = Float[np.ndarray, "_ _ _ _"]
@@ -106,7 +105,7 @@ class SeriesProblem(NamedTuple):
     """The number of samples."""
 
     def cost(self, model: PeriodicModel) -> float:
-        """Return the weighted sum of squares; infinite for a model whose predictions overflow."""
+        """Return the weighted sum of squares; infinite or NaN if predictions overflow."""
         cost = 0.0
         with np.errstate(all="ignore"):
             for part in self.parts:
@@ -116,7 +115,7 @@ class SeriesProblem(NamedTuple):
                     return np.inf
                 pairs = zip(path.whiten, path.error, strict=True)
                 cost += sum(float((_times(w, e) ** 2).sum()) for w, e in pairs)
-        return cost if np.isfinite(cost) else np.inf
+        return cost
 
     def reweighted(self, model: PeriodicModel) -> "SeriesProblem":
         """Return the problem with the covariance of the errors of a model."""
@@ -322,9 +321,9 @@ def noise_spectrum(
             f"the noise grows without bound: its model has a multiplier of modulus "
             f"{np.abs(noise.multipliers[0]):.4g}, which must be below 1."
         )
-    model = PeriodicModel.of(noise, np.ones(len(noise.outputs)))
     k = np.arange(N)
-    H = transfer(model, np.add.outer(k, f).ravel(), tuple(k.tolist()))  # (k, inputs at f + j)
+    matrices = (np.asarray(x) for x in (noise.A, noise.B, noise.C, noise.D))
+    H = harmonic_transfer(*matrices, np.add.outer(k, f).ravel())  # (k, inputs at f + j)
     square = (np.abs(H) ** 2).sum(axis=3).reshape(N, N, len(f), len(noise.outputs))
     return np.stack([square[k, (m - k) % N].sum(axis=0) for m in harmonics])
 

@@ -81,23 +81,18 @@ class PreparedRecords:
         self.n_sections, self.lead = about.n_sections, about.lead
         self.inputs, self.outputs = about.inputs, about.outputs
         self.grids = _grids(self.records)
-        self.cycles = 0
-        self.sampled = np.zeros((self.n_sections, len(self.outputs)), int)
-        excited, square = np.zeros(len(self.inputs), bool), np.zeros(len(self.outputs))
-        low, high = square + np.inf, square - np.inf
-        for grid in self.grids:
-            self.cycles = max(self.cycles, grid.y.shape[1])
-            self.sampled += grid.sampled.sum(axis=(0, 1))
-            excited |= grid.u.any(axis=(0, 1, 2))
-            square += (grid.y**2).sum(axis=(0, 1, 2))
-            low = np.minimum(low, np.where(grid.sampled, grid.y, np.inf).min(axis=(0, 1, 2)))
-            high = np.maximum(high, np.where(grid.sampled, grid.y, -np.inf).max(axis=(0, 1, 2)))
-        for name, moves in zip(self.inputs + self.outputs, [*excited, *(high > low)], strict=True):
-            if not moves:
+        self.cycles = max(map(count_cycles, self.records))
+        self.sampled = np.sum([grid.sampled.sum(axis=(0, 1)) for grid in self.grids], axis=0)
+        u, y = (np.concatenate([getattr(r, name) for r in self.records]) for name in "uy")
+        varies = np.fmax.reduce(y) > np.fmin.reduce(y)  # (without NaN)
+        for name, acts in zip(self.inputs + self.outputs, [*u.any(axis=0), *varies], strict=True):
+            if not acts:
                 what = "constant" if name in self.outputs else "zero"
                 raise DefinitionError(f"{name} is {what} or missing at every sample: leave it out.")
         require_deviations(self.records)
-        self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / self.sampled.sum(axis=0))
+        self.scale: Float[np.ndarray, " ny"] = np.sqrt(
+            np.nansum(y**2, axis=0) / self.sampled.sum(axis=0)
+        )
 
     def whole(self) -> CycleGrid:
         """Return all records on one grid."""
