@@ -135,7 +135,7 @@ def free_parameters(
     names = tuple(free)
     if not names or len(set(names)) < len(names):
         raise DefinitionError(f"`free` must name one parameter or more, each once, not {names}.")
-    low, high, size = [], [], []
+    rows = []
     for name in names:
         value = float(_value(system, observations, name))
         bounds = free[name] if isinstance(free, Mapping) else None
@@ -146,10 +146,8 @@ def free_parameters(
                 f"the bounds of '{name}', {bounds}, must be two numbers that enclose the value at "
                 f"which the fit starts, {value:g}."
             )
-        low.append(float(bounds[0]))
-        high.append(float(bounds[1]))
-        size.append(abs(value) if value else 1.0)
-    return Parameters(names, jnp.array(low), jnp.array(high), jnp.array(size))
+        rows.append((*bounds, abs(value) or 1.0))
+    return Parameters(names, *map(jnp.asarray, np.transpose(rows)))
 
 
 def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> tuple[LimitCycle, Turn | None]:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from .._core.arguments import require_equal
 from .._core.boundary.containers import Stream
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
@@ -106,11 +107,7 @@ def spectral_sums(
     total, count = None, 0
     for part in [data] if isinstance(data, ExperimentData) else data:
         setup = Setup(part.n_sections, part.periods, part.inputs, part.outputs)
-        if total is not None and setup != total.setup:
-            raise DefinitionError(
-                "`data` holds experiments of different sections, periods or signals: "
-                f"{total.setup}, {setup}."
-            )
+        require_equal("experiments", "setups", setup if total is None else total.setup, setup)
         chosen = () if harmonics == () else check_harmonics(harmonics, part.n_sections)
         sums = _sums_of_part(part, setup, chosen, threshold, repeats, count)
         total = sums if total is None else _add(total, sums)

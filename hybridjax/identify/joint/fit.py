@@ -96,8 +96,7 @@ class LDTPFit(MultiplierEstimate):
     feedback: str = eqx.field(static=True)
     misfit: str = eqx.field(static=True)
     _coordinates: LocalCoordinates
-    _root: Float[np.ndarray, "P r"]
-    _hidden: Float[np.ndarray, "P h"]
+    _spread: Spread
     _scale: Float[np.ndarray, " ny"]
 
     @property
@@ -121,9 +120,9 @@ class LDTPFit(MultiplierEstimate):
         fitted = harmonics is None
         harmonics = self.harmonics if fitted else check_harmonics(harmonics, self.n_sections)
         H = transfer(self._coordinates.model, f, harmonics)
-        variance, spread = np.zeros(H.shape), Spread(self._root, self._hidden)
+        variance = np.zeros(H.shape)
         for rows, slopes in transfer_slopes(self._coordinates, f, harmonics):
-            variance[:, rows] = spread.variance(slopes)
+            variance[:, rows] = self._spread.variance(slopes)
         size = self._scale[:, None]
         return HTF(
             f, H * size, harmonics, self.n_sections, self.inputs, self.outputs, "fit",
@@ -457,8 +456,7 @@ def _finished(
         feedback="",
         misfit="",
         _coordinates=point.coordinates,
-        _root=spread.root,
-        _hidden=spread.hidden,
+        _spread=spread,
         _scale=scale,
     )
 

@@ -89,12 +89,10 @@ class SeriesFit(MultiplierEstimate):
     def impulse_response(self, n_lags: PeriodCount) -> Float[np.ndarray, "N lags ny nu"]:
         """Return the Markov parameters: the response at section n to a unit input r sections
         earlier."""
-        N, R = self.numerators.shape[:2]
-        h = np.zeros((N, max(self.lead + n_lags, R), *self.numerators.shape[2:]))
-        h[:, :R] = self.numerators
-        for r in range(N, h.shape[1]):
-            for j, c in enumerate(self.coefficients[: r // N], 1):
-                h[:, r] -= c * h[:, r - j * N]
+        N, R, *shape = self.numerators.shape
+        cycles = -(-max(self.lead + n_lags, R) // N)
+        h = np.pad(self.numerators, ((0, 0), (0, cycles * N - R), (0, 0), (0, 0)))
+        h = divide_by_chi(self.coefficients, h.reshape(N, cycles, -1)).reshape(N, -1, *shape)
         return h[:, self.lead : self.lead + n_lags]
 
     @checked
@@ -249,22 +247,26 @@ def assemble(
 ) -> SeriesFit:
     """Return the fit with the denominator of a solution, in the units of the data."""
     N, nu, ny = problem.shape
+    d, columns = len(solution.c), problem.lags * nu  # lags, then inputs
+    widest = max(fit.root.shape[1] for section in solution.fits for fit in section)
+    numerators, slopes = np.zeros((N, columns, ny)), np.zeros((d, N, columns, ny))
+    roots = np.zeros((N, ny, columns, widest))
+    for n, (section, to_lags) in enumerate(zip(solution.fits, problem.to_lags, strict=True)):
+        for fit in section:
+            numerators[n][:, fit.outputs] = to_lags @ fit.coefficients[..., 0]
+            slopes[:, n][..., fit.outputs] = to_lags @ np.moveaxis(fit.slopes[..., 0], 1, 0)
+            roots[n, fit.outputs, :, : fit.root.shape[1]] = to_lags @ fit.root
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
         b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
         return np.swapaxes(b, -1, -2)
 
-    widest = max(root.shape[1] for row in solution.roots for root in row)
-    roots = np.zeros((N, ny, problem.lags * nu, widest))
-    for n, row in enumerate(solution.roots):
-        for i, root in enumerate(row):
-            roots[n, i, :, : root.shape[1]] = root
     return SeriesFit(
         multipliers=multipliers_of(solution.c),
         coefficients=solution.c,
         covariance=covariance.matrix,
-        numerators=by_input(solution.numerators),
-        slopes=by_input(solution.slope),
+        numerators=by_input(numerators),
+        slopes=by_input(slopes),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
         noise=_noise(solution) * problem.scale,
         covariance_freedom=covariance.freedom,

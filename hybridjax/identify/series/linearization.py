@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from ..._core.execution import on_all_cores
 from ..descent import ROUGH, Coefficients, least_squares
 from .output_error import OutputErrorProblem, SectionRegression, root_of
-from .records import CycleGrid, divide_by_chi
+from .records import CycleGrid, divide_by_chi, lagged_inputs, start_responses
 
 
 Outputs = Callable[[int, CycleGrid, int], Float[np.ndarray, "S T ny C"]]
@@ -122,12 +122,6 @@ class Linearization(NamedTuple):
     """Sum of the products of derivatives."""
     freedom: Int[np.ndarray, "N ny"]
     """Samples less unknowns."""
-    numerators: Float[np.ndarray, "N columns ny"]
-    """Numerators of the first column of outputs; rows are lags, then inputs."""
-    slope: Float[np.ndarray, "d N columns ny"]
-    """Their derivative with respect to c."""
-    roots: list[list[Float[np.ndarray, "columns r"]]]
-    """root @ root.T is the covariance of the numerators of a section and output, given c."""
     fits: list[list[SectionFit]]
     """The fits of each section."""
 
@@ -171,8 +165,7 @@ def linearize(
 
     **Arguments:** `outputs`: columns to take in place of the measured outputs.
     """
-    N, nu, ny = problem.shape
-    d, columns = len(c), problem.lags * nu
+    (N, _, ny), d = problem.shape, len(c)
     sums = sum_up(problem, c, outputs, _regressions_at(problem, c))
     out = Linearization(
         c=c,
@@ -180,22 +173,15 @@ def linearize(
         gradient=np.zeros((ny, d)),
         curvature=np.zeros((ny, d, d)),
         freedom=np.zeros((N, ny), int),
-        numerators=np.zeros((N, columns, ny)),
-        slope=np.zeros((d, N, columns, ny)),
-        roots=[[np.zeros((0, 0))] * ny for _ in range(N)],
         fits=[[each.fit for each in section] for section in sums],
     )
-    for n, (section, to_lags) in enumerate(zip(sums, problem.to_lags, strict=True)):
+    for n, section in enumerate(sums):
         for each in section:
-            fit, which = each.fit, each.fit.outputs
+            which = each.fit.outputs
             out.square[n, which] = np.trace(each.products, axis1=1, axis2=2)
             out.gradient[which] += each.gradient
             out.curvature[which] += each.curvature
-            out.freedom[n, which] = round(each.freedom) - fit.root.shape[1]
-            out.numerators[n][:, which] = to_lags @ fit.coefficients[..., 0]
-            out.slope[:, n][..., which] = to_lags @ np.moveaxis(fit.slopes[..., 0], 1, 0)
-            for i in which:
-                out.roots[n][i] = to_lags @ fit.root
+            out.freedom[n, which] = round(each.freedom) - each.fit.root.shape[1]
     return out
 
 
@@ -203,7 +189,11 @@ def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> Regress:
     inputs = [divide_by_chi(c, part.u) for part in problem.parts()]
 
     def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
-        return [problem.regression(part, inputs[k], c, n, alike[0]) for alike in problem.alike[n]]
+        rows = lagged_inputs(inputs[k], n, problem.lags, problem.records.lead) @ problem.to_lags[n]
+        T = part.y.shape[1]
+        starts = start_responses(c, part.first[:, n], T, min(problem.free, T))
+        sampled = (part.sampled[:, :, n, alike[0]] for alike in problem.alike[n])
+        return [SectionRegression.make(rows, starts, part.drift, x) for x in sampled]
 
     return regress
 

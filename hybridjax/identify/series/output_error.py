@@ -16,8 +16,8 @@ from jaxtyping import Float, Shaped
 from ..._core.execution import on_all_cores
 from ..._core.text import listed
 from ...errors import DefinitionError
-from ..descent import ROUNDING, Coefficients
-from .records import CycleGrid, PreparedRecords, lagged_inputs, start_responses
+from ..descent import ROUNDING
+from .records import CycleGrid, PreparedRecords, lagged_inputs
 
 
 # Singular values of regressors, relative to the largest, below which they are rounding errors.
@@ -184,23 +184,6 @@ class OutputErrorProblem(NamedTuple):
     def parts(self) -> list[CycleGrid]:
         """Return all grids, with the outputs in units of `scale`."""
         return [grid._replace(y=grid.y / self.scale) for grid in self.records.grids]
-
-    def regression(
-        self,
-        part: CycleGrid,
-        v: Float[np.ndarray, "S T N nu"],
-        c: Coefficients,
-        n: int,
-        output: int,
-    ) -> SectionRegression:
-        """Return the regression of section n for all outputs with the weights of `output`.
-
-        **Arguments:** `v`: the inputs, divided by chi.
-        """
-        inputs = lagged_inputs(v, n, self.lags, self.records.lead) @ self.to_lags[n]
-        T = part.y.shape[1]
-        starts = start_responses(c, part.first[:, n], T, min(self.free, T))
-        return SectionRegression.make(inputs, starts, part.drift, part.sampled[:, :, n, output])
 
 
 def _independent(triangle: np.ndarray, nu: int) -> np.ndarray:
