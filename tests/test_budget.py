@@ -32,7 +32,7 @@ PRONOUNS = set(
 # the last two.
 # (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 29_113,
+    "code": 29_051,
     "files": 245,
     "longest": 500,
     "public_names": 185,

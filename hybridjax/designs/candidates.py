@@ -212,9 +212,9 @@ def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
 
     **Raises:** `DefinitionError` if hardly any are stable.
     """
-    rng, models = np.random.default_rng(seed), []
+    rng, models, root = np.random.default_rng(seed), [], fit._spread.root
     for _ in range(_TRIES * count):
-        moved = fit._coordinates.moved(fit._root @ rng.normal(size=fit._root.shape[1]))
+        moved = fit._coordinates.moved(root @ rng.normal(size=root.shape[1]))
         if np.abs(np.linalg.eigvals(moved.monodromy())).max() < 1:
             models.append(moved.to_ldtp(fit._scale, fit.inputs, fit.outputs))
         if len(models) == count:

@@ -84,8 +84,8 @@ class PreparedRecords:
         self.cycles = max(map(count_cycles, self.records))
         self.sampled = np.sum([grid.sampled.sum(axis=(0, 1)) for grid in self.grids], axis=0)
         u, y = (np.concatenate([getattr(r, name) for r in self.records]) for name in "uy")
-        varies = np.fmax.reduce(y) > np.fmin.reduce(y)  # (without NaN)
-        for name, acts in zip(self.inputs + self.outputs, [*u.any(axis=0), *varies], strict=True):
+        varies = np.append(u.any(axis=0), np.fmax.reduce(y) > np.fmin.reduce(y))  # (without NaN)
+        for name, acts in zip(self.inputs + self.outputs, varies, strict=True):
             if not acts:
                 what = "constant" if name in self.outputs else "zero"
                 raise DefinitionError(f"{name} is {what} or missing at every sample: leave it out.")
