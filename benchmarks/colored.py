@@ -12,7 +12,8 @@ variances that realizations show (`htf`) and without (`htf_plain`), and `fit_ser
   five times as large. `fit_series` is also told of it (`Record(drift=20)`).
 
 Printed, as `name value` lines: rms error, rms of the standard errors (`said`), how many of the
-regions held the true multipliers (`held`), and `p` of the binomial test of 95 %.
+regions held the true multipliers (`held`), and `p` of the binomial test of 95 %; `doubted`: how
+many fits of series doubt themselves (`fit.doubt`).
 
     python benchmarks/colored.py [--draws 200] [--only white colored sensor drift]
 """
@@ -60,6 +61,7 @@ def found(fit, truth) -> dict[str, float]:
         "error": float(abs(fit.multipliers[k] - truth)),
         "said": float(fit.standard_errors[k]),
         "held": float(fit.contains([truth, truth.conjugate()]).all()),
+        "doubted": float(bool(fit.doubt)),
     }
 
 
@@ -71,6 +73,7 @@ def show(name: str, values: dict[str, np.ndarray]) -> None:
         "held": held,
         "draws": len(values["held"]),
         "p": stats.binomtest(held, len(values["held"]), 0.95).pvalue,
+        "doubted": int(values["doubted"].sum()),
     }
     for what, value in rows.items():
         print(f"colored.{name}.{what} {value:.4g}", flush=True)
@@ -108,7 +111,7 @@ def one_case(case: str, draws: int) -> None:
     values = hj.monte_carlo(one, draws, seed=1)
     for name in ("htf", "htf_plain", "series", "series_told"):
         if name != "series_told" or case == "drift":
-            kinds = ("error", "said", "held")
+            kinds = ("error", "said", "held", "doubted")
             show(f"{case}.{name}", {k: np.asarray(values[f"{name}.{k}"].values) for k in kinds})
 
 

@@ -292,7 +292,7 @@ def too_low(first: int, count: int) -> None:
             seconds[kind] += [whole, whole - spent[0]]
             error = np.abs(fit.multipliers[:, None] - true).min(axis=1) / fit.standard_errors
             name = "right" if order == len(true) else "wrong" if error.max() > 5 else "near"
-            counts[kind].update({name: 1, f"{name}.doubted": int(bool(fit.higher_order))})
+            counts[kind].update({name: 1, f"{name}.doubted": int(bool(fit.doubt))})
     for kind, values in counts.items():
         for name, value in values.items():
             print(f"in_loop.orders.{kind}.{name} {value}", flush=True)

@@ -184,17 +184,17 @@ class MultiplierEstimate(eqx.Module):
         """Pair the multipliers with the true ones; printing the result shows a table."""
         return compare_multipliers(self.multipliers, true)
 
-    def contradiction(self, higher: Iterable[Callable[[], RoughFit]], warn: bool) -> str:
-        """Return a sentence if a fit of a higher order contradicts the multipliers; else "".
+    def contradiction(self, others: Iterable[Callable[[], RoughFit]], drift: str = "") -> str:
+        """Return a sentence if another fit contradicts the multipliers; else "".
 
         It does if a multiplier is outside of its confidence regions, and its nearest one outside of
         those of this fit. (At 95 %. At 99 % half as many right orders are doubted, and a few more
         that are too low pass.)
 
-        **Arguments:** `higher`: the fits; a `DefinitionError` means too few data. `warn`: whether
-        to emit the sentence as a warning, too.
+        **Arguments:** `others`: the fits; a `DefinitionError` means too few data. `drift`: the
+        sentence, for fits that allow for drift. Default: a sentence about their order.
         """
-        for fit in higher:
+        for fit in others:
             with suppress(DefinitionError):
                 c, covariance = fit()
                 multipliers = multipliers_of(c)
@@ -204,11 +204,8 @@ class MultiplierEstimate(eqx.Module):
                     continue
                 other = MultiplierEstimate(multipliers, c, *covariance())
                 if (moved & ~other.contains(self.multipliers)).any():
-                    text = f"`order` may be too low: order {len(c)} gives other "
-                    text += f"{other.show_multipliers()}; compare both fits"
-                    if warn:
-                        warnings.warn(f"Order: {text}.", FindingWarning, stacklevel=6)
-                    return text
+                    order = f"`order` may be too low: order {len(c)} gives "
+                    return drift or f"{order}other {other.show_multipliers()}; compare both fits"
         return ""
 
     def __repr__(self) -> str:
@@ -243,3 +240,10 @@ class MultiplierEstimate(eqx.Module):
             return 2 * special.gammaincinv(degrees / 2, level)
         left = np.maximum(self.covariance_freedom - degrees + 1, 1.0)
         return degrees * self.covariance_freedom / left * special.fdtri(degrees, left, level)
+
+
+def warned(doubt: str, check: bool) -> str:
+    """Return a sentence of doubt, and emit it as a warning of a public function of fits."""
+    if doubt and check:
+        warnings.warn(f"Fit: {doubt}.", FindingWarning, stacklevel=5)
+    return doubt

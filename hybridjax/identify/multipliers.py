@@ -20,7 +20,7 @@ from ..linear.ldtp import LDTP
 from . import variable_projection as varpro
 from .denominator import chi, multipliers_of
 from .descent import ROUNDING
-from .multiplier_estimate import MultiplierEstimate, RoughFit
+from .multiplier_estimate import MultiplierEstimate, RoughFit, warned
 from .variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of, numerator_size
 from .weights import (
     SMALLEST_ERROR,
@@ -63,7 +63,7 @@ class StructuredFit(MultiplierEstimate):
       narrow band of frequencies many give the same fit; these are the smallest.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `harmonics` (M,), `n_sections`, `inputs`, `outputs`: names and numbers of the fitted HTFs.
-    - `higher_order`: a sentence if one more multiplier, or two, contradict those of this fit: they
+    - `doubt`: a sentence if one more multiplier, or two, contradict those of this fit: they
       lie outside of each other's confidence regions. Empty otherwise, and without `check`.
     """
 
@@ -77,7 +77,7 @@ class StructuredFit(MultiplierEstimate):
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
-    higher_order: str = eqx.field(static=True, default="")
+    doubt: str = eqx.field(static=True, default="")
 
     @checked
     def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
@@ -93,7 +93,7 @@ class StructuredFit(MultiplierEstimate):
     def _about(self) -> str:
         misfit = ", ".join(f"{n} {x:.1e}" for n, x in zip(self.outputs, self.residual, strict=True))
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
-        state += self.higher_order and f"; {self.higher_order}"
+        state += self.doubt and f"; {self.doubt}"
         return (
             f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}{state}"
@@ -197,7 +197,7 @@ def fit_multipliers(
 
     # One more multiplier, or a pair.
     more = [functools.partial(of_order, order + k) for k in (1, 2)]
-    return dataclasses.replace(fit, higher_order=fit.contradiction(more, warn=True))
+    return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), True))
 
 
 @checked

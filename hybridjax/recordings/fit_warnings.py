@@ -100,8 +100,8 @@ def advise(
     except DefinitionError:
         text = f"the data do not carry {d} multipliers: the weakest, and its region, may be noise."
         warnings.append(Finding("order", text))
-    if fit.higher_order:
-        warnings.append(Finding("order", f"{fit.higher_order}."))
+    if fit.doubt:
+        warnings.append(Finding("order", f"{fit.doubt}."))
     band = input_band(data)
     error = np.where(grid.sampled, grid.y - fit.simulate(grid, True), 0.0)
     for name, p in ({} if fit.reference else answering(grid, error, data.inputs)).items():

@@ -134,7 +134,7 @@ def test_instruments_of_series_hold_in_the_loop(plant):
         discs.append(np.mean(np.abs(htf.H - truth.H) <= htf.confidence_radius()))
     assert sum(held) >= 25  # (of 30 with 95 %: less in one of 600)
     assert 0.88 < np.mean(discs) < 0.98
-    assert not fit.higher_order
+    assert not fit.doubt
     with pytest.raises(hj.DefinitionError, match="the reference tells 2 multipliers, not 3"):
         hj.fit_series(series(plant, 0, noise=0.7), 3, reference="r")
     assert best_order(series(plant, 0), ("r",), 4) == (2, "")
@@ -146,8 +146,8 @@ def test_an_order_that_is_too_low_is_noticed_in_the_loop():
     T = rng.normal(size=(N, 3, 3)) + 2 * np.eye(3)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
     data = series(hj.LDTP(A, rng.normal(size=(N, 3, 1)), rng.normal(size=(N, 1, 3))), 0)
-    assert "3 gives other" in hj.fit_series(data, 2, reference="r").higher_order
-    assert not hj.fit_series(data, 3, reference="r").higher_order
+    assert "3 gives other" in hj.fit_series(data, 2, reference="r").doubt
+    assert not hj.fit_series(data, 3, reference="r").doubt
 
 
 def test_fits_without_a_reference_tell_of_the_controller(plant):

@@ -153,18 +153,41 @@ def test_an_order_that_is_too_low_is_noticed(small):
     """One multiplier of a pair; with the right order, nonlinear outputs are no reason for doubt."""
     for seed in range(2):
         data = record(small, 400, seed, 0.3, drift=np.inf)  # (a constant)
-        text = "Order: `order` may be too low: order 2 gives"
+        text = "Fit: `order` may be too low: order 2 gives"
         with pytest.warns(FindingWarning, match=text) as caught:
             fit = hj.fit_series(data, 1)
         assert caught[0].filename == __file__
-        assert fit.higher_order in repr(fit) and "may be too low" in fit._repr_html_()
+        assert fit.doubt in repr(fit) and "may be too low" in fit._repr_html_()
         bent = with_outputs(data, data.y + 0.1 * data.y**2 / data.y.std())
-        assert not hj.fit_series(bent, 2).higher_order
+        assert not hj.fit_series(bent, 2).doubt
     design = hj.multisine(4, 8, amplitude=1.0).realizations(4)
     data = hj.experiments.simulate_experiments(small, design)
     htf = hj.estimate_htf(hj.experiments.add_noise(data, snr=40, seed=1))
-    assert "2 gives other" in hj.fit_multipliers(htf, 1).higher_order
-    assert not hj.fit_multipliers(htf, 2).higher_order
+    assert "2 gives other" in hj.fit_multipliers(htf, 1).doubt
+    assert not hj.fit_multipliers(htf, 2).doubt
+
+
+def test_undeclared_drift_and_offsets_are_noticed(small):
+    """A drift with the right order or one less, and an offset with one multiplier too many."""
+    T = 100
+    slow = np.cos(np.pi / T * (np.arange(T) + 0.5) * np.arange(1, 5)[:, None]).sum(axis=0)
+    for seed in range(2):
+        plain = record(small, 4 * T, seed, 0.1)
+        drift, offset = (
+            with_outputs(plain, plain.y + size * plain.y.std(axis=0))
+            for size in (np.repeat(slow, 4)[:, None], 0.3)
+        )
+        for data, order in (drift, 1), (drift, 2), (offset, 3):
+            with pytest.warns(FindingWarning, match="Fit: outputs may drift"):
+                fit = hj.fit_series(data, order)
+            assert np.abs(fit.multipliers - small.multipliers[0]).max() > 0.1
+            fit = hj.fit_series(dataclasses.replace(data, drift=20), min(order, 2))
+            assert "drift" not in fit.doubt
+        assert not hj.fit_series(plain, 2).doubt
+    plain = record(small, 4 * T, 0, 0.1)
+    large = with_outputs(plain, plain.y + 3 * plain.y.std(axis=0) * np.repeat(slow, 4)[:, None])
+    with pytest.raises(hj.DefinitionError, match="not 2.*Outputs may drift: records with `drift"):
+        hj.fit_series(large, 2)
 
 
 def test_announced_drift_is_removed(small):

@@ -1,7 +1,7 @@
 """Multipliers and transfer functions from recorded time series with any input: output error."""
 
 import dataclasses
-from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -23,7 +23,7 @@ from .. import denominator
 from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate, RoughFit
+from ..multiplier_estimate import MultiplierEstimate, RoughFit, warned
 from ..multipliers import refuse_invented
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
@@ -31,17 +31,20 @@ from .in_loop import LoopEquations
 from .linearization import Linearization, each_fit, linearize, measured_outputs, minimize, sum_up
 from .output_error import OutputErrorProblem, SectionRegression, TooFewCycles
 from .records import (
+    SLOW,
     CycleGrid,
     PreparedRecords,
     delay_cycles,
     divide_by_chi,
     lagged_inputs,
     start_responses,
+    with_drift,
 )
 from .residuals import about_answering, answering
 
 
 _BIASED = "the fit is biased; name their `reference`"
+_SLOW = f"outputs may drift: records with `drift={SLOW:g}` give other multipliers; compare fits"
 
 
 class SeriesFit(MultiplierEstimate):
@@ -65,8 +68,8 @@ class SeriesFit(MultiplierEstimate):
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
-    - `higher_order`: a sentence if one more multiplier, or two, contradict those of this fit: they
-      lie outside of each other's confidence regions. Otherwise empty.
+    - `doubt`: a sentence if the multipliers change where outputs may drift, or with one more
+      multiplier or two: they lie outside of each other's confidence regions. Otherwise empty.
     - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
     - `reference`: signals that enter the loop from outside. With a reference, `noise` is the
       standard deviation of $\chi y$.
@@ -81,7 +84,7 @@ class SeriesFit(MultiplierEstimate):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
-    higher_order: str = eqx.field(static=True, default="")
+    doubt: str = eqx.field(static=True, default="")
     feedback: tuple[str, ...] = eqx.field(static=True, default=())
     reference: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -133,7 +136,7 @@ class SeriesFit(MultiplierEstimate):
         about = f"{loop}noise {noise}; {self.n_sections} sections, "
         about += f"{self.numerators.shape[1]} lags{state}"
         feedback = about_answering(self.feedback, _BIASED)
-        return "; ".join(filter(None, [about, self.higher_order, feedback]))
+        return "; ".join(filter(None, [about, self.doubt, feedback]))
 
     @property
     def free_cycles(self) -> int:
@@ -189,7 +192,7 @@ def fit_series(
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
       no input before. Default: "free".
     - `check`: whether to raise an error for an order that the data do not support, and to emit
-      `higher_order` as a `FindingWarning`. Default: True.
+      `doubt` as a `FindingWarning`. Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, by
       instrumental variables, which are consistent for any noise and controller. `start` has no
@@ -205,7 +208,7 @@ def fit_series(
         fit = SeriesFit(**LoopEquations(plant, drive, order, overhang).fit(check))
         fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
         more = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
-        return dataclasses.replace(fit, higher_order=fit.contradiction(more, check))
+        return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), check))
     records = data if isinstance(data, PreparedRecords) else PreparedRecords(data)
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
@@ -215,16 +218,42 @@ def fit_series(
     noise = _noise(solution)  # the weights that the residuals suggest
     problem = problem._replace(scale=problem.scale * noise)
     solution, converged = minimize(problem, solution.c)
-    fit = assemble(problem, solution, Covariance.unknown(order), converged)
+    fit = assemble(problem, solution, coefficient_covariance(problem, solution), converged)
     grid = records.whole()
     error = np.where(grid.sampled, grid.y - fit.simulate(grid, start == "free"), 0.0)
     feedback = tuple(answering(grid, error, records.inputs))
+    doubt = _about_drift(fit, records, start == "free")
     if check:
-        refuse_order(delayed, noise * _noise(solution), feedback)
-    fit = assemble(problem, solution, coefficient_covariance(problem, solution), converged)
+        refuse_order(delayed, noise * _noise(solution), about_answering(feedback, _BIASED) or doubt)
     # One more multiplier, or a pair.
     more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
-    return dataclasses.replace(fit, feedback=feedback, higher_order=fit.contradiction(more, check))
+    doubts = "; ".join(filter(None, (doubt, fit.contradiction(more))))
+    return dataclasses.replace(fit, feedback=feedback, doubt=warned(doubts, check))
+
+
+def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> str:
+    """Return a sentence if slow drift of the outputs may explain multipliers of a fit; else "".
+
+    It does if outputs that may drift have other multipliers, or as little noise without those that
+    may be 1, like which a constant looks.
+    """
+    slow, order = PreparedRecords(with_drift(records.records)), len(fit.coefficients)
+    may_be_one = fit.multipliers.real + 2 * fit.standard_errors > 1
+
+    def drifting() -> RoughFit:
+        problem = _problem_like(fit, slow, order, free_start)
+        return _rough(problem, total_least_squares(late_outputs(problem, order)))
+
+    doubt = fit.contradiction([drifting], _SLOW)
+    if not doubt and may_be_one.any() and not may_be_one.all():
+        fewer = np.poly(fit.multipliers[~may_be_one]).real[1:]
+        problem = _problem_like(fit, slow, len(fewer), free_start)
+        with suppress(TooFewCycles):
+            solution, _ = minimize(problem, fewer, rough=True)
+            _require_freedom(problem, solution)
+            spread = 1 / np.sqrt(2 * solution.freedom.sum(axis=0))
+            return _SLOW if (_noise(solution) < 1 + 3 * spread).all() else ""
+    return doubt
 
 
 def _of_order(order: int, records: PreparedRecords, fit: SeriesFit, free_start: bool) -> RoughFit:
@@ -232,12 +261,23 @@ def _of_order(order: int, records: PreparedRecords, fit: SeriesFit, free_start: 
 
     **Raises:** `DefinitionError` for too few cycles.
     """
-    (N, R), d = fit.numerators.shape[:2], len(fit.coefficients)
-    # No more lags than the fit has, if possible: without zero multipliers they are enough.
+    start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
+    return _rough(_problem_like(fit, records, order, free_start), start)
+
+
+def _problem_like(
+    fit: SeriesFit, records: PreparedRecords, order: int, free_start: bool
+) -> OutputErrorProblem:
+    """Return a problem in units of a fit's noise, with no more lags than the fit has, if possible:
+    without zero multipliers they are enough."""
+    N, R = fit.numerators.shape[:2]
     overhang = max(R - 1 - fit.lead - order * N, 0)
     problem = OutputErrorProblem.from_data(records, order, overhang, free_start)
-    problem = problem._replace(scale=fit.noise)
-    solution, _ = minimize(problem, np.pad(fit.coefficients, (0, order - d)), rough=True)
+    return problem._replace(scale=fit.noise)
+
+
+def _rough(problem: OutputErrorProblem, start: Coefficients) -> RoughFit:
+    solution, _ = minimize(problem, start, rough=True)
     _require_freedom(problem, solution)
     return solution.c, partial(coefficient_covariance, problem, solution)
 
@@ -354,14 +394,11 @@ def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]
     return multipliers_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
 
 
-def refuse_order(
-    delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"], feedback: Sequence[str] = ()
-) -> None:
+def refuse_order(delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"], cause: str = "") -> None:
     """**Raises:** `DefinitionError` if the outputs, with noise of this standard deviation, do not
-    support so many multipliers; `feedback`, inputs that answer residuals, is named as the cause."""
+    support so many multipliers; it names the `cause`."""
     rows = max(delayed.freedom, 1)
     gram = (delayed.gram / noise[:, None, None] ** 2).sum(axis=0)
-    cause = about_answering(feedback, _BIASED)
     refuse_invented(np.linalg.eigvalsh(gram) / rows, np.sqrt(2 / rows), cause)
 
 

@@ -1,5 +1,6 @@
 """Records as fits use them: grids of records, cycles and sections, with delays and filters."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,6 +10,11 @@ from scipy.signal import lfilter
 
 from ...errors import DefinitionError
 from ...experiments.record import Record, RecordedData, require_deviations, uninterrupted_records
+
+
+# Cycles of the fastest drift that fits try, to see whether it changes their multipliers. More: a
+# faster one passes for a multiplier. Fewer: drifts explain so much that multipliers become vague.
+SLOW = 20.0
 
 
 class CycleGrid(NamedTuple):
@@ -97,6 +103,11 @@ class PreparedRecords:
     def whole(self) -> CycleGrid:
         """Return all records on one grid."""
         return CycleGrid.from_records(self.records)
+
+
+def with_drift(records: Sequence[Record]) -> list[Record]:
+    """Return the records with unknown drifts that are slower than `SLOW` cycles."""
+    return [dataclasses.replace(r, drift=min(SLOW, r.drift or np.inf)) for r in records]
 
 
 def _grids(records: Sequence[Record]) -> list[CycleGrid]:
