@@ -27,21 +27,21 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 1150 lines are the algebra of HTFs, loops and
 # delays, 1160 the responses of cycles with noise, coupling and symmetry in time, 770 populations of
 # subjects, 980 motion and sliders, 610 simulators of others, 70 sweeps on the host, 60 comparisons
-# with higher orders, 260 turns and sections whose moves are computed side by side, 65 warnings and
-# refusals of fits; of the tests, 1900 are those of all, 70 of orders of names and samples, 150 of
-# the last two.
+# with higher orders, 260 turns and sections whose moves are computed side by side, 95 warnings and
+# refusals of fits (30 of them of drift that is not declared); of the tests, 1900 are those of all,
+# 70 of orders of names and samples, 170 of the last two.
 # (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 29_051,
+    "code": 29_079,
     "files": 245,
     "longest": 500,
     "public_names": 185,
     "many_parameters": 8,
-    "thresholds": 302,
+    "thresholds": 303,
     "structure": 13,
     "fragments": 10,
     "pronouns": 19,
-    "test_lines": 18_069,
+    "test_lines": 18_092,
     "doc_words": 38_877,
 }
 
