@@ -42,7 +42,7 @@ LIMITS = {
     "fragments": 10,
     "pronouns": 19,
     "test_lines": 18_092,
-    "doc_words": 38_877,
+    "doc_words": 38_890,
 }
 
 
