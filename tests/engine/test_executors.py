@@ -61,9 +61,8 @@ def agree(system, chart, state, u, begin, duration):
     arguments = (*start, np.reshape(u, (s.nu, 1)), start[0] + duration, settings)
     with unchecked_host():
         host = flow(system, *to_host(arguments))
-    assert all(on_host(x) for x in jax.tree_util.tree_leaves(host))
-    with unchecked_host():
         whole = flow(system, *to_host(arguments), at_once=True)
+    assert all(on_host(x) for x in jax.tree_util.tree_leaves(host))
     xla = compiled_flow(system, *from_host(arguments))
     assert np.sum(host.tape.code != IDLE) > 2
     # Steps amplify the rounding errors of their error estimates.
@@ -88,8 +87,9 @@ def test_both_agree_on_the_gallery(name):
     period = system.period()
     chart = Structure(system).chart_index(guess.chart)
     duration = 2.0 if period is None else 1.5 * float(period)
-    u = np.zeros(len(system.inputs))
-    agree(system, chart, np.asarray(guess.state), u, float(guess.time), duration)
+    # (The pitch of a level trot consists of rounding errors, which would decide on the steps.)
+    state = np.asarray(guess.state) + 0.01 * (name == "TrottingQuadruped")
+    agree(system, chart, state, np.zeros(len(system.inputs)), float(guess.time), duration)
 
 
 @pytest.mark.slow
