@@ -328,16 +328,15 @@ def _check(placed: PlacedSections, first: int) -> None:
     rounds = float(duration.sum()) / period
     if rounds < 1 - SAME:
         raise ComputationError(f"{name(0)} {again}{_remedy(placed, 0)}")
+    apart = np.abs(duration - period * np.rint(duration / period))
+    i, j = sorted((k := int(np.argmin(apart)), (k + 1) % N))
+    if i < j and apart[k] <= TOGETHER * period:
+        raise ComputationError(f"{name(j)} coincides with section {i} on the cycle: leave one out.")
     if rounds > 1 + SAME:
         late = int(np.argmax(duration))
         raise ComputationError(
             f"the sections are out of order: {name((late + 1) % N)} comes before section {late} on "
             f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
-        )
-    short = int(np.argmin(duration))
-    if duration[short] <= TOGETHER * period:
-        raise ComputationError(
-            f"{name((short + 1) % N)} coincides with section {short} on the cycle: leave one out."
         )
     for i, (count, steepness) in enumerate(zip(*_crossings(placed), strict=True)):
         if steepness < _LEAST_STEEPNESS:
