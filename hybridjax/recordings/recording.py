@@ -15,7 +15,7 @@ from .._core.boundary.checked import checked
 from .._core.signal import with_unit
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
-from .formats.columns import Columns, numbers, parse_table
+from .formats.columns import Columns, numbers, parse_table, require_aligned
 from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
@@ -76,9 +76,7 @@ class Recording(eqx.Module):
         backwards, and infinite values, with the sample.
         """
         where, units = f"trial '{name}'", dict(units or {})
-        series = [x.index for x in (time, *signals.values()) if hasattr(x, "iloc")]
-        if not all(index.equals(series[0]) for index in series):
-            raise DefinitionError(f"{where}: series of pandas have different indices: align them.")
+        require_aligned(where, [time, *signals.values()])
         time = numbers(where, "time", time)
         if not signals:
             raise DefinitionError(f"{where} has no signals.")

@@ -151,6 +151,8 @@ def test_feather(tmp_path):
     refused("no signal 'z'; it has ", tmp_path / "x.feather", signals="z", kind=hj.DefinitionError)
     with pytest.raises(hj.DefinitionError, match="different indices"):
         hj.Recording(table()["time"], {"y": table()["x (m)"][::-1]})
+    with pytest.raises(hj.DefinitionError, match="different indices"):
+        hj.Recording.from_frame({"time": table()["time"], "y": table()["x (m)"][::-1]})
     (tmp_path / "x.feather").write_bytes(b"ARROW1" + bytes(100))
     refused("no feather file, or damaged", tmp_path / "x.feather")
 

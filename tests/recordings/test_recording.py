@@ -135,10 +135,8 @@ def test_vicon(tmp_path, separator):
     assert found.signals == (f"{plate}.Fx", f"{plate}.Fy", f"{toe}.X", f"{toe}.Y")
     assert found.units == ("N", "N", "mm", "mm")
     np.testing.assert_allclose(found.trials[0].time, [0, 0.001, 0.002, 0.003])
-    nan = np.nan
-    np.testing.assert_array_equal(
-        found.trials[0].values[:, 1:3].T, [[1, 2, 3, 4], [10, nan, 11, nan]]
-    )
+    expected = [[1, 2, 3, 4], [10, np.nan, 11, np.nan]]
+    np.testing.assert_array_equal(found.trials[0].values[:, 1:3].T, expected)
     assert any("different rates" in note for note in found.notes)
     path.write_text(VICON.replace("500", "400"))
     with pytest.raises(FileFormatError, match="of different rates"):
@@ -185,9 +183,7 @@ def test_the_unit_of_time(tmp_path):
     np.testing.assert_allclose(found.trials[0].events["e"], [1.5e-3, 2.5e-3])
     frame = hj.Recording.from_frame({"time (ms)": T, "a (N)": T, "event e": T == 1})
     np.testing.assert_allclose(frame.trials[0].time, T / 1000)
-    assert (
-        frame.signals == ("a",) and frame.unit("a") == "N" and frame.trials[0].events["e"] == 1e-3
-    )
+    assert (frame.signals, frame.units, frame.trials[0].events["e"]) == (("a",), ("N",), 1e-3)
     (tmp_path / "y.csv").write_text("frame,a\n0,1\n1,2\n2,4\n")
     both = hj.Recording.join([hj.read_recording(tmp_path / "y.csv", time="frame")] * 2)
     assert "(the times in 'frame' have no unit: taken as seconds)" in repr(both)

@@ -2,7 +2,7 @@
 
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -64,6 +64,7 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
     **Raises:** `DefinitionError` if there are no times, or their unit is unknown; `FileFormatError`
     if there are several, or a unit is NaN.
     """
+    require_aligned(where, columns.values.values())
     headers = {x: split_header(x) for x in columns.values}
     exact = [x for x, (name, _) in headers.items() if time in (x, name)]
     clocks = exact or [x for x, (name, _) in headers.items() if name.lower() == time.lower()]
@@ -98,6 +99,13 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
         signals[name] = columns.values[header]
         units |= {name: unit} if unit else {}
     return Table(times, signals, units, events, clock)
+
+
+def require_aligned(where: str, columns: Iterable[Any]) -> None:
+    """**Raises:** `DefinitionError` for series of pandas with different indices."""
+    series = [x.index for x in columns if hasattr(x, "iloc")]
+    if not all(index.equals(series[0]) for index in series):
+        raise DefinitionError(f"{where}: series of pandas have different indices: align them.")
 
 
 def numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
