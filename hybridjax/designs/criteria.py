@@ -46,8 +46,8 @@ def criterion_of(
     **Raises:** `DefinitionError` for multipliers that do not exist or are not simple, parameters
     that do not exist, and combinations that the data do not identify, which are named.
     """
-    if isinstance(goal, Parameters) and len(models) > 1:
-        raise DefinitionError("a `goal` of parameters is for one cycle: give a single `model`.")
+    if isinstance(goal, Parameters) and (len(models) > 1 or not goal.cycle.stable):
+        raise DefinitionError("a `goal` of parameters needs a single `model` and a stable `cycle`.")
     each = []
     for model in models:
         if isinstance(goal, Multipliers):

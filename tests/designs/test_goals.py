@@ -75,8 +75,10 @@ def test_multipliers_keep_the_numbers_of_the_model():
 def test_bad_goals(model, usual):
     close = np.array([np.eye(2), [[0.5, 0.01], [0, 0.5 + 1e-9]]])
     double = hj.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
-    M = hj.designs.Multipliers
+    M, walker, at = hj.designs.Multipliers, hj.models.SimplestWalker(), hj.AtEvent("heelstrike")
+    short = hj.find_limit_cycle(walker, walker.short_gait(), section=at)
     cases = (
+        (model, hj.designs.Parameters(short, at, "slope"), "a stable `cycle`"),
         (model, hj.designs.FrequencyResponse((1.0, 3.0)), "must lie within 0 and 2"),
         (double, M(harmonics=0), "is double"),
     )
