@@ -303,7 +303,8 @@ class LDTP(eqx.Module):
 
         The same at every section, smooth also where multipliers meet, and differentiable, unlike
         `multipliers`. It forms the product of the factors, and coefficients beyond the number of
-        non-zero multipliers are zero up to rounding.
+        non-zero multipliers are zero up to rounding. Inside of JAX transformations more of these
+        may follow than outside: count coefficients from the first, not from the last.
         """
         return time_response.characteristic_polynomial(self.monodromy())
 
