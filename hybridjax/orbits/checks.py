@@ -17,6 +17,7 @@ from ..engine.unresolved import column_name, jumps, lines_of_jumps, may_be_sudde
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
 from ..systems.check import check_output, check_system
+from ..systems.quotient import Quotient
 from ..systems.structure import Outputs, Structure
 from ..systems.system import HybridSystem, Output, OutputNames
 from ..systems.transition import Scheduled
@@ -91,9 +92,11 @@ def check_times(
 
     **Arguments:** `scale`, sizes of the states by chart; `time`, a rough period.
 
-    **Raises:** `DefinitionError` if they do not have the period that the system states; NaN is
-    passed over.
+    **Raises:** `DefinitionError` if they do not have the period that the system states, or the
+    symmetry of a `Quotient`; NaN is passed over.
     """
+    if isinstance(s.system, Quotient):
+        s.system.check({x: np.asarray(scale)[a, : s.dims[a]] for a, x in enumerate(s.names)})
     if s.system.period() is None:
         return
     for a in np.unique(chart).tolist():
@@ -185,6 +188,18 @@ def _no_period(system: HybridSystem, problem: str) -> str:
     )
 
 
+def check_found(cycle: LimitCycle) -> None:
+    """Check the functions of a system on its cycle.
+
+    **Raises:** `DefinitionError` as `check_clock`, `check_times` and `check_jumps`.
+    """
+    s, legs = cycle.structure, to_host(cycle.legs)
+    check_clock(s)
+    check_times(s, legs.t, legs.chart, legs.q, cycle.settings.scale, float(cycle.period))
+    if int(cycle.result) in (Result.OK, Result.SINGULAR):
+        check_jumps(cycle)
+
+
 def check_jumps(cycle: LimitCycle) -> None:
     """**Raises:** `DefinitionError` if the field of a chart jumps on the cycle without an event, or
     has a pulse that is shorter than a step."""
@@ -237,11 +252,9 @@ def closes_early(cycle: LimitCycle) -> bool:
 
 def check_conserved(cycle: LimitCycle) -> None:
     """**Raises:** `DefinitionError` for a quantity in `conserved` that the system changes."""
-    kept = _conserved_outputs(cycle, tuple(cycle.conserved))
-    lost = [name for name in cycle.conserved if name not in kept]
-    if lost:
+    if lost := cycle.conserved.keys() - _conserved_outputs(cycle, tuple(cycle.conserved)):
         raise DefinitionError(
-            f"'{lost[0]}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
+            f"'{min(lost)}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
             "cycle change it in one turn. Leave it out of `conserved`."
         )
 
@@ -299,8 +312,7 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
     advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn, expected)
     if code in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
         advice += _about_decisions(s)
-    if not advice:
-        advice = _better_guess(expected)
+    advice = advice or _better_guess(expected)
     return f"no limit cycle of {name} was found: {reason}.{advice}"
 
 

@@ -184,11 +184,10 @@ def find_limit_cycle(
     if failure is not None:
         cycle = dataclasses.replace(cycle, result=jax.device_put(np.int32(failure)))
     keep_turn(cycle, solution.turn)
-    code, legs = Result(int(cycle.result)), to_host(cycle.legs)
-    checks.check_times(s, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
+    code = Result(int(cycle.result))
+    checks.check_found(cycle)
     if code in (Result.OK, Result.SINGULAR):
         check_begin(cycle.return_map)
-        checks.check_jumps(cycle)
         if conserved:
             checks.check_conserved(cycle)
     if throw and code != Result.OK:

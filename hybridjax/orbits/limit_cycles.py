@@ -22,7 +22,7 @@ from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem, copies_of
 from .batches import Rounds, Tiles, tiles_of
-from .checks import check_jumps, check_periodic, closes_early
+from .checks import check_found, check_periodic, closes_early
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle, require_unchanged
@@ -192,11 +192,11 @@ def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycl
     """The cycles, with the result `COINCIDENCE` if events coincide (`together`) that do not
     commute.
 
-    **Raises:** `DefinitionError` if the field jumps, or has a pulse, on one of eight cycles.
+    **Raises:** `DefinitionError` as `check_found`, for one of eight cycles.
     """
     good = np.flatnonzero(cycles.ok)
     for k in np.unique(np.linspace(0, len(good) - 1, min(len(good), _TESTED)).astype(int)):
-        check_jumps(cycles[int(good[k])])
+        check_found(cycles[int(good[k])])
     rows = np.flatnonzero(together & cycles.ok)
     return _marked(cycles, rows, lambda cycle: not commutes(cycle), Result.COINCIDENCE)
 

@@ -14,7 +14,6 @@ from .._core.arguments import require_among
 from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
-from .quotient import Quotient
 from .solver import ByChart
 from .structure import Structure, quoted
 from .system import HybridSystem, Output, arrays_of
@@ -52,8 +51,6 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
         clocked = tuple(_check_functions(Structure(system)))
         if form is not None:
             _passed[form] = clocked
-    if isinstance(system, Quotient):
-        system.check()
     return clocked
 
 

@@ -59,6 +59,9 @@ class Quotient(Derived):
     Inputs are those of the charts that are kept; with `half_period`, they act on the mirror image
     in every second half of a cycle.
 
+    Derivatives of a cycle by a parameter that breaks the symmetry (the stiffness of one leg) are
+    those of the map of the kept charts, and of no cycle of `system`.
+
     **Raises:** `DefinitionError` if charts or states do not fit together and, when a cycle is
     looked for, if a function does not have the symmetry; it names the function.
     """
@@ -78,25 +81,19 @@ class Quotient(Derived):
         translation: SignalNames = (),
         half_period: str | Callable | bool = False,
     ):
-        swap = dict(swap or {})
+        swap, relabel = dict(swap or {}), dict(relabel or {})
         if half_period:  # every chart is kept, and has an image
             swap |= {b: a for a, b in swap.items()}
             swap = {name: swap.get(name, name) for name in (*system.charts(), *swap)}
+        partners = {b: a for a, b in relabel.items()} | relabel
         self.system, self.solver, self.half_period = system, system.solver, half_period
-        self.pairs, self.names = tuple(swap.items()), tuple((relabel or {}).items())
-        self.flipped, self.translation = (
-            (x,) if isinstance(x, str) else tuple(x) for x in (flipped, translation)
-        )
+        self.pairs, self.names = tuple(swap.items()), tuple(partners.items())
+        self.flipped, self.translation = tuple(flipped), tuple(translation)
 
     @property
     def swap(self) -> dict[str, str]:
         """Charts that are kept, each with its mirror image, which is left out."""
         return dict(self.pairs)
-
-    @property
-    def relabel(self) -> dict[str, str]:
-        """States that are exchanged."""
-        return dict(self.names)
 
     @property
     def _kept_of(self) -> dict[str, str]:
@@ -107,7 +104,7 @@ class Quotient(Derived):
         charts = self.system.charts()
         require_among("chart", (*self.swap, *self.swap.values()), charts, "Quotient: ")
         states = sorted({state for chart in charts.values() for state in chart.states})
-        named = (*self.relabel, *self.relabel.values(), *self.flipped, *self.translation)
+        named = (*dict(self.names), *self.flipped, *self.translation)
         require_among("state", named, states, "Quotient: ")
         for kept, image in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
@@ -131,9 +128,8 @@ class Quotient(Derived):
                         f"Quotient: with `half_period`, '{x.name}' must not be scheduled at t = 0, "
                         "where halves begin: let the clock begin earlier."
                     )
-        for name, chart in self.system.charts().items():
-            named = [self.half_period] if isinstance(self.half_period, str) else []
-            require_among("state", named, chart.states, f"Quotient: in '{name}' ")
+        for name, x in self.system.charts().items() if isinstance(self.half_period, str) else ():
+            require_among("state", [self.half_period], x.states, f"Quotient: in '{name}' ")
 
     def period(self):
         return None if self.half_period else self.system.period()
@@ -211,21 +207,18 @@ class Quotient(Derived):
         still = self.translation
         return Quotient(self.system, translation=still) if still else self.system, at
 
-    def check(self) -> None:
-        """Raise an error for a function that does not have the symmetry."""
-        if is_traced(self):
-            return
-        claims = list(self._claims())
-        rng, d = np.random.default_rng(0), max(len(c.states) for c in self.system.charts().values())
-        u = jnp.zeros(len(self.inputs))
+    def check(self, sizes: Mapping[str, Any]) -> None:
+        """Raise an error for a function that does not have the symmetry.
 
-        @jax.jit
-        @jax.vmap
-        def both(q, t):
-            return [tuple(as_vector(f(t, q, u)) for f in pair) for _, *pair in claims]
-
-        values = both(rng.normal(size=(3, d)), rng.normal(size=3))
-        for (sentence, *_), pair in zip(claims, values, strict=True):
+        **Arguments:** `sizes`: magnitudes of the states of each chart. (In units in which states
+        are small, states of 1 would hide all but the highest powers.)
+        """
+        if isinstance(self.system, Quotient):
+            self.system.check({x: np.ones(len(c.states)) for x, c in self.system.charts().items()})
+        clock, rng = self.system.period(), np.random.default_rng(0)
+        q = rng.normal(size=(3, max(map(len, sizes.values()))))
+        values = _sides(self, sizes, q, rng.normal(size=3) * (1.0 if clock is None else clock))
+        for (sentence, *_), pair in zip(self._claims(sizes), values, strict=True):
             size = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
             x, y = (values / size for values in pair)
             if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
@@ -234,45 +227,49 @@ class Quotient(Derived):
                     f"{sentence}."
                 )
 
-    def _claims(self):
+    def _claims(self, sizes: Mapping[str, Any]):
         """The statements of the symmetry: a sentence for its failure, and two functions of
-        (t, q, u) that are equal. The first numbers of q are the state without translations."""
+        (t, q, u) that are equal. The first numbers of q are the state without translations, in
+        its `sizes`."""
         for name in self.system.charts() if self.translation else ():
-            parts = (self._parts(name, self._kept_of, shift=x) for x in (0.0, 0.7))
+            parts = (self._parts(name, self._kept_of, sizes, shift=x) for x in (0.0, 0.7))
             for (what, before), (_, after) in zip(*parts, strict=True):
                 yield f"the {what} changes under the translation", before, after
         images, later = self._kept_of, 0.0
         if self.half_period:
-            images, later = self.swap, 0.5 * (self.system.period() or 0.0)
+            clock = self.system.period()
+            images, later = self.swap, 0.0 if clock is None else 0.5 * clock
         for kept, other in self.swap.items():
-            ours = list(self._parts(kept, self._kept_of))
-            theirs = list(self._parts(other, images, later=later))
+            ours = list(self._parts(kept, self._kept_of, sizes))
+            # In a chart that is its own mirror image, the last transition is that of the first.
+            theirs = list(self._parts(other, images, sizes, later=later, back=kept == other))
             if len(ours) != len(theirs):
                 sentence = f"'{kept}' and '{other}' have different numbers of transitions"
                 yield sentence, lambda *_: 0.0, lambda *_: 1.0
-            if kept == other:  # its last transition is the image of its first
-                theirs[1:] = theirs[:0:-1]
             for (what, function), (name, image) in zip(ours, theirs, strict=False):
                 yield f"the {name} is not the mirror image of the {what}", function, image
 
-    def _parts(self, name: str, images: Mapping[str, str], shift: Any = 0.0, later: Any = 0.0):
+    def _parts(self, name, images, sizes, shift=0.0, later=0.0, back=False):
         """All functions of a chart, of points of the reduced one, with rates and states mirrored if
-        the chart is among the `images`."""
+        the chart is among the `images`; transitions in the order of their list, or `back`."""
         kept = images.get(name, name)
         chart, mirrored = self._reduced(kept), self._mirrored if name in images else _same
+        n, moves = len(chart.kept), np.isin(chart.chart.states, self.translation)
+        size = sizes[kept][:n]
+        state = lambda q: mirrored(kept, chart.full(size * q[:n], shift))  # noqa: E731
+        at = lambda f: lambda t, q, u: f(t + later, state(q), u)  # noqa: E731
         field = self.system.charts()[name].field
-
-        def at(function):
-            def moved(t, q, u):
-                return function(t + later, mirrored(kept, chart.full(q, shift)), u)
-
-            return moved
-
-        back = lambda *point: mirrored(kept, as_vector(field(*point)), back=True)  # noqa: E731
-        yield f"field of chart '{name}'", at(back)
-        for x in self.system.transitions():
+        rates = lambda *point: mirrored(kept, as_vector(field(*point)), back=True)  # noqa: E731
+        yield f"field of chart '{name}'", at(lambda *point: chart.less(rates(*point)) / size)
+        yield f"field of chart '{name}'", at(lambda *point: rates(*point)[moves])
+        for x in list(self.system.transitions())[:: -1 if back else 1]:
             if x.source == name:
-                yield f"transition '{x.name}'", at(self._event(x, images))
+                (target, reset), guard = self._landing(x, images), x.guard
+                if isinstance(guard, Scheduled):
+                    guard = _phase_of(guard)
+                into = sizes[target][: len(self._reduced(target).kept)]
+                yield f"transition '{x.name}'", at(lambda *y, r=reset, c=into: r(*y) / c)
+                yield f"transition '{x.name}'", at(lambda *y, g=guard, x=x: x.sign * g(*y))
         sign = -1.0 if name in images else 1.0
         for x in self._halves() if self.system.period() is None else ():
             if x.source == name:
@@ -293,16 +290,8 @@ class Quotient(Derived):
 
         return target, reset
 
-    def _event(self, x: Transition, images: Mapping[str, str]) -> Callable:
-        """Guard and reset of a transition, as one vector."""
-        (_, reset), sign, guard = self._landing(x, images), x.sign, x.guard
-        if isinstance(guard, Scheduled):
-            guard = _phase_of(guard)
-        return lambda t, q, u: jnp.append(reset(t, q, u), sign * guard(t, q, u))
-
     def _partner(self, name: str) -> str:
-        back = {b: a for a, b in self.relabel.items()}
-        return self.relabel.get(name, back.get(name, name))
+        return dict(self.names).get(name, name)
 
     def _mirrored(self, kept: str, q: Any, back: bool = False):
         """The mirror image of a state of a chart that is kept, or with `back`, of a state of its
@@ -314,6 +303,13 @@ class Quotient(Derived):
         order = [source.index(self._partner(name)) for name in target]
         names = target if back else map(self._partner, target)
         return q[np.array(order)] * np.array([-1.0 if x in self.flipped else 1.0 for x in names])
+
+
+@eqx.filter_jit
+def _sides(quotient: Quotient, sizes: Mapping[str, Any], q: Any, t: Any) -> list[tuple]:
+    """Both sides of all claims of a symmetry."""
+    u, claims = jnp.zeros(len(quotient.inputs)), [x for _, *x in quotient._claims(sizes)]
+    return jax.vmap(lambda q, t: [tuple(as_vector(f(t, q, u)) for f in x) for x in claims])(q, t)
 
 
 def _same(kept: str, q: Any, back: bool = False):

@@ -188,8 +188,8 @@ class HybridSystem(Definition):
     def period(self) -> Any | None:
         """The period of the clock that drives the system, or `None` if it is autonomous.
 
-        Fields, guards, resets and outputs of a clocked system must have this period in t. Those
-        of an autonomous one must not depend on t.
+        Fields, guards, resets and outputs of a clocked system must have this period in t, for all
+        values of its parameters. Those of an autonomous one must not depend on t.
         """
         return None
 

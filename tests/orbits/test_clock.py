@@ -36,6 +36,12 @@ def test_another_period_or_none(system, state, message):
         hj.find_limit_cycle(system, hj.Guess("fall", state, 0.1))
 
 
+def test_a_period_that_does_not_follow_a_parameter():
+    fixed = type("Fixed", (hj.models.Duffing,), {"period": lambda self: 4 * np.pi})
+    with pytest.raises(hj.DefinitionError, match="does not have the period 12.5664 that Fixed"):
+        hj.continuation(hj.find_limit_cycle(fixed()), "rate", (0.5, 0.51))
+
+
 def test_a_force_that_jumps_with_the_clock():
     """The cycle of x' = -x + (1, then 0, for half a period each), by hand."""
 

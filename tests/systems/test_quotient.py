@@ -47,55 +47,40 @@ class Full(hj.HybridSystem):
     early: hj.Parameter = hj.parameter(0.0)
 
     def charts(self):
-        model = hj.models.SimplestWalker()
-        leaning = hj.models.SimplestWalker(slope=0.009 + self.skew)
-        return {
-            "left stands": Stands(model, 0, self.drag),
-            "right stands": Stands(leaning, 1, self.drag),
-        }
+        slopes = enumerate([("left", 0.009), ("right", 0.009 + self.skew)])
+        walker = hj.models.SimplestWalker
+        return {f"{x} stands": Stands(walker(slope=y), k, self.drag) for k, (x, y) in slopes}
 
     def transitions(self):
-        found = []
         for leg, (name, other) in enumerate([("left", "right"), ("right", "left")]):
-            found.append(
-                hj.Transition(
-                    f"{other} lands", f"{name} stands", f"{other} stands",
-                    guard=lambda t, q, u, leg=leg: q[leg] + q[1 - leg] + leg * self.early,
-                    reset=lambda t, q, u, leg=leg: told(
-                        1 - leg, *_heelstrike(t, seen(q, leg), u), q[4]
-                    ),
-                    enabled=lambda t, q, u, leg=leg: q[leg] < 0,
-                )
+            yield hj.Transition(
+                f"{other} lands", f"{name} stands", f"{other} stands",
+                guard=lambda t, q, u, leg=leg: q[leg] + q[1 - leg] + leg * self.early,
+                reset=lambda t, q, u, k=leg: told(1 - k, *_heelstrike(t, seen(q, k), u), q[4]),
+                enabled=lambda t, q, u, leg=leg: q[leg] < 0,
             )  # fmt: skip
-        return found
 
     def guess(self):
         th, phi, w, p = hj.models.SimplestWalker().guess().state
         return hj.Guess("left stands", told(0, th, phi, w, p, 0.0))
 
 
-MIRROR = {
-    "swap": {"left stands": "right stands"},
-    "relabel": {"left": "right", "left_rate": "right_rate"},
-}
+PARTNERS = {"left": "right", "left_rate": "right_rate"}
+MIRROR = {"swap": {"left stands": "right stands"}, "relabel": PARTNERS}
 
 
-def test_a_step_modulo_the_symmetry():
-    walker = hj.Quotient(Full(), **MIRROR, translation=("x",))
-    step = hj.find_limit_cycle(walker, section=hj.AtEvent("right lands"))
-    expected = [LONG_GAIT, np.conj(LONG_GAIT)]
-    np.testing.assert_allclose(step.multipliers, expected, rtol=1e-9)
-    np.testing.assert_allclose(step.period, 3.88246375285137, rtol=1e-10)
+STRIDE = pytest.param(2, {}, hj.Crossing("left", "falling"), marks=pytest.mark.slow)
 
 
-@pytest.mark.slow
-def test_a_stride_is_two_steps():
-    walker = hj.Quotient(Full(), translation=("x",))
-    stride = hj.find_limit_cycle(walker, section=hj.Crossing("left", "falling"))
-    np.testing.assert_allclose(stride.period, 2 * 3.88246375285137, rtol=1e-10)
-    squares = np.array([LONG_GAIT, np.conj(LONG_GAIT)]) ** 2
-    squares, found = (x[np.argsort(x.imag)] for x in (squares, stride.multipliers))
-    np.testing.assert_allclose(found, squares, rtol=1e-8)
+@pytest.mark.parametrize(
+    "steps, symmetry, section", [(1, MIRROR, hj.AtEvent("right lands")), STRIDE]
+)
+def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section):
+    walker = hj.Quotient(Full(), **symmetry, translation=("x",))
+    cycle = hj.find_limit_cycle(walker, section=section)
+    np.testing.assert_allclose(cycle.period, steps * 3.88246375285137, rtol=1e-10)
+    expected = np.sort_complex(np.array([LONG_GAIT, np.conj(LONG_GAIT)]) ** steps)
+    np.testing.assert_allclose(np.sort_complex(cycle.multipliers), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -103,11 +88,7 @@ def test_a_stride_is_two_steps():
     [
         (Full(drag=0.1), {**MIRROR, "translation": ("x",)}, "field of chart 'left stands' changes"),
         (Full(skew=0.1), MIRROR, "chart 'right stands' is not the mirror image"),
-        (
-            Full(early=0.1),
-            MIRROR,
-            "transition 'left lands' is not the mirror image of .* 'right lands'",
-        ),
+        (Full(early=0.1), MIRROR, "'left lands' is not the mirror image of .* 'right lands'"),
     ],
 )
 def test_what_is_no_symmetry_is_refused(system, symmetry, message):
@@ -122,10 +103,27 @@ def test_an_odd_oscillator_closes_after_half_a_period():
     half = hj.find_limit_cycle(folded, hj.Guess("oscillation", (0.0, -1.9)), section=at)
     np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-11)
     np.testing.assert_allclose(half.multipliers**2, whole.multipliers, rtol=1e-9)
-    with pytest.raises(hj.DefinitionError, match="Duffing does not have the symmetry"):
-        hj.find_limit_cycle(hj.Quotient(duffing, flipped="x", half_period=True), section=at)
     with pytest.raises(hj.DefinitionError, match="must be True if a clock drives the system"):
         hj.Quotient(duffing, flipped=("x", "v"), half_period="x")
+
+
+class Biased(hj.models.Duffing):
+    bias: hj.Parameter = hj.parameter(0.0)
+
+    def _line(self, t, q, u):
+        return super()._line(t, q, u + self.bias)
+
+
+def test_the_symmetry_is_that_of_all_systems_in_all_units():
+    def half(bias):
+        system = Biased(beta=5e16, amplitude=5e-10, bias=bias)
+        return hj.Quotient(system, flipped=("x", "v"), half_period=True)
+
+    cycle = hj.find_limit_cycle(half(0.0), section=hj.AtEvent("half period"))
+    with pytest.raises(hj.DefinitionError, match="Biased does not have the symmetry"):
+        hj.find_limit_cycle(half(1e-10), cycle)
+    with pytest.raises(hj.DefinitionError, match="Biased does not have the symmetry"):
+        hj.find_limit_cycles([half(0.0), half(1e-10)], cycle)
 
 
 class Inverter(hj.HybridSystem):
