@@ -10,7 +10,7 @@ import numpy as np
 from ..executor import is_tracer
 from ..meaning import current, unchanged_code
 from ..signal import Signal
-from .values import TEXT, Kind, Misfit, listed, refuse_traced, show, with_article
+from .values import Kind, Misfit, listed, refuse_traced, show, with_article
 
 
 class Either(Kind):
@@ -134,7 +134,7 @@ class Names(Kind):
 
     def __init__(self, other: type | None = None, *, empty: bool = False, units: bool = False):
         self.empty, self.units = empty, units
-        self.item = TEXT if other is None else Either(TEXT, Instance(other))
+        self.types = (str,) if other is None else (str, other)
         self.allowed = "a name, or a sequence of distinct names"
         if other is not None:
             self.allowed += f" (or {with_article(other.__name__)} in place of one)"
@@ -143,27 +143,20 @@ class Names(Kind):
 
     def take(self, value):
         if self.units and isinstance(value, Mapping):
-            if not all(map(self._fits, (*value, *value.values()))):
+            if not all(isinstance(x, str) for x in (*value, *value.values())):
                 raise self.refused(value)
             value = tuple(map(Signal, value, value.values()))
         if not isinstance(value, list | tuple | np.ndarray):
             value = (value,)
         elif isinstance(value, np.ndarray) and value.ndim != 1:
             raise self.refused(value)
-        if not all(map(self._fits, value)) or not (len(value) or self.empty):
+        if not all(isinstance(x, self.types) for x in value) or not (len(value) or self.empty):
             raise self.refused(value)
         given = tuple(str(x) if isinstance(x, np.str_) else current(x) for x in value)
         names = [x for x in given if isinstance(x, str)]
         if len(set(names)) < len(names):
             raise Misfit(f"must name each only once, not {show(given)}", near=True)
         return given
-
-    def _fits(self, value: Any) -> bool:
-        try:
-            self.item.take(value)
-        except Misfit:
-            return False
-        return True
 
 
 def _taken(kind: Kind, key: Any, value: Any) -> Any:

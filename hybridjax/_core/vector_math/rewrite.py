@@ -84,8 +84,8 @@ def _number(eqn: jex.JaxprEqn) -> int:
 def jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:
     """Return the programs among the parameters of an equation, or in tuples of these.
     (`jax.extend.core` has a function for it since JAX 0.10.)"""
-    values = [x for value in params.values() for x in _as_tuple(value)]
-    programs = [x.jaxpr if isinstance(x, jex.ClosedJaxpr) else x for x in values]
+    parts = (x if isinstance(x, tuple) else (x,) for x in params.values())
+    programs = [x.jaxpr if isinstance(x, jex.ClosedJaxpr) else x for part in parts for x in part]
     return [x for x in programs if isinstance(x, jex.Jaxpr)]
 
 
@@ -104,7 +104,7 @@ def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
         behind |= dict.fromkeys(eqn.outvars, functions)
         vector = eqn.primitive.name in ("stack", "concatenate") and len(_shape(eqn.outvars[0])) == 1
         if vector and len(functions) > 1:
-            eqn = _in_place_of(eqn, _rows, tuple(v.aval for v in eqn.invars))
+            eqn = _in_place_of(eqn, _rows)
         eqns.append(eqn)
     return jaxpr.replace(eqns=eqns)
 
@@ -162,13 +162,12 @@ def _solved(eqn: jex.JaxprEqn, factors: dict) -> jex.JaxprEqn | None:
         return None
     if product.invars != times.jaxpr.invars:
         return None
-    both = [matrix, right]
-    return _in_place_of(eqn, factorizations.solve, (matrix.aval, right.aval), invars=both)
+    return _in_place_of(eqn, factorizations.solve, invars=[matrix, right])
 
 
 def _ours(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn | None:
     """Our equation in place of one of JAX, if we have one for its types."""
-    avals: Any = tuple(v.aval for v in eqn.invars)
+    avals: list[Any] = [v.aval for v in eqn.invars]
     if eqn.primitive in _FACTORIZATIONS:
         rows, columns = avals[0].shape[-2:]
         square = rows == columns and 0 < rows <= factorizations.MOST_ROWS
@@ -176,19 +175,20 @@ def _ours(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn | None:
             return None
         names = {"left_side", "lower", "transpose_a", "unit_diagonal"} & set(eqn.params)
         options = tuple((name, eqn.params[name]) for name in sorted(names))
-        return _in_place_of(eqn, _FACTORIZATIONS[eqn.primitive], avals, options)
+        return _in_place_of(eqn, _FACTORIZATIONS[eqn.primitive], options)
     if not trigonometry or eqn.primitive not in _TRIGONOMETRY:
         return None
     if eqn.params.get("accuracy") is not None or any(x.dtype != jnp.float64 for x in avals):
         return None
-    return _in_place_of(eqn, _TRIGONOMETRY[eqn.primitive], avals)
+    return _in_place_of(eqn, _TRIGONOMETRY[eqn.primitive])
 
 
 def _in_place_of(
-    eqn: jex.JaxprEqn, function: Callable, avals: tuple, options: tuple = (), invars: Any = None
+    eqn: jex.JaxprEqn, function: Callable, options: tuple = (), invars: Any = None
 ) -> jex.JaxprEqn:
     """The equation of one of our functions with the variables of another one."""
-    new, invars = _equation(function, avals, options), invars or eqn.invars
+    invars = invars or eqn.invars
+    new = _equation(function, tuple(v.aval for v in invars), options)
     return new.replace(invars=invars, outvars=eqn.outvars, source_info=eqn.source_info)
 
 
@@ -199,19 +199,12 @@ def _shape(v: Any) -> tuple[int, ...]:
 def _replaced_parameter(value: Any, trigonometry: bool) -> Any:
     if isinstance(value, jex.ClosedJaxpr):
         return _replaced_program(value, trigonometry)
-    if any(isinstance(item, jex.ClosedJaxpr) for item in _as_tuple(value)):
-        items = [
-            _replaced_program(x, trigonometry) if isinstance(x, jex.ClosedJaxpr) else x
-            for x in value
-        ]
-        same = all(new is old for new, old in zip(items, value, strict=True))
-        # (A solver's programs come as a tuple with names.)
-        return value if same else getattr(type(value), "_make", tuple)(items)
-    return value
-
-
-def _as_tuple(value: Any) -> tuple:
-    return value if isinstance(value, tuple) else (value,)
+    if not isinstance(value, tuple):
+        return value
+    items = [_replaced_parameter(x, trigonometry) for x in value]
+    same = all(new is old for new, old in zip(items, value, strict=True))
+    # (A solver's programs come as a tuple with names.)
+    return value if same else getattr(type(value), "_make", tuple)(items)
 
 
 # JAX traces an inner jit once and keeps it: what becomes of it is kept as well, since JAX's caches
