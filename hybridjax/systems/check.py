@@ -15,7 +15,7 @@ from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart
-from .structure import Structure, quoted
+from .structure import Structure, hashable, quoted
 from .system import HybridSystem, Output, arrays_of
 from .transition import Scheduled, Transition
 
@@ -45,24 +45,15 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
                 f"parameter `{name}` of {type(system).__name__} is "
                 f"{np.asarray(leaf)}; every parameter must be finite."
             )
-    form = _form(system)
+    leaves, structure = jax.tree_util.tree_flatten(system)
+    parts = ((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves)
+    form = hashable((structure, *parts))
     clocked = _passed.get(form) if form is not None else None
     if clocked is None:
         clocked = tuple(_check_functions(Structure(system)))
         if form is not None:
             _passed[form] = clocked
     return clocked
-
-
-def _form(system: HybridSystem) -> Hashable:
-    """All but the numbers of a system; `None` where that cannot be compared."""
-    leaves, structure = jax.tree_util.tree_flatten(system)
-    form = structure, *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves)
-    try:
-        hash(form)
-    except TypeError:
-        return None
-    return form
 
 
 def _check_functions(s: Structure) -> Iterator[str]:

@@ -143,26 +143,20 @@ def _radau(s: int) -> Method:
 
     # The Radau points are 1 and zeros of a Jacobi polynomial.
     c = np.append((1 + special.roots_jacobi(s - 1, 1, 0)[0]) / 2, 1.0)
-    a = np.array([_integrals(c, end) for end in c])
+    # Integrals of the Lagrange polynomials from 0 to each point.
+    x, weights = np.polynomial.legendre.leggauss(s)
+    a = np.array([y / 2 * weights @ [_lagrange(c, y * (1 + z) / 2) for z in x] for y in c])
     eigenvalues = np.linalg.eigvals(a)
     gamma = float(eigenvalues[np.argmin(np.abs(eigenvalues.imag))].real)
     # The quadrature formula of order s that has the weight gamma at the start of the step.
     powers = np.vander(c, s, increasing=True).T
     moments = 1 / np.arange(1, s + 1) - gamma * (np.arange(s) == 0)
     error = np.concatenate([[gamma], np.linalg.solve(powers, moments) - a[-1]])
-    full = np.zeros((s + 1, s + 1))
-    full[1:, 1:] = a
+    full = np.pad(a, ((1, 0), (1, 0)))
     return _method(
         f"Radau({s})", full, full[-1], np.concatenate([[0.0], c]), error, 2.0 * s,
         gain=2 * s / (s + 1), filter=gamma, rough=tuple(-_lagrange(c, 0.0) @ full[1:]),
     )  # fmt: skip
-
-
-def _integrals(c: Float[np.ndarray, " s"], end: float) -> Float[np.ndarray, " s"]:
-    """Integrals from 0 to `end` of the Lagrange polynomials at the points c."""
-    x, weights = np.polynomial.legendre.leggauss(len(c))
-    x = end * (1 + x) / 2
-    return end / 2 * weights @ np.array([_lagrange(c, point) for point in x])
 
 
 def _lagrange(c: Float[np.ndarray, " s"], x: float) -> Float[np.ndarray, " s"]:

@@ -88,10 +88,14 @@ def _form(x: Transition) -> Hashable:
     if isinstance(x.guard, Scheduled):
         return None
     leaves, structure = jax.tree_util.tree_flatten((x.guard, x.reset, x.enabled))
-    form = x.source, x.target, x.direction, structure, *map(_form_of_leaf, leaves)
+    return hashable((x.source, x.target, x.direction, structure, *map(_form_of_leaf, leaves)))
+
+
+def hashable(form: Hashable) -> Hashable:
+    """Return a form, or None if a part of it cannot be compared."""
     try:
         hash(form)
-    except TypeError:  # a static part of a function cannot be compared
+    except TypeError:
         return None
     return form
 
