@@ -57,10 +57,8 @@ class ProcessNoise:
         **Raises:** `DefinitionError` for a `std` of another number of sections.
         """
         self.require(n_sections)
-        if shape[0] == 0:
-            return np.zeros(shape)
         each = (np.random.default_rng((self.seed, first + s)) for s in range(shape[0]))
-        white = np.stack([rng.normal(size=shape[1:]) for rng in each])
+        white = np.reshape([rng.normal(size=shape[1:]) for rng in each], shape)
         return np.resize(self.std, shape[1])[:, None] * with_memory(white, self.memory, n_sections)
 
     def require(self, n_sections: SectionCount) -> None:

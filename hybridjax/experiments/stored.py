@@ -13,7 +13,7 @@ from .._core.boundary.kinds import ExperimentCount, FilePath, Index
 from .._core.execution import Execution
 from .._core.pieces.description import digest_of, versions
 from .._core.pieces.run import DaskClient, fill
-from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, absolute
+from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, absolute, flags
 from .._core.progress import working
 from .._core.results import Result
 from .._core.signal import Signal, unit_of
@@ -100,7 +100,6 @@ class StoredExperiments:
     def summary(self, limit: Index = 5) -> str:
         """Return the same as `ExperimentData.summary`, for all experiments."""
         result, failed_at = (self._store.array(name) for name in ("result", "failed_at"))
-        assert result is not None and failed_at is not None
         return summary(result, failed_at, self.n_sections, limit)
 
     def __repr__(self) -> str:
@@ -193,14 +192,10 @@ class ExperimentJob:
         campaign, text = self.campaign, self.description
         placed, values = campaign.placed, campaign.at_sections
         n, u = campaign.inputs.cycles * placed.n_sections, placed.cycle.system.inputs
-        codes = {
-            "flag_values": [int(x) for x in Result],
-            "flag_meanings": " ".join(x.name.lower() for x in Result),
-        }
         variables = {
             "u": Variable("<f8", ("sample", "input"), (n, len(u))),
             "y": Variable("<f8", ("sample", "output"), (n, len(values.outputs.names))),
-            "result": Variable("<i8", attributes=codes),
+            "result": Variable("<i8", attributes=flags([x.name.lower() for x in Result])),
             "failed_at": Variable("<i8"),
             "error": Variable("<f8"),
         }

@@ -101,14 +101,9 @@ class Space:
 
     def constants(self, units: Mapping[str, str]) -> dict[str, Constant]:
         """Return the parameters as coordinates of results."""
-        return {
-            name: (
-                (name if self.grid else "point",),
-                x,
-                {"units": units[name]} if units[name] else {},
-            )
-            for name, x in self.axes.items()
-        }
+        dims = self.dims if self.grid else self.dims * len(self.axes)
+        about = {name: {"units": unit} if unit else {} for name, unit in units.items()}
+        return {n: ((d,), x, about[n]) for d, (n, x) in zip(dims, self.axes.items(), strict=True)}
 
 
 class Family:

@@ -5,7 +5,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from .._core.pieces.store import Constant, Variable
+from .._core.pieces.store import Constant, Variable, flags
 from .._core.results import Result
 from .._core.signal import unit_of
 from ..errors import ComputationError, DefinitionError
@@ -50,9 +50,9 @@ class Wanted:
             values[name] = self._first(cycles, name, measure)[None]
         dims = {"state": ("state_name",), "multipliers": ("multiplier",)}
         attributes = {
-            "result": _flags([x.name.lower() for x in Result], [int(x) for x in Result]),
+            "result": flags([x.name.lower() for x in Result]),
             "period": {"units": self._time_unit} if self._time_unit else {},
-            "chart": _flags(self._charts),
+            "chart": flags(self._charts),
         }
         forms = {name: form(name, x[0]) for name, x in values.items()}
         return {
@@ -64,12 +64,9 @@ class Wanted:
         """Return the coordinates of results beside the parameters."""
         if "state" not in self.names:
             return {}
-        names = np.array([str(x) for x in self._all_states])
-        units = np.array([str(unit_of(x)) for x in self._all_states])
-        return {
-            "state_name": (("state_name",), names, {}),
-            "state_unit": (("state_name",), units, {}),
-        }
+        texts = {"state_name": map(str, self._all_states)}
+        texts["state_unit"] = map(unit_of, self._all_states)
+        return {name: (("state_name",), np.array([*x]), {}) for name, x in texts.items()}
 
     def values(self, cycles: LimitCycles, chosen: Mapping[str, Variable]) -> dict[str, np.ndarray]:
         """Return the results of some cycles."""
@@ -150,9 +147,3 @@ def stacked(name: str, values: Iterable[np.ndarray | None], variable: Variable) 
                 f"{variable.dtype} {variable.shape}, then {x.dtype.str} {x.shape}."
             )
     return np.array(rows, variable.dtype)
-
-
-def _flags(names: Sequence[str], values: Sequence[int] | None = None) -> dict[str, Any]:
-    """Return the attributes of integers that stand for names."""
-    values = range(len(names)) if values is None else values
-    return {"flag_values": list(values), "flag_meanings": " ".join(names)}

@@ -84,6 +84,11 @@ class Variable(NamedTuple):
         return -1 if np.dtype(self.dtype).kind == "i" else np.nan
 
 
+def flags(names: Sequence[str]) -> dict[str, Any]:
+    """Return the attributes of integers from 0 on that stand for names."""
+    return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
+
+
 Constant = tuple[Sequence[str], np.ndarray, Mapping[str, Any]]
 """Dimensions, values and attributes of an array that exists before anything is computed."""
 
@@ -211,13 +216,13 @@ class ZarrStore:
                 ) from error
         return values
 
-    def array(self, name: str) -> np.ndarray | None:
-        """Return a variable of all pieces, or a constant; None if there is none of this name.
+    def array(self, name: str) -> np.ndarray:
+        """Return a variable of all pieces, or a constant.
 
         **Raises:** `FileFormatError` if it is damaged.
         """
         try:
-            return np.asarray(self._group[name][...]) if name in self._group else None
+            return np.asarray(self._group[name][...])
         except Exception as error:  # (of many kinds)
             raise FileFormatError(f"'{self.address}' is damaged in `{name}`: delete it.") from error
 
