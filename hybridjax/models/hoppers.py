@@ -4,11 +4,10 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..systems.chart import Chart, FieldChart
+from ..systems.chart import FieldChart
 from ..systems.drawing import Drawing
 from ..systems.solver import Radau
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
@@ -23,18 +22,6 @@ def _hopper(i: int, yM: Array, ym: Array) -> tuple[dict, dict]:
     x, tag = 1.5 * i, f" {i + 1}" if i else ""
     circles = {f"body{tag}": (x, yM, 0.3), f"foot{tag}": (x, ym + 0.1, 0.1)}
     return {f"leg{tag}": Drawing.spring((x, ym + 0.2), (x, yM - 0.3))}, circles
-
-
-class HopperStance(Chart):
-    states = ("yM", "vM")
-    units = ("m", "m/s")
-    absent = {"ym": 0.0, "vm": 0.0}
-    hopper: "VerticalHopper"
-
-    def field(self, t, q, u):
-        p = self.hopper
-        yM, vM = q
-        return vM, (p.leg(t, yM, 0.0) + u[0]) / p.M - p.g
 
 
 class VerticalHopper(HybridSystem):
@@ -65,7 +52,10 @@ class VerticalHopper(HybridSystem):
         return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(self.omega * t)
 
     def charts(self):
-        return {"flight": self._flight(), "stance": HopperStance(self)}
+        pushed = lambda t, q, u: (q[1], (self.leg(t, q[0], 0.0) + u[0]) / self.M - self.g)  # noqa: E731
+        names, units = _MASSES
+        stance = FieldChart(pushed, names[:2], units[:2], absent=dict.fromkeys(names[2:], 0.0))
+        return {"flight": self._flight(), "stance": stance}
 
     def _flight(self) -> FieldChart:
         drag = lambda ym, vm: -self.b * vm  # noqa: E731
@@ -136,45 +126,26 @@ class CompliantHopper(VerticalHopper):
         return Guess("contact", (2.0, 1.9, -1e-4, 0.0), 0.5)
 
 
-_BODIES, _FEET = (("yM1", "vM1"), ("yM2", "vM2")), (("ym1", "vm1"), ("ym2", "vm2"))
-_STATES = sum(_BODIES + _FEET, ())
+_FEET = ("ym1", "vm1"), ("ym2", "vm2")
+_STATES = ("yM1", "vM1", "yM2", "vM2", *_FEET[0], *_FEET[1])
 # Chart by the feet that stand on the ground.
 _PAIR_CHARTS = {(): "air", (0,): "first", (1,): "second", (0, 1): "both"}
 
 
-class PairStanding(Chart):
-    pair: "HopperPair"
-    down: tuple[int, ...] = eqx.field(static=True)
+def _absent(down: tuple[int, ...]) -> dict[str, float]:
+    """States of the feet that stand."""
+    return {name: 0.0 for i in down for name in _FEET[i]}
 
-    @property
-    def absent(self) -> dict[str, float]:  # type: ignore[override]
-        return {name: 0.0 for i in self.down for name in _FEET[i]}
 
-    @property
-    def states(self) -> tuple[str, ...]:  # type: ignore[override]
-        return tuple(name for name in _STATES if name not in self.absent)
+def _part(down: tuple[int, ...], whole: Sequence) -> list:
+    """Those of all eight states that a chart has."""
+    return [x for name, x in zip(_STATES, whole, strict=True) if name not in _absent(down)]
 
-    @property
-    def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        return ("m", "m/s") * (len(self.states) // 2)
 
-    def whole(self, q: Array) -> list[Array]:
-        """All eight states: feet on the ground rest."""
-        return [q[self.states.index(x)] if x in self.states else jnp.zeros(()) for x in _STATES]
-
-    def part(self, whole: Sequence) -> list:
-        return [x for name, x in zip(_STATES, whole, strict=True) if name in self.states]
-
-    def field(self, t, q, u):
-        p, whole = self.pair, self.whole(q)
-        pull = p.coupling * (whole[2] - whole[0])
-        bodies, feet = [], []
-        for i, between in enumerate((pull, -pull)):
-            (y, v), (ym, vm) = whole[2 * i : 2 * i + 2], whole[2 * i + 4 : 2 * i + 6]
-            leg = p.leg(t - i * p.lag, y, ym)
-            bodies += [v, (leg + between + u[i]) / p.M - p.g]
-            feet += [vm, -(leg + p.b * vm) / p.m - p.g]
-        return self.part(bodies + feet)
+def _whole(down: tuple[int, ...], q: Array) -> list[Array]:
+    """All eight states, of those of a chart: feet on the ground rest."""
+    states = _part(down, _STATES)
+    return [q[states.index(x)] if x in states else jnp.zeros(()) for x in _STATES]
 
 
 class HopperPair(VerticalHopper):
@@ -193,7 +164,23 @@ class HopperPair(VerticalHopper):
     lag: Parameter = parameter(0.3, unit="s", doc="by which the second actuator runs behind")
 
     def charts(self):
-        return {name: PairStanding(self, down) for down, name in _PAIR_CHARTS.items()}
+        return {name: self._standing(down) for down, name in _PAIR_CHARTS.items()}
+
+    def _standing(self, down: tuple[int, ...]) -> FieldChart:
+        def field(t, q, u):
+            whole = _whole(down, q)
+            pull = self.coupling * (whole[2] - whole[0])
+            bodies, feet = [], []
+            for i, between in enumerate((pull, -pull)):
+                (y, v), (ym, vm) = whole[2 * i : 2 * i + 2], whole[2 * i + 4 : 2 * i + 6]
+                leg = self.leg(t - i * self.lag, y, ym)
+                bodies += [v, (leg + between + u[i]) / self.M - self.g]
+                feet += [vm, -(leg + self.b * vm) / self.m - self.g]
+            return _part(down, bodies + feet)
+
+        states = tuple(_part(down, _STATES))
+        units = ("m", "m/s") * (len(states) // 2)
+        return FieldChart(field, states, units, absent=_absent(down))
 
     def transitions(self):
         return tuple(self._step(i, down) for down in _PAIR_CHARTS for i in (0, 1))
@@ -202,18 +189,17 @@ class HopperPair(VerticalHopper):
         """Touchdown or liftoff of hopper i, while these feet are down."""
         lifts = i in down
         after = tuple(k for k in (0, 1) if (k in down) != (k == i))
-        before, landed = PairStanding(self, down), PairStanding(self, after)
 
         def guard(t, q, u):
-            whole = before.whole(q)
+            whole = _whole(down, q)
             force = self.leg(t - i * self.lag, whole[2 * i], 0.0) + self.m * self.g
             return force if lifts else whole[2 * i + 4]
 
         def reset(t, q, u):
-            whole = before.whole(q)
+            whole = _whole(down, q)
             if not lifts:
                 whole[2 * i + 1] = self.retention * whole[2 * i + 1]
-            return landed.part(whole)
+            return _part(after, whole)
 
         name = f"{'liftoff' if lifts else 'touchdown'} {i + 1} ({_PAIR_CHARTS[down]})"
         return Transition(name, _PAIR_CHARTS[down], _PAIR_CHARTS[after], guard, reset=reset)

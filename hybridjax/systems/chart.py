@@ -78,9 +78,11 @@ class FieldChart(Chart):
     states: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
     units: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
     solver: Any = eqx.field(static=True)  # type: ignore[misc]
+    absent: Mapping[str, float] = eqx.field(default_factory=dict)  # type: ignore[misc]
 
-    def __init__(self, function, states, units=(), solver=None):
+    def __init__(self, function, states, units=(), solver=None, absent=None):
         self.function, self.states, self.units, self.solver = function, states, units, solver
+        self.absent = absent or {}
 
     def field(self, t, q, u):
         return self.function(t, q, u)
