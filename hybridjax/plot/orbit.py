@@ -176,15 +176,13 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> 
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
     bars, step = [], max(1, round(placed.n_sections / 8))
     for i, (point, along) in enumerate(_meetings(s, placed, names, unit)):
-        bars.append(np.stack([point - _BAR * along, point + _BAR * along]))
+        bars += [point - _BAR * along, point + _BAR * along, (np.nan, np.nan)]
         if i % step == 0:  # at the end of the bar that is outside of the loop
             outwards = np.sign(along / unit @ ((point - center) / unit)) or 1.0
             x, y = point + 2 * _BAR * outwards * along
             ax.text(x, y, str(i), **_NUMBER)
-    bars = np.stack(bars)
-    gaps = np.full((len(bars), 1), np.nan)
-    flat = [np.hstack([bars[..., k], gaps]).ravel() for k in (0, 1)]
-    ax.plot(*flat, color="0.35", lw=0.8, zorder=4, label=f"sections ({placed.n_sections})")
+    label = f"sections ({placed.n_sections})"
+    ax.plot(*np.transpose(bars), color="0.35", lw=0.8, zorder=4, label=label)
 
 
 def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tuple]:
