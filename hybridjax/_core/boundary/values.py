@@ -326,13 +326,10 @@ class Reals(Kind):
     def _check_values(self, array: np.ndarray | jax.Array) -> None:
         values = np.asarray(array)
         # (A sum is a number where all of them are, and takes no memory.)
-        free = self.missing and self.infinite
         with np.errstate(all="ignore"):
-            finite = values.dtype.kind in "iu" or free or np.isfinite(np.sum(values))
+            finite = np.isfinite(np.sum(values))
         if not finite:
-            bad = np.isinf(values) if self.missing else ~np.isfinite(values)
-            if self.infinite:
-                bad &= ~np.isinf(values)
+            bad = np.isnan(values) & (not self.missing) | np.isinf(values) & (not self.infinite)
             self._refuse_any(bad, values, "finite")
         if self.sign == "positive":
             self._refuse_any(values <= 0, values, "positive")
