@@ -126,10 +126,8 @@ class _Kinds:
         """Names and kinds of those that can be given by position, and of all further ones
         (`*args`)."""
         parameters = inspect.signature(self.function).parameters.values()
-        further = [p.name for p in parameters if p.kind is p.VAR_POSITIONAL]
-        by_name = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-        positional = [p.name for p in parameters if p.kind not in by_name and p.name not in further]
-        name = further[0] if further else ""
+        positional = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD]
+        name = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
         return [(x, self.by_name[x]) for x in positional], (name, self.by_name.get(name))
 
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:

@@ -1,6 +1,7 @@
 """Kinds of single values and of arrays, and what is wrong with a value that does not fit."""
 
 import contextlib
+import dataclasses
 import math
 import numbers
 import operator
@@ -138,24 +139,19 @@ class Whole(Kind):
         return number
 
 
+@dataclasses.dataclass(eq=False, repr=False)
 class Number(Kind):
     """A finite real number between bounds, as a Python `float`: numbers of Python and NumPy, arrays
     of one number without axes; no bools, strings and complex numbers. With `infinite`, infinity may
     stand for no bound."""
 
-    def __init__(
-        self,
-        allowed: str = "a finite number",
-        *,
-        above: int | float = -math.inf,
-        low: int | float = -math.inf,
-        high: int | float = math.inf,
-        below: int | float = math.inf,
-        infinite: bool = False,
-    ):
-        self.allowed = allowed
-        self.above, self.low, self.high, self.below = above, low, high, below
-        self.infinite = infinite
+    allowed: str = "a finite number"
+    _: dataclasses.KW_ONLY
+    above: int | float = -math.inf
+    low: int | float = -math.inf
+    high: int | float = math.inf
+    below: int | float = math.inf
+    infinite: bool = False
 
     def take(self, value):
         number = value
@@ -256,7 +252,7 @@ class Reals(Kind):
     - `form`: makes arrays of one library of all: `np.asarray`, `jnp.asarray`.
     """
 
-    single, sort = "a finite number", "real numbers"
+    single, items = "a finite number", "real numbers"
     types = "fiu"
     dtype: type = float
 
@@ -271,13 +267,11 @@ class Reals(Kind):
     ):
         self.shape, self.sign = tuple(shape.split()), sign
         self.missing, self.infinite, self.form = missing, infinite, form
-        self.items = self.sort if sign == "any" else f"{sign} numbers"
-        if self.shape == ():
-            self.allowed = self.single if sign == "any" else f"a {sign} number"
-        elif self.shape == ("...",):
-            self.allowed = f"an array of {self.items}"
-        else:
-            self.allowed = f"an array of {self.items} with shape {self._written()}"
+        if sign != "any":
+            self.single, self.items = f"a {sign} number", f"{sign} numbers"
+        self.allowed = self.single if self.shape == () else f"an array of {self.items}"
+        if self.shape not in ((), ("...",)):
+            self.allowed += f" with shape {self._written()}"
 
     def take(self, value):
         array = value if isinstance(value, jax.Array) else self._array(value)
@@ -340,8 +334,7 @@ class Reals(Kind):
         if not bad.any():
             return
         if values.ndim == 0:
-            single = self.single if self.sign == "any" else f"a {self.sign} number"
-            raise Misfit(f"must be {single}, not {show(values.item())}", near=True)
+            raise Misfit(f"must be {self.single}, not {show(values.item())}", near=True)
         index = tuple(map(int, np.argwhere(bad)[0]))
         raise Misfit(
             f"must be {allowed}, but is {values[index]:.6g} at index "
@@ -356,7 +349,7 @@ class Reals(Kind):
 class Complexes(Reals):
     """An array of numbers, real or complex, as `Reals` otherwise."""
 
-    single, sort = "a finite number", "numbers"
+    single, items = "a finite number", "numbers"
     types = "cfiu"
     dtype = complex
 
@@ -364,6 +357,6 @@ class Complexes(Reals):
 class Integers(Reals):
     """An array of whole numbers, as `Reals` otherwise."""
 
-    single, sort = "an integer", "integers"
+    single, items = "an integer", "integers"
     types = "iu"
     dtype = int
