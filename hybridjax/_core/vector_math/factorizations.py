@@ -14,7 +14,6 @@ infinite. Derivatives are those of the operations. G. H. Golub, C. F. Van Loan, 
 """
 
 import functools as ft
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,25 +37,25 @@ def solve_positive(
     NaN where a pivot is not positive, up to rounding: the matrix is singular, or not definite.
     """
     n = right.shape[-1]
-    lower, below = _square(n), _square(n)
+    lower, below = dict[tuple[int, int], Array](), dict[tuple[int, int], Array]()
     pivots: list[Array] = []
     singular = jnp.asarray(False)
     for j in range(n):
         for i in range(j, n):
-            below[i][j] = _less(matrix[..., i, j], [(below[i][k], lower[j][k]) for k in range(j)])
-        pivot = below[j][j]
+            below[i, j] = _less(matrix[..., i, j], [(below[i, k], lower[j, k]) for k in range(j)])
+        pivot = below[j, j]
         singular = singular | ~(pivot > n * jnp.finfo(right.dtype).eps * matrix[..., j, j])
         pivots.append(1 / pivot)
         for i in range(j + 1, n):
-            lower[i][j] = below[i][j] * pivots[j]
+            lower[i, j] = below[i, j] * pivots[j]
 
     def by_factors(_, right):
         x: list[Array] = []
         for i in range(n):
             b = right[..., i] if i else jnp.where(singular, jnp.nan, right[..., i])
-            x.append(_less(b, [(lower[i][k], x[k]) for k in range(i)]))
+            x.append(_less(b, [(lower[i, k], x[k]) for k in range(i)]))
         for i in reversed(range(n)):
-            x[i] = _less(x[i] * pivots[i], [(lower[k][i], x[k]) for k in range(i + 1, n)])
+            x[i] = _less(x[i] * pivots[i], [(lower[k, i], x[k]) for k in range(i + 1, n)])
         return jnp.stack(x, axis=-1)
 
     # (Derivatives use the factors, too.)
@@ -103,7 +102,7 @@ def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     """Return L in `matrix = L @ L.T`, with zeros above the diagonal; of the matrix the lower
     triangle is read. NaN if it is not positive definite."""
     n = matrix.shape[-1]
-    lower = _square(n, jnp.zeros_like(matrix[..., 0, 0]))
+    lower = [[jnp.zeros_like(matrix[..., 0, 0])] * n for _ in range(n)]
     for j in range(n):
         for i in range(j, n):
             x = _less(matrix[..., i, j], [(lower[i][k], lower[j][k]) for k in range(j)])
@@ -170,10 +169,6 @@ def lu(
 
     order = jnp.broadcast_to(jnp.arange(n, dtype=np.int32), matrix.shape[:-1])
     return jax.lax.fori_loop(0, n, eliminate, (matrix, jnp.zeros_like(order), order))
-
-
-def _square(n: int, fill: Any = None) -> list[list[Any]]:
-    return [[fill] * n for _ in range(n)]
 
 
 def _less(x, products):

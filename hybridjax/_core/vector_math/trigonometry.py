@@ -90,11 +90,6 @@ def _(xs, dxs):
     return (s, c), (dx * c, -dx * s)
 
 
-def _tan(x):
-    s, c = _sincos(x)
-    return s / c
-
-
 def _arctan2(y, x):
     y, x = jnp.broadcast_arrays(y, x)
     n, ax, ay = _N, abs(x), abs(y)
@@ -129,7 +124,7 @@ def _function(name: str, function: Callable, *rules: Callable) -> Callable:
 
 sin = _function("sin", lambda x: _sincos(x)[0])
 cos = _function("cos", lambda x: _sincos(x)[1])
-tan = _function("tan", _tan)
+tan = _function("tan", lambda x: jnp.divide(*_sincos(x)))
 arctan2 = _function(
     "arctan2",
     _arctan2,
