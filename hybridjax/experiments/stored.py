@@ -210,19 +210,16 @@ class ExperimentJob:
     def arrays(self) -> list[np.ndarray]:
         """Return the arrays that records depend on beside inputs and parameters: those of the
         cycle, of the sections on it, of the step schedule and of the linearization."""
-        leaves = jax.tree_util.tree_leaves(self._computed())
-        return [np.asarray(x) for x in leaves if eqx.is_array(x)]
+        leaves = jax.tree_util.tree_leaves(eqx.filter(self._computed(), eqx.is_array))
+        return [np.asarray(x) for x in leaves]
 
     def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "ExperimentJob":
         """Return the job with the arrays of another process."""
-        new = iter(arrays)
-
-        def theirs(x: Any) -> Any:
-            if not eqx.is_array(x):
-                return x
-            return jax.numpy.asarray(next(new)) if isinstance(x, jax.Array) else next(new)
-
-        placed, stepping, model = jax.tree_util.tree_map(theirs, self._computed())
+        mine, other = eqx.partition(self._computed(), eqx.is_array)
+        leaves, structure = jax.tree_util.tree_flatten(mine)
+        pairs = zip(leaves, arrays, strict=True)
+        new = [jax.numpy.asarray(x) if isinstance(old, jax.Array) else x for old, x in pairs]
+        placed, stepping, model = eqx.combine(jax.tree_util.tree_unflatten(structure, new), other)
         campaign = dataclasses.replace(self.campaign, placed=placed, stepping=stepping, model=model)
         return dataclasses.replace(self, campaign=campaign)
 
