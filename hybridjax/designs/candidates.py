@@ -68,8 +68,7 @@ class Candidates(NamedTuple):
                 "with division='random' or 'disjoint'."
             )
         line, channel = np.unique(np.stack([design.line, design.channel]), axis=1)
-        strides = design.experiments * design.periods
-        return cls(line, channel, design.periods, design.n_sections, strides)
+        return cls(line, channel, design.periods, design.n_sections, design.cycles(0))
 
     @property
     def f(self) -> Powers:

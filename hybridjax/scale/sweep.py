@@ -95,7 +95,11 @@ def sweep(
     cycle in the middle, or the cluster is lost.
     """
     require_x64()
-    space = Space(over.values, False) if isinstance(over, Points) else Space(_axes(over), True)
+    given = over.values if isinstance(over, Points) else over
+    axes = {name: np.asarray(x, float) for name, x in given.items()}
+    if not axes or not all(map(len, axes.values())):
+        raise DefinitionError("`over` must name at least one parameter, each with a value or more.")
+    space = Space(axes, not isinstance(over, Points))
     family = Family(model, list(space.axes))
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
     system = family.check(middle)
@@ -115,13 +119,6 @@ def sweep(
     }
     job = SweepJob(family, system, space, blocks, wanted, guess, description)
     return fill(job, store, client).dataset()
-
-
-def _axes(over: Axes) -> dict[str, np.ndarray]:
-    axes = {name: np.asarray(x, float) for name, x in over.items()}
-    if not axes or not all(map(len, axes.values())):
-        raise DefinitionError("`over` must name at least one parameter, each with a value or more.")
-    return axes
 
 
 class Begun(NamedTuple):

@@ -191,9 +191,8 @@ def paper_design(
 
     **Raises:** `DefinitionError` as `multisine`.
     """
-    band = 0.0, 10.0
     return multisine(
-        n_sections, periods, band, seed=seed, division=division, experiments=experiments
+        n_sections, periods, (0.0, 10.0), seed=seed, division=division, experiments=experiments
     )
 
 
