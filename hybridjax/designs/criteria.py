@@ -129,9 +129,9 @@ def _parameters(goal: Parameters, model: Model, lines: Candidates, noise: Noise)
             raise DefinitionError(f"the data do not identify {lost}: leave it out of `free`.")
         shape = 2, len(htf.harmonics), len(members), htf.H[0, 0].size
         cosine = np.broadcast_to(members[:, None], shape).ravel()
-        channels.append(Channel.direct(cosine, data.sensitivity.T))
+        channels.append(Channel(cosine, data.sensitivity))
     rows = np.eye(len(free))[[free.index(name) for name in wanted]]
-    return LinearCriterion(wanted, free, tuple(channels), rows)
+    return LinearCriterion(wanted, free, tuple(channels), rows, np.arange(len(wanted)))
 
 
 def _channels(
@@ -147,4 +147,4 @@ def _channels(
         slopes = [group.weighted(c, group.period_delay[:, None] ** j * group.data) for j in delays]
         size = np.tile(group.weight / np.abs(chi(group.period_delay, c)), 2)
         cosines = np.tile(cosine[group.line], 2)
-        yield Channel(cosines, size[:, None] * group.basis, np.concatenate(slopes, axis=1))
+        yield Channel(cosines, np.concatenate(slopes, axis=1), size[:, None] * group.basis)

@@ -40,31 +40,25 @@ class Channel(NamedTuple):
 
     cosine: Int[np.ndarray, " E"]
     """The candidate that each equation belongs to."""
-    basis: Float[np.ndarray, "E r"]
-    """Orthonormal basis of the part that numerators can explain, at power 1."""
     slopes: Float[np.ndarray, "E n"]
     """Derivatives in units of standard deviations, for several entries: those by the first unknown
     for all entries, then those by the second, ..."""
-
-    @classmethod
-    def direct(
-        cls, cosine: Int[np.ndarray, " rows"], slopes: Float[np.ndarray, "d rows"]
-    ) -> "Channel":
-        """Return measurements that depend on the unknowns directly, without numerators."""
-        return cls(cosine, np.zeros((len(cosine), 0)), slopes.T)
+    basis: Float[np.ndarray, "E r"] | None = None
+    """Orthonormal basis of the part that numerators can explain, at power 1; None: measurements
+    depend on the unknowns directly, without numerators."""
 
     def only(self, kept: Kept) -> "Channel":
         """Return the channel where only these cosines are applied, which are numbered anew."""
         rows = np.flatnonzero(np.isin(self.cosine, kept))
-        basis = self.basis[rows]
-        basis = powers_basis(basis)[0] if basis.size else basis
-        return Channel(np.searchsorted(kept, self.cosine[rows]), basis, self.slopes[rows])
+        basis = None if self.basis is None else self.basis[rows]
+        basis = powers_basis(basis)[0] if basis is not None and basis.size else basis
+        return Channel(np.searchsorted(kept, self.cosine[rows]), self.slopes[rows], basis)
 
     def rows(self, power: Powers, unknowns: int) -> Float[np.ndarray, "d rows"]:
         """Return derivatives with these powers, less the part that numerators explain."""
         weight = np.sqrt(power)[self.cosine, None]
         slopes = weight * self.slopes
-        if self.basis.shape[1]:
+        if self.basis is not None:
             q, _ = np.linalg.qr(weight * self.basis)
             slopes -= q @ (q.T @ slopes)
         return slopes.reshape(len(slopes), unknowns, -1).swapaxes(0, 1).reshape(unknowns, -1)
@@ -79,9 +73,8 @@ class LinearCriterion(eqx.Module):
     channels: tuple[Channel, ...]
     wanted: Float[np.ndarray, "rows d"]
     """Derivatives of the functions by the unknowns."""
-    part: Int[np.ndarray, " rows"] | None = None
-    """The quantity that a row belongs to, whose variance is the sum over its rows; None: each
-    quantity has one row."""
+    part: Int[np.ndarray, " rows"]
+    """The quantity that a row belongs to, whose variance is the sum over its rows."""
 
     def only(self, kept: Kept) -> "LinearCriterion":
         channels = (channel.only(kept) for channel in self.channels)
@@ -95,10 +88,8 @@ class LinearCriterion(eqx.Module):
         spread = self.wanted @ half
         influence, variances = spread @ half.T @ rows, (spread**2).sum(axis=1)
         squares = np.bincount(np.concatenate(cosine), (influence**2).sum(axis=0), len(power))
-        criterion = float(variances.sum())
-        if self.part is not None:
-            variances = np.bincount(self.part, variances)
-        return Bound(variances, squares / power, criterion)
+        each = np.bincount(self.part, variances)
+        return Bound(each, squares / power, float(variances.sum()))
 
 
 class Criterion(eqx.Module):

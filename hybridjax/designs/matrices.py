@@ -45,7 +45,7 @@ class Matrices(NamedTuple):
         self,
         wanted: Float[np.ndarray, "rows P"],
         names: tuple[str, ...],
-        part: Int[np.ndarray, " rows"] | None = None,
+        part: Int[np.ndarray, " rows"],
     ) -> LinearCriterion:
         """Return the criterion of functions with these derivatives by the coordinates.
 
@@ -53,8 +53,7 @@ class Matrices(NamedTuple):
 
         **Raises:** `DefinitionError` if the usual design does not determine them.
         """
-        row = np.arange(len(wanted)) if part is None else part
-        shown, hidden = (np.bincount(row, ((wanted @ r) ** 2).sum(axis=1)) for r in self.spread)
+        shown, hidden = (np.bincount(part, ((wanted @ r) ** 2).sum(axis=1)) for r in self.spread)
         if (hidden > _MISSED * (shown + hidden)).any():
             raise DefinitionError("`design` does not determine the `goal`: add harmonics or lines.")
         wanted = wanted @ self.spread.root
@@ -91,7 +90,7 @@ def ldtp_matrices(
     for lines, rows in _rows(coordinates, htfs, scale):
         cosine.append(np.repeat(lines, rows.shape[2]))
         slopes.append(spread.root.T @ _flat(rows))
-    channel = Channel.direct(np.concatenate(cosine), np.concatenate(slopes, axis=1))
+    channel = Channel(np.concatenate(cosine), np.concatenate(slopes, axis=1).T)
     return Matrices(coordinates, channel, spread)
 
 

@@ -17,8 +17,8 @@ def criterion(slopes):
     """Return that of unknowns with these derivatives (d, K), one row for each cosine."""
     d, K = slopes.shape
     names = tuple(f"x{k}" for k in range(d))
-    channels = (Channel.direct(np.arange(K), slopes),)
-    return Criterion((LinearCriterion(names, names, channels, np.eye(d)),))
+    channels = (Channel(np.arange(K), slopes.T),)
+    return Criterion((LinearCriterion(names, names, channels, np.eye(d), np.arange(d)),))
 
 
 def limits(cost, curved=None):
