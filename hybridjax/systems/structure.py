@@ -425,13 +425,9 @@ class Outputs:
     def __init__(self, structure: Structure, outputs: Sequence[str | Output]):
         self.structure = structure
         defined = {o.name: o for o in structure.system.outputs()}
-        self.items: list[str | Output] = []
-        for item in outputs:
-            if isinstance(item, str) and item in defined:
-                item = defined[item]
-            if isinstance(item, str):
-                require_among("output", [item], structure.output_names())
-            self.items.append(item)
+        items = [defined.get(x, x) if isinstance(x, str) else x for x in outputs]
+        self.items: list[str | Output] = items
+        require_among("output", [x for x in items if isinstance(x, str)], structure.output_names())
         states = {str(name): name for name in structure.state_names()}
         self.names = tuple(
             states[o] if isinstance(o, str) else Signal(o.name, o.unit) for o in self.items
