@@ -129,9 +129,10 @@ def _clear_old_traces(things: Iterable[Any], definition: str) -> None:
 
 
 def _is_traced_by_identity(x: Any) -> bool:
-    if type(x).__hash__ is not object.__hash__ or not type(x).__weakrefoffset__:
-        return False
-    return isinstance(x, _JITTED) or not is_packaged(getattr(x, "__module__", None))
+    # (A function of `exec` without a `__name__` has no module.)
+    module = getattr(x, "__module__", None) or "exec" * isinstance(x, types.FunctionType)
+    by_identity = type(x).__hash__ is object.__hash__ and bool(type(x).__weakrefoffset__)
+    return by_identity and (isinstance(x, _JITTED) or not is_packaged(module))
 
 
 def meaning(*things: Any) -> str:
@@ -307,7 +308,8 @@ class _Walk:
         for base in inspect.getmro(x):
             module = str(base.__module__)  # (of a metaclass it may be a descriptor)
             self._origin(module, base.__qualname__)
-            if not is_packaged(module):
+            # (A class of `exec` without a `__name__` has the module of Python's own.)
+            if not is_packaged(module) or (module == "builtins" and "__module__" in vars(base)):
                 self.visit({k: v for k, v in vars(base).items() if not _is_description(k, v)})
         self.visit(type(x))
         self.classes -= 1

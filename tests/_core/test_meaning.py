@@ -132,14 +132,14 @@ WAYS = {
 }
 
 
+@pytest.mark.parametrize("named", [{"__name__": "users_module"}, {}])
 @pytest.mark.parametrize("way", WAYS)
-def test_a_change_is_noticed(way, monkeypatch):
+def test_a_change_is_noticed(way, named, monkeypatch):
     monkeypatch.setenv("K", "1")
     before, change = WAYS[way]
-    space = {"__name__": "users_module", "other": types.ModuleType("users_other")}
-    space["other"].K, space["other"].h = 1, lambda x: x
-    space["other"].inner = types.ModuleType("users_inner")
-    space["other"].inner.K = 1
+    other, inner = (types.ModuleType(x) for x in ("users_other", "users_inner"))
+    other.K, other.h, other.inner, inner.K = 1, lambda x: x, inner, 1
+    space = {**named, "other": other}
     exec(before, space)
     digest = meaning(space["f"])
     assert meaning(space["f"]) == digest
