@@ -266,11 +266,6 @@ class FiveLinkBiped(HybridSystem):
     def guess(self):
         s, k = self.stride, self.knee / 2
         rate, bend = 1.5, 2 * self.lift / self.stride
-        return Guess(
-            "step",
-            (
-                *(-s + k, -s - k, self.lean, s - k, s + k),
-                *(rate, rate, 0.0, -rate * (1 + bend / 2), -rate * (1 - bend / 2)),
-            ),
-            after="touchdown",
-        )
+        angles = -s + k, -s - k, self.lean, s - k, s + k
+        rates = rate, rate, 0.0, -rate * (1 + bend / 2), -rate * (1 - bend / 2)
+        return Guess("step", (*angles, *rates), after="touchdown")

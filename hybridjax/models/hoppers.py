@@ -205,11 +205,10 @@ class HopperPair(VerticalHopper):
         return Transition(name, _PAIR_CHARTS[down], _PAIR_CHARTS[after], guard, reset=reset)
 
     def draw(self, chart, t, q):
-        (lines, circles), (second, more) = (
-            _hopper(i, q[f"yM{i + 1}"], q[f"ym{i + 1}"]) for i in (0, 1)
-        )
+        hoppers = [_hopper(i, q[f"yM{i + 1}"], q[f"ym{i + 1}"]) for i in (0, 1)]
+        (first, circles), (second, more) = hoppers
         between = Drawing.spring((0.3, q["yM1"]), (1.2, q["yM2"]))
-        lines = {"ground": [(-1.0, 0.0), (2.5, 0.0)], **lines, **second, "coupling": between}
+        lines = {"ground": [(-1.0, 0.0), (2.5, 0.0)], **first, **second, "coupling": between}
         return Drawing(lines, circles={**circles, **more})
 
     def guess(self):
