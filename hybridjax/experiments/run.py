@@ -38,12 +38,8 @@ from .response import Course, Feedback, course, flow_batch, require_shape
 from .start import StartName, linearized, periodic_start, steady_start
 
 
-DesignLike = (
-    Design
-    | Annotated[
-        np.ndarray | jax.Array, Reals("experiments samples inputs", missing=True, infinite=True)
-    ]
-)
+_SAMPLES = Reals("experiments samples inputs", missing=True, infinite=True)
+DesignLike = Design | Annotated[np.ndarray | jax.Array, _SAMPLES]
 """A design, or inputs. (Arrays may lie on disk: their values are checked part by part.)"""
 
 # From so many samples in all, a run waits for the optimized program: it takes 10 s longer to

@@ -129,9 +129,8 @@ def _replaced(jaxpr: jex.Jaxpr, trigonometry: bool) -> jex.Jaxpr:
         for eqn in solved
         if eqn.primitive is not primitives.lu_p or not needed.isdisjoint(eqn.outvars)
     ]
-    same = len(eqns) == len(jaxpr.eqns)
-    changed = not same or any(new is not old for new, old in zip(eqns, jaxpr.eqns, strict=True))
-    return jaxpr.replace(eqns=eqns) if changed else jaxpr
+    same = list(map(id, eqns)) == list(map(id, jaxpr.eqns))
+    return jaxpr if same else jaxpr.replace(eqns=eqns)
 
 
 def _replaced_equation(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn:

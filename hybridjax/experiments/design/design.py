@@ -264,9 +264,8 @@ class Design(eqx.Module):
         """Return the cosines repeated, with other phases, in other experiments."""
         phase, experiment = phase.ravel(), experiment.ravel()
         order = np.lexsort((np.tile(self.line, count), experiment))
-        each: dict[str, Any] = {
-            n: np.tile(getattr(self, n), count)[order] for n in ("line", "channel", "amplitude")
-        }
+        same = "line", "channel", "amplitude"
+        each: dict[str, Any] = {n: np.tile(getattr(self, n), count)[order] for n in same}
         return dataclasses.replace(
             self,
             experiment=experiment[order],
