@@ -81,7 +81,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Otherwise nothing is written, and it exits with a sentence: with 1 where something failed, 2 for
     options that are wrong or contradict each other, 130 where it was interrupted.
     """
-    options = _parser().parse_args(arguments)
+    parser = argparse.ArgumentParser(
+        prog="hybridjax", description="Identify the dynamics of rhythmic hybrid systems."
+    )
+    parser.add_argument("--version", action="version", version=f"hybridjax {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_reproduce(commands)
+    _add_identify(commands)
+    _add_sweep(commands)
+    options = parser.parse_args(arguments)
     # XLA reports, as errors, that cached programs name CPU features of its own; and for small
     # matrices more BLAS threads than one only wait for each other.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -95,18 +103,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("hybridjax: interrupted.", file=sys.stderr)
         sys.exit(130)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="hybridjax", description="Identify the dynamics of rhythmic hybrid systems."
-    )
-    parser.add_argument("--version", action="version", version=f"hybridjax {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    _add_reproduce(commands)
-    _add_identify(commands)
-    _add_sweep(commands)
-    return parser
 
 
 def _add_reproduce(commands) -> None:
