@@ -133,7 +133,9 @@ def make_plan(
     # The largest share of the accuracy for each section that keeps their sum.
     section = np.arange(N)
     for share in accuracy * 0.5 ** np.arange(0, 4 + N.bit_length()):
-        best = _cheapest(impact, share)
+        # The first candidate of each section with so small an impact, or the best.
+        enough = impact <= share
+        best = np.where(enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0))
         total = impact[best, section].sum()
         if total <= accuracy:
             break
@@ -222,12 +224,6 @@ def _try_ways(placed: PlacedSections, settings: Settings, kicks: Float[Array, "M
         shortest = taken.reshape(W, M, N)[:K].min(axis=1)
         first = xp.where(shortest < 0.9 * first, shortest, longest)
     return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
-
-
-def _cheapest(impact: Float[np.ndarray, "K N"], share: float) -> Int[np.ndarray, " N"]:
-    """Return the first candidate of each section whose impact is at most `share`, or the best."""
-    enough = impact <= share
-    return np.where(enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0))
 
 
 def _lead(placed: PlacedSections, target):

@@ -1,5 +1,6 @@
 """Systems as a function of parameters, and the points at which a sweep evaluates them."""
 
+import contextlib
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -146,12 +147,10 @@ class Family:
 
     def units(self, system: HybridSystem) -> dict[str, str]:
         """Return the units of the parameters, "" if unknown."""
-        units = {}
+        units = dict.fromkeys(self.names, "")
         for name in self.names:
-            try:
+            with contextlib.suppress(AttributeError, KeyError):  # a parameter of a function
                 units[name] = unit_of_parameter(system, name)
-            except (AttributeError, KeyError):  # a parameter of a function
-                units[name] = ""
         return units
 
     def describe(self, system: HybridSystem) -> dict[str, Any]:

@@ -66,11 +66,10 @@ def sliding(
         raise DefinitionError(f"charts '{above}' and '{below}' need the same states and inputs.")
     middle = SlidingChart(f, g, surface)
     height = lambda t, q, u: surface(t, q)  # noqa: E731
-    held = lambda t, q, u: middle.rates(t, q, u)[1] >= 0  # noqa: E731
-    borne = lambda t, q, u: middle.rates(t, q, u)[0] <= 0  # noqa: E731
+    up, down = (lambda t, q, u, k=k: middle.rates(t, q, u)[k] for k in (0, 1))
+    held = lambda t, q, u: down(t, q, u) >= 0  # noqa: E731
+    borne = lambda t, q, u: up(t, q, u) <= 0  # noqa: E731
     no = lambda predicate: lambda t, q, u: ~predicate(t, q, u)  # noqa: E731
-    up = lambda t, q, u: middle.rates(t, q, u)[0]  # noqa: E731
-    down = lambda t, q, u: middle.rates(t, q, u)[1]  # noqa: E731
 
     def event(source, target, guard, sense: Direction = "falling", enabled=None):
         return Transition(f"{source} to {target}", source, target, guard, sense, enabled=enabled)
