@@ -286,17 +286,13 @@ class ObservedCycle(AbstractObservation):
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         t, y = observed_at(cycle, self.sections, self.outputs, last_turn(cycle))
+        predicted = {"values": y, "times": _times(cycle, t), "period": cycle.period}
         parts = []
         for name, measured, scale in zip(self.which, self.measured, self.scales, strict=True):
-            if name == "values":
-                error = y - measured
-            elif name == "times":
-                error = _times(cycle, t) - measured
-                if cycle.clocked:
-                    turns = jnp.round(error / cycle.period)
-                    error = error - jax.lax.stop_gradient(turns) * cycle.period
-            else:
-                error = cycle.period - measured
+            error = predicted[name] - measured
+            if name == "times" and cycle.clocked:
+                turns = jnp.round(error / cycle.period)
+                error = error - jax.lax.stop_gradient(turns) * cycle.period
             parts.append((error / scale).ravel())
         return jnp.concatenate(parts)
 

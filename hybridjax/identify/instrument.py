@@ -17,7 +17,7 @@ $M - 2 n + \mathrm{tr}\, (\hat U \hat U^*)^{-1} U U^*$, n the number of rows of 
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Int
@@ -73,13 +73,12 @@ def in_loop(data: RecordedData, reference: Sequence[str]) -> tuple[list[Record],
     names = records[0].inputs
     roles = Roles.of(names, reference)
     require_loop(roles, [r.u for r in records], names)
-    pick = lambda x: tuple(names[i] for i in x)  # noqa: E731
+    inputs, references = (tuple(names[i] for i in columns) for columns in roles)
     plant, drive = [], []
     for r in records:
         u, ref = r.u[:, roles.inputs], r.u[:, roles.references]
-        plant.append(dataclasses.replace(r, u=u, inputs=pick(roles.inputs)))
-        ends: dict[str, Any] = dict(inputs=pick(roles.references), outputs=pick(roles.inputs))
-        drive.append(dataclasses.replace(r, u=ref, y=u, **ends))
+        plant.append(dataclasses.replace(r, u=u, inputs=inputs))
+        drive.append(dataclasses.replace(r, u=ref, y=u, inputs=references, outputs=inputs))
     return plant, drive
 
 

@@ -432,10 +432,8 @@ def _combined(
     freedoms = [x.scatter.freedom for x in terms if x.scatter is not None]
     scatter = None
     if freedoms:  # of all lines of a class, the least
-        least = jnp.min(jnp.stack(freedoms), axis=0)[lines.row].min(axis=1)
-        rows = np.zeros(len(first.f), int)
-        rows[lines.row] = np.arange(len(lines.row))[:, None]
-        scatter = Scatter(least[rows], shared=True)
+        least = jnp.min(jnp.stack(freedoms), axis=0)[lines.row].min(axis=1, keepdims=True)
+        scatter = Scatter(jnp.zeros(len(first.f)).at[lines.row].set(least), shared=True)
     source = "exact" if all(x.source == "exact" for x in terms) else "estimate"
     return HTF(
         first.f, lines.entries(result), every, N, inputs, outputs, source,

@@ -195,7 +195,7 @@ class LDTP(eqx.Module):
         `D[n]` for `r = 0`, then `C[n] A[n-1] ... A[n-r+1] B[n-r]`.
         """
         require_x64(self)
-        return time_response.impulse_response(self.A, self.B, self.C, self.D, n_lags)
+        return time_response.impulse_response(self.matrices, n_lags)
 
     def htf(self, f: Frequencies, harmonics: Harmonics | None = None) -> HTF:
         """The exact harmonic transfer functions.
@@ -356,7 +356,7 @@ class LDTP(eqx.Module):
     def _response(self, u, x0, first_section):
         u, x0 = self._input(u), self._state(x0, first_section)
         sections = (first_section + jnp.arange(len(u))) % self.n_sections
-        return time_response.response(self.A, self.B, self.C, self.D, u, x0, sections)
+        return time_response.response(self.matrices, u, x0, sections)
 
     def _input(self, u):
         require_x64()

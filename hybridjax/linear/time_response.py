@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from .._core.compilation import host_first
 from .._core.executor import Array, namespace, scan, solve
+from .algebra import Matrices
 
 
 def monodromy(A: Float[Array, "N *S d d"]) -> Float[Array, "*S d d"]:
@@ -30,10 +31,7 @@ def _multiplied(product, factor):
 
 @jax.jit
 def response(
-    A: Float[Array, "N d d"],
-    B: Float[Array, "N d nu"],
-    C: Float[Array, "N ny d"],
-    D: Float[Array, "N ny nu"],
+    m: Matrices,
     u: Float[Array, "n nu"],
     x0: Float[Array, " d"],
     sections: Int[Array, " n"],
@@ -42,28 +40,23 @@ def response(
 
     def advance(x, step):
         n, u = step
-        return A[n] @ x + B[n] @ u, x
+        return m.A[n] @ x + m.B[n] @ u, x
 
     last, x = jax.lax.scan(advance, x0, (sections, u))
-    y = jnp.einsum("nij,nj->ni", C[sections], x) + jnp.einsum("nij,nj->ni", D[sections], u)
+    C, D = m.C[sections], m.D[sections]
+    y = jnp.einsum("nij,nj->ni", C, x) + jnp.einsum("nij,nj->ni", D, u)
     return jnp.concatenate([x, last[None]]), y
 
 
 @functools.partial(jax.jit, static_argnames="n_lags")
-def impulse_response(
-    A: Float[Array, "N d d"],
-    B: Float[Array, "N d nu"],
-    C: Float[Array, "N ny d"],
-    D: Float[Array, "N ny nu"],
-    n_lags: int,
-) -> Float[Array, "N lags ny nu"]:
+def impulse_response(m: Matrices, n_lags: int) -> Float[Array, "N lags ny nu"]:
     """`D[n]`, then `C[n] A[n-1] ... A[n-r+1] B[n-r]` at `[n, r]`, for all sections at once."""
 
     def advance(x, _):
-        return jnp.roll(A @ x, 1, axis=0), C @ x
+        return jnp.roll(m.A @ x, 1, axis=0), m.C @ x
 
-    _, later = jax.lax.scan(advance, jnp.roll(B, 1, axis=0), length=n_lags - 1)
-    return jnp.concatenate([D[None], later]).swapaxes(0, 1)
+    _, later = jax.lax.scan(advance, jnp.roll(m.B, 1, axis=0), length=n_lags - 1)
+    return jnp.concatenate([m.D[None], later]).swapaxes(0, 1)
 
 
 @host_first

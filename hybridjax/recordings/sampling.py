@@ -224,10 +224,8 @@ def _with_times(
             for p in parts
         ]
         section = np.concatenate([p.k % N for p in parts])
-        t, cycle = np.concatenate([p.t for p in parts]), np.concatenate(cycles).astype(float)
-        count = np.maximum(np.bincount(section, minlength=N), 1)
-        x = cycle - (np.bincount(section, cycle, N) / count)[section]
-        z = t - (np.bincount(section, t, N) / count)[section]
+        both = np.stack([np.concatenate(cycles), np.concatenate([p.t for p in parts])], axis=1)
+        x, z = (both - average_cycle(section, both, N)[section]).T
         late = np.split(z - (x @ z) / (x @ x) * x, np.cumsum([len(p.k) for p in parts])[:-1])
     sections = []
     for p, z in zip(parts, late, strict=True):

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 import hybridjax as hj
 from hybridjax.errors import FindingWarning
 from hybridjax.identify.series.fit import gradient_covariance
-from hybridjax.identify.series.linearization import each_fit, linearize
+from hybridjax.identify.series.linearization import each_fit, filtered_response, linearize
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.records import PreparedRecords
 
@@ -89,7 +89,8 @@ def slopes_of(problem, solution):
 
     def section(_, part, n, fit, regression):
         x = part.y[:, :, n, fit.outputs, None]
-        slopes[n] = fit.samples(solution.c, regression, x)[1].ravel()
+        fitted = filtered_response(fit.coefficients, solution.c, regression, x)
+        slopes[n] = regression.residual(fit.slopes, fitted).ravel()
 
     each_fit(problem, solution, section)
     return np.stack([slopes[n] for n in sorted(slopes)], axis=1)

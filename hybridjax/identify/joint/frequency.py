@@ -83,12 +83,8 @@ def transfer(
 ) -> Complex[np.ndarray, "M F ny nu"]:
     """Return the harmonic transfer functions of a model."""
     N = model.n_sections
-    G = np.stack(
-        [
-            _real_times(C, x) + D[:, None, :]
-            for x, C, D in zip(states_at(model, f), model.C, model.D, strict=True)
-        ]
-    )  # (N, ny, F, nu)
+    states = zip(states_at(model, f), model.C, model.D, strict=True)
+    G = np.stack([_real_times(C, x) + D[:, None] for x, C, D in states])  # (N, ny, F, nu)
     waves = np.exp(-2j * np.pi / N * np.outer(harmonics, np.arange(N))) / N
     return np.tensordot(waves, G, 1).swapaxes(1, 2)
 

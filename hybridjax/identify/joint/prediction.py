@@ -364,11 +364,9 @@ class Predictor(NamedTuple):
         """Return the outputs expected at each sample, given the samples before it."""
         part = SeriesPart.of(grid, np.ones(self.S.shape[1]))
         path = SeriesProblem([part], self.S, True, free_start, 0).path(self.model, part)
-        expected = [
-            x @ C.T + u @ D.T
-            for x, C, u, D in zip(path.x, self.model.C, part.u, self.model.D, strict=True)
-        ]
-        expected = np.where(part.sampled, part.y - np.stack(path.error), np.stack(expected))
+        states = zip(path.x, self.model.C, part.u, self.model.D, strict=True)
+        outputs = np.stack([x @ C.T + u @ D.T for x, C, u, D in states])
+        expected = np.where(part.sampled, part.y - np.stack(path.error), outputs)
         return np.moveaxis(expected, 0, 2)
 
     def errors(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "R T N ny"]:

@@ -107,9 +107,8 @@ def given_dims(dims: Any, N: int, name: str = "dims") -> list[int] | None:
     """
     if dims is None:
         return None
-    chosen = np.broadcast_to(np.asarray(dims), N) if np.ndim(dims) == 0 else np.asarray(dims)
-    require_axes(f"`{name}`", chosen, {"sections": N})
-    return [int(d) for d in chosen]
+    require_axes(f"`{name}`", dims, {}, {"sections": N})
+    return np.broadcast_to(dims, N).tolist()
 
 
 def _bases(

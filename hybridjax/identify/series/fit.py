@@ -28,7 +28,7 @@ from ..multipliers import refuse_invented
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
 from .in_loop import LoopEquations
-from .linearization import Linearization, each_fit, linearize, measured_outputs, minimize, sum_up
+from .linearization import Linearization, each_fit, filtered_response, linearize, minimize, sum_up
 from .output_error import OutputErrorProblem, SectionRegression, TooFewCycles
 from .records import (
     SLOW,
@@ -372,8 +372,8 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
     gram, freedom = np.zeros((ny, order + 1, order + 1)), 0
     for section in sum_up(problem, np.zeros(0), past, regress):
         for each in section:
-            gram[each.fit.outputs] += each.products
-            freedom += max(round(each.freedom) - each.fit.root.shape[1], 0) * len(each.fit.outputs)
+            gram[each.outputs] += each.products
+            freedom += max(round(each.freedom) - each.root.shape[1], 0) * len(each.outputs)
     return DelayedOutputs(gram, freedom)
 
 
@@ -441,7 +441,7 @@ def gradient_covariance(
 
     def outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         """Return the outputs, and noise filtered by the system."""
-        y = measured_outputs(k, part, n)
+        y = part.y[:, :, n, :, None]
         draws = np.random.default_rng((k, n)).standard_normal((*y.shape[:3], _FILTERED_DRAWS))
         return np.concatenate([y, divide_by_chi(memory, draws)], axis=-1)
 
@@ -457,7 +457,8 @@ def gradient_covariance(
         weights = denominator.inverse_of_remainder(inputs @ inputs.swapaxes(1, 2))
         x = outputs(k, part, n)[:, :, fit.outputs]
         error = regression.residual(fit.coefficients, x).reshape(x.shape)
-        _, slopes = fit.first.samples(solution.c, regression, x[..., :1])
+        a, by_c, y = (v[..., :1] for v in (fit.coefficients, fit.slopes, x))
+        slopes = regression.residual(by_c, filtered_response(a, solution.c, regression, y))
         slopes = np.moveaxis(slopes[..., 0], 1, -1).reshape(*error.shape[:3], d)
         square = [(x**2).sum(axis=(0, 1, 2)) for x in (error, backward(error))]
         late = backward(slopes)

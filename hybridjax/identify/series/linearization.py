@@ -1,6 +1,7 @@
 """The linearized output-error problem at some c: sums over all records, and its minimum in c."""
 
 import functools
+import itertools
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ Regress = Callable[[int, CycleGrid, int], list[SectionRegression]]
 
 
 class SectionFit(NamedTuple):
-    """The best fit of some outputs of a section, with equal weights."""
+    """The best fit of some outputs of a section, with equal weights, and sums over all records."""
 
     outputs: list[int]
     root: Float[np.ndarray, "r k"]
@@ -29,27 +30,6 @@ class SectionFit(NamedTuple):
     """Coefficients of the inputs, for C columns of each of m outputs."""
     slopes: Float[np.ndarray, "r d m C"]
     """Their derivatives with respect to c."""
-
-    @property
-    def first(self) -> "SectionFit":
-        """The fit of the first column."""
-        return self._replace(coefficients=self.coefficients[..., :1], slopes=self.slopes[..., :1])
-
-    def samples(
-        self, c: Coefficients, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]
-    ) -> tuple[Float[np.ndarray, "rows m C"], Float[np.ndarray, "rows d m C"]]:
-        """Return the weighted residuals and their derivatives with respect to c.
-
-        The derivatives omit the term that vanishes with the residuals (Kaufman 1975).
-        """
-        fitted = filtered_response(self.coefficients, c, regression, x)
-        return regression.residual(self.coefficients, x), regression.residual(self.slopes, fitted)
-
-
-class SectionSums(NamedTuple):
-    """Sums over all records for some outputs of a section."""
-
-    fit: SectionFit
     freedom: float
     products: Float[np.ndarray, "m C C"]
     """Products of the residuals of different columns."""
@@ -63,11 +43,12 @@ class SectionSums(NamedTuple):
         c: Coefficients,
         regressions: list[SectionRegression],
         columns: list[Float[np.ndarray, "_ _ m C"]],
-    ) -> "SectionSums":
+    ) -> "SectionFit":
         """Fit the columns of all grids.
 
         The normal equations are solved twice, and the second solution removes rounding errors: the
-        result is as accurate as that of one QR decomposition.
+        result is as accurate as that of one QR decomposition. The derivatives of the residuals omit
+        the term that vanishes with these (Kaufman 1975).
         """
         pairs = list(zip(regressions, columns, strict=True))
         root = root_of(_total(r.along(r.remainder) for r in regressions))
@@ -79,15 +60,18 @@ class SectionSums(NamedTuple):
         a = first + solve(_total(r.along(r.residual(first, x)) for r, x in pairs))
         fitted = (r.reduced(filtered_response(first, c, r, x)) for r, x in pairs)
         slopes = solve(_total(r.along(x) for r, x in zip(regressions, fitted, strict=True)))
-        fit = SectionFit(outputs, root, a, slopes)
-        samples = [fit.samples(c, r, x) for r, x in pairs]
-        missed = _total(r.along(s) for r, (_, s) in zip(regressions, samples, strict=True))
-        curvature = _total(np.einsum("rimk,rjmk->mij", s, s) for _, s in samples)
+        errors = [r.residual(a, x) for r, x in pairs]
+        by_c = [r.residual(slopes, filtered_response(a, c, r, x)) for r, x in pairs]
+        missed = _total(r.along(s) for r, s in zip(regressions, by_c, strict=True))
+        curvature = _total(np.einsum("rimk,rjmk->mij", s, s) for s in by_c)
         return cls(
-            fit,
+            outputs,
+            root,
+            a,
+            slopes,
             sum(r.freedom for r in regressions),
-            _total(np.einsum("rmk,rml->mkl", x, x) for x, _ in samples),
-            _total(np.einsum("rjmk,rmk->mj", s, x) for x, s in samples),
+            _total(np.einsum("rmk,rml->mkl", x, x) for x in errors),
+            _total(np.einsum("rjmk,rmk->mj", *x) for x in zip(by_c, errors, strict=True)),
             curvature - np.einsum("rimk,rjmk->mij", missed, solve(missed)),
         )
 
@@ -143,15 +127,15 @@ def measured_outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T 
 
 def sum_up(
     problem: OutputErrorProblem, c: Coefficients, outputs: Outputs, regress: Regress
-) -> list[list[SectionSums]]:
-    """Return the sums of each section, with one regression for each list of outputs."""
+) -> list[list[SectionFit]]:
+    """Return the fits of each section, with one regression for each list of outputs."""
     parts = problem.parts()
 
-    def section(n: int) -> list[SectionSums]:
+    def section(n: int) -> list[SectionFit]:
         regressions = [regress(k, part, n) for k, part in enumerate(parts)]
         columns = [outputs(k, part, n) for k, part in enumerate(parts)]
         return [
-            SectionSums.of(alike, c, list(each), [x[:, :, alike] for x in columns])
+            SectionFit.of(alike, c, list(each), [x[:, :, alike] for x in columns])
             for alike, each in zip(problem.alike[n], zip(*regressions, strict=True), strict=True)
         ]
 
@@ -166,22 +150,20 @@ def linearize(
     **Arguments:** `outputs`: columns to take in place of the measured outputs.
     """
     (N, _, ny), d = problem.shape, len(c)
-    sums = sum_up(problem, c, outputs, _regressions_at(problem, c))
     out = Linearization(
         c=c,
         square=np.zeros((N, ny)),
         gradient=np.zeros((ny, d)),
         curvature=np.zeros((ny, d, d)),
         freedom=np.zeros((N, ny), int),
-        fits=[[each.fit for each in section] for section in sums],
+        fits=sum_up(problem, c, outputs, _regressions_at(problem, c)),
     )
-    for n, section in enumerate(sums):
-        for each in section:
-            which = each.fit.outputs
-            out.square[n, which] = np.trace(each.products, axis1=1, axis2=2)
-            out.gradient[which] += each.gradient
-            out.curvature[which] += each.curvature
-            out.freedom[n, which] = round(each.freedom) - each.fit.root.shape[1]
+    for n, section in enumerate(out.fits):
+        for fit in section:
+            out.square[n, fit.outputs] = np.trace(fit.products, axis1=1, axis2=2)
+            out.gradient[fit.outputs] += fit.gradient
+            out.curvature[fit.outputs] += fit.curvature
+            out.freedom[n, fit.outputs] = round(fit.freedom) - fit.root.shape[1]
     return out
 
 
@@ -206,17 +188,13 @@ def each_fit(
     """Return, for each grid, the results of `work` at all sections and lists of outputs."""
     parts, regress = problem.parts(), _regressions_at(problem, solution.c)
 
-    def section(n: int) -> list[list[Any]]:
-        return [
-            [
-                work(k, part, n, fit, regression)
-                for fit, regression in zip(solution.fits[n], regress(k, part, n), strict=True)
-            ]
-            for k, part in enumerate(parts)
-        ]
+    def section(k: int, n: int) -> list[Any]:
+        pairs = zip(solution.fits[n], regress(k, parts[k], n), strict=True)
+        return [work(k, parts[k], n, *pair) for pair in pairs]
 
-    by_section = on_all_cores(section, range(problem.records.n_sections))
-    return [[x for grids in by_section for x in grids[k]] for k in range(len(parts))]
+    sections = range(problem.records.n_sections)
+    by_part = (on_all_cores(functools.partial(section, k), sections) for k in range(len(parts)))
+    return [list(itertools.chain(*by_section)) for by_section in by_part]
 
 
 def minimize(
