@@ -9,6 +9,7 @@ Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\vareps
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import count
 from typing import Any, Literal, NamedTuple
 
@@ -226,13 +227,11 @@ def summarize(
     square = shares.sum(axis=0)
     if errors == "variance":
         return sandwich(square - noise, square), cost, freedom
-    try:
+    with suppress(np.linalg.LinAlgError):  # some combination of coefficients is unknown
         root = np.linalg.cholesky(square)
         half = np.linalg.inv(root)
         left = inverse_of_remainder(half @ shares @ half.T, 0.5)
         score = np.einsum("lij,lj->li", left, score @ half.T) @ root.T
-    except np.linalg.LinAlgError:  # some combination of coefficients is unknown
-        pass
     return sandwich(square - noise, score.T @ score, shares), cost, freedom
 
 

@@ -68,8 +68,7 @@ def realize(
         return _from_htf(source, dims, order)
     spread = inputs = outputs = None
     if isinstance(source, SeriesFit):
-        N, R = source.numerators.shape[:2]
-        inputs, outputs = source.inputs, source.outputs
+        N, inputs, outputs = source.n_sections, source.inputs, source.outputs
         p = default_horizon(N)
         markov = source.impulse_response(2 * p + 1)
         spread = np.sqrt((source.roots**2).sum(axis=4).mean(axis=(0, 2, 3))) * source.noise

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from ..._core.execution import on_all_cores
 from ..descent import ROUGH, Coefficients, least_squares
 from .output_error import OutputErrorProblem, SectionRegression, root_of
-from .records import CycleGrid, divide_by_chi, lagged_inputs, start_responses
+from .records import CycleGrid, delay_cycles, divide_by_chi, lagged_inputs, start_responses
 
 
 Outputs = Callable[[int, CycleGrid, int], Float[np.ndarray, "S T ny C"]]
@@ -87,10 +87,10 @@ def filtered_response(
     x: Float[np.ndarray, "S T m C"],
 ) -> Float[np.ndarray, "S T d m C"]:
     """Return q^-jN / chi of the fitted outputs, j = 1, ..., d."""
-    fitted = regression.response(a, x)
+    filtered = divide_by_chi(c, regression.response(a, x))
     out = np.zeros((*x.shape[:2], len(c), *x.shape[2:]))
     for j in range(len(c)):
-        out[:, :, j] = divide_by_chi(c, fitted, j + 1)
+        out[:, :, j] = delay_cycles(filtered, j + 1)
     return out
 
 

@@ -144,10 +144,10 @@ def delay_cycles(
 
 
 def divide_by_chi(
-    c: Float[np.ndarray, " d"], x: Float[np.ndarray, "S T *columns"], delay: int = 0
+    c: Float[np.ndarray, " d"], x: Float[np.ndarray, "S T *columns"]
 ) -> Float[np.ndarray, "S T *columns"]:
-    """Filter x by 1 / chi from cycle to cycle, and delay it by a number of cycles."""
-    return delay_cycles(np.asarray(lfilter([1.0], np.concatenate([[1.0], c]), x, axis=1)), delay)
+    """Filter x by 1 / chi from cycle to cycle."""
+    return np.asarray(lfilter([1.0], np.append(1.0, c), x, axis=1))
 
 
 def start_responses(

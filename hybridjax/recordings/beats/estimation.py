@@ -149,10 +149,14 @@ def projected(
 
 
 def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
-    """Return the blocks whose errors count as independent."""
-    if int(intervals.trial[-1]) + 1 >= _BLOCKS:
-        return intervals.trial
-    return intervals.blocks(max(_SHORTEST_BLOCK, len(intervals.start) // (2 * _BLOCKS)))
+    """Return the blocks whose errors count as independent: successive intervals of one trial."""
+    trial, counts = intervals.trial, np.bincount(intervals.trial)
+    if len(counts) >= _BLOCKS:
+        return trial
+    length = max(_SHORTEST_BLOCK, len(trial) // (2 * _BLOCKS))
+    place = np.concatenate([np.arange(n) for n in counts])
+    block = np.minimum(place // length, np.maximum(counts[trial] // length, 1) - 1)
+    return np.unique(trial * (block.max() + 1) + block, return_inverse=True)[1]
 
 
 def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:

@@ -61,13 +61,6 @@ class Intervals(NamedTuple):
         """Return sums over each trial."""
         return np.bincount(self.trial, values)
 
-    def blocks(self, length: int) -> Int[np.ndarray, " L"]:
-        """Return the block of each interval: successive intervals of one trial."""
-        counts = np.bincount(self.trial)
-        place = np.concatenate([np.arange(n) for n in counts])
-        block = np.minimum(place // length, np.maximum(counts[self.trial] // length, 1) - 1)
-        return np.unique(self.trial * (block.max() + 1) + block, return_inverse=True)[1]
-
 
 def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     """Return the intervals between events, with the input of that name, linear between samples,

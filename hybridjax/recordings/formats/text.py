@@ -5,6 +5,7 @@ import csv
 import re
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
 
@@ -125,12 +126,9 @@ def read_table(
             raise FileFormatError(f"{text}export one of the two, and no separators of thousands.")
         lines = [x.replace(",", ".") for x in lines]
     values = np.zeros((0, 0))
-    try:  # a number in every field
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about an empty table
-            values = np.loadtxt(lines, delimiter=sep or None, ndmin=2, comments=None, quotechar='"')
-    except ValueError:
-        pass
+    with suppress(ValueError), warnings.catch_warnings():  # a number in every field
+        warnings.simplefilter("ignore")  # about an empty table
+        values = np.loadtxt(lines, delimiter=sep or None, ndmin=2, comments=None, quotechar='"')
     if values.shape[1] != len(headers):
         values = _by_line(path, headers, lines, start, sep)
     if not values.size:
