@@ -222,6 +222,7 @@ def test_the_band_holds_the_mean_and_draws_repeat():
     "no column 'subject'": lambda: Population({}, {"q": [1.0]}, {"q": [1.0]}),
     "standard error 0, not a": lambda: study([1.0], [0.0]),
     "no two conditions": lambda: study([1.0, 2], [1.0, 1]).difference("gain", "a", "b"),
+    "must be two": lambda: study([1.0, 2, 3], np.ones(3)).power("gain", 1, labels=["a"]),
     "no quantity 'x'": lambda: study([1.0, 2], [1.0, 1]).mean("x"),
 }.items())  # fmt: skip
 def test_refusals(sentence, call):

@@ -127,20 +127,20 @@ def test_slow_drift_is_taken_out(wave):
 def test_designs_as_tables(tmp_path, wave):
     design = hj.multisine(n_sections=8, periods=16, band=(0, 2.0))
     hj.recordings.write_design(tmp_path / "phase.csv", design, cycles=19)
-    hj.recordings.write_design(tmp_path / "time.csv", design, period=0.5, rate=160)
+    hj.recordings.write_design(tmp_path / "time.csv", design, period=0.29, rate=100)
     with pytest.raises(hj.DefinitionError, match="both the period and the rate"):
         hj.recordings.write_design(tmp_path / "time.csv", design, period=0.5)
     # Applied at the phases of the recording, and found again in its section data.
     phase = hj.recordings.estimate_phase(wave, CIRCLE)
     with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):
         hj.recordings.add_command(wave, phase, tmp_path / "time.csv")
-    lines = (tmp_path / "phase.csv").read_text().splitlines()
+    lines, timed = ((tmp_path / x).read_text().splitlines() for x in ("phase.csv", "time.csv"))
+    assert (len(timed) - 1) % (16 * 29) == 0  # (0.29 * 100 is 28.999...)
     (tmp_path / "one.csv").write_text("\n".join(lines[: 1 + 19 * 8]))
     told = hj.recordings.add_command(wave, phase, tmp_path / "one.csv")
     data = sample(told, phase, inputs="u", sampled="middle")
-    u = data.records[0].u[:, 0] + data.cycle_inputs[:, 0][
-        (data.records[0].first_section + np.arange(len(data.records[0].u))) % 8
-    ]  # fmt: skip
+    section = (data.records[0].first_section + np.arange(len(data.records[0].u))) % 8
+    u = data.records[0].u[:, 0] + data.cycle_inputs[section, 0]
     first = -data.records[0].first_section % 8
     np.testing.assert_allclose(u[first : first + 150], design.inputs(19)[0, :150, 0], atol=1e-9)
     with pytest.raises(hj.DefinitionError, match="1 trials, but the table has"):

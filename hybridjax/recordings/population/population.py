@@ -227,7 +227,7 @@ class Population:
         else:
             pilots = [data[["y", "v"]] for _, data in self._cells(quantity, 3)]
         y, v = pilots[0].to_numpy().T
-        if len(y) < 3 or len(pilots) > 1:
+        if len(y) < 3 or len(pilots) > 1 or len(labels) not in (0, 2):
             raise DefinitionError("`labels` must be two conditions of three or more subjects.")
         ones, rows = np.ones((len(y), 1)), []
         low, high = spread_interval(y, v, ones)
