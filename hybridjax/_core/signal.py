@@ -4,6 +4,10 @@ from collections.abc import Iterable
 from typing import Any
 
 
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+"""Units of time."""
+
+
 class Signal(str):
     """The name of a state, input or output, with its unit ("" where nobody said it).
 

@@ -9,7 +9,7 @@ from .._core.arguments import channel_index, require_index
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
 from .._core.results import Result
-from .._core.signal import Signal, ratio, square, unit_of, with_unit
+from .._core.signal import SECONDS, Signal, ratio, square, unit_of, with_unit
 from .._core.text import p_value
 from ..experiments.data import ExperimentData
 from ..identify.validate import Validation
@@ -20,10 +20,6 @@ from ..recordings.data import SectionData, input_spectrum
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase import Phase
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, axis_of, legend, letters, panels
-
-
-# Factors of what is per one unit of time, per another.
-_PER = {("ms", "s"): 1e3, ("s", "ms"): 1e-3}
 
 
 @checked
@@ -151,16 +147,17 @@ def phase_response(
     """The curve; an estimate with its 95 % band. Dotted lines are events of a model.
 
     **Arguments:** `model`: the curve of a model (`Responses.curve`), drawn over that of a
-    recording; a time in ms is converted. Phase 0 of both must be the same event.
+    recording, in its unit of time. Phase 0 of both must be the same event.
     """
     curves = [found] if model is None else [found, model]
     with panels(ax, height=2.8) as axes:
         panel = axes[0, 0]
-        for k, curve in enumerate(curves):
-            scale, color = _PER.get((curve.time_unit, found.time_unit), 1.0), CYCLE[k]
+        for curve, color in zip(curves, CYCLE, strict=False):
+            seconds = [SECONDS.get(x.time_unit, 0.0) for x in (found, curve)]
+            scale = seconds[0] / seconds[1] if all(seconds) else 1.0
             label = "model"
             if isinstance(curve, PhaseResponse):
-                low, high = curve.interval(curve.phase)
+                low, high = (scale * x for x in curve.interval(curve.phase))
                 panel.fill_between(curve.phase, low, high, color=color, alpha=0.25, lw=0)
                 label = "estimated, 95 %"
             panel.plot(curve.phase, scale * curve.values, color=color, label=label)

@@ -11,7 +11,7 @@ from .._core.arguments import Numbers, package, require_among, searching
 from .._core.boundary.checked import checked
 from .._core.boundary.values import Reals
 from .._core.results import Result
-from .._core.signal import Signal, ratio, with_unit
+from .._core.signal import ratio, with_unit
 from ..errors import ComputationError, DefinitionError
 from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle
@@ -218,8 +218,7 @@ def explore(
             raise DefinitionError(
                 f"`ranges` of '{name}' must be two numbers around its present value {value:.6g}."
             )
-        unit = Signal(name, unit_of_parameter(cycle.system, name)).unit
-        sliders.append([name, with_unit(name, unit), low, high])
+        sliders.append([name, with_unit(name, unit_of_parameter(cycle.system, name)), low, high])
     if not sliders:
         raise DefinitionError("explore: name one parameter or more, such as 'k'.")
     return Explorer(cycle, sliders, plane_of(cycle.structure, x, y))

@@ -19,6 +19,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, Positive, SignalNames
 from .._core.executor import to_host
 from .._core.results import Result
+from .._core.signal import SECONDS
 from .._core.writing import replacing
 from ..engine.trajectory import Trajectory, observed
 from ..errors import DefinitionError
@@ -39,7 +40,6 @@ from .plane import multipliers as draw_multipliers
 
 
 _GROUND: dict[str, Any] = {"color": COLORS["gray"], "lw": 1.0, "zorder": 1}
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 Part = tuple[Artist, Callable[[Any], Any], Sequence[Any]]
 """An artist, a function that moves it, and its argument for each frame."""
 Portrait = Callable[[LimitCycle], list[Artist]]
@@ -249,9 +249,9 @@ def _sheet() -> tuple[Figure, Any]:
 
 def _pace(length: float, unit: str, speed: float | None) -> tuple[float, str]:
     """Units of the system's time in a second of playback, and a note if that is not real speed."""
-    pace, real = length / 2 * (speed or 1.0), length * _SECONDS.get(unit, 0.0)
+    pace, real = length / 2 * (speed or 1.0), length * SECONDS.get(unit, 0.0)
     if real and (speed is not None or 0.25 <= real <= 20):
-        pace = (speed or 1.0) / _SECONDS[unit]
+        pace = (speed or 1.0) / SECONDS[unit]
     share = pace / length * real
     return pace, f"{share:.2g} x real speed" if real and abs(share - 1) > 1e-9 else ""
 
