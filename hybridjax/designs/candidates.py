@@ -171,10 +171,12 @@ class Measured(NamedTuple):
     """The HTFs from one input to the measured outputs."""
 
     htf: HTF
-    """With the variances at power 1."""
+    """With variances as large as its values: no unit of the inputs makes them rounding errors."""
     cosines: Int[np.ndarray, " F"]
     """Indices of the candidates at these frequencies."""
     channel: int
+    weight: float
+    """By which errors of these variances exceed those at power 1."""
 
 
 def measured_htfs(
@@ -193,10 +195,11 @@ def measured_htfs(
         variance: Any = 2 * spectrum[..., None] / (cosines.n_sections * cosines.strides)
         H: Any = np.asarray(htf.H)[:, :, noise.outputs, i : i + 1]
         outputs = tuple(htf.outputs[k] for k in noise.outputs)
+        larger = np.mean(np.abs(H) ** 2) / np.mean(variance) or 1.0
         htf = dataclasses.replace(
-            htf, H=H, variance=variance, inputs=htf.inputs[i : i + 1], outputs=outputs
+            htf, H=H, variance=larger * variance, inputs=htf.inputs[i : i + 1], outputs=outputs
         )
-        yield Measured(htf, members, int(i))
+        yield Measured(htf, members, int(i), float(np.sqrt(larger)))
 
 
 @checked

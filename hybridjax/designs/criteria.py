@@ -14,8 +14,7 @@ from ..fitting.observations import ObservedHTF
 from ..identify.denominator import chi, multipliers_of
 from ..identify.periodic import characteristic_slopes
 from ..identify.variable_projection import grouped
-from ..linear.htf import HTF
-from .candidates import Candidates, Model, Noise, Powers, measured_htfs
+from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
 from .criterion import Channel, Criterion, LinearCriterion
 from .goals import Goal, Multipliers, Parameters
 from .matrices import ldtp_matrices, response_criterion
@@ -79,7 +78,7 @@ def _multipliers(
         return matrices.criterion(wanted @ slopes, names, part)
     c = np.poly(multipliers).real[1:]
     htfs = measured_htfs(model, cosines, goal.fitted_harmonics, noise)
-    channels = [x for htf, each, _ in htfs for x in _channels(htf, each, c, goal.overhang)]
+    channels = [channel for x in htfs for channel in _channels(x, c, goal.overhang)]
     wanted, names, part = wanted_parts(goal, multipliers, c)
     unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
     return LinearCriterion(names, unknowns, tuple(channels), wanted, part)
@@ -121,7 +120,7 @@ def _parameters(goal: Parameters, model: Model, lines: Candidates, noise: Noise)
     wanted = free if goal.wanted is None else tuple(goal.wanted)
     require_among("free parameter", wanted, free, "`wanted` of `goal`: ")
     channels = []
-    for htf, members, _ in measured_htfs(model, lines, goal.harmonics, noise):
+    for htf, members, _, weight in measured_htfs(model, lines, goal.harmonics, noise):
         observed = ObservedHTF(htf, goal.sections)
         data = identifiability(goal.cycle.system, observed, free, guess=goal.cycle)
         if not data.complete:
@@ -129,22 +128,21 @@ def _parameters(goal: Parameters, model: Model, lines: Candidates, noise: Noise)
             raise DefinitionError(f"the data do not identify {lost}: leave it out of `free`.")
         shape = 2, len(htf.harmonics), len(members), htf.H[0, 0].size
         cosine = np.broadcast_to(members[:, None], shape).ravel()
-        channels.append(Channel(cosine, data.sensitivity))
+        channels.append(Channel(cosine, weight * data.sensitivity))
     rows = np.eye(len(free))[[free.index(name) for name in wanted]]
     return LinearCriterion(wanted, free, tuple(channels), rows, np.arange(len(wanted)))
 
 
-def _channels(
-    htf: HTF, cosine: Int[np.ndarray, " F"], c: Float[np.ndarray, " d"], overhang: int | None
-) -> Iterator[Channel]:
+def _channels(x: Measured, c: Float[np.ndarray, " d"], overhang: int | None) -> Iterator[Channel]:
     r"""Yield H delayed by 1 to d periods, and the part of it that numerators can explain, from
     $dH = dB/\chi - H\, d\chi/\chi$.
 
     **Raises:** `DefinitionError` if the HTFs have too few frequencies.
     """
-    for group in grouped(htf, len(c), overhang):
+    for group in grouped(x.htf, len(c), overhang):
         delays = range(1, len(c) + 1)
         slopes = [group.weighted(c, group.period_delay[:, None] ** j * group.data) for j in delays]
         size = np.tile(group.weight / np.abs(chi(group.period_delay, c)), 2)
-        cosines = np.tile(cosine[group.line], 2)
-        yield Channel(cosines, np.concatenate(slopes, axis=1), size[:, None] * group.basis)
+        cosines = np.tile(x.cosines[group.line], 2)
+        slope = x.weight * np.concatenate(slopes, axis=1)
+        yield Channel(cosines, slope, size[:, None] * group.basis)

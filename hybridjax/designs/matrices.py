@@ -99,8 +99,8 @@ def _rows(
 ) -> Iterator[tuple[Int[np.ndarray, " lines"], Float[np.ndarray, "lines P rows"]]]:
     """Yield derivatives of the measurements of some cosines, in units of their standard deviations
     at power 1."""
-    for htf, cosines, channel in htfs:
-        weight = error_weights(htf, scale)[..., 0] * scale
+    for htf, cosines, channel, unit in htfs:
+        weight = unit * error_weights(htf, scale)[..., 0] * scale
         for chunk, slopes in transfer_slopes(coordinates, np.asarray(htf.f), htf.harmonics):
             rows = slopes[..., channel] * weight[:, chunk]
             rows = np.ascontiguousarray(rows.transpose(2, 0, 1, 3))

@@ -90,10 +90,10 @@ def test_fits_reach_what_is_promised(model):
 
 
 def test_units_and_estimates(isochron_ldtp, usual):
-    """Newtons, piconewtons and meganewtons; an estimate in place of the model."""
-    a, b, c = (hj.optimal_design(isochron_ldtp, usual.scaled(rms)) for rms in (1e-12, 0.01, 1e6))
+    """Forces of 1e-16, 0.01 and 1e6; an estimate in place of the model."""
+    a, b, c = (hj.optimal_design(isochron_ldtp, usual.scaled(rms)) for rms in (1e-16, 0.01, 1e6))
     assert a.saved == pytest.approx(b.saved, rel=1e-6) == pytest.approx(c.saved, rel=1e-6)
-    assert a.certificate == pytest.approx(b.certificate, rel=1e-6)
+    assert (a.certificate, a.criterion) == pytest.approx((b.certificate, b.criterion), rel=1e-6)
     fit = hj.fit_multipliers(with_variance(isochron_ldtp, usual), 2)
     for goal in ("multipliers", hj.designs.Multipliers(0, "modulus")):
         estimated = hj.optimal_design(fit, usual, goal=goal, noise=NOISE)
