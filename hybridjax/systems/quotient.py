@@ -129,7 +129,7 @@ class Quotient(Derived):
                         "where halves begin: let the clock begin earlier."
                     )
         for name, x in self.system.charts().items() if isinstance(self.half_period, str) else ():
-            require_among("state", [self.half_period], x.states, f"Quotient: in '{name}' ")
+            require_among("state", [str(self.half_period)], x.states, f"Quotient: in '{name}' ")
 
     def period(self):
         return None if self.half_period else self.system.period()

@@ -238,7 +238,7 @@ def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> 
     may be 1, like which a constant looks.
     """
     slow, order = PreparedRecords(with_drift(records.records)), len(fit.coefficients)
-    may_be_one = fit.multipliers.real + 2 * fit.standard_errors > 1
+    may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
 
     def drifting() -> RoughFit:
         problem = _problem_like(fit, slow, order, free_start)
