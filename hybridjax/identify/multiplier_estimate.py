@@ -188,22 +188,23 @@ class MultiplierEstimate(eqx.Module):
         """Return a sentence if another fit contradicts the multipliers; else "".
 
         It does if a multiplier is outside of its confidence regions, and its nearest one outside of
-        those of this fit. (At 95 %. At 99 % half as many right orders are doubted, and a few more
-        that are too low pass.)
+        those of this fit. (Of 95 %: at 99 % half as many right orders are doubted, and a few more
+        that are too low pass. Drift moves multipliers further: regions of 99.9 % notice it.)
 
         **Arguments:** `others`: the fits; a `DefinitionError` means too few data. `drift`: the
         sentence, for fits that allow for drift. Default: a sentence about their order.
         """
+        level = 0.999 if drift else 0.95
         for fit in others:
             with suppress(DefinitionError):
                 c, covariance = fit()
                 multipliers = multipliers_of(c)
                 near = np.abs(multipliers - self.multipliers[:, None]).argmin(axis=1)
-                moved = ~self.contains(multipliers[near])
+                moved = ~self.contains(multipliers[near], level)
                 if not moved.any():
                     continue
                 other = MultiplierEstimate(multipliers, c, *covariance())
-                if (moved & ~other.contains(self.multipliers)).any():
+                if (moved & ~other.contains(self.multipliers, level)).any():
                     order = f"`order` may be too low: order {len(c)} gives "
                     return drift or f"{order}other {other.show_multipliers()}; compare both fits"
         return ""
