@@ -234,8 +234,8 @@ def fit_series(
 def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> str:
     """Return a sentence if slow drift of the outputs may explain multipliers of a fit; else "".
 
-    It does if outputs that may drift have other multipliers, or as little noise without those that
-    may be 1, like which a constant looks.
+    It does if outputs that may drift have other multipliers, or as little noise without the
+    multipliers that may be 1, which a constant resembles.
     """
     slow, order = PreparedRecords(with_drift(records.records)), len(fit.coefficients)
     may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
