@@ -42,7 +42,7 @@ LIMITS = {
     "fragments": 10,
     "pronouns": 17,
     "test_lines": 18_088,
-    "doc_words": 38_900,
+    "doc_words": 38_902,
 }
 
 
