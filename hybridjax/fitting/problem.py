@@ -85,8 +85,8 @@ class Parameters(eqx.Module):
         def changed(o):
             if not named or getattr(o, "delay", None) is None:
                 return o
-            both = [named.get(name, x) for name, x in zip(DELAYS, o.delay, strict=True)]
-            return eqx.tree_at(lambda o: o.delay, o, jnp.stack(both))
+            both = dict(zip(DELAYS, o.delay, strict=True)) | named
+            return eqx.tree_at(lambda o: o.delay, o, jnp.stack([*both.values()]))
 
         return [changed(o) for o in observations]
 

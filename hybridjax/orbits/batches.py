@@ -307,11 +307,11 @@ class Tiles(NamedTuple):
         """`function` of the return maps of some systems, and of further arguments, in calls of few
         sizes. (JAX compiles operations on numbers of systems for each size.)"""
         arrays, static = eqx.partition(self.systems, eqx.is_array)
-        compiled, map = self.program is not None and function is _turn, self.map
+        program, map = self.program if function is _turn else None, self.map
 
         def run(k):
             left = len(rows) - k
-            size = self.size if compiled else min(self.size, -(-left // WIDE) * WIDE)
+            size = self.size if program else min(self.size, -(-left // WIDE) * WIDE)
             tile = np.arange(k, k + size) % len(rows)
             systems = _pick(arrays, rows[tile])
             begin, expected, *further = _pick((anchor, period, *others), tile)
@@ -319,9 +319,9 @@ class Tiles(NamedTuple):
                 expected = self.periods[rows[tile]]
             grown = expected / map.expected if map.base is None else np.ones(size)
             begin = begin._replace(t=map.anchor.t * grown[:, None])
-            if compiled:
+            if program:
                 systems = eqx.combine(systems, static)
-                results = self.program(systems, map, begin, expected, *further, *options)
+                results = program(systems, map, begin, expected, *further, *options)
             else:
                 last = jax.tree_util.tree_map(lambda x: np.moveaxis(x, 0, -1), systems)
                 split = (True,) * len(jax.tree_util.tree_leaves(last))

@@ -124,7 +124,7 @@ class Curve:
         ahead, row = length * last.tangent * last.size, last.tangent / last.size
         guess = last.z + ahead
         if before and before.anchor is last.anchor:
-            guess = _cubic(before, last, row, 1 + length / (row @ (last.z - before.z)))
+            guess = _cubic(before, last, row, 1 + float(length / (row @ (last.z - before.z))))
         point = self._correct(last.z + ahead, row, last.size, last.tangent, last.anchor, guess)
         if isinstance(point, Result):
             return point

@@ -309,13 +309,13 @@ def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = No
     first = np.flatnonzero((k - begins) % most == 0)
     last = np.append(first[1:], len(k)) - 1
     h, code = t[last + 1] - t[first], np.maximum(moves.code[last], -1)
-    parts = np.maximum(np.ceil(h[:, 0].real / (longest * period) - 1e-9), 1).astype(int)
+    parts = np.maximum(np.ceil(np.real(h[:, 0]) / (longest * period) - 1e-9), 1).astype(int)
     whole = np.repeat(np.arange(len(first)), parts)
     part = np.arange(len(whole)) - np.repeat(np.cumsum(parts) - parts, parts)
     first, last, h, parts = first[whole], last[whole], h[whole], parts[whole, None]
     P, code = len(whole), np.where(part == parts[:, 0] - 1, code[whole], -1)
     time = t[first][:, None] + ((part[:, None] + nodes) / parts)[..., None] * h[:, None]
-    step = np.searchsorted(t.real[:-1, 0], time.real[..., 0], "right") - 1
+    step = np.searchsorted(np.real(t[:-1, 0]), time.real[..., 0], "right") - 1
     step = np.clip(step, first[:, None], last[:, None])
     # Directions are lanes of their own, and come last.
     each = 1 + d + np.arange(P * K * D) % D

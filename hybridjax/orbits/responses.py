@@ -128,7 +128,7 @@ class Coupling(eqx.Module):
         grid = (np.arange(steps + 1) - 0.5) / steps
         sign, value = np.sign(self(grid)), lambda x: float(self([x])[0])
         crossed = np.flatnonzero(sign[:-1] * sign[1:] < 0)
-        roots = [optimize.brentq(value, *grid[k : k + 2]) for k in crossed]
+        roots = [optimize.brentq(value, *grid[k : k + 2], full_output=True)[0] for k in crossed]
         return tuple(Locked(x % 1.0, float(self._slope([x])[0])) for x in roots)
 
 

@@ -181,7 +181,7 @@ class SettledCycle:
 
     plant: Plant
     sections: families.AbstractSections
-    inputs: tuple[Signal, ...]
+    inputs: tuple[str, ...]
     outputs: tuple[Signal, ...]
     period: float
     cycle_outputs: Float[np.ndarray, "N ny"]
@@ -243,7 +243,7 @@ class SettledCycle:
         # (Rows are as long as the inputs, and NaN from the end of an experiment on.)
         rows = np.full((*u.shape[:2], len(self.outputs) + 1), np.nan)
         for s, (values, _) in enumerate(trials):
-            rows[s, : len(values)] = np.reshape(values, (-1, rows.shape[2]))
+            rows[s, : len(values)] = np.reshape(values, (-1, rows.shape[-1]))
         causes = tuple(cause for _, cause in trials)
         failed_at = np.array([len(values) if cause else -1 for values, cause in trials])
         result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)

@@ -210,10 +210,10 @@ def explore(
         cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)
     if cycle.result != Result.OK:
         raise DefinitionError("`system` is a cycle that was not found: explore another one.")
-    sliders = []
-    for name in dict.fromkeys((*parameters, *(ranges or {}))):
+    sliders, ranges = [], ranges or {}
+    for name in dict.fromkeys((*parameters, *ranges)):
         value = float(parameter_of(cycle.system, name))
-        low, high = map(float, (ranges or {}).get(name, sorted((0.5 * value, 1.5 * value))))
+        low, high = map(float, ranges.get(name, sorted((0.5 * value, 1.5 * value))))
         if not low <= value <= high or low == high:
             raise DefinitionError(
                 f"`ranges` of '{name}' must be two numbers around its present value {value:.6g}."

@@ -40,7 +40,7 @@ from .plane import multipliers as draw_multipliers
 
 
 _GROUND: dict[str, Any] = {"color": COLORS["gray"], "lw": 1.0, "zorder": 1}
-Part = tuple[Artist, Callable[[Any], Any], Sequence[Any]]
+Part = tuple[Artist, Callable[[Any], Any], Sequence[Any] | np.ndarray]
 """An artist, a function that moves it, and its argument for each frame."""
 Portrait = Callable[[LimitCycle], list[Artist]]
 

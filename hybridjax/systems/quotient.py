@@ -160,11 +160,11 @@ class Quotient(Derived):
         for name in self.swap if rises else ():
             if period is not None:
                 guard = lambda t, q, u: t - period / 2  # noqa: E731
-            elif isinstance(rises, str):
+            elif callable(rises):
+                guard = lambda t, q, u: rises(t, q)  # noqa: E731
+            else:
                 place = charts[name].states.index(rises)
                 guard = lambda t, q, u, k=place: q[k]  # noqa: E731
-            else:
-                guard = lambda t, q, u: rises(t, q)  # noqa: E731
             title = "half period" + f" ({name})" * (len(self.pairs) > 1)
             yield Transition(title, name, name, guard, "rising")
 
@@ -172,10 +172,10 @@ class Quotient(Derived):
         guess = self.system.guess()
         if guess is None or guess.chart not in self.charts():
             return None
-        chart = self.charts()[guess.chart]
+        chart, period = self.charts()[guess.chart], self.system.period()
         state, time = chart.less(guess.state), guess.time
-        if chart.clocked:
-            state, time = jnp.append(state, jnp.asarray(time) % (self.system.period() / 2)), 0.0
+        if chart.clocked and period is not None:
+            state, time = jnp.append(state, jnp.asarray(time) % (period / 2)), 0.0
         return Guess(guess.chart, state, time, after=guess.after)
 
     def outputs(self):
@@ -272,8 +272,8 @@ class Quotient(Derived):
                 yield f"transition '{x.name}'", at(lambda *y, g=guard, x=x: x.sign * g(*y))
         sign = -1.0 if name in images else 1.0
         for x in self._halves() if self.system.period() is None else ():
-            if x.source == name:
-                yield f"sign of '{x.name}'", at(lambda *point, x=x: sign * x.guard(*point))
+            if x.source == name and callable(x.guard):
+                yield f"sign of '{x.name}'", at(lambda *point, g=x.guard: sign * g(*point))
 
     def _reduced(self, name: str) -> "_Reduced":
         clocked = bool(self.half_period) and self.system.period() is not None

@@ -57,7 +57,7 @@ class Varied(Structure):
 
     @classmethod
     def tree_unflatten(cls, parameter, children):
-        return cls(*children, parameter)
+        return cls(children[0], parameter)
 
     def under(self, u: Array) -> Structure:
         value = parameter_of(self.system, self.parameter) + u[0]

@@ -115,10 +115,10 @@ def _function(name: str, function: Callable, *rules: Callable) -> Callable:
 
     **Arguments:** `rules`: one (tangent, value, *arguments) for each argument. Default: derived.
     """
+    function.__name__ = name
     if rules:
         function = jax.custom_jvp(function)
         function.defjvps(*rules)
-    function.__name__ = name
     return jax.jit(function)
 
 

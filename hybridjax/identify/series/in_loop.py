@@ -117,12 +117,12 @@ class LoopEquations:
         self.records, self.order, self.reference = PreparedRecords(plant), order, drive[0].inputs
         self.grid = self.records.whole()
         S, T, N, nu = self.grid.u.shape
-        overhang = N if overhang is None else overhang
-        self.lags = self.records.lead + order * N + overhang + 1
+        span = N if overhang is None else overhang
+        self.lags = self.records.lead + order * N + span + 1
         z = np.zeros((S, T * N, nu + self.grid.y.shape[3]))
         for s, (r, x) in enumerate(zip(plant, predicted(plant, drive, order), strict=True)):
             z[s, r.first_section : r.first_section + len(x)] = x
-        z, free = z.reshape(S, T, N, -1), order + -(-overhang // N)
+        z, free = z.reshape(S, T, N, -1), order + -(-span // N)
         self.sections = [self._section(n, z, free) for n in range(N)]
 
     def _section(self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int) -> SectionEquations:
