@@ -19,6 +19,7 @@ from .._core.results import Result
 from .._core.text import number
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_system, evaluating
+from ..systems.quotient import Quotient
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
@@ -206,19 +207,19 @@ def simulate(
     settings = Settings() if settings is None else settings
     system = settings.system(system)
     check_system(system)
+    if isinstance(system, Quotient):
+        system.check()
     constant = _constant_input(system, input)
     s = Structure(current(Driven(system, input)) if callable(input) else system)
     start = Guess(chart, state, time)
     lanes = begin = lane_at(s, chart, start.state, start.time, "`state`")
     settings, u, end = settings.filled(SIMULATION), constant[:, None], lanes.t + float(duration)
-    tapes, steps, h = [], 0, None
-    while True:
+    tapes, steps, h, result = [], 0, None, Result.STEP_LIMIT
+    while result == Result.STEP_LIMIT and steps < max_steps:
         moved, tape = _piece(s, lanes, u, end, settings, h)
         tapes.append(tape)
         lanes, h, steps = moved.lanes, moved.h, steps + settings.max_steps
         result = Result(int(np.asarray(moved.result)[0]))
-        if result != Result.STEP_LIMIT or steps >= max_steps:
-            break
     path = recorded(s, begin, tapes, u, result)
     passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
     if passed is not None:

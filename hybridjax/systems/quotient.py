@@ -62,8 +62,8 @@ class Quotient(Derived):
     Derivatives of a cycle by a parameter that breaks the symmetry (the stiffness of one leg) are
     those of the map of the kept charts, and of no cycle of `system`.
 
-    **Raises:** `DefinitionError` if charts or states do not fit together and, when a cycle is
-    looked for, if a function does not have the symmetry; it names the function.
+    **Raises:** `DefinitionError` if charts or states do not fit together and, when a cycle or a
+    trajectory is computed, if a function does not have the symmetry; it names the function.
     """
 
     pairs: tuple[tuple[str, str], ...] = eqx.field(static=True)
@@ -207,14 +207,15 @@ class Quotient(Derived):
         still = self.translation
         return Quotient(self.system, translation=still) if still else self.system, at
 
-    def check(self, sizes: Mapping[str, Any]) -> None:
+    def check(self, sizes: Mapping[str, Any] | None = None) -> None:
         """Raise an error for a function that does not have the symmetry.
 
-        **Arguments:** `sizes`: magnitudes of the states of each chart. (In units in which states
-        are small, states of 1 would hide all but the highest powers.)
+        **Arguments:** `sizes`: magnitudes of the states of each chart. Default: 1. (In units in
+        which states are small, states of 1 hide all but the highest powers.)
         """
+        sizes = sizes or {name: np.ones(len(x.states)) for name, x in self.charts().items()}
         if isinstance(self.system, Quotient):
-            self.system.check({x: np.ones(len(c.states)) for x, c in self.system.charts().items()})
+            self.system.check()
         clock, rng = self.system.period(), np.random.default_rng(0)
         q = rng.normal(size=(3, max(map(len, sizes.values()))))
         values = _sides(self, sizes, q, rng.normal(size=3) * (1.0 if clock is None else clock))
@@ -222,10 +223,8 @@ class Quotient(Derived):
             size = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
             x, y = (values / size for values in pair)
             if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
-                raise DefinitionError(
-                    f"{type(self.system).__name__} does not have the symmetry of its Quotient: "
-                    f"{sentence}."
-                )
+                text = f"{type(self.system).__name__} does not have the symmetry of its Quotient"
+                raise DefinitionError(f"{text}: {sentence}.")
 
     def _claims(self, sizes: Mapping[str, Any]):
         """The statements of the symmetry: a sentence for its failure, and two functions of
@@ -235,10 +234,9 @@ class Quotient(Derived):
             parts = (self._parts(name, self._kept_of, sizes, shift=x) for x in (0.0, 0.7))
             for (what, before), (_, after) in zip(*parts, strict=True):
                 yield f"the {what} changes under the translation", before, after
-        images, later = self._kept_of, 0.0
-        if self.half_period:
-            clock = self.system.period()
-            images, later = self.swap, 0.0 if clock is None else 0.5 * clock
+        clock: Any = self.system.period()
+        images = self.swap if self.half_period else self._kept_of
+        later = 0.5 * clock if self.half_period is True else 0.0
         for kept, other in self.swap.items():
             ours = list(self._parts(kept, self._kept_of, sizes))
             # In a chart that is its own mirror image, the last transition is that of the first.

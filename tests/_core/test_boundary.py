@@ -28,7 +28,6 @@ GAPS = Annotated[Numbers, Reals("n", missing=True)]
 
 # An annotation, what is given, and what arrives.
 TAKEN = [
-    (int, 3, 3),
     (int, np.int32(3), 3),
     (Count | None, None, None),
     (float, 3, 3.0),
@@ -46,11 +45,9 @@ TAKEN = [
     (Annotated[Numbers, Reals()], [1, 2], np.array([1.0, 2.0])),
     (Annotated[Numbers, Reals("n 2")], np.ones((3, 2), np.float32), np.ones((3, 2))),
     (GAPS, np.ma.masked_less([1, 2], 2), np.array([NAN, 2.0])),
-    (GAPS, [1, NAN], np.array([1, NAN])),
     (Annotated[Numbers, Reals("n", missing=True, infinite=True)], [INF, NAN], np.array([INF, NAN])),
     (Annotated[Numbers, Reals("n")], jnp.arange(2), jnp.arange(2.0)),
     (Annotated[Numbers, Complexes("n")], [1, 2j], np.array([1, 2j])),
-    (Annotated[Numbers, Integers("n")], [1, 2], np.array([1, 2])),
     (Annotated[Numbers, Integers("n")], np.arange(2, dtype=np.uint8), np.arange(2)),
 ]
 
@@ -101,6 +98,11 @@ def test_what_fits_arrives_in_one_form(annotation, given, expected):
     assert type(found) is type(expected)
     np.testing.assert_array_equal(found, expected)
     assert getattr(found, "dtype", None) == getattr(expected, "dtype", None)
+
+
+def test_arrays_that_may_hold_any_number_are_not_read(monkeypatch):
+    monkeypatch.setattr(np, "sum", None)  # (They may lie on disk.)
+    called(Annotated[Numbers, Reals("n", missing=True, infinite=True)], np.zeros(2))
 
 
 @pytest.mark.parametrize("annotation, given, said", REFUSED)
@@ -178,8 +180,7 @@ def test_a_class_is_checked_where_it_is_built_and_used():
     ]:
         with pytest.raises(hj.DefinitionError, match=f"^{name} must be an integer"):
             bad()
-    assert module._hidden(0) == 0
-    assert Heir(1, z=2).z == 2
+    assert module._hidden(0) == 0 and Heir(1, z=2).z == 2
     assert jax.tree_util.tree_map(lambda x: x, module).n == 3
 
 
@@ -235,9 +236,7 @@ TRANSFORMS = {"jit": jax.jit, "vmap": lambda f: lambda x: jax.vmap(f)(x[None]), 
 @pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
 def test_where_values_are_needed_a_sentence_says_so(transform):
     x = jnp.arange(3.0)
-    with pytest.raises(
-        hj.DefinitionError, match="^summed: `power` must be .* traces it: call this"
-    ):
+    with pytest.raises(hj.DefinitionError, match="^summed: `power` must be .* traces it: call"):
         transform(lambda x: summed(x, power=x[0]))(x)
     for function, name in [(on_host, "on_host"), (around, "around")]:
         with pytest.raises(hj.DefinitionError, match=f"^{name} needs values, but JAX traces them"):

@@ -92,8 +92,9 @@ def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section
     ],
 )
 def test_what_is_no_symmetry_is_refused(system, symmetry, message):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.find_limit_cycle(hj.Quotient(system, **symmetry))
+    for use in (hj.find_limit_cycle, lambda q: hj.simulate(q, "left stands", q.guess().state, 1)):
+        with pytest.raises(hj.DefinitionError, match=message):
+            use(hj.Quotient(system, **symmetry))
 
 
 def test_an_odd_oscillator_closes_after_half_a_period():

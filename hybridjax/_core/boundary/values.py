@@ -319,9 +319,9 @@ class Reals(Kind):
 
     def _check_values(self, array: np.ndarray | jax.Array) -> None:
         values = np.asarray(array)
-        # (A sum is a number where all of them are, and takes no memory.)
+        # (A sum is a number where all of them are, and takes no memory. What is free is not read.)
         with np.errstate(all="ignore"):
-            finite = np.isfinite(np.sum(values))
+            finite = (self.missing and self.infinite) or np.isfinite(np.sum(values))
         if not finite:
             bad = np.isnan(values) & (not self.missing) | np.isinf(values) & (not self.infinite)
             self._refuse_any(bad, values, "finite")
