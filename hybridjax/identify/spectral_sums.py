@@ -106,10 +106,10 @@ def spectral_sums(
     """
     total, count = None, 0
     for part in [data] if isinstance(data, ExperimentData) else data:
-        setup = Setup(part.n_sections, part.periods, part.inputs, part.outputs)
-        require_equal("experiments", "setups", setup if total is None else total.setup, setup)
+        new = Setup(part.n_sections, part.periods, part.inputs, part.outputs)
+        require_equal("`data`", "sections, periods or signals", total.setup if total else new, new)
         chosen = () if harmonics == () else check_harmonics(harmonics, part.n_sections)
-        sums = _sums_of_part(part, setup, chosen, threshold, repeats, count)
+        sums = _sums_of_part(part, new, chosen, threshold, repeats, count)
         total = sums if total is None else _add(total, sums)
         count += len(part.ok)
     if total is None:

@@ -183,7 +183,7 @@ def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(whole, arg
     good, high = np.cos(2 * np.pi * n / 64 * 3), np.cos(2 * np.pi * n / 64 * 19)
     good, bad = (hj.ExperimentData(u, u, n_sections=4, periods=16) for u in (good, good + high))
     for parts, message in (
-        ([whole, other], "experiments have different setups"),
+        ([whole, other], "`data` have different sections, periods or signals"),
         ([], "not an empty list"),
         ([good, good, bad], "experiment 2: f = "),
     ):
