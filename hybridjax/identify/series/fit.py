@@ -15,6 +15,7 @@ from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ..._core.text import signal_values
+from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
@@ -68,8 +69,8 @@ class SeriesFit(MultiplierEstimate):
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
-    - `doubt`: a sentence if the multipliers change where outputs may drift, or with one more
-      multiplier or two: they lie outside of each other's confidence regions. Otherwise empty.
+    - `doubt`: a sentence if drift of the outputs (in the first 1000 cycles), or one more multiplier
+      or two, give multipliers outside of each other's confidence regions. Otherwise empty.
     - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
     - `reference`: signals that enter the loop from outside. With a reference, `noise` is the
       standard deviation of $\chi y$.
@@ -237,18 +238,19 @@ def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> 
     It does if outputs that may drift have other multipliers, or as little noise without the
     multipliers that may be 1, which a constant resembles.
     """
-    slow, order = PreparedRecords(with_drift(records.records)), len(fit.coefficients)
+    # (It is refused where an input acts later than the records begin.)
+    slow, order = partial(PreparedRecords, with_drift(records.records)), len(fit.coefficients)
     may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
 
     def drifting() -> RoughFit:
-        problem = _problem_like(fit, slow, order, free_start)
+        problem = _problem_like(fit, slow(), order, free_start)
         return _rough(problem, total_least_squares(late_outputs(problem, order)))
 
     doubt = fit.contradiction([drifting], _SLOW)
     if not doubt and may_be_one.any() and not may_be_one.all():
         fewer = np.poly(fit.multipliers[~may_be_one]).real[1:]
-        problem = _problem_like(fit, slow, len(fewer), free_start)
-        with suppress(TooFewCycles):
+        with suppress(DefinitionError):
+            problem = _problem_like(fit, slow(), len(fewer), free_start)
             solution, _ = minimize(problem, fewer, rough=True)
             _require_freedom(problem, solution)
             spread = 1 / np.sqrt(2 * solution.freedom.sum(axis=0))

@@ -96,9 +96,7 @@ class PreparedRecords:
                 what = "constant" if name in self.outputs else "zero"
                 raise DefinitionError(f"{name} is {what} or missing at every sample: leave it out.")
         require_deviations(self.records)
-        self.scale: Float[np.ndarray, " ny"] = np.sqrt(
-            np.nansum(y**2, axis=0) / self.sampled.sum(axis=0)
-        )
+        self.scale = np.sqrt(np.nansum(y**2, axis=0) / self.sampled.sum(axis=0))
 
     def whole(self) -> CycleGrid:
         """Return all records on one grid."""
@@ -106,15 +104,19 @@ class PreparedRecords:
 
 
 def with_drift(records: Sequence[Record]) -> list[Record]:
-    """Return the records with unknown drifts that are slower than `SLOW` cycles."""
-    return [dataclasses.replace(r, drift=min(SLOW, r.drift or np.inf)) for r in records]
+    """Return the beginnings of records, with unknown drifts that are slower than `SLOW` cycles.
+
+    (Time grows with the third power of their length: 8000 cycles took half a minute.)
+    """
+    n = int(50 * SLOW) * records[0].n_sections
+    begun = [dataclasses.replace(r, u=r.u[:n], y=r.y[:n]) for r in records]
+    return [dataclasses.replace(r, drift=min(SLOW, r.drift or np.inf)) for r in begun]
 
 
 def _grids(records: Sequence[Record]) -> list[CycleGrid]:
     left, grids = sorted(records, key=count_cycles, reverse=True), []
     while left:
-        enough = 0.5 * count_cycles(left[0])
-        alike = [r for r in left if count_cycles(r) >= enough]
+        alike = [r for r in left if 2 * count_cycles(r) >= count_cycles(left[0])]
         grids.append(CycleGrid.from_records(alike))
         left = left[len(alike) :]
     return grids
