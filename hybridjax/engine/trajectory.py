@@ -19,7 +19,7 @@ from .._core.results import Result
 from .._core.text import number
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_system, evaluating
-from ..systems.quotient import Quotient
+from ..systems.quotient import check_symmetry
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
@@ -207,8 +207,7 @@ def simulate(
     settings = Settings() if settings is None else settings
     system = settings.system(system)
     check_system(system)
-    if isinstance(system, Quotient):
-        system.check()
+    check_symmetry(system)
     constant = _constant_input(system, input)
     s = Structure(current(Driven(system, input)) if callable(input) else system)
     start = Guess(chart, state, time)

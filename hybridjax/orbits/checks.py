@@ -17,7 +17,7 @@ from ..engine.unresolved import column_name, jumps, lines_of_jumps, may_be_sudde
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
 from ..systems.check import check_output, check_system
-from ..systems.quotient import Quotient
+from ..systems.quotient import check_symmetry
 from ..systems.structure import Outputs, Structure
 from ..systems.system import HybridSystem, Output, OutputNames
 from ..systems.transition import Scheduled
@@ -79,7 +79,7 @@ def check_clock(s: Structure) -> None:
                 )
 
 
-def check_times(
+def check_claims(
     s: Structure,
     t: Float[np.ndarray, " K"],
     chart: Int[np.ndarray, " K"],
@@ -87,16 +87,16 @@ def check_times(
     scale: Float[Array, "A d"],
     time: float,
 ) -> None:
-    """Compare fields, guards, resets, predicates and outputs with those one to three periods of the
-    clock later, at K points.
+    """Check the symmetry that a system states; compare fields, guards, resets, predicates and
+    outputs with those one to three periods of the clock later, at K points.
 
     **Arguments:** `scale`, sizes of the states by chart; `time`, a rough period.
 
-    **Raises:** `DefinitionError` if they do not have the period that the system states, or the
-    symmetry of a `Quotient`; NaN is passed over.
+    **Raises:** `DefinitionError` if they do not have the period or the symmetry that the system
+    states; NaN is passed over.
     """
-    if isinstance(s.system, Quotient):
-        s.system.check({x: np.asarray(scale)[a, : s.dims[a]] for a, x in enumerate(s.names)})
+    sizes = {x: np.asarray(scale)[a, : s.dims[a]] for a, x in enumerate(s.names)}
+    check_symmetry(s.system, sizes)
     if s.system.period() is None:
         return
     for a in np.unique(chart).tolist():
@@ -191,11 +191,11 @@ def _no_period(system: HybridSystem, problem: str) -> str:
 def check_found(cycle: LimitCycle) -> None:
     """Check the functions of a system on its cycle.
 
-    **Raises:** `DefinitionError` as `check_clock`, `check_times` and `check_jumps`.
+    **Raises:** `DefinitionError` as `check_clock`, `check_claims` and `check_jumps`.
     """
     s, legs = cycle.structure, to_host(cycle.legs)
     check_clock(s)
-    check_times(s, legs.t, legs.chart, legs.q, cycle.settings.scale, float(cycle.period))
+    check_claims(s, legs.t, legs.chart, legs.q, cycle.settings.scale, float(cycle.period))
     if int(cycle.result) in (Result.OK, Result.SINGULAR):
         check_jumps(cycle)
 

@@ -23,7 +23,7 @@ from ..engine.target import Target, toward, until
 from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
-from .checks import check_times
+from .checks import check_claims
 from .coincidence import SAME
 from .crossing import AtEvent, Crossing, to_section
 from .return_map import ReturnMap
@@ -85,7 +85,7 @@ def return_map_near(
     near = sizes_near(s, a, time[0], q[:, 0], None if period is None else float(period))
     settings = dataclasses.replace(settings, scale=scale_of(s, near.sizes | given))
     charts = np.arange(len(s.charts))
-    check_times(s, np.repeat(time, len(charts)), charts, near.points.T, settings.scale, near.time)
+    check_claims(s, np.repeat(time, len(charts)), charts, near.points.T, settings.scale, near.time)
     map = ReturnMap(system, settings, lanes, None, real(np.nan), {}, multiplicity)
     if settle:
         say("settling")

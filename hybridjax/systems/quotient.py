@@ -207,25 +207,6 @@ class Quotient(Derived):
         still = self.translation
         return Quotient(self.system, translation=still) if still else self.system, at
 
-    def check(self, sizes: Mapping[str, Any] | None = None) -> None:
-        """Raise an error for a function that does not have the symmetry.
-
-        **Arguments:** `sizes`: magnitudes of the states of each chart. Default: 1. (In units in
-        which states are small, states of 1 hide all but the highest powers.)
-        """
-        sizes = sizes or {name: np.ones(len(x.states)) for name, x in self.charts().items()}
-        if isinstance(self.system, Quotient):
-            self.system.check()
-        clock, rng = self.system.period(), np.random.default_rng(0)
-        q = rng.normal(size=(3, max(map(len, sizes.values()))))
-        values = _sides(self, sizes, q, rng.normal(size=3) * (1.0 if clock is None else clock))
-        for (sentence, *_), pair in zip(self._claims(sizes), values, strict=True):
-            size = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
-            x, y = (values / size for values in pair)
-            if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
-                text = f"{type(self.system).__name__} does not have the symmetry of its Quotient"
-                raise DefinitionError(f"{text}: {sentence}.")
-
     def _claims(self, sizes: Mapping[str, Any]):
         """The statements of the symmetry: a sentence for its failure, and two functions of
         (t, q, u) that are equal. The first numbers of q are the state without translations, in
@@ -301,6 +282,27 @@ class Quotient(Derived):
         order = [source.index(self._partner(name)) for name in target]
         names = target if back else map(self._partner, target)
         return q[np.array(order)] * np.array([-1.0 if x in self.flipped else 1.0 for x in names])
+
+
+def check_symmetry(system: HybridSystem, sizes: Mapping[str, Any] | None = None) -> None:
+    """Raise an error if functions do not have the symmetry that a `Quotient` states.
+
+    **Arguments:** `sizes`: magnitudes of the states of each chart. Default: 1. (In units in
+    which states are small, states of 1 hide all but the highest powers.)
+    """
+    if not isinstance(system, Quotient):
+        return
+    check_symmetry(system.system)
+    sizes = sizes or {name: np.ones(len(x.states)) for name, x in system.charts().items()}
+    clock, rng = system.system.period(), np.random.default_rng(0)
+    q = rng.normal(size=(3, max(map(len, sizes.values()))))
+    values = _sides(system, sizes, q, rng.normal(size=3) * (1.0 if clock is None else clock))
+    for (sentence, *_), pair in zip(system._claims(sizes), values, strict=True):
+        size = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
+        x, y = (values / size for values in pair)
+        if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
+            text = f"{type(system.system).__name__} does not have the symmetry of its Quotient"
+            raise DefinitionError(f"{text}: {sentence}.")
 
 
 @eqx.filter_jit
