@@ -86,6 +86,7 @@ def read_module(path: Path, kinds: Mapping[str, type]) -> Any:
     try:
         return put_together(kind, static, members)
     except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
+        # (Whatever a constructor objects to; its text is for the user, and nothing reads it.)
         reason = textwrap.shorten(str(error), 200)
         raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
 
