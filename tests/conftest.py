@@ -91,9 +91,7 @@ DATA = pathlib.Path(__file__).parent / "data"
 
 APEX = hj.Crossing("vM", "falling")
 ISOCHRONS = hj.ClockPhase(32, anchor=APEX)
-KINEMATIC = hj.KinematicPhase(
-    32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
-)
+KINEMATIC = hj.KinematicPhase(32, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 OUTPUTS = ("yM", "vM")
 
 

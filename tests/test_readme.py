@@ -35,9 +35,8 @@ def test_sessions_print_what_the_readme_shows(capsys, tmp_path, monkeypatch):
     for code, shown in zip(blocks_of("python"), blocks_of("text"), strict=True):
         session.run(code)
         printed = capsys.readouterr().out
-        assert same_output(shown, printed), (
-            f"README.md shows\n{shown}\nbut this is printed\n{printed}"
-        )
+        differ = f"README.md shows\n{shown}\nbut this is printed\n{printed}"
+        assert same_output(shown, printed), differ
     pyplot.close("all")
     assert (tmp_path / "bode.png").stat().st_size > 10_000
 

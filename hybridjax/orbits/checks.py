@@ -373,8 +373,7 @@ def _about_guards(s: Structure, turn: Turn, expected: float) -> str:
                 values.setdefault(g, []).extend(s.transitions[g].sign * row)
     text = "; ".join(
         f"the guard of '{s.transitions[g].name}', which should be {s.transitions[g].direction}, "
-        f"began at {x[0]:.3g} and stayed between {min(x):.3g} and {max(x):.3g}"
+        f"went from {x[0]:.3g} to {x[-1]:.3g} (between {min(x):.3g} and {max(x):.3g})"
         for g, x in values.items()
     )
-    advice = "Check its direction, and that the system does not come to rest."
-    return f" No event happened: {text}. {advice}{_better_guess(expected)}" * bool(text)
+    return f" No event happened: {text}. Check its direction.{_better_guess(expected)}" * bool(text)

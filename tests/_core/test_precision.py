@@ -16,9 +16,7 @@ DEFINITIONS = {
     "settings": lambda: hj.Settings(1e-11, 1e-13, scale=np.full((2, 4), 0.1)),
     "crossing": lambda: hj.Crossing("vM", "falling", value=0.1),
     "clock": lambda: hj.ClockPhase(8, anchor=0.1),
-    "kinematic": lambda: hj.KinematicPhase(
-        8, position="yM", velocity="vM", center=(1.9, 0.1), scale=[0.3, 1.9], anchor=0.2
-    ),
+    "kinematic": lambda: hj.KinematicPhase(8, "yM", "vM", (1.9, 0.1), [0.3, 1.9], anchor=0.2),
     "schedule": lambda: hj.Scheduled(0.1, 0.7),
 }
 

@@ -142,9 +142,7 @@ def test_a_zoo_of_functions_gives_what_it_gave_before():
         return values, rates, slopes
 
     ours, truth = jax.jit(
-        lambda: [
-            {name: evaluated(wrap(f)) for name, f in ZOO.items()} for wrap in (vectorized, same)
-        ]
+        lambda: [{k: evaluated(wrap(f)) for k, f in ZOO.items()} for wrap in (vectorized, same)]
     )()
     tolerance = 2e-14
     pairs = zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(truth), strict=True)

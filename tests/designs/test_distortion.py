@@ -16,9 +16,7 @@ from ..toys import Field, toy
 
 Limits, Distortion = hj.designs.Limits, hj.designs.Distortion
 # (Eight sections: shapes are the same in all tests of the hopper, so that each is compiled once.)
-KINEMATIC = hj.KinematicPhase(
-    8, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
-)
+KINEMATIC = hj.KinematicPhase(8, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 LEVEL = {"yM": 6e-6, "vM": 1.2e-5}
 NOISE = {"yM": 6e-6, "vM": 1.2e-5}
 EXPERIMENTS = hj.multisine(8, periods=8, band=(0.0, 1.0))

@@ -21,9 +21,7 @@ def lines_of(design, experiment):
 
 
 bands = st.tuples(st.integers(1, 9), st.integers(2, 12)).flatmap(
-    lambda size: st.tuples(
-        st.just(size[0]), st.just(size[1]), st.integers(1, size[0] * size[1] // 2)
-    )
+    lambda n: st.tuples(st.just(n[0]), st.just(n[1]), st.integers(1, n[0] * n[1] // 2))
 )
 
 
@@ -180,9 +178,7 @@ def test_crest_factors(hopper):
     assert auto.noise_variance is None
     np.testing.assert_array_equal(auto.scatter.freedom, 2)
     with pytest.raises(hj.DefinitionError, match="belong together in several experiments"):
-        hj.experiments.optimize_phases(
-            hj.multisine(4, 8, (0, 2.0), inputs=2, division="orthogonal")
-        )
+        hj.experiments.optimize_phases(hj.multisine(4, 8, (0, 2), inputs=2, division="orthogonal"))
 
 
 def test_realizations_pairs_and_scales():

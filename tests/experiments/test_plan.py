@@ -12,9 +12,7 @@ from hybridjax.sections.place import PATIENCE
 from ..conftest import APEX
 
 
-KINEMATIC = hj.KinematicPhase(
-    7, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
-)
+KINEMATIC = hj.KinematicPhase(7, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 PLANE = hj.KinematicPhase(7, position="x", velocity="v")
 FAMILIES = {"VanDerPol": PLANE, "VerticalHopper": KINEMATIC}
 MODELS = ("VanDerPol", "VerticalHopper", "BuckConverter", "CompassGait", "PaddleJuggler")

@@ -34,9 +34,8 @@ def exact(reference):
 
 @pytest.fixture(scope="session")
 def multipliers():
-    return np.array(
-        [-0.248983334735609 + 0.699333251798004j, -0.248983334735609 - 0.699333251798004j]
-    )
+    first = -0.248983334735609 + 0.699333251798004j
+    return np.array([first, np.conj(first)])
 
 
 @pytest.fixture(scope="session")

@@ -11,11 +11,7 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.joint.frequency import transfer, transfer_slopes
-from hybridjax.identify.periodic import (
-    PeriodicModel,
-    characteristic_slopes,
-    local_coordinates,
-)
+from hybridjax.identify.periodic import PeriodicModel, characteristic_slopes, local_coordinates
 from hybridjax.linear.frequency_response import harmonic_transfer
 
 from .conftest import scaled

@@ -29,8 +29,7 @@ def driven(model, size, sensor=0.1):
 def noisy(model, noise, cycles, seed):
     rng, n = np.random.default_rng(seed), model.n_sections * cycles
     before = 20 * model.n_sections
-    u = rng.normal(size=(n + before, len(model.inputs)))
-    w = rng.normal(size=(n + before, len(noise.inputs)))
+    u, w = (rng.normal(size=(n + before, len(x.inputs))) for x in (model, noise))
     y = np.asarray(model.simulate(u) + noise.simulate(w))
     about = dict(n_sections=model.n_sections, outputs=model.outputs)
     return hj.Record(u[before:], y[before:], **about)
@@ -44,9 +43,8 @@ def with_gaps(whole, share, seed):
 @pytest.fixture(scope="module")
 def gappy(small):
     """Three short records that start at different sections, a twentieth of the samples missing."""
-    return [
-        with_gaps(record(small, 4 * 12 + k, k, 0.1, first_section=k), 0.05, k) for k in range(3)
-    ]
+    whole = (record(small, 48 + k, k, 0.1, first_section=k) for k in range(3))
+    return [with_gaps(x, 0.05, k) for k, x in enumerate(whole)]
 
 
 def in_innovation_form(model, seed=0):

@@ -1,5 +1,6 @@
 """Validation: fits in percent, tests with the level that they state, amplitude sweeps."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 from scipy import stats
@@ -37,10 +38,8 @@ def test_the_fit_is_the_share_explained(small):
 
 def test_a_wrong_model_is_refused(small):
     data = record(small, 4 * 200, 0, 0.3)
-    B = np.asarray(small.B).copy()
-    B[2] *= 1.3
-    wrong = hj.LDTP(small.A, B, small.C, small.D, small.dims, small.inputs, small.outputs)
-    found = hj.validate(wrong, data)
+    more = small.B * np.reshape([1, 1, 1.3, 1], (4, 1, 1))
+    found = hj.validate(eqx.tree_at(lambda m: m.B, small, more), data)
     assert not found.independent and found.independence.min() < 1e-6
     assert "with the input: yes" in repr(found)
 
@@ -70,10 +69,9 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     cycle = ((1 + np.arange(4 * 150)) // 4 + 0.5) / 151
     wave = 9 * np.cos(np.pi * 3 * cycle) * np.cos(np.arange(4 * 150) % 4) + 7
     about = dict(n_sections=4, first_section=1, outputs=plain.outputs, drift=50)
-    still, moved = (
-        hj.validate(small, hj.Record(plain.u, plain.y + x, **about), start=start)
-        for x in (0.0, wave[:, None] * [1.0, -2.0])
-    )
+    added = 0.0, wave[:, None] * [1.0, -2.0]
+    records = (hj.Record(plain.u, plain.y + x, **about) for x in added)
+    still, moved = (hj.validate(small, x, start=start) for x in records)
     np.testing.assert_allclose(moved.noise, still.noise, rtol=1e-3)
     np.testing.assert_allclose(moved.whiteness, still.whiteness, rtol=0.05)
     assert moved.white and moved.independent

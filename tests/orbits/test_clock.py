@@ -40,6 +40,11 @@ def test_a_period_that_does_not_follow_a_parameter():
     fixed = type("Fixed", (hj.models.Duffing,), {"period": lambda self: 4 * np.pi})
     with pytest.raises(hj.DefinitionError, match="does not have the period 12.5664 that Fixed"):
         hj.continuation(hj.find_limit_cycle(fixed()), "rate", (0.5, 0.51))
+    every = lambda self: hj.Scheduled(20 * np.pi * self.damping, 1.0)  # noqa: E731
+    tick = {"transitions": lambda self: [hj.Transition("tick", "line", "line", every(self))]}
+    ticks = type("Ticks", (hj.models.Duffing,), tick)
+    with pytest.raises(hj.DefinitionError, match="the schedule of 'tick' must divide the clock's"):
+        hj.find_limit_cycles([ticks(), ticks(damping=0.11)], hj.find_limit_cycle(ticks()))
 
 
 def test_a_force_that_jumps_with_the_clock():
@@ -50,6 +55,5 @@ def test_a_force_that_jumps_with_the_clock():
     square = toy(charts, [hj.Transition("half", "a", "a", hj.Scheduled(0.5))], period=1.0)
     cycle = hj.find_limit_cycle(square, hj.Guess("a", (0.3,), 0.25))
     x = (1 - np.exp(-0.5)) * np.exp(-0.5) / (1 - np.exp(-1.0))
-    x = 1 + (x - 1) * np.exp(-0.25)
-    np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-6)
+    np.testing.assert_allclose(cycle.state["x"], 1 + (x - 1) * np.exp(-0.25), rtol=1e-6)
     np.testing.assert_allclose(cycle.settings.scale, 1 / (1 + np.exp(-0.5)), rtol=1e-3)

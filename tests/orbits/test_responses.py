@@ -340,10 +340,7 @@ def test_the_curve_of_a_simulated_neuron_lies_in_the_band_of_its_estimate(tmp_pa
     curve = hj.find_limit_cycle(system).responses().curve()
     (low, high), values = measured.interval(curve.phase), curve.values
     assert np.mean(((low <= values) & (values <= high))[np.isfinite(values)]) > 0.9
-    slow = type(curve)(curve.phase, 60 * values, curve.input, time_unit="min")
-    plot = hj.plot.phase_response(measured, model=slow)
-    np.testing.assert_allclose(plot.ax.lines[1].get_ydata(), values, rtol=1e-12)
-    hj.plot.save(tmp_path / "both", plot)
+    hj.plot.save(tmp_path / "both", hj.plot.phase_response(measured, model=curve))
 
 
 def _shifted(cycle, name, step):

@@ -51,9 +51,7 @@ def test_sections_at_events():
     items = [hj.Crossing("y", "rising", level), hj.Crossing("y", "falling", level)]
     cycle = hj.plants.settle(Circle(), items, ("x", "y"), cycles=20)
     true = [[math.cos(0.2), level], [-math.cos(0.2), level]]
-    assert (
-        abs(cycle.period - 2 * math.pi) < 1e-9 and np.abs(cycle.cycle_outputs - true).max() < 1e-8
-    )
+    assert abs(cycle.period - math.tau) < 1e-9 and np.abs(cycle.cycle_outputs - true).max() < 1e-8
     returns = cycle.perturbed_returns()
     assert abs(returns.multipliers[0] - math.exp(-0.4 * math.pi)) < 1e-6
     assert len(returns.multipliers) == 1

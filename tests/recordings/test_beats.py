@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.orbits.responses import PhaseCurve
 from hybridjax.recordings.beats.model import forecast, intervals_of, tabulated
 
 from .mishaps import mishandle, misjudged
@@ -53,6 +54,11 @@ def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     assert rms(found.values - CURVE) < 0.12
     assert found.left_out_flat + 0.01 < found.left_out < 1
     assert "Shape: it adds" in repr(found)
+    curve = PhaseCurve(X, CURVE, "u", time_unit="ms")
+    drawn, band = hj.plot.phase_response(curve, model=found).ax, found.interval(found.phase)[0]
+    np.testing.assert_allclose(drawn.lines[1].get_ydata(), found.values / 1000)
+    heights = drawn.collections[0].get_paths()[0].vertices[:, 1]
+    assert heights.min() == pytest.approx(band.min() / 1000)
 
 
 def rms(values):
@@ -67,10 +73,8 @@ def test_slopes_are_derivatives(noisy):
         moved = forecast(intervals, table, a + 1e-5 * np.eye(5)[k], rates)
         difference = (moved.duration - base.duration) / 1e-5
         np.testing.assert_allclose(base.slopes[:, k], difference, atol=0.02 * 0.1)
-    moved = forecast(intervals, table, a, rates + 1e-5)
-    np.testing.assert_allclose(
-        base.slopes[:, -1], (moved.duration - base.duration) / 1e-5, atol=5e-4
-    )
+    difference = (forecast(intervals, table, a, rates + 1e-5).duration - base.duration) / 1e-5
+    np.testing.assert_allclose(base.slopes[:, -1], difference, atol=5e-4)
 
 
 def test_intervals_of_all_lengths_are_no_missed_events():

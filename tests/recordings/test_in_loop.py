@@ -21,9 +21,7 @@ def field(t, x, u=0.0):
 
 @pytest.fixture(scope="module")
 def multipliers():
-    ends = [
-        solve_ivp(field, (0, 1), x, rtol=1e-10, atol=1e-12).y[:, -1] for x in ([1.0, 0], [0, 1.0])
-    ]
+    ends = [solve_ivp(field, (0, 1), x, rtol=1e-10, atol=1e-12).y[:, -1] for x in np.eye(2)]
     return np.linalg.eigvals(np.transpose(ends))
 
 

@@ -42,9 +42,7 @@ def test_a_list_of_sections_of_every_kind(hopper_cycle):
 def test_a_number_as_the_anchor(hopper_cycle):
     clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=0.1))
     np.testing.assert_allclose(clock.lanes.t % 1, [0.1, 0.1 + 1 / 3, 0.1 + 2 / 3], atol=1e-12)
-    family = hj.KinematicPhase(
-        4, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=0.3
-    )
+    family = hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=0.3)
     q = np.asarray(hj.place_sections(hopper_cycle, family).lanes.q)
     angle = np.unwrap(np.angle((q[0] - 1.9) / 0.3 + 1j * q[1] / 1.9))
     np.testing.assert_allclose(angle, 0.3 - np.pi / 2 * np.arange(4), atol=1e-10)
@@ -52,10 +50,7 @@ def test_a_number_as_the_anchor(hopper_cycle):
 
 def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle):
     """On which side of it is no matter; it was taken for a section that is touched."""
-    center, scale = (1.9, -0.3), (0.3, 1.9)
-    family = hj.KinematicPhase(
-        4, position="yM", velocity="vM", center=center, scale=scale, anchor=APEX
-    )
+    family = hj.KinematicPhase(4, "yM", "vM", (1.9, -0.3), (0.3, 1.9), anchor=APEX)
     placed = hj.place_sections(hopper_cycle, family)
     np.testing.assert_allclose(np.sum(placed.duration), 1.0, atol=1e-12)
     assert abs(placed.lanes.q[1, 0]) < 1e-12
@@ -86,7 +81,7 @@ TOP = Crossing("v", "falling")
         ),
         ([Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / 6.6633), "falling")], "depends on time"),
         (hj.ClockPhase(4, Crossing("x", "rising", 9.0)), "on the cycle: from -2.009 to 2.009"),
-        ([TOP, TOP], r"section 1 \(v falling\) coincides with section 0"),
+        ([TOP, Crossing("x", "rising"), TOP], r"section 2 \(v falling\) coincides with section 0"),
         (hj.KinematicPhase(8, "x", "v", (5.0, 0.0)), r"turn about the `center` \(5.0, 0.0\)"),
     ],
 )

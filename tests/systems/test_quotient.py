@@ -7,6 +7,7 @@ import pytest
 import hybridjax as hj
 from hybridjax.models.walkers import _heelstrike
 from hybridjax.systems.chart import FieldChart
+from hybridjax.systems.quotient import check_symmetry
 
 
 hj.enable_x64()
@@ -56,7 +57,8 @@ class Full(hj.HybridSystem):
             yield hj.Transition(
                 f"{other} lands", f"{name} stands", f"{other} stands",
                 guard=lambda t, q, u, leg=leg: q[leg] + q[1 - leg] + leg * self.early,
-                reset=lambda t, q, u, k=leg: told(1 - k, *_heelstrike(t, seen(q, k), u), q[4]),
+                reset=lambda t, q, u, k=leg, x=leg * self.early: told(
+                    1 - k, *_heelstrike(t, seen(q, k), u), q[4] + x),
                 enabled=lambda t, q, u, leg=leg: q[leg] < 0,
             )  # fmt: skip
 
@@ -125,6 +127,10 @@ def test_the_symmetry_is_that_of_all_systems_in_all_units():
         hj.find_limit_cycle(half(1e-10), cycle)
     with pytest.raises(hj.DefinitionError, match="Biased does not have the symmetry"):
         hj.find_limit_cycles([half(0.0), half(1e-10)], cycle)
+    check_symmetry(hj.Quotient(hj.models.Duffing(rate=1e16), flipped=("x", "v"), half_period=True))
+    with pytest.raises(hj.DefinitionError, match="'left lands' is not the mirror image"):
+        sizes = {"left stands": np.r_[1, 1, 1, 1, 1e-9]}
+        check_symmetry(hj.Quotient(Full(early=1e-10), **MIRROR), sizes)
 
 
 class Inverter(hj.HybridSystem):
