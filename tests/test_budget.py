@@ -27,12 +27,12 @@ PRONOUNS = set(
 # a change that needs less lowers it. Of the code, 1150 lines are the algebra of HTFs, loops and
 # delays, 1160 the responses of cycles with noise, coupling and symmetry in time, 770 populations of
 # subjects, 980 motion and sliders, 610 simulators of others, 70 sweeps on the host, 60 comparisons
-# with higher orders, 260 turns and sections whose moves are computed side by side, 95 warnings and
+# with higher orders, 260 turns and sections whose moves are computed side by side, 98 warnings and
 # refusals of fits (30 of them of drift that is not declared); of the tests, 1900 are those of all,
 # 70 of orders of names and samples, 170 of the last two.
 # (The thirteenth structure is that of a trajectory of a simulator.)
 LIMITS = {
-    "code": 28_934,
+    "code": 28_937,
     "files": 245,
     "longest": 500,
     "public_names": 185,
@@ -41,8 +41,8 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 17,
-    "test_lines": 18_088,
-    "doc_words": 38_902,
+    "test_lines": 18_097,
+    "doc_words": 38_904,
 }
 
 

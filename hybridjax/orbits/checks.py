@@ -373,7 +373,8 @@ def _about_guards(s: Structure, turn: Turn, expected: float) -> str:
                 values.setdefault(g, []).extend(s.transitions[g].sign * row)
     text = "; ".join(
         f"the guard of '{s.transitions[g].name}', which should be {s.transitions[g].direction}, "
-        f"went from {x[0]:.3g} to {x[-1]:.3g} (between {min(x):.3g} and {max(x):.3g})"
+        f"began at {x[0]:.3g} and stayed between {min(x):.3g} and {max(x):.3g}"
         for g, x in values.items()
     )
-    return f" No event happened: {text}. Check its direction.{_better_guess(expected)}" * bool(text)
+    advice = "Check its direction, and that the system does not come to rest."
+    return f" No event happened: {text}. {advice}{_better_guess(expected)}" * bool(text)

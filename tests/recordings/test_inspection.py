@@ -11,6 +11,7 @@ from scipy import signal
 
 import hybridjax as hj
 from hybridjax.apps.identify import _page
+from hybridjax.recordings.inspection.faults import slow_changes
 
 from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle, signals
 
@@ -105,6 +106,14 @@ def test_causes_are_named(cause, mishap):
     phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
     named = causes(mishandle(made_up(0), mishap, **NAMES), phase)
     assert cause in named if cause else not named
+
+
+def test_drift_that_is_left_asks_for_a_smaller_number():
+    recording = mishandle(made_up(0), "slow drift", **NAMES)
+    phase = hj.recordings.estimate_phase(recording, TOP)
+    for removed, advised in (np.inf, 50), (50.0, 25):
+        finding, *_ = slow_changes(recording, phase, ("x", "v"), removed)
+        assert f"`drift={advised}` takes it out" in finding.text
 
 
 def test_an_order_that_is_too_low_is_named():

@@ -186,8 +186,8 @@ def fit_series(
 
     **Arguments:**
 
-    - `data`: a `Record` of any length, with gaps or without; `ExperimentData` (all cycles of the
-      successful experiments); `SectionData`; or several of these.
+    - `data`: `Record`s, `ExperimentData` (all cycles of successful experiments), or `SectionData`.
+      If outputs drift or have offsets: `[dataclasses.replace(r, drift=20) for r in data.records]`.
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model that has this number.
     - `overhang`: number of lags of the numerators beyond d N, with N sections. Default: N.
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
@@ -226,10 +226,10 @@ def fit_series(
     doubt = _about_drift(fit, records, start == "free")
     if check:
         refuse_order(delayed, noise * _noise(solution), about_answering(feedback, _BIASED) or doubt)
-    # One more multiplier, or a pair.
+    # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
     more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
-    doubts = "; ".join(filter(None, (doubt, fit.contradiction(more))))
-    return dataclasses.replace(fit, feedback=feedback, doubt=warned(doubts, check))
+    doubt = warned(doubt or fit.contradiction(more), check)
+    return dataclasses.replace(fit, feedback=feedback, doubt=doubt)
 
 
 def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> str:

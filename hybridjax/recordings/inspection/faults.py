@@ -338,8 +338,11 @@ def _difference(mean: Cycles, usual: Cycles, name: str, outputs: list[str]) -> I
         yield Finding("another cycle", text)
 
 
-def slow_changes(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -> Iterator[Finding]:
-    """Find means over cycles that change much more slowly than they scatter."""
+def slow_changes(
+    recording: Recording, phase: Phase, outputs: tuple[str, ...], removed: float
+) -> Iterator[Finding]:
+    """Find means over cycles that change much more slowly than they scatter, where changes slower
+    than some cycles have been `removed`."""
     for name in outputs:
         power, trials = np.zeros(_COSINES), phase.by_trial(recording)
         for (_, x), (trial, parts) in zip(recording.samples(name), trials, strict=True):
@@ -348,5 +351,6 @@ def slow_changes(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
                 if len(level) >= 2 * _COSINES:
                     power += np.asarray(fft.dct(level, norm="ortho"))[1 : _COSINES + 1] ** 2
         if power[: _COSINES // 4].mean() > _RATIO * power[_COSINES // 4 :].mean():
-            text = f"{name} drifts or slips: if that is the sensor, `drift=50` takes it out."
+            text = f"{name} drifts or slips: if that is the sensor, "
+            text += f"`drift={min(50.0, removed / 2):g}` takes it out."
             yield Finding("drift", text)

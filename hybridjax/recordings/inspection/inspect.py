@@ -116,7 +116,7 @@ def inspect_cycles(recording: Recording, phase: Phase, data: SectionData) -> lis
         *faults.odd_cycles(recording, phase),
         *inexact_events(data),
         *faults.other_cycles(recording, phase, outputs),
-        *faults.slow_changes(recording, phase, outputs),
+        *faults.slow_changes(recording, phase, outputs, data.records[0].drift or np.inf),
         *(unanswered(data, [t.name for t in recording.trials]) if outputs else ()),
         *feedback(data),
     ]
