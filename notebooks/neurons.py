@@ -29,7 +29,7 @@ import hybridjax as hj
 
 hj.enable_x64()
 files = [folder / "pacemaker_neurons.npz" for folder in (Path("data"), Path("notebooks/data"))]
-data = np.load(next(path for path in files if path.exists()))
+data = dict(np.load(next(path for path in files if path.exists())))
 
 # %% [markdown]
 # ## A recording of events

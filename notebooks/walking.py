@@ -30,7 +30,7 @@ import hybridjax as hj
 
 hj.enable_x64()
 files = [folder / "human_walk.npz" for folder in (Path("data"), Path("notebooks/data"))]
-data = np.load(next(path for path in files if path.exists()))
+data = dict(np.load(next(path for path in files if path.exists())))
 
 # %%
 trials = []
