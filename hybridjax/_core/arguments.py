@@ -129,10 +129,8 @@ def package(name: str) -> ModuleType:
     except ImportError as error:
         name = name.split(".")[0]
         extra = _EXTRAS.get(name, name)
-        raise DefinitionError(
-            f"this needs the package {name}, which is not installed: "
-            f"`pip install 'hybridjax[{extra}]'`."
-        ) from error
+        text = f"this needs the package {name}: `pip install 'hybridjax[{extra}]'`."
+        raise DefinitionError(text) from error
 
 
 # The extra of a library that is not called like it.

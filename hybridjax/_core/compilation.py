@@ -67,15 +67,13 @@ def enable_loop_kernels() -> None:
     **Raises:** `ComputationError`, on CPU, if XLA has read its options already, or does not have
     this option.
     """
-    before = os.environ.get("XLA_FLAGS")
-    os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*(before or "").split(), _LOOP_KERNELS]))
+    before = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*before.split(), _LOOP_KERNELS]))
     if jax.default_backend() == "cpu" and not _loops_are_kernels():
-        os.environ.pop("XLA_FLAGS")
-        if before is not None:
-            os.environ["XLA_FLAGS"] = before
+        os.environ["XLA_FLAGS"] = before
         raise ComputationError(
-            "XLA does not make single kernels of loops: it has read its options already (call "
-            "`enable_loop_kernels()` before JAX computes anything), or it is of another version."
+            "XLA has read its options already (call `enable_loop_kernels()` before JAX computes "
+            "anything), or is of another version."
         )
 
 

@@ -21,9 +21,6 @@ class Memory:
     def __init__(self):
         self._values: dict[int, dict[Hashable, Any]] = {}
 
-    def __len__(self) -> int:
-        return len(self._values)
-
     def get(self, owner: Any, key: Hashable) -> Any:
         """Return the value that is kept for this owner and key, or None."""
         return self._values.get(id(owner), {}).get(key)

@@ -27,20 +27,15 @@ def require_x64(*trees: Any) -> None:
     of `trees` is of less than 64 bits (an array of JAX that was made before `enable_x64()`).
     """
     if not jax.config.read("jax_enable_x64"):
-        raise PrecisionError(
-            "JAX is in 32-bit mode, too coarse for limit cycles and their derivatives: call "
-            "`hybridjax.enable_x64()` first."
-        )
+        raise PrecisionError("JAX is in 32-bit mode: call `hybridjax.enable_x64()` first.")
     for path, leaf in jax.tree_util.tree_leaves_with_path(trees):
         dtype = getattr(leaf, "dtype", None)
         if dtype is None or not jnp.issubdtype(dtype, jnp.inexact):
             continue
         if dtype not in (jnp.float64, jnp.complex128):
             name = jax.tree_util.keystr(path[1:]).lstrip(".") or "argument"
-            raise PrecisionError(
-                f"`{name}` is {dtype}: it was built before `hybridjax.enable_x64()`. Switch 64-bit "
-                "mode on first, then build it again."
-            )
+            text = "it was built before `hybridjax.enable_x64()`: build it again"
+            raise PrecisionError(f"`{name}` is {dtype}: {text}.")
 
 
 def real(x: Any) -> jax.Array:

@@ -57,16 +57,12 @@ class Candidates(NamedTuple):
         """
         half = is_half_integer(design.line, design.periods)
         if half.any():
-            raise DefinitionError(
-                f"f = {design.f[half][0]:g} is a multiple of 1/2, which is measured in two "
-                "experiments that belong together: use a `design` without such lines."
-            )
+            text = f"f = {design.f[half][0]:g} is a multiple of 1/2"
+            raise DefinitionError(f"{text}: use a `design` without such lines.")
         shared = np.stack([design.experiment, design.line])
         if len(np.unique(shared, axis=1).T) < len(design.line):
-            raise DefinitionError(
-                "the `design` excites several inputs with one line of one experiment: use one "
-                "with division='random' or 'disjoint'."
-            )
+            text = "use division='random' or 'disjoint'"
+            raise DefinitionError(f"the `design` excites several inputs with one line: {text}.")
         line, channel = np.unique(np.stack([design.line, design.channel]), axis=1)
         return cls(line, channel, design.periods, design.n_sections, design.cycles(0))
 
@@ -104,10 +100,6 @@ class Candidates(NamedTuple):
         return self.powers_in(design).mean(axis=0)
 
 
-def rate_of(name: str) -> str:
-    return f"rate of {name}"
-
-
 def mean_squares(model: Model, cosines: Candidates) -> Squares:
     """Return the mean squares of inputs, outputs, and rates of inputs.
 
@@ -116,7 +108,7 @@ def mean_squares(model: Model, cosines: Candidates) -> Squares:
     """
     inputs = {n: (cosines.channel == i).astype(float) for i, n in enumerate(model.inputs)}
     change = 4 * np.sin(np.pi * cosines.f / cosines.n_sections) ** 2
-    rates = {rate_of(name): square * change for name, square in inputs.items()}
+    rates = {f"rate of {name}": square * change for name, square in inputs.items()}
     H = cosines.responses(model)
     outputs = dict(zip(model.outputs, (np.abs(H) ** 2).sum(axis=1).T, strict=True))
     return {**inputs, **outputs, **rates}
@@ -221,7 +213,5 @@ def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
             models.append(moved.to_ldtp(fit._scale, fit.inputs, fit.outputs))
         if len(models) == count:
             return models
-    raise DefinitionError(
-        f"only {len(models)} of {_TRIES * count} models in the confidence region of this estimate "
-        "are stable: measure more before a design is made."
-    )
+    text = f"only {len(models)} of {_TRIES * count} models in its confidence region are stable"
+    raise DefinitionError(f"`fit` is uncertain, {text}: measure more before a design is made.")

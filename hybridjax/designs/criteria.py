@@ -69,10 +69,8 @@ def _multipliers(
         if goal.which is not None and goal.which < len(multipliers):
             apart = np.abs(minimal - multipliers[goal.which])
             if not apart.min() < _SAME * np.abs(multipliers).max():
-                raise DefinitionError(
-                    f"no input excites the multiplier {multipliers[goal.which]:.4g}, or no output "
-                    "depends on it: add an input or an output."
-                )
+                text = f"multiplier {multipliers[goal.which]:.4g}: add an input or an output"
+                raise DefinitionError(f"no input excites, or no output has, the {text}.")
             goal = dataclasses.replace(goal, which=int(np.argmin(apart)))
         wanted, names, part = wanted_parts(goal, minimal, c)
         return matrices.criterion(wanted @ slopes, names, part)
@@ -100,10 +98,7 @@ def wanted_parts(
         if goal.which is None and z.imag < 0:
             continue
         if abs(slope[k]) < _SAME:
-            raise DefinitionError(
-                f"the multiplier {z:.4g} is double, so that its variance is infinite to first "
-                "order: choose another `goal`."
-            )
+            raise DefinitionError(f"the multiplier {z:.4g} is double: choose another `goal`.")
         gradient = -(z ** np.arange(d - 1, -1, -1)) / slope[k]
         name = f"{z.real:.4g}" if z.imag == 0 else f"{z.real:.4g}{z.imag:+.4g}i"
         rows = [gradient.real, gradient.imag][: 1 + (z.imag != 0)]

@@ -25,7 +25,7 @@ from ..experiments.design.multisine import optimize_phases
 from ..orbits.cycle import LimitCycle
 from ..sections.families import FamilyLike, as_family
 from ..sections.second_order import Quadratic, second_order
-from .candidates import Candidates, Kept, Model, Powers, Squares, rate_of
+from .candidates import Candidates, Kept, Model, Powers, Squares
 
 
 # Lower bound of a cosine's price, relative to its price without negative terms. Larger: prices are
@@ -107,10 +107,8 @@ class Limits(eqx.Module):
         periods = design.periods
         count = design.experiments if self.strides is None else self.strides // periods
         if count == 0:
-            raise DefinitionError(
-                f"`limit` allows {self.strides} strides, but one experiment has {periods} periods: "
-                "allow more, or take shorter experiments."
-            )
+            text = f"`limit` allows {self.strides} strides, fewer than one experiment has"
+            raise DefinitionError(f"{text}, {periods}: allow more.")
         if count > cosines:
             text = f"take a `design` with more lines, or fewer experiments than {count}"
             raise DefinitionError(f"the `design` has {cosines} cosines: {text}.")
@@ -122,10 +120,6 @@ Limit = Words | Mapping[str, Level] | Limits
 
 def as_limits(limit: Limit) -> Limits:
     return limit if isinstance(limit, Limits) else Limits(limit)
-
-
-def peak_of(name: str) -> str:
-    return f"peak of {name}"
 
 
 class PowerLimits(NamedTuple):
@@ -177,10 +171,8 @@ class PowerLimits(NamedTuple):
         alone = np.diagonal(self.curved, axis1=1, axis2=2)
         free = np.concatenate([self.cost, alone]).max(axis=0) == 0
         if free.any():
-            raise DefinitionError(
-                f"`limit` leaves cosine {int(np.argmax(free))} of the design free, because it "
-                "moves no limited signal: limit the input, too."
-            )
+            text = f"cosine {int(np.argmax(free))} of the design moves no signal of `limit`"
+            raise DefinitionError(f"{text}: limit the input, too.")
 
 
 def power_limits(
@@ -203,14 +195,14 @@ def power_limits(
         levels = [{str(n): float(x) for n, x in limits.rms.items()} for _ in squares]
     limits.require_inputs(inputs)
     for level in levels:
-        level |= {rate_of(n): float(x) for n, x in limits.rate.items()}
-        level |= {peak_of(n): float(x) for n, x in limits.peak.items()}
+        level |= {f"rate of {n}": float(x) for n, x in limits.rate.items()}
+        level |= {f"peak of {n}": float(x) for n, x in limits.peak.items()}
     silent = [n for level in levels for n, rms in level.items() if rms == 0]
     if silent:
         raise DefinitionError(f"the `design` does not move {silent[0]}: leave it out of `limit`.")
     names = [n for level in levels for n in level]
     rows = [
-        square[n.removeprefix(peak_of(""))] / rms**2
+        square[n.removeprefix("peak of ")] / rms**2
         for square, level in zip(squares, levels, strict=True)
         for n, rms in level.items()
     ]
@@ -268,10 +260,10 @@ class Products(NamedTuple):
             expected = H_model[:, model.outputs.index(name)]
             difference, size = np.linalg.norm(H - expected), np.linalg.norm(expected)
             if difference > _DIFFERENT * size:
+                share = difference / max(size, np.finfo(float).tiny)
                 raise DefinitionError(
-                    f"`limit` has the distortion of another system than the model: H_0 to {name} "
-                    f"differs by {difference / max(size, np.finfo(float).tiny):.0%}. Are its "
-                    "sections those of the model?"
+                    f"the distortion of `limit` and the model have different H_0 (to {name}, by "
+                    f"{share:.0%}): use one system, and the same sections."
                 )
 
     def rms(self, design: Design, phases: bool = False) -> Float[np.ndarray, " O"]:

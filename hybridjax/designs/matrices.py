@@ -72,8 +72,7 @@ def ldtp_matrices(
     """
     if not isinstance(model, LDTP):
         raise DefinitionError(
-            "a goal of `fit_ldtp` needs a model with matrices: an `LDTP`, such as `fit.model` of "
-            "`fit_ldtp` or a result of `hj.identify.realize`."
+            "a goal of `fit_ldtp` needs an `LDTP`: `fit_ldtp(...).model`, or `hj.identify.realize`."
         )
     lags = 2 * default_horizon(model.n_sections) + 1
     response = np.asarray(model.impulse_response(lags))[:, :, noise.outputs]

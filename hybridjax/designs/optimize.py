@@ -28,7 +28,6 @@ from .limits import (
     Products,
     as_limits,
     below_peaks,
-    peak_of,
     power_limits,
     products,
 )
@@ -204,7 +203,7 @@ class Rules(NamedTuple):
         use: dict[str, float] = {}
         shares = self.linear.cost @ self.cosines.power_of(design)
         for name, share in zip(self.linear.names, shares, strict=True):
-            use[name] = max(use.get(name, 0.0), np.inf if name.startswith(peak_of("")) else share)
+            use[name] = max(use.get(name, 0.0), np.inf if name.startswith("peak of ") else share)
         if self.distortion is not None:
             levels = zip(self.distorted(design).items(), self.distortion.level, strict=True)
             use |= {name: rms / level for (name, rms), level in levels}

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import require_equal, require_index, require_same
+from .._core.arguments import require_among, require_equal, require_index, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, OptionalNames, Order, Positive, Seed
 from .._core.execution import one_blas_thread
@@ -114,13 +114,9 @@ class Study(eqx.Module):
         if limits.strides is not None:
             raise DefinitionError("a study ends at `standard_error`: leave strides out of `limit`.")
         limits.require_inputs(first.input_names)
-        signals = (*first.input_names, *self.outputs)
-        named = () if isinstance(limits.rms, str) else limits.rms
-        if unknown := [n for n in named if n not in signals]:
-            raise DefinitionError(
-                f"`limit` has '{unknown[0]}', but the signals are {', '.join(signals)}: if it is "
-                "an output that will be recorded, name it in `outputs`."
-            )
+        named, signals = limits.rms, (*first.input_names, *self.outputs)
+        if not isinstance(named, str):
+            require_among("signal", named, signals, "`limit` (`outputs` names those to come): ")
         if not is_traced(first):
             Candidates.of(first)
 
@@ -196,10 +192,8 @@ class Study(eqx.Module):
         blocks = (*self._history.blocks, block)
         best = estimate(blocks, self.order, self.goal)
         if are_alike(best.fit.correlation, best.fit.freedom):
-            raise DefinitionError(
-                f"the data show more than {self.order} multipliers (misfits are alike at nearby "
-                "frequencies): add the blocks to a study with a larger `order`."
-            )
+            text = f"the data show more than {self.order} multipliers"
+            raise DefinitionError(f"{text}: add the blocks to a study with a larger `order`.")
         errors = _standard_errors(best.fit, self.goal)
         if best.objection:
             errors = np.full_like(errors, np.nan)

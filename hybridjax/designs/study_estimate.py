@@ -160,7 +160,6 @@ def refuse_transient(
     if left > allowed:
         raise DefinitionError(
             f"after {before} discarded cycles a part of {left:.1g} of the start's transient is "
-            f"left in the response, but {allowed:.1g} is allowed: use "
-            "`hj.identify.remove_transient(data).data`, or begin in the periodic response "
-            "(start='steady' in simulations)."
+            f"left (allowed: {allowed:.1g}): use `hj.identify.remove_transient(data).data`, or in "
+            "simulations start='steady'."
         )

@@ -106,15 +106,11 @@ class ExperimentData(eqx.Module):
         self.n_sections, self.periods = n_sections, periods
         sizes = self.u.shape[2], self.y.shape[2]
         self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
-        (S, n, ny), N, P = self.y.shape, self.n_sections, self.periods
+        (S, n, ny), N = self.y.shape, self.n_sections
         if n % N:
-            raise DefinitionError(
-                f"the record has {n} samples, not a multiple of N = {N} sections: cut it to whole "
-                "periods, beginning at section 0."
-            )
-        if n < N * P:
-            text = f"longer than the record, {n // N} periods: record more, or lower `periods`"
-            raise DefinitionError(f"the window of P = {P} periods is {text}.")
+            text = f"a whole number of periods of N = {N} sections, not {n} samples"
+            raise DefinitionError(f"records must hold {text}.")
+        self.windows()
         for name in ("result", "failed_at", "error"):
             require_axes(f"`{name}`", getattr(self, name), {"experiments": S})
         if self.cycle_outputs is not None:
@@ -126,9 +122,9 @@ class ExperimentData(eqx.Module):
             bad = ~finite.all(axis=2) & self.ok[:, None]
             if bad.any():
                 s, i = (int(x) for x in np.argwhere(bad)[0])
+                text = "repair the record, or mark the experiment as failed in `result`"
                 raise DefinitionError(
-                    f"experiment {s}: {name} is NaN or infinite at sample {i}; repair the record, "
-                    "or mark the experiment as failed in `result`."
+                    f"experiment {s}: {name} is not finite at sample {i}: {text}."
                 )
 
     @property
@@ -178,11 +174,8 @@ class ExperimentData(eqx.Module):
         """
         n, length = self.u.shape[1], self.n_sections * self.periods
         if repeats * length > n:
-            raise DefinitionError(
-                f"{repeats} windows of P = {self.periods} periods need {repeats * self.periods} "
-                f"cycles, but the record has {n // self.n_sections}: record "
-                "more cycles, or take fewer repeats."
-            )
+            text = f"{n // self.n_sections} cycles are too few for {repeats} x P = {self.periods}"
+            raise DefinitionError(f"{text} periods: record more, or lower `periods` or repeats.")
         first = n - repeats * length
         return [slice(first + r * length, first + (r + 1) * length) for r in range(repeats)]
 
@@ -217,10 +210,8 @@ class ExperimentData(eqx.Module):
         apart = ~(total <= _OPPOSITE * size)
         if apart.any():
             k = 2 * int(np.argmax(apart))
-            raise DefinitionError(
-                f"experiments {k} and {k + 1} are no pair: their inputs are not opposite "
-                "(`Design.with_negatives` makes pairs)."
-            )
+            text = "their inputs are not opposite (`Design.with_negatives` makes pairs)"
+            raise DefinitionError(f"experiments {k} and {k + 1} are no pair: {text}.")
         first, second = self.result[::2], self.result[1::2]
         broken = first != Result.OK
         failed_at = np.where(broken, self.failed_at[::2], self.failed_at[1::2])

@@ -110,8 +110,7 @@ def simulate_experiments(
     discard = (DISCARD if start == "cycle" else 0) if discard is None else discard
     if start == "cycle" and discard and (np.abs(ldtp.multipliers) >= 1).any():
         raise DefinitionError(
-            "the model is unstable: its transient grows, and no window is periodic. Use "
-            'start="periodic", or discard=0 for the transient itself.'
+            'the model is unstable: use start="periodic", or discard=0 for the transient itself.'
         )
     u = applied = design.inputs(design.periods + discard)
     x0 = ldtp.periodic_states(design.inputs(), design.periods) if start == "periodic" else None

@@ -124,9 +124,8 @@ def make_plan(
     if lost.any():
         k = int(np.argmax(lost))
         raise ComputationError(
-            f"experiments cannot go from section {k} to {placed.family.describe((k + 1) % N)}: "
-            "the limit on steps is reached even on the cycle. Place more sections, or find the "
-            "cycle with `settings=Settings(max_steps=...)`."
+            f"too many steps from section {k} to {placed.family.describe((k + 1) % N)}: place more "
+            "sections, or find the cycle with `settings=Settings(max_steps=...)`."
         )
     estimate = np.maximum(ways.estimate, _LEAST_SHARE)
 

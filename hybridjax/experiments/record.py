@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.arguments import Numbers, input_and_output_names
+from .._core.arguments import Numbers, input_and_output_names, require_index
 from .._core.boundary.checked import checked
 from .._core.boundary.containers import Stream
 from .._core.boundary.kinds import Index, NewNames, NewOptionalNames, SectionCount
@@ -66,10 +66,7 @@ class Record(eqx.Module):
         if len(self.u) != len(self.y) or 0 in (len(self.u), *self.y.shape):
             text = f"`u` {self.u.shape} and `y` {self.y.shape} must have the same samples"
             raise DefinitionError(f"{text} (their first axes), one or more.")
-        if first_section >= n_sections:
-            raise DefinitionError(
-                f"`first_section` must be one of 0..{n_sections - 1}, not {first_section}."
-            )
+        require_index("section", first_section, n_sections)
         self.n_sections, self.first_section, self.lead = n_sections, first_section, lead
         self.drift = drift
         sizes = self.u.shape[1], self.y.shape[1]
@@ -124,16 +121,13 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
         raise DefinitionError("`data` holds no experiment that ran well: see `data.summary()`.")
     if not all(record.inputs for record in records):
         raise DefinitionError(
-            "`data` holds no input: name the signals that acted, or use what needs none "
-            "(`hj.recordings.natural_multipliers`)."
+            "`data` holds no input: name one, or use `hj.recordings.natural_multipliers`."
         )
     about = [(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records]
     other = [x for x in about if x != about[0]]
     if other:
-        raise DefinitionError(
-            "`data` holds records of different sections, inputs, outputs, lead or drift: "
-            f"{about[0]}, {other[0]}."
-        )
+        text = "different sections, inputs, outputs, lead or drift"
+        raise DefinitionError(f"`data` holds records of {text}: {about[0]}, {other[0]}.")
     usable = [part for record in records for part in _with_known_inputs(record)]
     if not usable:
         raise DefinitionError("an input is NaN at every sample: give the input that acted.")

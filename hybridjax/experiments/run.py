@@ -259,9 +259,8 @@ class Campaign:
         if (change > stepping.accuracy).any():
             s = int(np.nanargmax(change))
             raise ComputationError(
-                f"experiment {first + s}: no periodic response was found near the one that the "
-                f"linearization predicts (Newton's last step is {change[s]:.1e} of the state's "
-                "size): make the input smaller, or discard cycles instead."
+                f"experiment {first + s}: no periodic response was found (Newton's last step is "
+                f"{change[s]:.1e} of the state's size): make the input smaller, or discard cycles."
             )
         start = np.where(np.isnan(change), predicted, start)
         return start, parts if still and window.shape == u.shape else None
@@ -354,18 +353,12 @@ def _controller(
     **Raises:** `DefinitionError` if it does not fit; `ComputationError` if the loop is unstable.
     """
     if options.start != "cycle":
-        raise DefinitionError(
-            f"with `feedback` experiments cannot begin with start='{options.start}': use "
-            "start='cycle', and discard cycles."
-        )
+        raise DefinitionError("with `feedback`, use start='cycle', and discard cycles.")
     model, F = linearize(placed.cycle, placed, outputs=outputs), options.feedback
     loop = model.feedback(F)  # type: ignore[arg-type]  # (not None)
     if len(loop.multipliers) and abs(loop.multipliers[0]) >= 1:
-        raise ComputationError(
-            f"with this feedback the limit cycle is not stable (largest multiplier "
-            f"{abs(loop.multipliers[0]):.4g} in modulus): see "
-            "`linearize(...).feedback(controller).multipliers`."
-        )
+        text = f"its largest multiplier is {abs(loop.multipliers[0]):.4g} in modulus"
+        raise ComputationError(f"with this feedback the limit cycle is not stable: {text}.")
     if isinstance(F, LDTP):
         return to_host(F.matrices)
     shape = len(model.inputs), len(model.outputs)
@@ -391,10 +384,7 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, inputs: tupl
             )
     cycles = u.shape[1] // n_sections
     if discard >= cycles:
-        raise DefinitionError(
-            f"of {cycles} cycles of inputs, discard={discard} leaves none: give longer inputs, or "
-            "a smaller `discard`."
-        )
+        raise DefinitionError(f"discard={discard} leaves none of {cycles} cycles of inputs.")
     return Inputs(u, cycles, cycles - discard)
 
 
@@ -402,17 +392,15 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections, stabilized: bool)
     """**Raises:** an error for cycles that experiments would leave."""
     if not cycle.clocked and bool(np.isfinite(placed.bound.time).any()):
         raise DefinitionError(
-            f"clock sections sample {type(cycle.system).__name__}, which has no clock, at fixed "
-            "times: nothing brings its phase back (a multiplier of exactly 1), so that every input "
-            "shifts it for good. Use sections that depend on the state (KinematicPhase, or a list "
-            "of Crossing and AtEvent)."
+            f"{type(cycle.system).__name__} has no clock: at clock sections nothing brings its "
+            "phase back (a multiplier of exactly 1). Use sections that depend on the state "
+            "(KinematicPhase, or a list of Crossing and AtEvent)."
         )
     if not cycle.stable and not stabilized:
         largest = np.abs(cycle.multipliers[0])
         raise ComputationError(
-            f"the limit cycle is not stable (largest multiplier {largest:.4g} in modulus), so "
-            "experiments would leave it: stabilize the system, for example by `feedback`, or use "
-            "the exact linearization (`linearize`), which needs no experiments."
+            f"the limit cycle is not stable (largest multiplier {largest:.4g} in modulus): "
+            "stabilize it, for example by `feedback`, or use `linearize` without experiments."
         )
 
 

@@ -85,10 +85,8 @@ class StoredExperiments:
         `FileFormatError` if one is damaged."""
         missing = self.missing()
         if missing:
-            raise DefinitionError(
-                f"{len(missing)} of {len(self)} chunks in '{self.address}' are missing, the first "
-                f"is {missing[0]}: make the call that began it again to run them."
-            )
+            text = f"{len(missing)} of {len(self)} chunks in '{self.address}' are missing"
+            raise DefinitionError(f"{text}: make the call that began it again to run them.")
         for k in range(len(self)):
             yield self[k]
 
@@ -259,7 +257,6 @@ class ExperimentJob:
 
 def _design(source: Design | np.ndarray) -> str:
     if isinstance(source, Design):
-        arrays = jax.tree_util.tree_leaves(eqx.filter(source, eqx.is_array))
-        return digest_of(*map(digest_of, arrays), repr(source.input_names))
+        return digest_of(source)
     parts = (source[k : k + CHUNK] for k in range(0, len(source), CHUNK))  # (may lie on disk)
     return digest_of(*map(digest_of, parts))

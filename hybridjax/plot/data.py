@@ -81,7 +81,6 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
                 last.tick_params(labelleft=False)
         for panel in axes[-1, :2]:
             panel.set_xlabel("phase (cycles)")
-        axes[0, 0].get_figure(root=True).align_ylabels(axes)
         letters(axes)
     return Plot(axes)
 
@@ -203,7 +202,6 @@ def experiment(data: ExperimentData, index: int = 0, *, ax: AxesLike | None = No
         if not data.ok[index]:
             title += f": {Result(int(data.result[index])).message}"
         axes[0, 0].set_title(title, wrap=True)
-        axes[0, 0].get_figure(root=True).align_ylabels(axes)
     return Plot(axes)
 
 
@@ -246,7 +244,6 @@ def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | Non
         axes[-1, 0].set_xlabel("time (cycles)")
         for lags in axes[-1, 1:]:
             lags.set_xlabel("lag (sections)")
-        axes[0, 0].get_figure(root=True).align_ylabels(axes[:, 0])
     return Plot(axes)
 
 

@@ -51,7 +51,6 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
         limits = dict(xlim=(0, f.max()), ylim=(1e-3 * top, 2 * top))
         below.set(yscale="log", xlabel=FREQUENCY, ylabel=label, **limits)
         below.legend()
-        axes[0, 0].get_figure(root=True).align_ylabels(axes)
     return Plot(axes)
 
 

@@ -126,6 +126,7 @@ def panels(
             for panel in axes.flat:  # here, since ticks are made when the figure is drawn
                 panel.tick_params(labelsize=_STYLE["xtick.labelsize"])
             yield axes
+            axes[0, 0].figure.align_ylabels(axes)
         return
     axes = np.asarray(ax, dtype=object)
     if not all(isinstance(panel, Axes) for panel in axes.flat):

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from .._core.signal import Signal
 from ..errors import DefinitionError
@@ -85,12 +86,8 @@ def sweep(maps: Any, name: str = "spectral_radius", *, ax: AxesLike | None = Non
 
     **Raises:** `DefinitionError` if the dataset has no such quantity over one or two parameters.
     """
-    axes_of = {str(key): values.dims for key, values in maps.data_vars.items()}
-    if not 1 <= len(axes_of.get(name, ())) <= 2:
-        drawable = [key for key, dims in axes_of.items() if 1 <= len(dims) <= 2]
-        raise DefinitionError(
-            f"the sweep has no `{name}` over one or two parameters; it has {', '.join(drawable)}."
-        )
+    drawable = [str(key) for key, values in maps.data_vars.items() if 1 <= values.ndim <= 2]
+    require_among("map", [name], drawable, "over one or two parameters ")
     with panels(ax) as axes:
         quantity = maps[name]
         quantity.plot(ax=axes[0, 0], **({"x": quantity.dims[0]} if quantity.ndim == 2 else {}))

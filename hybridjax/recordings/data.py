@@ -1,6 +1,5 @@
 """Data at the sections of a recorded cycle."""
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -127,9 +126,7 @@ class SectionData(eqx.Module):
         cycles = np.concatenate([self.cycle_inputs, self.cycle_outputs], axis=1)
         drawn = [
             picture([Curve(phase, x, "average cycle", color)], "phase (cycles)", with_unit(*name))
-            for *name, x, color in list(
-                zip(self.signals, self.units, cycles.T, itertools.cycle(COLORS), strict=False)
-            )[:4]
+            for *name, x, color in zip(self.signals[:4], self.units, cycles.T, COLORS, strict=False)
         ]
         return card("SectionData", "", text(repr(self)), *drawn)
 

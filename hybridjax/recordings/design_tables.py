@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .._core.arguments import require_equal
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, PeriodCount, Positive
 from .._core.writing import replacing
@@ -82,9 +83,8 @@ def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording
     count = np.unique(experiment, return_counts=True)[1]
     if (count != count[0]).any() or (np.diff(experiment) < 0).any():
         raise FileFormatError(f"'{path}' must have experiments of one length, in order.")
-    if len(count) != len(recording.trials):
-        text = f"{len(recording.trials)} trials, but the table has {len(count)} experiments."
-        raise DefinitionError(f"there are {text}")
+    numbers = len(recording.trials), len(count)
+    require_equal("recording and table", "numbers of trials", *numbers)
     names = [k for k in columns if k not in _BY_PHASE]
     command = np.stack([columns[k].reshape(len(count), -1) for k in names], axis=2)
     command = np.pad(command, ((0, 0), (1, 1), (0, 0)))  # zero before and after the experiment

@@ -105,9 +105,8 @@ def advise(
     band = input_band(data)
     error = np.where(grid.sampled, grid.y - fit.simulate(grid, True), 0.0)
     for name, p in ({} if fit.reference else answering(grid, error, data.inputs)).items():
-        text = f"{name} answers earlier residuals of the outputs ({p_value(p)}), as by a "
-        text += f"controller: fits are biased. {NAME_REFERENCE}"
-        warnings.append(Finding("feedback", text))
+        text = f"{name} answers earlier residuals of the outputs ({p_value(p)}): fits are biased. "
+        warnings.append(Finding("feedback", text + NAME_REFERENCE))
     warnings += [*_about_excitation(data, fit, band), *_about_outputs(grid, fit)]
     if bias > 2 * fit.standard_errors.max():
         values = ", ".join(f"{z:.4f}" for z in plain)
@@ -147,9 +146,10 @@ def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:
     cycles = max(len(r.u) for r in data.records) / data.n_sections
     for z in fit.multipliers:
         if z.imag >= 0 and abs(z) > max(_DAMPED, _DECAYED ** (1 / cycles)):
-            text = f"the mode of the multiplier {z:.3g} hardly decays in the longest record, of "
-            text += f"{cycles:.0f} cycles: hum near a multiple of the rhythm, or drift, looks the "
-            text += "same and spoils the other multipliers. Look for it in the spectra of outputs."
+            text = (
+                f"the mode of the multiplier {z:.3g} hardly decays in {cycles:.0f} cycles, as hum "
+            )
+            text += "or drift, which spoil the others: look for them in the spectra of outputs."
             yield Finding("no decay", text)
 
 
@@ -160,9 +160,8 @@ def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> I
             at = abs(np.angle(z)) / (2 * np.pi)
             near = np.abs((f[:, None] - [at, -at] + 0.5) % 1 - 0.5).min(axis=1) < 0.1
             if strength[near].max(initial=0) < LEAST_POWER * strength.max():
-                text = f"{name} has next to no power at the frequencies {at:.2f} + k cycles per "
-                text += f"period, where the multiplier {z:.3g} is seen."
-                yield Finding("weak excitation", text)
+                text = f"{name} has next to no power at {at:.2f} + k cycles per period, where the "
+                yield Finding("weak excitation", f"{text}multiplier {z:.3g} is seen.")
         if edge < WHOLE_BAND * fit.n_sections / 2:
             text = f"transfer functions are determined up to {edge:.3g} cycles per period, where "
             text += f"the power of {name} ends."
@@ -171,15 +170,13 @@ def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> I
 
 
 def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
-    y = np.where(grid.sampled, grid.y, np.nan)
-    for i, j in combinations(range(y.shape[3]), 2):
-        both = np.stack([y[..., i], y[..., j]]).reshape(2, -1, y.shape[2])
-        both = np.where(np.isfinite(both).all(axis=0), both, np.nan)
-        count = np.maximum(np.isfinite(both[0]).sum(axis=0), 1)
-        both = np.nan_to_num(both - np.nansum(both, axis=1, keepdims=True) / count)
-        size = np.sqrt(np.prod((both**2).sum(axis=1), axis=0))
-        correlation = np.abs(np.prod(both, axis=0).sum(axis=0)) / np.maximum(size, 1e-300)
-        if np.median(correlation) > _SAME_OUTPUTS:
+    N, ny = grid.y.shape[2:]
+    for i, j in combinations(range(ny), 2):
+        y, sampled = (x[..., [i, j]].reshape(-1, N, 2) for x in (grid.y, grid.sampled))
+        both = np.asarray(sampled.all(axis=2))
+        with np.errstate(invalid="ignore"):  # of an output that is constant at a section
+            matrices = [np.corrcoef(y[both[:, n], n].T) for n in range(N)]
+        if np.median(np.nan_to_num(np.abs(matrices)[:, 0, 1])) > _SAME_OUTPUTS:
             text = f"where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} carry the "
             text += "same information, as signals are whose angle is the phase: cycles from "
             yield Finding("outputs", f"{text}crossing to crossing may have smaller errors.")

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.optimize.elementwise import find_root
 
 from .._core import limits
-from .._core.arguments import require_among
+from .._core.arguments import require_among, require_equal
 from .._core.boundary.checked import checked
 from .._core.signal import with_unit
 from ..errors import DefinitionError
@@ -83,9 +83,7 @@ class Recording(eqx.Module):
         columns = {key: numbers(where, key, values) for key, values in signals.items()}
         happened = {key: numbers(where, key, values) for key, values in (events or {}).items()}
         for key, values in columns.items():
-            if len(values) != len(time):
-                text = f"{key} has {len(values)} samples, but time has {len(time)}."
-                raise DefinitionError(f"{where}: {text}")
+            require_equal(f"{where}: {key} and time", "lengths", len(values), len(time))
         for key, values in (happened | columns).items():
             if np.isinf(values).any():
                 text = f"{key} is infinite at sample {int(np.argmax(np.isinf(values)))}"
@@ -148,14 +146,10 @@ class Recording(eqx.Module):
         units = dict(zip(first.signals, first.units, strict=True))
         trials: list[Trial] = []
         for other in recordings:
-            a, b = first.trials[0].name, other.trials[0].name
-            if set(other.signals) != set(units):
-                text = f"{', '.join(units)}, and {', '.join(other.signals)}."
-                raise DefinitionError(f"trials '{a}' and '{b}' have different signals: {text}")
+            pair = f"trials '{first.trials[0].name}' and '{other.trials[0].name}'"
+            require_equal(pair, "signals", sorted(units), sorted(other.signals))
             for key, unit in units.items():
-                if other.unit(key) != unit:
-                    text = f"in trial '{a}', but in '{other.unit(key)}' in '{b}': convert one."
-                    raise DefinitionError(f"{key} is in '{unit}' {text}")
+                require_equal(pair, f"units of {key}", unit, other.unit(key))
             order = list(map(other.column, units))
             for t in other.trials:  # (signals in the same order are not copied)
                 same = order == sorted(order)
@@ -291,8 +285,7 @@ def check_events(
     within = (at >= time[0] - margin) & (at <= time[-1] + margin)
     if len(at) and not within.any():
         raise DefinitionError(
-            f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording, "
-            f"which is from {time[0]:.6g} to {time[-1]:.6g} s: their times have another zero or "
-            "unit."
+            f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording "
+            f"({time[0]:.6g} to {time[-1]:.6g} s): their times have another zero or unit."
         )
     return at[within]

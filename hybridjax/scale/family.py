@@ -41,10 +41,8 @@ class Points:
         self.values = {name: np.asarray(x, float) for name, x in values.items()}
         lengths = sorted({len(x) for x in self.values.values()})
         if len(lengths) != 1 or lengths == [0]:
-            raise DefinitionError(
-                f"`values` must hold at least one point, and as many values of each parameter, "
-                f"not {', '.join(map(str, lengths)) or 'none'}."
-            )
+            numbers = ", ".join(map(str, lengths)) or "none"
+            raise DefinitionError(f"`values` must hold as many of each parameter, not {numbers}.")
 
     @classmethod
     def sobol(
@@ -137,10 +135,8 @@ class Family:
         """
         system = self.system({name: jnp.asarray(x) for name, x in values.items()})
         if not isinstance(system, HybridSystem):
-            raise DefinitionError(
-                f"`model` must be a system, or a function of parameters that returns one, not a "
-                f"{type(system).__name__}."
-            )
+            text = "a system, or a function of parameters that returns one"
+            raise DefinitionError(f"`model` must be {text}, not a {type(system).__name__}.")
         require_x64(system)
         check_periodic(system)
         return system

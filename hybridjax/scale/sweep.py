@@ -149,7 +149,7 @@ class SweepJob:
     wanted: Wanted
     guess: LimitCycle | None
     description: Mapping[str, Any]
-    begun: Begun | None = None
+    begun: Begun = None  # type: ignore[assignment]
     variables: Mapping[str, Variable] = dataclasses.field(default_factory=dict)
     cycles: LimitCycles | None = None
 
@@ -170,7 +170,6 @@ class SweepJob:
 
     def arrays(self) -> list[np.ndarray]:
         """Return the arrays of the common beginning."""
-        assert self.begun is not None
         return [np.asarray(x) for x in jax.tree_util.tree_leaves(self.begun.parts())]
 
     def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "SweepJob":
@@ -183,7 +182,6 @@ class SweepJob:
 
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
         """Return the results at the points of piece k."""
-        assert self.begun is not None
         if len(self.blocks) == 1:
             cycles = self.cycles or self.coarse()[1]
         else:
@@ -203,7 +201,6 @@ class SweepJob:
 
     def coarse(self) -> tuple[Known, LimitCycles]:
         """Return the cycles of the coarse pass."""
-        assert self.begun is not None
         index = self.begun.index
         tiles = self._tiles(index, None)
         rounds = tiles.solve(len(index[0]))
@@ -211,7 +208,6 @@ class SweepJob:
         return Known(None, rounds.anchor, rounds.period, jacobian, result), as_cycles(tiles, rounds)
 
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
-        assert self.begun is not None
         systems, total = self.family.systems(self.space.at(index)), math.prod(self.blocks.shape)
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
         size = min(BATCH, math.prod(self.blocks.block)) if total > SMALL else None

@@ -41,10 +41,8 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
     for name, leaf in arrays_of(system).items():
         real = jnp.issubdtype(leaf.dtype, jnp.inexact) and not is_traced(leaf)
         if real and not np.all(np.isfinite(leaf)):
-            raise DefinitionError(
-                f"parameter `{name}` of {type(system).__name__} is "
-                f"{np.asarray(leaf)}; every parameter must be finite."
-            )
+            text = f"parameter `{name}` of {type(system).__name__} is {np.asarray(leaf)}"
+            raise DefinitionError(f"{text}; every parameter must be finite.")
     leaves, structure = jax.tree_util.tree_flatten(system)
     parts = ((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves)
     form = hashable((structure, *parts))
@@ -178,7 +176,5 @@ def _check_names(what: str, kind: str, names: Sequence[str], units: Sequence[str
     if len(set(names)) < len(names):
         raise DefinitionError(f"{what} has {kind} of the same name: {quoted(names)}.")
     if len(units) not in (0, len(names)):
-        raise DefinitionError(
-            f"{what} has the {kind} {quoted(names)}, but {len(units)} units: give one for each, "
-            "or none."
-        )
+        text = f"{what} has the {kind} {quoted(names)}, but {len(units)} units"
+        raise DefinitionError(f"{text}: give one for each, or none.")

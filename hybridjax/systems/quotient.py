@@ -110,9 +110,8 @@ class Quotient(Derived):
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[image].states):
                 raise DefinitionError(
-                    f"Quotient: mirrored, chart '{kept}' has the states {sorted(mirrored)}, but "
-                    f"chart '{image}' has {sorted(charts[image].states)}: give the states "
-                    "that are exchanged by `relabel`."
+                    f"Quotient: mirrored, chart '{kept}' has the states {sorted(mirrored)}, chart "
+                    f"'{image}' {sorted(charts[image].states)}: exchange states by `relabel`."
                 )
         if self.half_period:
             self._check_half_period()
@@ -124,10 +123,8 @@ class Quotient(Derived):
         for x in self.system.transitions():
             if isinstance(x.guard, Scheduled) and not is_traced(x.guard):
                 if abs(math.remainder(x.guard.offset / x.guard.period, 1.0)) < TOGETHER:
-                    raise DefinitionError(
-                        f"Quotient: with `half_period`, '{x.name}' must not be scheduled at t = 0, "
-                        "where halves begin: let the clock begin earlier."
-                    )
+                    text = f"'{x.name}' must not be scheduled at t = 0, where halves begin"
+                    raise DefinitionError(f"Quotient: {text}: let the clock begin earlier.")
         for name, x in self.system.charts().items() if isinstance(self.half_period, str) else ():
             require_among("state", [str(self.half_period)], x.states, f"Quotient: in '{name}' ")
 

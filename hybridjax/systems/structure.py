@@ -454,9 +454,8 @@ class Outputs:
         for a, (item, name) in itertools.product(charts, outputs):
             if self._function(item, a) is None:
                 raise DefinitionError(
-                    f"output '{name}' is not defined in chart '{self.structure.names[a]}': give "
-                    f"its value there (`absent = {{'{name}': ...}}` in the chart, or an `Output` "
-                    "with a function for every chart)."
+                    f"output '{name}' is not defined in chart '{self.structure.names[a]}': give a "
+                    f"value (`absent = {{'{name}': ...}}` there, or an `Output` for every chart)."
                 )
 
     def _function(self, item: str | Output, a: int):

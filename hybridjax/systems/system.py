@@ -168,10 +168,8 @@ class HybridSystem(Definition):
         super().__init_subclass__(**options)
         for name in ("charts", "transitions", "period", "outputs", "guess", "draw"):
             if not callable(vars(cls).get(name, callable)):
-                raise DefinitionError(
-                    f"{cls.__name__}: `{name}` must be a method, not a value or parameter: write "
-                    f"`def {name}(self): return ...`."
-                )
+                text = f"must be a method: write `def {name}(self): return ...`"
+                raise DefinitionError(f"{cls.__name__}: `{name}` {text}.")
 
     def __new__(cls, *args, **kwargs):
         check_fields(cls, args, kwargs)

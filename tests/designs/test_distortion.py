@@ -226,7 +226,7 @@ def test_without_distortion(quadratic):
     usual = hj.multisine(4, periods=16).scaled(0.01)
     linear = Distortion(cycle, sections, {"x": 1e-3})
     options = dict(noise={"x": 1e-4}, goal=GOAL)
-    with pytest.raises(hj.DefinitionError, match="moves no limited signal: limit the input"):
+    with pytest.raises(hj.DefinitionError, match="moves no signal of `limit`: limit the input"):
         hj.optimal_design(model, usual, limit=Limits(distortion=linear), **options)
     both = Limits(rms={"u": 0.01}, distortion=linear)
     plan = hj.optimal_design(model, usual, limit=both, **options)
@@ -240,7 +240,7 @@ def test_bad_distortions(quadratic):
     twice = hj.LDTP(model.A, 2 * model.B, model.C, outputs="x")
     for family, message in (
         (hj.ClockPhase(8), "different n_sections: 8 and 4"),
-        (sections, "another system .* to x differs by 50%"),
+        (sections, "have different H_0 .to x, by 50%"),
     ):
         limit = Limits(distortion=Distortion(cycle, family, {"x": 1.0}))
         with pytest.raises(hj.DefinitionError, match=message):

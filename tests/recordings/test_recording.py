@@ -17,7 +17,7 @@ GOOD = {"a": T, "b": 2 * T}
         ([0, 1, 1, 2, 3], GOOD, {}, "time repeats, .* at sample 2 .1, then 1"),
         ([0, 1, 0.5, 2, 3], GOOD, {}, "runs backwards .* at sample 2 .1, then 0.5"),
         ([0, 1, np.nan, 2, 3], GOOD, {}, "is not finite at sample 2 .1, then nan"),
-        (T, {"a": T[1:]}, {}, "a has 4 samples, but time has 5"),
+        (T, {"a": T[1:]}, {}, "a and time have different lengths: 4 and 5"),
         (T, {"a": [0, 1, np.inf, 0, 0]}, {}, "a is infinite at sample 2"),
         (T, {"a": list("abcde")}, {}, "a must be real numbers"),
         (T, GOOD, {"units": {"c": "N"}}, "there is no signal 'c'; signals are a, b"),
@@ -37,9 +37,9 @@ def test_trials_must_belong_together():
     both = hj.Recording.join([one, other])
     np.testing.assert_array_equal(both.trials[1].values[:, both.column("b")], T)
     assert "Recording(2 trials: a (N), b)" in repr(both)
-    with pytest.raises(hj.DefinitionError, match="a is in 'N' in trial 'one', but in 'kN'"):
+    with pytest.raises(hj.DefinitionError, match="'two' have different units of a: N and kN"):
         hj.Recording.join([one, hj.Recording(T, GOOD, units={"a": "kN"}, name="two")])
-    with pytest.raises(hj.DefinitionError, match="different signals: a, b, and a"):
+    with pytest.raises(hj.DefinitionError, match="different signals: ..a', 'b'. and ..a"):
         hj.Recording.join([one, hj.Recording(T, {"a": T})])
 
 

@@ -143,7 +143,7 @@ def test_designs_as_tables(tmp_path, wave):
     u = data.records[0].u[:, 0] + data.cycle_inputs[section, 0]
     first = -data.records[0].first_section % 8
     np.testing.assert_allclose(u[first : first + 150], design.inputs(19)[0, :150, 0], atol=1e-9)
-    with pytest.raises(hj.DefinitionError, match="1 trials, but the table has"):
+    with pytest.raises(hj.DefinitionError, match="different numbers of trials: 1 and "):
         hj.recordings.add_command(wave, phase, tmp_path / "phase.csv")
     experiments = data.experiments(periods=16)
     assert experiments.u.shape[1] % 8 == 0 and experiments.n_sections == 8

@@ -40,11 +40,6 @@ class Instance(Kind):
     def take(self, value):
         if isinstance(value, self.cls):
             return current(value)
-        if isinstance(value, type) and issubclass(value, self.cls):
-            raise Misfit(
-                f"must be {self.allowed}, not the class itself: write {value.__name__}(...)",
-                near=True,
-            )
         raise self.refused(value)
 
 
@@ -117,13 +112,7 @@ class Table(Kind):
             raise self.refused(value)
         out = {}
         for name, item in value.items():
-            if self.key is not None:
-                try:
-                    name = self.key.take(name)
-                except Misfit as misfit:
-                    raise Misfit(
-                        f"has the key {show(name)}, but keys {misfit.problem}", near=True
-                    ) from None
+            name = name if self.key is None else _taken(self.key, name, name)
             out[name] = item if self.value is None else _taken(self.value, name, item)
         return out
 

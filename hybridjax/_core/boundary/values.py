@@ -36,9 +36,6 @@ class Misfit(Exception):
         """The words, composed at the first use: of several kinds most do not fit, unseen."""
         return self._problem if isinstance(self._problem, str) else self._problem()
 
-    def __str__(self) -> str:
-        return self.problem
-
     def inside(self, key: Any) -> "Misfit":
         """The same, of a value that stands under this key of the argument."""
         return Misfit(self._problem, near=True, path=f"[{key!r}]{self.path}")
@@ -229,11 +226,8 @@ def unmasked(values: Any) -> np.ndarray:
 
 def refuse_traced(value: Any, allowed: str) -> None:
     if is_tracer(value):
-        raise Misfit(
-            f"must be {allowed} whose value is known, but JAX traces it: call this outside of jit, "
-            "vmap and grad",
-            near=True,
-        )
+        text = f"must be {allowed}, but JAX traces it: call this outside of jit, vmap and grad"
+        raise Misfit(text, near=True)
 
 
 class Reals(Kind):

@@ -38,11 +38,6 @@ def run_on(client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequen
     **Raises:** `DefinitionError` for a client whose workers cannot do it; `ComputationError` for a
     piece that ends its workers, and if the cluster is lost.
     """
-    if not isinstance(client, Client):
-        raise DefinitionError(
-            f"`client` must be a distributed.Client, not a {type(client).__name__}: "
-            "`from dask.distributed import Client`."
-        )
     try:
         say("waiting for workers")
         client.wait_for_workers(1)
@@ -52,10 +47,8 @@ def run_on(client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequen
     except (OSError, RuntimeError, CancelledError) as error:
         if isinstance(error, HybridJaxError) or client.status == "running":
             raise
-        raise ComputationError(
-            "the Dask cluster was lost while it worked. What is in a `store` is kept: make the "
-            "same call again with a new client."
-        ) from error
+        text = "the Dask cluster was lost: make the same call again with a new client."
+        raise ComputationError(text) from error
 
 
 def _run(client: Client, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]) -> None:
@@ -73,10 +66,8 @@ def _run(client: Client, job: Any, store: ArrayStore | ZarrStore, missing: Seque
             try:
                 values = task.result()
             except KilledWorker as error:
-                raise ComputationError(
-                    f"piece {k} has ended each worker that it was given to: too little memory, or "
-                    "a fault in compiled code."
-                ) from error
+                text = f"piece {k} has ended each worker that it was given to"
+                raise ComputationError(f"{text}: give workers more memory.") from error
             if values is not None:
                 store.write(k, values)
     finally:
@@ -118,10 +109,8 @@ def _check_packages(client: Client) -> None:
             theirs = about["packages"].get(name)
             if theirs != mine[name]:
                 has = f"has {name} {theirs}" if theirs else f"lacks {name}"
-                raise DefinitionError(
-                    f"the Dask worker {worker} {has}, and this process has {mine[name]}: let "
-                    "workers run in the same environment."
-                )
+                text = f"{has}, and this process has {mine[name]}: use one environment"
+                raise DefinitionError(f"the Dask worker {worker} {text}.")
 
 
 def _piece(k: int, packed: bytes, x64: bool) -> dict[str, np.ndarray] | None:

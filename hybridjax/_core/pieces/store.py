@@ -210,10 +210,8 @@ class ZarrStore:
             try:
                 values[name] = array[(*self.layout.blocks.slices(k), ...)]
             except Exception as error:  # (of many kinds: checksums, sizes, headers)
-                raise FileFormatError(
-                    f"piece {k} of '{self.address}' is damaged in `{name}`: make the call that "
-                    "wrote it again, and it will be run again."
-                ) from error
+                text = f"piece {k} of '{self.address}' is damaged in `{name}`"
+                raise FileFormatError(f"{text}: make the call that wrote it again.") from error
         return values
 
     def array(self, name: str) -> np.ndarray:
@@ -273,10 +271,8 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
     except Exception as error:  # (of many kinds)
         if isinstance(error, FileNotFoundError) and not sizes:
             return None
-        raise DefinitionError(
-            f"'{address}' is no store of results, or was not written to its end: choose another "
-            f"name, or delete it ({error!r})."
-        ) from error
+        text = f"'{address}' is no store of results, or only begun ({error!r})"
+        raise DefinitionError(f"{text}: choose another name, or delete it.") from error
     change = difference(json.loads(json.dumps(job.description)), theirs)
     if change is not None:
         raise DefinitionError(f"'{address}' holds other results: {change}. Choose another store.")

@@ -338,10 +338,8 @@ def require_inputs(design: Design, other: str, n_sections: int, inputs: tuple[st
 def check_window(n_sections: int, periods: int) -> None:
     """**Raises:** `DefinitionError` for windows that no memory holds."""
     if n_sections * periods > limits.WINDOW:
-        raise DefinitionError(
-            f"{n_sections} sections in {periods} periods are more samples than an experiment may "
-            f"have ({limits.WINDOW}): take fewer."
-        )
+        text = f"more samples than an experiment may have ({limits.WINDOW}): take fewer"
+        raise DefinitionError(f"{n_sections} sections in {periods} periods are {text}.")
 
 
 def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
@@ -355,8 +353,7 @@ def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarr
     if wrong.any():
         f = float(np.asarray(frequencies)[np.argmax(wrong)])
         raise DefinitionError(
-            f"f = {f:.10g} is not a multiple of 1/{periods}, so its cosine does not fit into "
-            f"periods = {periods}; move it or choose another number of periods."
+            f"f = {f:.10g} is not a multiple of 1/{periods}: move it, or choose other `periods`."
         )
     return lines.astype(int)
 

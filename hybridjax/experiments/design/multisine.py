@@ -127,8 +127,7 @@ def _number(j: np.ndarray, periods: int, nu: int, experiments: int | None) -> in
         return fewest
     if not fewest <= experiments <= len(j) * nu:
         raise DefinitionError(
-            f"{len(np.unique(j))} frequencies of {nu} inputs need at least {fewest} experiments "
-            f"and at most {len(j) * nu}, not {experiments}."
+            f"`experiments` must be {fewest} to {len(j) * nu} for these lines, not {experiments}."
         )
     return experiments
 
@@ -137,10 +136,7 @@ def _check_choices(lines, division, periods) -> None:
     if lines == "two-phase" and division not in ("random", "sum-free"):
         raise DefinitionError("lines='two-phase' goes with division='random' or 'sum-free' only.")
     if lines == "odd" and periods % 2:
-        raise DefinitionError(
-            f"lines='odd' needs an even number of periods, not {periods}: else the even-order "
-            "products fall on the lines themselves."
-        )
+        raise DefinitionError(f"lines='odd' needs an even number of periods, not {periods}.")
 
 
 def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarray:
@@ -155,22 +151,17 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
     if lines == "odd":
         j = j[j % 2 == 1]
     if len(j) == 0:
-        raise DefinitionError(
-            f"no line of lines='{lines}', a multiple of 1/{periods}, lies between {f_min} and "
-            f"{f_max}: take more periods or a wider band."
-        )
+        text = "take more periods or a wider band"
+        raise DefinitionError(f"no line of '{lines}' lies between {f_min} and {f_max}: {text}.")
     return j
 
 
 def _orthogonal(division, j, phase):
     """Return every set of lines in nu experiments, with phases that turn from one to the next."""
     nu, K = phase.shape
-    count = division.max() + 1
-    _, first, _ = np.meshgrid(np.arange(nu), division, np.arange(nu), indexing="ij")
-    block, _, channel = np.meshgrid(np.arange(nu), np.arange(K), np.arange(nu), indexing="ij")
-    turned = phase.T[None] + 2 * np.pi / nu * block * channel
-    experiment, line = block * count + first, np.broadcast_to(j[None, :, None], (nu, K, nu))
-    return experiment.ravel(), line.ravel(), channel.ravel(), turned.ravel()
+    block, k, channel = np.indices((nu, K, nu)).reshape(3, -1)
+    turned = phase[channel, k] + 2 * np.pi / nu * block * channel
+    return block * (division.max() + 1) + division[k], j[k], channel, turned
 
 
 @checked
@@ -219,8 +210,7 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
     free = (count[pair] == 1) & ~real
     if not free.any():
         raise DefinitionError(
-            "the phases of this design belong together in several experiments (or have a fixed "
-            "sign), so none of them can be chosen for the crest factor."
+            "no phase of this design is free: each is shared or has a fixed sign."
         )
     where = design.experiment * nu + design.channel
     size = np.where(real, 2.0, 1.0) * 0.5 * length * np.asarray(design.amplitude)

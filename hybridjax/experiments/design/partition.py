@@ -131,9 +131,8 @@ def avoid_second_order(
                 bad.append(f)
     if any(hits):
         raise DefinitionError(
-            f"no division into {len(members)} experiments was found in which second-order products "
-            f"miss the lines of their own experiment ({sum(hits)} still hit): take more "
-            "experiments, or division='random'."
+            f"in each division that was tried ({len(members)} experiments), second-order products "
+            f"fall on lines ({sum(hits)} at least): take more experiments, or division='random'."
         )
     out = np.empty_like(experiment)
     for e, m in enumerate(members):
@@ -177,15 +176,11 @@ def check_sharing(
         if low < high:
             relation = "add up to" if (high - low) % periods else "differ by"
             reason = f"{f} and {high / periods:.10g} {relation} an integer"
-        count, most = int((experiment == number).sum()), periods // 2 + 1
-        hint = ""
-        if count > most:
-            hint = (
-                f" ({count} lines are excited, and no experiment can hold more than {most}: a "
-                f"recorded input must repeat after P = {periods} periods, with noise below "
-                "`threshold`, and one that a controller makes needs its `reference`)"
-            )
+        remedy = "move one of them to another experiment"
+        if (experiment == number).sum() > periods // 2 + 1:  # more than any design may have
+            remedy = f"a recorded input must repeat after P = {periods} periods, with noise below "
+            remedy += "`threshold`; one that a controller makes needs its `reference`"
         raise DefinitionError(
-            f"experiment {number}: {reason}, so their responses fall on the same frequencies; "
-            f"move one of them to another experiment{hint}."
+            f"experiment {number}: {reason}, so their responses fall on the same frequencies: "
+            f"{remedy}."
         )

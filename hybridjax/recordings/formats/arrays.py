@@ -130,15 +130,14 @@ def _read_tree(
 
 
 def _columns(path: Path, name: str, leaf: Leaf, out: Columns) -> dict[str, Float[np.ndarray, " n"]]:
-    clock, times = next(iter(out.values.items()))
+    times = next(iter(out.values.values()))
     values = np.atleast_1d(np.squeeze(leaf.array[()]))
     if values.ndim == 2 and len(values) != len(times):
         values = values.T
     if values.ndim > 2 or len(values) != len(times):
         raise FileFormatError(
-            f"'{path}': '{name}' has {' x '.join(map(str, leaf.array.shape))} numbers, but its "
-            f"times '{split_header(clock)[0]}' {times.size}: put signals of another rate into a "
-            "group with times of their own, or choose `signals`."
+            f"'{path}': '{name}' has the shape {leaf.array.shape}, but {times.size} times: put "
+            "signals of another rate into a group with times of their own, or choose `signals`."
         )
     if values.ndim == 1:
         return {with_unit(name, leaf.unit): values}

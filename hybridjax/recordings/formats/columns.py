@@ -13,18 +13,14 @@ from jaxtyping import Float
 from ..._core import limits
 from ..._core.archive import damaged
 from ..._core.boundary.values import unmasked
+from ..._core.signal import SECONDS
 from ...errors import DefinitionError, FileFormatError, HybridJaxError
 
 
 # Prefix of the names of columns that mark events.
 EVENT = "event "
-_SECONDS = {
-    "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0,
-    "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9,
-    "min": 60.0, "h": 3600.0,
-}  # fmt: skip
 _BRACKETED = re.compile(r"(.*?)\s*[(\[]([^)\]]*)[)\]]")
-_TRAILING = re.compile(rf"(.+?)(?:\s*/\s*|[\s_]+)({'|'.join(_SECONDS)})")
+_TRAILING = re.compile(rf"(.+?)(?:\s*/\s*|[\s_]+)({'|'.join(SECONDS)})")
 _FACTOR = (
     r"(?:[nuµμmckMG]?(?:s|m|g|N|V|A|Pa|W|J|Hz|K|T|L|l|bar|rad)|sec|min|h|deg|°C?|%|in|ft|lb|BW|1)"
     r"\^?[-⁻]?[0-9²³¹]*"
@@ -75,12 +71,12 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
         raise DefinitionError(f"{where} has no column '{time}': choose `time` from {names}.")
     clock = clocks[0]
     unit = time_unit(clock) or "s"
-    if unit not in _SECONDS:
+    if unit not in SECONDS:
         raise DefinitionError(
             f"{where}: the times in '{clock}' are in '{unit}', which is no known unit of time: "
             "convert them to s, ms, us, ns, min or h (divide frames by the sampling rate)."
         )
-    scale = _SECONDS[unit]
+    scale = SECONDS[unit]
     times = scale * numbers(where, clock, columns.values[clock])
     events = {name: at * scale for name, at in columns.events.items()}
     signals: dict[str, Any] = {}
@@ -118,10 +114,8 @@ def numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
     except (ValueError, TypeError):  # rows of different lengths, a dataset
         values = np.empty((0, 0), object)
     if values.dtype.kind not in "fiub" or values.ndim != 1:
-        raise DefinitionError(
-            f"{where}: {name} must be real numbers on one axis, not {values.dtype} of shape "
-            f"{values.shape}."
-        )
+        given = f"{values.dtype}{values.shape}"
+        raise DefinitionError(f"{where}: {name} must be real numbers on one axis, not {given}.")
     return values.astype(float)
 
 

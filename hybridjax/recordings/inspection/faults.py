@@ -126,10 +126,8 @@ def wrapped(recording: Recording, name: str) -> Iterator[Finding]:
         jumps = np.diff(count) / 2.0**bits
         both = min((jumps > 0.5).sum(), (jumps < -0.5).sum())
         if off < 1e-3 and abs(whole / 2.0**bits - 1) < _ALL_LEVELS and both:  # but for rounding
-            text = (
-                f"{name} jumps by its whole range in trial '{trial.name}', as integers that "
-                f"overflow: undo it (`numpy.unwrap` with period={2**bits * step:.6g})."
-            )
+            remedy = f"undo it (`numpy.unwrap` with period={2**bits * step:.6g})"
+            text = f"{name} jumps by its whole range in trial '{trial.name}': {remedy}."
             yield Finding("overflow", text, "refused")
             return
 

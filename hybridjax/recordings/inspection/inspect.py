@@ -294,9 +294,8 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
     times = np.concatenate(late)
     follows = abs(times[1:] @ times[:-1]) / max(times @ times, np.finfo(float).tiny)
     if left < (1 - _SHIFTED) * whole and follows < 0.5:
-        text = f"outputs deviate at the start of cycles as if it were inexact by {times.std():.2g} "
-        text += "of a cycle: define the phase by the crossing of a signal, or by an angle."
-        yield Finding("inexact events", text)
+        text = f"the starts of cycles seem to scatter by {times.std():.2g} of a cycle: define the "
+        yield Finding("inexact events", f"{text}phase by the crossing of a signal, or by an angle.")
 
 
 def feedback(data: SectionData) -> Iterator[Finding]:
@@ -314,14 +313,14 @@ def feedback(data: SectionData) -> Iterator[Finding]:
         repeated = float(np.nanvar(data.cycle_inputs[:, i]))
         share = repeated / max(repeated + float(deviations[i]) ** 2, np.finfo(float).tiny)
         if share > 0.5:
-            text = f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: fits "
-            text += "are biased. " + NAME_REFERENCE
-            yield Finding("feedback", text)
+            text = (
+                f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: fits are "
+            )
+            yield Finding("feedback", f"{text}biased. {NAME_REFERENCE}")
         elif share > CLEAR**2 / data.cycles and data.n_sections > 2 * shapes.shape[1]:
             mean = np.nan_to_num(data.cycle_inputs[:, i] - np.nanmean(data.cycle_inputs[:, i]))
             left = mean - shapes @ np.linalg.lstsq(shapes, mean)[0]
             if left @ left < 0.1 * (mean @ mean):
                 text = f"{name} contains the outputs ({100 * share:.0f} % of its variance repeats "
-                text += "as they do), as by feedback or crosstalk: fits are biased. Remove these "
-                text += "from the input, or name the perturbation as the input."
+                text += "as they do): fits are biased. Name the perturbation alone as the input."
                 yield Finding("feedback", text)

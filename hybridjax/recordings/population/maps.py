@@ -14,12 +14,11 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float, Inexact
 
-from ..._core.arguments import Numbers
+from ..._core.arguments import Numbers, require_axes
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Seed, Vector
 from ..._core.boundary.values import Complexes
 from ..._core.text import p_value
-from ...errors import DefinitionError
 from .tables import Columns, require, rows_with, signed, table_of
 
 
@@ -82,13 +81,9 @@ class PopulationMaps:
         values = np.asarray(values)
         self.values = values if values.imag.any() else values.real
         self.axes = {str(name): np.asarray(x, float) for name, x in axes.items()}
-        grid = tuple(map(len, self.axes.values()))
-        if values.shape[1:] != grid:
-            raise DefinitionError(
-                f"`values` must have the shape (rows, {', '.join(axes)}), with {grid} after the "
-                f"rows, but has {values.shape}."
-            )
         self.table, self.unit = table_of(table, len(values)), unit
+        grid = {name: len(x) for name, x in self.axes.items()}
+        require_axes("`values`", values, {"rows": len(values)} | grid)
 
     def __repr__(self) -> str:
         count = self.table["subject"].nunique()

@@ -6,11 +6,10 @@ from typing import Annotated, Any
 import numpy as np
 from scipy import stats
 
-from ..._core.arguments import Numbers, package
+from ..._core.arguments import Numbers, package, require_equal
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, OptionalNames, Positive, Seed
 from ..._core.boundary.values import Reals
-from ..._core.signal import unit_of
 from ...errors import DefinitionError
 from ...identify.multiplier_estimate import MultiplierEstimate
 from ...scale.draws import monte_carlo
@@ -69,10 +68,8 @@ class Population:
                 raise DefinitionError(f"`values` and `errors` of '{name}' must have {rows} rows.")
             wrong = np.isfinite(values[name]) & ~(error > 0)
             for subject, number in zip(self.table["subject"][wrong], error[wrong], strict=True):
-                raise DefinitionError(
-                    f"'{name}' of subject '{subject}' has the standard error {number:.3g}, not a "
-                    "positive number: give one, or NaN in place of the value."
-                )
+                text = f"has the standard error {number:.3g}: it must be a positive number."
+                raise DefinitionError(f"'{name}' of subject '{subject}' {text}")
         self.units = dict.fromkeys(values, "") | dict(units or {})
         self.freedom = np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)
 
@@ -87,20 +84,16 @@ class Population:
         **Raises:** `DefinitionError` for a fit without covariance, and outputs or units that
         differ.
         """
-        frame, names = table_of(table, len(fits)), [_signals(fit) for fit in fits]
+        frame = table_of(table, len(fits))
         most = max((len(fit.coefficients) for fit in fits), default=0)
         numbers = np.full((2, 2 + most, len(fits)), np.nan)
         for row, (subject, fit) in enumerate(zip(frame["subject"], fits, strict=True)):
-            if names[row] != names[0]:
-                raise DefinitionError(
-                    f"the fit of subject '{subject}' is of {names[row]}, but that of "
-                    f"'{frame['subject'][0]}' of {names[0]}: use the same outputs and units."
-                )
+            outputs = [getattr(x, "outputs", ()) for x in (fits[0], fit)]
+            pair = f"the fits of subjects '{frame['subject'][0]}' and '{subject}'"
+            require_equal(pair, "outputs", *outputs)
             if not np.isfinite(fit.covariance).all():
-                raise DefinitionError(
-                    f"the fit of subject '{subject}' has no covariance: record more strides, or "
-                    "leave the subject out."
-                )
+                text = f"the fit of subject '{subject}' has no covariance"
+                raise DefinitionError(f"{text}: record more strides, or leave the subject out.")
             z, covariance = complex(fit.multipliers[0]), fit.multiplier_covariances[0]
             polar = np.array([[z.real, z.imag], [-z.imag / abs(z), z.real / abs(z)]]) / abs(z)
             squares = *np.diag(polar @ covariance @ polar.T), *np.diag(fit.covariance)
@@ -275,10 +268,8 @@ class Population:
         trial = max(scatter.sum() / max((count - 1).sum(), 1), 0.0)
         between -= trial * np.mean(1 / count) * (trial > 0)
         if not between > 0:
-            raise DefinitionError(
-                f"subjects differ in '{quantity}' by no more than their errors, and then one with "
-                "many strides is the cheapest: find their spread from more subjects."
-            )
+            text = f"subjects differ in '{quantity}' by no more than their errors"
+            raise DefinitionError(f"{text}: find their spread from more subjects.")
         stride = np.mean(trials["v"] * trials["strides"])
         k = max(round(np.sqrt(trial / between * subject_cost / trial_cost)), 1)
         cost = (subject_cost + k * trial_cost) / stride_cost
@@ -372,8 +363,3 @@ def _test(v, n: int, spread: float, difference: float, paired: bool):
         return int(abs(value) > stats.t.isf(0.025, freedom) * error)
 
     return draw
-
-
-def _signals(fit: MultiplierEstimate) -> str:
-    names = getattr(fit, "outputs", ("multipliers",))
-    return ", ".join(f"{x} ({unit_of(x)})" if unit_of(x) else str(x) for x in names)

@@ -6,7 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ... import __version__
-from ..._core.arguments import package
+from ..._core.arguments import package, require_axes
 from ...errors import DefinitionError
 
 
@@ -27,11 +27,7 @@ def table_of(table: Columns, rows: int) -> Any:
     if "subject" not in columns:
         raise DefinitionError("`table` has no column 'subject': add one, with a name in each row.")
     for name, values in columns.items():
-        if values.shape != (rows,):
-            raise DefinitionError(
-                f"column '{name}' of `table` must have one value for each of the {rows} estimates, "
-                f"but has shape {values.shape}."
-            )
+        require_axes(f"column '{name}' of `table`", values, {"estimates": rows})
     frame = package("pandas").DataFrame(columns)
     labels = ["subject", *factors_of(frame)]
     if len(rows_without := np.flatnonzero(frame[labels].isna().any(axis=1))):
@@ -75,11 +71,8 @@ def rows_with(table: Any, *labels: str) -> tuple[str, Any]:
 def require(subjects: Mapping[str, Iterable[str]], needed: int) -> None:
     """**Raises:** `DefinitionError` if a group or condition has fewer subjects."""
     for cell, names in subjects.items():
-        if len(set(names)) < needed:
-            raise DefinitionError(
-                f"'{cell}' has too few subjects ({', '.join(sorted(set(names))) or 'none'}): at "
-                f"least {needed} are needed."
-            )
+        if (count := len(set(names))) < needed:
+            raise DefinitionError(f"'{cell}' has too few subjects: {count} of {needed}.")
 
 
 def signed(text: str) -> str:
