@@ -215,12 +215,8 @@ def test_the_band_holds_the_mean_and_draws_repeat():
     "row 1 of `table` has no subj": lambda: study([1.0, 2], [1.0, 1], subject=["a", None]),
     "'x' has too few": lambda: study([1.0, 2, 3], np.ones(3), condition="xyy").mean("gain"),
     "has no covariance": lambda: fitted(fit_of([0.5], scale=np.inf)),
-    "'a' and 'b' have different outputs: .*'x'": lambda: fitted(
-        fit_of([0.5]), fit_of([0.5], outputs=("x",))),
     "'a' and 'b' .*'y' .m.,. and .'y' .um.,": lambda: fitted(
         fit_of([0.5], outputs=METERS), fit_of([0.5], outputs=MICROMETERS)),
-    "'all' has too few subjects: 1 of 2": lambda: fitted(
-        fit_of([0.5]), fit_of([0.5, 0.5])).mean("c2"),
     "'all' has too few subjects: 0 of 2": lambda: fitted(fit_of([0.5])).mean("angle"),
     "no column 'subject'": lambda: Population({}, {"q": [1.0]}, {"q": [1.0]}),
     "standard error 0: it must": lambda: study([1.0], [0.0]),
