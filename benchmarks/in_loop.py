@@ -44,7 +44,6 @@ from scipy import stats
 import hybridjax as hj
 from hybridjax.identify.denominator import multipliers_of
 from hybridjax.identify.instrument import in_loop
-from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 from hybridjax.identify.periodic import (
     PeriodicModel,
@@ -52,6 +51,7 @@ from hybridjax.identify.periodic import (
     local_coordinates,
 )
 from hybridjax.identify.series import fit as series_fit
+from hybridjax.identify.series.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.series.records import CycleGrid
 
 

@@ -28,13 +28,13 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.denominator import multipliers_of
-from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 from hybridjax.identify.periodic import (
     PeriodicModel,
     characteristic_slopes,
     local_coordinates,
 )
+from hybridjax.identify.series.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.series.records import CycleGrid
 
 

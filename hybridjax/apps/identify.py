@@ -257,8 +257,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         method = f"instrumental variables of {escape(listed(loop))}"
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(found).items() if amount}
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
-    pairs = zip(found.advice.strides, found.advice.expected, strict=True)
-    expected = (pair for pair in pairs if np.isfinite(pair[1]).all())
+    expected = zip(found.advice.strides, found.advice.expected, strict=True)
     parts = [
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",
@@ -274,7 +273,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         html.card(
             "Standard errors to be expected from more strides", "", html.table(
                 ("strides", *map(html.complex_number, found.fit.multipliers)),
-                [(str(n), *(f"{e:.1e}" for e in errors)) for n, errors in expected],
+                [(str(n), *(f"{e:.1e}" for e in x)) for n, x in expected if np.isfinite(x).all()],
             ),
         ),
         *(f"<p>{text}</p>" for text in MEANING),

@@ -118,7 +118,7 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
     c = min(fits, key=lambda fit: fit[0])[1]
 
-    basis = _decays(c, cycles)
+    basis = start_responses(c, np.zeros(1, int), cycles, len(c))[0]
     clean, removed = data.y[:, N:].copy(), np.full((S, ny), np.nan)
     for Q, z, s in zip(free, left, good, strict=True):
         transient = basis @ np.linalg.lstsq(Q @ basis, z, rcond=None)[0]
@@ -138,11 +138,6 @@ def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows c
     inner = (classes > 0) & (2 * classes < P)
     signals = np.concatenate([np.cos(angle), np.sin(angle[:, inner])], axis=1)
     return np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
-
-
-def _decays(c: Float[np.ndarray, " d"], cycles: int) -> Float[np.ndarray, "cycles d"]:
-    """Return a basis of the solutions of `v[p] + c_1 v[p-1] + ... + c_d v[p-d] = 0`."""
-    return start_responses(c, np.zeros(1, int), cycles, len(c))[0]
 
 
 def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
@@ -166,7 +161,7 @@ def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
     cycles = blocks[0][0].shape[1]
 
     def residual(c):
-        basis, out = _decays(c, cycles), []
+        basis, out = start_responses(c, np.zeros(1, int), cycles, len(c))[0], []
         for Q, z in blocks:
             q = np.linalg.qr(Q @ basis)[0]
             out.append((z - q @ (q.T @ z)).ravel())

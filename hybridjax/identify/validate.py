@@ -18,9 +18,9 @@ from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
 from .instrument import in_loop
 from .joint.fit import LDTPFit
-from .joint.prediction import Predictor
 from .periodic import PeriodicModel
 from .series.fit import SeriesFit
+from .series.prediction import Predictor
 from .series.records import CycleGrid, PreparedRecords, drift_waves
 from .series.residuals import FEWEST_SAMPLES, independence_test, whiteness_test
 
@@ -230,8 +230,7 @@ def validate(
         raise DefinitionError(f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles.")
     # One period, less for few cycles.
     tried = range(1, min(N, few // _SAMPLES_PER_LAG) + 1)
-    enough = [count(lag).min() >= FEWEST_SAMPLES for lag in tried]
-    lags = max(sum(map(bool, enough)), 1)
+    lags = max((k for k in tried if count(k).min() >= FEWEST_SAMPLES), default=1)
     if (count(lags).max(axis=0) < FEWEST_SAMPLES).any():
         raise DefinitionError(
             "the records are too short: record longer without gaps, until each section was sampled "

@@ -276,9 +276,8 @@ def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> li
     turned = np.concatenate([powers, 1j * powers], axis=1)
     pair = np.concatenate([turned, np.concatenate([powers, -1j * powers], axis=1)])
     row_of = {m % N: row for row, m in enumerate(htf.harmonics)}
-    real: list[tuple] = []
-    single: list[tuple] = []
-    double: list[tuple] = []
+    entries: tuple[list[tuple], ...] = [], [], []
+    real, single, double = entries
     half = np.sqrt(0.5)
     for m, row in row_of.items():
         other, h, w = row_of.get(-m % N, -1), H[row], weight[row]
@@ -296,7 +295,7 @@ def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> li
             elif row < other:
                 both = np.concatenate([h[at], g[at]]), np.concatenate([w[at], v[at]])
                 double.append((row, other, 1.0, channel, *both))
-    kinds = (powers, real), (turned, single), (pair, double)
+    kinds = zip((powers, turned, pair), entries, strict=True)
     sources = np.arange(len(f)) if htf.scatter is None else htf.scatter.sources(f)
     return [group for kind in kinds if kind[1] for group in equal_weights(f, sources, size, *kind)]
 

@@ -15,6 +15,7 @@ from hybridjax.identify.periodic import PeriodicModel, characteristic_slopes, lo
 from hybridjax.linear.frequency_response import harmonic_transfer
 
 from .conftest import scaled
+from .test_uncertainty import noisy
 
 
 F = np.linspace(0.03, 2.9, 40)
@@ -37,12 +38,6 @@ def with_values(htf, H, variance=None):
     if variance is not None:
         variance = np.full(H.shape, variance)
     return dataclasses.replace(htf, H=H, variance=variance)
-
-
-def noisy(htf, rng):
-    size = np.sqrt(np.asarray(htf.variance) / 2)
-    error = rng.normal(size=(2, *htf.H.shape)) * size
-    return eqx.tree_at(lambda h: h.H, htf, htf.H + error[0] + 1j * error[1])
 
 
 def shaken(model, rng, size=0.02):
@@ -128,7 +123,7 @@ def test_undetermined_responses_have_infinite_variance():
     small = scaled(3, (2, 3, 4, 2), 2, 1)
     f = np.arange(1, 40) / 80
     htf = small.htf(f, (-1, 0, 1))
-    draw = noisy(with_values(htf, htf.H, 1e-6), np.random.default_rng(0))
+    draw = noisy(htf, np.full(htf.H.shape, 1e-6), np.random.default_rng(0))
     fit = hj.fit_ldtp(draw, shaken(small, np.random.default_rng(1)))
     variance = fit.htf(f, (-2, -1, 0, 1)).variance
     assert np.isinf(variance[0]).all() and variance[1:].max() < 1e-6
@@ -139,7 +134,7 @@ def test_errors_are_as_small_as_the_bound(model, exact):
     """The rms error, the misfit and the coverage of 40 draws, each at the level of 0.1 %."""
     rng, draws = np.random.default_rng(3), 40
     bound = hj.identify.ldtp_bound(model, exact)
-    fits = [hj.fit_ldtp(noisy(exact, rng), model) for _ in range(draws)]
+    fits = [hj.fit_ldtp(noisy(exact, exact.variance, rng), model) for _ in range(draws)]
     error = np.array([fit.coefficients - bound.coefficients for fit in fits])
     square = np.einsum("si,ij,sj->", error, np.linalg.inv(bound.covariance), error)
     assert 1e-3 < stats.chi2(2 * draws).cdf(square) < 1 - 1e-3
@@ -152,7 +147,7 @@ def test_errors_are_as_small_as_the_bound(model, exact):
     square = np.mean(np.abs(H - np.asarray(exact.H)) ** 2, axis=0)
     assert abs(np.mean(square / variance) - 1) < 0.1
     # Without variances, the residuals give them.
-    draw = noisy(exact, np.random.default_rng(4))
+    draw = noisy(exact, exact.variance, np.random.default_rng(4))
     fit = hj.fit_ldtp(with_values(draw, draw.H), model)
     np.testing.assert_allclose(fit.standard_errors, fits[0].standard_errors, rtol=0.2)
     assert fit.cost == pytest.approx(fit.freedom)

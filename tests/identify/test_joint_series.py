@@ -6,8 +6,8 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem, noise_spectrum
 from hybridjax.identify.periodic import PeriodicModel, local_coordinates
+from hybridjax.identify.series.prediction import SeriesPart, SeriesProblem, noise_spectrum
 from hybridjax.identify.series.records import CycleGrid
 from hybridjax.identify.series.residuals import about_misfit, answering
 
@@ -118,7 +118,7 @@ def test_too_few_dimensions_are_named(small):
     for noise in (0.3, 0.0):
         for dims, named in ((small.dims, False), (2, True)):
             fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
-            assert bool(fit.misfit) == named == ("depend on the inputs" in repr(fit))
+            assert bool(fit.doubt) == named == ("depend on the inputs" in repr(fit))
 
 
 def test_residuals_of_exact_data_tell_nothing(small):

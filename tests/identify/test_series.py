@@ -184,13 +184,19 @@ def test_undeclared_drift_and_offsets_are_noticed(small):
         data = record(small, 400, seed, 0.1)
         return with_outputs(data, data.y + np.reshape(change, (-1, 1)) * data.y.std(axis=0))
 
-    drift, offset = moved(slow.repeat(4)), moved(0.3)
-    for data, order in (drift, 1), (drift, 2), (offset, 3):
-        with pytest.warns(FindingWarning, match="Fit: outputs may drift"):
-            fit = hj.fit_series(data, order)
-        assert np.abs(fit.multipliers - small.multipliers[0]).max() > 0.1
-    for data in (moved(0.0), *(dataclasses.replace(x, drift=20) for x in (drift, offset))):
+    drift, offset, far = moved(slow.repeat(4)), moved(0.3), moved(1.0)
+    for fit, cases in (
+        (hj.fit_series, ((drift, 1), (drift, 2), (offset, 3))),
+        (hj.fit_ldtp, ((drift, small.dims), (far, small.dims))),
+    ):
+        for data, guess in cases:
+            with pytest.warns(FindingWarning, match="Fit: outputs may drift"):
+                multipliers = fit(data, guess).multipliers
+            assert np.abs(multipliers - small.multipliers[0]).max() > 0.1
+    for data in (moved(0.0), *(dataclasses.replace(x, drift=20) for x in (drift, offset, far))):
         assert not hj.fit_series(data, 2).doubt
+        fit = hj.fit_ldtp(data, small.dims, noise="innovations")
+        assert fit.result == hj.Result.OK and not fit.doubt
     with pytest.raises(hj.DefinitionError, match="not 2.*Outputs may drift: records with `drift"):
         hj.fit_series(moved(3 * slow.repeat(4), seed=0), 2)
     (begun,) = with_drift([record(small, 4100, drift=5)])  # (Longer ones take too long.)

@@ -23,17 +23,17 @@ from ...linear.frequency_response import Harmonics, all_harmonics, check_harmoni
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .. import weights
-from ..denominator import multipliers_of
+from ..denominator import Covariance, multipliers_of
 from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate
+from ..multiplier_estimate import MultiplierEstimate, RoughFit
 from ..multipliers import exact_htf
 from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
-from ..series.records import PreparedRecords
-from ..series.residuals import REMEDIES, UNSEEN, about_answering, about_misfit, answering
+from ..series import residuals
+from ..series.prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
+from ..series.records import MAY_DRIFT, PreparedRecords, with_drift
 from ..series.subspace import answers_at_once, default_horizon, subspace_model
 from .frequency import FrequencyProblem, transfer, transfer_slopes
-from .prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
 from .realization import given_dims, realize
 
 
@@ -81,9 +81,9 @@ class LDTPFit(MultiplierEstimate):
       the outputs; None for HTFs.
     - `feedback`: a sentence about inputs of time series that a controller makes, or may make; empty
       if nothing speaks for a controller, or a `reference` was given.
-    - `misfit`: a sentence if residuals of time series depend on the inputs: the dimensions are too
-      few, or the iteration found a local minimum, and multipliers may be wrong by more than their
-      standard errors; empty if not, and for HTFs.
+    - `doubt`: a sentence if drift of the outputs of time series (in the first 1000 cycles) gives
+      multipliers outside of each other's confidence regions, or if residuals depend on the inputs:
+      the dimensions are too few, or the iteration found a local minimum. Otherwise empty.
     """
 
     model: LDTP
@@ -93,11 +93,11 @@ class LDTPFit(MultiplierEstimate):
     result: int = eqx.field(static=True)
     harmonics: tuple[int, ...] = eqx.field(static=True)
     noise: LDTP | None
-    feedback: str = eqx.field(static=True)
-    misfit: str = eqx.field(static=True)
     _coordinates: LocalCoordinates
     _spread: Spread
     _scale: Float[np.ndarray, " ny"]
+    feedback: str = eqx.field(static=True, default="")
+    doubt: str = eqx.field(static=True, default="")
 
     @property
     def unknowns(self) -> int:
@@ -178,7 +178,7 @@ class LDTPFit(MultiplierEstimate):
             size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
             about = f"errors one step ahead {signal_values(self.outputs, size)}"
         about = f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
-        return "; ".join(filter(None, [about, self.misfit, self.feedback]))
+        return "; ".join(filter(None, [about, self.doubt, self.feedback]))
 
 
 @checked
@@ -227,7 +227,7 @@ def fit_ldtp(
       `hj.identify.realize` for HTFs, and from a subspace method for time series. Alternatively, an
       observable initial model with these dimensions; if its D is zero, D stays zero. Too few
       dimensions bias the multipliers: compare `cost` with `freedom` where variances are known;
-      for time series, see `misfit`. The iteration finds a local minimum; the same checks reveal a
+      for time series, see `doubt`. The iteration finds a local minimum; the same checks reveal a
       poor one.
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
@@ -261,16 +261,25 @@ def fit_ldtp(
         fit = _fit_to_series(records, guess, *how, direct)
         grid = records.whole()
         errors = lambda: cast(Predictor, fit.predictor).errors(grid, start == "free")  # noqa: E731
-        feedback = UNSEEN * (innovations and direct and drive is None)
-        if drive is None and (answers := answering(grid, errors(), records.inputs)):
+        feedback = residuals.UNSEEN * (innovations and direct and drive is None)
+        if drive is None and (answers := residuals.answering(grid, errors(), records.inputs)):
             if innovations and direct and not isinstance(guess, LDTP):
                 fit, direct = _fit_to_series(records, guess, *how, False), False
-            remedy = REMEDIES[innovations + (innovations and not direct)]
-            feedback = about_answering(answers, remedy)
-        misfit = about_misfit(outside.whole(), grid, errors(), innovations) if check else ""
-        if misfit:
-            warnings.warn(f"Fit: {misfit}.", FindingWarning, stacklevel=3)
-        return dataclasses.replace(fit, feedback=feedback, misfit=misfit)
+            remedy = residuals.REMEDIES[innovations + (innovations and not direct)]
+            feedback = residuals.about_answering(answers, remedy)
+
+        fit = dataclasses.replace(fit, feedback=feedback)
+        if not check or residuals.is_exact(grid, error := errors()).all():
+            return fit
+
+        def drifting() -> RoughFit:
+            slow = _fit_to_series(PreparedRecords(with_drift(records.records)), guess, *how, direct)
+            return slow.coefficients, lambda: Covariance(slow.covariance, slow.covariance_freedom)
+
+        misfit = residuals.about_misfit(outside.whole(), grid, error, innovations)
+        if doubt := fit.contradiction([drifting], MAY_DRIFT) or misfit:
+            warnings.warn(f"Fit: {doubt}.", FindingWarning, stacklevel=3)
+        return dataclasses.replace(fit, doubt=doubt)
     if reference is not None:
         raise DefinitionError(
             "`reference` is for time series: estimate the HTFs by "
@@ -360,7 +369,8 @@ class ModelPoint(Point):
 
     def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
         self.problem, self.direct, self.model = problem, direct, model
-        with suppress(np.linalg.LinAlgError):  # a resonant model stays as it is
+        # A resonant model stays as it is; one that overflows has no finite cost.
+        with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
             self.model = model.refined(direct, problem.linearize)
         self.cost = problem.cost(self.model)
 
@@ -453,8 +463,6 @@ def _finished(
         result=Result.OK if converged else Result.NOT_CONVERGED,
         harmonics=harmonics,
         noise=noise,
-        feedback="",
-        misfit="",
         _coordinates=point.coordinates,
         _spread=spread,
         _scale=scale,

@@ -32,7 +32,7 @@ from .in_loop import LoopEquations
 from .linearization import Linearization, each_fit, filtered_response, linearize, minimize, sum_up
 from .output_error import OutputErrorProblem, SectionRegression, TooFewCycles
 from .records import (
-    SLOW,
+    MAY_DRIFT,
     CycleGrid,
     PreparedRecords,
     delay_cycles,
@@ -45,7 +45,6 @@ from .residuals import about_answering, answering
 
 
 _BIASED = "the fit is biased; name their `reference`"
-_SLOW = f"outputs may drift: records with `drift={SLOW:g}` give other multipliers; compare fits"
 
 
 class SeriesFit(MultiplierEstimate):
@@ -246,7 +245,7 @@ def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> 
         problem = _problem_like(fit, slow(), order, free_start)
         return _rough(problem, total_least_squares(late_outputs(problem, order)))
 
-    doubt = fit.contradiction([drifting], _SLOW)
+    doubt = fit.contradiction([drifting], MAY_DRIFT)
     if not doubt and may_be_one.any() and not may_be_one.all():
         fewer = np.poly(fit.multipliers[~may_be_one]).real[1:]
         with suppress(DefinitionError):
@@ -254,7 +253,7 @@ def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> 
             solution, _ = minimize(problem, fewer, rough=True)
             _require_freedom(problem, solution)
             spread = 1 / np.sqrt(2 * solution.freedom.sum(axis=0))
-            return _SLOW if (_noise(solution) < 1 + 3 * spread).all() else ""
+            return MAY_DRIFT if (_noise(solution) < 1 + 3 * spread).all() else ""
     return doubt
 
 

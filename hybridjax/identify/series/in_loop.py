@@ -29,6 +29,7 @@ from ..descent import Coefficients
 from ..instrument import in_loop
 from ..multiplier_estimate import RoughFit
 from .output_error import RANK, SectionRegression
+from .prediction import Predictor
 from .records import PreparedRecords, delay_cycles, lagged_inputs
 from .subspace import subspace_model
 
@@ -44,8 +45,10 @@ _BLOCK = 10
 _TOLD = 10.0
 
 
-def predicted(plant: list[Record], drive: list[Record], order: int) -> list[np.ndarray]:
-    """Return inputs and outputs of each record as the references explain them.
+def predicted(
+    plant: list[Record], drive: list[Record], order: int
+) -> Float[np.ndarray, "S T N nuy"]:
+    """Return inputs and outputs as the references explain them.
 
     They are simulated, from zero, by a model with `order` dimensions.
 
@@ -59,14 +62,9 @@ def predicted(plant: list[Record], drive: list[Record], order: int) -> list[np.n
     ]
     records = PreparedRecords(closed)
     model = subspace_model(records, [order] * records.n_sections, False)
-    signals = []
-    for r in closed:
-        x, z = np.zeros(order), np.zeros(r.y.shape)
-        for i, u in enumerate(r.u):
-            A, B, C, D, _ = (m[(r.first_section + i) % r.n_sections] for m in model)
-            z[i], x = C @ x + D @ u, A @ x + B @ u
-        signals.append(z * records.scale)
-    return signals
+    predictor = Predictor(model, np.tile(np.eye(len(records.outputs)), (len(model.A), 1, 1)))
+    grid = records.whole()
+    return predictor.predict(grid._replace(drift=grid.drift[..., :0]), False) * records.scale
 
 
 class SectionEquations(NamedTuple):
@@ -116,13 +114,10 @@ class LoopEquations:
     def __init__(self, plant: list[Record], drive: list[Record], order: int, overhang: int | None):
         self.records, self.order, self.reference = PreparedRecords(plant), order, drive[0].inputs
         self.grid = self.records.whole()
-        S, T, N, nu = self.grid.u.shape
+        N = self.records.n_sections
         span = N if overhang is None else overhang
         self.lags = self.records.lead + order * N + span + 1
-        z = np.zeros((S, T * N, nu + self.grid.y.shape[3]))
-        for s, (r, x) in enumerate(zip(plant, predicted(plant, drive, order), strict=True)):
-            z[s, r.first_section : r.first_section + len(x)] = x
-        z, free = z.reshape(S, T, N, -1), order + -(-span // N)
+        z, free = predicted(plant, drive, order), order + -(-span // N)
         self.sections = [self._section(n, z, free) for n in range(N)]
 
     def _section(self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int) -> SectionEquations:

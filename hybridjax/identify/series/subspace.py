@@ -9,6 +9,7 @@ from scipy import special
 from ...errors import DefinitionError
 from ..denominator import SLOWEST
 from ..periodic import PeriodicModel
+from .output_error import SectionRegression
 from .records import PreparedRecords
 from .residuals import ANSWER
 
@@ -40,9 +41,9 @@ def subspace_model(
 
     **Raises:** `DefinitionError` for too few cycles for a past as long as the states need.
     """
-    grid, N, ny, most = records.whole(), len(dims), len(records.outputs), int(max(dims))
-    z = np.concatenate([grid.u, grid.y / records.scale], axis=3)
-    sampled, columns = np.asarray(grid.sampled.all(axis=3)), z.shape[3]
+    N, ny, most = len(dims), len(records.outputs), int(max(dims))
+    z, sampled = _signals(records)
+    columns = z.shape[3]
     sections = [_Section(z, sampled, n, ny) for n in range(N)]
     samples = min(len(section.y) for section in sections)
     past = min(samples // (_ROWS * columns), default_horizon(N))
@@ -82,11 +83,9 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
     **Raises:** `DefinitionError` if both answer each other at once: no model of the noise tells
     them apart.
     """
-    grid, ny = records.whole(), len(records.outputs)
-    nr = len(drive.inputs)
-    z = np.concatenate([drive.whole().u, grid.u, grid.y / records.scale], axis=3)
-    sampled = np.asarray(grid.sampled.all(axis=3))
-    statistic, freedom, left, whole = 0.0, 0, 0.0, 0.0
+    z, sampled = _signals(records, drive.whole().u)
+    ny, nr = len(records.outputs), len(drive.inputs)
+    statistic, left, whole = 0.0, 0.0, 0.0
     for n in range(records.n_sections):
         section = _Section(z, sampled, n, ny)
         count = len(section.y)
@@ -98,10 +97,9 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
         floor = _SHRINKAGE * section.y.T @ section.y  # errors of the regressions, without noise
         sizes = [np.linalg.slogdet(e.T @ e + floor)[1] for e in errors]
         statistic += max(count - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (sizes[0] - sizes[1])
-        freedom += ny * nr
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
-    if special.gammaincc(freedom / 2, statistic / 2) > ANSWER:
+    if special.gammaincc(records.n_sections * ny * nr / 2, statistic / 2) > ANSWER:
         return False
     if left > _SHRINKAGE * whole:
         raise DefinitionError(
@@ -110,6 +108,17 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
             "apart. Pass a model with D = 0 as `guess` if outputs do not respond at once."
         )
     return True
+
+
+def _signals(records: PreparedRecords, *more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return inputs and outputs (R, T, N, columns), without drift, and where all are sampled."""
+    grid = records.whole()
+    y, none = np.zeros(grid.y.shape), grid.drift[..., :0]
+    sampled = np.asarray(grid.sampled.all(axis=3))
+    for n in range(records.n_sections):
+        rows = SectionRegression.make(none, none, grid.drift, sampled[:, :, n])
+        y[:, :, n] = rows.reduced(grid.y[:, :, n] / records.scale).reshape(y[:, :, n].shape)
+    return np.concatenate([*more, grid.u, y], axis=3), sampled
 
 
 class _Section:

@@ -20,9 +20,9 @@ from ...linear.frequency_response import Harmonics, check_harmonics, harmonic_tr
 from ...linear.ldtp import LDTP
 from ..descent import NormalEquations
 from ..periodic import LocalCoordinates, PeriodicModel
-from ..series.output_error import RANK
-from ..series.records import CycleGrid
 from ..weights import SMALLEST_ERROR
+from .output_error import RANK
+from .records import CycleGrid
 
 
 Columns = Float[np.ndarray, "_ _ _ _"]
