@@ -1,6 +1,7 @@
 """Simulators of other packages as plants: MuJoCo, FMI 2.0 (co-simulation), Gymnasium."""
 
 import dataclasses
+import functools
 import os
 import shutil
 import weakref
@@ -18,11 +19,9 @@ from ..errors import ComputationError, DefinitionError
 class _Made:
     """A plant that another process makes again from its fields."""
 
-    def __getstate__(self) -> Any:
-        return {x.name: getattr(self, x.name) for x in dataclasses.fields(self)}  # type: ignore[arg-type]
-
-    def __setstate__(self, state: Any) -> None:
-        self.__init__(**state)  # type: ignore[misc]
+    def __reduce__(self) -> Any:
+        fields = {x.name: getattr(self, x.name) for x in dataclasses.fields(self)}  # type: ignore[arg-type]
+        return functools.partial(type(self), **fields), ()
 
 
 def _numbered(names: Sequence[str], sizes: Any) -> list[str]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from .._core.arguments import Numbers, require_among
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.containers import Names
-from .._core.boundary.kinds import FilePath, Index, Positive, Seed, SignalNames
+from .._core.boundary.kinds import FilePath, Index, Positive, Seed, SignalNames, Vector
 from .._core.boundary.values import Reals, Whole
 from .._core.execution import core_count
 from .._core.pieces.description import digest_of
@@ -332,7 +332,7 @@ def settle(
     outputs: SignalNames,
     *,
     cycles: Annotated[int, Whole(8, 1_000_000)] = 100,
-    guess: Annotated[Numbers, Reals("states")] | None = None,
+    guess: Vector | None = None,
     seed: Seed = 0,
 ) -> SettledCycle:
     """Let a plant run without inputs until it repeats itself, and locate sections on its cycle.

@@ -1,15 +1,14 @@
 """Sliders for parameters: the limit cycle, its multipliers and its gain follow them."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from matplotlib import pyplot
 from matplotlib.widgets import Slider
 
-from .._core.arguments import Numbers, package, require_among, searching
+from .._core.arguments import package, require_among, searching
 from .._core.boundary.checked import checked
-from .._core.boundary.values import Reals
 from .._core.results import Result
 from .._core.signal import ratio, with_unit
 from ..errors import ComputationError, DefinitionError
@@ -25,7 +24,6 @@ from .motion import portrait, widened
 from .orbit import plane_of
 
 
-Ranges = Mapping[str, Annotated[Numbers, Reals("2")]]
 # Input frequencies of the gain, in cycles per period. Fewer: resonances have corners. More: slow.
 _FREQUENCIES = np.linspace(0.02, 1.98, 197)
 # Sliders, and the picture that comes from Python. While one is on its way, only the last place of
@@ -187,7 +185,7 @@ class Explorer:
 def explore(
     system: HybridSystem | LimitCycle,
     *parameters: str,
-    ranges: Ranges | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
     x: str | None = None,
     y: str | None = None,
 ) -> Explorer:

@@ -68,7 +68,7 @@ class ImpulseResponses(eqx.Module):
 
 
 ResponseCycles = Annotated[float, Number("a number above 0, up to 10000", above=0, high=1e4)]
-PushWidth = Annotated[float, Number("a number above 0, up to 1000", above=0, high=1e3)]
+PushWidth = Annotated[float, Number("a number from 0 to 1000", low=0, high=1e3)]
 
 
 @checked

@@ -4,17 +4,16 @@ import contextlib
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.arguments import Numbers, require_among
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import ExperimentCount, Seed
-from .._core.boundary.values import Reals
+from .._core.boundary.kinds import ExperimentCount, Seed, Vector
 from .._core.meaning import current
 from .._core.pieces.description import digest_of
 from .._core.pieces.store import Constant
@@ -25,7 +24,7 @@ from ..systems.system import HybridSystem, describe, parameters_of, unit_of_para
 from ..systems.varied import with_parameters
 
 
-Axes = Mapping[str, Annotated[Numbers, Reals("n")]]
+Axes = Mapping[str, Vector]
 """Values of parameters by name."""
 
 

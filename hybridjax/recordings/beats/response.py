@@ -1,16 +1,12 @@
 """The phase response curve of a rhythm, from the times of its events under a known input."""
 
-from typing import Annotated
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from ..._core.arguments import Numbers
 from ..._core.boundary.checked import checked, checked_methods
-from ..._core.boundary.kinds import Probability
-from ..._core.boundary.values import Reals
+from ..._core.boundary.kinds import Probability, Vector
 from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.signal import Signal, with_unit
@@ -25,9 +21,6 @@ from ..recording import Recording
 from ..smoothing import Series
 from .estimation import WAVES, CurveFit, accuracy_of, fit_curve
 from .model import Intervals, basis, intervals_of
-
-
-Phases = Annotated[Numbers, Reals("n")]
 
 
 @checked_methods
@@ -78,11 +71,11 @@ class PhaseResponse(PhaseCurve):
         """Limits of what the data support."""
         return tuple(about_phase_response(self))
 
-    def __call__(self, phase: Phases) -> Series:
+    def __call__(self, phase: Vector) -> Series:
         """Return the curve at some phases, in cycles."""
         return self._waves(phase) @ self.coefficients
 
-    def interval(self, phase: Phases, level: Probability = 0.95) -> tuple[Series, Series]:
+    def interval(self, phase: Vector, level: Probability = 0.95) -> tuple[Series, Series]:
         """Return lower and upper bounds that hold the curve with this probability, as a mean over
         the phases: they are too narrow where it changes faster than elsewhere."""
         waves = self._waves(phase)
@@ -91,7 +84,7 @@ class PhaseResponse(PhaseCurve):
         middle = waves @ self.coefficients
         return middle - reach, middle + reach
 
-    def _waves(self, phase: Phases) -> Float[np.ndarray, "n p"]:
+    def _waves(self, phase: Vector) -> Float[np.ndarray, "n p"]:
         return basis(np.asarray(phase, float) % 1.0, len(self.coefficients) - 1)
 
     def __repr__(self) -> str:

@@ -196,23 +196,19 @@ def _odd(
         text = f"the outputs do not answer {name}: was it recorded with them?"
         yield Finding("no answer", text, "warned" if several else "refused")
         return
+    turned = gain < -np.maximum(usual / 2, CLEAR * error)
+    foreign = (gain < usual / 2) & (gain + CLEAR * error < usual)
+    disturbed = left > np.maximum(_DISTURBED * np.median(left), explained / 4)
+    first = np.select([turned, foreign, disturbed], [0, 1, 2], -1)
     texts = {
         "another sign": "the outputs answer {} with the other sign ({}): turn it.",
         "foreign input": "the outputs do not answer {} as elsewhere ({}): it belongs to another "
         "trial, or came earlier or later.",
         "disturbed": "something else than {} moved the outputs ({}).",
     }
-    odd = {
-        "another sign": gain < -np.maximum(usual / 2, CLEAR * error),
-        "foreign input": (gain < usual / 2) & (gain + CLEAR * error < usual),
-        "disturbed": left > np.maximum(_DISTURBED * np.median(left), explained / 4),
-    }
-    left_over = np.ones(len(gain), bool)
-    for cause, parts in odd.items():
-        spans = [where[k] for k in np.flatnonzero(parts & left_over)]
-        left_over &= ~parts
-        if spans:
-            text = texts[cause].format(name, listed(spans))
+    for k, (cause, text) in enumerate(texts.items()):
+        if spans := [where[n] for n in np.flatnonzero(first == k)]:
+            text = text.format(name, listed(spans))
             yield Finding(cause, text, "refused" if cause == "another sign" else "warned")
 
 
