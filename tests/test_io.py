@@ -141,7 +141,7 @@ def rewrite(path, header=None, arrays=None):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"header": {"format_version": 9, "package_version": "9.0"}}, "version 9 .hybridjax 9.0"),
+        ({"header": {"format_version": 9, "package_version": "9.0"}}, "version 9.* hybridjax 9.0"),
         ({"header": {"format": "other"}}, "not written by `hj.save`"),
         ({"header": {"kind": "os.system"}}, "holds a 'os.system'; `load` reads Design"),
         ({"header": {"kind": "LDTP"}}, "not those of LDTP"),
@@ -166,7 +166,7 @@ def test_pickles_are_not_executed(folder, things):
     with pytest.raises(hj.errors.FileFormatError, match="damaged"):
         hj.load(path)
     path.write_bytes(pickle.dumps(_Trap()))
-    with pytest.raises(hj.errors.FileFormatError, match="not an npz file"):
+    with pytest.raises(hj.errors.FileFormatError, match="is damaged"):
         hj.load(path)
 
 

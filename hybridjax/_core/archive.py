@@ -163,10 +163,8 @@ def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
     if name != _FORMAT:
         raise FileFormatError(f"'{path}' was not written by `hj.save`, whose files alone are read.")
     if version != _VERSION:
-        raise FileFormatError(
-            f"'{path}' has format version {version} (hybridjax {header.get('package_version')}), "
-            f"but hybridjax {__version__} reads version {_VERSION}: use a matching hybridjax."
-        )
+        text = f"format version {version}, not {_VERSION}: use hybridjax"
+        raise FileFormatError(f"'{path}' has {text} {header.get('package_version')}.")
     kind = header.get("kind")
     if not isinstance(kind, str) or kind not in kinds:
         raise FileFormatError(f"'{path}' holds a {kind!r}; `load` reads {', '.join(kinds)} only.")
@@ -230,8 +228,6 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     if path.stat().st_size == 0:  # also of a pipe or device, which may have no end
         raise FileFormatError(f"'{path}' is empty: write it again.")
     with open(path, "rb") as file:
-        if not zipfile.is_zipfile(file):
-            raise FileFormatError(f"'{path}' is not an npz file of `hj.save`, or is damaged.")
         try:
             with zipfile.ZipFile(file) as archive:
                 members = archive.infolist()

@@ -276,10 +276,8 @@ class _Walk:
         is_hidden = _HIDDEN.fullmatch(name) or (not self.classes and _READING.fullmatch(name))
         is_hidden = is_hidden and is_packaged(getattr(value, "__module__", None))
         if is_hidden or value is sys.modules:
-            raise DefinitionError(
-                f"`{x.__qualname__}` uses `{name or 'sys.modules'}`, so that a change of what it "
-                "reads cannot be noticed: read values before, and use them by their names."
-            )
+            text = f"uses `{name or 'sys.modules'}`, whose changes cannot be noticed"
+            raise DefinitionError(f"`{x.__qualname__}` {text}: read values before, by their names.")
 
     def _attributes(self, module: types.ModuleType, names: Names) -> None:
         """Visit the attributes of a module that a function names."""

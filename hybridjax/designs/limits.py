@@ -260,11 +260,8 @@ class Products(NamedTuple):
             expected = H_model[:, model.outputs.index(name)]
             difference, size = np.linalg.norm(H - expected), np.linalg.norm(expected)
             if difference > _DIFFERENT * size:
-                share = difference / max(size, np.finfo(float).tiny)
-                raise DefinitionError(
-                    f"the distortion of `limit` and the model have different H_0 (to {name}, by "
-                    f"{share:.0%}): use one system, and the same sections."
-                )
+                text = f"H_0 (to {name}, by {difference / max(size, np.finfo(float).tiny):.0%})"
+                raise DefinitionError(f"the model and the distortion of `limit` differ in {text}.")
 
     def rms(self, design: Design, phases: bool = False) -> Float[np.ndarray, " O"]:
         """Return the distortion in a design: expected with random phases, or with its `phases`."""

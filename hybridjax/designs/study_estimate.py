@@ -158,8 +158,6 @@ def refuse_transient(
     size = np.sqrt(np.maximum(excess, 0) / np.mean(y**2, axis=(0, 1)))
     left = np.where(excess > threshold, size, 0).max() * np.abs(multipliers).max() ** (before - k)
     if left > allowed:
-        raise DefinitionError(
-            f"after {before} discarded cycles a part of {left:.1g} of the start's transient is "
-            f"left (allowed: {allowed:.1g}): use `hj.identify.remove_transient(data).data`, or in "
-            "simulations start='steady'."
-        )
+        text = f"{left:.1g} of the start's transient is left (allowed: {allowed:.1g})"
+        remedy = "use `hj.identify.remove_transient(data).data`, or start='steady'"
+        raise DefinitionError(f"after {before} discarded cycles a part of {text}: {remedy}.")

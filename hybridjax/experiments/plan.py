@@ -123,10 +123,8 @@ def make_plan(
     lost = ~np.isfinite(impact).any(axis=0)
     if lost.any():
         k = int(np.argmax(lost))
-        raise ComputationError(
-            f"too many steps from section {k} to {placed.family.describe((k + 1) % N)}: place more "
-            "sections, or find the cycle with `settings=Settings(max_steps=...)`."
-        )
+        text = "place more sections, or find the cycle with `settings=Settings(max_steps=...)`"
+        raise ComputationError(f"too many steps from section {k} to the next: {text}.")
     estimate = np.maximum(ways.estimate, _LEAST_SHARE)
 
     # The largest share of the accuracy for each section that keeps their sum.

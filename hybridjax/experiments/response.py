@@ -88,8 +88,7 @@ def require_shape(shape: tuple[int, ...], n_sections: int, nu: int) -> None:
     """**Raises:** `DefinitionError` for inputs that are not (S, n, nu) with n a multiple of N."""
     if len(shape) != 3 or shape[2] != nu or shape[1] % n_sections or 0 in shape:
         raise DefinitionError(
-            f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple of "
-            f"the {n_sections} sections; got {shape}."
+            f"inputs must have the shape (experiments, periods x {n_sections}, {nu}), not {shape}."
         )
 
 

@@ -258,10 +258,8 @@ class Campaign:
         )
         if (change > stepping.accuracy).any():
             s = int(np.nanargmax(change))
-            raise ComputationError(
-                f"experiment {first + s}: no periodic response was found (Newton's last step is "
-                f"{change[s]:.1e} of the state's size): make the input smaller, or discard cycles."
-            )
+            text = f"was found (Newton's last step: {change[s]:.1e}): lower the input, or discard"
+            raise ComputationError(f"experiment {first + s}: no periodic response {text} cycles.")
         start = np.where(np.isnan(change), predicted, start)
         return start, parts if still and window.shape == u.shape else None
 
@@ -397,11 +395,10 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections, stabilized: bool)
             "(KinematicPhase, or a list of Crossing and AtEvent)."
         )
     if not cycle.stable and not stabilized:
-        largest = np.abs(cycle.multipliers[0])
-        raise ComputationError(
-            f"the limit cycle is not stable (largest multiplier {largest:.4g} in modulus): "
-            "stabilize it, for example by `feedback`, or use `linearize` without experiments."
+        text = (
+            f"the limit cycle is not stable (largest multiplier {np.abs(cycle.multipliers[0]):.4g})"
         )
+        raise ComputationError(f"{text}: stabilize it, as by `feedback`, or use `linearize` alone.")
 
 
 class _AtSections(NamedTuple):

@@ -144,8 +144,8 @@ def _part(down: tuple[int, ...], whole: Sequence) -> list:
 
 def _whole(down: tuple[int, ...], q: Array) -> list[Array]:
     """All eight states, of those of a chart: feet on the ground rest."""
-    states = _part(down, _STATES)
-    return [q[states.index(x)] if x in states else jnp.zeros(()) for x in _STATES]
+    moving = iter(q)
+    return [jnp.zeros(()) if x in _absent(down) else next(moving) for x in _STATES]
 
 
 class HopperPair(VerticalHopper):

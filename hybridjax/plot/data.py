@@ -19,6 +19,7 @@ from ..recordings.beats.response import PhaseResponse
 from ..recordings.data import SectionData, input_spectrum
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase import Phase
+from . import look
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, axis_of, legend, letters, panels
 
 
@@ -107,15 +108,10 @@ def impulse_responses(
         for i, name in enumerate(found.outputs):
             plane, curves = axes[i]
             values = found.values[:, :, i, pushing]
-            top = np.abs(values).max()
-            image = plane.pcolormesh(
-                found.lag, found.phase, values, cmap="RdBu_r", vmin=-top, vmax=top,
-                rasterized=True, shading="nearest",
-            )  # fmt: skip
             pushed = found.inputs[pushing]
             impulse = Signal(pushed, unit_of(pushed) and f"{unit_of(pushed)} s")
             label = with_unit(f"{name} / impulse\n", ratio(name, impulse))
-            plane.get_figure().colorbar(image, ax=plane, label=label)
+            look.colored(plane, found.lag, found.phase, values, label)
             plane.set_ylabel("phase of the push")
             for k, m in enumerate(dict.fromkeys([0, N // 4, N // 2, 3 * N // 4])):
                 band = 1.96 * found.errors[m, :, i, pushing]

@@ -132,16 +132,22 @@ def panels(
     if not all(isinstance(panel, Axes) for panel in axes.flat):
         raise DefinitionError("`ax` must hold Axes of matplotlib, and nothing else.")
     if axes.size != rows * columns:
-        raise DefinitionError(
-            f"this plot has {rows} x {columns} panels, but `ax` holds {axes.size}: make as many, "
-            "e.g. by `matplotlib.pyplot.subplots`."
-        )
+        text = f"{rows} x {columns} Axes, one for each panel, not {axes.size}"
+        raise DefinitionError(f"`ax` must hold {text}.")
     yield axes.reshape(rows, columns)
 
 
 def axis_of(name: str, *, deviation: bool = False) -> str:
     """The label of an axis for a signal, or for its deviation from the cycle, with the unit."""
     return with_unit(rf"$\delta$ {name}" if deviation else name, unit_of(name))
+
+
+def colored(ax: Axes, x, y, values: np.ndarray, label: str, is_size: bool = False) -> None:
+    """A map in colors with a bar: around zero, or of magnitudes from zero on."""
+    top = np.abs(values).max()
+    look: Any = {"cmap": "viridis", "vmin": 0} if is_size else {"cmap": "RdBu_r", "vmin": -top}
+    image = ax.pcolormesh(x, y, values, **look, vmax=top, rasterized=True, shading="nearest")
+    cast(Any, ax.figure).colorbar(image, ax=ax, label=label)
 
 
 def legend(ax: Axes, place: str, **options: Any) -> None:

@@ -7,7 +7,7 @@ from .._core.signal import with_unit
 from ..errors import DefinitionError
 from ..recordings.population.maps import MapResult
 from ..recordings.population.population import Population
-from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, panels
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, colored, panels
 
 
 @checked
@@ -93,12 +93,7 @@ def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
             panel.set(xlabel=name, ylabel=label)
         else:
             y, x = result.axes.values()
-            top = np.abs(values).max()
-            cmap, low = ("viridis", 0) if is_complex else ("RdBu_r", -top)
-            look = {"cmap": cmap, "vmin": low, "vmax": top, "shading": "nearest"}
-            panel.figure.colorbar(
-                panel.pcolormesh(x, y, values, **look, rasterized=True), ax=panel, label=label
-            )
+            colored(panel, x, y, values, label, is_complex)
             if inside.any() and not inside.all():
                 panel.contour(x, y, inside, [0.5], colors="black", linewidths=1.2)
             panel.set(xlabel=other[0], ylabel=name)

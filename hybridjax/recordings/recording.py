@@ -92,10 +92,11 @@ class Recording(eqx.Module):
             raise DefinitionError(f"{where} has {len(time)} samples, but two or more are needed.")
         if not (np.diff(time) > 0).all() or np.isinf(time).any():
             bad = 1 + int(np.argmin(np.diff(np.where(np.isinf(time), np.nan, time)) > 0))
+            text = (
+                f"({time[bad - 1]:.10g}, then {time[bad]:.10g}): sort, or make a trial of each part"
+            )
             raise DefinitionError(
-                f"{where}: time repeats, runs backwards or is not finite at sample {bad} "
-                f"({time[bad - 1]:.10g}, then {time[bad]:.10g}): sort the samples, export more "
-                "digits, or make a trial of each part."
+                f"{where}: time repeats or runs backwards at sample {bad} {text}."
             )
         require_among("signal", units, columns, f"{where}, `units`: ")
         if both := set(happened) & set(columns):
@@ -284,8 +285,6 @@ def check_events(
     at, margin = at[np.isfinite(at)], float(np.median(np.diff(time)))
     within = (at >= time[0] - margin) & (at <= time[-1] + margin)
     if len(at) and not within.any():
-        raise DefinitionError(
-            f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording "
-            f"({time[0]:.6g} to {time[-1]:.6g} s): their times have another zero or unit."
-        )
+        text = f"are outside of the recording ({time[0]:.6g} to {time[-1]:.6g} s): convert them"
+        raise DefinitionError(f"{where}: all events '{name}' ({at[0]:.6g} s, ...) {text}.")
     return at[within]

@@ -30,10 +30,8 @@ class Wanted:
         taken = {*get_args(Want), "result", "chart", "state_name", "state_unit"}
         for name in self.measures:
             if not name.isidentifier() or name in taken or len(functions) > len(self.measures):
-                raise DefinitionError(
-                    "each function of `want` needs a name of its own, under which its values are "
-                    f"kept, other than {', '.join(sorted(taken))}: define it by `def`."
-                )
+                text = f"names of their own, other than {', '.join(sorted(taken))}"
+                raise DefinitionError(f"functions of `want` need {text}: define them by `def`.")
         # (Words only: workers get a copy.)
         s = Structure(system)
         self._charts, self._time_unit = tuple(s.names), str(system.time_unit or "")
@@ -105,10 +103,8 @@ class Wanted:
                 return as_numbers(name, measure(cycles[i]))
             except ComputationError as failure:
                 error = failure
-        raise ComputationError(
-            f"`{name}` succeeds on none of {len(cycles)} points that are spread over all, so the "
-            f"shape of its values is unknown ({error or 'none has a limit cycle'})."
-        )
+        text = f"{len(cycles)} points over all ({error or 'none has a limit cycle'})"
+        raise ComputationError(f"`{name}` succeeds on none of {text}.")
 
 
 def _measured(cycles: LimitCycles, name: str, measure: Measure) -> Iterator[np.ndarray | None]:
@@ -142,8 +138,6 @@ def stacked(name: str, values: Iterable[np.ndarray | None], variable: Variable) 
     rows = [np.full(variable.shape, variable.fill) if x is None else x for x in values]
     for x in rows:
         if x.shape != variable.shape or not np.can_cast(x.dtype, variable.dtype):
-            raise DefinitionError(
-                f"`{name}` must always give real or always complex arrays of one shape: first "
-                f"{variable.dtype} {variable.shape}, then {x.dtype.str} {x.shape}."
-            )
+            text = f"{variable.dtype} {variable.shape}, then {x.dtype.str} {x.shape}"
+            raise DefinitionError(f"`{name}` must always give one type and shape: first {text}.")
     return np.array(rows, variable.dtype)

@@ -64,9 +64,8 @@ def _check_functions(s: Structure) -> Iterator[str]:
         ("outputs", system.outputs(), Output),
     ):
         if not isinstance(items, Iterable) or not all(isinstance(x, type_) for x in items):
-            several = "a dict {name: chart}, each" if type_ is Chart else "a list, each item"
-            item = f"`hj.{type_.__name__}`"
-            raise DefinitionError(f"{kind}.{name}() must return {several} of the class {item}.")
+            several = "a dict {name: chart}" if type_ is Chart else "a list"
+            raise DefinitionError(f"{kind}.{name}() must return {several} of `{type_.__name__}`.")
     if not s.charts:
         raise DefinitionError(f"{kind} has no charts.")
     _check_names(kind, "inputs", system.inputs, system.input_units)

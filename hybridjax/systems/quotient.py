@@ -109,10 +109,8 @@ class Quotient(Derived):
         for kept, image in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[image].states):
-                raise DefinitionError(
-                    f"Quotient: mirrored, chart '{kept}' has the states {sorted(mirrored)}, chart "
-                    f"'{image}' {sorted(charts[image].states)}: exchange states by `relabel`."
-                )
+                text = f"{sorted(mirrored)}, those of '{image}' {sorted(charts[image].states)}"
+                raise DefinitionError(f"Quotient: '{kept}' mirrored has {text}: use `relabel`.")
         if self.half_period:
             self._check_half_period()
 

@@ -68,7 +68,7 @@ HOSTILE = {
         "two of its arrays have one name",
     ),
     "objects": (lambda p: np.savez(p, time=np.array([{}])), "holds Python objects"),
-    "a renamed npy": (lambda p: p.write_bytes(npy((1,), bytes(8))), "not an npz file"),
+    "a renamed npy": (lambda p: p.write_bytes(npy((1,), bytes(8))), "is damaged"),
 }
 DECLARED = {
     "sections": (dict(n_sections=10**12), "n_sections is 1000000000000"),

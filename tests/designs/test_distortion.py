@@ -240,7 +240,7 @@ def test_bad_distortions(quadratic):
     twice = hj.LDTP(model.A, 2 * model.B, model.C, outputs="x")
     for family, message in (
         (hj.ClockPhase(8), "different n_sections: 8 and 4"),
-        (sections, "have different H_0 .to x, by 50%"),
+        (sections, "differ in H_0 .to x, by 50%"),
     ):
         limit = Limits(distortion=Distortion(cycle, family, {"x": 1.0}))
         with pytest.raises(hj.DefinitionError, match=message):

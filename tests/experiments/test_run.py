@@ -109,7 +109,7 @@ def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
     ("change", "message"),
     [
         (dict(design=hj.multisine(16, band=(0, 7.0))), "different n_sections: 16 and 32"),
-        (dict(design=np.zeros((2, 33, 1))), "multiple of the 32 sections"),
+        (dict(design=np.zeros((2, 33, 1))), "periods x 32, 1"),
         (dict(design=np.zeros((2, 64, 1)), discard=2), "leaves none"),
         (dict(start="steady", discard=7), "needs inputs of whole windows"),
     ],

@@ -330,11 +330,8 @@ class Reals(Kind):
         if values.ndim == 0:
             raise Misfit(f"must be {self.single}, not {show(values.item())}", near=True)
         index = tuple(map(int, np.argwhere(bad)[0]))
-        raise Misfit(
-            f"must be {allowed}, but is {values[index]:.6g} at index "
-            f"{index[0] if len(index) == 1 else index}",
-            near=True,
-        )
+        place = index[0] if len(index) == 1 else index
+        raise Misfit(f"must be {allowed}, but is {values[index]:.6g} at index {place}", near=True)
 
     def _written(self) -> str:
         return f"({', '.join(self.shape)}{',' * (len(self.shape) == 1)})"

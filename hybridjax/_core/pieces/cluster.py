@@ -136,9 +136,7 @@ def _unpacked(packed: bytes, x64: bool) -> tuple[Any, ZarrStore | None]:
     imported, packed = cloudpickle.loads(packed)
     for x, digest in imported:
         if meaning(x) != digest:
-            raise DefinitionError(
-                f"`{x.__name__}` on a Dask worker is not what it is in this process: after changes "
-                "of a module, call `client.restart()`, and change no values from outside of it."
-            )
+            text = "is not what it is in this process: after changes of it, call `client.restart()`"
+            raise DefinitionError(f"`{x.__name__}` on a Dask worker {text}.")
     job, address = cloudpickle.loads(packed)
     return job, None if address is None else ZarrStore(address)

@@ -1,8 +1,7 @@
 """Multisine designs: which cosines, with which phases, in which experiment."""
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
@@ -92,26 +91,18 @@ class Design(eqx.Module):
             if np.isscalar(values):
                 return np.full(sum(sizes), values, dtype)
             if [np.size(v) for v in values] != sizes:
-                raise DefinitionError(
-                    f"`{name}` must be one number or have as many entries as `frequencies` in "
-                    f"each of the {len(sizes)} experiments."
-                )
+                text = "one number, or as many as `frequencies` in each experiment"
+                raise DefinitionError(f"`{name}` must be {text}.")
             return np.concatenate([[], *map(np.ravel, values)]).astype(dtype)
 
-        lines = to_lines(flat("frequencies", frequencies, float), periods)
-        experiment = np.repeat(np.arange(len(sizes)), sizes)
-        order = np.lexsort((lines, experiment))
-        return cls(
-            experiment=experiment[order],
-            line=lines[order],
-            channel=flat("channels", channels, int)[order],
-            amplitude=flat("amplitudes", amplitudes, float)[order],
-            phase=flat("phases", phases, float)[order],
-            n_sections=n_sections,
-            periods=periods,
-            experiments=len(sizes),
-            input_names=input_names(inputs),
-        )
+        cosines = [
+            np.repeat(np.arange(len(sizes)), sizes),
+            to_lines(flat("frequencies", frequencies, float), periods),
+            flat("channels", channels, int),
+            flat("amplitudes", amplitudes, float),
+            flat("phases", phases, float),
+        ]
+        return ordered(cosines, n_sections, periods, len(sizes), input_names(inputs))
 
     def check(self) -> None:
         """Check the rules under which the HTFs follow from the experiments uniquely (Sec. V).
@@ -262,17 +253,9 @@ class Design(eqx.Module):
 
     def _times(self, count: int, phase, experiment) -> "Design":
         """Return the cosines repeated, with other phases, in other experiments."""
-        phase, experiment = phase.ravel(), experiment.ravel()
-        order = np.lexsort((np.tile(self.line, count), experiment))
-        same = "line", "channel", "amplitude"
-        each: dict[str, Any] = {n: np.tile(getattr(self, n), count)[order] for n in same}
-        return dataclasses.replace(
-            self,
-            experiment=experiment[order],
-            phase=phase[order],
-            experiments=count * self.experiments,
-            **each,
-        )
+        same = [np.tile(x, count) for x in (self.line, self.channel, self.amplitude)]
+        cosines, experiments = [experiment.ravel(), *same, phase.ravel()], count * self.experiments
+        return ordered(cosines, self.n_sections, self.periods, experiments, self.input_names)
 
     def expected_variance(
         self, noise: kinds.NonNegative = 1.0, repeats: Count = 1
@@ -314,6 +297,17 @@ class Design(eqx.Module):
             f"  noise        of std 1 in an output gives H_m a std of {_span(np.sqrt(per))}",
         ]
         return "\n".join(rows)
+
+
+def ordered(
+    cosines: Sequence[np.ndarray], n_sections: int, periods: int, experiments: int, names: tuple
+) -> Design:
+    """Return the design of cosines in any order: their experiments, lines, channels, amplitudes and
+    phases."""
+    order = np.lexsort([cosines[k] for k in (2, 1, 0)])
+    experiment, line, channel, amplitude, phase = (x[order] for x in cosines)
+    waves = experiment, line, channel, amplitude, phase
+    return Design(*waves, n_sections, periods, experiments, names)
 
 
 def _span(values: np.ndarray) -> str:

@@ -11,7 +11,7 @@ from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import ExperimentCount, NonNegative, PeriodCount, SectionCount, Seed
 from ...errors import DefinitionError
 from . import partition
-from .design import OFF_LINE, Design, InputNames, check_window, input_names
+from .design import OFF_LINE, Design, InputNames, check_window, input_names, ordered
 from .partition import assign, avoid_second_order, fewest_experiments, is_real, needs_two_phases
 
 
@@ -102,22 +102,11 @@ def multisine(
         experiment = assign(line, periods, total, rng)
     elif division == "orthogonal" and nu > 1:
         experiment, line, channel, phase = _orthogonal(sets[0], j, np.array(phases))
-    order = np.lexsort((channel, line, experiment))
-    line = line[order]
     size = np.asarray(amplitude(line / periods) if callable(amplitude) else amplitude)
     if size.dtype.kind not in "fiu":
         raise DefinitionError(f"`amplitude` must return real numbers, not {size.dtype}.")
-    return Design(
-        experiment=experiment[order],
-        line=line,
-        channel=channel[order],
-        amplitude=np.array(np.broadcast_to(np.asarray(size, float), line.shape)),
-        phase=phase[order] % (2 * np.pi),
-        n_sections=n_sections,
-        periods=periods,
-        experiments=int(experiment.max()) + 1,
-        input_names=names,
-    )
+    cosines = experiment, line, channel, np.full(line.shape, size, float), phase % (2 * np.pi)
+    return ordered(cosines, n_sections, periods, int(experiment.max()) + 1, names)
 
 
 def _number(j: np.ndarray, periods: int, nu: int, experiments: int | None) -> int:

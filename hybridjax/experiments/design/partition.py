@@ -130,10 +130,8 @@ def avoid_second_order(
             if hits_f and f not in bad:
                 bad.append(f)
     if any(hits):
-        raise DefinitionError(
-            f"in each division that was tried ({len(members)} experiments), second-order products "
-            f"fall on lines ({sum(hits)} at least): take more experiments, or division='random'."
-        )
+        text = f"{len(members)} experiments: take more, or division='random'"
+        raise DefinitionError(f"no division keeps second-order products off the lines of {text}.")
     out = np.empty_like(experiment)
     for e, m in enumerate(members):
         out[m] = e
@@ -180,7 +178,5 @@ def check_sharing(
         if (experiment == number).sum() > periods // 2 + 1:  # more than any design may have
             remedy = f"a recorded input must repeat after P = {periods} periods, with noise below "
             remedy += "`threshold`; one that a controller makes needs its `reference`"
-        raise DefinitionError(
-            f"experiment {number}: {reason}, so their responses fall on the same frequencies: "
-            f"{remedy}."
-        )
+        text = f"{reason}, so their responses fall on the same frequencies: {remedy}"
+        raise DefinitionError(f"experiment {number}: {text}.")

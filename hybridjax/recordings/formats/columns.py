@@ -72,10 +72,8 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
     clock = clocks[0]
     unit = time_unit(clock) or "s"
     if unit not in SECONDS:
-        raise DefinitionError(
-            f"{where}: the times in '{clock}' are in '{unit}', which is no known unit of time: "
-            "convert them to s, ms, us, ns, min or h (divide frames by the sampling rate)."
-        )
+        text = "convert them to s, ms, us, ns, min or h (divide frames by the sampling rate)"
+        raise DefinitionError(f"{where}: the times in '{clock}' are in '{unit}': {text}.")
     scale = SECONDS[unit]
     times = scale * numbers(where, clock, columns.values[clock])
     events = {name: at * scale for name, at in columns.events.items()}

@@ -9,7 +9,7 @@ with known $v_{sc}$ (meta-analysis: Hardy and Thompson 1996; Jackson, Riley and 
 models of other libraries estimate one variance of all errors instead.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -117,7 +117,7 @@ def spread_interval(y: Reals, v: Reals, x: Design) -> tuple[float, float]:
         if weighted_squares(y, v, x) < quantile:
             return 0.0
         excess = lambda variance: weighted_squares(y, v + variance, x) - quantile  # noqa: E731
-        return float(np.sqrt(optimize.brentq(excess, 0.0, largest, xtol=1e-12 * largest)))
+        return float(np.sqrt(_root(excess, 0.0, largest)))
 
     return bound(0.025), bound(0.975)
 
@@ -139,6 +139,10 @@ def moderated(v: Reals, freedom: Reals, trend: Float[np.ndarray, "N k"]) -> Real
     # The half of the prior freedom, at which a log chi-squared has the variance of the excess.
     prior = 1e9
     if excess > 1e-9:
-        prior = optimize.brentq(lambda z: special.polygamma(1, z) - excess, 1e-3, 1e9)
+        prior = _root(lambda z: special.polygamma(1, z) - excess, 1e-3, 1e9)
     common = np.exp(mean + special.digamma(prior) - np.log(prior))
     return (prior * common + half * v) / (prior + half)
+
+
+def _root(function: Any, low: float, high: float) -> Any:
+    return optimize.brentq(function, low, high, xtol=1e-12 * high)

@@ -36,9 +36,9 @@ def table_of(table: Columns, rows: int) -> Any:
     frame = frame.astype(dict.fromkeys(labels, str))
     for subject, groups in frame.groupby("subject")["group"] if "group" in frame else ():
         if len(groups.unique()) > 1:
+            text = f"in the groups {' and '.join(map(repr, groups.unique()))}"
             raise DefinitionError(
-                f"subject '{subject}' is in the groups {' and '.join(map(repr, groups.unique()))}: "
-                "give one group, or call the column 'condition' if subjects were recorded in both."
+                f"subject '{subject}' is {text}: conditions may differ, not groups."
             )
     return frame
 
@@ -62,10 +62,8 @@ def rows_with(table: Any, *labels: str) -> tuple[str, Any]:
         if len(set(labels)) == len(labels) and set(labels) <= set(table[factor]):
             return factor, table[factor].isin(labels)
     listed = ", ".join(f"'{x}'" for factor in factors_of(table) for x in table[factor].unique())
-    raise DefinitionError(
-        f"{' and '.join(map(repr, labels))} are no two conditions or groups of `table`, which has "
-        f"{listed or 'neither'}."
-    )
+    text = f"are no two conditions or groups of `table`, which has {listed or 'neither'}"
+    raise DefinitionError(f"{' and '.join(map(repr, labels))} {text}.")
 
 
 def require(subjects: Mapping[str, Iterable[str]], needed: int) -> None:
