@@ -79,8 +79,10 @@ def to_host(tree: Any) -> Any:
 
 def from_host(tree: Any) -> Any:
     """`tree` with copies of its arrays as JAX's. (`jnp.array` compiles a program for each shape,
-    and `jax.device_put` alone may share memory.)"""
-    return jax.tree_util.tree_map(lambda x: jax.device_put(np.array(x)) if on_host(x) else x, tree)
+    and `jax.device_put` alone may share memory, and is slow for one array after the other.)"""
+    hosted = [np.array(x) for x in jax.tree_util.tree_leaves(tree) if on_host(x)]
+    arrays = iter(jax.device_put(hosted))
+    return jax.tree_util.tree_map(lambda x: next(arrays) if on_host(x) else x, tree)
 
 
 def cond(some: Any, yes: Callable, no: Callable, *operands: Any) -> Any:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.compilation import kernel
+from .._core.compilation import POINTS, kernel
 from .._core.executor import from_host, on_host
 from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method
@@ -33,9 +33,6 @@ Expanded = Float[Array, "rows columns L"]
 Some = Bool[Array, " L"] | None
 Items = tuple[str | Output, ...]
 
-# Lanes of programs that are called for many points at once. Higher: single points wait for lanes
-# that nobody needs. Lower: many points take more calls.
-POINTS = 16
 # Lanes of programs for systems or directions side by side. More: the last call has more empty
 # lanes. Fewer: calls cost more than they compute.
 WIDE = 256
@@ -76,14 +73,12 @@ def watched(
     u: Inputs,
     index: Int[Array, " #L"],
     some: Some = None,
-    lanes: int | None = None,
+    lanes: int = 0,
 ) -> Expanded:
     """The guards of chart a, and the level if it has one, with their derivatives."""
     static = a, s.guard_kinds(a)
     if not on_host(q):
         return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(t, q, u, index)
-    # (A program for many points is worth its compilation from so many calls on.)
-    lanes = lanes or (1 if q.shape[-1] < WIDE else POINTS)
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
@@ -224,6 +219,8 @@ class Tangents(Structure):
         super().__init__(s.source)
         self.directions, self._levels, self._plain = directions, levels, s
         self._along, self.nu = (along, by_levels), s.nu
+        leaves = map(np.asarray, jax.tree_util.tree_leaves(self._along))
+        self.moving = sum(x.reshape(directions, -1).any(axis=1) for x in leaves) > 0
 
     def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:
         """Inputs of zero, and the directions of lanes; of negative index, none."""
@@ -302,6 +299,12 @@ def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
         return np.zeros((s.nu, len(lane)))
     n = 1 + s.d  # directions of the start of a move come first
     return s.pushed(lane % (n + s.directions) - n)
+
+
+def parted(tree: Any) -> tuple[Any, Any]:
+    """Complex arrays (N, P, ...) as values (N, ...) and derivatives (P, N, ...)."""
+    by = lambda x: np.swapaxes(x.imag, 0, 1) / TINY  # noqa: E731
+    return jax.tree_util.tree_map(lambda x: x.real[:, 0], tree), jax.tree_util.tree_map(by, tree)
 
 
 class _Tangent(NamedTuple):

@@ -180,7 +180,6 @@ class Variation:
         self._s, self._moves, self.first = s, moves, np.flatnonzero(moves.order == 0)
         if len(self.first) < len(lanes.t):
             raise NotOnHostError
-        self.starts = Moves(*(x[..., self.first] for x in moves))
         # Every move in all directions: of its start, and the P ones.
         many = lambda x: np.repeat(x, n + P, axis=-1)  # noqa: E731
         aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), len(moves.t))
@@ -193,8 +192,10 @@ class Variation:
                 end, u = (t + h).real[at] + 0j, kernels.unpushed(s, lane[at])
                 h[at] = end + kernels.due(s, g, end, q[:, at], u)[0, 0] - t[at]
         along = along._replace(t=t, q=q, h=h, lane=lane)
-        needed = twice | (lane % (n + P) >= n)
-        along = Moves(*(x[..., needed] for x in along))
+        # (Directions that move no more than the start of the flow are among those of every start.)
+        self._unit = np.eye(P)[s.moving | times.any(axis=1) | (np.arange(P) == 0)]
+        needed = np.append(np.full(n, twice), self._unit.any(axis=0))
+        along = Moves(*(x[..., np.tile(needed, len(moves.t))] for x in along))
         later = np.concatenate([np.zeros((n, len(lanes.t))), times]).T.ravel()
         target = dataclasses.replace(
             target, time=many(target.time) + 1j * kernels.TINY * later,
@@ -203,7 +204,8 @@ class Variation:
         end, by = linear_moves(s, along, target)
         by, end = by.reshape(len(moves.t), -1, *by.shape[1:]), end.reshape(len(moves.t), -1, n)
         self._by, self._change = np.real(by[:, 0]), np.imag(by) / kernels.TINY
-        self._kick = np.moveaxis(np.imag(end[:, -P:]) / kernels.TINY, 1, 2)
+        kick = np.imag(end[:, -len(self._unit) :]) / kernels.TINY
+        self._kick = np.moveaxis(kick, 1, 2) @ self._unit
 
     def tangents(self, begin: Float[np.ndarray, "n P"]) -> Float[np.ndarray, "moves n P"]:
         """Tangents of (t, q) where moves start, and at the last end."""
@@ -212,24 +214,26 @@ class Variation:
             starts.append(by @ starts[-1] + kick)
         return np.stack(starts)
 
-    def jacobians(self, tangents: Float[np.ndarray, "moves n P"]) -> Any:
+    def jacobians(self, tangents: Float[np.ndarray, "moves n P"], sizes: Any = None) -> Any:
         """Derivatives (L, P, n, m) of (t, q) at the ends of lanes by (t, q, u) at their starts, and
-        their own in each direction, as complex numbers."""
+        their own in each direction, as complex numbers. `sizes`: as `across` of `chain`."""
         moves, (M, n, m), P = self._moves, self._by.shape, tangents.shape[2]
-        along = np.concatenate([tangents[:-1], np.tile(np.eye(P), (M, 1, 1))], axis=1)
+        along = np.concatenate([tangents[:-1], np.tile(self._unit, (M, 1, 1))], axis=1)
         change = np.moveaxis(along, 1, 2) @ self._change.reshape(*along.shape[:2], n * m)
         by = self._by[:, None] + 1j * kernels.TINY * change.reshape(M, P, n, m)
+        if sizes is not None:
+            f = slopes(self._s, *self.points(tangents, np.arange(M))).T.reshape(M, P, n - 1)
+            by[..., 1:n] = by[..., 1:n] @ projections(f, sizes[moves.chart][:, None])
         lane, order = (np.repeat(x, P) for x in (moves.lane, moves.order))
         moves = moves._replace(lane=lane * P + np.arange(M * P) % P, order=order)
         return _products(moves, by.reshape(-1, n, m), len(self.first) * P).reshape(-1, P, n, m)
 
-    def points(self, tangents: Float[np.ndarray, "moves n P"]) -> tuple:
-        """Times, charts, states and inputs where lanes start, in each direction."""
-        P, starts = tangents.shape[2], self.starts
-        aside = np.moveaxis(tangents[self.first], 1, 0).reshape(tangents.shape[1], -1)
-        t, chart, q = (np.repeat(x, P, axis=-1) for x in (starts.t, starts.chart, starts.q))
-        u, aside = self._s.pushed(np.arange(len(t)) % P), 1j * kernels.TINY * aside
-        return t + aside[0], chart, q + aside[1:], u
+    def points(self, tangents: Float[np.ndarray, "moves n P"], move: Any) -> tuple:
+        """Times, charts, states and inputs where some moves start, in each direction."""
+        n, P = tangents.shape[1:]
+        aside = 1j * kernels.TINY * np.moveaxis(tangents[move], 1, 0).reshape(n, -1)
+        t, chart, q, *_ = (np.repeat(x[..., move], P, axis=-1) for x in self._moves)
+        return t + aside[0], chart, q + aside[1:], self._s.pushed(np.arange(len(t)) % P)
 
 
 def linear_moves(s: Structure, moves: Moves, target: Target) -> tuple[np.ndarray, np.ndarray]:

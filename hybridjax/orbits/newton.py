@@ -98,8 +98,8 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     begin = np.zeros((1 + len(sizes), P))
     begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
     longer = np.zeros(P) if by.expected is None else by.expected
-    part = np.where(np.isfinite(ends.time), (ends.time - map.anchor.t) / map.expected, 0.0)
-    times = begin[0][:, None] * np.isfinite(ends.time) + longer[:, None] * part
+    along = begin[0][:, None] + np.outer(longer, (ends.time - map.anchor.t) / map.expected)
+    times = np.where(np.isfinite(ends.time), along, 0.0)
     orbit = Variation(s, turn.legs, ends, side_by_side(turn.tapes), times, factors)
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
     moved = np.where(map.valid, orbit.tangents(begin)[-1, 1:].T, 0.0) / sizes
@@ -111,7 +111,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     if factors:
         legs, by_factor = turn.legs, orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)]
         if map.base is not None:
-            f = slopes(s, *orbit.points(tangents)).T.reshape(*by_factor.shape[:3])
+            f = slopes(s, *orbit.points(tangents, orbit.first)).T.reshape(*by_factor.shape[:3])
             by_factor = across(f, map.scale[legs.chart][:, None], by_factor)
         t_legs = np.moveaxis(tangents[orbit.first], 0, -1)
         moving = moving._replace(

@@ -104,9 +104,9 @@ def _matrices(
 def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     """`_matrices` on the host, and its derivatives."""
     (cycle, family, outputs, turn), (by_cycle, by_family, *_) = arguments, directions
-    placed, moved, s, jacobians = place_along(cycle, family, turn, by_cycle, by_family)
-    (N, P, n, _), lanes = jacobians.shape, moved.lanes
-    embed, select = moved.frames()
+    placed, s, jacobians = place_along(cycle, family, turn, by_cycle, by_family)
+    (N, P, n, _), lanes = jacobians.shape, placed.lanes
+    embed, select = placed.frames()
     after = np.roll(select.reshape(N, P, *select.shape[1:]), -1, axis=0)
     A = after @ jacobians[..., :n] @ embed.reshape(N, P, *embed.shape[1:])
     values = lambda a, *point: kernels.outputs(s, a, outputs, *point)  # noqa: E731
@@ -114,9 +114,8 @@ def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     by = with_derivatives(s, values, lanes.chart, lanes.t, lanes.q, len(outputs), u)
     J = np.moveaxis(by[:, 1:], -1, 0)
     C, D = (x.reshape(N, P, *x.shape[1:]) for x in (J[..., :n] @ embed, J[..., n:]))
-    each = A, after @ jacobians[..., n:], C, D
-    columns = (np.moveaxis(x.imag / kernels.TINY, 1, 0) for x in each)
-    return _matrices_of(placed, outputs), (*columns, None)
+    values, columns = kernels.parted((A, after @ jacobians[..., n:], C, D))
+    return (*values, placed.dims[::P]), (*columns, None)
 
 
 _of_family = by_columns(_matrices, _matrices_along, of_flow)

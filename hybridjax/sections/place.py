@@ -6,7 +6,6 @@ from typing import Any, cast
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
@@ -14,7 +13,6 @@ from .._core.boundary.checked import checked
 from .._core.compilation import at_ease, host_first, quick_jit
 from .._core.executor import Array, is_traced, namespace, on_host, put, stop_gradient, to_host
 from .._core.host_derivatives import NotOnHostError, by_columns, require_program
-from .._core.lanes import by_lane
 from .._core.precision import require_x64
 from .._core.results import Result
 from ..engine import kernels
@@ -165,9 +163,9 @@ def place_along(
     turn: Any,
     by_cycle: LimitCycle,
     by_family: AbstractSections,
-) -> tuple[PlacedSections, PlacedSections, kernels.Tangents, np.ndarray]:
-    """Sections placed on the host; and in P directions, as complex numbers of N P sections (see
-    `kernels.Tangents`): the same, the structure, and the Jacobians (N, P, n, m) of the flow."""
+) -> tuple[PlacedSections, kernels.Tangents, np.ndarray]:
+    """Sections placed on the host in P directions, as complex numbers of N P sections (see
+    `kernels.Tangents`), the structure, and the Jacobians (N, P, n, m) of the flow."""
     flows: list[Any] = []
     map, N, M = _patient(cycle), family.n_sections, family.points
     placed = PlacedSections(cycle, family, *_locate(map, family, turn, flows)[1])
@@ -187,30 +185,28 @@ def place_along(
     if isinstance(family.anchor, Crossing):
         levels = ListLevels((cast(Crossing, by_family.anchor),))
         x = follow(flows.pop(0), levels, np.zeros((P, 1)))[1][-1]
-    start, points = jax.tree_util.tree_map(lambda x: x[0], flows[0][0]), x[None]
-    orbit = Orbit(cycle.period, start.t, start.chart, start.q.T)
+    lanes, points = side_by_side(flows[0][0]), x[None]
+    orbit = Orbit(cycle.period, lanes.t[:M], lanes.chart[:M], lanes.q.T[:M])
     if M > 1:
         times = x[0][:, None] + longer[:, None] * np.arange(1, M + 1) / M
         flow, points, _ = follow(flows.pop(0), None, times)
         points = points[flow.first]
-        orbit = Orbit(cycle.period, flow.starts.t, flow.starts.chart, flow.starts.q.T)
     moving = longer, np.moveaxis(points[:, 0], 1, 0), np.moveaxis(points[:, 1:], 2, 0)
     raw, by_bound = to_host(_bind_along(s, family, orbit, (by_cycle.structure, by_family, moving)))
     clock = np.isfinite(bound.time)
     late = np.rint((bound.time[0] - raw.time[0]) / cycle.period) if clock[0] else 0.0
-    (flow,) = flows
-    k = np.arange(N + 1)[-len(flow[1].time) :]
+    k = np.arange(N + 1)[-len(flows[0][1].time) :]
     by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
     times = clock[k % N] * (by_time[:, k % N] + (late + k // N) * longer[:, None])
-    flow, tangents, along = follow(flow, by_bound.levels, times, True)
-    t, chart, q, u = (y[..., -N * P :] for y in flow.points(tangents))
+    flow, tangents, along = follow(flows[0], by_bound.levels, times, True)
+    t, chart, q, u = flow.points(tangents, flow.first[-N:])
     many = lambda y: np.repeat(y, P)  # noqa: E731
     lanes = placed.lanes._replace(t=t, chart=chart, q=q)
     bound = dataclasses.replace(bound, time=many(bound.time), event=many(bound.event))
     normal = _normals(along, bound, lanes, many(np.arange(N)), u)
     rows = dict(drop=many(placed.drop), dims=many(placed.dims), normal=normal)
     moved = dataclasses.replace(placed, bound=bound, lanes=lanes, **rows)
-    return placed, moved, along, flow.jacobians(tangents)[-N:]
+    return moved, along, flow.jacobians(tangents, placed.across)[-N:]
 
 
 def _observed(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str, ...], _: Any):
@@ -221,16 +217,13 @@ def _observed(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str, .
 def _observed_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     """`_observed` on the host, and its derivatives."""
     (cycle, family, outputs, turn), (by_cycle, by_family, *_) = arguments, directions
-    placed, moved, s, _ = place_along(cycle, family, turn, by_cycle, by_family)
-    lanes, P = moved.lanes, len(moved.lanes.t) // family.n_sections
-    values, by = (placed.lanes.t, None), (lanes.t, None)
+    placed, s, _ = place_along(cycle, family, turn, by_cycle, by_family)
+    lanes, P, y = placed.lanes, s.directions, None
     if outputs:
         u = s.pushed(np.arange(len(lanes.t)) % P)
-        values = placed.lanes.t, placed.observe(outputs)
-        by = lanes.t, observe(s, check_outputs(cycle, outputs), lanes, u).T
-    directions_first = lambda x: np.swapaxes(x.reshape(-1, P, *x.shape[1:]), 0, 1)  # noqa: E731
-    tangents = lambda x: directions_first(x.imag) / kernels.TINY  # noqa: E731
-    return values, jax.tree_util.tree_map(tangents, by)
+        y = observe(s, check_outputs(cycle, outputs), lanes, u).T
+    split = lambda x: x.reshape(-1, P, *x.shape[1:])  # noqa: E731
+    return kernels.parted(jax.tree_util.tree_map(split, (lanes.t, y)))
 
 
 observed_at = by_columns(_observed, _observed_along, of_flow)
@@ -281,24 +274,13 @@ def _normals(s: Structure, bound: BoundSections, lanes: Lanes, index, u) -> Arra
     state_based = xp.isinf(bound.time) & (bound.event < 0)
 
     def work(a, mask, out):
-        n = s.dims[a]
-        point = only(mask, index), only(mask, lanes.t), only(mask, lanes.q[:n])
-        gradients = put(out, slice(1 + n), _level_gradients(s, a, levels, *point, u))
-        return xp.where(mask, gradients, out) if levels.present(s, a) else out
+        if not levels.present(s, a):
+            return out
+        point = [only(mask, x) for x in (lanes.t, lanes.q[: s.dims[a]], u, index)]
+        by = kernels.watched(s, a, levels, *point)[-1, 1 : 2 + s.dims[a]]
+        return xp.where(mask, put(out, slice(len(by)), by), out)
 
     return for_each_chart(s, lanes.chart, state_based, work, out).T
-
-
-def _level_gradients(s: Structure, a: int, levels: AbstractLevels, i, t, q, u) -> Array:
-    """Gradients (n, N) of levels i with respect to (t, q) in chart a."""
-    if on_host(t):
-        return kernels.watched(s, a, levels, t, q, u, i)[-1, 1 : 2 + len(q)]
-
-    def gradient(i, t, q):
-        g = jax.grad(lambda t, q: levels.level(s, a, i, t, q), argnums=(0, 1))(t, q)
-        return jnp.concatenate([g[0][None], g[1]])
-
-    return by_lane(gradient)(i, t, q)
 
 
 def _check(placed: PlacedSections, first: int) -> None:
@@ -357,9 +339,7 @@ def _remedy(placed: PlacedSections, i: int) -> str:
     if isinstance(section, Crossing):
         i, N, levels = 0, 1, ListLevels((section,))
     s, (t, chart, q) = cycle.structure, cycle.trajectory().dense()
-    level = np.full(len(t), np.nan)
-    if levels is not None:
-        level = levels_at(s, levels, N, t, chart, q.T)[0, i]
+    level = levels_at(s, levels, N, t, chart, q.T)[0, i]
     level[-1] = level[0]  # (the same point, but for rounding)
     falls = (np.diff(level) < 0) & (np.diff(t) > 0)
     crossed = np.flatnonzero(falls & (level[:-1] > 0) & (level[1:] <= 0))

@@ -134,22 +134,24 @@ class PlacedSections(eqx.Module):
 
     @property
     def flow_jacobians(self) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
-        """A and B of the flow from each section to the next, padded; NaN if it failed.
-
-        (On the host, the direction of an autonomous flow does not drown strong contraction.)
-        """
+        """A and B of the flow from each section to the next, padded; NaN if it failed."""
         placed = self if is_hidden(self) else to_host(self)
-        lanes, n, across = placed.lanes, 1 + placed.lanes.q.shape[0], None
-        if on_host(lanes.t) and not self.cycle.clocked and np.isinf(placed.bound.time).all():
-            across = placed.cycle.settings.scale
+        s, n, sizes = self.structure(), 1 + placed.lanes.q.shape[0], placed.across
         following, _, target = placed.onwards()
         with at_ease():
-            jacobian, _ = tape_jacobian(self.structure(), lanes, target, placed.tape, across=across)
+            jacobian, _ = tape_jacobian(s, placed.lanes, target, placed.tape, across=sizes)
         xp = namespace(jacobian)
         jacobian = xp.where((placed.result == Result.OK)[:, None, None], jacobian, xp.nan)
         embed, select = placed.frames()
         after = select[following]
         return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
+
+    @property
+    def across(self) -> Float[Array, "A d"] | None:
+        """Sizes of the states, on the host, of an autonomous system between sections that depend on
+        the state only: the direction of its flow must not drown strong contraction."""
+        hidden = is_hidden(self) or self.cycle.clocked or np.isfinite(self.bound.time).any()
+        return None if hidden else to_host(self.cycle.settings.scale)
 
     def coordinates(self) -> tuple[tuple[str, ...], ...]:
         """Names of the coordinates on each section: deviations of the time of crossing (`t`) and
