@@ -252,9 +252,8 @@ def _page(found: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
     data, recording, warnings = found.data, found.recording, found.advice.warnings
     trials = escape(", ".join(t.name for t in recording.trials))
-    loop, method = found.fit.reference, "output-error fit"
-    if loop:
-        method = f"instrumental variables of {escape(listed(loop))}"
+    loop = found.fit.reference
+    method = f"instrumental variables of {escape(listed(loop))}" if loop else "output-error fit"
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(found).items() if amount}
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
     expected = zip(found.advice.strides, found.advice.expected, strict=True)

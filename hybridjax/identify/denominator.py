@@ -27,10 +27,7 @@ _SMALLEST_REMAINDER = 0.1
 
 def chi(period_delay: Complex[np.ndarray, " E"], c: Coefficients) -> Complex[np.ndarray, " E"]:
     r"""Return $1 + c_1 z^{-N} + \ldots + c_d z^{-dN}$ at values of $z^{-N}$, the period's delay."""
-    value = np.zeros_like(period_delay)
-    for coefficient in c[::-1]:
-        value = (value + coefficient) * period_delay
-    return 1 + value
+    return np.polyval([*c[::-1], 1.0], period_delay)
 
 
 def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:

@@ -11,6 +11,7 @@ Helmersson and Ribarits 2004; Ribarits, Deistler and Hanzon 2005; for each secti
 """
 
 from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -61,8 +62,12 @@ class PeriodicModel(NamedTuple):
         self, scale: Float[np.ndarray, " ny"], inputs: tuple[str, ...], outputs: tuple[str, ...]
     ) -> LDTP:
         """Return the model with outputs in their own units."""
+        return LDTP.from_blocks(*self.times(scale)[:4], inputs, outputs)
+
+    def times(self, scale: Float[np.ndarray, " ny"]) -> "PeriodicModel":
+        """Return the model with outputs and errors that are larger by these factors."""
         C, D = ([scale[:, None] * x for x in blocks] for blocks in (self.C, self.D))
-        return LDTP.from_blocks(self.A, self.B, C, D, inputs, outputs)
+        return self._replace(C=C, D=D, K=[K / scale[: K.shape[1]] for K in self.K])
 
     @property
     def dims(self) -> list[int]:
@@ -85,10 +90,7 @@ class PeriodicModel(NamedTuple):
 
     def monodromy(self, first: int = 0) -> Float[np.ndarray, "d d"]:
         """Return the product of A over one period from section `first` on."""
-        product = np.eye(self.A[first].shape[1])
-        for k in range(self.n_sections):
-            product = self.A[(first + k) % self.n_sections] @ product
-        return product
+        return reduce(lambda product, A: A @ product, [*self.A[first:], *self.A[:first]])
 
     def refined(
         self, direct: bool, linearize: Callable[["LocalCoordinates"], NormalEquations]

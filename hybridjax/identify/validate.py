@@ -41,25 +41,6 @@ def can_be_compared(model: LDTP | SeriesFit | Predictor, record: Record, free_st
     return int(np.isfinite(record.y).sum()) > _SAMPLES_PER_UNKNOWN * unknown
 
 
-def simulate(
-    model: LDTP | SeriesFit | Predictor, grid: CycleGrid, free_start: bool
-) -> Float[np.ndarray, "S T N ny"]:
-    """Return the outputs of a model: a `Predictor` one step ahead, others from inputs alone.
-
-    **Arguments:** `free_start`: from the states that fit each record best, or from zero. A drift
-    that the records announce is estimated in either case.
-    """
-    if isinstance(model, SeriesFit):
-        return model.simulate(grid, free_start)
-    if isinstance(model, LDTP):
-        # Outputs in units of their size, so that none is neglected.
-        square = (grid.y**2).sum(axis=(0, 1, 2))
-        S = np.diag(np.where(square > 0, square / grid.sampled.sum(axis=(0, 1, 2)), 1.0))
-        plain = PeriodicModel.of(model, np.ones(len(S)))
-        model = Predictor(plain, np.stack([S] * model.n_sections))
-    return model.predict(grid, free_start)
-
-
 # Cycles that a notebook draws. More: they are harder to see.
 _DRAWN = 4
 # Samples for each lag that is tested by default. Fewer: correlations of too few samples; more: late
@@ -170,7 +151,8 @@ def validate(
     these means, are tested separately; the p-value is the smaller one, corrected for the choice.
     *Independence*: the part of the residuals that lagged inputs explain, compared with the rest (an
     F ratio for each section), for any spectrum of the input; its level holds for residuals that are
-    white.
+    white. It allows for the errors of numerators of `fit_series`, and of fits of `fit_ldtp` to
+    series, but the test of whiteness does not.
 
     For a fit of `fit_ldtp` to series, the errors of predictions one step ahead are tested (Ljung
     1999): they are white for a true model if the fit also models the noise. All fields of the
@@ -217,14 +199,11 @@ def validate(
         )
     prepared = PreparedRecords(compared)
     grid, sampled = prepared.whole(), prepared.sampled
-    first = np.array([r.first_section for r in compared])
-    before = np.arange(grid.inside[0].size).reshape(-1, N) - first[:, None, None]  # in the record
     y = np.where(grid.sampled, grid.y, np.nan)
-    spread = np.nanstd(y, axis=(0, 1, 2))
 
     def count(lags: int) -> Int[np.ndarray, "N ny"]:
         """Return how often each section was sampled with so many samples before it."""
-        return (grid.sampled & (before >= lags)[..., None]).sum(axis=(0, 1))
+        return (grid.sampled & (grid.age > lags)[..., None]).sum(axis=(0, 1))
 
     if (few := int(sampled.min())) < FEWEST_SAMPLES:
         raise DefinitionError(f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles.")
@@ -236,20 +215,25 @@ def validate(
             "the records are too short: record longer without gaps, until each section was sampled "
             f"{FEWEST_SAMPLES} times with {lags} samples before it in its record."
         )
-    simulated = simulate(tested, grid, free_start)
+    spread = None if isinstance(model, LDTP) or isinstance(tested, LDTP) else model.spread(grid)
+    if isinstance(tested, LDTP):  # outputs in units of their size, so that none is neglected
+        S = np.tile(np.diag(prepared.scale**2), (N, 1, 1))
+        tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
+    simulated = tested.predict(grid, free_start)
     error = y - simulated
     square = np.nansum(error**2, axis=(0, 1))
     rms = np.sqrt(square.sum(axis=0) / sampled.sum(axis=0))
     size = np.sqrt(np.mean(simulated[grid.inside] ** 2, axis=0))
     auto, whiteness = whiteness_test(error, np.sqrt(square / sampled), lags)
-    late = np.where((before >= lags - 1)[..., None], error, np.nan)
+    late = np.where((grid.age >= lags)[..., None], error, np.nan)
     outside = CycleGrid.from_records(list(itertools.compress(drive or records, kept))).u
-    cross, independence, visible = independence_test(outside, late, lags, level / ny)
+    cross, independence, visible = independence_test(outside, late, lags, level / ny, spread)
     k = int(np.argmax([len(r.u) for r in compared]))
     longest = compared[k]
-    shown = slice(first[k], first[k] + len(longest.u) - longest.lead)  # later inputs are unknown
+    first = longest.first_section
+    shown = slice(first, first + len(longest.u) - longest.lead)  # later inputs are unknown
     return Validation(
-        fit=100 * (1 - rms / spread),
+        fit=100 * (1 - rms / np.nanstd(y, axis=(0, 1, 2))),
         noise=rms,
         whiteness=whiteness,
         independence=independence,
@@ -259,7 +243,7 @@ def validate(
         measured=y[k].reshape(-1, ny)[shown],
         simulated=simulated[k].reshape(-1, ny)[shown],
         level=level,
-        first_section=longest.first_section,
+        first_section=first,
         left_out=len(records) - len(compared),
         n_sections=N,
         inputs=longest.inputs,

@@ -16,10 +16,10 @@ from .._core.results import Result
 from .._core.text import p_value
 from ..errors import DefinitionError
 from ..identify.multiplier_estimate import compare_multipliers
-from ..identify.series.fit import SeriesFit, late_outputs, ordinary_least_squares, refuse_order
+from ..identify.series.fit import SeriesFit, refuse_order
 from ..identify.series.output_error import OutputErrorProblem
-from ..identify.series.records import CycleGrid, PreparedRecords
-from ..identify.series.residuals import answering
+from ..identify.series.records import MAY_DRIFT, CycleGrid, PreparedRecords
+from ..identify.series.subspace import late_outputs, ordinary_least_squares
 from ..identify.validate import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import NAME_REFERENCE, Finding, print_findings, warn_of
@@ -101,12 +101,11 @@ def advise(
         text = f"the data do not carry {d} multipliers: the weakest, and its region, may be noise."
         warnings.append(Finding("order", text))
     if fit.doubt:
-        warnings.append(Finding("order", f"{fit.doubt}."))
+        warnings.append(Finding("drift" if fit.doubt == MAY_DRIFT else "order", f"{fit.doubt}."))
     band = input_band(data)
-    error = np.where(grid.sampled, grid.y - fit.simulate(grid, True), 0.0)
-    for name, p in ({} if fit.reference else answering(grid, error, data.inputs)).items():
-        text = f"{name} answers earlier residuals of the outputs ({p_value(p)}): fits are biased. "
-        warnings.append(Finding("feedback", text + NAME_REFERENCE))
+    for name in fit.feedback:
+        text = f"{name} answers earlier residuals of the outputs: fits are biased. {NAME_REFERENCE}"
+        warnings.append(Finding("feedback", text))
     warnings += [*_about_excitation(data, fit, band), *_about_outputs(grid, fit)]
     if bias > 2 * fit.standard_errors.max():
         values = ", ".join(f"{z:.4f}" for z in plain)
@@ -123,9 +122,9 @@ def advise(
     # the test sees the distortion of small pushes if there is little noise.
     p = np.ones(1) if validation is None else validation.independence
     if validation and not validation.independent and validation.fit[p.argmin()] < 99:
-        text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}), as by "
-        text += f"errors of {unknowns} unknowns from {sampled} strides: record more, or take fewer "
-        warnings.append(Finding("left over", f"{text}sections; then push less, or raise `order`."))
+        text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}), more "
+        text += "than by errors of the fit, as by responses that are not linear: push less."
+        warnings.append(Finding("left over", text))
     if data.missing > _FEW:
         warnings.append(Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing."))
     for name, count in zip(data.signals, data.spikes, strict=True):

@@ -9,18 +9,12 @@ from .._core.boundary.kinds import Order
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Covariance
-from ..identify.series.fit import (
-    SeriesFit,
-    assemble,
-    fit_series,
-    late_outputs,
-    missing_cycles,
-    total_least_squares,
-)
+from ..identify.series.fit import SeriesFit, assemble, fit_series, missing_cycles
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem, TooFewCycles
 from ..identify.series.records import CycleGrid, PreparedRecords
-from ..identify.validate import Validation, can_be_compared, simulate, validate
+from ..identify.series.subspace import late_outputs, total_least_squares
+from ..identify.validate import Validation, can_be_compared, validate
 from .data import SectionData
 from .findings import untried_orders, warn_of
 
@@ -77,7 +71,7 @@ class Split(NamedTuple):
             raise DefinitionError(obstacle)
         grid, misfits = CycleGrid.from_records(ends), []
         for fit in fits:
-            error = (simulate(fit, grid, free_start=True) - grid.y) * grid.sampled
+            error = (fit.predict(grid, free_start=True) - grid.y) * grid.sampled
             square = (error**2).sum(axis=(0, 1, 2)) / grid.sampled.sum(axis=(0, 1, 2))
             misfits.append(float(np.log(square).mean()) / 2)
         best = 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))

@@ -13,6 +13,7 @@ from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit, fit_series
 from ..identify.series.in_loop import best_order
+from ..identify.series.records import SLOW
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import Finding, refuse, untried_orders, warn_of
@@ -134,8 +135,10 @@ def identify_recording(
     elif best > order:
         text = f"held-out strides are predicted better with {best} multipliers than with {order}: "
         text = text if outside is None else f"the reference tells {best} multipliers, not {order}: "
-        text += f"{order} may be biased, and their intervals too narrow. Compare order={best}."
-        findings = (*findings, Finding("order", text))
+        text += f"{order} may be biased, and their intervals too narrow. Compare order={best}"
+        slow = outside is None and split(whole.with_drift(SLOW)).best_order(most)[0] <= order
+        text += f", and drift={SLOW:g}, with which {order} are as good." if slow else "."
+        findings = (*findings, Finding("drift" if slow else "order", text))
     say("fit to the first three quarters")
     held = parts.fit(order, outside)
     say("fit to all")

@@ -9,7 +9,6 @@ import hybridjax as hj
 from hybridjax.identify.series.in_loop import best_order
 from hybridjax.identify.series.records import CycleGrid
 from hybridjax.identify.series.residuals import feedback_test
-from hybridjax.identify.validate import simulate
 
 
 N, SEEN = 4, ("u", "r", "d")
@@ -116,11 +115,9 @@ def test_discs_and_multipliers_of_transfer_functions_hold(plant):
 
 
 def test_regions_of_series_hold_in_the_loop(plant):
-    held = []
-    for seed in range(20):
-        fit = hj.fit_ldtp(series(plant, seed, noise=0.5), 2, reference="r")
-        held.append(fit.contains(plant.multipliers)[0])
-    assert sum(held) >= 16  # (of 20 with 95 %: less in one of 2500)
+    fits = (hj.fit_ldtp(series(plant, k, noise=0.5), 2, reference="r") for k in range(20))
+    held = sum(fit.contains(plant.multipliers)[0] for fit in fits)
+    assert held >= 16  # (of 20 with 95 %: less in one of 2500)
 
 
 def test_instruments_of_series_hold_in_the_loop(plant):
@@ -204,12 +201,10 @@ def test_residuals_tell_of_the_loop(plant):
     alone = hj.Record(early.u[:, :1], early.y, n_sections=N, inputs="u")
     biased = hj.fit_series(alone, 2, check=False)
     assert not hj.validate(biased, late, reference="r").independent
-    for record, answers in (
-        (alone, True),
-        (dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",)), False),
-    ):
+    driven = dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",))
+    for record, answers in (alone, True), (driven, False):
         fit, grid = hj.fit_series(record, 2, check=False), CycleGrid.from_records([record])
-        p = feedback_test(grid, grid.y - simulate(fit, grid, True))
+        p = feedback_test(grid, grid.y - fit.predict(grid, True))
         assert (p[0] < 1e-3) == answers
     unstable = hj.LDTP(1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1)))
     unstable = dataclasses.replace(unstable, inputs=("u",), outputs=early.outputs)
@@ -236,5 +231,5 @@ def test_what_does_not_fit_is_refused(plant):
             data.u[:2, :, :2], data.y[:2], n_sections=N, periods=8, inputs=("u", "r")
         )
         hj.estimate_htf(part, reference="r")
-    with refused("`reference` is for time series"):
+    with refused("`reference`, `noise` and `start` are for time series"):
         hj.fit_ldtp(plant.htf([0.3]), 2, reference="r")

@@ -9,10 +9,11 @@ from hypothesis import given, settings, strategies as st
 import hybridjax as hj
 from hybridjax.errors import FindingWarning
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
-from hybridjax.identify.series.fit import gradient_covariance, late_outputs, total_least_squares
+from hybridjax.identify.series.fit import gradient_covariance
 from hybridjax.identify.series.linearization import each_fit, filtered_response, linearize
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.records import PreparedRecords, with_drift
+from hybridjax.identify.series.subspace import late_outputs, total_least_squares
 
 from .conftest import SHAPES, scaled
 from .test_uncertainty import covered

@@ -12,16 +12,20 @@ from .test_uncertainty import covered
 
 
 def test_the_true_model_leaves_white_noise(small):
-    """Both p-values are uniformly distributed, though starts are unknown and samples missing."""
-    p = []
+    """P-values are uniform, for unknown starts and missing samples, and for fits to other data."""
+    p, of_fits = [], []
     for seed in range(30):
         data = record(small, 4 * 100, seed, 0.3, first_section=1, x0=np.ones(3))
         data.y[np.random.default_rng(seed).random(data.y.shape) < 0.02] = np.nan
         found = hj.validate(small, data)
         p.append([found.whiteness, found.independence])
+        other = record(small, 4 * 100, 100 + seed, 0.3)
+        fits = hj.fit_series(other, 2), hj.fit_ldtp(other, small)
+        of_fits.append([hj.validate(fit, data).independence for fit in fits])
     for test in np.reshape(p, (30, 2, 2)).transpose(1, 2, 0).reshape(4, 30):
         assert stats.kstest(test, "uniform").pvalue > 1e-3
     assert covered(int((np.array(p) > 0.05).sum()), 120)
+    assert covered(int((np.array(of_fits) > 0.05).sum()), 120)
 
 
 def test_the_fit_is_the_share_explained(small):
@@ -42,6 +46,8 @@ def test_a_wrong_model_is_refused(small):
     found = hj.validate(eqx.tree_at(lambda m: m.B, small, more), data)
     assert not found.independent and found.independence.min() < 1e-6
     assert "with the input: yes" in repr(found)
+    low = hj.fit_series(record(small, 4 * 300, 1, 0.1), 1, overhang=0, check=False)
+    assert not hj.validate(low, data).independent
 
 
 def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):

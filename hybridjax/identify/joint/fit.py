@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import cached_property
 from typing import Annotated, Literal, cast
@@ -29,9 +30,9 @@ from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate, RoughFit
 from ..multipliers import exact_htf
 from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
-from ..series import residuals
-from ..series.prediction import Predictor, SeriesPart, SeriesProblem, noise_model, noise_spectrum
-from ..series.records import MAY_DRIFT, PreparedRecords, with_drift
+from ..series import prediction, residuals
+from ..series.prediction import Predictor, SeriesPart, SeriesProblem
+from ..series.records import MAY_DRIFT, CycleGrid, PreparedRecords, with_drift
 from ..series.subspace import answers_at_once, default_horizon, subspace_model
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .realization import given_dims, realize
@@ -150,21 +151,25 @@ class LDTPFit(MultiplierEstimate):
                 "no noise was fitted, because HTFs give its variance at their lines only "
                 "(`HTF.variance`): fit time series."
             )
-        return noise_spectrum(self.noise, np.atleast_1d(np.asarray(f, float)), harmonics)
+        return prediction.noise_spectrum(self.noise, np.atleast_1d(np.asarray(f, float)), harmonics)
+
+    def spread(self, grid: CycleGrid) -> Iterator[Float[np.ndarray, "S T ny r"]]:
+        """Iterate over sections: roots of the covariance of the predictions by errors of the fit,
+        in units of the noise."""
+        part, model = SeriesPart.of(grid, self._scale), self._coordinates.model
+        S = cast(Predictor, self.predictor).S / np.outer(self._scale, self._scale)
+        path = SeriesProblem([part], S, True, True, 0).path(model, part)
+        sizes = np.sqrt(np.diagonal(S, axis1=1, axis2=2))[:, :, None]
+        for J, size in zip(prediction.slopes_of(self._coordinates, part, path), sizes, strict=True):
+            yield J @ self._spread.root / size
 
     @property
     def predictor(self) -> Predictor | None:
         """The predictor one step ahead that `hj.validate` uses; None if no noise was fitted."""
         if self.noise is None:
             return None
-        model, size = self._coordinates.model, self._scale[:, None]
         D = np.asarray(self.noise.D)
-        model = model._replace(
-            C=[size * C for C in model.C],
-            D=[size * x for x in model.D],
-            K=[K / size.T if K.shape[1] else K for K in model.K],
-        )
-        return Predictor(model, D @ D.swapaxes(1, 2))
+        return Predictor(self._coordinates.model.times(self._scale), D @ D.swapaxes(1, 2))
 
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
@@ -280,15 +285,11 @@ def fit_ldtp(
         if doubt := fit.contradiction([drifting], MAY_DRIFT) or misfit:
             warnings.warn(f"Fit: {doubt}.", FindingWarning, stacklevel=3)
         return dataclasses.replace(fit, doubt=doubt)
-    if reference is not None:
+    if reference is not None or noise == "innovations" or start == "cycle":
         raise DefinitionError(
-            "`reference` is for time series: estimate the HTFs by "
-            "`estimate_htf(data, reference=...)`, and leave `reference` out here."
+            "`reference`, `noise` and `start` are for time series: give the data, not HTFs, or "
+            "leave these arguments out (and pass `reference` to `estimate_htf`)."
         )
-    if noise == "innovations":
-        raise DefinitionError("noise='innovations' needs time series: give the data, not HTFs.")
-    if start == "cycle":
-        raise DefinitionError("HTFs are of periodic responses, without a start: leave `start` out.")
     return _fit_to_htf(data, guess, check)
 
 
@@ -448,7 +449,9 @@ def _finished(
         size = problem.weight * problem.target
         correlation = weights.neighbor_correlation(problem.errors(model), size, np.asarray(data.f))
     else:
-        noise = noise_model(model, cast(SeriesProblem, point.problem).S, scale, data.outputs)
+        noise = prediction.noise_model(
+            model, cast(SeriesProblem, point.problem).S, scale, data.outputs
+        )
     c, slopes = characteristic_slopes(point.coordinates)
     spread = point.equations.spread(unit)
     return LDTPFit(

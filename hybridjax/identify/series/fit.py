@@ -1,13 +1,14 @@
 """Multipliers and transfer functions from recorded time series with any input: output error."""
 
 import dataclasses
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, SignalNames, Vector
@@ -22,26 +23,26 @@ from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .. import denominator
 from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
-from ..descent import NO_LEADING_COEFFICIENT, Coefficients
+from ..descent import Coefficients
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate, RoughFit, warned
 from ..multipliers import refuse_invented
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
 from .in_loop import LoopEquations
-from .linearization import Linearization, each_fit, filtered_response, linearize, minimize, sum_up
+from .linearization import Linearization, each_fit, filtered_response, linearize, minimize
 from .output_error import OutputErrorProblem, SectionRegression, TooFewCycles
 from .records import (
     MAY_DRIFT,
     CycleGrid,
     PreparedRecords,
-    delay_cycles,
     divide_by_chi,
     lagged_inputs,
     start_responses,
     with_drift,
 )
 from .residuals import about_answering, answering
+from .subspace import DelayedOutputs, late_outputs, total_least_squares
 
 
 _BIASED = "the fit is biased; name their `reference`"
@@ -142,10 +143,17 @@ class SeriesFit(MultiplierEstimate):
     def free_cycles(self) -> int:
         """The cycles at the start of a record on which earlier inputs act without a model."""
         N, R = self.numerators.shape[:2]
-        d = len(self.coefficients)
-        return d + -(-(R - 1 - self.lead - d * N) // N)
+        return -(-(R - 1 - self.lead) // N)
 
-    def simulate(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "S T N ny"]:
+    def spread(self, grid: CycleGrid) -> Iterator[Float[np.ndarray, "S T ny r"]]:
+        """Iterate over sections: roots of the covariance of the outputs by errors of numerators,
+        for noise of variance one. (Errors of c change single sections little.)"""
+        N, ny, R, nu, r = self.roots.shape
+        v = divide_by_chi(self.coefficients, grid.u)
+        for n, root in enumerate(self.roots.reshape(N, ny, R * nu, r)):
+            yield np.tensordot(lagged_inputs(v, n, R, self.lead), root, (2, 1))
+
+    def predict(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "S T N ny"]:
         """Return the outputs from the inputs, and from the starts and drift that fit best."""
         N, R, ny, nu = self.numerators.shape
         v, T = divide_by_chi(self.coefficients, grid.u), grid.u.shape[1]
@@ -220,8 +228,8 @@ def fit_series(
     solution, converged = minimize(problem, solution.c)
     fit = assemble(problem, solution, coefficient_covariance(problem, solution), converged)
     grid = records.whole()
-    error = np.where(grid.sampled, grid.y - fit.simulate(grid, start == "free"), 0.0)
-    feedback = tuple(answering(grid, error, records.inputs))
+    error = np.where(grid.sampled, grid.y - fit.predict(grid, start == "free"), 0.0)
+    feedback = answering(grid, error, records.inputs)
     doubt = _about_drift(fit, records, start == "free")
     if check:
         refuse_order(delayed, noise * _noise(solution), about_answering(feedback, _BIASED) or doubt)
@@ -339,60 +347,6 @@ def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> No
     if missing := missing_cycles(problem, solution, order + 1):
         n, i = np.argwhere(solution.freedom <= order)[0]
         raise TooFewCycles(problem, n, i, missing)
-
-
-class DelayedOutputs(NamedTuple):
-    """The outputs 0, 1, ..., d cycles earlier, without the part that inputs explain."""
-
-    gram: Float[np.ndarray, "ny d1 d1"]
-    """Their Gram matrix, for each output."""
-    freedom: int
-    """The number of independent rows of all outputs: noise of variance 1 makes the sum of the Gram
-    matrices that large."""
-
-
-def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
-    """Return the Gram matrix from the rows whose lagged inputs and outputs are all measured."""
-    N, _, ny = problem.shape
-    delays = range(order + 1)
-
-    def past(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny d1"]:
-        return np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=3)
-
-    def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
-        inputs = lagged_inputs(part.u, n, problem.lags, problem.records.lead) @ problem.to_lags[n]
-        later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
-        sampled = part.sampled[:, :, n]
-        before = np.all([delay_cycles(sampled, j, not problem.free) for j in delays], axis=0)
-        starts = part.drift[:, :, :0]
-        return [
-            SectionRegression.make(inputs, starts, part.drift, later & before[..., alike[0]])
-            for alike in problem.alike[n]
-        ]
-
-    gram, freedom = np.zeros((ny, order + 1, order + 1)), 0
-    for section in sum_up(problem, np.zeros(0), past, regress):
-        for each in section:
-            gram[each.outputs] += each.products
-            freedom += max(round(each.freedom) - each.root.shape[1], 0) * len(each.outputs)
-    return DelayedOutputs(gram, freedom)
-
-
-def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
-    """Return c without bias by white noise in the outputs."""
-    order = delayed.gram.shape[1] - 1
-    null = np.linalg.eigh(delayed.gram.sum(axis=0))[1][:, 0]
-    if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
-        return np.zeros(order)
-    roots = np.roots(null / null[0])
-    size = np.maximum(np.abs(roots) / denominator.SLOWEST, 1.0)
-    return np.pad(np.poly(roots / size).real[1:], (0, order - len(roots)))
-
-
-def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]:
-    """Return the multipliers by plain regression, which noise in the outputs biases to zero."""
-    gram = delayed.gram.sum(axis=0)
-    return multipliers_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
 
 
 def refuse_order(delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"], cause: str = "") -> None:

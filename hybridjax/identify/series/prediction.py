@@ -139,7 +139,7 @@ class SeriesProblem(NamedTuple):
             path = self.path(coordinates.model, part)
             R, _ = part.shape
             along = np.zeros((R, path.start_gram.shape[1], P))
-            for n, slopes in enumerate(_slopes(coordinates, part, path)):
+            for n, slopes in enumerate(slopes_of(coordinates, part, path)):
                 J = path.whiten[n] @ part.without_drift(n, slopes)
                 flat = J.reshape(-1, P)
                 gram += flat.T @ flat
@@ -240,7 +240,7 @@ def recursion(
         drive(n, x)
 
 
-def _slopes(
+def slopes_of(
     coordinates: LocalCoordinates, part: SeriesPart, path: Path
 ) -> Iterator[Float[np.ndarray, "_ _ ny P"]]:
     """Iterate over the derivatives of the predictions at each section."""

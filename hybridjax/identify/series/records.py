@@ -54,6 +54,11 @@ class CycleGrid(NamedTuple):
         """The cycle in which each record first crosses a section."""
         return np.argmax(self.inside, axis=1)
 
+    @property
+    def age(self) -> Int[np.ndarray, "S T N"]:
+        """The number of samples from the start of each record to each sample, which counts."""
+        return np.cumsum(self.inside.reshape(len(self.u), -1), axis=1).reshape(self.inside.shape)
+
 
 def count_cycles(record: Record) -> int:
     """Return the number of cycles that a record touches, counted from section 0 of its first."""

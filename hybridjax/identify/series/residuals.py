@@ -1,6 +1,7 @@
 """Tests of residuals, section by section: their correlations in time and with inputs."""
 
 from collections.abc import Iterable
+from itertools import compress, repeat
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -64,22 +65,28 @@ def whiteness_test(
 
 
 def independence_test(
-    u: Float[np.ndarray, "S T N nu"], error: Float[np.ndarray, "S T N ny"], lags: int, level: float
+    u: Float[np.ndarray, "S T N nu"],
+    error: Float[np.ndarray, "S T N ny"],
+    lags: int,
+    level: float,
+    spread: Iterable[Float[np.ndarray, "S T ny r"]] | None = None,
 ) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
     """Test the part of residuals that present and past inputs explain, section by section.
 
-    **Arguments:** `error`: NaN where the inputs of so many lags are not known.
+    **Arguments:** `error`: NaN where the inputs of so many lags are not known. `spread`: for each
+    section, a root of the covariance that errors of a fit to other data have, for noise of
+    variance one. Default: no errors.
 
     **Returns:** the correlations with the inputs, the p-values, and the smallest visible misfits,
     in standard deviations of the noise, for tests of this level. A misfit of rms r times the noise
     makes F ratios of n samples noncentral, by $n r^2$. The power is that of one F ratio with the
     degrees of freedom of all sections, which is 1 to 4 % too optimistic.
     """
-    _, _, N, ny = error.shape
+    S, T, N, ny = error.shape
     nu = u.shape[3]
     z, deviates, tested = np.zeros((N, lags, ny, nu)), np.zeros(ny), np.zeros(ny)
-    degrees = np.zeros((2, ny))
-    for n in range(N):
+    degrees, by_fits = np.zeros((2, ny)), np.zeros(ny)
+    for n, root in zip(range(N), spread or repeat(np.zeros((S, T, ny, 0))), strict=False):
         past = lagged_inputs(u, n, lags, 0)
         for i in range(ny):
             present = np.isfinite(error[:, :, n, i])
@@ -93,13 +100,17 @@ def independence_test(
             left = left[:, s > RANK * s[0]][:, : count // 2]
             # Explained against unexplained part: an F ratio, as its Gaussian deviate.
             a, b = left.shape[1], count - left.shape[1]
-            inside = ((left.T @ r) ** 2).sum()
-            p = stats.f.sf((inside / a) / ((r @ r - inside) / b), a, b)
+            rows = np.column_stack([r, root[:, :, i][present]])
+            inside = ((left.T @ rows) ** 2).sum(axis=0)
+            outside, by_fit = (rows**2).sum(axis=0) - inside, inside[1:].sum()
+            p = stats.f.sf(inside[0] / (a + by_fit) * (b + outside[1:].sum()) / outside[0], a, b)
+            by_fits[i] += by_fit
             deviates[i] += stats.norm.isf(np.clip(p, 1e-300, 1 - 1e-16))
             degrees[:, i] += a, b
             tested[i] += 1
     p = stats.norm.sf(deviates / np.sqrt(np.maximum(tested, 1)))
     shift = special.ncfdtrinc(*degrees, 1 - _POWER, special.fdtri(*degrees, 1 - level))
+    shift *= 1 + by_fits / np.maximum(degrees[0], 1)
     return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
 
 
@@ -118,9 +129,9 @@ def about_misfit(
     **Arguments:** `outside`: the inputs that do not respond to outputs. `error`: the residuals of
     `grid`, NaN where an output was not sampled.
     """
-    S, T, N, ny = error.shape
-    late = np.cumsum(grid.inside.reshape(S, -1), axis=1).reshape(S, T, N) > N
-    p = independence_test(outside.u, np.where(late[..., None], error, np.nan), N, ANSWER)[1]
+    N, ny = error.shape[2:]
+    late = np.where((grid.age > N)[..., None], error, np.nan)
+    p = independence_test(outside.u, late, N, ANSWER)[1]
     if not ((p < ANSWER / ny) & ~is_exact(grid, error)).any():
         return ""
     remedies = "more dimensions" if innovations else "more dimensions, noise='innovations'"
@@ -132,12 +143,10 @@ def about_misfit(
 
 def answering(
     grid: CycleGrid, error: Float[np.ndarray, "S T N ny"], inputs: tuple[str, ...]
-) -> dict[str, float]:
-    """Return the inputs that answer earlier residuals, as by a controller, with their p-values."""
-    if is_exact(grid, error).all():
-        return {}
-    p = feedback_test(grid, error)
-    return {name: float(x) for name, x in zip(inputs, p, strict=True) if x < ANSWER}
+) -> tuple[str, ...]:
+    """Return the inputs that answer earlier residuals, as by a controller."""
+    answers = feedback_test(grid, error) < ANSWER * ~is_exact(grid, error).all()
+    return tuple(compress(inputs, answers))
 
 
 def about_answering(inputs: Iterable[str], remedy: str) -> str:
@@ -161,9 +170,8 @@ def feedback_test(
     late = np.zeros((S, T * N, error.shape[3]))
     late[:, 1:] = np.nan_to_num(error).reshape(S, T * N, -1)[:, :-1]
     new = np.full(grid.u.shape, np.nan)
-    start = np.cumsum(grid.inside.reshape(S, -1), axis=1).reshape(S, T, N) > lags + 1
     for n in range(N):
-        rows = grid.inside[:, :, n] & start[:, :, n]
+        rows = grid.inside[:, :, n] & (grid.age[:, :, n] > lags + 1)
         past, u = lagged_inputs(grid.u, n, lags + 1, 0)[rows][:, nu:], grid.u[:, :, n][rows]
         new[:, :, n][rows] = u - past @ np.linalg.lstsq(past, u)[0]
     return independence_test(late.reshape(error.shape), new, lags, ANSWER)[1]

@@ -1,16 +1,19 @@
-"""First models of time series, by a subspace method."""
+"""First models of time series, by total least squares and by a subspace method."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 from scipy import special
 
 from ...errors import DefinitionError
-from ..denominator import SLOWEST
+from ..denominator import SLOWEST, multipliers_of
+from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..periodic import PeriodicModel
-from .output_error import SectionRegression
-from .records import PreparedRecords
+from .linearization import sum_up
+from .output_error import OutputErrorProblem, SectionRegression
+from .records import CycleGrid, PreparedRecords, delay_cycles, lagged_inputs
 from .residuals import ANSWER
 
 
@@ -186,3 +189,57 @@ def _from_states(
 def _slowest_error(model: PeriodicModel) -> float:
     """Return the largest modulus of a multiplier of A - K C, for errors of predictions."""
     return float(np.abs(np.linalg.eigvals(model._replace(A=model.F).monodromy())).max())
+
+
+class DelayedOutputs(NamedTuple):
+    """The outputs 0, 1, ..., d cycles earlier, without the part that inputs explain."""
+
+    gram: Float[np.ndarray, "ny d1 d1"]
+    """Their Gram matrix, for each output."""
+    freedom: int
+    """The number of independent rows of all outputs: noise of variance 1 makes the sum of the Gram
+    matrices that large."""
+
+
+def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
+    """Return the Gram matrix from the rows whose lagged inputs and outputs are all measured."""
+    N, _, ny = problem.shape
+    delays = range(order + 1)
+
+    def past(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny d1"]:
+        return np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=3)
+
+    def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
+        inputs = lagged_inputs(part.u, n, problem.lags, problem.records.lead) @ problem.to_lags[n]
+        later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
+        sampled = part.sampled[:, :, n]
+        before = np.all([delay_cycles(sampled, j, not problem.free) for j in delays], axis=0)
+        starts = part.drift[:, :, :0]
+        return [
+            SectionRegression.make(inputs, starts, part.drift, later & before[..., alike[0]])
+            for alike in problem.alike[n]
+        ]
+
+    gram, freedom = np.zeros((ny, order + 1, order + 1)), 0
+    for section in sum_up(problem, np.zeros(0), past, regress):
+        for each in section:
+            gram[each.outputs] += each.products
+            freedom += max(round(each.freedom) - each.root.shape[1], 0) * len(each.outputs)
+    return DelayedOutputs(gram, freedom)
+
+
+def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
+    """Return c without bias by white noise in the outputs."""
+    order = delayed.gram.shape[1] - 1
+    null = np.linalg.eigh(delayed.gram.sum(axis=0))[1][:, 0]
+    if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
+        return np.zeros(order)
+    roots = np.roots(null / null[0])
+    size = np.maximum(np.abs(roots) / SLOWEST, 1.0)
+    return np.pad(np.poly(roots / size).real[1:], (0, order - len(roots)))
+
+
+def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]:
+    """Return the multipliers by plain regression, which noise in the outputs biases to zero."""
+    gram = delayed.gram.sum(axis=0)
+    return multipliers_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
