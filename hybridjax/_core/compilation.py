@@ -47,9 +47,6 @@ _WORTH_OPTIMIZING = 8.0
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
 # is 1024.
 _LOOP_KERNELS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
-# Lanes of programs that are called for many points at once. Higher: single points wait for lanes
-# that nobody needs. Lower: many points take more calls.
-POINTS = 16
 # Programs of either kind that are kept. Fewer: taking turns with many systems compiles again.
 _KEPT = 1024
 
@@ -361,14 +358,10 @@ def kernel(
     and shapes and types of arrays. The arrays themselves are arguments.
 
     The program is for this number of `lanes`: more are done in several calls, fewer are filled up.
-    With 0 `lanes` it is for single ones, and once there were many of these for `POINTS`.
     (XLA runs the smallest programs, of a thousand operations, in the thread that calls them, and
     hands larger ones to another thread, which takes longer than they do.)
     """
     return ft.partial(_run_lanes, *_bound(function, form, static, trees, lanes), lanes)
-
-
-_singles: collections.Counter = collections.Counter()
 
 
 def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=None) -> np.ndarray:
@@ -377,9 +370,6 @@ def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=Non
         values = _run_lanes(program, arrays, lanes, *arguments)
         return values[..., np.maximum(np.cumsum(some) - 1, 0)]
     L = max(x.shape[-1] for x in arguments)
-    if not lanes:  # (After fewer single ones, another program would not pay in most processes.)
-        _singles[program] += L
-        lanes = POINTS if L > 1 and _singles[program] > 64 * POINTS else 1
     if L == lanes == 1:
         return np.asarray(program(arrays, *arguments))
     filled = -(-L // lanes) * lanes

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.compilation import POINTS, kernel
+from .._core.compilation import kernel
 from .._core.executor import from_host, on_host
 from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method
@@ -33,6 +33,9 @@ Expanded = Float[Array, "rows columns L"]
 Some = Bool[Array, " L"] | None
 Items = tuple[str | Output, ...]
 
+# Lanes of programs that are called for many points at once. Higher: single points wait for lanes
+# that nobody needs. Lower: many points take more calls.
+POINTS = 16
 # Lanes of programs for systems or directions side by side. More: the last call has more empty
 # lanes. Fewer: calls cost more than they compute.
 WIDE = 256
@@ -73,12 +76,14 @@ def watched(
     u: Inputs,
     index: Int[Array, " #L"],
     some: Some = None,
-    lanes: int = 0,
+    lanes: int | None = None,
 ) -> Expanded:
     """The guards of chart a, and the level if it has one, with their derivatives."""
     static = a, s.guard_kinds(a)
     if not on_host(q):
         return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(t, q, u, index)
+    # (A program for many points is worth its compilation from so many calls on.)
+    lanes = lanes or (1 if q.shape[-1] < 4 * POINTS else POINTS)
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 

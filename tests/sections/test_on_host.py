@@ -1,5 +1,7 @@
 """Derivatives outside of programs come from the host: against finite differences."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -9,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 import hybridjax as hj
 from hybridjax._core.host_derivatives import only_on_host
 
-from ..conftest import APEX
+from ..conftest import APEX, KINEMATIC
 
 
 @pytest.fixture
@@ -98,3 +100,15 @@ def test_a_converter():
     """Events that are scheduled by a parameter."""
     cycle = hj.find_limit_cycle(hj.models.BuckConverter())
     agrees(cycle.system, measured(cycle, hj.ClockPhase(2)), 1e-8)
+
+
+def test_later_calls_repeat_the_first_to_the_last_bit():
+    """Programs are chosen by what a call is given, not by the calls before."""
+
+    class Hopper(hj.models.VerticalHopper):
+        """Its programs are its own."""
+
+    cycle, matrices = hj.find_limit_cycle(Hopper()), []
+    for _ in range(10):
+        matrices.append(hj.linearize(dataclasses.replace(cycle), KINEMATIC, "yM").matrices)
+    np.testing.assert_array_equal(ravel_pytree(matrices[-1])[0], ravel_pytree(matrices[0])[0])
