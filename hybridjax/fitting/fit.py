@@ -91,7 +91,9 @@ def fit_model(
     around = _SPREAD * np.random.default_rng(seed).uniform(-1, 1, (guesses - 1, len(x0)))
     ends: list[End] = []
     for start in counted(np.stack([x0, *(x0 + around)]), "guesses", guesses):
-        ends.append(_descend(problem, system, start, near))
+        at_guess = not ends and near.system is system
+        cycle = near if at_guess else _cycle_at(problem, system, start, near)
+        ends.append(_descend(problem, start, cycle))
         if ends[-1].explains(problem.weighted):
             break
     best = min(ends, key=lambda end: (end.cost, -len(end.residuals)))
@@ -192,10 +194,7 @@ def _cycle_at(
     return find_limit_cycle(p.insert(system, p.decode(jnp.asarray(x))), near, throw=False)
 
 
-def _descend(
-    problem: FitProblem, system: HybridSystem, start: Float[np.ndarray, " p"], near: LimitCycle
-) -> End:
-    cycle = _cycle_at(problem, system, start, near)
+def _descend(problem: FitProblem, start: Float[np.ndarray, " p"], cycle: LimitCycle) -> End:
     if cycle.result != Result.OK:
         none = np.zeros(0), np.zeros((0, len(start)))
         return End(start, start, np.inf, *none, cycle, 0, int(cycle.result))

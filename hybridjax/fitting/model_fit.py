@@ -222,18 +222,12 @@ class ModelFit(eqx.Module):
         return "\n".join(lines)
 
     def _cost(self) -> str:
-        misfit = 100 * np.sqrt(np.mean(self.residuals**2))
-        expected = (
-            f", expected {self.freedom}"
-            if self.weighted
-            else f", residuals {misfit:.2g} % of the data"
-        )
+        misfit = f"residuals {100 * np.sqrt(np.mean(self.residuals**2)):.2g} % of the data"
+        expected = f"expected {self.freedom}" if self.weighted else misfit
         good = sum(guess.result == Result.OK for guess in self.guesses)
         steps = sum(guess.steps for guess in self.guesses)
-        return (
-            f"cost {self.cost:.6g}{expected}; {good} of {len(self.guesses)} guesses converged, "
-            f"{steps} evaluations"
-        )
+        head = f"cost {self.cost:.6g}, {expected}; {good} of {len(self.guesses)} guesses converged"
+        return f"{head}, {steps} evaluations"
 
     def _repr_html_(self) -> str:
         rows = []

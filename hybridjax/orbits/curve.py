@@ -17,6 +17,7 @@ from ..systems.system import HybridSystem
 from ..systems.varied import Varied, parameter_of, with_parameters
 from .coincidence import SAME
 from .cycle import LimitCycle, as_found, what_changed
+from .linear_flow import begin_later, last_turn
 from .newton import FEW_STEPS
 from .return_map import ReturnMap, Turn, turn_product
 from .shooting import newton_steps
@@ -244,14 +245,11 @@ def away_from_events(cycle: LimitCycle) -> LimitCycle:
     cycle = as_found(cycle) if what_changed(cycle.system, cycle.numbers) else cycle
     if not cycle.clocked or what_changed(cycle.system, cycle.numbers):
         return cycle
-    path, legs, anchor = cycle.trajectory(), to_host(cycle.legs), cycle.anchor
+    path = cycle.trajectory()
     if not len(events := path.t[path.event >= 0]):
         return cycle
-    k = far_from_events(legs.t, events, float(cycle.period))
-    if k == 0:
-        return cycle
-    at = anchor._replace(t=legs.t[[k]], chart=legs.chart[[k]], q=legs.q[:, [k]])
-    return dataclasses.replace(cycle, anchor=at)
+    k = far_from_events(last_turn(cycle)[0].t, events, float(cycle.period))
+    return begin_later(cycle, k) if k else cycle
 
 
 def _rotated(sequence: Iterable[int]) -> tuple[int, ...]:

@@ -254,6 +254,17 @@ def last_turn(cycle: Any) -> Any:
     return _turns.get(cycle, None) if is_hidden(cycle) else _turns.recall(cycle, None, make)
 
 
+def begin_later(cycle: Any, k: int) -> Any:
+    """A guess for neighbors of a clocked cycle that begins with its piece k, with its last turn."""
+    lanes, tape = jax.tree_util.tree_map(lambda x: np.roll(x, -k, axis=-1), last_turn(cycle))
+    later = float(cycle.period) * (np.arange(len(lanes.t)) >= len(lanes.t) - k)
+    anchor = cycle.anchor._replace(t=lanes.t[:1], chart=lanes.chart[:1], q=lanes.q[:, :1])
+    guess = dataclasses.replace(cycle, anchor=anchor)
+    turn = lanes._replace(t=lanes.t + later), tape._replace(t=tape.t + later)
+    _turns.recall(hosted(guess), None, lambda: turn)
+    return guess
+
+
 def recorded_ends(map: ReturnMap, lanes: Lanes) -> Target:
     """The ends of pieces that begin as recorded. (The search may have expected another period.)"""
     ends = map.ends()
