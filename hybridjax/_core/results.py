@@ -32,26 +32,10 @@ class Result(enum.IntEnum):
     EQUILIBRIUM = 11, "the iteration ended in an equilibrium instead of a cycle"
     EXTRA_TURNS = 12, "the cycle closes sooner, or meets its section more often, than asked"
     COINCIDENCE = 13, "two events coincide on the cycle: their order is not fixed beside it"
-    STEP_COLLAPSE = (
-        14,
-        "steps shrank to nothing although the state hardly moves: a field that jumps must do so at "
-        "the guard of a transition",
-    )
-    FIELD_NOT_FINITE = (
-        15,
-        "the field, a guard, its derivative or a reset is NaN or infinite: a division by zero, or "
-        "a mass matrix that is singular there",
-    )
-    GUARD_PASSED = (
-        16,
-        "a reset put the state on a guard, through which it then went without an event: what comes "
-        "to rest there needs a chart of its own",
-    )
-    PULSE_PASSED = (
-        17,
-        "the field or a guard has a pulse, or another sudden change, over which steps pass: begin "
-        "and end it by transitions (`hj.Scheduled` at known times)",
-    )
+    STEP_COLLAPSE = 14, "steps shrank to nothing: a field may jump only where a transition does"
+    FIELD_NOT_FINITE = 15, "the field, a guard or a reset is NaN or infinite (a division by zero?)"
+    GUARD_PASSED = 16, "a reset put the state on a guard: what comes to rest there needs a chart"
+    PULSE_PASSED = 17, "steps pass over a pulse: begin and end it by transitions (`hj.Scheduled`)"
     PLANT_STOPPED = 18, "the plant ended the experiment: see `data.simulated.causes`"
 
 

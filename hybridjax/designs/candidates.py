@@ -148,11 +148,9 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
         levels = np.empty((*folded.shape, len(measured)))
         for k, (name, level) in enumerate(measured.items()):
             value = np.asarray(level(folded) if callable(level) else level)
-            if value.dtype.kind not in "fiu" or value.shape not in ((), folded.shape):
-                text = f"`noise` of {name} must return a real number for each frequency."
-                raise DefinitionError(text)
-            if not ((value > 0) & np.isfinite(value)).all():
-                raise DefinitionError(f"`noise` of {name} must be positive at all frequencies.")
+            fits = value.dtype.kind in "fiu" and value.shape in ((), folded.shape)
+            if not fits or not ((value > 0) & np.isfinite(value)).all():
+                raise DefinitionError(f"`noise` of {name} must be positive at each frequency.")
             levels[..., k] = value
         return levels**2
 

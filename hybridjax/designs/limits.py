@@ -260,8 +260,9 @@ class Products(NamedTuple):
             expected = H_model[:, model.outputs.index(name)]
             difference, size = np.linalg.norm(H - expected), np.linalg.norm(expected)
             if difference > _DIFFERENT * size:
-                text = f"H_0 (to {name}, by {difference / max(size, np.finfo(float).tiny):.0%})"
-                raise DefinitionError(f"the model and the distortion of `limit` differ in {text}.")
+                share = difference / max(size, np.finfo(float).tiny)
+                text = f"differ in H_0 (to {name}, by {share:.0%}): use the same sections"
+                raise DefinitionError(f"the model and the distortion of `limit` {text}.")
 
     def rms(self, design: Design, phases: bool = False) -> Float[np.ndarray, " O"]:
         """Return the distortion in a design: expected with random phases, or with its `phases`."""

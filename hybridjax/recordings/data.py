@@ -83,16 +83,10 @@ class SectionData(eqx.Module):
     def of_inputs(self, names: Sequence[str]) -> "SectionData":
         """Return the data with some of the inputs only."""
         columns = [self.inputs.index(name) for name in names]
-        kept = [*columns, *range(len(self.inputs), len(self.signals))]
-        return replace(
-            self,
-            records=tuple(
-                replace(r, u=r.u[:, columns], inputs=tuple(self.inputs[k] for k in columns))
-                for r in self.records
-            ),
-            cycle_inputs=self.cycle_inputs[:, columns],
-            spikes=tuple(self.spikes[k] for k in kept),
-        )
+        inputs, cycle = tuple(self.inputs[k] for k in columns), self.cycle_inputs[:, columns]
+        records = tuple(replace(r, u=r.u[:, columns], inputs=inputs) for r in self.records)
+        spikes = (*(self.spikes[k] for k in columns), *self.spikes[len(self.inputs) :])
+        return replace(self, records=records, cycle_inputs=cycle, spikes=spikes)
 
     def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""

@@ -112,20 +112,21 @@ def impulse_responses(
     recursion[::N] = [1.0, *fit.coefficients]
     longest = max(fit.lead + lags + reach, R)
 
+    def whole(x: Float[np.ndarray, "r ..."]) -> Float[np.ndarray, "longest ..."]:
+        x = np.pad(x, [(0, longest - len(x))] + [(0, 0)] * (x.ndim - 1))
+        return np.asarray(signal.lfilter([1.0], recursion, x, axis=0))
+
     def pushed(x: Float[np.ndarray, "r ..."]) -> Float[np.ndarray, "lags ..."]:
         """Return responses to a push, which begins some sections before its middle."""
-        x = np.pad(x, [(0, longest - len(x))] + [(0, 0)] * (x.ndim - 1))
-        x = np.asarray(signal.lfilter([1.0], recursion, x, axis=0))
-        x = ndimage.correlate1d(x, weights, axis=0, mode="constant")
+        x = ndimage.correlate1d(whole(x), weights, axis=0, mode="constant")
         return x[fit.lead : fit.lead + lags]
 
     h = fit.numerators.swapaxes(0, 1)
-    whole = np.pad(h, [(0, longest - R), (0, 0), (0, 0), (0, 0)])
-    whole = np.asarray(signal.lfilter([1.0], recursion, whole, axis=0))
+    response = whole(h)
     slope = np.zeros((longest, len(fit.coefficients), *h.shape[1:]))
     slope[:R] = fit.slopes.transpose(2, 0, 1, 3, 4)
     for j in range(slope.shape[1]):
-        slope[(j + 1) * N :, j] -= whole[: max(longest - (j + 1) * N, 0)]
+        slope[(j + 1) * N :, j] -= response[: max(longest - (j + 1) * N, 0)]
     slope, root = pushed(slope), pushed(fit.roots.transpose(2, 0, 1, 3, 4))
     by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
     std = np.sqrt((root**2).sum(axis=4) * fit.noise[:, None] ** 2 + by_coefficients)

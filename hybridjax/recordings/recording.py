@@ -285,6 +285,6 @@ def check_events(
     at, margin = at[np.isfinite(at)], float(np.median(np.diff(time)))
     within = (at >= time[0] - margin) & (at <= time[-1] + margin)
     if len(at) and not within.any():
-        text = f"are outside of the recording ({time[0]:.6g} to {time[-1]:.6g} s): convert them"
+        text = f"are outside of the recording ({time[0]:.6g} to {time[-1]:.6g} s): check their unit"
         raise DefinitionError(f"{where}: all events '{name}' ({at[0]:.6g} s, ...) {text}.")
     return at[within]

@@ -58,8 +58,7 @@ class Points:
 
         for name, (low, high) in ranges.items():
             if not low < high:
-                message = f"the range of `{name}` must go up, not from {low} to {high}."
-                raise DefinitionError(message)
+                raise DefinitionError(f"the range of `{name}` must go up: {low} to {high}.")
         if not ranges:
             raise DefinitionError("`ranges` must name at least one parameter.")
         sequence = qmc.Sobol(len(ranges), rng=np.random.default_rng(seed))

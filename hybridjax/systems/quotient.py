@@ -109,7 +109,7 @@ class Quotient(Derived):
         for kept, image in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[image].states):
-                text = f"{sorted(mirrored)}, those of '{image}' {sorted(charts[image].states)}"
+                text = f"{sorted(mirrored)}, but '{image}' {sorted(charts[image].states)}"
                 raise DefinitionError(f"Quotient: '{kept}' mirrored has {text}: use `relabel`.")
         if self.half_period:
             self._check_half_period()

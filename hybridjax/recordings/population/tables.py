@@ -70,7 +70,7 @@ def require(subjects: Mapping[str, Iterable[str]], needed: int) -> None:
     """**Raises:** `DefinitionError` if a group or condition has fewer subjects."""
     for cell, names in subjects.items():
         if (count := len(set(names))) < needed:
-            raise DefinitionError(f"'{cell}' has too few subjects: {count} of {needed}.")
+            raise DefinitionError(f"'{cell}' has too few subjects: {count} of {needed} needed.")
 
 
 def signed(text: str) -> str:
