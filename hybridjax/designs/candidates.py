@@ -150,7 +150,8 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
             value = np.asarray(level(folded) if callable(level) else level)
             fits = value.dtype.kind in "fiu" and value.shape in ((), folded.shape)
             if not fits or not ((value > 0) & np.isfinite(value)).all():
-                raise DefinitionError(f"`noise` of {name} must be positive at each frequency.")
+                text = f"`noise` of {name} must be positive: one real number, or one per frequency."
+                raise DefinitionError(text)
             levels[..., k] = value
         return levels**2
 
