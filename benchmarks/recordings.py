@@ -43,7 +43,7 @@ PHASES = ("apex", "angle")
 RATE, BANDWIDTH, RMS = 500, 8.0, 0.0205  # Hz, Hz, N: outputs deviate by 9.7e-4 m (rms)
 NOISES = (1e-4, 1e-3)
 # Causes of warnings that clean recordings have too.
-HINTS = {"noise", "band", "outputs", "left over"}
+HINTS = {"band", "outputs", "left over"}
 
 
 def hopper(strides, seeds):

@@ -147,7 +147,7 @@ def _add_identify(commands) -> None:
     add("--input", required=True, type=_names, metavar="NAMES", help="measured perturbations")
     add("--reference", type=_names, default=(), metavar="NAMES", help="signals that act from "
         "outside on a loop, if a controller makes the inputs")  # fmt: skip
-    add("--outputs", required=True, type=_names, metavar="NAMES", help="measured outputs")
+    add("--outputs", default=(), type=_names, metavar="NAMES", help="measured outputs, if any")
     phase = identify.add_mutually_exclusive_group(required=True)
     phase.add_argument("--phase", type=_two_names, metavar="X,V",
         help="two signals whose angle about the center is the phase")  # fmt: skip

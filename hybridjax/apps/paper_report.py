@@ -110,8 +110,8 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
         note(
             f"{name}: |H_m| is negligible for |m| >= 2",
             np.all(second < 0.1),
-            f"max|H_+-2| / max|H_0|: {_pairs(second)}; share of the energy "
-            f"in |m| <= 1: {_pairs(within[0])}, in |m| <= 2: {_pairs(within[1])}",
+            f"max|H_+-2| / max|H_0|: {_pairs(second)}; part of the sum of "
+            f"|H_m|^2 with |m| <= 1: {_pairs(within[0])}, with |m| <= 2: {_pairs(within[1])}",
         )
         close = [family.rational.compare(family.ldtp.multipliers, k).max_error for k in OUTPUTS]
         note(

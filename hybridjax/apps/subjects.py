@@ -54,9 +54,16 @@ class Study:
     results: Any
     folder: Path
 
+    @property
+    def remarks(self) -> list[str]:
+        """Failures, and the fits to doubt, in sentences."""
+        fits = zip(self.population.table["report"], self.fits, strict=True)
+        doubts = [f"{name} is doubtful: {fit.doubt}." for name, fit in fits if fit.doubt]
+        return [f"{name} failed: {text}" for name, text in self.failures.items()] + doubts
+
     def __repr__(self) -> str:
         lines = [f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"]
-        lines += [f"  {name} failed: {text}" for name, text in self.failures.items()]
+        lines += [f"  {text}" for text in self.remarks]
         if len(self.results):
             lines.append(self.results.T.to_string(header=False, float_format="{:.4g}".format))
         return "\n".join(lines)
@@ -206,7 +213,7 @@ def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) ->
     links = (f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>' for n in population.table["report"])
     errors = {f"{name}_error": error for name, error in population.errors.items()}
     parts = [
-        *(f'<p class="warn">{escape(f"{n} failed: {x}")}</p>' for n, x in study.failures.items()),
+        *(f'<p class="warn">{escape(x)}</p>' for x in study.remarks),
         f"<ul>{''.join(links)}</ul>",
         results.T.to_html(header=False, float_format="{:.4g}".format, na_rep=""),
         *(f"<p>{escape(x)}</p>" for x in methods),

@@ -125,12 +125,10 @@ class OptimalDesign(eqx.Module):
         special = [n for n in self.limited if n.startswith(prefixes)]
         rms = " and ".join(n for n in self.limited if n not in special)
         limits = " and ".join([f"rms of {rms}"] * bool(rms) + special)
-        verdict = "" if self.saved > _WORTH_IT else ", which are nearly optimal"
         saved = float(f"{self.saved:.2g}")  # (a third digit differs between machines)
-        return (
-            f"With the {limits} limited, one stride of this design replaces {saved:g} "
-            f"with {self.usual_name}{verdict}."
-        )
+        text = f"one stride of this design replaces {saved:g} with {self.usual_name}."
+        text = text if self.saved > _WORTH_IT else f"{self.usual_name} are nearly optimal."
+        return f"With the {limits} limited, {text}"
 
     def __repr__(self) -> str:
         rows = [("", self.usual_name, "optimal")]
@@ -142,7 +140,7 @@ class OptimalDesign(eqx.Module):
         bounded = any(n.startswith("distortion of ") for n in self.rms)
         certificate = (
             f"certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
-            f"{'(the convex bound of distortions) ' * bounded}"
+            f"{'(of distortion: an upper bound) ' * bounded}"
             f"needs less than {1 / self.certificate:.1%} of these strides"
         )
         below = "\n".join(["", self.advice, certificate, repr(self.design)]).replace("\n", "\n  ")

@@ -2,7 +2,7 @@
 
 import itertools
 import operator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -214,10 +214,9 @@ class ModelFit(eqx.Module):
     def __repr__(self) -> str:
         width = max(map(len, self.names))
         lines = [f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"]
-        lines.append(f"  {self._cost()}; values ± standard errors of noise, without distortion:")
-        for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            shown = f"± {error:.2g}" if np.isfinite(error) else "not seen by itself"
-            lines.append(f"  {name:{width}}  {value:<14.9g} {shown}")
+        lines.append(f"  {self._cost()}; standard errors are those by noise; distortion adds more:")
+        for name, value, error, unit in self._rows():
+            lines.append(f"  {name:{width}}  {value:<14} {error} {unit}".rstrip())
         lines += [f"  not seen: {text}" for text in self.identifiability.descriptions()]
         return "\n".join(lines)
 
@@ -229,14 +228,16 @@ class ModelFit(eqx.Module):
         head = f"cost {self.cost:.6g}, {expected}; {good} of {len(self.guesses)} guesses converged"
         return f"{head}, {steps} evaluations"
 
-    def _repr_html_(self) -> str:
-        rows = []
+    def _rows(self) -> Iterator[tuple[str, str, str, str]]:
+        """Yield each name with its value, standard error and unit."""
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            shown = f"{error:.2g}" if np.isfinite(error) else "not seen by itself"
+            shown = f"± {error:.2g}" if np.isfinite(error) else "not seen by itself"
             system = self.system
             unit = system.time_unit if name in DELAYS else unit_of_parameter(system, name)
-            rows.append((name, f"{value:.9g}", shown, unit))
-        parameters = table(("parameter", "value", "± standard error", "unit"), rows)
+            yield name, f"{value:.9g}", shown, unit
+
+    def _repr_html_(self) -> str:
+        parameters = table(("parameter", "value", "standard error", "unit"), self._rows())
         unseen = [f"not seen: {x}" for x in self.identifiability.descriptions()]
         of = f"of {type(self.system).__name__}: {Result(self.result).message}"
         return card("ModelFit", of, parameters, text("\n".join([self._cost(), *unseen])))

@@ -11,7 +11,7 @@ from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..linear.htf import HTF
-from .instrument import Roles, Sums, solve, spectral_products
+from .instrument import Roles, Sums, require_loop, solve, spectral_products
 
 
 class Loop(eqx.Module):
@@ -63,7 +63,7 @@ def loop(
     - `repeats`: as for `estimate_htf`. Default: 1.
 
     **Raises:** `DefinitionError` without a reference, for references that are not among the inputs,
-    too few of them, or those that excite too little.
+    too few of them, equal to an input, or those that excite too little.
     """
     require_x64()
     r, d = at_input or (), at_output or ()
@@ -73,6 +73,7 @@ def loop(
             "(`at_input`), at its output (`at_output`), or both."
         )
     roles = Roles.of(data.inputs, (*r, *d), fewest=0)
+    require_loop(roles, [data.u], data.inputs)
     u, y = [data.inputs[i] for i in roles.inputs], data.outputs
     for what, given, needed in (("at_input", r, u), ("at_output", d, y)):
         if given and len(given) < len(needed):

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
-from .._core.arguments import channel_index, require_index
+from .._core.arguments import channel_index, require_equal, require_index
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
 from .._core.results import Result
@@ -143,8 +143,12 @@ def phase_response(
 
     **Arguments:** `model`: the curve of a model (`Responses.curve`), drawn over that of a
     recording, in its unit of time. Phase 0 of both must be the same event.
+
+    **Raises:** `DefinitionError` for inputs in different units.
     """
     curves = [found] if model is None else [found, model]
+    if all(units := [unit_of(x.input) for x in curves]):
+        require_equal("the inputs of both curves", "units", units[0], units[-1])
     with panels(ax, height=2.8) as axes:
         panel = axes[0, 0]
         for curve, color in zip(curves, CYCLE, strict=False):
@@ -236,7 +240,8 @@ def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | Non
                 _stems(cross, lags, values, CYCLE[(1 + j) % len(CYCLE)], 0.2 * j, limit)
             cross.set_title(f"with the input\n{p_value(found.independence[i])}", loc="right")
         if ax is None:
-            legend(axes[0, 0], "upper left", ncols=2)
+            axes[0, 0].fill_between([], [], color="0.9", label="99 % band without correlation")
+            legend(axes[0, 0], "upper left", ncols=3)
         axes[-1, 0].set_xlabel("time (cycles)")
         for lags in axes[-1, 1:]:
             lags.set_xlabel("lag (sections)")

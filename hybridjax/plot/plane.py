@@ -153,18 +153,19 @@ def _borders(estimates: Mapping[str, Any]) -> dict[str, list[np.ndarray]]:
 
 def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders) -> Axes | None:
     """An inset around the leading true multiplier, at a place that is free of markers; none where
-    it would enlarge less than twice."""
+    it would enlarge less than twice or no place is free."""
     leading = complex(true[np.lexsort((-np.imag(true), -np.abs(true)))[0]])
     nearest = [z[np.argmin(np.abs(z - leading))] for z in series.values()]
     # Of the region next to the leading multiplier, all of it.
     regions = [min(np.abs(x - leading).max() for x in region) for region in borders.values()]
     reach = 1.35 * max([1e-12, *(np.abs(z - leading) for z in nearest), *regions])
     side, far = 0.36, ax.get_xlim()[1]
-    if 2 * reach > side * far:
-        return None
     points = (np.concatenate([true, *series.values()]) / far + 1 + 1j) / 2
-    places = [0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j]
-    place = max(places, key=lambda c: np.abs(points - c).min())
+    places = np.array([0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j])
+    room = np.abs((points - places[:, None])[..., None].view(float)).max(axis=2).min(axis=1)
+    place = places[int(room.argmax())]
+    if 2 * reach > side * far or room.max() < side / 2:
+        return None
     inset = ax.inset_axes(
         (place.real - side / 2, place.imag - side / 2, side, side),
         xlim=leading.real + np.array([-reach, reach]),

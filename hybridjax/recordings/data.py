@@ -106,14 +106,9 @@ class SectionData(eqx.Module):
         N = self.n_sections
         parts = [r.part(-r.first_section % N, len(r.u)) for r in self.records]
         n = min(len(r.u) for r in parts) // N * N
-        return ExperimentData(
-            np.stack([r.u[:n] for r in parts]),
-            np.stack([r.y[:n] for r in parts]),
-            n_sections=N,
-            periods=periods,
-            inputs=self.inputs,
-            outputs=self.outputs,
-        )
+        u, y = np.stack([r.u[:n] for r in parts]), np.stack([r.y[:n] for r in parts])
+        names = {"inputs": self.inputs, "outputs": self.outputs}
+        return ExperimentData(u, y, n_sections=N, periods=periods, **names)
 
     def _repr_html_(self) -> str:
         phase = np.arange(self.n_sections) / self.n_sections

@@ -52,7 +52,7 @@ def write_design(
         place = np.stack([k // N, k % N, (k % N) / N], axis=1)
     else:
         header = ("experiment", "time")
-        time = np.arange(int(n / N * period * rate + 1e-6)) / rate
+        time = np.arange(np.ceil(n / N * period * rate - 1e-6)) / rate
         u = u[:, np.minimum((time * N / period + 1e-9).astype(int), n - 1)]  # (rounding)
         place = time[:, None]
     with replacing(Path(path)) as new, open(new, "w", newline="", encoding="utf-8") as file:

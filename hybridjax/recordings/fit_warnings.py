@@ -15,7 +15,6 @@ from .._core.boundary.checked import checked
 from .._core.results import Result
 from .._core.text import p_value
 from ..errors import DefinitionError
-from ..identify.multiplier_estimate import compare_multipliers
 from ..identify.series.fit import SeriesFit, refuse_order
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import MAY_DRIFT, CycleGrid, PreparedRecords
@@ -76,9 +75,9 @@ def advise(
     """List the reasons to doubt a fit to recorded data.
 
     They are: too few strides for the unknowns, more multipliers than the data support, inputs
-    without power at the frequencies of the multipliers, redundant outputs, noise that would bias
-    plain regression, inputs that answer the outputs, confidence intervals that reach the unit
-    circle, an iteration that did not converge, gaps and spikes.
+    without power at the frequencies of the multipliers, redundant outputs, inputs that answer the
+    outputs, confidence intervals that reach the unit circle, an iteration that did not converge,
+    gaps and spikes.
 
     **Arguments:** `data`: the data at the sections. `fit`: the result of `fit_series`.
     `validation`: a validation on held-out strides, whose tests are reported. `findings`: findings
@@ -90,7 +89,6 @@ def advise(
     delayed, grid = late_outputs(problem, d), records.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())
     unknowns, plain = R * nu + len(grid.y) * (d + 1), ordinary_least_squares(delayed)
-    bias = float(compare_multipliers(plain, fit.multipliers).max_error)
     warnings = list(findings)
     if sampled - unknowns < _FEW * sampled:
         text = f"a section was sampled {sampled} times for {unknowns} unknowns; record more, take "
@@ -107,10 +105,6 @@ def advise(
         text = f"{name} answers earlier residuals of the outputs: fits are biased. {NAME_REFERENCE}"
         warnings.append(Finding("feedback", text))
     warnings += [*_about_excitation(data, fit, band), *_about_outputs(grid, fit)]
-    if bias > 2 * fit.standard_errors.max():
-        values = ", ".join(f"{z:.4f}" for z in plain)
-        text = f"plain regression (ARX) would give {values}, off by {bias:.2g}; do not use it here."
-        warnings.append(Finding("noise", text))
     for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
         if z.imag >= 0 and abs(z) + 2 * error > 1:
             text = f"the interval of the multiplier {z:.3g} reaches the unit circle."
@@ -129,7 +123,7 @@ def advise(
         warnings.append(Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing."))
     for name, count in zip(data.signals, data.spikes, strict=True):
         if count:
-            text = f"{count} samples of {name} stuck out of all around them, and were left out."
+            text = f"isolated outliers of {name} that were left out: {count}."
             warnings.append(Finding("spikes", text))
     # Variances decrease with the number of strides beyond that of the unknowns.
     strides = (100, 300, 1000, 3000)
@@ -183,13 +177,10 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
 
 def about_natural_multipliers(result: Any) -> Iterator[Finding]:
     """Limits of a result of `natural_multipliers`."""
-    low, high = result.interval()[0]
-    modulus, plain = abs(result.multipliers[0]), abs(result.plain[0])
-    text = f"the largest modulus lies between {low:.2f} and {high:.2f} (95 %), from {result.cycles}"
-    yield Finding("width", f"{text} cycles; four times as many would halve that.")
-    each = result.cycles / result.records
+    each, high = result.cycles / result.records, result.interval()[0, 1]
     if each < _FEW_CYCLES:
-        bias = f"a bias of about {(1 + 3 * modulus) / each:.2f} was corrected to first order only."
+        size = (1 + 3 * abs(result.multipliers[0])) / each
+        bias = f"a bias of about {size:.2f} was corrected to first order only."
         yield Finding("few cycles", f"{each:.3g} in each of {result.records} records; {bias}")
     if result.strength < 0.5:
         text = f"earlier sections explain {100 * result.strength:.0f} % of the states' variance."
@@ -197,22 +188,17 @@ def about_natural_multipliers(result: Any) -> Iterator[Finding]:
     if high >= 1:
         text = f"the interval of the largest modulus reaches {high:.2f}, beyond 1."
         yield Finding("stability", text)
-    more = "less" if modulus > plain else "more"
-    text = f"least squares gives {plain:.3f} for the largest modulus, {abs(modulus - plain):.3f}"
-    yield Finding("noise", f"{text} {more}.")
+    if result.doubt:
+        yield Finding("order", result.doubt)
 
 
 def about_phase_response(r: Any) -> Iterator[Finding]:
     """Limits of a result of `phase_response`."""
-    mean, flat = abs(r.coefficients[0]), r.left_out_flat
-    text = f"it adds {r.left_out - flat:.3f} to the R2 of intervals left out; a flat curve has "
-    text += f"{flat:.3f} of {r.left_out:.3f}."
     if r.p_flat > _LEVEL:
-        text = f"nothing is seen of it ({p_value(r.p_flat)} for a flat one, with R2 {flat:.3f})."
-    yield Finding("shape", text)
+        yield Finding("shape", f"a flat curve explains the data as well ({p_value(r.p_flat)}).")
     low, high = r.interval(r.phase)
     half = (high - low) / 2
-    if half.max() > mean / 2:
+    if half.max() > abs(r.coefficients[0]) / 2:
         worst = int(np.argmax(half))
         text = f"at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
         yield Finding("wide", f"{text}either side, more than half of the mean.")
@@ -224,7 +210,10 @@ def about_phase_response(r: Any) -> Iterator[Finding]:
         yield Finding("misfit", f"{text}independent errors: the phase model lacks something.")
     if abs(r.memory) > _MEMORY:
         text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the phase"
-        yield Finding("memory", f"{text} is not all of the state. Standard errors allow for it.")
+        text += (
+            " is not all of the state. The curve shows the effect of a push on its own interval,"
+        )
+        yield Finding("memory", f"{text} which is not its lasting effect on the phase.")
     if r.miscounted:
         text = f"{r.miscounted} of {r.intervals} intervals miss the model by half a cycle or more"
         yield Finding("miscounted", f"{text}, as if an event had been missed; they are not used.")

@@ -10,6 +10,7 @@ $$J = E[z_{k+1} q_k^T] \, E[z_k q_k^T]^{+}$$
 has no such bias (instrumental variables, two-stage least squares: Söderström and Stoica 1983).
 """
 
+import dataclasses
 from typing import Annotated, NamedTuple
 
 import equinox as eqx
@@ -54,6 +55,7 @@ class NaturalMultipliers(eqx.Module):
     - `strength`: fraction of the states' variance that the instruments explain.
     - `cycles`: number of used cycles, which are followed by another one, in so many `records`.
       `block`: cycles of a block; those of a record, where whole records are drawn.
+    - `doubt`: a sentence if one multiplier more changes the largest modulus, else "".
     """
 
     multipliers: Complex[np.ndarray, " d"]
@@ -64,6 +66,7 @@ class NaturalMultipliers(eqx.Module):
     cycles: int = eqx.field(static=True)
     records: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
+    doubt: str = eqx.field(static=True, default="")
 
     def interval(
         self, level: Probability = 0.95, *, plain: bool = False
@@ -95,7 +98,7 @@ class NaturalMultipliers(eqx.Module):
                 value = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
                 bounds = f"modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
                 lines.append(f"  {name:15s} {value:>15s}   {bounds}")
-        return "\n".join([*lines, print_findings(self.warnings, "  ")])
+        return "\n".join([*lines, print_findings(self.warnings, "  ")]).rstrip()
 
 
 @checked
@@ -121,13 +124,27 @@ def natural_multipliers(
 
     - `data`: result of `section_data(..., inputs=())`; the average cycle of each trial is
       subtracted.
-    - `order`: the number of multipliers. Directions of smaller variance act as disturbances. Rely
-      only on results that do not change with the order. Default: 1.
+    - `order`: the number of multipliers. Directions of smaller variance act as disturbances. If
+      one multiplier more contradicts the largest modulus, `doubt` reports both. Default: 1.
     - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
       (Künsch 1989), within each record; whole records where these are short.
 
     **Raises:** `DefinitionError` for too few cycles or signals.
     """
+    result = _estimate(data, order, seed)
+    try:
+        larger = _estimate(data, order + 1, seed)
+    except DefinitionError:
+        return result
+    pair = [(abs(x.multipliers[0]), x.interval()[0]) for x in (result, larger)]
+    if any(low <= z <= high for (z, _), (_, (low, high)) in (pair, pair[::-1])):
+        return result
+    text = f"{order + 1} multipliers give {pair[1][0]:.3f} for the largest modulus: raise `order`."
+    return dataclasses.replace(result, doubt=text)
+
+
+def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
+    """Estimate so many multipliers, without a second number of them."""
     moments = _moments(data, order)
     K = len(moments.records)
     counts = np.unique(moments.records, return_counts=True)[1]

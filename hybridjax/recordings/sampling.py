@@ -71,14 +71,16 @@ def section_data(
     that remains (`Record.drift`). Drift of sensors also moves the phase: remove it from the signals
     before (`without_drift`), as `identify_recording` does.
 
-    **Raises:** `DefinitionError` for unknown names, constant signals, another number of sections
-    than the family's, a recording without a whole cycle, and as `estimate_phase`.
+    **Raises:** `DefinitionError` for unknown names, no names, constant signals, another number of
+    sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
     inputs, outputs = tuple(inputs), tuple(outputs)
     for name in (*inputs, *outputs):
         values = [x[np.isfinite(x)] for _, x in recording.samples(name)]
         if not any(len(x) and np.ptp(x) for x in values):
             raise DefinitionError(f"{name} is constant in all trials: leave it out.")
+    if not (inputs or outputs):
+        raise DefinitionError("events alone determine no multipliers: name inputs or outputs.")
     if not outputs and timing is None:
         timing = "duration"
     if not isinstance(phase, Phase):

@@ -188,7 +188,7 @@ def test_designs_within_a_distortion(hopper_cycle):
         assert max(rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL) == pytest.approx(1)
     assert plan.saved > 1.2 and 1 <= plan.certificate < 1.1
     assert f"With the {' and '.join(plan.limited)} limited, one stride" in plan.advice
-    assert "convex bound of distortions" in repr(plan)
+    assert "of distortion: an upper bound" in repr(plan)
     # Twice what is allowed: twice the power, half of the strides.
     twice = Distortion(hopper_cycle, sections, {n: 2 * x for n, x in LEVEL.items()})
     more = hj.optimal_design(model, usual, limit=Limits(distortion=twice), noise=NOISE)

@@ -224,12 +224,12 @@ def test_what_does_not_fit_is_refused(plant):
     same = hj.Record(record.u[:, [1, 1]], record.y, n_sections=N, inputs=("u", "r"))
     with refused("u and r are equal"):
         hj.fit_ldtp(same, 2, reference="r")
+    shape = {"n_sections": N, "periods": 8, "inputs": ("u", "r")}
+    with refused("u and r are equal"):
+        hj.identify.loop(hj.ExperimentData(data.u[..., [1, 1]], data.y, **shape), at_input="r")
     with refused("name those that enter at the plant's input"):
         hj.identify.loop(data)
     with refused("excites too little: at f = .* tells 2 of 4 components apart"):
-        part = hj.ExperimentData(
-            data.u[:2, :, :2], data.y[:2], n_sections=N, periods=8, inputs=("u", "r")
-        )
-        hj.estimate_htf(part, reference="r")
+        hj.estimate_htf(hj.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape), reference="r")
     with refused("`reference`, `noise` and `start` are for time series"):
         hj.fit_ldtp(plant.htf([0.3]), 2, reference="r")

@@ -108,6 +108,8 @@ def test_multipliers(hopper, rational, structured):
     for points in (z, *rational.multipliers, structured.multipliers):
         first = points[points.imag > 0][0]
         assert left < first.real < right and low < first.imag < high
+    crowd = (np.arange(-4, 5)[:, None] + 1j * np.arange(-4, 5)).ravel() / 6
+    assert not hj.plot.multipliers(crowd, {"near": crowd + 1e-3}).ax.child_axes
 
 
 def test_poles_and_zeros(rational):
@@ -127,9 +129,8 @@ def test_poles_and_zeros(rational):
 
 
 def test_experiment(hopper):
-    data = hj.experiments.simulate_experiments(
-        hopper, hj.multisine(periods=4, band=(0, 2.0)), discard=2
-    )
+    design = hj.multisine(periods=4, band=(0, 2.0))
+    data = hj.experiments.simulate_experiments(hopper, design, discard=2)
     figure = hj.plot.experiment(data, -1).figure
     assert [ax.get_ylabel() for ax in figure.axes] == ["u", r"$\delta$ yM", r"$\delta$ vM"]
     y = figure.axes[2].get_lines()[0]
@@ -210,9 +211,7 @@ def test_no_texts_overlap_at_the_width_of_a_column(found):
 
 
 def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():
-    estimate = MultiplierEstimate(
-        np.array([0.3 + 0j]), np.array([-0.3]), np.array([[0.01]]), np.inf
-    )
+    estimate = MultiplierEstimate(np.array([0.3 + 0j]), -np.ones(1) * 0.3, np.eye(1) / 100, np.inf)
     plot = hj.plot.multipliers([0.3], {"fit": estimate}, zoom=False)
     plot.figure.canvas.draw()
     picture = np.asarray(plot.figure.canvas.buffer_rgba())

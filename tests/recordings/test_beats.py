@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.signal import Signal
 from hybridjax.orbits.responses import PhaseCurve
 from hybridjax.recordings.beats.model import forecast, intervals_of, tabulated
 
@@ -53,12 +54,15 @@ def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     assert 3 < found.detail < 10 and abs(found.jitter - 0.05) < 0.01 and found.p_flat < 1e-3
     assert rms(found.values - CURVE) < 0.12
     assert found.left_out_flat + 0.01 < found.left_out < 1
-    assert "Shape: it adds" in repr(found)
+    assert "Resolution: the jitter" in repr(found)
     curve = PhaseCurve(X, CURVE, "u", time_unit="ms")
     drawn, band = hj.plot.phase_response(curve, model=found).ax, found.interval(found.phase)[0]
     np.testing.assert_allclose(drawn.lines[1].get_ydata(), found.values / 1000)
     heights = drawn.collections[0].get_paths()[0].vertices[:, 1]
     assert heights.min() == pytest.approx(band.min() / 1000)
+    other = [PhaseCurve(X, CURVE, Signal("u", unit)) for unit in ("nA", "pA")]
+    with pytest.raises(hj.DefinitionError, match="different units: nA and pA"):
+        hj.plot.phase_response(other[0], model=other[1])
 
 
 def rms(values):
@@ -90,7 +94,7 @@ def test_events_alone_are_identified(noisy):
     found = hj.identify_recording(noisy, BEAT, inputs="u", outputs=(), order=1, n_sections=4)
     assert found.data.outputs == ("duration",) and found.fit.outputs == ("duration",)
     assert np.isfinite(found.fit.numerators).all()
-    assert any("Shape: it adds" in repr(x) for x in found.advice.warnings)
+    assert any("Resolution: the jitter" in repr(x) for x in found.advice.warnings)
 
 
 def test_what_is_refused(noisy):

@@ -13,7 +13,7 @@ import hybridjax as hj
 from hybridjax.apps.identify import _page
 from hybridjax.recordings.inspection.faults import slow_changes
 
-from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle, signals
+from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle, scaled, signals
 
 
 STRIDES, TRIALS, RATE = 60, 3, 64
@@ -79,7 +79,7 @@ CAUSES = {
     "no value": ["-9999 for no value"],
     "frozen": ["0 for no value", "output frozen for a while", "push frozen for a while"],
     "an empty trial": ["output frozen"],
-    "another unit": ["millimeters in one trial", "kilonewtons in one trial"],
+    "another unit": ["millimeters in one trial", "kilonewtons in one trial", scaled("y0", 57.3)],
     "another sign": ["sign of an output in one trial", "sign of the push in one trial"],
     "another zero": ["other zero in one trial"],
     "swapped columns": ["columns swapped in one trial"],
@@ -172,9 +172,8 @@ def test_none_is_silently_wrong(hopper_cycle, mishap):
     phase = hj.AtEvent("apex") if mishap in EVENT_MISHAPS else APEX
     try:
         dirty = mishandle(trials, mishap, input="u", outputs=outputs, event="apex")
-        found = hj.identify_recording(
-            dirty, phase, inputs="u", outputs=outputs, n_sections=16, order=2
-        )
+        names = {"inputs": "u", "outputs": outputs, "n_sections": 16}
+        found = hj.identify_recording(dirty, phase, order=2, **names)
     except hj.DefinitionError:
         return
     assert found.findings or found.fit.contains(hopper_cycle.multipliers, 0.999).all()

@@ -27,9 +27,8 @@ def sample(recording, phase=CIRCLE, **options):
 
 def test_a_circle(wave):
     data = sample(wave)
-    np.testing.assert_allclose(
-        data.cycle_outputs[:, 0], np.cos(np.pi / 4 * np.arange(8)), atol=2e-3
-    )
+    circle = np.cos(np.pi / 4 * np.arange(8))
+    np.testing.assert_allclose(data.cycle_outputs[:, 0], circle, atol=2e-3)
     (record,), (times,) = data.records, data.times
     np.testing.assert_allclose(np.diff(times), 1 / 8, atol=1e-4)
     area = np.sin(3 * times)
@@ -42,6 +41,8 @@ def test_a_circle(wave):
     assert timed.outputs == ("x", "v", "time") and timed.rms()[1][2] < 1e-4
     with pytest.raises(hj.DefinitionError, match="different n_sections: 16 and 8"):
         sample(wave, n_sections=16)
+    with pytest.raises(hj.DefinitionError, match="events alone determine no multipliers"):
+        sample(wave, inputs=(), outputs=())
     assert "SectionData(19.75 cycles of 8 sections in 1 records; period 1;" in repr(data)
 
 
@@ -72,9 +73,8 @@ def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     events = {k: v[np.abs(v - 77) > 3.4] for k, v in trial.events.items()}
     signals = dict(zip(dirty.signals, trial.values[kept].T, strict=True))
     paused = hj.Recording(trial.time[kept], signals, events=events)
-    found = hj.identify_recording(
-        paused, hj.AtEvent("top"), inputs="force", outputs=("x", "v"), n_sections=8, order=1
-    )
+    names = {"inputs": "force", "outputs": ("x", "v"), "n_sections": 8}
+    found = hj.identify_recording(paused, hj.AtEvent("top"), order=1, **names)
     assert found.fit.contains([MULTIPLIER], 0.999).all()
     assert found.phase.dropped == 10 and len(found.phase.stretches[0]) == 12
     assert found.phase.cycles + found.phase.missed == 199
@@ -92,10 +92,8 @@ def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
         start = at + 0.5 - rng.uniform(0.02, 0.18)
         hidden[(t > start) & (t < start + 0.2), 1:] = np.nan
     options = {"inputs": "force", "n_sections": 16, "bandwidth": 8.0}
-    clean, dirty = (
-        sample(hj.Recording(t, dict(zip(names, x.T, strict=True))), top, **options)
-        for x in (values, hidden)
-    )
+    both = [hj.Recording(t, dict(zip(names, x.T, strict=True))) for x in (values, hidden)]
+    clean, dirty = (sample(x, top, **options) for x in both)
     assert len(dirty.records) == 6 and dirty.cycles == pytest.approx(clean.cycles - 10, abs=0.1)
     (before,) = clean.times
     for record, times in zip(dirty.records, dirty.times, strict=True):
@@ -114,8 +112,7 @@ def test_slow_drift_is_taken_out(wave):
     rough = hj.recordings.estimate_phase(recording, CIRCLE)
     flat = without_drift(recording, rough, ("f", "x", "v"), 4)
     assert sample(flat).rms()[1][0] < 0.02
-    assert sample(flat).records[0].drift == np.inf
-    assert sample(flat).with_drift(9).records[0].drift == 9
+    assert [x.records[0].drift for x in (sample(flat), sample(flat).with_drift(9))] == [np.inf, 9]
     for phase, cycles, message in [
         (rough, 3, "four cycles or more, not 3"),
         (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "numbers of trials: 0 and 1"),
@@ -127,15 +124,16 @@ def test_slow_drift_is_taken_out(wave):
 def test_designs_as_tables(tmp_path, wave):
     design = hj.multisine(n_sections=8, periods=16, band=(0, 2.0))
     hj.recordings.write_design(tmp_path / "phase.csv", design, cycles=19)
-    hj.recordings.write_design(tmp_path / "time.csv", design, period=0.29, rate=100)
+    for period, rows in ((0.2901, 465), (0.29, 16 * 29)):  # (0.29 * 100 is 28.999...)
+        hj.recordings.write_design(tmp_path / "time.csv", design, period=period, rate=100)
+        assert (tmp_path / "time.csv").read_text().count("\n") - 1 == design.experiments * rows
     with pytest.raises(hj.DefinitionError, match="both the period and the rate"):
         hj.recordings.write_design(tmp_path / "time.csv", design, period=0.5)
     # Applied at the phases of the recording, and found again in its section data.
     phase = hj.recordings.estimate_phase(wave, CIRCLE)
     with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):
         hj.recordings.add_command(wave, phase, tmp_path / "time.csv")
-    lines, timed = ((tmp_path / x).read_text().splitlines() for x in ("phase.csv", "time.csv"))
-    assert (len(timed) - 1) % (16 * 29) == 0  # (0.29 * 100 is 28.999...)
+    lines = (tmp_path / "phase.csv").read_text().splitlines()
     (tmp_path / "one.csv").write_text("\n".join(lines[: 1 + 19 * 8]))
     told = hj.recordings.add_command(wave, phase, tmp_path / "one.csv")
     data = sample(told, phase, inputs="u", sampled="middle")

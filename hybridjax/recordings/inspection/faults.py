@@ -218,11 +218,10 @@ def other_settings(
             if not (width[k, s] > 0 and span[k] > 0):
                 continue
             ratio, is_output = width[k, s] / span[k], name in outputs
-            power = round(np.log10(ratio))
             off = abs(middle[k, s] - usual[k])
             # Pushes may be chosen to be ten times as strong.
-            units = (1, 2, 3, 6) if is_output else (3, 6)
-            if abs(power) in units and abs(np.log(ratio / 10.0**power)) < np.log(_ALIKE):
+            units = np.log((10, 180 / np.pi, 1e2, 1e3, 1e6) if is_output else (1e3, 1e6))
+            if np.abs(abs(np.log(ratio)) - units).min() < np.log(_ALIKE):
                 text = f"{name} varies {ratio:.3g} times as much in trial '{trial.name}': its unit?"
                 yield Finding("another unit", text, "refused" if is_output else "warned")
             elif is_output and off > max(span[k] / _OFF, _OFF * np.abs(peers[k] - usual[k]).max()):
