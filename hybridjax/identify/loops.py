@@ -93,15 +93,13 @@ def loop(
         controller = estimate(u, y, d)
         controller = eqx.tree_at(lambda x: x.H, controller, -controller.H)
     text = "The {} is not estimated: this needs experiments with a reference that is added to its "
-    whole = (
-        (r, "plant", "input (a push, an injected current)."),
-        (d, "controller", "measured signal y (a moved scene, an offset)."),
-    )
-    missing = tuple(text.format(name) + signal for given, name, signal in whole if not given)
+    missing = [] if r else [f"{text.format('plant')}input (a push, an injected current)."]
+    end = "measured signal y (a moved scene, an offset)."
+    missing += [] if d else [text.format("controller") + end]
     first = r or d
     answer, entered = (y, u) if r else (u, y)
     closed, sensitivity = (estimate(x, first, first) for x in (answer, entered))
-    return Loop(plant, controller, closed, sensitivity, missing)
+    return Loop(plant, controller, closed, sensitivity, tuple(missing))
 
 
 def _without(sums: Sums, known: np.ndarray) -> Sums:

@@ -209,11 +209,8 @@ def about_phase_response(r: Any) -> Iterator[Finding]:
         text = f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
         yield Finding("misfit", f"{text}independent errors: the phase model lacks something.")
     if abs(r.memory) > _MEMORY:
-        text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the phase"
-        text += (
-            " is not all of the state. The curve shows the effect of a push on its own interval,"
-        )
-        yield Finding("memory", f"{text} which is not its lasting effect on the phase.")
+        text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the curve "
+        yield Finding("memory", f"{text}shows the effect of a push on its own interval, not later.")
     if r.miscounted:
         text = f"{r.miscounted} of {r.intervals} intervals miss the model by half a cycle or more"
         yield Finding("miscounted", f"{text}, as if an event had been missed; they are not used.")

@@ -137,10 +137,9 @@ def natural_multipliers(
     except DefinitionError:
         return result
     pair = [(abs(x.multipliers[0]), x.interval()[0]) for x in (result, larger)]
-    if any(low <= z <= high for (z, _), (_, (low, high)) in (pair, pair[::-1])):
-        return result
+    agree = any(low <= z <= high for (z, _), (_, (low, high)) in (pair, pair[::-1]))
     text = f"{order + 1} multipliers give {pair[1][0]:.3f} for the largest modulus: raise `order`."
-    return dataclasses.replace(result, doubt=text)
+    return result if agree else dataclasses.replace(result, doubt=text)
 
 
 def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
