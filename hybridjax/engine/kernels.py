@@ -54,10 +54,10 @@ def step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: S
 
 
 def step_along(
-    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, along: States
+    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, along: States, some: Some
 ) -> tuple[Step, States, States]:
     """A step in chart a, and the derivatives of its end and of its estimate along a direction."""
-    rows = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)(t, q, u, h, along)
+    rows = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)(t, q, u, h, along, some=some)
     return Step(*rows[:5]), rows[5], rows[6]
 
 
@@ -99,12 +99,9 @@ def enabled(
     s: Structure, g: Member, t: Times, q: States, u: Inputs, lanes: int = 1
 ) -> Bool[Array, " L"]:
     """Test whether the predicates of transitions of one kind hold."""
-    of_lanes = (
-        s.kernel(_enabled, by_lane, g.kind, lanes=lanes)
-        if on_host(q)
-        else s.by_lane(ft.partial(_enabled, g.kind))
-    )
-    return of_lanes(t, q, u, g.place)
+    if on_host(q):
+        return s.kernel(_enabled, by_lane, g.kind, lanes=lanes)(t, q, u, g.place)
+    return s.by_lane(ft.partial(_enabled, g.kind))(t, q, u, g.place)
 
 
 def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:

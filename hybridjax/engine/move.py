@@ -53,9 +53,6 @@ def move(
         setout = stride(setout)
     if result is None:
         result = xp.full(lanes.t.shape, Result.OK, xp.int32)
-    if on_host(lanes.t) and len(lanes.t) == 1 and not s.by_system:
-        _, (_, *row) = through(s, (lanes, setout, result), u, target, settings, options)
-        return Recorded(*jax.tree_util.tree_map(lambda x: x[0], row))
     if on_host(lanes.t):
         return search(s, lanes, u, target, settings, setout, result, options)
     return _move(s, lanes, u, target, fixed(setout), result, settings, options)
@@ -85,11 +82,9 @@ def through(
     """
     ends, levels = (targets.time, targets.index, targets.event, targets.limit), targets.levels
     by = targets.missed, targets.event_sequence
-    if not on_host(u) or s.by_system:
+    if not options.at_once:
         return _pieces((move, options, *by), s, levels, settings, ends, begin, u, patience)
     static = search, options._replace(tangents=bool(options.tangents), at_once=False), *by
-    if not options.at_once:
-        return _pieces(static, s, levels, settings, ends, begin, u, patience)
     make = lambda: whole(_pieces, (static,), (s, levels, settings))  # noqa: E731
     arguments = ends, begin, u, np.float64(patience)
     return s.once(("through", static), (levels, settings), make)(*arguments)

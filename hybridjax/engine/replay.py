@@ -94,10 +94,10 @@ def _advance(
         t_out, q_out = out
         n = s.dims[a]
         system, levels = needed(here, (s, target.levels))
-        goal = dataclasses.replace(target, levels=levels, index=only(here, target.index))
+        goal = levels, only(here, target.index)
         t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
-        flow = ChartFlow(system, a, u0, goal)
-        still = ChartFlow(fixed(system), a, fixed(u0), goal)
+        flow = ChartFlow(system, a, u0, *goal)
+        still = ChartFlow(fixed(system), a, fixed(u0), *goal)
         # (The charts, which may hold traced values, are made here, and not within a branch.)
         method = flow.method
         crossing = jnp.where(here, which, -1)
@@ -294,7 +294,7 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndar
     lands = np.flatnonzero(which >= 0)
     if len(lands):
         point, landing = (t[lands], q[:, lands], f[:, lands]), s.at(lands)
-        flow = ChartFlow(landing, a, u[:, lands], dataclasses.replace(target, index=index[lands]))
+        flow = ChartFlow(landing, a, u[:, lands], target.levels, index[lands])
         zero = flow.locate(*point, which[lands])
         t[lands] += zero.past
         q[:, lands] = zero.q

@@ -30,7 +30,7 @@ LIMIT_CYCLE = 1e-12
 SWEEP = 1e-9
 """Many limit cycles at once (`find_limit_cycles`)."""
 TRANSIENT = 1e-6
-"""Waiting until transients have died out, where a sweep's Newton fails."""
+"""Flows that leave no trace in results: to the section, and the first turns of Newton's method."""
 
 # Accuracies of data: the error at every section, accumulated since the start of an experiment,
 # relative to the size of each state on the limit cycle.

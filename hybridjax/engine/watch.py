@@ -1,6 +1,5 @@
 """The functions whose zeros end a step: guards, and the level function of the target section."""
 
-import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -9,14 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.executor import namespace, on_host, put
-from .._core.lanes import pick, put_rows, shared
+from .._core.lanes import PerLane, pick, put_rows, shared
 from ..systems.solver import Method
 from ..systems.structure import Structure
 from . import kernels
 from .arrays import AnyInputs, AnyTimes, Array, Index, Inputs, Mask, Padded, States, Times
 from .lanes import for_each_chart, only
 from .runge_kutta import LaneField, Step, short_step, step_along, take_step
-from .target import Target
+from .target import AbstractLevels, Target
 
 
 class Watch(NamedTuple):
@@ -52,12 +51,13 @@ class Located(NamedTuple):
 
 class ChartFlow(NamedTuple):
     """The field and the watched functions of one chart, under the inputs of lanes and for their
-    targets."""
+    targets: levels by index."""
 
     s: Structure
     a: int
     u: Inputs
-    target: Target
+    levels: AbstractLevels | PerLane | None
+    index: Index
     subset: Mask | None = None
     """On the host, the lanes that are needed; `None` for all."""
 
@@ -75,7 +75,7 @@ class ChartFlow(NamedTuple):
 
     @property
     def has_level(self) -> bool:
-        s, a, levels = self.s, self.a, self.target.levels
+        s, a, levels = self.s, self.a, self.levels
         if levels is None:
             return False
         return s.once(("level", a), (levels,), lambda: shared(levels).present(s, a))
@@ -96,12 +96,12 @@ class ChartFlow(NamedTuple):
     ) -> tuple[Step, States, States]:
         """A step, and the derivatives of its end and of its estimate along a direction."""
         if on_host(q):
-            return kernels.step_along(self.s, self.a, t, q, self.u, h, along)
+            return kernels.step_along(self.s, self.a, t, q, self.u, h, along, self.subset)
         return step_along(self.method, self.field, t, q, h, along)
 
     def watch(self, t: AnyTimes, q: States, f: States) -> Watch:
         """The watched functions, in the order of `rows`; f is the field there."""
-        a, levels, index = self.a, self.target.levels, self.target.index
+        a, levels, index = self.a, self.levels, self.index
         if on_host(q):
             rows = kernels.watched(self.s, a, levels, t, q, self.u, index, self.subset)
             return Watch(rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1))
@@ -137,10 +137,7 @@ class ChartFlow(NamedTuple):
 
 def chart_flow(s: Structure, a: int, here: Mask, u: Inputs, target: Target) -> ChartFlow:
     """The `ChartFlow` of the lanes `here`; the others are taken along as copies of one of them."""
-    index = only(here, target.index)
-    if index is not target.index:
-        target = dataclasses.replace(target, index=index)
-    return ChartFlow(s, a, only(here, u), target).only(here)
+    return ChartFlow(s, a, only(here, u), target.levels, only(here, target.index)).only(here)
 
 
 def slopes(s: Structure, t: Times, chart: Index, q: Padded, u: AnyInputs) -> Padded:

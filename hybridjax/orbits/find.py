@@ -16,6 +16,7 @@ from .._core.executor import is_traced, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
+from ..engine.lanes import side_by_side
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.unresolved import has_kinks
 from ..errors import ComputationError, DefinitionError
@@ -215,8 +216,8 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     """A cycle that was found in rough sizes, in the sizes that states have on it."""
     s = map.structure
     while solution.is_fixed_point:
-        period, rough = solution.turn.period, sizes_of(s, map.scale)
-        sizes = sizes_on(s, solution.turn.legs, float(period))
+        turn, rough = solution.turn, sizes_of(s, map.scale)
+        sizes = sizes_on(s, turn.legs, float(turn.period))
         # A state at rest keeps its rough size: on the cycle it has only rounding errors. (If all
         # are, the rough sizes are those of a guess that is far too large.)
         moving = {k: x for k, x in sizes.items() if x > SAME * rough[k]}
@@ -225,17 +226,17 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
             map,
             settings=dataclasses.replace(map.settings, scale=scale_of(s, sizes)),
             anchor=solution.anchor,
-            expected=map.expected if map.base is None else period,
+            expected=map.expected if map.base is None else turn.period,
         )
         if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # accurate enough
-            residual, before = np.abs(solution.turn.residual), to_host(map).sizes
+            residual, before = np.abs(turn.residual), to_host(map).sizes
             after = to_host(fine).sizes
             # (Gaps between moves are part of the distance, too.)
-            gap = np.asarray(solution.turn.distance) - np.max(residual / before)
+            gap = np.asarray(turn.distance) - np.max(residual / before)
             distance = real(np.max(residual / after) + gap * np.max(before / after))
-            return fine, solution._replace(turn=solution.turn._replace(distance=distance))
+            return fine, solution._replace(turn=turn._replace(distance=distance))
         say("Newton's method, in the sizes of the cycle")
-        again = solve(fine)
+        again = solve(fine, False, True, (turn.legs, side_by_side(to_host(turn.tapes))))
         if not again.is_fixed_point:
             break
         map, solution = fine, again._replace(steps=solution.steps)

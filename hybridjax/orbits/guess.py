@@ -18,7 +18,7 @@ from ..engine import kernels
 from ..engine.lanes import Lanes, lane_at
 from ..engine.move import move
 from ..engine.search.state import Moved
-from ..engine.settings import Settings
+from ..engine.settings import TRANSIENT, Settings
 from ..engine.target import Target, toward, until
 from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure
@@ -186,7 +186,7 @@ def _go(
 
 @host_first
 def _moved(map: ReturnMap, lanes: Lanes, target: Target) -> Moved:
-    settings = dataclasses.replace(map.settings, max_steps=1_000_000)
+    settings = Settings(np.array(TRANSIENT), np.array(TRANSIENT), 1_000_000, map.scale)
     u = namespace(lanes.t).zeros((map.structure.nu, 1))
     return move(map.structure, lanes, u, target, settings).moved
 

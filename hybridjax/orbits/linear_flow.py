@@ -250,7 +250,7 @@ def last_turn(cycle: Any) -> Any:
     """The starts and the steps of the pieces of a cycle's last turn, side by side; None where JAX
     traces the cycle, and the host did not take them."""
     cycle = hosted(cycle)
-    make = lambda: side_by_side(to_host(cycle.return_map).pieces(tangents=True))  # noqa: E731
+    make = lambda: side_by_side(to_host(cycle.return_map).pieces())  # noqa: E731
     return _turns.get(cycle, None) if is_hidden(cycle) else _turns.recall(cycle, None, make)
 
 

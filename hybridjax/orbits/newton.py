@@ -23,11 +23,11 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Lanes, side_by_side
 from ..engine.replay import Variation
+from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
 from .crossing import ListLevels
-from .return_map import CLOSED, SINGULAR, ReturnMap, Turn, across
-from .scale import has_implicit
-from .shooting import ATOL, RTOL, excess, fixed_point, newton_steps, travel
+from .return_map import SINGULAR, ReturnMap, Turn, across
+from .shooting import ATOL, RTOL, excess, fixed_point, follow_moves, newton_steps, travel
 
 
 # Steps that a good guess needs: a continuation then takes longer steps, and a system of a sweep
@@ -156,31 +156,36 @@ def root(
 
 
 def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Newton's method with the steps and the test of optimistix."""
+    """Newton's method with the steps and the test of optimistix: first on rough turns, then on
+    accurate ones; where these fail, it begins again without rough ones."""
     sizes, x, steps, expected = map.sizes, map.anchor.q[:, 0] / map.sizes, 0, None
-    assert map.settings.rtol is not None
+    rough = Settings(np.array(TRANSIENT), np.array(TRANSIENT), map.settings.max_steps, map.scale)
+    now, again = dataclasses.replace(map, settings=rough), x
     if near is not None:
-        x, expected = fixed_point(map, near, x)
-    # (Implicit steps have errors that decay before the turn ends, and leave gaps between moves.)
-    explicit = not has_implicit(map.structure)
+        (x, expected), now, again = fixed_point(map, near, x), map, None
     while True:
-        travelled = None
-        if expected is not None and explicit:
-            travelled = travel(map, x * sizes, expected)
-        turn = map.turn_with_jacobian(x * sizes, travelled=travelled)
+        travelled = None if expected is None else travel(map, x * sizes, expected)
+        turn = now.turn_with_jacobian(x * sizes, travelled=travelled)
         residual = turn.residual / sizes
         (step,) = newton_steps((turn.jacobian * sizes / sizes[:, None])[None], residual[None])
-        x, steps = x + step, steps + 1
+        x, steps, expected = x + step, steps + 1, None
+        if not np.isfinite(x).all() and again is not None:
+            now, x, again, steps = map, again, None, 0
+            continue
         # (Gaps may be as large as errors of steps.)
         gap = travelled[2] if travelled else 0.0
-        close = np.max(np.abs(residual)) < ATOL and gap < ATOL + map.settings.rtol
+        close = np.max(np.abs(residual)) < ATOL and gap < ATOL + np.asarray(map.settings.rtol)
         done = excess(x[None], step[None])[0] < 1 and close
-        if done or steps == max_steps or not np.isfinite(x).all():
+        if now is map and (done or steps == max_steps or not np.isfinite(x).all()):
             return x * sizes, turn, np.asarray(steps)
-        expected = None
-        # (Later ones have not helped before, and short steps need none.)
-        if steps < FEW_STEPS and (explicit or np.abs(step).max() > CLOSED):
-            x, expected = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), x)
+        newton = x
+        # (Later ones have not helped before.)
+        if steps < FEW_STEPS:
+            x, expected = fixed_point(now, (turn.legs, side_by_side(turn.tapes)), x)
+        if now is not map and (x is not newton or steps == FEW_STEPS):
+            now, begin = map, map.departure(x * sizes)
+            pieces = expected and follow_moves(map, begin, map.ends(), expected)
+            x, expected = fixed_point(map, pieces[::2], x) if pieces else (x, None)
 
 
 def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:

@@ -45,7 +45,7 @@ LEGS = 16
 PATIENCE = 1024
 # The part of the last period after which an autonomous system is integrated to its section.
 # Nearer to 1: a shorter return is missed. Smaller: an earlier crossing is taken for the return.
-_FREE = 0.75
+_FREE = 0.73
 # Smallest singular value of J - I, in sizes of the states, at which it is singular. Smaller: cycles
 # of a family pass for isolated ones. Larger: cycles with a multiplier near 1 are rejected.
 SINGULAR = 1e-7
@@ -359,9 +359,9 @@ class ReturnMap(eqx.Module):
         residual = xp.where(same[..., None], residual, np.nan)
         return Return(residual, each(end.t - self.anchor.t), each(result)), extra
 
-    def pieces(self, tangents: bool = False) -> tuple[Lanes, Tape]:
+    def pieces(self) -> tuple[Lanes, Tape]:
         """The starts and tapes of the pieces of one turn."""
-        options = Options(tape=True, new_input=False, tangents=tangents)
+        options = Options(True, new_input=False, tangents=True)
         with at_ease():
             _, (lanes, _, tapes) = self.travel(self.anchor.q[:, 0], options)
         return lanes, tapes

@@ -17,8 +17,10 @@ from ..engine.events import arm, belongs
 from ..engine.lanes import ARRIVE_TIME, MOVE, Lanes, Tape, regrouped, start_lanes
 from ..engine.move import Options, move, stride
 from ..engine.replay import Moves, linear_moves, recorded_moves
+from ..engine.search.attempt import deviation
 from ..engine.target import Target, until
 from .return_map import CLOSED, LEGS, SINGULAR, Return, ReturnMap
+from .scale import has_implicit
 
 
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
@@ -77,11 +79,11 @@ def fixed_point(
         h = (end + (by[:, :, :n] @ shift[:, :, None])[:, :, 0] - starts - shift)[:, 0]
         length = np.max(np.abs(shift[:, 1:] / map.scale[moves.chart]))
         if not (length <= 0.5 * last and (moves.order == 0).sum() == LEGS):
-            # (Of short steps no more than rounding is left.)
-            return (x, _forwards(moves)) if last <= CLOSED else (otherwise, None)
+            return otherwise, None
         x, last, starts = x + step, length, starts + shift
         moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
-        if length < ATOL + RTOL:
+        # (The error after a step is about its square.)
+        if length <= np.maximum(CLOSED, np.asarray(map.settings.rtol)):
             return x, _forwards(moves)
 
 
@@ -102,7 +104,8 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple
     """A turn, as by `ReturnMap.travel`, and the largest gap between its moves, in sizes of the
     states; None if it has other moves than expected."""
     begin = map.departure(q)
-    if (pieces := follow_moves(map, begin, map.ends(), expected)) is None:
+    pieces = follow_moves(map, begin, map.ends(), expected)
+    if pieces is None or pieces[-1] > CLOSED:
         return None
     legs, moved, tape, gap = pieces
     end = jax.tree_util.tree_map(lambda x: x[..., -1], moved.lanes)
@@ -137,12 +140,16 @@ def follow_moves(map: ReturnMap, begin: Lanes, ends: Target, expected: Moves) ->
     )  # fmt: skip
     lanes = start_lanes(s, moves.t, moves.chart.astype(np.int32), moves.q)
     lanes = arm(s, lanes, map.watch(lanes, until(lanes.t)), map.expected)
-    lanes = lanes._replace(events=(np.cumsum(code >= 0) - (code >= 0)).astype(np.int32))
-    lanes = lanes._replace(events=lanes.events + begin.events)
+    lanes = lanes._replace(events=begin.events + np.cumsum(code >= 0, dtype=np.int32) - (code >= 0))
     lanes.armed[:, :1] = begin.armed
     # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
     h = np.where(timed, np.where(moves.h > 0, 2 * moves.h, map.expected), 1.01 * moves.h)
     setout = stride(h)._replace(lead=0 * h)
+    if has_implicit(s):  # (a deviation goes on until a piece ends or an event happens)
+        along, (_, by) = deviation(s, lanes, settings), linear_moves(s, moves, ends)
+        for k in np.flatnonzero((np.diff(piece) == 0) & (code[:-1] < 0)):
+            along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
+        setout = setout._replace(along=along)
     u, options = np.zeros((s.nu, len(code))), Options(True, new_input=False, tangents=True)
     for _ in range(2):
         moved, tape = move(s, lanes, u, target, settings, setout, None, options)
@@ -151,12 +158,13 @@ def follow_moves(map: ReturnMap, begin: Lanes, ends: Target, expected: Moves) ->
         if same:
             break
         lanes.armed[:, 1:] = end.armed[:, :-1]
-    for ended, begun in ((end.chart, lanes.chart), (end.events, lanes.events)):
-        same = same and (ended[:-1] == begun[1:]).all()
+    pairs = (end.chart, lanes.chart), (end.events, lanes.events)
+    same = same and all((ended[:-1] == begun[1:]).all() for ended, begun in pairs)
     late = np.append(begin.t, end.t[:-1]) - lanes.t
     apart = np.column_stack([begin.q, end.q[:, :-1]]) - lanes.q
-    gap = max(np.abs(late / map.expected).max(), np.abs(apart.T / map.scale[lanes.chart]).max())
-    if not (same and (moved.result == Result.OK).all() and gap <= CLOSED):
+    sizes = np.maximum(map.scale[lanes.chart], np.abs(lanes.q.T))
+    gap = max(np.abs(late / map.expected).max(), np.abs(apart.T / sizes).max())
+    if not (same and (moved.result == Result.OK).all()):
         return None
     assert tape is not None
     first = np.flatnonzero(np.diff(piece, prepend=-1))

@@ -16,7 +16,6 @@ from hybridjax.engine.move import Options, move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.orbits import newton
-from hybridjax.orbits.scale import has_implicit
 from hybridjax.orbits.shooting import fixed_point, travel
 from hybridjax.systems.structure import Structure
 
@@ -103,14 +102,12 @@ def test_both_agree_on_random_systems(name):
         agree(system, 0, start.q, start.u, start.t, 2.0)
 
 
-@pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("HopfOscillator", "VerticalHopper")))
+@pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("FitzHughNagumo", "VerticalHopper")))
 def test_a_turn_with_its_moves_side_by_side(name):
     """The same moves, with the same derivatives, as one after the other."""
     system = getattr(hj.models, name)()
     if system.guess() is None or name in ("BuckConverter", "SLIPRunner", "TrottingQuadruped"):
         pytest.skip("has no guess of its own, a family of cycles, or events at one instant")
-    if has_implicit(Structure(system)):
-        pytest.skip("is computed one move after the other")
     with unchecked_host():
         cycle = hj.find_limit_cycle(system)
         map = to_host(cycle.return_map)

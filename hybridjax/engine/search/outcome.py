@@ -188,8 +188,6 @@ def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:
 def _expected(sequence: tuple[int, ...] | None, events: Index, fired: Index) -> Bool[Array, " L"]:
     """Test whether the next event of each lane is that of the limit cycle."""
     xp = namespace(fired)
-    if sequence is None:
-        return xp.ones(fired.shape, bool)
     if not sequence:
-        return xp.zeros(fired.shape, bool)
+        return xp.full(fired.shape, sequence is None)
     return xp.array(sequence)[events % len(sequence)] == fired

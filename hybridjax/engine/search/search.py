@@ -54,9 +54,7 @@ def search(
     tape = blank_tape(settings.max_steps, lanes) if options.tape else None
 
     def all_the_way() -> Recorded:
-        def going(carry):
-            state, _ = carry
-            return (state.i < settings.max_steps) & state.active.any()
+        going = lambda x: (x[0].i < settings.max_steps) & x[0].active.any()  # noqa: E731
 
         def iterate(carry):
             state, tape = carry
@@ -92,7 +90,7 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
     result = update_result(result, ~finite, Result.BAD_INPUT)
     watched = watch(s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK)
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
-    follows = implicit and task.tangents is not False
+    follows, along = implicit and task.tangents is not False, task.stride.along
     none, zero, no = xp.zeros(L, xp.int32), xp.zeros(L), xp.zeros(L, bool)
     return State(
         arm(s, lanes, watched, task.span) if new_input else lanes,
@@ -100,7 +98,7 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
         level_counts(watched, task.span),
         Approach(no, none, zero, zero, zero, none),
         task.stride.h,
-        deviation(s, lanes, task.settings) if follows else None,
+        deviation(s, lanes, task.settings) if follows and along is None else along,
         zero,
         result,
         no,

@@ -24,6 +24,8 @@ class Stride(NamedTuple):
     not known."""
     slack: Times
     """A step's error estimate may be this many times the tolerance."""
+    along: Padded | None = None
+    """Deviations that began before (see `State`). Default: they begin with the flow."""
 
 
 class Options(NamedTuple):
