@@ -172,13 +172,13 @@ def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray
         if not np.isfinite(x).all() and again is not None:
             now, x, again, steps = map, again, None, 0
             continue
-        # (Gaps may be as large as errors of steps.)
+        # (Gaps may be as large as errors of steps; rough turns lead close to the cycle only.)
         gap = travelled[2] if travelled else 0.0
         close = np.max(np.abs(residual)) < ATOL and gap < ATOL + np.asarray(map.settings.rtol)
-        done = excess(x[None], step[None])[0] < 1 and close
+        done = excess(x[None], step[None])[0] < 1 and close and (travelled or again is None)
         if now is map and (done or steps == max_steps or not np.isfinite(x).all()):
             return x * sizes, turn, np.asarray(steps)
-        newton = x
+        newton, again = x, None if now is map else again
         # (Later ones have not helped before.)
         if steps < FEW_STEPS:
             x, expected = fixed_point(now, (turn.legs, side_by_side(turn.tapes)), x)
