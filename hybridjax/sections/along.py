@@ -43,8 +43,8 @@ def flow_along(
         return None
     # Moves start at the beginning, where recorded moves do, and at targets, which take the place of
     # a recorded start at the same time.
-    key, time, state = places
-    first, replaced = _place(map, moves, begin.t), time - moves.t[key] <= late
+    first, key, time, state = places
+    replaced = time - moves.t[key] <= late
     between = np.setdiff1d(np.arange(first[0] + 1, key[-1] + 1), key[replaced])
     keys = np.concatenate([first, between, key])
     times = np.concatenate([begin.t, moves.t[between], time])
@@ -71,19 +71,16 @@ def flow_along(
     return (last, *carry[1:]), jax.tree_util.tree_map(one_by_one, flow)
 
 
-def _place(map: ReturnMap, moves: Moves, time: Float[np.ndarray, " K"]) -> Int[np.ndarray, " K"]:
-    """Numbers of the moves in which times lie."""
-    return np.searchsorted(moves.t, time + TOGETHER * map.expected, side="right") - 1
-
-
 def _places_on(map: ReturnMap, moves: Moves, ends: Any, begin: Lanes, targets: Target):
-    """The numbers of the moves that start at targets, or in which these lie, and the times and
-    states (d, K) of the targets, which follow each other. `ends` are those of one turn."""
+    """The numbers of the moves in which `begin` lies, and that start at targets, or in which these
+    lie, and the times and states (d, K) of the targets, which follow each other. `ends` are those
+    of one turn."""
     s, period, late = map.structure, map.expected, TOGETHER * map.expected
     M, K, clock = ends.shape[1], len(targets.time), np.isfinite(targets.time[0])
     event = np.broadcast_to(targets.event, K)
+    place = lambda time: np.searchsorted(moves.t, time + late, side="right") - 1  # noqa: E731
     if clock:
-        move = _place(map, moves, targets.time)
+        move = place(targets.time)
         h = targets.time - moves.t[move]
     else:
         level = _levels_on(s, Moves(*(x[..., :M] for x in moves)), ends, targets)
@@ -110,10 +107,10 @@ def _places_on(map: ReturnMap, moves: Moves, ends: Any, begin: Lanes, targets: T
         turns = np.ceil((begin.t[0] + late - time[0]) / period)
         turns = turns + np.cumsum(np.append(False, time[1:] <= time[:-1] + late))
     time = time + turns * period
-    key = np.where(event < 0, _place(map, moves, time), turns * M + move + 1).astype(int)
+    key = np.where(event < 0, place(time), turns * M + move + 1).astype(int)
     state = moves.q[:, key]
     state[:, cut] = end[:, 1:].T
-    return key, time, state
+    return place(begin.t), key, time, state
 
 
 def _levels_on(

@@ -76,7 +76,7 @@ def linearize(
     placed: Any = sections if of_family else as_placed(cycle, sections)
     z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
     z.require(*(range(len(s.charts)) if traced else np.unique(placed.lanes.chart).tolist()))
-    (names, columns), d = s.inputs_among(inputs), s.d + 1
+    names, columns = s.inputs_among(inputs)
     if of_family:
         A, B, C, D, dims = _of_family(cycle, as_family(placed), tuple(z.items), last_turn(cycle))
     else:
@@ -84,8 +84,9 @@ def linearize(
     if not traced:
         A, B, C, D = jax.device_get((A, B, C, D))
         d = int(np.max(np.asarray(dims)))
+        A, B, C = A[:, :d, :d], B[:, :d], C[:, :, :d]
     return LDTP(
-        A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], dims,
+        A, B[..., columns], C, D[..., columns], dims,
         inputs=names, outputs=z.names,
         coordinates=None if traced else placed.coordinates(),
     )  # fmt: skip

@@ -147,14 +147,14 @@ def _locate(map: ReturnMap, family: AbstractSections, turn: Any, flows: list) ->
         pieces = jax.tree_util.tree_map(lambda x: x[1:], pieces)
     first = before[1].result[0, 0]
     lanes, moved, tape = side_by_side(pieces)
-    end, result = moved.lanes.t, moved.result
     normal = _normals(s, bound, lanes, xp.arange(N), u)
     f = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
     share = xp.abs(normal.T * xp.concatenate([xp.ones((1, N)), f]))
     flat = xp.max(share, axis=0) == 0
     drop = xp.where(flat, -1, xp.argmax(share, axis=0))
     dims = xp.asarray(s.dims)[lanes.chart] + (xp.isinf(bound.time) & (map.base is None)) - ~flat
-    return first, (bound, lanes, tape, end - lanes.t, result, drop, dims, normal)
+    duration = moved.lanes.t - lanes.t
+    return first, (bound, lanes, tape, duration, moved.result, drop, dims, normal)
 
 
 def place_along(
@@ -218,10 +218,9 @@ def _observed_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     """`_observed` on the host, and its derivatives."""
     (cycle, family, outputs, turn), (by_cycle, by_family, *_) = arguments, directions
     placed, s, _ = place_along(cycle, family, turn, by_cycle, by_family)
-    lanes, P, y = placed.lanes, s.directions, None
-    if outputs:
-        u = s.pushed(np.arange(len(lanes.t)) % P)
-        y = observe(s, check_outputs(cycle, outputs), lanes, u).T
+    lanes, P = placed.lanes, s.directions
+    u = s.pushed(np.arange(len(lanes.t)) % P)
+    y = observe(s, check_outputs(cycle, outputs), lanes, u).T if outputs else None
     split = lambda x: x.reshape(-1, P, *x.shape[1:])  # noqa: E731
     return kernels.parted(jax.tree_util.tree_map(split, (lanes.t, y)))
 
