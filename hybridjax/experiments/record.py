@@ -37,7 +37,7 @@ class Record(eqx.Module):
       that depend on later events.
     - `drift`: number of cycles. The outputs at each section may also contain an unknown drift that
       is slower than this. Infinite: the drift is a constant, such as an error of the subtracted
-      average cycle. None: no drift.
+      average cycle. None: no drift. Fits cut records of more than 50 times this number.
     """
 
     u: Float[np.ndarray, "n nu"]

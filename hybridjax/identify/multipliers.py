@@ -184,8 +184,6 @@ def fit_multipliers(
         inputs=htf.inputs,
         outputs=htf.outputs,
     )
-    if not check:
-        return fit
 
     def of_order(order: int) -> RoughFit:
         # No larger numerators, if possible: without zero multipliers they are large enough.
@@ -196,8 +194,8 @@ def fit_multipliers(
         return c, lambda: varpro.summarize(groups, c, errors)[0]
 
     # One more multiplier, or a pair.
-    more = [functools.partial(of_order, order + k) for k in (1, 2)]
-    return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), True))
+    more = [functools.partial(of_order, order + k) for k in (1, 2) if check]
+    return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), check))
 
 
 @checked

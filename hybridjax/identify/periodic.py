@@ -12,6 +12,7 @@ Helmersson and Ribarits 2004; Ribarits, Deistler and Hanzon 2005; for each secti
 
 from collections.abc import Callable
 from functools import reduce
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -232,11 +233,9 @@ def characteristic_slopes(
         M = phi @ M + c[-1] * np.eye(d)
     slopes = np.zeros((d, coordinates.size))
     order = [(first + k) % N for k in range(N)]
-    before = [np.eye(d)]
-    for n in order[:-1]:
-        before.append(model.A[n] @ before[-1])
+    before = accumulate((model.A[n] for n in order[:-1]), lambda P, A: A @ P, initial=np.eye(d))
     after = np.eye(d)
-    for n, entering in zip(reversed(order), reversed(before), strict=True):
+    for n, entering in zip(reversed(order), reversed(list(before)), strict=True):
         by_A = after.T @ np.array(by_phi) @ entering.T
         slopes[:, places[n]["Y"]] = (coordinates.to_A[n].T @ by_A).reshape(d, -1)
         if model.K[n].shape[1]:

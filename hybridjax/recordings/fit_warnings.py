@@ -84,7 +84,7 @@ def advise(
     of an inspection and of other estimates, which come first. Default: none.
     """
     N, R, _, nu = fit.numerators.shape
-    d, records = len(fit.multipliers), PreparedRecords(data)
+    d, records = len(fit.multipliers), PreparedRecords(data, free_start=True)
     problem = OutputErrorProblem.from_data(records, d, R - 1 - fit.lead - d * N, free_start=True)
     delayed, grid = late_outputs(problem, d), records.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())

@@ -24,8 +24,7 @@ def test_two_multipliers_are_two(size, small, variance):
 
 def test_the_level_of_the_rank_test(small, variance):
     """In 1 % of cases noise looks like one more multiplier, which fits refuse in the others."""
-    _, htf = small
-    htf, runs, refused = htf.select((-1, 0, 1)), 50, 0
+    htf, runs, refused = small[1].select((-1, 0, 1)), 50, 0
     for seed in range(runs):
         data = noisy(htf, variance[1:], np.random.default_rng(seed))
         try:
@@ -39,8 +38,7 @@ def test_the_level_of_the_rank_test(small, variance):
 
 def test_variances_from_few_realizations(small, variance):
     """They make noise look larger than it is, and its tails longer; not like more multipliers."""
-    _, htf = small
-    htf, runs, refused = htf.select((-1, 0, 1)), 12, 0
+    htf, runs, refused = small[1].select((-1, 0, 1)), 12, 0
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         rough = variance[1:] * rng.gamma(3.0, 1 / 3, variance[1:].shape)

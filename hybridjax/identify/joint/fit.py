@@ -258,8 +258,8 @@ def fit_ldtp(
         if reference is not None:
             data, drive = in_loop(data, reference)
         innovations = noise == "innovations" or drive is not None
-        records, direct = PreparedRecords(data), _is_direct(guess)
-        outside = records if drive is None else PreparedRecords(drive)
+        records, direct = PreparedRecords(data, start == "free"), _is_direct(guess)
+        outside = records if drive is None else PreparedRecords(drive, start == "free")
         if innovations and not isinstance(guess, LDTP):
             direct = answers_at_once(records, outside)
         how = (innovations, start == "free", check)

@@ -217,7 +217,7 @@ def fit_series(
         fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
         more = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
         return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), check))
-    records = data if isinstance(data, PreparedRecords) else PreparedRecords(data)
+    records = data if isinstance(data, PreparedRecords) else PreparedRecords(data, start == "free")
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
     delayed = late_outputs(problem, order)
@@ -245,8 +245,8 @@ def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> 
     It does if outputs that may drift have other multipliers, or as little noise without the
     multipliers that may be 1, which a constant resembles.
     """
-    # (It is refused where an input acts later than the records begin.)
-    slow, order = partial(PreparedRecords, with_drift(records.records)), len(fit.coefficients)
+    # (It is refused where an input acts later than the records begin, or drift was declared.)
+    slow, order = (lambda: PreparedRecords(with_drift(records.records))), len(fit.coefficients)
     may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
 
     def drifting() -> RoughFit:

@@ -114,11 +114,10 @@ class LoopEquations:
     def __init__(self, plant: list[Record], drive: list[Record], order: int, overhang: int | None):
         self.records, self.order, self.reference = PreparedRecords(plant), order, drive[0].inputs
         self.grid = self.records.whole()
-        N = self.records.n_sections
+        N, z = self.records.n_sections, predicted(plant, drive, order)
         span = N if overhang is None else overhang
         self.lags = self.records.lead + order * N + span + 1
-        z, free = predicted(plant, drive, order), order + -(-span // N)
-        self.sections = [self._section(n, z, free) for n in range(N)]
+        self.sections = [self._section(n, z, order + -(-span // N)) for n in range(N)]
 
     def _section(self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int) -> SectionEquations:
         grid, delays = self.grid, range(self.order + 1)

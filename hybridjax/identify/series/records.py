@@ -83,12 +83,17 @@ class PreparedRecords:
     **Fields:** `records`, without unknown inputs. `n_sections`, `lead`, `inputs`, `outputs`: as in
     `Record`. `grids`: the grids. `cycles`: number of cycles of the longest record. `sampled` (N,
     ny): number of samples. `scale` (ny,): rms of the outputs.
+
+    **Arguments:** `free_start`: whether the states at the starts are unknown. Records that drift
+    are then cut into pieces with starts and drifts of their own, because the time of fits grows
+    with the third power of their length. Default: False.
     """
 
-    def __init__(self, data: RecordedData):
+    def __init__(self, data: RecordedData, free_start: bool = False):
         """**Raises:** `DefinitionError` as `uninterrupted_records`, and for inputs that are
         zero and outputs that are constant at every sample, missing, or no deviations."""
-        self.records = uninterrupted_records(data)
+        cut = _pieces if free_start else lambda record: [record]
+        self.records = uninterrupted_records(x for r in uninterrupted_records(data) for x in cut(r))
         about = self.records[0]
         self.n_sections, self.lead = about.n_sections, about.lead
         self.inputs, self.outputs = about.inputs, about.outputs
@@ -110,13 +115,19 @@ class PreparedRecords:
 
 
 def with_drift(records: Sequence[Record]) -> list[Record]:
-    """Return the beginnings of records, with unknown drifts that are slower than `SLOW` cycles.
+    """Return the first 1000 cycles of records, with unknown drifts slower than `SLOW` cycles.
 
-    (Time grows with the third power of their length: 8000 cycles took half a minute.)
+    Records that may drift as fast already are left out.
     """
-    n = int(50 * SLOW) * records[0].n_sections
-    begun = [dataclasses.replace(r, u=r.u[:n], y=r.y[:n]) for r in records]
-    return [dataclasses.replace(r, drift=min(SLOW, r.drift or np.inf)) for r in begun]
+    slower, n = [r for r in records if (r.drift or np.inf) > SLOW], 1000 * records[0].n_sections
+    return [dataclasses.replace(r.part(0, n), drift=SLOW) for r in slower]
+
+
+def _pieces(record: Record) -> list[Record]:
+    """Cut a record into pieces of 50 times its drift, or less."""
+    longest = 50 * (record.drift or np.inf) * record.n_sections
+    n = -(-len(record.u) // max(int(np.ceil(len(record.u) / longest)), 1))
+    return [record.part(k, k + n) for k in range(0, len(record.u), n)]
 
 
 def _grids(records: Sequence[Record]) -> list[CycleGrid]:
