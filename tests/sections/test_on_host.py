@@ -49,6 +49,7 @@ def agrees(system, measure, rtol):
     e = 2e-4
     minus2, minus, plus, plus2 = (kept(at(k * e)) for k in (-2, -1, 1, 2))
     differences, size = (8 * (plus - minus) - (plus2 - minus2)) / (12 * e), kept(by_host)
+    np.testing.assert_allclose(kept(values), kept(at(0.0)), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(size, differences, rtol=rtol, atol=rtol * np.max(np.abs(size)))
     weights = [np.cos(np.arange(np.size(x)).reshape(np.shape(x))) for x in values]
     expected = sum(np.sum(w * np.asarray(x)) for w, x in zip(weights, by_host, strict=True))

@@ -177,15 +177,16 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
         if isinstance(other := attempt(family), str) or isinstance(placed, str):
             assert placed == other
             continue
-        both = [(x.lanes, x.flow_jacobians) for x in (placed, other)]
-        (own, A), (their, B) = jax.device_get(both)
+        both = [(x.lanes, x.flow_jacobians, x.tape) for x in (placed, other)]
+        (own, A, *tapes), (their, B, tape) = jax.device_get(both)
         own, their = (x._replace(armed=x.armed & belongs(s, x.chart)[:-1]) for x in (own, their))
         scale = np.asarray(cycle.settings.scale)[their.chart].T
         assert np.abs((own.q - their.q) / scale).max() < 1e-12
         np.testing.assert_allclose(own.t, their.t, rtol=1e-12)
         for field in ("chart", "events", "armed"):
             np.testing.assert_array_equal(getattr(own, field), getattr(their, field))
-        for x, y in zip(A, B, strict=True):
+        before = (x.before.transpose(2, 0, 1)[x.code.T >= 0] for x in (*tapes, tape))
+        for x, y in zip([*A, next(before)], [*B, next(before)], strict=True):
             np.testing.assert_allclose(x, y, atol=1e-10 * np.abs(y).max(initial=1e-300))
         np.testing.assert_array_equal(placed.drop, other.drop)
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
