@@ -52,6 +52,7 @@ _CAPTIONS = {
     "bode": "Magnitude and phase of H₀, with bands of 95 %.",
     "harmonics": "Magnitudes of H₀, H₁ and H₋₁, with bands of 95 %.",
     "phase": "Durations of the cycles.",
+    "curve": "Phase response curve with its band of 95 %.",
     "sections": "Average cycle; deviations with twice their standard deviation; power of inputs, "
     "and outputs from cycle to cycle at the section where they vary most.",
 }
@@ -124,7 +125,7 @@ def report_folder(
     """Return a context with a new folder for the results, which at the end replace those in
     `folder`."""
     files = (PAGE, "sections.csv", "cycle.csv", "htf.npz", "fit.npz", "summary.json")
-    figures = ["phase", "sections", "multipliers", "impulse_responses", "validation"]
+    figures = ["phase", "sections", "multipliers", "impulse_responses", "validation", "curve"]
     for suffix in _suffixes(inputs):
         figures += [f"bode{suffix}", f"harmonics{suffix}"]
     images = [f"figures/{name}.{format}" for name in figures for format in with_png(formats)]
@@ -243,9 +244,9 @@ def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
         for i, suffix in enumerate(_suffixes(htf.inputs)):
             figures[f"bode{suffix}"] = plot.bode(htf, input=i)
             figures[f"harmonics{suffix}"] = plot.harmonics({"": htf}, input=i, decades=3)
-        figures["phase"] = plot.phase(found.phase)
-        figures["sections"] = plot.section_data(found.data)
-    return figures
+        curve = {} if found.curve is None else {"curve": plot.phase_response(found.curve)}
+        figures |= {"phase": plot.phase(found.phase), "sections": plot.section_data(found.data)}
+    return figures | curve
 
 
 def _page(found: Identification, images: dict[str, str]) -> str:

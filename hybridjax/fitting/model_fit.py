@@ -214,7 +214,7 @@ class ModelFit(eqx.Module):
     def __repr__(self) -> str:
         width = max(map(len, self.names))
         lines = [f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"]
-        lines.append(f"  {self._cost()}; standard errors are those by noise; distortion adds more:")
+        lines.append(f"  {self._cost()}; standard errors include noise, but no distortion:")
         for name, value, error, unit in self._rows():
             lines.append(f"  {name:{width}}  {value:<14} {error} {unit}".rstrip())
         lines += [f"  not seen: {text}" for text in self.identifiability.descriptions()]

@@ -196,8 +196,7 @@ def about_phase_response(r: Any) -> Iterator[Finding]:
     """Limits of a result of `phase_response`."""
     if r.p_flat > _LEVEL:
         yield Finding("shape", f"a flat curve explains the data as well ({p_value(r.p_flat)}).")
-    low, high = r.interval(r.phase)
-    half = (high - low) / 2
+    half = np.ptp(r.interval(r.phase), axis=0) / 2
     if half.max() > abs(r.coefficients[0]) / 2:
         worst = int(np.argmax(half))
         text = f"at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
