@@ -191,3 +191,11 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
         np.testing.assert_array_equal(placed.drop, other.drop)
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
     assert implicit or (all(kept) if name == "VerticalHopper" else sum(kept) > 1)
+
+
+def test_a_section_at_the_time_of_an_event_is_refused():
+    wheel = hj.find_limit_cycle(hj.models.RimlessWheel())
+    path = wheel.trajectory()
+    impact = float(path.t[path.event >= 0][0] / wheel.period)
+    with pytest.raises(hj.ComputationError, match="coincides with an event"):
+        hj.place_sections(wheel, hj.ClockPhase(2, anchor=impact))

@@ -45,8 +45,12 @@ def subspace_model(
     **Raises:** `DefinitionError` for too few cycles for a past as long as the states need.
     """
     N, ny, most = len(dims), len(records.outputs), int(max(dims))
-    z, sampled = _signals(records)
-    columns = z.shape[3]
+    grid = records.whole()
+    y, none, sampled = grid.y / records.scale, grid.drift[..., :0], grid.sampled.all(axis=3)
+    for n in range(N):
+        without_drift = SectionRegression.make(none, none, grid.drift, sampled[:, :, n])
+        y[:, :, n] = without_drift.reduced(y[:, :, n]).reshape(y[:, :, n].shape)
+    z, columns = np.concatenate([grid.u, y], axis=3), grid.u.shape[3] + ny
     sections = [_Section(z, sampled, n, ny) for n in range(N)]
     samples = min(len(section.y) for section in sections)
     past = min(samples // (_ROWS * columns), default_horizon(N))
@@ -86,7 +90,10 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
     **Raises:** `DefinitionError` if both answer each other at once: no model of the noise tells
     them apart.
     """
-    z, sampled = _signals(records, drive.whole().u)
+    grid = records.whole()
+    # (A controller answers outputs as they are measured, with their drift.)
+    z = np.concatenate([drive.whole().u, grid.u, grid.y / records.scale], axis=3)
+    sampled = grid.sampled.all(axis=3)
     ny, nr = len(records.outputs), len(drive.inputs)
     statistic, left, whole = 0.0, 0.0, 0.0
     for n in range(records.n_sections):
@@ -111,17 +118,6 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
             "apart. Pass a model with D = 0 as `guess` if outputs do not respond at once."
         )
     return True
-
-
-def _signals(records: PreparedRecords, *more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs and outputs (R, T, N, columns), without drift, and where all are sampled."""
-    grid = records.whole()
-    y, none = np.zeros(grid.y.shape), grid.drift[..., :0]
-    sampled = np.asarray(grid.sampled.all(axis=3))
-    for n in range(records.n_sections):
-        rows = SectionRegression.make(none, none, grid.drift, sampled[:, :, n])
-        y[:, :, n] = rows.reduced(grid.y[:, :, n] / records.scale).reshape(y[:, :, n].shape)
-    return np.concatenate([*more, grid.u, y], axis=3), sampled
 
 
 class _Section:
