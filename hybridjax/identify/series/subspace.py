@@ -46,9 +46,10 @@ def subspace_model(
     """
     N, ny, most = len(dims), len(records.outputs), int(max(dims))
     grid = records.whole()
-    y, none, sampled = grid.y / records.scale, grid.drift[..., :0], grid.sampled.all(axis=3)
+    y, sampled = grid.y / records.scale, np.asarray(grid.sampled.all(axis=3))
     for n in range(N):
-        without_drift = SectionRegression.make(none, none, grid.drift, sampled[:, :, n])
+        waves = grid.drift[..., :0], grid.drift[..., :0], grid.drift
+        without_drift = SectionRegression.make(*waves, sampled[:, :, n])
         y[:, :, n] = without_drift.reduced(y[:, :, n]).reshape(y[:, :, n].shape)
     z, columns = np.concatenate([grid.u, y], axis=3), grid.u.shape[3] + ny
     sections = [_Section(z, sampled, n, ny) for n in range(N)]
@@ -93,11 +94,10 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
     grid = records.whole()
     # (A controller answers outputs as they are measured, with their drift.)
     z = np.concatenate([drive.whole().u, grid.u, grid.y / records.scale], axis=3)
-    sampled = grid.sampled.all(axis=3)
     ny, nr = len(records.outputs), len(drive.inputs)
     statistic, left, whole = 0.0, 0.0, 0.0
     for n in range(records.n_sections):
-        section = _Section(z, sampled, n, ny)
+        section = _Section(z, np.asarray(grid.sampled.all(axis=3)), n, ny)
         count = len(section.y)
         length = max(min(count // (_ROWS * z.shape[3]), default_horizon(len(z[0, 0]))), 1)
         past = section.past(length)
