@@ -320,7 +320,10 @@ def _check(placed: PlacedSections, first: int) -> None:
             f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
         )
     if np.sum(np.asarray(placed.tape.code) >= 0) != len(placed.cycle.event_sequence):
-        raise ComputationError("a section coincides with an event: move it, or use `AtEvent`.")
+        raise ComputationError(
+            "a section coincides with an event (move it, or use `AtEvent`), or there were too few "
+            "steps (find the cycle with `settings=Settings(max_steps=...)`)."
+        )
     for i, (count, steepness) in enumerate(zip(*_crossings(placed), strict=True)):
         if steepness < _LEAST_STEEPNESS:
             raise ComputationError(
