@@ -22,7 +22,7 @@ from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Lanes, side_by_side
-from ..engine.replay import Variation
+from ..engine.replay import Moves, Variation
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
 from .crossing import ListLevels
@@ -156,36 +156,59 @@ def root(
 
 
 def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Newton's method with the steps and the test of optimistix: first on rough turns, then on
-    accurate ones; where these fail, it begins again without rough ones."""
-    sizes, x, steps, expected = map.sizes, map.anchor.q[:, 0] / map.sizes, 0, None
-    rough = Settings(np.array(TRANSIENT), np.array(TRANSIENT), map.settings.max_steps, map.scale)
-    now, again = dataclasses.replace(map, settings=rough), x
+    """Newton's method from the fixed point of the moves of a `near` turn, or from where rough turns
+    lead; if these lead nowhere, from the anchor's state."""
+    begin = map.anchor.q[:, 0] / map.sizes
     if near is not None:
-        (x, expected), now, again = fixed_point(map, near, x), map, None
-    while True:
-        travelled = None if expected is None else travel(map, x * sizes, expected)
-        turn = now.turn_with_jacobian(x * sizes, travelled=travelled)
-        residual = turn.residual / sizes
-        (step,) = newton_steps((turn.jacobian * sizes / sizes[:, None])[None], residual[None])
-        x, steps, expected = x + step, steps + 1, None
-        if not np.isfinite(x).all() and again is not None:
-            now, x, again, steps = map, again, None, 0
-            continue
-        # (Gaps may be as large as errors of steps; rough turns lead close to the cycle only.)
-        gap = travelled[2] if travelled else 0.0
-        close = np.max(np.abs(residual)) < ATOL and gap < ATOL + np.asarray(map.settings.rtol)
-        done = excess(x[None], step[None])[0] < 1 and close and (travelled or again is None)
-        if now is map and (done or steps == max_steps or not np.isfinite(x).all()):
-            return x * sizes, turn, np.asarray(steps)
-        newton, again = x, None if now is map else again
+        return _newton(map, *fixed_point(map, near, begin), 0, max_steps)
+    end = _newton(map, *_by_rough_turns(map, begin), max_steps)
+    return end if np.isfinite(end[0]).all() else _newton(map, begin, None, 0, max_steps)
+
+
+def _by_rough_turns(map: ReturnMap, x: np.ndarray) -> tuple[np.ndarray, Moves | None, int]:
+    """Newton's method on turns with errors of `TRANSIENT`, until the moves of one have a fixed
+    point: that of these moves, divided at full accuracy, the moves, and the number of steps."""
+    rough = Settings(np.array(TRANSIENT), np.array(TRANSIENT), map.settings.max_steps, map.scale)
+    rough_map, moves = dataclasses.replace(map, settings=rough), None
+    for steps in range(1, FEW_STEPS + 1):  # noqa: B007
+        turn, step = _step_from(rough_map, x)
+        x = newton = x + step
+        if np.isfinite(x).all():
+            x, moves = fixed_point(rough_map, (turn.legs, side_by_side(turn.tapes)), newton)
+        if x is not newton or not np.isfinite(x).all():
+            break
+    pieces = moves and follow_moves(map, map.departure(x * map.sizes), map.ends(), moves)
+    x, moves = fixed_point(map, pieces[::2], x) if pieces else (x, None)
+    return x, moves, steps
+
+
+def _newton(
+    map: ReturnMap, x: np.ndarray, moves: Moves | None, first: int, max_steps: int
+) -> tuple[np.ndarray, Turn, np.ndarray]:
+    """Newton's method from a state, in sizes, with the steps and the test of optimistix. The first
+    turn makes the `moves` if they are right; `first` steps were taken before."""
+    for steps in itertools.count(first + 1):
+        travelled = None if moves is None else travel(map, x * map.sizes, moves)
+        turn, step = _step_from(map, x, travelled)
+        x = x + step
+        # (Gaps between moves may be as large as errors of steps.)
+        close = turn.distance < ATOL + (np.asarray(map.settings.rtol) if travelled else 0.0)
+        # (The first state need not be as accurate as a Newton step.)
+        done = excess(x[None], step[None])[0] < 1 and close and (travelled or steps > first + 1)
+        if done or steps == max_steps or not np.isfinite(x).all():
+            break
+        moves = None
         # (Later ones have not helped before.)
         if steps < FEW_STEPS:
-            x, expected = fixed_point(now, (turn.legs, side_by_side(turn.tapes)), x)
-        if now is not map and (x is not newton or steps == FEW_STEPS):
-            now, begin = map, map.departure(x * sizes)
-            pieces = expected and follow_moves(map, begin, map.ends(), expected)
-            x, expected = fixed_point(map, pieces[::2], x) if pieces else (x, None)
+            x, moves = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), x)
+    return x * map.sizes, turn, np.asarray(steps)
+
+
+def _step_from(map: ReturnMap, x: np.ndarray, travelled: Any = None) -> tuple[Turn, np.ndarray]:
+    """The turn from a state, in sizes, and the Newton step."""
+    turn, sizes = map.turn_with_jacobian(x * map.sizes, travelled=travelled), map.sizes
+    jacobian, residual = turn.jacobian * sizes / sizes[:, None], turn.residual / sizes
+    return turn, newton_steps(jacobian[None], residual[None])[0]
 
 
 def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:

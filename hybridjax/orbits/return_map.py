@@ -44,7 +44,8 @@ LEGS = 16
 # events reach it. Larger: vain searches last longer.
 PATIENCE = 1024
 # The part of the last period after which an autonomous system is integrated to its section.
-# Nearer to 1: a shorter return is missed. Smaller: an earlier crossing is taken for the return.
+# Nearer to 1: a shorter return is missed. Smaller: an earlier crossing is taken for the return. At
+# a simple fraction, pieces end on the events of symmetric cycles.
 _FREE = 0.73
 # Smallest singular value of J - I, in sizes of the states, at which it is singular. Smaller: cycles
 # of a family pass for isolated ones. Larger: cycles with a multiplier near 1 are rejected.

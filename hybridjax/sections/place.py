@@ -319,6 +319,7 @@ def _check(placed: PlacedSections, first: int) -> None:
             f"the sections are out of order: {name((late + 1) % N)} comes before section {late} on "
             f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
         )
+    # (By rounding, a round may hold the event at which it begins and ends twice, or not at all.)
     if np.sum(np.asarray(placed.tape.code) >= 0) != len(placed.cycle.event_sequence):
         raise ComputationError(
             "a section coincides with an event (move it, or use `AtEvent`), or there were too few "
