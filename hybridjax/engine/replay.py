@@ -192,8 +192,8 @@ class Variation:
                 end, u = (t + h).real[at] + 0j, kernels.unpushed(s, lane[at])
                 h[at] = end + kernels.due(s, g, end, q[:, at], u)[0, 0] - t[at]
         along = along._replace(t=t, q=q, h=h, lane=lane)
-        # (A direction that moves the start of the flow, and nothing else, needs no lanes of its own:
-        # the start of each move is varied anyway.)
+        # A direction that moves only the start of the flow needs no lanes of its own: the start of
+        # each move is varied anyway.
         self._unit = np.eye(P)[s.moving | times.any(axis=1) | (np.arange(P) == 0)]
         needed = np.append(np.full(n, twice), self._unit.any(axis=0))
         along = Moves(*(x[..., np.tile(needed, len(moves.t))] for x in along))
