@@ -1,5 +1,7 @@
 """`fit_ldtp` of series: output error and innovations, gaps, starts, and the noise it finds."""
 
+import dataclasses
+
 import equinox as eqx
 import numpy as np
 import pytest
@@ -76,10 +78,7 @@ def test_predictions_are_those_of_the_recursion_sample_by_sample(small, gappy):
 @pytest.mark.parametrize("drift", (None, np.inf))
 def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
     """With errors of outputs that depend on each other."""
-    records = [
-        hj.Record(r.u, r.y + 3.0, n_sections=4, first_section=r.first_section, drift=drift)
-        for r in gappy
-    ]
+    records = [dataclasses.replace(r, y=r.y + 3.0, drift=drift) for r in gappy]
     part = SeriesPart.of(CycleGrid.from_records(records), ONE)
     problem = SeriesProblem([part], COVARIANCES, True, free, 0)
     coordinates = local_coordinates(in_innovation_form(small), True)

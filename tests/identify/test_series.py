@@ -1,6 +1,7 @@
 """Fits to time series: accurate without noise, calibrated with noise, gaps, unknown starts."""
 
 import dataclasses
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hybridjax.identify.series.fit import gradient_covariance
 from hybridjax.identify.series.linearization import each_fit, filtered_response, linearize
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.records import PreparedRecords, with_drift
-from hybridjax.identify.series.subspace import late_outputs, total_least_squares
+from hybridjax.identify.series.subspace import late_outputs, subspace_model, total_least_squares
 
 from .conftest import SHAPES, scaled
 from .test_uncertainty import covered
@@ -177,7 +178,7 @@ def test_an_order_that_is_too_low_is_noticed(small):
     assert not hj.fit_multipliers(htf, 2).doubt
 
 
-def test_undeclared_drift_and_offsets_are_noticed(small):
+def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
     """A drift with the right order or one less, and an offset with one multiplier too many."""
     slow = np.cos(np.pi / 100 * (np.arange(100) + 0.5) * np.arange(1, 5)[:, None]).sum(axis=0)
 
@@ -194,10 +195,13 @@ def test_undeclared_drift_and_offsets_are_noticed(small):
             with pytest.warns(FindingWarning, match="Fit: outputs may drift"):
                 multipliers = fit(data, guess).multipliers
             assert np.abs(multipliers - small.multipliers[0]).max() > 0.1
+    first = mock.Mock(wraps=subspace_model)
+    monkeypatch.setattr("hybridjax.identify.joint.fit.subspace_model", first)
     for data in (moved(0.0), *(dataclasses.replace(x, drift=20) for x in (drift, offset, far))):
         assert not hj.fit_series(data, 2).doubt
         fit = hj.fit_ldtp(data, small.dims, noise="innovations")
         assert fit.result == hj.Result.OK and not fit.doubt
+    assert first.call_count == 4  # (Trials of a drift begin at the fit.)
     with pytest.raises(hj.DefinitionError, match="not 2.*Outputs may drift: records with `drift"):
         hj.fit_series(moved(3 * slow.repeat(4), seed=0), 2)
     (begun,) = with_drift([record(small, 4100)])  # (Longer ones take too long.)

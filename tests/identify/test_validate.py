@@ -36,8 +36,7 @@ def test_the_fit_is_the_share_explained(small):
     left = np.sqrt(np.mean((data.y - clean) ** 2, axis=0))
     np.testing.assert_allclose(found.noise, left)
     np.testing.assert_allclose(found.fit, 100 * (1 - left / data.y.std(axis=0)))
-    assert found.white and found.independent
-    assert "with the input: no sign of it" in repr(found)
+    assert found.white and "with the input: no sign of it" in repr(found)
 
 
 def test_a_wrong_model_is_refused(small):

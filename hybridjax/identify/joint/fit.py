@@ -118,15 +118,15 @@ class LDTPFit(MultiplierEstimate):
         **Arguments:** `harmonics`: Default: those that were fitted.
         """
         f = np.atleast_1d(np.asarray(f, float))
-        fitted = harmonics is None
-        harmonics = self.harmonics if fitted else check_harmonics(harmonics, self.n_sections)
+        N = self.n_sections
+        harmonics = self.harmonics if harmonics is None else check_harmonics(harmonics, N)
         H = transfer(self._coordinates.model, f, harmonics)
         variance = np.zeros(H.shape)
         for rows, slopes in transfer_slopes(self._coordinates, f, harmonics):
             variance[:, rows] = self._spread.variance(slopes)
         size = self._scale[:, None]
         return HTF(
-            f, H * size, harmonics, self.n_sections, self.inputs, self.outputs, "fit",
+            f, H * size, harmonics, N, self.inputs, self.outputs, "fit",
             variance=variance * size**2,
         )  # fmt: skip
 
@@ -147,10 +147,7 @@ class LDTPFit(MultiplierEstimate):
         **Raises:** `DefinitionError` if no noise was fitted, or if it grows without bound.
         """
         if self.noise is None:
-            raise DefinitionError(
-                "no noise was fitted, because HTFs give its variance at their lines only "
-                "(`HTF.variance`): fit time series."
-            )
+            raise DefinitionError("no noise is fitted to HTFs (`HTF.variance`): fit time series.")
         return prediction.noise_spectrum(self.noise, np.atleast_1d(np.asarray(f, float)), harmonics)
 
     def spread(self, grid: CycleGrid) -> Iterator[Float[np.ndarray, "S T ny r"]]:
@@ -238,8 +235,8 @@ def fit_ldtp(
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
     - `check`: whether to raise an error if outputs do not respond to the inputs (not with
-      "innovations"), and to test whether residuals of time series depend on them; then `misfit`
-      says so, in a `FindingWarning`, too. Default: True.
+      "innovations"), and to test whether residuals of time series depend on them, or
+      drift explains the multipliers; `doubt` and a `FindingWarning` then say so. Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, always
       with innovations. The fit is consistent if D is zero at sections where the controller responds
@@ -277,8 +274,10 @@ def fit_ldtp(
         if not check or residuals.is_exact(grid, error := errors()).all():
             return fit
 
-        def drifting() -> RoughFit:
-            slow = _fit_to_series(PreparedRecords(with_drift(records.records)), guess, *how, direct)
+        def drifting() -> RoughFit:  # (from the fit on: half of the steps)
+            begun = PreparedRecords(with_drift(records.records))
+            model = fit._coordinates.model.times(fit._scale / begun.scale)
+            slow = _fit_to_series(begun, model, *how, direct)
             return slow.coefficients, lambda: Covariance(slow.covariance, slow.covariance_freedom)
 
         misfit = residuals.about_misfit(outside.whole(), grid, error, innovations)
@@ -321,7 +320,7 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
 
 def _fit_to_series(
     records: PreparedRecords,
-    guess: Guess,
+    guess: Guess | PeriodicModel,
     innovations: bool,
     free_start: bool,
     check: bool,
@@ -338,11 +337,13 @@ def _fit_to_series(
     drift = sum(round(float((part.drift**2).sum())) for part in parts)
     numbers = int(records.sampled.sum()) - drift
     problem = SeriesProblem(parts, np.tile(np.eye(ny), (N, 1, 1)), innovations, free_start, numbers)
-    if not isinstance(guess, LDTP):
-        model = subspace_model(records, given_dims(guess, N, "guess") or [], innovations, direct)
-    else:
+    if isinstance(guess, PeriodicModel):
+        model = guess
+    elif isinstance(guess, LDTP):
         require_same("guess and data", guess, records)
         model = PeriodicModel.of(guess, scale, ny if innovations else 0)
+    else:
+        model = subspace_model(records, given_dims(guess, N, "guess") or [], innovations, direct)
     unknowns = local_coordinates(model, direct).size
     starts = sum(model.dims[n] for n in first) if free_start else 0
     freedom = numbers - unknowns - starts
@@ -449,9 +450,8 @@ def _finished(
         size = problem.weight * problem.target
         correlation = weights.neighbor_correlation(problem.errors(model), size, np.asarray(data.f))
     else:
-        noise = prediction.noise_model(
-            model, cast(SeriesProblem, point.problem).S, scale, data.outputs
-        )
+        S = cast(SeriesProblem, point.problem).S
+        noise = prediction.noise_model(model, S, scale, data.outputs)
     c, slopes = characteristic_slopes(point.coordinates)
     spread = point.equations.spread(unit)
     return LDTPFit(
