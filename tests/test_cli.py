@@ -85,6 +85,7 @@ WRONG = {
         "--crossing y:up": "'y:up' is not a signal, a direction and a value",
         "--crossing y:rising:nan": "'y:rising:nan' is not a signal, a direction and a value",
     },
+    "identify x.csv --out x --input u": {"--phase y,v": "name --outputs, or choose --timing"},
     "": {"": "required: COMMAND", "fly": "invalid choice: 'fly'"},
 }
 

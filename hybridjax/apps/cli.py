@@ -147,7 +147,8 @@ def _add_identify(commands) -> None:
     add("--input", required=True, type=_names, metavar="NAMES", help="measured perturbations")
     add("--reference", type=_names, default=(), metavar="NAMES", help="signals that act from "
         "outside on a loop, if a controller makes the inputs")  # fmt: skip
-    add("--outputs", default=(), type=_names, metavar="NAMES", help="measured outputs, if any")
+    add("--outputs", default=(), type=_names, metavar="NAMES", help="measured outputs; by default "
+        "the durations between the events of --event")  # fmt: skip
     phase = identify.add_mutually_exclusive_group(required=True)
     phase.add_argument("--phase", type=_two_names, metavar="X,V",
         help="two signals whose angle about the center is the phase")  # fmt: skip
@@ -217,6 +218,8 @@ def _identify(options) -> int:
         options.parser.error("--center and --scale are of the angle of --phase, which is not given")
     if bool(options.files) == bool(options.table):
         options.parser.error("give either files of one subject or --table TABLE.csv")
+    if not (options.outputs or options.event or options.timing):
+        options.parser.error("name --outputs, or choose --timing, which makes times an output")
     _begin(cache=False)
     if options.table:
         from .subjects import run as run_table
