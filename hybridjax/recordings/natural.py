@@ -55,7 +55,8 @@ class NaturalMultipliers(eqx.Module):
     - `strength`: fraction of the states' variance that the instruments explain.
     - `cycles`: number of used cycles, which are followed by another one, in so many `records`.
       `block`: cycles of a block; those of a record, where whole records are drawn.
-    - `doubt`: a sentence if one multiplier more changes the largest modulus, else "".
+    - `doubt`: a sentence if one multiplier more changes the largest modulus, as one for slow drift
+      of the outputs does; else "".
     """
 
     multipliers: Complex[np.ndarray, " d"]
@@ -125,7 +126,7 @@ def natural_multipliers(
     - `data`: result of `section_data(..., inputs=())`; the average cycle of each trial is
       subtracted.
     - `order`: the number of multipliers. Directions of smaller variance act as disturbances. If
-      one multiplier more contradicts the largest modulus, `doubt` reports both. Default: 1.
+      one multiplier more contradicts the largest modulus, `doubt` says so. Default: 1.
     - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
       (Künsch 1989), within each record; whole records where these are short.
 
@@ -138,7 +139,8 @@ def natural_multipliers(
         return result
     pair = [(abs(x.multipliers[0]), x.interval()[0]) for x in (result, larger)]
     agree = any(low <= z <= high for (z, _), (_, (low, high)) in (pair, pair[::-1]))
-    text = f"{order + 1} multipliers give {pair[1][0]:.3f} for the largest modulus: raise `order`."
+    text = f"{order + 1} multipliers give {pair[1][0]:.3f} for the largest modulus: raise `order`"
+    text += ", or, if outputs drift, take them `without_drift`."
     return result if agree else dataclasses.replace(result, doubt=text)
 
 

@@ -9,7 +9,7 @@ from hybridjax.recordings.inspection.inspect import feedback
 N = 8
 
 
-def variable(noise, strides=(300, 300), multiplier=0.6, seed=0):
+def variable(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
     """A linear rhythm with one multiplier, disturbed at every section, seen by three signals."""
     rng, gains = np.random.default_rng(seed), np.random.default_rng(5).normal(size=(N, 3))
     trials = []
@@ -19,7 +19,8 @@ def variable(noise, strides=(300, 300), multiplier=0.6, seed=0):
             y.append(gains[n % N] * np.real(x))
             x = multiplier ** (1 / N) * x + rng.normal()
         y = np.array(y)
-        y += noise * y.std(axis=0) * rng.normal(size=y.shape)
+        slow = drift * np.sin(np.arange(len(y))[:, None] / 800)
+        y += y.std(axis=0) * (noise * rng.normal(size=y.shape) + slow)
         signals = {f"y{i}": column for i, column in enumerate(y.T)}
         t, events = np.arange(len(y)) / N, {"e": np.arange(count)}
         trials.append(hj.Recording(t, signals, events=events, name=f"{len(trials)}"))
@@ -38,6 +39,8 @@ def test_instruments_have_no_bias_by_noise():
     single, both = (hj.recordings.natural_multipliers(pair, order) for order in (1, 2))
     assert "Order: 2 multipliers give 0.5" in repr(single)
     assert not any(f.doubt for f in (*found, both))
+    drifting = [hj.recordings.natural_multipliers(variable(0.1, seed=k, drift=1)) for k in range(3)]
+    assert all("if outputs drift" in f.doubt for f in drifting)
 
 
 def test_short_records_are_drawn_whole():
