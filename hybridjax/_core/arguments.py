@@ -129,8 +129,7 @@ def package(name: str) -> ModuleType:
     except ImportError as error:
         name = name.split(".")[0]
         extra = _EXTRAS.get(name, name)
-        text = f"this needs the package {name}: `pip install 'hybridjax[{extra}]'`."
-        raise DefinitionError(text) from error
+        raise DefinitionError(f"this needs {name}: `pip install 'hybridjax[{extra}]'`.") from error
 
 
 # The extra of a library that is not called like it.

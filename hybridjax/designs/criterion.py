@@ -128,14 +128,13 @@ def _root(matrix: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]) -> Float[
     size = np.sqrt(np.diag(matrix))
     lost = np.flatnonzero(~(size > 0))
     if len(lost):
-        text = f"no response depends on {unknowns[lost[0]]}: leave it out, or add an output."
-        raise DefinitionError(text)
+        raise DefinitionError(f"no response depends on {unknowns[lost[0]]}: add an output.")
     values, vectors = np.linalg.eigh(matrix / size / size[:, None])
     if not values[0] > ROUNDING:  # relative to the largest, for combinations of matrices
         direction = vectors[:, 0] / size
         largest = np.abs(direction).max()
         named = zip(direction, unknowns, strict=True)
         parts = [f"{x:+.2g} {name}" for x, name in named if abs(x) > 1e-3 * largest]
-        text = "do not change with this combination of unknowns: fix one, or add an output"
-        raise DefinitionError(f"the responses {text}: {' '.join(parts)}.")
+        combination = " ".join(parts)
+        raise DefinitionError(f"no response depends on {combination}: fix one, or add an output.")
     return vectors / np.sqrt(values) / size[:, None]

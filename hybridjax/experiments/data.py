@@ -108,8 +108,7 @@ class ExperimentData(eqx.Module):
         self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
         (S, n, ny), N = self.y.shape, self.n_sections
         if n % N:
-            text = f"a whole number of periods of N = {N} sections, not {n} samples"
-            raise DefinitionError(f"records must hold {text}.")
+            raise DefinitionError(f"records must hold whole periods of N = {N} samples, not {n}.")
         self.windows()
         for name in ("result", "failed_at", "error"):
             require_axes(f"`{name}`", getattr(self, name), {"experiments": S})

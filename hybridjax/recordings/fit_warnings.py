@@ -139,10 +139,8 @@ def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:
     cycles = max(len(r.u) for r in data.records) / data.n_sections
     for z in fit.multipliers:
         if z.imag >= 0 and abs(z) > max(_DAMPED, _DECAYED ** (1 / cycles)):
-            text = (
-                f"the mode of the multiplier {z:.3g} hardly decays in {cycles:.0f} cycles, as hum "
-            )
-            text += "or drift, which spoil the others: look for them in the spectra of outputs."
+            text = f"the mode of the multiplier {z:.3g} hardly decays in {cycles:.0f} cycles, as "
+            text += "hum or drift, which spoil the others: look for them in the spectra of outputs."
             yield Finding("no decay", text)
 
 

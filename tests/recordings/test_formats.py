@@ -86,7 +86,7 @@ def test_matlab(tmp_path, write):
     np.testing.assert_array_equal(samples(found, "pair.1")[1], 2 * X)
     np.testing.assert_array_equal(found.trials[0].events["strike"], [0.05, 0.1])
     write(tmp_path / "y.mat", {"time": SLOW, "x": X, "f": F})
-    refused("'f' has the shape .*190.*, but 20 times", tmp_path / "y.mat")
+    refused("'f' has the shape .*190.*, but its group 20 times", tmp_path / "y.mat")
     refused("no times 't' for '[ftx]", tmp_path / "y.mat", time="t", kind=hj.DefinitionError)
     only = hj.read_recording(tmp_path / "x.mat", signals="pair", units={"pair.0": "m"})
     assert only.signals == ("pair.0", "pair.1") and only.unit("pair.0") == "m"

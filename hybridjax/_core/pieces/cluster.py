@@ -47,8 +47,7 @@ def run_on(client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequen
     except (OSError, RuntimeError, CancelledError) as error:
         if isinstance(error, HybridJaxError) or client.status == "running":
             raise
-        text = "the Dask cluster was lost: make the same call again with a new client."
-        raise ComputationError(text) from error
+        raise ComputationError("the Dask cluster was lost: call again with a new one.") from error
 
 
 def _run(client: Client, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]) -> None:

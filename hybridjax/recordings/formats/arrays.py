@@ -135,10 +135,8 @@ def _columns(path: Path, name: str, leaf: Leaf, out: Columns) -> dict[str, Float
     if values.ndim == 2 and len(values) != len(times):
         values = values.T
     if values.ndim > 2 or len(values) != len(times):
-        text = (
-            f"has the shape {leaf.array.shape}, but {times.size} times: put its own into its group"
-        )
-        raise FileFormatError(f"'{path}': '{name}' {text}, or choose other `signals`.")
+        text = f"has the shape {leaf.array.shape}, but its group {times.size} times"
+        raise FileFormatError(f"'{path}': '{name}' {text}: add its own, or choose `signals`.")
     if values.ndim == 1:
         return {with_unit(name, leaf.unit): values}
     return {with_unit(f"{name}.{k}", leaf.unit): x for k, x in enumerate(values.T)}
