@@ -254,7 +254,7 @@ def _bind(
         lanes = side_by_side(go(carry, toward(times, -1, times))[1][0])
     orbit = Orbit(period, lanes.t, lanes.chart, lanes.q.T)
     bound = to_host(_bind_program(map, family, orbit)) if on_host(period) else family.bind(s, orbit)
-    late = xp.ceil((t - bound.time[0]) / period - TOGETHER)
+    late = xp.ceil((t - bound.time[0]) / period)
     late = xp.where(xp.isfinite(bound.time[0]), stop_gradient(late), 0.0)
     return dataclasses.replace(bound, time=bound.time + late * period)
 

@@ -43,10 +43,17 @@ def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
 
 
 def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
-    data = run(1e-3 * DESIGN.inputs(6), discard=0)
-    model = hj.linearize(placed.cycle, placed, ("x", "v"))
-    exact = np.stack([model.simulate(u) for u in data.u])
-    np.testing.assert_allclose(data.y, exact, rtol=0, atol=1e-3 * np.abs(exact).max())
+    """Also those that a controller adds."""
+    model, r = hj.linearize(placed.cycle, placed, ("x", "v")), 1e-3 * DESIGN.inputs(6)
+    sizes, rng = ((4, 1, 1), (4, 1, 2), (4, 1, 1), (4, 1, 2)), np.random.default_rng(0)
+    matrices = [0.3 * rng.normal(size=size) for size in sizes]
+    F = hj.LDTP(*matrices, inputs=model.outputs, outputs=model.inputs)
+    for system, controller in ((model, None), (model.feedback(F), F)):
+        data = run(r, discard=0, feedback=controller)
+        exact = np.stack([system.simulate(x) for x in r])
+        np.testing.assert_allclose(data.y, exact, rtol=0, atol=1e-3 * np.abs(exact).max())
+    u = r - np.stack([F.simulate(x) for x in exact])
+    np.testing.assert_allclose(data.u, np.dstack([u, r]), rtol=0, atol=1e-3 * np.abs(u).max())
 
 
 def test_a_steady_start_that_is_not_there_is_named(run, monkeypatch):

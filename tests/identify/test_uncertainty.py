@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
+from hybridjax.identify.denominator import multipliers_of
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 from hybridjax.identify.variable_projection import error_spectrum, group_htf
 from hybridjax.identify.weights import weights_of
@@ -126,6 +127,7 @@ def test_first_order_covariances_and_regions(pair_and_real):
     """Against the roots of coefficients drawn at random."""
     estimate, rng = pair_and_real
     true, c = estimate.multipliers, estimate.coefficients
+    np.testing.assert_allclose(multipliers_of(c), true, rtol=1e-12)  # in this order
     draws = rng.multivariate_normal(c, estimate.covariance, size=2000)
     roots = np.array([np.roots([1, *draw]) for draw in draws])
     pick = np.argmin(np.abs(roots[:, :, None] - true), axis=1)
@@ -138,12 +140,13 @@ def test_first_order_covariances_and_regions(pair_and_real):
     radius = np.sqrt(np.mean(np.abs(roots - true) ** 2, axis=0))
     np.testing.assert_allclose(estimate.standard_errors, radius, rtol=0.05)
     # The border of the first-order region has the distance of the exact one.
-    for i, degrees in ((0, 2), (2, 1)):
-        border = estimate.ellipse(i, 0.9)
+    for i, degrees, freedom in ((0, 2, 1e9), (2, 1, 1e9), (0, 2, 9), (2, 1, 9)):
+        border = dataclasses.replace(estimate, covariance_freedom=freedom).ellipse(i, 0.9)
         if degrees == 1:
             border = border[[np.argmin(border.real), np.argmax(border.real)]].real
-        distance = estimate.distance(border)
-        np.testing.assert_allclose(distance, stats.chi2.ppf(0.9, degrees), rtol=0.05)
+        left = freedom - degrees + 1  # Hotelling's distribution
+        quantile = degrees * freedom / left * stats.f(degrees, left).ppf(0.9)
+        np.testing.assert_allclose(estimate.distance(border), quantile, rtol=0.05)
     # The share of draws that a region around the truth holds.
     held = [
         MultiplierEstimate(true, draw, estimate.covariance, np.inf).contains(true) for draw in draws

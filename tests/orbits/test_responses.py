@@ -124,6 +124,9 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     np.testing.assert_allclose(amplitude["y"], np.sin(angle), rtol=0, atol=1e-12)
     np.testing.assert_allclose(responses.exponents, [-0.2], rtol=0, atol=1e-12)
     assert "exponent -0.2" in str(responses)
+    fast = hj.find_limit_cycle(StuartLandau(mu=1.0), guess, section=section).responses()
+    amplitude = fast.amplitude(0, PHASES)  # without a part along the flow, which would grow
+    np.testing.assert_allclose(amplitude["x"], np.cos(angle), rtol=0, atol=1e-10)
     # Isochrons are logarithmic spirals: phase = angle + alpha log(r / sqrt(mu)).
     cycle = hj.find_limit_cycle(system, guess, section=section)
     phase = cycle.asymptotic_phase("plane", (0.3, 0.15))
@@ -193,6 +196,8 @@ def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
     np.testing.assert_allclose(np.abs(rates), 2 * np.pi * size * np.sqrt(1.16), rtol=1e-11)
     together, apart = responses.coupling("x").locked(mutual=True)
     np.testing.assert_allclose([*together, *apart], [0, -1, 0.5, 1], rtol=0, atol=1e-12)
+    leads = [x.lead for x in type(pushed)(np.array([0.0, np.exp(0.5002j * np.pi)])).locked()]
+    np.testing.assert_allclose(leads, [0.9999, 0.4999], rtol=1e-9)
     with pytest.raises(hj.DefinitionError, match="`harmonics` = 64 does not resolve jumps"):
         hj.find_limit_cycle(Neuron(grip=0.3)).responses().coupling("v")
 

@@ -41,8 +41,9 @@ def test_a_list_of_sections_of_every_kind(hopper_cycle):
 
 
 def test_a_number_as_the_anchor(hopper_cycle):
-    clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=0.1))
-    np.testing.assert_allclose(clock.lanes.t % 1, [0.1, 0.1 + 1 / 3, 0.1 + 2 / 3], atol=1e-12)
+    first = np.nextafter(hopper_cycle.anchor.t[0], 0.0)  # by rounding before the cycle begins
+    clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=first))
+    np.testing.assert_allclose(clock.lanes.t % 1, (first + np.arange(3) / 3) % 1, atol=1e-12)
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=0.3)
     q = np.asarray(hj.place_sections(hopper_cycle, family).lanes.q)
     angle = np.unwrap(np.angle((q[0] - 1.9) / 0.3 + 1j * q[1] / 1.9))

@@ -1,0 +1,45 @@
+"""Impacts: the truth is from `python benchmarks/chain_truth.py` and `trot_truth.py`."""
+
+import json
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import DATA
+
+
+TRUTH = json.loads((DATA / "bouncing_chain.json").read_text())
+# Of the rates of heave and pitch by height and pitch; the rest is the identity. By what the foot
+# that is first does, the coupling changes its sign.
+LET_GO = [[1.528341, 0.235829], [0.0, 2.5]]
+LAND = [[-2.390006, -0.195003], [0.0, -2.5]]
+
+
+@pytest.mark.parametrize("n", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 5, 10))])
+def test_the_cycle_and_its_multipliers(n):
+    cycle, truth = hj.find_limit_cycle(hj.models.BouncingChain(n=n)), TRUTH[str(n)]
+    np.testing.assert_allclose(list(cycle.state.values()), truth["state"], atol=1e-12)
+    exact = np.array(truth["multipliers"]) @ [1, 1j]
+    apart = np.abs(exact[:, None] - cycle.multipliers)
+    assert apart.min(axis=0).max() < 1e-12
+    assert apart.min(axis=1).max() < 1e-12
+    events = cycle.trajectory().events
+    np.testing.assert_allclose([e.time for e in events], [t for t, _ in truth["impacts"]])
+    assert [e.name for e in events] == [f"impact {i}" for _, i in truth["impacts"]]
+
+
+@pytest.mark.slow
+def test_each_order_of_the_feet_has_its_derivative():
+    cycle = hj.find_limit_cycle(hj.models.TrottingQuadruped(thrust=1.0), throw=False)
+    assert cycle.result == hj.Result.COINCIDENCE
+    found = sorted(hj.coincidences(cycle), key=lambda x: x.time)
+    np.testing.assert_allclose([x.time for x in found], [0.48890534976601, 0.79608769379953])
+    for both, expected in zip(found, (LET_GO, LAND), strict=True):
+        assert not both.commute and len(both.orders) == 2
+        for order, derivative in zip(both.orders, both.derivatives, strict=True):
+            sign = 1 if order[0].startswith("hind") else -1
+            whole = np.eye(4)
+            whole[1::2, ::2] = expected * np.array([[1, sign], [1, 1]])
+            np.testing.assert_allclose(derivative, whole, atol=1e-6)
