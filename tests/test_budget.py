@@ -41,7 +41,7 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 17,
-    "test_lines": 18_113,
+    "test_lines": 18_110,
     "doc_words": 38_897,
 }
 
