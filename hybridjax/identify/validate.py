@@ -175,18 +175,14 @@ def validate(
 
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few
     cycles, all records are too short to be compared or for so many lags, or a plant that is
-    unstable outside of its loop, unless it is a fit of `fit_ldtp`.
+    unstable outside of its loop or grows without bound, unless it is a fit of `fit_ldtp`.
     """
     free_start = start == "free"
     tested = (model.predictor or model.model) if isinstance(model, LDTPFit) else model
+    unstable = not isinstance(tested, Predictor) and (np.abs(model.multipliers) >= 1).any()
     records, drive = uninterrupted_records(data), None
     if reference is not None:
         records, drive = in_loop(data, reference)
-        if not isinstance(tested, Predictor) and (np.abs(model.multipliers) >= 1).any():
-            raise DefinitionError(
-                "the simulation of an unstable plant grows without bound: validate a fit of "
-                "`fit_ldtp` with `reference`, which predicts one step ahead."
-            )
     require_same("model and data", model, records[0])
     kept = [can_be_compared(tested, r, free_start) for r in records]
     compared = list(itertools.compress(records, kept))
@@ -219,7 +215,12 @@ def validate(
     if isinstance(tested, LDTP):  # outputs in units of their size, so that none is neglected
         S = np.tile(np.diag(prepared.scale**2), (N, 1, 1))
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
-    simulated = tested.predict(grid, free_start)
+    with np.errstate(all="ignore"):
+        simulated = tested.predict(grid, free_start)
+    if unstable and (drive or not np.isfinite(simulated[grid.inside]).all()):
+        raise DefinitionError(
+            "the simulation of an unstable plant grows without bound: validate `fit_ldtp(series)`."
+        )
     error = y - simulated
     square = np.nansum(error**2, axis=(0, 1))
     rms = np.sqrt(square.sum(axis=0) / sampled.sum(axis=0))

@@ -249,7 +249,7 @@ def test_bad_records(small, monkeypatch):
         "section 0 was sampled 14 times, too few.* 5 or more cycles": record(small, 56),
         "y1 is constant or missing": with_outputs(good, good.y * [1, np.nan]),
         "y0 is constant or missing": with_outputs(good, good.y * [0, 1] + [2, 0]),
-        "different sections, inputs": [good, hj.Record(good.u, good.y, n_sections=5)],
+        "the same sections, inputs": [good, hj.Record(good.u, good.y, n_sections=5)],
     }
     for message, data in cases.items():
         with pytest.raises(hj.DefinitionError, match=message):
