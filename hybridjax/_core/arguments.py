@@ -49,8 +49,7 @@ def input_and_output_names(
 def require_apart(inputs: Collection[str], outputs: Collection[str]) -> None:
     """**Raises:** `DefinitionError` for an output that is an input."""
     if shared := [name for name in outputs if name in inputs]:
-        text = "take it from one of them, or rename it."
-        raise DefinitionError(f"'{shared[0]}' is in `inputs` and in `outputs`: {text}")
+        raise DefinitionError(f"'{shared[0]}' is in `inputs` and in `outputs`: name it in one.")
 
 
 def require_same(

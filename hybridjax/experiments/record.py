@@ -126,8 +126,8 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     about = [(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records]
     other = [x for x in about if x != about[0]]
     if other:
-        text = "different sections, inputs, outputs, lead or drift"
-        raise DefinitionError(f"`data` holds records of {text}: {about[0]}, {other[0]}.")
+        text = "the same sections, inputs, outputs, lead and drift"
+        raise DefinitionError(f"records of `data` must have {text}, not {about[0]} and {other[0]}.")
     usable = [part for record in records for part in _with_known_inputs(record)]
     if not usable:
         raise DefinitionError("an input is NaN at every sample: give the input that acted.")
