@@ -33,7 +33,7 @@ class Result(enum.IntEnum):
     EXTRA_TURNS = 12, "the cycle closes sooner, or meets its section more often, than asked"
     COINCIDENCE = 13, "two events coincide on the cycle: their order is not fixed beside it"
     STEP_COLLAPSE = 14, "steps shrank to nothing: a field may jump only where a transition does"
-    FIELD_NOT_FINITE = 15, "NaN or infinity in a field, guard or reset: 1/0, or a singular matrix?"
+    FIELD_NOT_FINITE = 15, "NaN or infinity in a field, guard or reset: 1/0 or a singular matrix"
     GUARD_PASSED = 16, "a reset put the state on a guard: what comes to rest there needs a chart"
     PULSE_PASSED = 17, "steps pass over a pulse: begin and end it by transitions (`hj.Scheduled`)"
     PLANT_STOPPED = 18, "the plant ended the experiment: see `data.simulated.causes`"

@@ -139,8 +139,8 @@ class OptimalDesign(eqx.Module):
         rows += [(f"rms of {n}", f"{x:.3g}", f"{self.rms[n]:.3g}") for n, x in rms]
         bounded = any(n.startswith("distortion of ") for n in self.rms)
         certificate = (
-            f"certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
-            f"{'(of distortion: an upper bound) ' * bounded}"
+            f"certificate {self.certificate:.3f} (1 at the optimum):\n  "
+            f"no design within the limits {'(of distortion: an upper bound) ' * bounded}"
             f"needs less than {1 / self.certificate:.1%} of these strides"
         )
         below = "\n".join(["", self.advice, certificate, repr(self.design)]).replace("\n", "\n  ")

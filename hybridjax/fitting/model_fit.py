@@ -214,7 +214,7 @@ class ModelFit(eqx.Module):
     def __repr__(self) -> str:
         width = max(map(len, self.names))
         lines = [f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"]
-        lines.append(f"  {self._cost()}; standard errors include noise, but no distortion:")
+        lines.append(f"  {self._cost()}\n  standard errors include noise, but no distortion:")
         for name, value, error, unit in self._rows():
             lines.append(f"  {name:{width}}  {value:<14} {error} {unit}".rstrip())
         lines += [f"  not seen: {text}" for text in self.identifiability.descriptions()]
@@ -224,9 +224,8 @@ class ModelFit(eqx.Module):
         misfit = f"residuals {100 * np.sqrt(np.mean(self.residuals**2)):.2g} % of the data"
         expected = f"expected {self.freedom}" if self.weighted else misfit
         good = sum(guess.result == Result.OK for guess in self.guesses)
-        steps = sum(guess.steps for guess in self.guesses)
         head = f"cost {self.cost:.6g}, {expected}; {good} of {len(self.guesses)} guesses converged"
-        return f"{head}, {steps} evaluations"
+        return f"{head}, {sum(guess.steps for guess in self.guesses)} evaluations"
 
     def _rows(self) -> Iterator[tuple[str, str, str, str]]:
         """Yield each name with its value, standard error and unit."""

@@ -373,7 +373,8 @@ def _about_guards(s: Structure, turn: Turn, expected: float) -> str:
                 values.setdefault(g, []).extend(s.transitions[g].sign * row)
     text = "; ".join(
         f"the guard of '{s.transitions[g].name}', which should be {s.transitions[g].direction}, "
-        f"began at {x[0]:.3g} and stayed between {min(x):.3g} and {max(x):.3g}"
+        f"began {'past zero, ' * bool(s.transitions[g].sign * x[0] < 0)}at {x[0]:.3g} and stayed "
+        f"between {min(x):.3g} and {max(x):.3g}"
         for g, x in values.items()
     )
     advice = "Check its direction, and that the system does not come to rest."

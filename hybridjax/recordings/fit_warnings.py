@@ -96,7 +96,7 @@ def advise(
     try:
         refuse_order(delayed, fit.noise / problem.scale)
     except DefinitionError:
-        text = f"the data do not carry {d} multipliers: the weakest, and its region, may be noise."
+        text = f"the data do not carry {d} multipliers: some may be noise. Compare lower orders."
         warnings.append(Finding("order", text))
     if fit.doubt:
         warnings.append(Finding("drift" if fit.doubt == MAY_DRIFT else "order", f"{fit.doubt}."))
@@ -117,7 +117,7 @@ def advise(
     p = np.ones(1) if validation is None else validation.independence
     if validation and not validation.independent and validation.fit[p.argmin()] < 99:
         text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}), more "
-        text += "than by errors of the fit, as by responses that are not linear: push less."
+        text += "than by errors of the fit: raise `order`, sample faster, or push less."
         warnings.append(Finding("left over", text))
     if data.missing > _FEW:
         warnings.append(Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing."))

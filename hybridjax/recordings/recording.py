@@ -90,14 +90,12 @@ class Recording(eqx.Module):
                 raise DefinitionError(f"{where}: {text}; put NaN where a sample is bad.")
         if len(time) < 2:
             raise DefinitionError(f"{where} has {len(time)} samples, but two or more are needed.")
-        if not (np.diff(time) > 0).all() or np.isinf(time).any():
-            bad = 1 + int(np.argmin(np.diff(np.where(np.isinf(time), np.nan, time)) > 0))
-            text = (
-                f"({time[bad - 1]:.10g}, then {time[bad]:.10g}): sort, or make a trial of each part"
-            )
-            raise DefinitionError(
-                f"{where}: time repeats or runs backwards at sample {bad} {text}."
-            )
+        if not (later := np.diff(np.where(np.isinf(time), np.nan, time)) > 0).all():
+            bad = 1 + int(np.argmin(later))
+            a, b = time[bad - 1 : bad + 1]
+            advice = "sort, or make a trial of each part" if b < a else "leave out such samples"
+            text = f"time does not increase at sample {bad} ({a:.10g}, then {b:.10g})"
+            raise DefinitionError(f"{where}: {text}: {advice}.")
         require_among("signal", units, columns, f"{where}, `units`: ")
         if both := set(happened) & set(columns):
             raise DefinitionError(f"{where}: '{min(both)}' is a signal and an event: rename one.")

@@ -348,7 +348,9 @@ class Structure:
         """Transition g's guard, signed so that it falls through zero at the event."""
         tr = self.transition(g)
         assert not isinstance(tr.guard, Scheduled)
-        return tr.sign * jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)), float)
+        if (value := jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)))).dtype == bool:
+            raise DefinitionError(f"the guard of '{tr.name}' must be `a - b`, not `a > b`.")
+        return tr.sign * jnp.asarray(value, float)
 
     def guard_values(self, kinds: Sequence[Kind], t: Array, q: Array, u: Array) -> list[jax.Array]:
         """All guards of some kinds, in parts: a vector for each kind, or numbers if each guard is

@@ -90,12 +90,7 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
 @pytest.mark.parametrize(
     "system, guess, message",
     [
-        pytest.param(
-            WRONG_WAY,
-            (0.2, 0.5),
-            "No event happened: the guard of 'impact', which should be risin",
-            marks=pytest.mark.slow,
-        ),
+        (WRONG_WAY, (0.2, 0.5), "'impact', which should be rising, began past zero, at"),
         (DAMPED, (0.0, 0.0), r'is stiff: a mode decays .*solver="auto".*max_steps'),
     ],
 )

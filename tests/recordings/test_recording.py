@@ -14,9 +14,9 @@ GOOD = {"a": T, "b": 2 * T}
 @pytest.mark.parametrize(
     ("time", "signals", "options", "message"),
     [
-        ([0, 1, 1, 2, 3], GOOD, {}, "time repeats or .* at sample 2 .1, then 1"),
-        ([0, 1, 0.5, 2, 3], GOOD, {}, "runs backwards at sample 2 .1, then 0.5"),
-        ([0, 1, np.nan, 2, 3], GOOD, {}, "backwards at sample 2 .1, then nan"),
+        ([0, 1, 1, 2, 3], GOOD, {}, "time does .* at sample 2 .1, then 1.: leave out"),
+        ([0, 1, 0.5, 2, 3], GOOD, {}, "increase at sample 2 .1, then 0.5.: sort"),
+        ([0, 1, np.nan, 2, 3], GOOD, {}, "sample 2 .1, then nan.: leave out such"),
         (T, {"a": T[1:]}, {}, "a and time have different lengths: 4 and 5"),
         (T, {"a": [0, 1, np.inf, 0, 0]}, {}, "a is infinite at sample 2"),
         (T, {"a": list("abcde")}, {}, "a must be real numbers"),

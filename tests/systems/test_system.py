@@ -67,6 +67,7 @@ class Early(hj.models.VerticalHopper):
         (replaced(source="c"), "there is no chart 'c'; charts are a, b"),
         (replaced(reset=lambda t, q, u: q), r"reset of transition 'go' \(a -> b\) returns shape"),
         (replaced(guard=lambda t, q, u: q), r"guard of transition 'go' \(a -> b\) returns shape"),
+        (replaced(guard=lambda t, q, u: q[0] > 0), "guard of 'go' must be `a - b`, not `a > b`"),
         (replaced(enabled=lambda t, q, u: q > 0), r"`enabled` of transition 'go' .* returns shape"),
         (moved(lambda t, q, u: (q[1], -q[2])), "field of chart 'a' cannot .* index 2 is out of"),
         (toy(ROOM, (TO_B, TO_B)), "transitions of the same name: 'go', 'go'"),
