@@ -40,7 +40,8 @@ def write_design(
     **Arguments:** `cycles`: cycles of each experiment. Default: its periods P. `period`: period of
     the cycle in seconds. `rate`: samples per second.
 
-    **Raises:** `DefinitionError` for a period without a rate, and a file that cannot be written.
+    **Raises:** `DefinitionError` for a period without a rate, a rate with less than one sample for
+    each section, and a file that cannot be written.
     """
     if (period is None) != (rate is None):
         raise DefinitionError("a table against time needs both the period and the rate.")
@@ -50,6 +51,8 @@ def write_design(
     if period is None or rate is None:
         header, k = _BY_PHASE, np.arange(n)
         place = np.stack([k // N, k % N, (k % N) / N], axis=1)
+    elif period * rate < N:
+        raise DefinitionError(f"`rate` must be {N / period:g} or more: a sample for each section.")
     else:
         header = ("experiment", "time")
         time = np.arange(np.ceil(n / N * period * rate - 1e-6)) / rate
@@ -83,8 +86,7 @@ def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording
     count = np.unique(experiment, return_counts=True)[1]
     if (count != count[0]).any() or (np.diff(experiment) < 0).any():
         raise FileFormatError(f"'{path}' must have experiments of one length, in order.")
-    numbers = len(recording.trials), len(count)
-    require_equal("recording and table", "numbers of trials", *numbers)
+    require_equal("recording and table", "numbers of trials", len(recording.trials), len(count))
     names = [k for k in columns if k not in _BY_PHASE]
     command = np.stack([columns[k].reshape(len(count), -1) for k in names], axis=2)
     command = np.pad(command, ((0, 0), (1, 1), (0, 0)))  # zero before and after the experiment

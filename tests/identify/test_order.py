@@ -37,7 +37,6 @@ def test_the_level_of_the_rank_test(small, variance, few, runs):
             refused += "the data support 2 multipliers, not 3" in str(error)
     assert hj.select_order(data, 4).by_rank == 2
     assert covered(refused, runs, 0.98)
-    hj.fit_multipliers(data, 3, check=False)
 
 
 def test_exact_htfs_have_no_more_multipliers(small):

@@ -127,8 +127,9 @@ def test_designs_as_tables(tmp_path, wave):
     for period, rows in ((0.2901, 465), (0.29, 16 * 29)):  # (0.29 * 100 is 28.999...)
         hj.recordings.write_design(tmp_path / "time.csv", design, period=period, rate=100)
         assert (tmp_path / "time.csv").read_text().count("\n") - 1 == design.experiments * rows
-    with pytest.raises(hj.DefinitionError, match="both the period and the rate"):
-        hj.recordings.write_design(tmp_path / "time.csv", design, period=0.5)
+    for rate, message in ((None, "both the period and the rate"), (15.9, "must be 16 or more")):
+        with pytest.raises(hj.DefinitionError, match=message):
+            hj.recordings.write_design(tmp_path / "time.csv", design, period=0.5, rate=rate)
     # Applied at the phases of the recording, and found again in its section data.
     phase = hj.recordings.estimate_phase(wave, CIRCLE)
     with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):

@@ -91,8 +91,7 @@ class Design(eqx.Module):
             if np.isscalar(values):
                 return np.full(sum(sizes), values, dtype)
             if [np.size(v) for v in values] != sizes:
-                text = "one number, or as many as `frequencies` in each experiment"
-                raise DefinitionError(f"`{name}` must be {text}.")
+                raise DefinitionError(f"`{name}` must be one number, or as many as `frequencies`.")
             return np.concatenate([[], *map(np.ravel, values)]).astype(dtype)
 
         cosines = [
