@@ -10,7 +10,8 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
-from hybridjax.recordings.impulse import ImpulseResponses
+from hybridjax.recordings.data import SectionData
+from hybridjax.recordings.impulse import ImpulseResponses, impulse_responses
 from hybridjax.recordings.sampling import without_drift
 
 from .conftest import MULTIPLIER
@@ -236,3 +237,14 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
     m, r = np.arange(N)[:, None], np.arange(1, 7)
     expected = b[m] * a ** (r - 1) * c[(m + r) % N] / (2.0 / N)
     np.testing.assert_allclose(found.of_model(model)[:, 1:, 0, 0], expected, rtol=1e-13)
+    # Their standard errors are the scatter of fits.
+    apart, rng, about = [], np.random.default_rng(0), dict(inputs=("f",), outputs=("x",))
+    for _ in range(60):
+        u = rng.normal(size=(240, 1))
+        y = np.asarray(model.simulate(u)) + 20 * rng.normal(size=(240, 1))
+        record, cycle = hj.Record(u, y, n_sections=N, **about), np.zeros((N, 1))
+        data = SectionData((record,), (np.arange(240) / 2,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))
+        found = impulse_responses(hj.fit_series(record, 1, check=False), data, 4, width=0.0)
+        apart.append((found.values - found.of_model(model)) / found.errors)
+    size = np.sqrt(np.mean(np.array(apart)[:, :, [[1, 2, 3, 4], [13, 14, 15, 16]]] ** 2, (0, 1, 3)))
+    np.testing.assert_allclose(size, 1, atol=0.06)
