@@ -216,7 +216,7 @@ class ModelFit(eqx.Module):
         lines = [f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"]
         lines.append(f"  {self._cost()}\n  standard errors include noise, but no distortion:")
         for name, value, error, unit in self._rows():
-            lines.append(f"  {name:{width}}  {value:<14} {error} {unit}".rstrip())
+            lines.append(f"  {name:{width}}  {value:<14} {error} {unit * ('±' in error)}".rstrip())
         lines += [f"  not seen: {text}" for text in self.identifiability.descriptions()]
         return "\n".join(lines)
 

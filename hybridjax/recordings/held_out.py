@@ -57,8 +57,8 @@ class Split(NamedTuple):
                 missing = error.missing + d
             if missing:
                 obstacle = f"{self.early.sampled.max()} cycles (a quarter is held out) are too few "
-                obstacle += f"for order {d} with {N} sections: record {4 * missing / 3:.0f} more, "
-                obstacle += "or take fewer sections."
+                obstacle += f"for order {d} with {N} sections: record {4 * missing / 3:.0f} more"
+                obstacle += ", or take fewer sections." if N > 1 else "."
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]

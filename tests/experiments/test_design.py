@@ -72,14 +72,15 @@ def test_the_numbers_of_the_paper():
     paper, smallest = hj.paper_design(), hj.multisine()
     both = hj.multisine(lines="two-phase")
     assert len(paper.frequencies) == len(smallest.frequencies) == 620
-    assert (paper.experiments, smallest.experiments) == (80, 20)
+    assert (paper.experiments, smallest.experiments, paper.cycles()) == (80, 20, 80 * 84)
     assert set(np.bincount(paper.experiment)) == {7, 8}
     assert set(np.bincount(smallest.experiment)) == {31}
     assert (len(both.frequencies), both.experiments) == (641, 21)
-    assert paper.cycles() == 80 * 84
     assert "80 experiments of 64 periods" in repr(paper) and "620, 0.01562" in repr(paper)
     with pytest.raises(hj.DefinitionError, match="must be 20 to 620"):
         hj.multisine(experiments=19)
+    with pytest.raises(hj.DefinitionError, match="take `periods` that 3 does not divide"):
+        hj.multisine(periods=12, band=(0, 2.0), lines="all", experiments=9, division="sum-free")
 
 
 def test_signals_are_sums_of_cosines():
@@ -118,8 +119,7 @@ def test_designs_that_break_a_rule_name_what_breaks_it(message):
 
 
 def test_half_integers_by_hand():
-    phases = [[0.0], [1.0]]
-    design = hj.Design.from_lines([[1.5], [1.5]], 0.1, phases, n_sections=8, periods=8)
+    design = hj.Design.from_lines([[1.5], [1.5]], 0.1, [[0.0], [1.0]], n_sections=8, periods=8)
     assert design.experiments == 2
     hj.Design.from_lines([[0.0, 0.5], [4.0, 0.5]], 0.1, [[0, 0], [0, 1]], n_sections=8, periods=8)
     with pytest.raises(hj.DefinitionError, match="f = 0 is zero at every section"):

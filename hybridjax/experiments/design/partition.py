@@ -130,8 +130,8 @@ def avoid_second_order(
             if hits_f and f not in bad:
                 bad.append(f)
     if any(hits):
-        text = f"{len(members)} experiments: take more, or division='random'"
-        raise DefinitionError(f"no division keeps second-order products off the lines of {text}.")
+        more = "`periods` that 3 does not divide" if periods / 3 in classes else "more experiments"
+        raise DefinitionError(f"second-order products remain: take {more}, or division='random'.")
     out = np.empty_like(experiment)
     for e, m in enumerate(members):
         out[m] = e

@@ -138,8 +138,8 @@ class OutputErrorProblem(NamedTuple):
         free = order + -(-overhang // N) if free_start else 0
         if lags > records.cycles * N:
             raise DefinitionError(
-                f"numerators of {lags} lags reach beyond the longest record, of "
-                f"{records.cycles * N} samples: take fewer sections, or lower `order`."
+                f"{lags} lags reach beyond the longest record, of {records.cycles * N} samples: "
+                "record longer, take fewer sections, or lower `order`."
             )
 
         def triangle(n: int):

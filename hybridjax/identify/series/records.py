@@ -105,7 +105,7 @@ class PreparedRecords:
         for name, acts in zip(self.inputs + self.outputs, varies, strict=True):
             if not acts:
                 what = "constant" if name in self.outputs else "zero"
-                raise DefinitionError(f"{name} is {what} or missing at every sample: leave it out.")
+                raise DefinitionError(f"{name} is {what} or missing: leave it out, or record more.")
         require_deviations(self.records)
         self.scale = np.sqrt(np.nansum(y**2, axis=0) / self.sampled.sum(axis=0))
 
