@@ -104,9 +104,8 @@ figure = hj.plot.section_data(data)
 #
 # The order with the best prediction of held-out strides is chosen. Then a model is fitted to the
 # first three quarters and simulated on the last. Its residuals are correlated in time, because the
-# splines smooth over neighboring sections. They are correlated with the input, because the
-# numerators are estimates (98 at each section, from 360 strides) and the hopper is not exactly
-# linear.
+# splines smooth over neighboring sections. The test for a correlation with the input allows for
+# errors of the numerators (98 at each section, estimated from 360 strides).
 
 # %%
 print("order:", hj.recordings.choose_order(data))
