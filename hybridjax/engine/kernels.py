@@ -220,8 +220,8 @@ class Tangents(Structure):
     def __init__(self, s: Structure, along: Structure, levels, by_levels, directions: int):
         super().__init__(s.source)
         self.directions, self._levels, self._plain = directions, levels, s
-        self._along, self.nu = (along, by_levels), s.nu
-        leaves = map(np.asarray, jax.tree_util.tree_leaves(self._along))
+        self._along, self.nu = from_host((along, by_levels)), s.nu
+        leaves = map(np.asarray, jax.tree_util.tree_leaves((along, by_levels)))
         self.moving = sum(x.reshape(directions, -1).any(axis=1) for x in leaves) > 0
 
     def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:

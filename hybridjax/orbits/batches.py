@@ -240,7 +240,8 @@ class Tiles(NamedTuple):
         same = anchor.chart[near] == anchor.chart[first][:, None]
         apart = _powers(parameters[near] - parameters[first][:, None]) * same
         change = (values[near] - values[first][:, None]) * same
-        slope = np.linalg.pinv(apart, rcond=ROUNDING) @ change
+        gram, moment = (np.swapaxes(apart, 1, 2) @ x for x in (apart, change))
+        slope = np.linalg.pinv(gram, rcond=ROUNDING, hermitian=True) @ moment
         guess = values[first] + (_powers(wanted - parameters[first])[:, None] @ slope)[:, 0]
         d = anchor.q.shape[1]
         anchor = _pick(anchor, first)._replace(q=guess[:, :d, None])

@@ -125,9 +125,9 @@ def together(
     times at which the turns begin, minus infinity for one that begins with no event.
     """
     out = np.zeros(len(codes), bool)
-    row, column = np.nonzero(codes >= 0)
-    t, first = times[row, column], np.diff(row, prepend=-1) > 0
-    before = np.where(first, begin[row], np.roll(t, 1))
+    event = np.flatnonzero(codes >= 0)
+    row, t = event // codes.shape[1], times.ravel()[event]
+    before = np.where(np.diff(row, prepend=-1) > 0, begin[row], np.roll(t, 1))
     out[row[t - before <= TOGETHER * period[row]]] = True
     return out
 

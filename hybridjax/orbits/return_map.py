@@ -138,12 +138,12 @@ class ReturnMap(eqx.Module):
         assert self.settings.scale is not None
         return self.settings.scale
 
-    @property
+    @remembered
     def sizes(self) -> Float[Array, " d"]:
         """Sizes of the states of the anchor's chart."""
         return self.each(self.scale[self.anchor.chart])
 
-    @property
+    @remembered
     def valid(self) -> Bool[Array, " d"]:
         """The entries of the padded state that the anchor's chart has."""
         chart = self.each(self.anchor.chart)

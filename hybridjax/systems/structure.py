@@ -416,9 +416,8 @@ class Structure:
 
     def resolve_outputs(self, outputs: Sequence[str | Output] | str | Output) -> "Outputs":
         """Outputs by name or by `Output`, checked and ready to evaluate in any chart."""
-        if isinstance(outputs, str | Output):
-            outputs = (outputs,)
-        return Outputs(self, tuple(outputs))
+        outputs = (outputs,) if isinstance(outputs, str | Output) else tuple(outputs)
+        return self.once((Outputs, len(outputs)), outputs, lambda: Outputs(self, outputs))
 
 
 class Outputs:
