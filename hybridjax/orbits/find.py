@@ -12,6 +12,7 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
+from .._core.compilation import uncollected
 from .._core.executor import is_traced, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
@@ -45,6 +46,7 @@ _ENOUGH = 4096
 
 @checked
 @working("find_limit_cycle")
+@uncollected()
 def find_limit_cycle(
     system: HybridSystem,
     guess: Guess | LimitCycle | None = None,
@@ -177,11 +179,8 @@ def find_limit_cycle(
     failure = None
     if solution.is_fixed_point and checks.closes_early(cycle):
         failure = Result.EXTRA_TURNS
-    elif solution.is_fixed_point and coincident(map, solution.turn):
-        if commutes(cycle):
-            say("events coincide, and commute")
-        else:
-            failure = Result.COINCIDENCE
+    elif solution.is_fixed_point and coincident(map, solution.turn) and not commutes(cycle):
+        failure = Result.COINCIDENCE
     if failure is not None:
         cycle = dataclasses.replace(cycle, result=jax.device_put(np.int32(failure)))
     keep_turn(cycle, solution.turn)
