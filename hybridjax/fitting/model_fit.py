@@ -80,7 +80,7 @@ class Identifiability(eqx.Module):
 def diagnose(names: tuple[str, ...], sensitivity: Float[np.ndarray, "r p"]) -> Identifiability:
     """Return the identifiability from the sensitivities S of weighted residuals to relative changes
     of the parameters."""
-    _, values, rows = np.linalg.svd(sensitivity, full_matrices=True)
+    _, values, rows = np.linalg.svd(np.linalg.qr(sensitivity, mode="r"))
     values = np.concatenate([values, np.zeros(len(names) - len(values))])
     rank = int(np.sum(values > _RANK * values[0]))
     return Identifiability(names, rank, values, _readable(rows[rank:]), sensitivity)
