@@ -168,22 +168,12 @@ def fit_multipliers(
     if check:
         require_order(groups, htf, order, cost / freedom, residual)
 
+    correlation = neighbor_correlation(misfit / scale, H / scale, f)
+    result = Result.OK if converged else Result.NOT_CONVERGED
     fit = StructuredFit(
-        multipliers=multipliers_of(c),
-        coefficients=c,
-        covariance=covariance.matrix,
-        covariance_freedom=covariance.freedom,
-        residual=residual,
-        correlation=neighbor_correlation(misfit / scale, H / scale, f),
-        numerators=B,
-        cost=cost,
-        freedom=freedom,
-        result=Result.OK if converged else Result.NOT_CONVERGED,
-        harmonics=htf.harmonics,
-        n_sections=htf.n_sections,
-        inputs=htf.inputs,
-        outputs=htf.outputs,
-    )
+        multipliers_of(c), c, *covariance, residual, correlation, B, cost, freedom, result,
+        htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
+    )  # fmt: skip
 
     def of_order(order: int) -> RoughFit:
         # No larger numerators, if possible: without zero multipliers they are large enough.

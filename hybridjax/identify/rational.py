@@ -172,18 +172,9 @@ def fit_rational(
     roots = np.stack([_roots(a) for a in denominator])
     with np.errstate(over="ignore", invalid="ignore"):  # a useless pole far outside overflows
         multipliers = roots**htf.n_sections
-    return RationalFit(
-        numerator=numerator,
-        denominator=denominator,
-        poles=roots,
-        zeros=np.stack([_roots(b) for b in numerator]),
-        multipliers=multipliers,
-        residual=residual,
-        result=result,
-        n_sections=htf.n_sections,
-        outputs=tuple(htf.outputs[row] for row in rows),
-        input=htf.inputs[column],
-    )
+    fitted = numerator, denominator, roots, np.stack([_roots(b) for b in numerator]), multipliers
+    names = tuple(htf.outputs[row] for row in rows)
+    return RationalFit(*fitted, residual, result, htf.n_sections, names, htf.inputs[column])
 
 
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:

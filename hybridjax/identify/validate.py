@@ -22,7 +22,7 @@ from .periodic import PeriodicModel
 from .series.fit import SeriesFit
 from .series.prediction import Predictor
 from .series.records import CycleGrid, PreparedRecords, drift_waves
-from .series.residuals import FEWEST_SAMPLES, independence_test, whiteness_test
+from .series.residuals import FEWEST_SAMPLES, independence_test, whitened, whiteness_test
 
 
 # Samples for each unknown of its initial condition and drift, which a record must exceed. Fewer:
@@ -151,8 +151,9 @@ def validate(
     these means, are tested separately; the p-value is the smaller one, corrected for the choice.
     *Independence*: the part of the residuals that lagged inputs explain, compared with the rest (an
     F ratio for each section), for any spectrum of the input; its level holds for residuals that are
-    white. It allows for the errors of numerators of `fit_series`, and of fits of `fit_ldtp` to
-    series, but the test of whiteness does not.
+    white. Both allow for the errors of numerators of `fit_series`, and of fits of `fit_ldtp` to
+    series. Errors of c are left out: right fits to far fewer cycles than are tested are called not
+    white too often.
 
     For a fit of `fit_ldtp` to series, the errors of predictions one step ahead are tested (Ljung
     1999): they are white for a true model if the fit also models the noise. All fields of the
@@ -211,7 +212,7 @@ def validate(
             "the records are too short: record longer without gaps, until each section was sampled "
             f"{FEWEST_SAMPLES} times with {lags} samples before it in its record."
         )
-    spread = None if isinstance(model, LDTP) or isinstance(tested, LDTP) else model.spread(grid)
+    roots = [] if isinstance(model, LDTP) or isinstance(tested, LDTP) else list(model.spread(grid))
     if isinstance(tested, LDTP):  # outputs in units of their size, so that none is neglected
         S = np.tile(np.diag(prepared.scale**2), (N, 1, 1))
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
@@ -222,15 +223,13 @@ def validate(
             "the simulation of an unstable plant grows without bound: validate `fit_ldtp(series)`."
         )
     error = y - simulated
-    square = np.nansum(error**2, axis=(0, 1))
-    rms = np.sqrt(square.sum(axis=0) / sampled.sum(axis=0))
+    rms = np.sqrt(np.nanmean(error**2, axis=(0, 1, 2)))
     size = np.sqrt(np.mean(simulated[grid.inside] ** 2, axis=0))
-    auto, whiteness = whiteness_test(error, np.sqrt(square / sampled), lags)
+    auto, whiteness = whiteness_test(whitened(error, roots), lags)
     late = np.where((grid.age >= lags)[..., None], error, np.nan)
     outside = CycleGrid.from_records(list(itertools.compress(drive or records, kept))).u
-    cross, independence, visible = independence_test(outside, late, lags, level / ny, spread)
-    k = int(np.argmax([len(r.u) for r in compared]))
-    longest = compared[k]
+    cross, independence, visible = independence_test(outside, late, lags, level / ny, roots)
+    k, longest = max(enumerate(compared), key=lambda pair: len(pair[1].u))
     first = longest.first_section
     shown = slice(first, first + len(longest.u) - longest.lead)  # later inputs are unknown
     return Validation(

@@ -18,9 +18,8 @@ N, SEEN = 4, ("u", "r", "d")
 def plant():
     """Multipliers of modulus 0.8, in the loop 0.41; no feed-through."""
     rng = np.random.default_rng(3)
-    turn = 0.8 ** (1 / N) * np.array(
-        [[np.cos(0.225), -np.sin(0.225)], [np.sin(0.225), np.cos(0.225)]]
-    )
+    c, s = np.cos(0.225), np.sin(0.225)
+    turn = 0.8 ** (1 / N) * np.array([[c, -s], [s, c]])
     T = rng.normal(size=(N, 2, 2)) + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ turn @ np.linalg.inv(T[n]) for n in range(N)]
     return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
@@ -123,13 +122,16 @@ def test_regions_of_series_hold_in_the_loop(plant):
 def test_instruments_of_series_hold_in_the_loop(plant):
     fit = hj.fit_series(series(plant, 0), 2, reference="r")
     assert fit.compare(plant.multipliers).max_error < 1e-8  # (without noise)
-    held, discs, truth = [], [], plant.htf(np.arange(1, 9) / 4)
+    held, discs, off, truth = [], [], [], plant.htf(np.arange(1, 9) / 4)
     for seed in range(30):
         fit = hj.fit_series(series(plant, seed, noise=0.7), 2, reference="r")
         held.append(fit.contains(plant.multipliers)[0])
         htf = fit.htf(truth.f)
         discs.append(np.mean(np.abs(htf.H - truth.H) <= htf.confidence_radius()))
+        few = hj.fit_series(series(plant, seed, 40, noise=0.5), 2, reference="r", check=False)
+        off.append(abs(few.multipliers[0] - plant.multipliers[0]) / few.standard_errors[0])
     assert sum(held) >= 25  # (of 30 with 95 %: less in one of 600)
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3  # (few cycles are divided into blocks)
     assert 0.88 < np.mean(discs) < 0.98
     assert not fit.doubt
     with pytest.raises(hj.DefinitionError, match="the reference tells 2 multipliers, not 3"):
@@ -208,7 +210,7 @@ def test_residuals_tell_of_the_loop(plant):
         assert (p[0] < 1e-3) == answers
     unstable = hj.LDTP(1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1)))
     unstable = dataclasses.replace(unstable, inputs=("u",), outputs=early.outputs)
-    with pytest.raises(hj.DefinitionError, match="predicts one step ahead"):
+    with pytest.raises(hj.DefinitionError, match="grows without bound: validate"):
         hj.validate(unstable, late, reference="r")
 
 

@@ -35,18 +35,16 @@ def test_two_inputs_may_share_an_experiment_on_different_lines(hopper):
     design = hj.Design.from_lines(
         lines, 1.0, 0.4, n_sections=3, periods=10, channels=[[0, 1], [1, 0]], inputs=2
     )
-    estimate = hj.estimate_htf(
-        hj.experiments.simulate_experiments(model, design, start="periodic"), (-1, 0)
-    )
+    data = hj.experiments.simulate_experiments(model, design, start="periodic")
+    estimate = hj.estimate_htf(data, (-1, 0))
     assert estimate.harmonics == (-1, 0)
     np.testing.assert_allclose(estimate.H, model.htf([0.1, 0.3], (-1, 0)).H, atol=1e-13)
 
 
 def test_repeated_frequencies_are_averaged_by_their_power():
     """With y = g u exactly for one experiment and 3 g u for the other."""
-    design = hj.Design.from_lines(
-        [[0.25]] * 2, [[1.0], [2.0]], [[0.3], [2.0]], n_sections=4, periods=4
-    )
+    lines = [[0.25]] * 2, [[1.0], [2.0]], [[0.3], [2.0]]
+    design = hj.Design.from_lines(*lines, n_sections=4, periods=4)
     u = design.inputs(9)
     y = u * np.array([1.0, 3.0])[:, None, None]
     estimate = hj.estimate_htf(hj.ExperimentData(u, y, n_sections=4, periods=4))

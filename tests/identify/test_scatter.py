@@ -21,14 +21,10 @@ def model():
 
 
 def realized(model, count, repeats=1, noise=0.0, seed=0, process_noise=0.0):
+    options = dict(start="periodic", discard=(repeats - 1) * P)
+    options["process_noise"] = hj.experiments.ProcessNoise(process_noise, seed)
     design = LINES.realizations(count, seed)
-    data = hj.experiments.simulate_experiments(
-        model,
-        design,
-        start="periodic",
-        discard=(repeats - 1) * P,
-        process_noise=hj.experiments.ProcessNoise(process_noise, seed),
-    )
+    data = hj.experiments.simulate_experiments(model, design, **options)
     return hj.experiments.add_noise(data, std=noise, seed=seed)
 
 

@@ -45,18 +45,11 @@ def recording():
 
 
 def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
-    np.savez(tmp_path / "trial.npz", **recording)
+    trial, out = (str(tmp_path / name) for name in ("trial.npz", "o"))
+    np.savez(trial, **recording)
     options = "--input u --reference r --outputs x,v --crossing clock:rising --sections 16"
     with pytest.warns(FindingWarning):
-        assert not main(
-            [
-                "identify",
-                str(tmp_path / "trial.npz"),
-                *options.split(),
-                "--out",
-                str(tmp_path / "o"),
-            ]
-        )
+        assert not main(["identify", trial, *options.split(), "--out", out])
     summary = json.loads((tmp_path / "o" / "summary.json").read_text())
     assert summary["references"] == ["r"] and "u" in summary["inputs"]
     assert not any("feedback" in x.lower() for x in summary["warnings"])

@@ -311,19 +311,13 @@ def assemble(
         return np.swapaxes(b, -1, -2)
 
     return SeriesFit(
-        multipliers=multipliers_of(solution.c),
-        coefficients=solution.c,
-        covariance=covariance.matrix,
+        *(multipliers_of(solution.c), solution.c, *covariance),
         numerators=by_input(numerators),
         slopes=by_input(slopes),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
         noise=_noise(solution) * problem.scale,
-        covariance_freedom=covariance.freedom,
         result=Result.OK if converged else Result.NOT_CONVERGED,
-        n_sections=N,
-        inputs=problem.records.inputs,
-        outputs=problem.records.outputs,
-        lead=problem.records.lead,
+        **problem.records.about,
     )
 
 

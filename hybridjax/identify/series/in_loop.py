@@ -156,8 +156,7 @@ class LoopEquations:
         """
         c, covariance, noise = self.solve(check)
         N, R, nu, ny = *self.grid.u.shape[2:3], self.lags, self.grid.u.shape[3], len(noise)
-        b = np.array([x.numerators for x in self.sections]).reshape(N, R, nu, ny, -1)
-        b = b.swapaxes(2, 3)
+        b = np.array([x.numerators.reshape(R, nu, ny, -1).swapaxes(1, 2) for x in self.sections])
         roots = np.zeros((N, ny, R, nu, max(x.root.shape[1] for x in self.sections)))
         for n, x in enumerate(self.sections):
             roots[n, ..., : x.root.shape[1]] = x.root.reshape(R, nu, -1)
@@ -171,10 +170,7 @@ class LoopEquations:
             noise=noise,
             covariance_freedom=covariance.freedom,
             result=Result.OK,
-            n_sections=N,
-            inputs=self.records.inputs,
-            outputs=self.records.outputs,
-            lead=self.records.lead,
+            **self.records.about,
             reference=self.reference,
         )
 

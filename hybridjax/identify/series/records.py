@@ -81,8 +81,8 @@ class PreparedRecords:
     """Records as grids of similar lengths.
 
     **Fields:** `records`, without unknown inputs. `n_sections`, `lead`, `inputs`, `outputs`: as in
-    `Record`. `grids`: the grids. `cycles`: number of cycles of the longest record. `sampled` (N,
-    ny): number of samples. `scale` (ny,): rms of the outputs.
+    `Record`; `about`: by name. `grids`: the grids. `cycles`: number of cycles of the longest
+    record. `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
 
     **Arguments:** `free_start`: whether the states at the starts are unknown. Records that drift
     are then cut into pieces with starts and drifts of their own, because the time of fits grows
@@ -94,9 +94,9 @@ class PreparedRecords:
         zero and outputs that are constant at every sample, missing, or no deviations."""
         cut = _pieces if free_start else lambda record: [record]
         self.records = uninterrupted_records(x for r in uninterrupted_records(data) for x in cut(r))
-        about = self.records[0]
-        self.n_sections, self.lead = about.n_sections, about.lead
-        self.inputs, self.outputs = about.inputs, about.outputs
+        names = "n_sections", "lead", "inputs", "outputs"
+        self.about = {name: getattr(self.records[0], name) for name in names}
+        self.n_sections, self.lead, self.inputs, self.outputs = self.about.values()
         self.grids = _grids(self.records)
         self.cycles = max(map(count_cycles, self.records))
         self.sampled = np.sum([grid.sampled.sum(axis=(0, 1)) for grid in self.grids], axis=0)

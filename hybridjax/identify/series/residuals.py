@@ -1,6 +1,6 @@
 """Tests of residuals, section by section: their correlations in time and with inputs."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import compress, repeat
 
 import numpy as np
@@ -35,14 +35,30 @@ UNSEEN = (
 )
 
 
-def whiteness_test(
-    error: Float[np.ndarray, "S T N ny"], size: Float[np.ndarray, "N ny"], lags: int
-) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
-    """Return correlations of residuals with earlier ones, section by section, and p-values.
+def whitened(
+    error: Float[np.ndarray, "S T N ny"], spread: Sequence[Float[np.ndarray, "S T ny r"]]
+) -> Float[np.ndarray, "S T N ny"]:
+    """Return residuals that are white if the noise is, whatever errors a fit to other data has.
 
-    **Arguments:** `size`: rms of the residuals at each section.
+    **Arguments:** `spread`: for each section, a root of the covariance of these errors, for noise
+    of variance one. Residuals are divided by the root of the sum of both covariances.
     """
+    error = error.copy()
+    for n, root in enumerate(spread):
+        for i in range(error.shape[3]):
+            at = np.isfinite(error[:, :, n, i])
+            left, s, _ = np.linalg.svd(root[:, :, i][at], full_matrices=False)
+            along = left.T @ error[at, n, i]
+            error[at, n, i] -= left @ (along * (1 - 1 / np.sqrt(1 + s**2)))
+    return error
+
+
+def whiteness_test(
+    error: Float[np.ndarray, "S T N ny"], lags: int
+) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
+    """Return correlations of residuals with earlier ones, section by section, and p-values."""
     S, T, N, ny = error.shape
+    size = np.sqrt(np.nanmean(error**2, axis=(0, 1)))
     scaled = (error / np.where(size > 0, size, 1.0)).reshape(S, T * N, ny)
     z, tested = np.zeros((N, lags, ny)), np.zeros((N, lags, ny), bool)
     for k in range(lags):
@@ -69,7 +85,7 @@ def independence_test(
     error: Float[np.ndarray, "S T N ny"],
     lags: int,
     level: float,
-    spread: Iterable[Float[np.ndarray, "S T ny r"]] | None = None,
+    spread: Sequence[Float[np.ndarray, "S T ny r"]] = (),
 ) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
     """Test the part of residuals that present and past inputs explain, section by section.
 
