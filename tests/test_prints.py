@@ -117,7 +117,7 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     branch = Branch("k", np.array([1.0, 2.0]), many(hopper_cycle, 2), (point,), (end, end))
     t = np.linspace(0.0, 20.0, 2001)
     tt, *values = hopper_cycle.trajectory()("yM", "vM")
-    y, v = (np.interp(t, tt, x, period=1.0) for x in values)
+    y, v = (np.interp(t, tt, x, period=1.0) * (1 + 1e-6 * np.sin(t)) for x in values)
     signals, events = {"<u>": np.cos(3 * t), "yM & co": y, "vM": v}, {"<hit>": [1.0]}
     recording = hj.Recording(t, signals, units={"vM": "m/s"}, events=events, name="<i>")
     data = hj.recordings.section_data(

@@ -36,6 +36,9 @@ class SectionData(eqx.Module):
     - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
     - `period`: the median. `bandwidth`: bandwidth of the splines through the outputs, in Hz.
     - `spikes`: for each signal (inputs, then outputs), the number of samples left out as spikes.
+    - `unresolved`: median change of an output at sections if every second sample of the recording
+      were left out, relative to its rms deviation; of the output with the largest ratio. It is
+      below 1.3 for noise.
     """
 
     records: tuple[Record, ...]
@@ -46,6 +49,7 @@ class SectionData(eqx.Module):
     period: float = eqx.field(static=True)
     bandwidth: float = eqx.field(static=True)
     spikes: tuple[int, ...] = eqx.field(static=True)
+    unresolved: float = eqx.field(static=True, default=0.0)
 
     n_sections = property(lambda self: self.records[0].n_sections)
     inputs = property(lambda self: self.records[0].inputs)

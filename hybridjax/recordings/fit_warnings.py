@@ -89,7 +89,7 @@ def advise(
     delayed, grid = late_outputs(problem, d), records.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())
     unknowns, plain = R * nu + len(grid.y) * (d + 1), ordinary_least_squares(delayed)
-    warnings = list(findings)
+    warnings: list[Finding] = []
     if sampled - unknowns < _FEW * sampled:
         text = f"a section was sampled {sampled} times for {unknowns} unknowns; record more, take "
         warnings.append(Finding("few strides", f"{text}fewer sections, or excite fewer inputs."))
@@ -130,8 +130,16 @@ def advise(
     later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
     with np.errstate(divide="ignore"):
         expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
-    warn_of(warnings[len(findings) :])
+    warn_of(warnings)
+    warnings = [*findings, *slow_sampling(data), *warnings]
     return Advice(tuple(warnings), plain, tuple(band), strides, expected)
+
+
+def slow_sampling(data: SectionData) -> list[Finding]:
+    """Find outputs of which interpolation between samples loses as much as they deviate."""
+    text = f"without every second sample, outputs would change by {data.unresolved:.2g} times their"
+    finding = Finding("sampling", f"{text} deviations: multipliers may be wrong. Sample faster.")
+    return [finding] * (data.unresolved > 1.5)
 
 
 def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:

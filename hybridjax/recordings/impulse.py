@@ -11,9 +11,11 @@ from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.values import Number
 from ..errors import DefinitionError
+from ..experiments.record import average_cycle
 from ..identify.series.fit import SeriesFit
 from ..linear.ldtp import LDTP
 from .data import WHOLE_BAND, SectionData, input_band
+from .smoothing import Series
 
 
 # Standard deviations of the push's spectrum up to the edge of the band, where 4 % are left of it.
@@ -37,7 +39,7 @@ class ImpulseResponses(eqx.Module):
     - `errors`: their standard errors.
     - `phase` (N,): phase of the push. `lag` (lags,): time since then. Both in cycles.
     - `width`: standard deviation of the push, in cycles; 0 for a push that lasts for one section.
-    - `period`, `inputs`, `outputs`.
+    - `durations` (N,): mean time from each section to the next. `inputs`, `outputs`.
     """
 
     values: Float[np.ndarray, "N lags ny nu"]
@@ -45,17 +47,15 @@ class ImpulseResponses(eqx.Module):
     phase: Float[np.ndarray, " N"]
     lag: Float[np.ndarray, " lags"]
     width: float = eqx.field(static=True)
-    period: float = eqx.field(static=True)
+    durations: Float[np.ndarray, " N"]
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
 
-    @property
-    def n_sections(self) -> int:
-        return len(self.phase)
+    n_sections = property(lambda self: len(self.phase))
 
     @checked
     def of_model(self, model: LDTP) -> Float[np.ndarray, "N lags ny nu"]:
-        """Return the responses of a model to the same pushes: what `values` estimate.
+        """Return the responses of a model to pushes that are held from each section to the next.
 
         **Raises:** `DefinitionError` if the model has other sections or names.
         """
@@ -63,8 +63,8 @@ class ImpulseResponses(eqx.Module):
         N, lags = self.values.shape[:2]
         weights = _push(self.width * N)
         h = np.asarray(model.impulse_response(lags + len(weights) // 2)).swapaxes(0, 1)
-        h = ndimage.correlate1d(h, weights, axis=0, mode="constant")
-        return _by_push(h, lags, self.period)
+        h = ndimage.correlate1d(h, weights, axis=0, mode="constant")[:lags]
+        return _by_push(h, self.durations, weights)
 
 
 ResponseCycles = Annotated[float, Number("a number above 0, up to 10000", above=0, high=1e4)]
@@ -81,10 +81,15 @@ def impulse_responses(
 ) -> ImpulseResponses:
     """Return the responses of a fit to a push at each phase, with standard errors.
 
+    The standard errors are those of white noise. They leave out the change of inputs between one
+    section and the next, which a fit takes as constant. The error decreases with the square of
+    `n_sections`: it is 0.07 % (rms) of the largest response of the paper's hopper under a force up
+    to 8 Hz with 16 sections, and 0.015 % with 32.
+
     **Arguments:**
 
-    - `fit`: the fit. `data`: the data that were fitted; their period gives the area of an input
-      held for one section.
+    - `fit`: the fit. `data`: the data that were fitted; their times give the area of an input that
+      is held for a section.
     - `cycles`: duration of the responses. Default: 3, or longer if the push is wide.
     - `width`: standard deviation of the push (Gaussian), in cycles. 0: the push is held for one
       section. Default: the smallest width for which the spectrum of the push lies in the band of
@@ -130,20 +135,23 @@ def impulse_responses(
     slope, root = pushed(slope), pushed(fit.roots.transpose(2, 0, 1, 3, 4))
     by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
     std = np.sqrt((root**2).sum(axis=4) * fit.noise[:, None] ** 2 + by_coefficients)
-    values, std = (_by_push(x, lags, data.period) for x in (pushed(h), std))
-    phase, lag, period = np.arange(N) / N, np.arange(lags) / N, data.period
-    return ImpulseResponses(values, std, phase, lag, float(width), period, fit.inputs, fit.outputs)
+    section = [x.first_section + np.arange(len(x.u) - 1) for x in data.records]
+    steps = np.concatenate([np.diff(t) for t in data.times])
+    durations = average_cycle(np.concatenate(section) % N, steps[:, None], N)[:, 0]
+    values, std = (_by_push(x, durations, weights) for x in (pushed(h), std))
+    about = (np.arange(N) / N, np.arange(lags) / N, float(width), durations)
+    return ImpulseResponses(values, std, *about, fit.inputs, fit.outputs)
 
 
-def _push(width: float) -> Float[np.ndarray, " n"]:
+def _push(width: float) -> Series:
     """A Gaussian of this standard deviation in sections, as weights of sum 1 around its middle."""
     reach = int(np.ceil(_PUSH_REACH * width))
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width, 1e-9)) ** 2)
     return weights / weights.sum()
 
 
-def _by_push(h: Float[np.ndarray, "r N ..."], lags: int, period: float) -> Any:
+def _by_push(h: Float[np.ndarray, "lags N ..."], durations: Series, weights: Series) -> Any:
     """Responses to a push of area 1 by its section, from those by the section of the response."""
-    N = h.shape[1]
-    m, r = np.arange(N)[:, None], np.arange(lags)
-    return h[r, (m + r) % N] / (period / N)
+    N, area = len(durations), ndimage.correlate1d(durations, weights, mode="wrap")
+    m, r = np.arange(N)[:, None], np.arange(len(h))
+    return h[r, (m + r) % N] / area[:, None, None, None]

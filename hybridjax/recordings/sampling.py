@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Literal, NamedTuple
+from itertools import compress
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,8 +15,11 @@ from .._core.boundary.values import Number
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record, average_cycle
+from ..identify.descent import ROUNDING
 from . import smoothing
 from .data import SectionData
+from .findings import warn_of
+from .fit_warnings import slow_sampling
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
 from .phase_estimation import PhaseDefinition, estimate_phase
 from .recording import Recording, Trial
@@ -71,8 +75,9 @@ def section_data(
     that remains (`Record.drift`). Drift of sensors also moves the phase: remove it from the signals
     before (`without_drift`), as `identify_recording` does.
 
-    **Raises:** `DefinitionError` for unknown names, no names, constant signals, another number of
-    sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
+    **Raises:** `DefinitionError` for unknown names, no names, constant signals, outputs that repeat
+    from cycle to cycle, another number of sections than the family's, a recording without a whole
+    cycle, and as `estimate_phase`.
     """
     inputs, outputs = tuple(inputs), tuple(outputs)
     for name in (*inputs, *outputs):
@@ -95,7 +100,7 @@ def section_data(
         signals, struck = _without_spikes(trial.time, trial.values[:, columns], nu, stretches)
         spikes += struck
         for name, count in zip((*inputs, *outputs), np.isfinite(signals).sum(axis=0), strict=True):
-            if count < FEWEST:
+            if count < 2 * FEWEST:  # (a half of them is left out to see what interpolation loses)
                 text = f"trial '{trial.name}' has {count} samples of {name}: leave the trial out."
                 raise DefinitionError(text)
         sections = _sample(trial.time, signals, nu, stretches, N, phase.period, bandwidth, sampled)
@@ -110,36 +115,29 @@ def section_data(
         cycles += [mean] * len(sections)
     if not parts:
         raise DefinitionError("the recording holds no whole cycle without gaps: record longer.")
+    cycle = np.average(cycles, axis=0, weights=[len(x.k) for x in parts])
+    _require_changes(parts, cycle, nu, outputs)
     names = [Signal(x, recording.unit(x)) for x in (*inputs, *outputs)]
     if timing is not None:
         names.append(Signal("time" if timing == "clock" else "duration", "s"))
         spikes = np.append(spikes, 0)
     # A smoothing spline averages over neighbors on both sides.
     lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
-    records = [
-        Record(
-            x.values[:, :nu],
-            x.values[:, nu:],
-            n_sections=N,
-            first_section=int(x.k[0]) % N,
-            inputs=tuple(names[:nu]),
-            outputs=tuple(names[nu:]),
-            lead=lead,
-            drift=np.inf,
-        )
-        for x in parts
-    ]
-    cycle = np.average(cycles, axis=0, weights=[len(x.k) for x in parts])
-    return SectionData(
-        records=tuple(records),
-        times=tuple(x.t for x in parts),
-        trials=tuple(trials),
-        cycle_inputs=cycle[:, :nu],
-        cycle_outputs=cycle[:, nu:],
-        period=phase.period,
-        bandwidth=bandwidth,
-        spikes=tuple(spikes.tolist()),
+    change = np.median(np.concatenate([x.change for x in parts]), axis=0)
+    squares = np.concatenate([x.values[:, nu : nu + len(outputs)] ** 2 for x in parts])
+    size = np.maximum(np.nanmean(squares, axis=0), np.finfo(float).tiny)
+    about: dict[str, Any] = {"n_sections": N, "lead": lead, "drift": np.inf}
+    about |= {"inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
+    records = (
+        Record(*np.split(x.values, [nu], 1), first_section=int(x.k[0]) % N, **about) for x in parts
     )
+    data = SectionData(
+        tuple(records), tuple(x.t for x in parts), tuple(trials), cycle[:, :nu], cycle[:, nu:],
+        phase.period, bandwidth, tuple(spikes.tolist()),
+        float(np.sqrt(change / size).max(initial=0)),
+    )  # fmt: skip
+    warn_of(slow_sampling(data))
+    return data
 
 
 def _without_spikes(
@@ -171,6 +169,22 @@ class _Sections(NamedTuple):
     t: Series
     observed: Bool[np.ndarray, " n"]
     values: Float[np.ndarray, "n nuy"]
+    change: Float[np.ndarray, "n ny"]
+    """Mean squares of changes of the outputs, if every second sample is left out."""
+
+
+def _require_changes(
+    parts: list[_Sections], cycle: Float[np.ndarray, "N nuy"], nu: int, outputs: Sequence[str]
+) -> None:
+    """**Raises:** `DefinitionError` for an output that most cycles repeat, but no input."""
+    whole = [x.values[: len(x.k) // len(cycle) * len(cycle)] for x in parts]
+    whole = [x.reshape(-1, *cycle.shape) for x in whole]
+    steps = np.concatenate([np.abs(np.diff(x, axis=0)).max(axis=1) for x in whole])
+    steps = np.sort(np.nan_to_num(steps, nan=np.inf), axis=0)[len(steps) // 2 :]
+    same = steps.min(axis=0, initial=np.inf) <= 1e3 * ROUNDING * np.abs(cycle).max(axis=0)
+    for name in compress(outputs, same[nu:] & ~same[:nu].any()):
+        text = f"{name} is the same in all cycles, but for rounding: it holds no deviations. "
+        raise DefinitionError(f"{text}Record it while it varies, or leave it out.")
 
 
 def _sample(
@@ -184,8 +198,11 @@ def _sample(
     sampled: Literal["mean", "middle"],
 ) -> list[_Sections]:
     """Sample a trial (nu inputs, then outputs) in stretches of a whole cycle; NaN in gaps."""
-    curves = [spline(time, x, bandwidth) for x in signals.T[nu:]]
-    sections = []
+    sections, kept = [], [np.flatnonzero(np.isfinite(x)) for x in signals.T[nu:]]
+    curves = [
+        [spline(time[k], x[k], bandwidth) for k in (at, at[::2], at[1::2])]
+        for x, at in zip(signals.T[nu:], kept, strict=True)
+    ]
     for w in stretches:
         first, last = w.phase[[0, -1]] * N
         k = np.arange(np.ceil(first - 1e-9), np.floor(last + 1e-9) + 1).astype(int)  # rounding
@@ -195,13 +212,14 @@ def _sample(
         start, end = t[:-1], t[1:]
         unobserved = w.gaps[np.diff(w.gaps, axis=1)[:, 0] > period / N]
         observed = ~inside(unobserved, start, start)
-        values = np.zeros((len(start), signals.shape[1]))
+        values, change = (np.zeros((len(start), signals.shape[1] - k)) for k in (0, nu))
         for i, x in enumerate(signals.T):
             finite = np.isfinite(x)
             holes = gaps(time[finite], bridgeable(time[finite], period / N))
             lost = inside(holes, start, end)
             if i >= nu:
-                values[:, i] = curves[i - nu](start)
+                values[:, i], *halves = (curve(start) for curve in curves[i - nu])
+                change[:, i - nu] = np.mean((halves - values[:, i]) ** 2, axis=0)
                 lost = inside(holes, start, start) | ~observed
             elif sampled == "mean":
                 values[:, i] = means(time, x, t)
@@ -209,7 +227,7 @@ def _sample(
                 at = time[finite]
                 values[:, i] = x[finite][np.searchsorted((at[:-1] + at[1:]) / 2, (start + end) / 2)]
             values[lost, i] = np.nan
-        sections.append(_Sections(k[:-1], start, observed, values))
+        sections.append(_Sections(k[:-1], start, observed, values, change))
     return sections
 
 

@@ -22,10 +22,11 @@ def angle():
 
 @pytest.fixture
 def wave():
-    """Twenty turns of a circle with an input that does nothing."""
+    """Twenty turns of a circle, nearly, with an input that does nothing."""
     t = np.linspace(0.0, 20.0, 2001)
-    signals = {"f": np.cos(3 * t), "x": np.cos(2 * np.pi * t), "v": -np.sin(2 * np.pi * t)}
-    return hj.Recording(t, signals)
+    noise = 1e-6 * np.random.default_rng(0).normal(size=(2, len(t)))
+    x, v = np.array([np.cos(2 * np.pi * t), -np.sin(2 * np.pi * t)]) + noise
+    return hj.Recording(t, {"f": np.cos(3 * t), "x": x, "v": v})
 
 
 @pytest.fixture(scope="session")

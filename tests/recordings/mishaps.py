@@ -210,15 +210,12 @@ def with_end(recording, *_):
 MISHAPS = {
     # sensors, amplifiers, converters
     "white noise": signals("y", lambda x, s: x + 0.01 * x.std() * s.normal()),
-    "rounded to 12 bits": signals(
-        "uy", lambda x, s: np.round(x / (np.ptp(x) / 2**12)) * (np.ptp(x) / 2**12)
-    ),
-    "slow drift": signals(
-        "y", lambda x, s: x + 0.1 * x.std() * np.sin(2 * np.pi * s.cycles / s.cycles[-1])
-    ),
-    "the zero wanders": signals(
-        "y", lambda x, s: x + 0.1 * x.std() * np.cumsum(s.normal()) / np.sqrt(len(x))
-    ),
+    "rounded to 12 bits": signals("uy", lambda x, s: np.ptp(x) / 2**12 * np.round(
+        x / (np.ptp(x) / 2**12))),
+    "slow drift": signals("y", lambda x, s: x + 0.1 * x.std() * np.sin(
+        2 * np.pi * s.cycles / s.cycles[-1])),
+    "the zero wanders": signals("y", lambda x, s: x + 0.1 * x.std() * (
+        np.cumsum(s.normal()) / np.sqrt(len(x)))),
     "hum of the mains": signals("uy", lambda x, s: x + 0.02 * x.std() * np.sin(
         2 * np.pi * 50.2 * s.trial.time / s.period)),
     "hum near the rhythm": signals("uy", lambda x, s: x + 0.02 * x.std() * np.sin(
@@ -234,9 +231,8 @@ MISHAPS = {
     "integers overflow": signals("y0", overflow(12)),
     "16 bits overflow": signals("y-1", overflow(16)),
     # missing and wrong samples
-    "1 % of the samples lost": signals(
-        "y", lambda x, s: np.where(s.rng.random(len(x)) < 0.01, np.nan, x)
-    ),
+    "1 % of the samples lost": signals("y", lambda x, s: np.where(
+        s.rng.random(len(x)) < 0.01, np.nan, x)),
     "gap of five cycles": signals("y", lambda x, s: np.where(s.from_middle < 2.65, np.nan, x)),
     "gap of the push": signals("u", lambda x, s: np.where(s.from_middle < 1.15, np.nan, x)),
     "gaps over the crossing": hidden(lambda at, s: s.rng.choice(at, 5, replace=False)),
@@ -257,9 +253,8 @@ MISHAPS = {
     "sign of the push in one trial": scaled("u", -1.0),
     "other gain in one trial": scaled("y0", 1.1),
     "other zero in one trial": scaled("y0", offset=0.5),
-    "sensor slips in one trial": signals(
-        "y0", lambda x, s: x + 0.3 * x.std() * (s.trial.time > s.trial.time.mean()), SECOND
-    ),
+    "sensor slips in one trial": signals("y0", lambda x, s: x + 0.3 * x.std() * (
+        s.trial.time > s.trial.time.mean()), SECOND),
     "columns swapped in one trial": trials(swapped, SECOND),
     "an output twice": signals("y1", lambda x, s: s.values(s.outputs[0])),
     "push of another trial": signals("u", lambda x, s: np.resize(
@@ -271,18 +266,16 @@ MISHAPS = {
     "the same trial thrice": with_copies,
     "overlapping trials": with_end,
     # clocks
-    "a third of the samples not there": trials(
-        lambda trial, s: kept(trial, s.rng.random(len(trial.time)) > 1 / 3)
-    ),
+    "a third of the samples not there": trials(lambda trial, s: kept(
+        trial, s.rng.random(len(trial.time)) > 1 / 3)),
     "few samples": trials(lambda trial, s: kept(trial, slice(0, None, 8))),
     "jitter of the time stamps": trials(lambda trial, s: replace(trial, time=trial.time + (
         0.05 * np.median(np.diff(trial.time)) * s.rng.uniform(-1, 1, len(trial.time))))),
     "a pause": trials(pause),
     "clock slows down": clock(lambda t, s: t + 0.05 * (t - s.trial.time[0]) ** 2 / (
         2 * np.ptp(s.trial.time))),
-    "clock set forward": clock(
-        lambda t, s: t + 0.3 * s.period * (t > s.trial.time.mean()), SECOND
-    ),
+    "clock set forward": clock(lambda t, s: t + 0.3 * s.period * (
+        t > s.trial.time.mean()), SECOND),
     "clock set back": clock(lambda t, s: t - 0.3 * s.period * (t > s.trial.time.mean()), SECOND),
     "milliseconds in one trial": clock(lambda t, s: 1000.0 * t, SECOND),
     "slow clock in one trial": clock(lambda t, s: 1.1 * t, SECOND),

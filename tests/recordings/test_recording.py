@@ -208,7 +208,6 @@ def test_a_recording_that_is_too_short_is_refused(rhythm, strides):
     signals = dict(zip(rhythm.signals, trial.values[kept].T, strict=True))
     short = hj.Recording(trial.time[kept], signals)
     inputs, *outputs = rhythm.signals
+    names = dict(inputs=inputs, outputs=outputs, n_sections=8)
     with pytest.raises(hj.DefinitionError, match="too few|reach beyond"):
-        hj.identify_recording(
-            short, hj.Crossing(outputs[0], "rising"), inputs=inputs, outputs=outputs, n_sections=8
-        )
+        hj.identify_recording(short, hj.Crossing(outputs[0], "rising"), **names)

@@ -47,6 +47,20 @@ def test_a_circle(wave):
     assert "SectionData(19.75 cycles of 8 sections in 1 records; period 1;" in repr(data)
 
 
+def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
+    (trial,), names = rhythm.trials, rhythm.signals
+    t, z = trial.time, np.exp(2j * np.pi * trial.time)
+    for inputs in ((), "force"):
+        with pytest.raises(hj.DefinitionError, match="^x is the same in all cycles, but for round"):
+            exact = hj.Recording(t, {"force": trial.values[:, 0], "x": z.real, "v": -z.imag})
+            sample(exact, inputs=inputs)
+    for step, few in ((13, True), (5, False)):
+        thin = hj.Recording(t[::step], dict(zip(names, trial.values[::step].T, strict=True)))
+        data = sample(thin, inputs="force")
+        advice = hj.recordings.advise(data, hj.fit_series(data, 1, check=False))
+        assert any(w.cause == "sampling" for w in advice.warnings) == few
+
+
 def test_gaps_are_masked_and_cut(wave):
     t, values = wave.trials[0].time, wave.trials[0].values.copy()
     values[(t > 4.3) & (t < 4.5), 1] = np.nan  # of an output, too short to lose the count
@@ -227,15 +241,17 @@ def test_signals_with_clocks_of_their_own(rhythm):
 
 
 def test_responses_of_a_model_are_by_the_section_of_the_push():
-    """One state: a push of area 1 at section m decays by A from section to section."""
+    """One state: a push of area 1 at section m decays by A; sections last 0.2, ..., 0.8."""
     N, a, b, c = 4, 0.8, np.array([1.0, 2.0, 3.0, 4.0]), np.array([5.0, 7.0, 11.0, 13.0])
     model = hj.LDTP(
         np.full((N, 1, 1), a), b[:, None, None], c[:, None, None], inputs="f", outputs="x"
     )
     zero, grid = np.zeros((N, 7, 1, 1)), (np.arange(N) / N, np.arange(7) / N)
-    found = ImpulseResponses(zero, zero, *grid, 0.0, 2.0, ("f",), ("x",))
+    steps = np.array([0.2, 0.4, 0.6, 0.8])
+    times = np.cumsum(np.tile(np.roll(steps, 1), 60))
+    found = ImpulseResponses(zero, zero, *grid, 0.0, steps, ("f",), ("x",))
     m, r = np.arange(N)[:, None], np.arange(1, 7)
-    expected = b[m] * a ** (r - 1) * c[(m + r) % N] / (2.0 / N)
+    expected = b[m] * a ** (r - 1) * c[(m + r) % N] / steps[m]
     np.testing.assert_allclose(found.of_model(model)[:, 1:, 0, 0], expected, rtol=1e-13)
     # Their standard errors are the scatter of fits.
     apart, rng, about = [], np.random.default_rng(0), dict(inputs=("f",), outputs=("x",))
@@ -243,8 +259,9 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
         u = rng.normal(size=(240, 1))
         y = np.asarray(model.simulate(u)) + 20 * rng.normal(size=(240, 1))
         record, cycle = hj.Record(u, y, n_sections=N, **about), np.zeros((N, 1))
-        data = SectionData((record,), (np.arange(240) / 2,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))
+        data = SectionData((record,), (times,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))
         found = impulse_responses(hj.fit_series(record, 1, check=False), data, 4, width=0.0)
         apart.append((found.values - found.of_model(model)) / found.errors)
+    np.testing.assert_allclose(found.durations, steps)
     size = np.sqrt(np.mean(np.array(apart)[:, :, [[1, 2, 3, 4], [13, 14, 15, 16]]] ** 2, (0, 1, 3)))
     np.testing.assert_allclose(size, 1, atol=0.06)

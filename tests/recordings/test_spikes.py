@@ -86,9 +86,8 @@ def test_impacts_are_part_of_the_motion(wave):
     phase = hj.KinematicPhase(8, position="x", velocity="v")
 
     def sampled(more):
-        return hj.recordings.section_data(
-            hj.Recording(t, {"f": f, "x": x + more, "v": v}), phase, **options
-        )
+        recording = hj.Recording(t, {"f": f, "x": x + more, "v": v})
+        return hj.recordings.section_data(recording, phase, **options)
 
     assert sampled(impact).spikes == (0, 0, 0)
     both = sampled(impact + spikes)
