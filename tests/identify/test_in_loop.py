@@ -134,6 +134,9 @@ def test_instruments_of_series_hold_in_the_loop(plant):
     assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3  # (few cycles are divided into blocks)
     assert 0.88 < np.mean(discs) < 0.98
     assert not fit.doubt
+    moved = dataclasses.replace(series(plant, 0, 150, noise=0.5), drift=20)
+    moved.y[:, 0] += 30 * np.sin(np.arange(600) / 38)
+    assert hj.fit_series(moved, 2, reference="r").standard_errors[0] < 0.2
     with pytest.raises(hj.DefinitionError, match="the reference tells 2 multipliers, not 3"):
         hj.fit_series(series(plant, 0, noise=0.7), 3, reference="r")
     assert best_order(series(plant, 0), ("r",), 4) == (2, "")

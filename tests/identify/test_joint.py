@@ -59,9 +59,8 @@ def test_the_coordinates_are_as_many_as_there_are_models(model, exact, growth):
     after = np.roll(dims, -1)
     entries = (after * dims + after * 2 + 2 * dims + 4).sum()
     assert coordinates.size == entries - (dims**2).sum()
-    np.testing.assert_allclose(
-        transfer(coordinates.model, F, exact.harmonics), model.htf(F).H, rtol=1e-9, atol=1e-9
-    )
+    found = transfer(coordinates.model, F, exact.harmonics)
+    np.testing.assert_allclose(found, model.htf(F).H, rtol=1e-9, atol=1e-9)
     J = np.concatenate([s.reshape(len(s), -1) for _, s in
                         transfer_slopes(coordinates, F, exact.harmonics)], axis=1)  # fmt: skip
     assert np.linalg.matrix_rank(np.concatenate([J.real, J.imag], axis=1)) == coordinates.size
@@ -82,15 +81,12 @@ def test_derivatives_are_those_of_jax(model, errors):
     _, true = jax.jvp(lambda *x: harmonic_transfer(*x, jnp.asarray(F)), tuple(here), tuple(change))
     harmonics = (-2, 0, 1)
     slopes = np.concatenate([s for _, s in transfer_slopes(coordinates, F, harmonics)], axis=2)
-    np.testing.assert_allclose(
-        np.tensordot(step, slopes, 1), np.asarray(true)[np.array(harmonics)], atol=1e-11
-    )
+    true = np.asarray(true)[np.array(harmonics)]
+    np.testing.assert_allclose(np.tensordot(step, slopes, 1), true, atol=1e-11)
     c, by_step = characteristic_slopes(coordinates)
     np.testing.assert_allclose(c, np.poly(np.asarray(model.multipliers)).real[1:], atol=1e-12)
-    ahead, back = (
-        characteristic_slopes(local_coordinates(coordinates.moved(h * step), True))[0]
-        for h in (1e-6, -1e-6)
-    )
+    moved = (local_coordinates(coordinates.moved(h * step), True) for h in (1e-6, -1e-6))
+    ahead, back = (characteristic_slopes(x)[0] for x in moved)
     np.testing.assert_allclose(by_step @ step, (ahead - back) / 2e-6, rtol=1e-6)
 
 

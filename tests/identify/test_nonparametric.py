@@ -88,3 +88,4 @@ def test_half_integers_need_two_phases():
     uneven = hj.estimate_htf(record([(1.5, 0.3)], [(1.5, 0.9)], [(1.5, 2.0)]))
     np.testing.assert_allclose(uneven[0], 1.0, atol=1e-13)
     np.testing.assert_allclose(uneven[-3], 0.0, atol=1e-13)
+    np.testing.assert_array_equal(uneven.scatter.freedom, 1)  # (of three for two unknowns)

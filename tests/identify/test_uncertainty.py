@@ -55,12 +55,8 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
     model, htf = small
     true, runs = model.multipliers, 60
     bound = hj.identify.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
-    fits = [
-        hj.fit_multipliers(
-            noisy(htf, variance, np.random.default_rng(seed), correlation), 2, errors=errors
-        )
-        for seed in range(runs)
-    ]
+    draws = (noisy(htf, variance, np.random.default_rng(k), correlation) for k in range(runs))
+    fits = [hj.fit_multipliers(draw, 2, errors=errors) for draw in draws]
     assert covered(sum(fit.contains(true).all() for fit in fits), runs)
     rms = np.sqrt(np.mean([fit.compare(true).error ** 2 for fit in fits], axis=0))
     said = np.sqrt(np.mean([fit.standard_errors**2 for fit in fits], axis=0))
@@ -134,9 +130,8 @@ def test_first_order_covariances_and_regions(pair_and_real):
     roots = np.take_along_axis(roots, pick, axis=1)
     for i in range(3):
         parts = np.stack([roots[:, i].real, roots[:, i].imag])
-        np.testing.assert_allclose(
-            np.cov(parts), estimate.multiplier_covariances[i], rtol=0.1, atol=1e-7
-        )
+        found = estimate.multiplier_covariances[i]
+        np.testing.assert_allclose(np.cov(parts), found, rtol=0.1, atol=1e-7)
     radius = np.sqrt(np.mean(np.abs(roots - true) ** 2, axis=0))
     np.testing.assert_allclose(estimate.standard_errors, radius, rtol=0.05)
     # The border of the first-order region has the distance of the exact one.
