@@ -18,10 +18,11 @@ from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..orbits.guess import require_similar
+from ..systems.quotient import check_symmetry
 from ..systems.system import Guess, HybridSystem
 from .model_fit import Identifiability, ModelFit, ParameterGuess, diagnose
 from .observations import AbstractObservation
-from .problem import FitProblem, Free, Parameters, descend, evaluate, free_parameters
+from .problem import DELAYS, FitProblem, Free, Parameters, descend, evaluate, free_parameters
 
 
 Data = AbstractObservation | Sequence[AbstractObservation]
@@ -145,6 +146,8 @@ def _prepare(
     moved = away_from_events(near)
     if moved is not near:
         near = find_limit_cycle(near.system, moved, settings=near.settings)
+    for name in {*parameters.names} - {*DELAYS}:
+        check_symmetry(near.system, near.structure.sizes(near.settings.scale), name)
     prepared = tuple(observation.prepare(near) for observation in observations)
     return FitProblem(parameters, prepared), near
 

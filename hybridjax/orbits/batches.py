@@ -30,7 +30,7 @@ from .guess import require_similar
 from .newton import FEW_STEPS, USUAL_STEPS
 from .return_map import ReturnMap, Turn
 from .scale import ROUNDING
-from .shooting import excess, newton_steps
+from .shooting import excess, newton_steps, one_by_one
 
 
 # Largest number of systems whose turns are computed on the host. Larger: that takes longer than
@@ -51,8 +51,7 @@ _QUADRATIC = 4
 
 def _apart(map: ReturnMap, lanes: Lanes) -> Lanes:
     """Lanes as single ones, on the first axis; the lane of a single system as it is."""
-    first = lambda x: np.moveaxis(x, -1, 0)[..., None]  # noqa: E731
-    return jax.tree_util.tree_map(first, lanes) if map.expected.ndim else lanes
+    return jax.tree_util.tree_map(one_by_one, lanes) if map.expected.ndim else lanes
 
 
 def _turn(map: ReturnMap, wanted):

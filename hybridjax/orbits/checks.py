@@ -95,8 +95,7 @@ def check_claims(
     **Raises:** `DefinitionError` if they do not have the period or the symmetry that the system
     states; NaN is passed over.
     """
-    sizes = {x: np.asarray(scale)[a, : s.dims[a]] for a, x in enumerate(s.names)}
-    check_symmetry(s.system, sizes)
+    check_symmetry(s.system, s.sizes(scale))
     if s.system.period() is None:
         return
     for a in np.unique(chart).tolist():

@@ -150,14 +150,12 @@ def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
 
 def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> bool:
     """True if all orders lead from chart a to the same state, with the same derivative."""
-    if len(orders) < 2:  # in the other order an event does not happen
-        return False
-    b = orders[0].chart
-    if any(order.chart != b for order in orders):
+    # (Where there is a single order, an event does not happen in the other.)
+    if len(orders) < 2 or len({order.chart for order in orders}) > 1:
         return False
     m, n = orders[0].derivative.shape
     rows = [np.column_stack([x.state, x.derivative * scale[a, :n]]) for x in orders]
-    return bool(np.max(np.ptp(rows, axis=0) / scale[b, :m, None]) < SAME)
+    return bool(np.max(np.ptp(rows, axis=0) / scale[orders[0].chart, :m, None]) < SAME)
 
 
 def _orders(s: Structure, t: float, before: _Order, left: int, due: float) -> Iterator[_Order]:

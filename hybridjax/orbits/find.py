@@ -13,7 +13,7 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
 from .._core.compilation import uncollected
-from .._core.executor import is_traced, to_host
+from .._core.executor import is_traced, is_tracer, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
@@ -21,9 +21,10 @@ from ..engine.lanes import side_by_side
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.unresolved import has_kinks
 from ..errors import ComputationError, DefinitionError
+from ..systems.quotient import check_symmetry
 from ..systems.solver import Radau
 from ..systems.structure import Structure
-from ..systems.system import Guess, HybridSystem, copies_of, integrated
+from ..systems.system import Guess, HybridSystem, arrays_of, copies_of, integrated
 from . import checks
 from .coincidence import SAME, check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
@@ -139,6 +140,9 @@ def find_limit_cycle(
     if isinstance(guess, LimitCycle):
         _check_fits(guess, s, multiplicity, bool(settle) or max_period is not None)
         conserved = guess.conserved if conserved is None else conserved
+        for name in () if is_traced(guess) else arrays_of(system):
+            if is_tracer(arrays_of(system)[name]):
+                check_symmetry(guess.system, guess.structure.sizes(guess.settings.scale), name)
         map = guess.return_map.at_phase_of(system)
         settings = dataclasses.replace(settings, scale=scale_of(s, given, guess.settings.scale))
         base = map.base if section is None else section

@@ -137,8 +137,7 @@ def fastest(
 
 def is_implicit(s: Structure, a: int) -> bool:
     """True if chart a is integrated by an implicit method."""
-    method = s.method(a)
-    return method is not None and method.implicit
+    return s.method(a).implicit
 
 
 def has_implicit(s: Structure) -> bool:

@@ -18,8 +18,9 @@ from .._core.executor import Array, is_traced, namespace, on_host, svdvals
 from .._core.text import number
 from ..engine import kernels
 from ..errors import ComputationError
+from ..systems.quotient import check_symmetry
 from ..systems.structure import Structure
-from ..systems.varied import Varied, parameter_of
+from ..systems.varied import Varied
 from .crossing import AtEvent, ListLevels
 from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
 from .responses import Phases, loop
@@ -68,7 +69,7 @@ class Sensitivity(eqx.Module):
 
 def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
     """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`)."""
-    parameter_of(cycle.system, parameter)
+    check_symmetry(cycle.system, cycle.structure.sizes(cycle.settings.scale), parameter)
     flow = linear_flow(cycle, parameter=parameter)
     with at_ease():
         return _sensitivity(cycle, flow, Varied(cycle.system, parameter))

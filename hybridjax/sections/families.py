@@ -315,13 +315,8 @@ class SectionList(AbstractSections):
         if not self.items:
             raise DefinitionError("a list of sections needs one Crossing or AtEvent, or more.")
 
-    @property  # type: ignore[misc]
-    def n_sections(self) -> int:  # type: ignore[override]
-        return len(self.items)
-
-    @property  # type: ignore[misc]
-    def anchor(self) -> None:  # type: ignore[override]
-        return None
+    n_sections = property(lambda self: len(self.items))  # type: ignore[assignment]
+    anchor = property(lambda self: None)  # type: ignore[assignment]
 
     def check(self, s: Structure) -> None:
         for item in self.items:

@@ -19,6 +19,7 @@ from .chart import DerivedChart
 from .structure import as_vector
 from .system import Derived, Guess, HybridSystem, Output
 from .transition import TOGETHER, Scheduled, Transition
+from .varied import parameter_of, with_parameters
 
 
 @checked
@@ -59,11 +60,10 @@ class Quotient(Derived):
     Inputs are those of the charts that are kept; with `half_period`, they act on the mirror image
     in every second half of a cycle.
 
-    Derivatives of a cycle by a parameter that breaks the symmetry (the stiffness of one leg) are
-    those of the map of the kept charts, and of no cycle of `system`.
-
     **Raises:** `DefinitionError` if charts or states do not fit together and, when a cycle or a
     trajectory is computed, if a function does not have the symmetry; it names the function.
+    Derivatives by a parameter that breaks the symmetry (the stiffness of one leg) are refused, and
+    inside of `jit` a system that is made there with such a parameter.
     """
 
     pairs: tuple[tuple[str, str], ...] = eqx.field(static=True)
@@ -279,30 +279,36 @@ class Quotient(Derived):
         return q[np.array(order)] * np.array([-1.0 if x in self.flipped else 1.0 for x in names])
 
 
-def check_symmetry(system: HybridSystem, sizes: Mapping[str, Any] | None = None) -> None:
-    """Raise an error if functions do not have the symmetry that a `Quotient` states.
+@jax.ensure_compile_time_eval()
+def check_symmetry(system: HybridSystem, sizes: Any = None, along: str | None = None) -> None:
+    """Raise an error if functions, or with `along` their derivatives by this parameter, do not have
+    the symmetry that a `Quotient` states.
 
     **Arguments:** `sizes`: magnitudes of the states of each chart. Default: 1. (In units in
     which states are small, states of 1 hide all but the highest powers.)
     """
     if not isinstance(system, Quotient):
         return
-    check_symmetry(system.system)
+    check_symmetry(system.system, None, along and along.removeprefix("system."))
     sizes = sizes or {name: np.ones(len(x.states)) for name, x in system.charts().items()}
     clock, rng = system.system.period(), np.random.default_rng(0)
     q = rng.normal(size=(3, max(map(len, sizes.values()))))
-    values = _sides(system, sizes, q, rng.normal(size=3) * (1.0 if clock is None else clock))
+    t = rng.normal(size=3) * (1.0 if clock is None else clock)
+    values = _sides(system, sizes, q, t, along)
     for (sentence, *_), pair in zip(system._claims(sizes), values, strict=True):
         size = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
         x, y = (values / size for values in pair)
         if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
             text = f"{type(system.system).__name__} does not have the symmetry of its Quotient"
-            raise DefinitionError(f"{text}: {sentence}.")
+            raise DefinitionError(f"{text}{f' once {along!r} changes' * bool(along)}: {sentence}.")
 
 
 @eqx.filter_jit
-def _sides(quotient: Quotient, sizes: Mapping[str, Any], q: Any, t: Any) -> list[tuple]:
-    """Both sides of all claims of a symmetry."""
+def _sides(quotient: Any, sizes: Any, q: Any, t: Any, along: str | None) -> list[tuple]:
+    """Both sides of all claims of a symmetry, or with `along` their derivatives by a parameter."""
+    if along:
+        at = lambda x: _sides(with_parameters(quotient, {along: x}), sizes, q, t, None)  # noqa: E731
+        return jax.jvp(at, (parameter_of(quotient, along),), (1.0,))[1]
     u, claims = jnp.zeros(len(quotient.inputs)), [x for _, *x in quotient._claims(sizes)]
     return jax.vmap(lambda q, t: [tuple(as_vector(f(t, q, u)) for f in x) for x in claims])(q, t)
 

@@ -404,6 +404,10 @@ class Structure:
         """The names of chart a's states, with their units."""
         return signals(self.charts[a].states, self.charts[a].units)
 
+    def sizes(self, scale: Any) -> dict[str, np.ndarray]:
+        """Sizes of the states of each chart, by its name, from `Settings.scale`."""
+        return {x: np.asarray(scale)[a, : self.dims[a]] for a, x in enumerate(self.names)}
+
     def by_name(self, a: int, q: np.ndarray) -> dict[str, float]:
         """A state of chart a by names."""
         return ByName(zip(self.charts[a].states, q.tolist(), strict=False))

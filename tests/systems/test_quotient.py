@@ -1,5 +1,6 @@
 """Cycles modulo a symmetry: the walker in full, with two legs that have names and a place."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -40,9 +41,7 @@ def told(leg, th, phi, w, p, x):
     return a, b, va, vb, x
 
 
-class Full(hj.HybridSystem):
-    """Nothing is relabeled in the resets."""
-
+class Full(hj.HybridSystem):  # Nothing is relabeled in the resets.
     drag: hj.Parameter = hj.parameter(0.0)
     skew: hj.Parameter = hj.parameter(0.0)
     early: hj.Parameter = hj.parameter(0.0)
@@ -69,8 +68,7 @@ class Full(hj.HybridSystem):
 
 PARTNERS = {"left": "right", "left_rate": "right_rate"}
 MIRROR = {"swap": {"left stands": "right stands"}, "relabel": PARTNERS}
-
-
+ODD, SIZES = {"flipped": ("x", "v"), "half_period": True}, np.r_[1, 1, 1, 1, 1e-9]
 STRIDE = pytest.param(2, {}, hj.Crossing("left", "falling"), marks=pytest.mark.slow)
 
 
@@ -118,24 +116,25 @@ class Biased(hj.models.Duffing):
 
 
 def test_the_symmetry_is_that_of_all_systems_in_all_units():
-    def half(bias):
-        system = Biased(beta=5e16, amplitude=5e-10, bias=bias)
-        return hj.Quotient(system, flipped=("x", "v"), half_period=True)
-
+    half = lambda x: hj.Quotient(Biased(beta=5e16, amplitude=5e-10, bias=x), **ODD)  # noqa: E731
     cycle = hj.find_limit_cycle(half(0.0), section=hj.AtEvent("half period"))
-    with pytest.raises(hj.DefinitionError, match="Biased does not have the symmetry"):
-        hj.find_limit_cycle(half(1e-10), cycle)
-    with pytest.raises(hj.DefinitionError, match="Biased does not have the symmetry"):
-        hj.find_limit_cycles([half(0.0), half(1e-10)], cycle)
-    check_symmetry(hj.Quotient(hj.models.Duffing(rate=1e16), flipped=("x", "v"), half_period=True))
+    seen = hj.ObservedCycle(cycle.base, period=6.0)
+    for use in (
+        lambda: hj.find_limit_cycle(half(1e-10), cycle),
+        lambda: hj.find_limit_cycles([half(0.0), half(1e-10)], cycle),
+        lambda: cycle.sensitivity("system.bias"),
+        lambda: jax.grad(lambda x: hj.find_limit_cycle(half(x), cycle).period)(0.0),
+        lambda: hj.identifiability(cycle.system, seen, "system.bias", guess=cycle),
+    ):
+        with pytest.raises(hj.DefinitionError, match="Biased does not have the symmetry"):
+            use()
+    cycle.sensitivity("system.beta")
+    check_symmetry(hj.Quotient(hj.models.Duffing(rate=1e16), **ODD))
     with pytest.raises(hj.DefinitionError, match="'left lands' is not the mirror image"):
-        sizes = {"left stands": np.r_[1, 1, 1, 1, 1e-9]}
-        check_symmetry(hj.Quotient(Full(early=1e-10), **MIRROR), sizes)
+        check_symmetry(hj.Quotient(Full(early=1e-10), **MIRROR), {"left stands": SIZES})
 
 
-class Inverter(hj.HybridSystem):
-    """A coil between the poles of a supply, which two switches exchange."""
-
+class Inverter(hj.HybridSystem):  # A coil between the poles of a supply, exchanged by switches.
     early: float = 0.125
 
     def charts(self):
