@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 
-import hybridjax as hj
 from hybridjax.apps.cli import main
 
-from .conftest import OUTPUTS
 from .sessions import ROOT, Session, blocks, fences, run_python, same_output
 
 
@@ -42,18 +40,10 @@ def test_sessions_print_what_the_readme_shows(capsys, tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def read_section(tmp_path_factory, hopper_cycle):
+def read_section(tmp_path_factory):
     """A function that runs the fences of one section of the README after those of its opening, and
     returns the module in which they ran."""
     folder = tmp_path_factory.mktemp("readme")
-    # What the README's recording is read from.
-    force = [hj.testing.random_force(200, 100, bandwidth=8, rms=0.02, seed=k) for k in range(2)]
-    force = np.stack(force)
-    made = hj.testing.simulate_recording(hopper_cycle, force, OUTPUTS, rate=100, steps=1)
-    for name, trial in zip(("trial1", "trial2"), made.trials, strict=True):
-        table = np.column_stack([trial.time, trial.values])
-        header = ",".join(("time", *("force" if x == "u" else x for x in made.signals)))
-        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header=header, comments="")
     parts = re.split(r"^## (.*)$", (ROOT / "README.md").read_text(), flags=re.MULTILINE)
     sections = dict(zip(parts[1::2], parts[2::2], strict=True))
 

@@ -50,7 +50,7 @@ Format = Literal["png", "pdf", "svg"]
 
 
 @contextlib.contextmanager
-def results_folder(folder: Path, kind: str, names: Iterable[str] = ()) -> Iterator[Path]:
+def results_folder(folder: Path, kind: str, names: Iterable[str]) -> Iterator[Path]:
     """A new folder for results of this kind, which are moved to `folder` when all are there.
 
     Results of the same kind that are there already are replaced or removed. After an error `folder`

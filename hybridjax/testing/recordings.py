@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +13,7 @@ from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Fraction, NonNegative, Positive, Seed, SignalNames
 from .._core.boundary.values import Reals
+from .._core.compilation import quick_jit
 from .._core.limits import PERIODS, SECTIONS
 from .._core.signal import unit_of
 from ..errors import DefinitionError
@@ -91,7 +91,7 @@ def simulate_recording(
 
     **Raises:** `DefinitionError` as `response_function`.
     """
-    check_outputs(cycle, outputs)
+    recorded = check_outputs(cycle, outputs)
     force, inputs = np.asarray(force, float), cycle.structure.inputs
     if force.shape[1] < 2 or force.shape[2] != len(inputs):
         raise DefinitionError(
@@ -106,14 +106,14 @@ def simulate_recording(
         )
     K = round(rate * period)
     S, n, nu = force.shape
-    cycles = -(-(n - 1) // K)
+    # (A power of two: recordings of other lengths share a compiled program.)
+    cycles = 1 << (-(-(n - 1) // K) - 1).bit_length()
     x = np.concatenate([force, np.zeros((S, cycles * K + 1 - n, nu))], axis=1)
     middle = (np.arange(steps) + 0.5) / steps
     u = x[:, :-1, None] + (x[:, 1:] - x[:, :-1])[:, :, None] * middle[:, None]
     response = response_function(cycle, ClockPhase(K * steps), outputs)
     y = np.asarray(_respond(response, jnp.asarray(u.reshape(S, -1, nu))))[:, ::steps]
-    s = response.placed.structure()
-    names = s.inputs + s.resolve_outputs(response.outputs).names
+    names = inputs + recorded.names
     units = dict(zip(names, map(unit_of, names), strict=True))
     time = np.arange(y.shape[1]) * period / K
     trials = []
@@ -124,7 +124,7 @@ def simulate_recording(
     return Recording.join(trials)
 
 
-_respond = eqx.filter_jit(lambda response, u: response(u).y)
+_respond = quick_jit(lambda response, u: response(u).y)
 
 
 @checked
@@ -160,8 +160,7 @@ def spoil(
     columns, trials = [recording.column(x) for x in signals], []
     for trial in recording.trials:
         values, time = np.array(trial.values), trial.time
-        y = values[:, columns]
-        y = y + noise * rng.normal(size=y.shape)
+        y = values[:, columns] + noise * rng.normal(size=(len(time), len(columns)))
         y = np.round(y / quantum) * quantum if quantum else y
         if spikes:
             struck = rng.random(y.shape) < spikes

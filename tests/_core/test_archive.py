@@ -4,12 +4,13 @@ import io
 import json
 import tracemalloc
 import zipfile
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core import limits
+from hybridjax._core import archive, limits
 
 
 def npy(shape, data=b"", dtype="<f8"):
@@ -125,3 +126,11 @@ def test_a_parquet_file_that_declares_more_than_it_holds(tmp_path):
     parquet.write_table(pyarrow.table({"time": values}), path)
     assert path.stat().st_size < 2**20
     refused(hj.read_recording, path, "it declares .*, and is not that large|declares 16777216 rows")
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError(5, "Input/output error")])
+def test_a_computer_that_fails_is_no_damaged_file(tmp_path, monkeypatch, error):
+    saved(path := tmp_path / "good.npz", {})
+    monkeypatch.setattr(archive, "_array", Mock(side_effect=error))
+    with pytest.raises(type(error)):
+        archive.read_arrays(path)

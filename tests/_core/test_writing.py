@@ -121,7 +121,7 @@ def test_a_list_with_names_outside_touches_nothing_there(full):
 def test_an_error_leaves_nothing(tmp_path):
     for error in (ValueError, KeyboardInterrupt):
         with pytest.raises(error):
-            with results_folder(tmp_path / "new" / "er", "report") as new:
+            with results_folder(tmp_path / "new" / "er", "report", []) as new:
                 (new / "report.html").write_text("half")
                 raise error
     assert tree(tmp_path) == {}

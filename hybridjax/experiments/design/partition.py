@@ -89,7 +89,6 @@ def avoid_second_order(
     line: Int[np.ndarray, " K"],
     periods: int,
     rng: np.random.Generator,
-    rounds: int = 200_000,
 ) -> Int[np.ndarray, " K"]:
     """Return the partition after random swaps, such that no second-order product of an experiment
     falls on one of its own lines. Sizes stay as they are.
@@ -104,7 +103,7 @@ def avoid_second_order(
     held = [[classes[i] for i in m] for m in members]
     hits = [_hits(c, products) for c in held]
     draws: Iterator[list[float]] = iter(())
-    for k in range(rounds):
+    for k in range(200_000):
         if k % 4096 == 0:
             bad = [e for e, n in enumerate(hits) if n]
             draws = iter(rng.random((4096, 5)).tolist())
@@ -123,7 +122,7 @@ def avoid_second_order(
         new_e[i], new_f[j] = b, a
         hits_e, hits_f = _hits(new_e, products), _hits(new_f, products)
         worse = hits_e + hits_f - hits[e] - hits[f]
-        heat = 0.5 * max(1 - 2 * k / rounds, 0.0) + 1e-3
+        heat = 0.5 * max(1 - k / 100_000, 0.0) + 1e-3  # cold in the second half
         if worse <= 0 or x[4] < np.exp(-worse / heat):
             members[e][i], members[f][j] = members[f][j], members[e][i]
             held[e], held[f], hits[e], hits[f] = new_e, new_f, hits_e, hits_f
