@@ -290,7 +290,7 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
             "is wanted by the value of the quantity (an output of the system), e.g. "
             f"`conserved={example}`, or take the one nearest to the guess with `throw=False`."
         )
-    reason = code.message
+    reason = code.message + f" from {cycle.settings.max_steps}" * (code == Result.STEP_LIMIT)
     if code == Result.EXTRA_TURNS and cycle.multiplicity > 1:
         return (
             f"the cycle of {name} that was found closes sooner than after the "
