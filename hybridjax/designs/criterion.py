@@ -136,5 +136,5 @@ def _root(matrix: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]) -> Float[
         named = zip(direction, unknowns, strict=True)
         parts = [f"{x:+.2g} {name}" for x, name in named if abs(x) > 1e-3 * largest]
         combination = " ".join(parts)
-        raise DefinitionError(f"no response depends on {combination}: fix one, or add an output.")
+        raise DefinitionError(f"no response changes along {combination}: fix one, or add an output.")
     return vectors / np.sqrt(values) / size[:, None]
