@@ -135,6 +135,6 @@ def _root(matrix: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]) -> Float[
         largest = np.abs(direction).max()
         named = zip(direction, unknowns, strict=True)
         parts = [f"{x:+.2g} {name}" for x, name in named if abs(x) > 1e-3 * largest]
-        combination = " ".join(parts)
-        raise DefinitionError(f"no response changes along {combination}: fix one, or add an output.")
+        along = " ".join(parts)
+        raise DefinitionError(f"no response changes along {along}: fix one, or add an output.")
     return vectors / np.sqrt(values) / size[:, None]
