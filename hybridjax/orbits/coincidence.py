@@ -64,7 +64,7 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
     `throw=False`). A group contains at least one event that is not scheduled.
     """
     cycle = to_host(cycle)
-    s, period, path, groups = cycle.structure, float(cycle.period), cycle.trajectory(2.0), []
+    s, period, path, groups = cycle.structure, float(cycle.period), cycle.trajectory(1.01), []
     at = np.flatnonzero(path.event >= 0)
     times = path.t[at]
     starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)
