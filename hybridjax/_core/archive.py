@@ -235,7 +235,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
                 _check_sizes(members, path.stat().st_size)
                 return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
         except Exception as error:  # whatever broken bytes make zipfile and numpy stumble over
-            # (A place outside of the file is EINVAL; what else the system reports is no damage.)
+            # (A place outside of the file is EINVAL; what else the system reports is no damage. The
+            # text is for the user, and nothing reads it.)
             if isinstance(error, MemoryError) or getattr(error, "errno", EINVAL) != EINVAL:
                 raise
             raise damaged(path, str(error) or type(error).__name__) from error

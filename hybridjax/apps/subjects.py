@@ -181,7 +181,7 @@ def identify_subjects(
         for factor in factors_of(frame):
             pairs = itertools.combinations(frame[factor].unique()[::-1], 2)
             parts += [population.difference("modulus", a, b) for a, b in pairs]
-    except DefinitionError as error:  # too few subjects: the report shows why
+    except DefinitionError as error:  # too few subjects: the report shows its text
         failures["population"] = str(error)
     results = package("pandas").concat(parts, ignore_index=True)
     study = Study(population, fits, failures, results, root)

@@ -22,15 +22,7 @@ from .candidates import Candidates, Model, NoiseLike, Powers, make_noise, mean_s
 from .criteria import criterion_of
 from .criterion import Criterion
 from .goals import Goal, Multipliers
-from .limits import (
-    Limit,
-    PowerLimits,
-    Products,
-    as_limits,
-    below_peaks,
-    power_limits,
-    products,
-)
+from .limits import Limit, PowerLimits, Products, as_limits, below_peaks, power_limits, products
 
 
 # Ratio of strides from which on `advice` recommends the design. Larger: designs that save a third

@@ -123,8 +123,8 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     objection = ""
     try:
         require_order(groups, htf, order, fit.cost / fit.freedom, fit.residual)
-    except DefinitionError as error:  # (the advice after its first sentence is for a single fit)
-        objection = f"{str(error).split('. ')[0]} (or add the blocks to a study of lower `order`)"
+    except DefinitionError:  # (with advice for a single fit)
+        objection = f"the data do not support {order} multipliers (lower `order` in a new study)"
     if not objection and (np.abs(fit.multipliers) >= 1).any():
         objection = "the estimate is unstable, and an unstable system has no periodic response"
     return Estimate(fit, by_level, noise, objection)

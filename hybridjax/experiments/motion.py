@@ -22,8 +22,7 @@ from .response import require_shape
 
 @checked
 def perturbed_trajectory(
-    placed: PlacedSections,
-    inputs: Annotated[Numbers, Reals("samples inputs")],
+    placed: PlacedSections, inputs: Annotated[Numbers, Reals("samples inputs")]
 ) -> Trajectory:
     """Return the motion from section 0 of the cycle under inputs that are held from section to
     section, for `hj.plot.animate` and `hj.plot.cycle`.

@@ -31,10 +31,7 @@ def _multiplied(product, factor):
 
 @jax.jit
 def response(
-    m: Matrices,
-    u: Float[Array, "n nu"],
-    x0: Float[Array, " d"],
-    sections: Int[Array, " n"],
+    m: Matrices, u: Float[Array, "n nu"], x0: Float[Array, " d"], sections: Int[Array, " n"]
 ) -> tuple[Float[Array, "time d"], Float[Array, "n ny"]]:
     """`x0` and the states after each input, and the outputs; `sections`, where each input acts."""
 

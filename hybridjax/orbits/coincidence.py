@@ -64,6 +64,8 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
     `throw=False`). A group contains at least one event that is not scheduled.
     """
     cycle = to_host(cycle)
+    # (A little more than one turn, for events at its end. Rounding may spoil another one, where
+    # events coincide.)
     s, period, path, groups = cycle.structure, float(cycle.period), cycle.trajectory(1.01), []
     at = np.flatnonzero(path.event >= 0)
     times = path.t[at]

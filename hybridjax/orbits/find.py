@@ -140,9 +140,9 @@ def find_limit_cycle(
     if isinstance(guess, LimitCycle):
         _check_fits(guess, s, multiplicity, bool(settle) or max_period is not None)
         conserved = guess.conserved if conserved is None else conserved
-        for name in () if is_traced(guess) else arrays_of(system):
-            if is_tracer(arrays_of(system)[name]):
-                check_symmetry(guess.system, guess.structure.sizes(guess.settings.scale), name)
+        moving = [name for name, x in arrays_of(system).items() if is_tracer(x)]
+        for name in [] if is_traced(guess) else moving:
+            check_symmetry(guess.system, guess.structure.sizes(guess.settings.scale), name)
         map = guess.return_map.at_phase_of(system)
         settings = dataclasses.replace(settings, scale=scale_of(s, given, guess.settings.scale))
         base = map.base if section is None else section

@@ -139,8 +139,8 @@ def impulse_responses(
     steps = np.concatenate([np.diff(t) for t in data.times])
     durations = average_cycle(np.concatenate(section) % N, steps[:, None], N)[:, 0]
     values, std = (_by_push(x, durations, weights) for x in (pushed(h), std))
-    about = (np.arange(N) / N, np.arange(lags) / N, float(width), durations)
-    return ImpulseResponses(values, std, *about, fit.inputs, fit.outputs)
+    phase, lag, width = np.arange(N) / N, np.arange(lags) / N, float(width)
+    return ImpulseResponses(values, std, phase, lag, width, durations, fit.inputs, fit.outputs)
 
 
 def _push(width: float) -> Series:

@@ -222,10 +222,6 @@ def integrated(system: HybridSystem, solver: Any) -> HybridSystem:
     return current(other)
 
 
-def _of_system(name: str) -> Any:
-    return lambda self, *arguments: getattr(self.system, name)(*arguments)
-
-
 class Derived(HybridSystem):
     """A system made of another one, of which it has all that it does not define anew."""
 
@@ -234,9 +230,20 @@ class Derived(HybridSystem):
     inputs, time_unit = attribute_of("system", "inputs"), attribute_of("system", "time_unit")
     input_units = attribute_of("system", "input_units")
 
-    charts, transitions, period, outputs, draw = map(
-        _of_system, ("charts", "transitions", "period", "outputs", "draw")
-    )
+    def charts(self):
+        return self.system.charts()
+
+    def transitions(self):
+        return self.system.transitions()
+
+    def period(self):
+        return self.system.period()
+
+    def outputs(self):
+        return self.system.outputs()
+
+    def draw(self, chart, t, q):
+        return self.system.draw(chart, t, q)
 
 
 class Driven(Derived):

@@ -67,7 +67,7 @@ def test_too_much_noise_to_begin_with(model, first):
     lost = study.add(measured(model, first, factor=1e4))
     assert not lost.done and np.isnan(lost.standard_errors).all() and lost.plan is None
     assert "the first design again, since the data " in repr(lost)
-    assert "study of lower `order`" in repr(lost) and "check=" not in repr(lost)
+    assert "lower `order` in a new study" in repr(lost) and "check=" not in repr(lost)
     np.testing.assert_array_equal(lost.design.line, first.line)
     assert (lost.design.phase != first.phase).all()
     found = lost.add(measured(model, lost.design))

@@ -47,7 +47,7 @@ def run_on(client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequen
     except (OSError, RuntimeError, CancelledError) as error:
         if isinstance(error, HybridJaxError) or client.status == "running":
             raise
-        raise ComputationError("the Dask cluster was lost: make a new client.") from error
+        raise ComputationError("the Dask cluster is lost: call again with a new client.") from error
 
 
 def _run(client: Client, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]) -> None:

@@ -103,7 +103,8 @@ def avoid_second_order(
     held = [[classes[i] for i in m] for m in members]
     hits = [_hits(c, products) for c in held]
     draws: Iterator[list[float]] = iter(())
-    for k in range(200_000):
+    rounds = 200_000  # (fewer: divisions are missed that there are; more: vain searches last)
+    for k in range(rounds):
         if k % 4096 == 0:
             bad = [e for e, n in enumerate(hits) if n]
             draws = iter(rng.random((4096, 5)).tolist())
@@ -122,7 +123,7 @@ def avoid_second_order(
         new_e[i], new_f[j] = b, a
         hits_e, hits_f = _hits(new_e, products), _hits(new_f, products)
         worse = hits_e + hits_f - hits[e] - hits[f]
-        heat = 0.5 * max(1 - k / 100_000, 0.0) + 1e-3  # cold in the second half
+        heat = 0.5 * max(1 - 2 * k / rounds, 0.0) + 1e-3  # cold in the second half
         if worse <= 0 or x[4] < np.exp(-worse / heat):
             members[e][i], members[f][j] = members[f][j], members[e][i]
             held[e], held[f], hits[e], hits[f] = new_e, new_f, hits_e, hits_f

@@ -454,10 +454,12 @@ def _finished(
         noise = prediction.noise_model(model, S, scale, data.outputs)
     c, slopes = characteristic_slopes(point.coordinates)
     spread = point.equations.spread(unit)
-    estimate = multipliers_of(c), c, spread.covariance(slopes), np.inf if known else float(freedom)
     return LDTPFit(
-        *estimate,
         model=model.to_ldtp(scale, data.inputs, data.outputs),
+        multipliers=multipliers_of(c),
+        coefficients=c,
+        covariance=spread.covariance(slopes),
+        covariance_freedom=np.inf if known else float(freedom),
         cost=point.cost if known else float(freedom),
         freedom=freedom,
         correlation=correlation,

@@ -311,7 +311,10 @@ def assemble(
         return np.swapaxes(b, -1, -2)
 
     return SeriesFit(
-        *(multipliers_of(solution.c), solution.c, *covariance),
+        multipliers=multipliers_of(solution.c),
+        coefficients=solution.c,
+        covariance=covariance.matrix,
+        covariance_freedom=covariance.freedom,
         numerators=by_input(numerators),
         slopes=by_input(slopes),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),

@@ -103,7 +103,7 @@ def best_order(data: RecordedData, reference: Sequence[str], most: int) -> tuple
             if LoopEquations(*in_loop(data, reference), order, None).solution.told >= order:
                 return order, obstacle
             obstacle = ""
-        except DefinitionError as error:  # too few cycles for so many: a finding says why
+        except DefinitionError as error:  # too few cycles for so many: a finding shows its text
             obstacle = str(error)
     return 1, obstacle
 
