@@ -41,7 +41,7 @@ LIMITS = {
     "structure": 13,
     "fragments": 10,
     "pronouns": 17,
-    "test_lines": 18_097,
+    "test_lines": 18096,
     "doc_words": 38_886,
 }
 

@@ -128,8 +128,7 @@ def _root(matrix: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]) -> Float[
     size = np.sqrt(np.diag(matrix))
     lost = np.flatnonzero(~(size > 0))
     if len(lost):
-        name = unknowns[lost[0]]
-        raise DefinitionError(f"no response depends on {name}: leave it out, or add an output.")
+        raise DefinitionError(f"{unknowns[lost[0]]} changes no response: drop it or add an output.")
     values, vectors = np.linalg.eigh(matrix / size / size[:, None])
     if not values[0] > ROUNDING:  # relative to the largest, for combinations of matrices
         direction = vectors[:, 0] / size

@@ -190,8 +190,8 @@ def keep_pace(
     """
     xp, (since, gap, streak, total) = namespace(pace), pace
     since = since + moved
-    ratio = xp.where(gap > 0, since / xp.where(gap > 0, gap, 1.0), 0.0)
-    shrinks = ratio < 1
+    ratio = since / xp.where(gap > 0, gap, 1.0)
+    shrinks = (since < gap) | (since == 0)  # (not the first interval after events at one time)
     streak = xp.where(event, xp.where(shrinks, streak + 1, 0.0), streak)
     total = xp.where(event, xp.where(shrinks, total + since, 0.0), total)
     to_come = xp.where(shrinks, since * ratio / xp.where(shrinks, 1 - ratio, 1.0), xp.inf)

@@ -60,5 +60,5 @@ def test_unidentifiable_unknowns_are_named():
     same = criterion(np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]))
     with pytest.raises(hj.DefinitionError, match=r"no response changes along .*x0 .*x1"):
         allocate(same, limits(np.ones(3)), np.ones(3))
-    with pytest.raises(hj.DefinitionError, match="no response depends on x1"):
+    with pytest.raises(hj.DefinitionError, match="x1 changes no response"):
         allocate(criterion(np.array([[1.0, 2], [0, 0]])), limits(np.ones(2)), np.ones(2))

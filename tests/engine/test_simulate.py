@@ -71,12 +71,11 @@ BLOWUP = toy({"x": Field(("x",), lambda t, q, u: q**2)})  # infinite at t = 1 / 
 
 def test_a_hundred_bounces():
     bounces = ball(1.0, 200 * FALL)
-    n = np.arange(1, 101)
-    np.testing.assert_allclose(times(bounces), FALL * (2 * n - 1), rtol=1e-11)
+    np.testing.assert_allclose(times(bounces), FALL * np.arange(1, 200, 2), rtol=1e-11)
     first = bounces.events[0]
     assert (first.name, first.source, first.target) == ("bounce", "fall", "fall")
-    np.testing.assert_allclose(first.before["v"], -np.sqrt(2 * G), rtol=1e-13)
-    np.testing.assert_allclose(first.after["v"], np.sqrt(2 * G), rtol=1e-13)
+    speeds = [-first.before["v"], first.after["v"]]
+    np.testing.assert_allclose(speeds, np.sqrt(2 * G), rtol=1e-13)
 
 
 @pytest.mark.parametrize("e", [0.1, 0.9])
@@ -85,8 +84,7 @@ def test_zeno_is_seen_before_its_limit(e):
     limit = FALL * (1 + e) / (1 - e)
     assert found.result == hj.Result.ZENO
     assert limit * (1 - 1e-3) < found.t[-1] < limit
-    n = np.arange(len(found.events))
-    expected = FALL * (1 + 2 * e * (1 - e**n) / (1 - e))
+    expected = FALL * (1 + 2 * e * (1 - e ** np.arange(len(found.events))) / (1 - e))
     np.testing.assert_allclose(times(found), expected, rtol=1e-10)
     with pytest.raises(hj.ComputationError, match=r"in chart 'fall': events accumulate .*Zeno"):
         ball(e)
@@ -98,8 +96,7 @@ def test_grazing(gap):
     found = hj.simulate(Toys(ceiling, [1 + gap]), "air", (0.0, np.sqrt(2.0)), 2.0, throw=False)
     hit = np.sqrt(2.0) - np.sqrt(max(-2 * gap, 0.0))
     if abs(gap) < 1e-10:
-        assert found.result == hj.Result.GRAZING
-        assert all(abs(t - hit) < 1e-6 for t in times(found))
+        assert found.result == hj.Result.GRAZING and np.all(np.abs(times(found) - hit) < 1e-6)
     else:
         assert found.result == hj.Result.OK
         np.testing.assert_allclose(times(found), [hit] if gap < 0 else [], atol=1e-10)
@@ -117,8 +114,7 @@ def test_a_guard_that_dips_within_a_step_fires(exponent):
 
 def test_blow_up():
     found = hj.simulate(BLOWUP, "x", (1.0,), 2.0, throw=False)
-    assert found.result == hj.Result.BLOW_UP
-    assert abs(found.t[-1] - 1.0) < 1e-6
+    assert found.result == hj.Result.BLOW_UP and abs(found.t[-1] - 1.0) < 1e-6
     with pytest.raises(hj.ComputationError, match="the state left all bounds"):
         hj.simulate(BLOWUP, "x", (1.0,), 2.0)
     decay = hj.simulate(BLOWUP, "x", (-1.0,), 2.0)
@@ -126,16 +122,12 @@ def test_blow_up():
 
 
 @pytest.mark.parametrize(
-    "low, high, order",
-    [
-        (0.4999999, 0.5, ["high", "low"]),
-        (0.5, 0.4999999, ["low", "high"]),
-        (0.5, 0.5, ["low", "high"]),
-    ],
+    "low, high, first", [(0.4999999, 0.5, "high"), (0.5, 0.4999999, "low"), (0.5, 0.5, "low")]
 )
-def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, order):
+def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, first):
     found = hj.simulate(Toys(turning, [low, high]), "turn", (0.0, -1.0, 0.0), 2 * np.pi)
-    assert [e.name for e in found.events if e.name != "gated"] == order
+    names = [e.name for e in found.events if e.name != "gated"]
+    assert names[0] == first and sorted(names) == ["high", "low"]
     for name, level in (("low", low), ("high", high)):
         expected = np.pi / 2 + np.arccos(level)
         np.testing.assert_allclose(times(found, name), [expected], atol=1e-12)

@@ -132,7 +132,9 @@ def attempt(state: State, aim: Aim, task: Task, unroll=False, in_step: bool = Fa
             after = cond(present, lambda: flow.watch(t + moved, end.q, end.f), lambda: before)
             bent = _bent(flow, before, after, (q, step.f0), end, t, moved, task.span)
             chosen = (np.array(rows)[:, None] == which) & end.lands
-            far, slow = _clearance(before, after, moved, take_rows(state.ready, rows), chosen)
+            # (Where events coincide, the step to the second is rounding, and tells no speed.)
+            judged = chosen & (xp.abs(before.value) > width(t, task.span, before.rate))
+            far, slow = _clearance(before, after, moved, take_rows(state.ready, rows), judged)
             calm = (far | chosen).all(axis=0) & ~bent & ~slow
             out = out._replace(
                 watched=write(out.watched, rows, here, after),
@@ -229,10 +231,10 @@ def _bent(flow: ChartFlow, before: Watch, after: Watch, start, end, t, moved, sp
 
 
 def _clearance(
-    before: Watch, after: Watch, moved: AnyTimes, armed: Flags, chosen: Flags
+    before: Watch, after: Watch, moved: AnyTimes, armed: Flags, judged: Flags
 ) -> tuple[Flags, Mask]:
     """Test whether watched functions stay away from zero, by bounds of their interpolants, and find
-    lanes that land on a `chosen` zero at a vanishing speed."""
+    lanes that land on a `judged` zero at a vanishing speed."""
     xp = namespace(moved)
     ends = before.value, after.value, moved * before.rate, moved * after.rate
     points = control_points(*ends)
@@ -241,7 +243,7 @@ def _clearance(
     far = xp.where(armed, low > NEAR * xp.maximum(xp.abs(ends[0]), xp.abs(ends[1])), high <= 0)
     fastest = xp.maximum(xp.abs(ends[2]), xp.abs(ends[0]))
     # (By rounding, the zero may lie a little before the start.)
-    slow = (chosen & (xp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)
+    slow = (judged & (xp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)
     return far, slow
 
 
