@@ -47,6 +47,8 @@ _WORTH_OPTIMIZING = 8.0
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
 # is 1024.
 _LOOP_KERNELS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
+# JAX's settings by which the same function becomes another program.
+_SETTINGS = "jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion"
 # Programs of either kind that are kept. Fewer: taking turns with many systems compiles again.
 _KEPT = 1024
 
@@ -175,10 +177,10 @@ def host_first(function: Callable, derived: Callable = lambda compiled: compiled
     spent: dict[tuple, float] = collections.defaultdict(float)
     programs: dict[tuple, Callable] = {}
 
-    def compile_(key, arguments):
+    def compile_(arguments):
         # (It is not run: programs with factorizations may run in one thread only, see `in_turn`.)
-        with on_the_cpu():
-            programs[key] = getattr(compiled, "lower")(*arguments).compile()  # noqa: B009
+        with on_the_cpu():  # (under JAX's settings of this thread)
+            programs[kind(arguments)] = compiled.lower(*arguments).compile()  # type: ignore
 
     @ft.wraps(function)
     def call(*arguments):
@@ -201,7 +203,7 @@ def host_first(function: Callable, derived: Callable = lambda compiled: compiled
         finally:
             spent[key] += time.thread_time() - begin
             if before <= WORTH_COMPILING < spent[key] and key not in programs:
-                threading.Thread(target=compile_, args=(key, arguments)).start()
+                threading.Thread(target=compile_, args=(arguments,)).start()
 
     return call
 
@@ -213,9 +215,11 @@ def at_ease() -> contextlib.AbstractContextManager:
 
 
 def kind(arguments) -> tuple:
-    """All of the arguments that a program is compiled for: everything but the values of arrays."""
+    """All that a program is compiled for: everything of the arguments but the values of arrays, and
+    JAX's settings (in a thread: those of all threads)."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
-    return structure, *((x.shape, x.dtype) if _is_array(x) else (type(x), x) for x in leaves)
+    types = ((x.shape, x.dtype) if _is_array(x) else (type(x), x) for x in leaves)
+    return structure, *(getattr(jax.config, name) for name in _SETTINGS), *types
 
 
 class TwoTiers:
@@ -234,7 +238,7 @@ class TwoTiers:
     def __call__(self, *arguments: Any) -> Any:
         if not _is_simple() or is_hidden(arguments):
             return one_tier(self._function, self.large)(*arguments)
-        key = self._function, _settings(), kind(arguments)
+        key = self._function, kind(arguments)
         arrays, static = eqx.partition(arguments, _is_array)
         leaves, structure = jax.tree_util.tree_flatten(arrays)
         if key not in self._chosen:
@@ -323,12 +327,6 @@ def _is_simple() -> bool:
     first = device in (None, "cpu") or device == jax.local_devices(backend="cpu")[0]
     names = "jax_disable_jit", "jax_debug_nans", "jax_debug_infs"
     return on_cpu() and first and not any(getattr(jax.config, name) for name in names)
-
-
-def _settings() -> tuple:
-    """Settings by which the same function becomes another program."""
-    names = "jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion"
-    return tuple(getattr(jax.config, name) for name in names)
 
 
 # XLA hands factorizations that are left in a program (`vector_math/rewrite.py`) to LAPACK, on the

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.orbits.linear_flow import begin_later, last_turn
 
 from ..toys import Switched
 
@@ -39,6 +40,8 @@ def test_the_hopper_and_its_events(reference, hopper_cycle):
         (touchdown.after, "touchdown_post"),
     ):
         np.testing.assert_allclose(list(found.values()), data[name], atol=1e-10)
+    (before, _), (after, _) = map(last_turn, (hopper_cycle, begin_later(hopper_cycle, 2)))
+    np.testing.assert_array_equal(after.t, np.append(before.t[2:], before.t[:2] + 1.0))
     text = repr(hopper_cycle)
     assert "liftoff, touchdown" in text and "-0.248983335+0.699333252j" in text
 

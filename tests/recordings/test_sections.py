@@ -66,10 +66,11 @@ def test_gaps_are_masked_and_cut(wave):
     values[(t > 4.3) & (t < 4.5), 1] = np.nan  # of an output, too short to lose the count
     values[(t > 9.1) & (t < 9.3), 0] = np.nan  # of the input, longer than a section
     values[(t > 14) & (t < 16), 1:] = np.nan
-    data = sample(hj.Recording(t, dict(zip("fxv", values.T, strict=True))))
+    data = sample(hj.Recording(t, dict(zip("fxv", values.T, strict=True))), timing="duration")
     assert len(data.records) == 2
     for record, times in zip(data.records, data.times, strict=True):
-        lost = np.isnan(record.y[:, 0])
+        lost, x = np.isnan(record.y[:, [0, 2]]).T
+        np.testing.assert_array_equal(x, lost | np.append(True, lost[:-1]))
         np.testing.assert_array_equal(lost & (times > 4.29) & (times < 4.51), lost)
         end = np.append(times[1:], times[-1] + 0.125)
         np.testing.assert_array_equal(np.isnan(record.u[:, 0]), (end > 9.11) & (times < 9.29))

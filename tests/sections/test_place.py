@@ -200,3 +200,5 @@ def test_a_section_at_the_time_of_an_event_is_refused():
     impact = float(path.t[path.event >= 0][0] / wheel.period)
     with pytest.raises(hj.ComputationError, match="coincides with an event"):
         hj.place_sections(wheel, hj.ClockPhase(2, anchor=impact))
+    with pytest.raises(hj.ComputationError, match="does not reach section 0"):
+        hj.place_sections(wheel, hj.Crossing("th", "rising", 1.0))
