@@ -3,9 +3,9 @@ import gc
 import importlib.metadata
 import os
 import pathlib
+import re
 import subprocess
 import sys
-import threading
 
 
 # Said before NumPy and XLA are loaded, here and in the workers of pytest-xdist: threads of BLAS
@@ -138,26 +138,32 @@ def forget_programs():
 
 
 @contextlib.contextmanager
-def no_compilation(after):
-    """A context in which nothing may be compiled, once `after()` has run. Functions of few lanes
-    stay on the host in both: by default the seconds that earlier tests have spent there decide."""
-    threads, patience = [], compilation.WORTH_COMPILING
+def compiled():
+    """The names of all that is compiled in this context, where functions of few lanes stay on the
+    host: by default the seconds that earlier tests have spent there decide."""
+    names, patience = set(), compilation.WORTH_COMPILING
 
-    def listen(event, duration, **_):
+    def listen(event, *_, fun_name="", **__):
         if "backend_compile" in event:
-            threads.append(threading.current_thread().name)
+            names.add(re.sub(r"^jit\(|_[0-9a-f]{32}|\)$", "", fun_name))
 
     compilation.WORTH_COMPILING = np.inf
+    jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        after()
-        jax.monitoring.register_event_duration_secs_listener(listen)
-        try:
-            yield
-        finally:
-            jax.monitoring.unregister_event_duration_listener(listen)
+        yield names
     finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
         compilation.WORTH_COMPILING = patience
-    assert not threads, f"programs were compiled in {threads}"
+
+
+@contextlib.contextmanager
+def no_compilation(after):
+    """A context in which nothing may be compiled, once `after()` has run."""
+    with compiled():
+        after()
+    with compiled() as names:
+        yield
+    assert not names
 
 
 @pytest.fixture(scope="session")

@@ -69,9 +69,11 @@ def namespace(x: Array) -> Any:
 
 
 def to_host(tree: Any) -> Any:
-    """`tree` with its arrays on the host, but for those of a `Definition`."""
+    """`tree` with its arrays on the host, but for those of a `Definition`. Where JAX traces some of
+    them, all remain what they are."""
+    traced = is_traced(tree)
     return jax.tree_util.tree_map(
-        lambda x: np.asarray(x) if isinstance(x, jax.Array) else x,
+        lambda x: np.asarray(x) if isinstance(x, jax.Array) and not traced else x,
         tree,
         is_leaf=lambda x: isinstance(x, Definition),
     )

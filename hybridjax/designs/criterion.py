@@ -134,7 +134,6 @@ def _root(matrix: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]) -> Float[
         direction = vectors[:, 0] / size
         largest = np.abs(direction).max()
         named = zip(direction, unknowns, strict=True)
-        parts = [f"{x:+.2g} {name}" for x, name in named if abs(x) > 1e-3 * largest]
-        along = " ".join(parts)
+        along = " ".join(f"{x:+.2g} {name}" for x, name in named if abs(x) > 1e-3 * largest)
         raise DefinitionError(f"no response changes along {along}: fix one, or add an output.")
     return vectors / np.sqrt(values) / size[:, None]

@@ -4,10 +4,10 @@ import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
+from .._core.executor import from_host, to_host
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import require_deviations
@@ -53,7 +53,7 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     names = data.inputs, data.outputs
     htf = HTF(np.arange(len(f)), H[..., None], each[0].harmonics, N, *names, variance=variance)
     # Frequencies may occur several times, measured each time on their own.
-    htf = eqx.tree_at(lambda htf: htf.f, htf, jnp.asarray(f / P))
+    htf = eqx.tree_at(lambda htf: htf.f, htf, from_host(f / P))
     return Block(htf, data.u.shape[0] * data.u.shape[1] // N)
 
 
@@ -88,8 +88,8 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     and distortion at the lines that matter, valid for any spectrum of the noise, but uncertain
     where these are few; and from the levels of the noise, as if it were white.
     """
-    htfs = [block.htf for block in blocks]
-    f, H = jnp.concatenate([x.f for x in htfs]), jnp.concatenate([x.H for x in htfs], axis=1)
+    htfs = to_host([block.htf for block in blocks])
+    f, H = np.concatenate([x.f for x in htfs]), np.concatenate([x.H for x in htfs], axis=1)
     member = np.repeat(np.arange(len(blocks)), [len(htf.f) for htf in htfs])
     # To begin with, all of it may be noise.
     square = [np.mean(np.abs(htf.H) ** 2 / htf.variance, axis=(0, 1, 3)) for htf in htfs]
@@ -98,8 +98,8 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     def weighted() -> tuple[HTF, list[HTFGroup]]:
         """Return all lines of all blocks, one after the other, with their variances."""
         each = [htf.variance * std[:, None] ** 2 for htf, std in zip(htfs, noise, strict=True)]
-        values = f, H, jnp.concatenate(each, axis=1)
-        htf = eqx.tree_at(lambda htf: (htf.f, htf.H, htf.variance), htfs[0], values)
+        values = f, H, np.concatenate(each, axis=1)
+        htf = from_host(eqx.tree_at(lambda x: (x.f, x.H, x.variance), htfs[0], values))
         return htf, grouped(htf, order, goal.overhang)
 
     for _ in range(_SWEEPS):

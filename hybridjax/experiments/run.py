@@ -360,7 +360,7 @@ def _controller(
     if isinstance(F, LDTP):
         return to_host(F.matrices)
     shape = len(model.inputs), len(model.outputs)
-    return to_host(static_gain(from_host(F), model.n_sections, shape))
+    return to_host(static_gain(to_host(F), model.n_sections, shape))
 
 
 def check_inputs(design: DesignLike, discard: int, n_sections: int, inputs: tuple) -> Inputs:

@@ -198,7 +198,7 @@ def _cycle_at(
 
 
 def _descend(problem: FitProblem, start: Float[np.ndarray, " p"], cycle: LimitCycle) -> End:
-    if cycle.result != Result.OK:
+    if int(cycle.result) != Result.OK:
         none = np.zeros(0), np.zeros((0, len(start)))
         return End(start, start, np.inf, *none, cycle, 0, int(cycle.result))
     x, r, J, near, steps, converged = descend(problem, start, cycle)

@@ -223,7 +223,7 @@ def _with_jacobian(problem: FitProblem, x, guess):
     and the anchor, the period and the last turn."""
     at = lambda x: problem.residuals(x, guess)  # noqa: E731
     push = lambda t: jax.jvp(at, (x,), (t,), has_aux=True)  # noqa: E731
-    return jax.vmap(push, out_axes=(None, -1, None))(jnp.eye(x.shape[0]))
+    return jax.vmap(push, out_axes=(None, -1, None))(np.eye(x.shape[0]))
 
 
 _compiled = quick_jit(_with_jacobian)

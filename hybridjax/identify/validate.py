@@ -37,7 +37,7 @@ def can_be_compared(model: LDTP | SeriesFit | Predictor, record: Record, free_st
     if isinstance(model, SeriesFit):
         unknown += N * ny * model.free_cycles * free_start
     elif free_start:
-        unknown += int(model.dims[record.first_section])
+        unknown += int(np.asarray(model.dims)[record.first_section])
     return int(np.isfinite(record.y).sum()) > _SAMPLES_PER_UNKNOWN * unknown
 
 

@@ -56,11 +56,11 @@ def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, 
     variance = np.asarray(htf.variance)
     if htf.scatter is not None and variance.all():
         _, same = np.unique(np.abs(htf.harmonics), return_inverse=True)
-        share = np.asarray(htf.scatter.freedom) / np.sum(htf.scatter.freedom)
+        freedom = np.asarray(htf.scatter.freedom)
         size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
         for _ in range(20):  # more sweeps change nothing in 6 digits
             by_line = (variance / size[same]).mean(axis=0)
-            mean = np.tensordot(share, variance / by_line, axes=(0, 1))
+            mean = np.average(variance / by_line, axis=1, weights=freedom)
             size = np.stack([mean[same == k].mean(axis=0) for k in range(len(size))])[:, None]
         variance = size[same] * by_line
     return weights_of(variance, rms)

@@ -83,11 +83,11 @@ def connect(
     return Matrices(A, B, C, M @ D @ by_input, a.dims + b.dims)
 
 
-def require_well_posed(through: Float[Array, "N n n"]) -> None:
-    """**Raises:** `DefinitionError` where a section answers itself without bounds."""
-    if is_traced(through):
+def require_well_posed(D: Float[Array, "N ny nu"], F: Float[Array, "N nu ny"]) -> None:
+    """**Raises:** `DefinitionError` where a section answers itself without bounds by -F."""
+    if is_traced(D, F):
         return
-    values = np.linalg.svd(np.eye(through.shape[1]) - np.asarray(through), compute_uv=False)
+    values = np.linalg.svd(np.eye(D.shape[1]) + np.asarray(D) @ np.asarray(F), compute_uv=False)
     if len(bad := np.flatnonzero(values[:, -1] < _WELL_POSED * np.maximum(values[:, 0], 1))):
         raise DefinitionError(
             f"the loop has no response at section {bad[0]}, where direct feed-through answers "

@@ -14,7 +14,7 @@ from .._core.arguments import Numbers, names, require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, Vector
 from .._core.boundary.values import Complexes, Reals, Whole
-from .._core.executor import from_host, is_traced
+from .._core.executor import from_host, is_traced, namespace, put, to_host
 from .._core.html import COLORS, Curve, card, picture
 from .._core.precision import require_x64
 from .._core.signal import ratio, with_unit
@@ -57,8 +57,7 @@ class Scatter(eqx.Module):
     ):
         require_x64()
         self.shared = shared
-        self.freedom = jnp.asarray(freedom)
-        self.roundness = None if roundness is None else jnp.asarray(roundness)
+        self.freedom, self.roundness = from_host((freedom, roundness))
 
     def sources(self, f: Float[np.ndarray, " F"]) -> Int[np.ndarray, " F"]:
         """Return the index of the noise from which the errors of each line stem."""
@@ -77,11 +76,11 @@ class Scatter(eqx.Module):
         zero. If the mean of a few of them is large, they lie on an arc, nearly on a line, and w is
         small.
         """
-        miss = 1 - level
-        if self.roundness is not None:
-            miss = miss * (1 + level**2 * (self.roundness - 1))
-        freedom = self.freedom[:, None, None]
-        return freedom * jnp.expm1(-jnp.log(miss) / freedom)
+        freedom, roundness = to_host((self.freedom, self.roundness))
+        excess = 0.0 if roundness is None else roundness - 1
+        miss = (1 - level) * (1 + level**2 * excess)
+        freedom, xp = freedom[:, None, None], namespace(freedom)
+        return from_host(freedom * xp.expm1(-xp.log(miss) / freedom))
 
 
 Variance = Annotated[Numbers, Reals(_ENTRIES, sign="nonnegative", infinite=True)]
@@ -216,7 +215,7 @@ class HTF(eqx.Module):
 
         **Raises:** `DefinitionError` if it is not among the harmonics stored.
         """
-        return self.H[self._index(m)]
+        return from_host(to_host(self.H)[self._index(m)])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """`H`, for functions of NumPy."""
@@ -228,7 +227,7 @@ class HTF(eqx.Module):
         rows = np.array([self._index(m) for m in harmonics])
         arrays = {"H": self.H, "variance": self.variance, "noise_variance": self.noise_variance}
         roundness = None if self.scatter is None else self.scatter.roundness
-        arrays, roundness = jax.tree.map(lambda x: x[rows], (arrays, roundness))
+        arrays, roundness = jax.tree.map(lambda x: x[rows], to_host((arrays, roundness)))
         scatter = self.scatter and replace(self.scatter, roundness=roundness)
         return replace(self, harmonics=harmonics, scatter=scatter, **arrays)
 
@@ -298,9 +297,9 @@ class HTF(eqx.Module):
                 "the HTFs have no variance: estimate them from several realizations of the "
                 "design or from repeated periods."
             )
-        if self.scatter is None:
-            return jnp.sqrt(-np.log1p(-level) * self.variance)
-        return jnp.sqrt(self.scatter.quantile(level) * self.variance)
+        quantile = -np.log1p(-level) if self.scatter is None else self.scatter.quantile(level)
+        quantile, variance = to_host((quantile, self.variance))
+        return from_host((quantile * variance) ** 0.5)
 
     def predict(self, u: Annotated[Numbers, Reals("samples inputs")]) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
@@ -351,12 +350,12 @@ class HTF(eqx.Module):
         fields = "n_sections", "harmonics", "inputs", "outputs"
         require_same("HTFs to be compared", self, other, fields)
         _require_same_lines(self, other)
-        scale = jnp.max(jnp.abs(other[0]), axis=(0, 2))
-        return jnp.max(jnp.abs(self.H - other.H), axis=(1, 3)) / scale
+        H, reference, zero = to_host((self.H, other.H, other[0]))
+        return from_host(abs(H - reference).max((1, 3)) / abs(zero).max((0, 2)))
 
     def error(self, other: "HTF") -> Float[Array, " ny"]:
         """The largest of `harmonic_errors`, per output."""
-        return jnp.max(self.harmonic_errors(other), axis=0)
+        return from_host(to_host(self.harmonic_errors(other)).max(0))
 
     def require_sampled(self, name: str) -> None:
         """**Raises:** `DefinitionError` in continuous time."""
@@ -419,21 +418,22 @@ def _combined(
         if x.harmonics != every:
             raise DefinitionError(f"algebra needs all {N} harmonics: leave `harmonics` out.")
     lines = algebra.Lines.of(np.asarray(first.f), N)
-    result, pairs = operation(*(lines.matrices(x.H) for x in terms))
+    result, pairs = operation(*(lines.matrices(x) for x in to_host([x.H for x in terms])))
 
     def variance(name: str) -> Array | None:
-        given = [getattr(x, name) for x in terms]
+        given = to_host([getattr(x, name) for x in terms])
         exact = [x.source == "exact" for x in terms]
         if all(exact) or any(v is None and not e for v, e in zip(given, exact, strict=True)):
             return None
-        full = [jnp.zeros(x.H.shape) if v is None else v for x, v in zip(terms, given, strict=True)]
+        full = [np.zeros(x.H.shape) if v is None else v for x, v in zip(terms, given, strict=True)]
         return lines.entries(algebra.variance_of(pairs, [*map(lines.matrices, full)])).real
 
-    freedoms = [x.scatter.freedom for x in terms if x.scatter is not None]
+    freedoms = to_host([x.scatter.freedom for x in terms if x.scatter is not None])
     scatter = None
     if freedoms:  # of all lines of a class, the least
-        least = jnp.min(jnp.stack(freedoms), axis=0)[lines.row].min(axis=1, keepdims=True)
-        scatter = Scatter(jnp.zeros(len(first.f)).at[lines.row].set(least), shared=True)
+        xp = namespace(freedoms[0])
+        least = xp.stack(freedoms).min(axis=0)[lines.row].min(axis=1, keepdims=True)
+        scatter = Scatter(put(xp.zeros(len(first.f)), lines.row, least), shared=True)
     source = "exact" if all(x.source == "exact" for x in terms) else "estimate"
     return HTF(
         first.f, lines.entries(result), every, N, inputs, outputs, source,

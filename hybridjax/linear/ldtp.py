@@ -12,7 +12,7 @@ from .._core.arguments import Numbers, names, require_axes, require_equal, requi
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, PeriodCount, Vector
 from .._core.boundary.values import Integers, Reals
-from .._core.executor import from_host, is_traced
+from .._core.executor import from_host, is_traced, namespace, to_host
 from .._core.html import card, facts, multiplier_table, unit_circle
 from .._core.memo import remembered
 from .._core.precision import require_x64
@@ -211,12 +211,11 @@ class LDTP(eqx.Module):
         transformations values are not known, and the result there is infinite or meaningless.)
         """
         harmonics = check_harmonics(harmonics, self.n_sections)
-        f = jnp.atleast_1d(f)
         require_x64(self, f)
+        f = from_host(to_host(f).reshape(-1))
         self._refuse_resonance(f)
-        H = harmonic_transfer(self.A, self.B, self.C, self.D, f)
-        chosen = np.asarray(harmonics) % self.n_sections
-        return HTF(f, H[chosen], harmonics, self.n_sections, self.inputs, self.outputs, "exact")
+        H = to_host(harmonic_transfer(*self.matrices[:4], f))[np.array(harmonics) % self.n_sections]
+        return HTF(f, H, harmonics, self.n_sections, self.inputs, self.outputs, "exact")
 
     def __matmul__(self, other: "LDTP") -> "LDTP":
         """This system after another, which acts first: the series `P @ Q`.
@@ -254,9 +253,9 @@ class LDTP(eqx.Module):
                 "an inverse needs a square and invertible D at all sections, since it would have "
                 "to know later outputs without: invert the HTFs, `model.htf(f).inverse()`."
             )
-        D = jnp.linalg.inv(self.D)
-        A, B = self.A - self.B @ D @ self.C, self.B @ D
-        return LDTP(A, B, -D @ self.C, D, self.dims, self.outputs, self.inputs)
+        A, B, C, D = to_host(self.matrices[:4])
+        D = namespace(D).linalg.inv(D)
+        return LDTP(A - B @ D @ C, B @ D, -D @ C, D, self.dims, self.outputs, self.inputs)
 
     def feedback(self, controller: "LDTP | Gain") -> "LDTP":
         r"""The loop of this system and a controller, $u = r - F y$: $(I + P F)^{-1} P$.
@@ -277,8 +276,8 @@ class LDTP(eqx.Module):
             require_chain("feedback", controller.outputs, self.inputs, self, controller)
             F = controller.matrices
         else:
-            F = algebra.static_gain(from_host(controller), self.n_sections, (nu, ny))
-        algebra.require_well_posed(-self.D @ F.D)
+            F = algebra.static_gain(to_host(controller), self.n_sections, (nu, ny))
+        algebra.require_well_posed(self.D, F.D)
         K, L = np.zeros((nu + ny, ny + nu)), np.eye(nu + ny, nu)
         K[:nu, ny:], K[nu:, :ny] = -np.eye(nu), np.eye(ny)
         return self._connected(F, K, L, np.eye(ny, ny + nu), self.inputs, self.outputs)
@@ -290,7 +289,7 @@ class LDTP(eqx.Module):
 
     def _connected(self, other, K, L, M, inputs, outputs) -> "LDTP":
         A, B, C, D, dims = algebra.connect(self.matrices, other, K, L, M)
-        d = A.shape[1] if is_traced(dims) else int(np.max(dims))  # without common padding
+        d = A.shape[1] if is_traced(dims) else int(np.asarray(dims).max())  # without common padding
         return LDTP(A[:, :d, :d], B[:, :d], C[:, :, :d], D, dims, inputs, outputs)
 
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
@@ -355,7 +354,7 @@ class LDTP(eqx.Module):
 
     def _response(self, u, x0, first_section):
         u, x0 = self._input(u), self._state(x0, first_section)
-        sections = (first_section + jnp.arange(len(u))) % self.n_sections
+        sections = (first_section + np.arange(len(u))) % self.n_sections
         return time_response.response(self.matrices, u, x0, sections)
 
     def _input(self, u):
@@ -369,7 +368,7 @@ class LDTP(eqx.Module):
     def _state(self, x0, first_section):
         d = self.A.shape[-1]
         if x0 is None:
-            return jnp.zeros(d)
+            return np.zeros(d)
         x0 = jnp.asarray(x0)
         n = first_section % self.n_sections
         true = d if is_traced(self.dims) else int(np.asarray(self.dims)[n])
@@ -417,7 +416,7 @@ class LDTP(eqx.Module):
 
 def _dimensions(dims, n_sections, d):
     if dims is None:
-        return jnp.full(n_sections, d)
+        return from_host(np.full(n_sections, d))
     require_axes("`dims`", dims, {"sections": n_sections})
     if not is_traced(dims):
         dims = np.asarray(dims)

@@ -318,7 +318,7 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
 def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -> str:
     """The place where steps shrank to nothing, or the mode that keeps them short."""
     lanes = turn.legs
-    if turn.result == Result.STEP_COLLAPSE:
+    if int(turn.result) == Result.STEP_COLLAPSE:
         a = int(lanes.chart[0])
         path = simulate(
             cycle.system, s.names[a], np.asarray(lanes.q)[: s.dims[a], 0], expected,
@@ -326,7 +326,7 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
         )  # fmt: skip
         if path.result != Result.OK:
             return f" It stopped at t = {path.t[-1]:.6g} in chart '{s.names[path.chart[-1]]}'."
-    if turn.result != Result.STEP_LIMIT:
+    if int(turn.result) != Result.STEP_LIMIT:
         return ""
     explicit = (x for x in points(s, lanes) if not is_implicit(s, x[0]))
     rate = max((float(fastest(s, *x).max()) for x in explicit), default=0.0)

@@ -325,7 +325,7 @@ class LimitCycle(eqx.Module):
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
-        if what_changed(self.system, self.numbers) or self.result != Result.OK:
+        if what_changed(self.system, self.numbers) or int(self.result) != Result.OK:
             return card("LimitCycle", self._title(), facts(self._facts()))
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
         orbit = orbit_picture(self.trajectory())

@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from .._core.arguments import require_among
+from .._core.executor import is_tracer, to_host
 from .._core.precision import real
 from ..engine import kernels
 from ..engine.lanes import Lanes
@@ -105,9 +106,9 @@ def scale_of(
     scale = np.full((len(s.charts), s.d), np.nan)
     for a, chart in enumerate(s.charts):
         scale[a, : s.dims[a]] = [sizes.get(name, np.nan) for name in chart.states]
-    if otherwise is None:
-        return real(np.where(np.isnan(scale), 1.0, scale))
-    return jnp.where(np.isnan(scale), otherwise, scale)
+    otherwise = 1.0 if otherwise is None else to_host(otherwise)
+    xp = jnp if is_tracer(otherwise) else np
+    return real(xp.where(np.isnan(scale), otherwise, scale))
 
 
 def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:

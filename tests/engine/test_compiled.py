@@ -1,16 +1,11 @@
 """What is compiled: users' functions, and programs with a name, but no single operations."""
 
-import contextlib
-import re
-
-import jax
 import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core import compilation
 
-from ..conftest import APEX, OUTPUTS
+from ..conftest import APEX, OUTPUTS, compiled
 
 
 # Sections, experiments and periods of which no other test has as many: single operations would be
@@ -23,26 +18,8 @@ FAMILY = hj.KinematicPhase(SECTIONS, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=
 NAMED = {"run", "program", "_bind_program", "_constant", "<lambda>", "true_divide"}
 
 
-@contextlib.contextmanager
-def compiled():
-    """The names of all that is compiled in this context."""
-    names = set()
-
-    def listen(event, *_, fun_name="", **__):
-        if "backend_compile" in event:
-            names.add(re.sub(r"^jit\(|_[0-9a-f]{32}|\)$", "", fun_name))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield names
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
-
-
 @pytest.mark.slow
-def test_no_operation_outside_of_programs_compiles_one(monkeypatch):
-    # (However much the host has done in tests before.)
-    monkeypatch.setattr(compilation, "WORTH_COMPILING", np.inf)
+def test_no_operation_outside_of_programs_compiles_one():
     u = np.full((EXPERIMENTS, PERIODS * SECTIONS, 1), 1e-3)
     with compiled() as names:
         cycle = hj.find_limit_cycle(hj.models.VerticalHopper(k=10.5))
@@ -53,3 +30,16 @@ def test_no_operation_outside_of_programs_compiles_one(monkeypatch):
         trajectory(*OUTPUTS)
         print(cycle, model, hj.place_sections(cycle, FAMILY), data, trajectory, trajectory.events)
     assert names <= NAMED
+
+
+def test_harmonic_transfer_functions_compile_nothing():
+    ports, f = {"inputs": ("a", "b"), "outputs": ("a", "b")}, np.arange((SECTIONS + 1) // 2)
+    model = hj.LDTP(*0.1 * np.random.default_rng(0).normal(size=(4, SECTIONS, 2, 2)), **ports)
+    with compiled() as names:
+        exact, loop = model.htf(f), model.feedback(np.eye(2)).inverse()
+        size, more = np.ones(exact.H.shape), {"n_sections": SECTIONS, **ports}
+        scatter = hj.Scatter(np.full(len(f), 4.0), size)
+        htf = hj.HTF(f, exact.H, exact.harmonics, **more, variance=size, scatter=scatter)
+        hj.plot.bode(htf @ exact, htf.feedback(exact).inverse(), htf + exact, model, loop)
+        print(htf.error(exact), htf.select(1).confidence_radius())
+    assert names <= {"_constant", "stage"}
