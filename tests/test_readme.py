@@ -70,14 +70,14 @@ def section(test):
 
 
 @section
-@pytest.mark.parametrize("heading", ["Many of them, and derivatives", "Fewer strides"])
+@pytest.mark.parametrize("heading", ["Batches and derivatives", "Fewer strides"])
 def test_the_section_runs(heading, read_section):
     read_section(heading)
 
 
 @section
 def test_the_section_on_fits_finds_the_parameters(read_section):
-    made = read_section("Along a parameter, and from data to parameters")
+    made = read_section("Continuation and parameter fits")
     for name in ("M", "k", "b"):  # up to the distortion that the experiments hold
         value, true = (float(getattr(x, name)) for x in (made.fit.system, made.hopper))
         assert abs(value / true - 1) < 1e-4, name
