@@ -103,9 +103,9 @@ figure = hj.plot.section_data(data)
 # ## How many multipliers, and is the model good?
 #
 # The order with the best prediction of held-out strides is chosen. Then a model is fitted to the
-# first three quarters and simulated on the last. Its residuals are correlated in time, because the
-# splines smooth over neighboring sections. The test for a correlation with the input allows for
-# errors of the numerators (98 at each section, estimated from 360 strides).
+# first three quarters and simulated on the last. Its residuals are not correlated in time or with
+# the input beyond the errors of the numerators (98 at each section, estimated from 360 strides),
+# for which both tests allow.
 
 # %%
 print("order:", hj.recordings.choose_order(data))

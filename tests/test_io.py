@@ -81,8 +81,7 @@ def test_every_kind_comes_back_bit_by_bit(folder, things, htf):
     for thing in things:
         dataset = hj.convert.to_xarray(thing)
         assert isinstance(dataset, xarray.Dataset) and same(hj.convert.from_xarray(dataset), thing)
-        copy = xarray.Dataset.from_dict(dataset.to_dict())
-        assert same(hj.convert.from_xarray(copy), thing)
+        assert same(hj.convert.from_xarray(xarray.Dataset.from_dict(dataset.to_dict())), thing)
     dataset = hj.convert.to_xarray(htf)
     assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
 
@@ -166,7 +165,7 @@ def test_pickles_are_not_executed(folder, things):
     with pytest.raises(hj.errors.FileFormatError, match="damaged"):
         hj.load(path)
     path.write_bytes(pickle.dumps(_Trap()))
-    with pytest.raises(hj.errors.FileFormatError, match="is damaged"):
+    with pytest.raises(hj.errors.FileFormatError, match="is damaged, or no npz file"):
         hj.load(path)
 
 

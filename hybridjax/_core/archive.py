@@ -243,7 +243,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def damaged(path: Path, reason: str) -> FileFormatError:
-    return FileFormatError(f"'{path}' is damaged: {reason.rstrip('.')}. Write it again.")
+    return FileFormatError(f"'{path}' is damaged, or no npz file: {reason.rstrip('.')}.")
 
 
 def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:

@@ -144,8 +144,6 @@ def _suffixes(inputs: Sequence[str]) -> list[str]:
 
 def write_results(folder: Path, found: Identification, formats: Sequence[Format]) -> None:
     """Write all results into a folder that is new."""
-    from matplotlib import pyplot
-
     (folder / "figures").mkdir()
     data, recording = found.data, found.recording
     # 240 frequencies, up to the edge of the band that the inputs excited.
@@ -153,9 +151,8 @@ def write_results(folder: Path, found: Identification, formats: Sequence[Format]
     htf = found.fit.htf(np.linspace(0, edge, 241)[1:])
     images = {}
     for name, drawn in _figures(found, htf).items():
-        image, *_ = look.save(folder / "figures" / name, drawn, with_png(formats))
+        image, *_ = look.save_and_close(folder / "figures" / name, drawn, with_png(formats))
         images[name] = base64.b64encode(image.read_bytes()).decode()
-        pyplot.close(drawn.figure)
     save(folder / "htf.npz", htf)
     save(folder / "fit.npz", found.fit)
     header = [f"{n} ({u})" if u else n for n, u in zip(data.signals, data.units, strict=True)]

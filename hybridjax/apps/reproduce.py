@@ -141,13 +141,11 @@ def _identify(name: str, cycle: LimitCycle, design: Design, discard: int, begin:
 
 def _draw(cycle: LimitCycle, families: Mapping[str, Family], out: Path, formats, begin) -> None:
     """Write the figures."""
-    from matplotlib import pyplot  # here, since it is heavy
-
-    from .. import plot
+    from .. import plot  # here, since it is heavy
+    from ..plot.look import save_and_close
 
     for name, drawn in _figures(plot, cycle, families):
-        plot.save(out / name, drawn, formats)
-        pyplot.close(drawn.figure)
+        save_and_close(out / name, drawn, formats)
         _log(begin, name)
 
 

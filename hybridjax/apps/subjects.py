@@ -27,6 +27,7 @@ from .._core.writing import Format, results_folder
 from ..errors import ComputationError, DefinitionError, HybridJaxError
 from ..identify.series.fit import SeriesFit
 from ..io import load
+from ..plot.look import save_and_close
 from ..recordings.population.population import Population
 from ..recordings.population.tables import factors_of, table_of
 from ..recordings.read import read_recording
@@ -195,8 +196,8 @@ def _rows(path: Path) -> Any:
     how = {"dtype": text, "keep_default_na": False, "skipinitialspace": True, "index_col": False}
     try:
         rows = package("pandas").read_csv(path, encoding="utf-8-sig", **how)
-    except (OSError, ValueError) as error:
-        raise DefinitionError(f"cannot read the table '{path}': {error}.") from None
+    except (OSError, ValueError) as why:
+        raise DefinitionError(f"cannot read '{path}': {getattr(why, 'strerror', why)}.") from None
     if not all(name in rows and len(rows) and rows[name].all() for name in ("file", "subject")):
         raise DefinitionError(
             f"the table '{path}' needs 'file' and 'subject' in each row, separated by commas."
@@ -220,7 +221,7 @@ def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) ->
     ]
     with results_folder(study.folder, "population", _FILES) as new:
         with off_screen(), contextlib.suppress(DefinitionError):  # for too few subjects
-            plot.save(new / "forest", plot.forest(population, "modulus"), with_png(formats))
+            save_and_close(new / "forest", plot.forest(population, "modulus"), with_png(formats))
             parts.append('<img alt="Modulus of the leading multiplier" src="forest.png">')
         population.table.assign(**population.values, **errors).to_csv(new / _FILES[0], index=False)
         results.to_csv(new / _FILES[1], index=False)

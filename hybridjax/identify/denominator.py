@@ -120,5 +120,4 @@ def block_freedom(
     d = score.shape[1]
     part = np.einsum("bi,ij,bj->b", score, np.linalg.pinv(score.T @ score), score) / d
     normal = np.trace(share, axis1=1, axis2=2) / d
-    scatter = max(((part - normal) ** 2).sum() * d / 2, (normal**2).sum())
-    return float(1 / scatter)
+    return float(1 / max(((part - normal) ** 2).sum() * d / 2, (normal**2).sum()))

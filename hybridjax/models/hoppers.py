@@ -58,8 +58,7 @@ class VerticalHopper(HybridSystem):
         return {"flight": self._flight(), "stance": stance}
 
     def _flight(self) -> FieldChart:
-        drag = lambda ym, vm: -self.b * vm  # noqa: E731
-        return FieldChart(self._moving(drag), *_MASSES)
+        return FieldChart(self._moving(lambda ym, vm: -self.b * vm), *_MASSES)
 
     def _moving(self, on_foot):
         """The field of both masses, with a force on the foot by its height and speed."""

@@ -132,8 +132,7 @@ def fastest(
     s: Structure, a: int, t: Float[np.ndarray, " P"], q: Float[np.ndarray, "n P"]
 ) -> Float[np.ndarray, " P"]:
     """The rates at which the fastest modes of chart a decay; 0 if none does."""
-    rates = -np.real(_modes(s, a, t, q))
-    return np.maximum(rates.max(axis=1, initial=0.0), 0.0)
+    return -np.real(_modes(s, a, t, q)).min(axis=1, initial=0.0)
 
 
 def is_implicit(s: Structure, a: int) -> bool:

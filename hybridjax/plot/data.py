@@ -231,13 +231,11 @@ def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | Non
             signal.margins(x=0.02)
             _powers_of_ten(signal)
             auto.set_ylabel("standard deviations")
-            after = np.arange(1, 1 + found.autocorrelation.shape[1])
-            _stems(auto, after, found.autocorrelation[:, :, i], CYCLE[0], 0.0, limit)
+            _stems(auto, 1.0, found.autocorrelation[:, :, i], CYCLE[0], limit)
             auto.set_title(f"residuals\n{p_value(found.whiteness[i])}", loc="right")
             for j, _ in enumerate(found.inputs):
-                lags = np.arange(found.cross_correlation.shape[1])
-                values = found.cross_correlation[:, :, i, j]
-                _stems(cross, lags, values, CYCLE[(1 + j) % len(CYCLE)], 0.2 * j, limit)
+                color = CYCLE[(1 + j) % len(CYCLE)]
+                _stems(cross, 0.2 * j, found.cross_correlation[:, :, i, j], color, limit)
             cross.set_title(f"with the input\n{p_value(found.independence[i])}", loc="right")
         if ax is None:
             axes[0, 0].fill_between([], [], color="0.9", label="99 % band without correlation")
@@ -248,10 +246,10 @@ def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | Non
     return Plot(axes)
 
 
-def _stems(ax: Axes, lags, values, color, shift: float, limit: float) -> None:
-    """Means over the sections of values that have variance 1 each."""
+def _stems(ax: Axes, first: float, values, color, limit: float) -> None:
+    """Means over the sections of values that have variance 1 each, from a first lag on."""
     mean = values.sum(axis=0) / np.sqrt(np.maximum((values != 0).sum(axis=0), 1))
     ax.axhspan(-limit, limit, color="0.9", zorder=0)
-    ax.vlines(lags + shift, 0, mean, color=color, lw=1.2)
+    ax.vlines(first + np.arange(len(mean)), 0, mean, color=color, lw=1.2)
     ax.axhline(0, color="black", lw=0.5)
     ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))

@@ -191,3 +191,10 @@ def save(
             with replacing(target) as new:
                 figure.savefig(new, format=format, dpi=_STYLE["figure.dpi"])
     return paths
+
+
+def save_and_close(path: FilePath, plot: Plot, formats: Sequence[Format]) -> tuple[Path, ...]:
+    """Write a figure that is not shown, and free its memory."""
+    paths = save(path, plot, formats)
+    pyplot.close(plot.figure)
+    return paths

@@ -242,7 +242,7 @@ def _both_halves(cycle: LimitCycle) -> LimitCycle:
 def _sheet() -> tuple[Figure, Any]:
     """A figure and its cells, at fixed places, so that labels find theirs before it is drawn."""
     figure = pyplot.figure(figsize=(5.6, 3.6), dpi=86)
-    borders: dict[str, float] = {"left": 0.13, "right": 0.98, "bottom": 0.11, "top": 0.96}
+    borders: dict[str, float] = {"left": 0.13, "right": 0.98, "bottom": 0.11, "top": 0.93}
     ratios: Any = {"width_ratios": (1.15, 1), "height_ratios": (1.4, 1)}
     return figure, figure.add_gridspec(2, 2, **borders, **ratios, wspace=0.3, hspace=0.3)
 

@@ -167,8 +167,7 @@ def test_one_cosine_in_closed_form(quadratic, f):
     found = products(limit, cosines, ("u",), cosines.power_of(design))
     x1 = a / np.abs(z - 0.6)
     mean, twice = 0.7 * x1**2 / 2 / 0.4, 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
-    x = np.sqrt(mean**2 + twice**2 / 2)
-    assert found.rms(design)[0] == pytest.approx(x, rel=1e-9)
+    assert found.rms(design)[0] == pytest.approx(np.sqrt(mean**2 + twice**2 / 2), rel=1e-9)
     np.testing.assert_allclose(found.rms(design, phases=True), found.rms(design), rtol=1e-9)
     u2 = design.inputs()[0, :, 0] ** 2
     both = found.quadratic.second_order(design.inputs())[0]

@@ -40,6 +40,8 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(band, seed, lines,
     if not wanted:
         with pytest.raises(hj.DefinitionError, match="take more periods or a wider band"):
             hj.multisine(**arguments, seed=seed)
+        with pytest.raises(hj.DefinitionError, match="must increase in"):
+            hj.multisine(N, P, band=(1.0, 0.5))
         return
     phases = {j: 2 if (2 * j) % P == 0 and 0 < 2 * j < N * P else 1 for j in wanted}
     # All lines that disturb j disturb each other: so many experiments are needed at least.

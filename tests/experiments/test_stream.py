@@ -79,8 +79,7 @@ def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, who
 
 def test_workers_and_batches_change_nothing(arguments, whole):
     def run(workers=1):
-        execution = hj.Execution(batch=5, workers=workers)
-        return hj.run_experiments(*arguments, execution=execution)
+        return hj.run_experiments(*arguments, execution=hj.Execution(batch=5, workers=workers))
 
     with no_compilation(after=run):
         for workers in (1, 3):

@@ -41,8 +41,7 @@ def oscillation():
 
 @pytest.fixture(scope="session")
 def hopper_htf(hopper_cycle):
-    model = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS)
-    return model.htf(np.arange(0.1, 4, 0.2), (-1, 0, 1))
+    return hj.linearize(hopper_cycle, SECTIONS, OUTPUTS).htf(np.arange(0.1, 4, 0.2), (-1, 0, 1))
 
 
 @pytest.fixture(scope="session")

@@ -179,8 +179,7 @@ def test_errors_are_as_large_as_said(small):
     ]
     square = [fit.distance(small.multipliers)[0] for fit in fits]
     assert 1e-3 < stats.chi2(2 * runs).cdf(sum(square)) < 1 - 1e-3
-    hits = sum(int(fit.contains(small.multipliers[0]).all()) for fit in fits)
-    assert covered(hits, runs)
+    assert covered(sum(int(fit.contains(small.multipliers[0]).all()) for fit in fits), runs)
 
 
 def test_the_spectrum_of_noise(small):

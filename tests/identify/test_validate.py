@@ -12,8 +12,9 @@ from .test_uncertainty import covered
 
 
 def test_the_true_model_leaves_white_noise(small):
-    """P-values are uniform, for unknown starts and missing samples, and for fits to other data."""
-    p, of_fits = [], []
+    """P-values are uniform, for unknown starts and missing samples, and for fits to other data,
+    and correlations have variance one."""
+    p, of_fits, correlations = [], [], []
     for seed in range(30):
         data = record(small, 4 * 100, seed, 0.3, first_section=1, x0=np.ones(3))
         data.y[np.random.default_rng(seed).random(data.y.shape) < 0.02] = np.nan
@@ -23,9 +24,11 @@ def test_the_true_model_leaves_white_noise(small):
         for fit in (hj.fit_series(other, 2), hj.fit_ldtp(other, small)):
             found = hj.validate(fit, data)
             of_fits.append([found.whiteness, found.independence])
+            correlations.append(found.cross_correlation)
     for test in np.reshape(p, (30, 2, 2)).transpose(1, 2, 0).reshape(4, 30):
         assert stats.kstest(test, "uniform").pvalue > 1e-3
     assert covered(int((np.array(p) > 0.05).sum()), 120)
+    np.testing.assert_allclose(np.mean(np.square(correlations)), 1, atol=0.15)
     for test in np.swapaxes(of_fits, 0, 1):
         assert covered(int((test > 0.05).sum()), 120)
 

@@ -78,5 +78,7 @@ def test_no_input_gives_the_cycle():
     data = hj.ExperimentData(np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2)
     motion = hj.plot.animate(cycle, sections=placed, perturbed=data)
     assert abs(motion.interval * len(motion.times) - 2 * float(cycle.period)) < 1e-9
+    motion.figure.draw_without_rendering()
+    assert all(motion.figure.bbox.y1 > x.title.get_tightbbox().y1 for x in motion.figure.axes)
     with pytest.raises(hj.DefinitionError, match="and their `sections`"):
         hj.plot.animate(cycle, perturbed=data)

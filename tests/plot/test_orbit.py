@@ -15,8 +15,7 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
     assert set(lines) == {"stance", "flight", "sections (32)", "perturbed"}
     arrow, *texts = ax.texts
     assert (arrow.xy[0] - arrow.xyann[0]) * arrow.xy[1] > 0  # x moves as its velocity says
-    names = [t.get_text() for t in texts]
-    assert names == ["liftoff", "touchdown", *map(str, range(0, 32, 4))]
+    assert [t.get_text() for t in texts] == ["liftoff", "touchdown", *map(str, range(0, 32, 4))]
 
     # Bars lie on their sections: rays from the center of the kinematic phase, in equal angles.
     bars = lines["sections (32)"].get_xydata().reshape(32, 3, 2)[:, :2]

@@ -3,9 +3,11 @@
 import dataclasses
 import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from scipy import linalg, stats
 
 import hybridjax as hj
@@ -236,7 +238,7 @@ def fitted(*fits):
 def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     """Each subject has a report, failures are named, and a second call computes nothing anew."""
     rows = ["file,subject,group,age"]
-    for k in range(4):
+    for k in range(6):
         (trial,) = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3, seed=k).trials
         table = np.column_stack([trial.time, trial.values])
         np.savetxt(tmp_path / f"{k}.csv", table, "%.6g", delimiter=",", comments="",
@@ -251,9 +253,10 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "S9-a failed: cannot read" in printed and "a - b" in printed.replace("b - a", "a - b")
     assert "S0-a is doubtful: odd." in printed
+    assert Path("out/forest.png").exists() and not pyplot.get_fignums()
     page, table = ((tmp_path / "out" / x).read_text() for x in ("population.html", "subjects.csv"))
-    assert page.count("report.html") == 4 and "Hartung" in page and "S9-a failed" in page
-    assert table.count("\n") == 5 and table.startswith("report,subject,group,age,strides,period")
+    assert page.count("report.html") == 6 and "Hartung" in page and "S9-a failed" in page
+    assert table.count("\n") == 7 and table.startswith("report,subject,group,age,strides,period")
     monkeypatch.setattr(subjects, "read_recording", lambda *files, **options: 1 / 0)
     assert main(["identify", "--table", "subjects.csv", *options]) == 1
     printed = capsys.readouterr().out

@@ -132,7 +132,7 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
     """Return the lines j of a band."""
     f_min, f_max = band
     if not f_min <= f_max <= n_sections / 2:
-        raise DefinitionError(f"`band` {f_min} to {f_max} must lie in [0, N/2 = {n_sections / 2}].")
+        raise DefinitionError(f"`band` {band} must increase in [0, N/2 = {n_sections / 2}].")
     low, high = int(np.ceil(f_min * periods - OFF_LINE)), int(np.floor(f_max * periods + OFF_LINE))
     j = np.arange(low, high + 1)
     if lines != "two-phase":
@@ -141,7 +141,7 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
         j = j[j % 2 == 1]
     if len(j) == 0:
         text = "take more periods or a wider band"
-        raise DefinitionError(f"no line of '{lines}' lies between {f_min} and {f_max}: {text}.")
+        raise DefinitionError(f"lines='{lines}' excites nothing in `band` {band}: {text}.")
     return j
 
 

@@ -111,12 +111,15 @@ def independence_test(
                 continue
             size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
             U = U / np.where(size > 0, size, 1.0)  # inputs have units of their own
-            z[n, :, i] = (U.T @ r).reshape(lags, nu)
+            rows = np.column_stack([r, root[:, :, i][present]])
+            along, *by_fit = (U.T @ rows).T
+            variance = 1 + np.sum(np.square(by_fit), axis=0) * (r @ r) / count
+            variance /= 1 + (rows[:, 1:] ** 2).sum() / count
+            z[n, :, i] = (along / np.sqrt(variance)).reshape(lags, nu)
             left, s, _ = np.linalg.svd(U, full_matrices=False)
             left = left[:, s > RANK * s[0]][:, : count // 2]
             # Explained against unexplained part: an F ratio, as its Gaussian deviate.
             a, b = left.shape[1], count - left.shape[1]
-            rows = np.column_stack([r, root[:, :, i][present]])
             inside = ((left.T @ rows) ** 2).sum(axis=0)
             outside, by_fit = (rows**2).sum(axis=0) - inside, inside[1:].sum()
             p = stats.f.sf(inside[0] / (a + by_fit) * (b + outside[1:].sum()) / outside[0], a, b)
