@@ -80,8 +80,8 @@ panel.errorbar(
 legend = panel.legend(fontsize="x-small")
 
 # %% [markdown]
-# The published curve was estimated from stimulation with noise currents. Near the spike our curve is
-# negative, and the published one is not (`docs/real-data.md`). The smoothness of our curve is
+# The published curve was estimated from stimulation with noise currents. Near the spike our curve
+# is negative, and the published one is not (`docs/real-data.md`). The smoothness of our curve is
 # determined by the data (marginal likelihood). The residuals of neighboring intervals are
 # correlated, so that the phase alone is not the complete state of the neuron. The confidence
 # intervals are valid only for the phase model.
