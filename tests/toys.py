@@ -44,7 +44,7 @@ def hopper_in(length, time):
 
 
 class Toys(hj.HybridSystem):
-    """Systems of which `make` returns the charts and transitions, with numbers."""
+    """Systems of which `make` returns the charts, transitions and perhaps period, with numbers."""
 
     make: Callable = eqx.field(static=True)
     numbers: Float[Array, " n"] = eqx.field(converter=lambda x: jnp.array(x, float))
@@ -54,6 +54,9 @@ class Toys(hj.HybridSystem):
 
     def transitions(self):
         return self.make(*self.numbers)[1]
+
+    def period(self):
+        return (*self.make(*self.numbers), None)[2]
 
 
 class Switched(hj.HybridSystem):

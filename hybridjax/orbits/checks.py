@@ -1,6 +1,5 @@
 """Checks of a system's clock and of conserved quantities; the reasons of a search that failed."""
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, cast
@@ -8,7 +7,6 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.compilation import at_ease
 from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
 from ..engine import kernels, unresolved
@@ -235,18 +233,6 @@ def check_jumps(cycle: LimitCycle) -> None:
                     "and a `Transition` between them, or `hj.sliding` for a surface along which "
                     "the state may slide."
                 )
-
-
-def closes_early(cycle: LimitCycle) -> bool:
-    """Test whether a cycle closes after a part of its `multiplicity` periods already."""
-    map, m = to_host(cycle).return_map, cycle.multiplicity
-    for d in (d for d in range(1, m) if m % d == 0):
-        part = dataclasses.replace(map, multiplicity=d, expected=map.expected * (d / m))
-        with at_ease():
-            residual = part.turn(map.anchor.q[:, 0]).residual
-        if np.max(np.abs(residual) / map.sizes) < SAME:
-            return True
-    return False
 
 
 def check_conserved(cycle: LimitCycle) -> None:

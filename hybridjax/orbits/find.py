@@ -180,13 +180,9 @@ def find_limit_cycle(
         solution = search(map)
     map, solution = _in_own_sizes(map, solution, given)
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
-    failure = None
-    if solution.is_fixed_point and checks.closes_early(cycle):
-        failure = Result.EXTRA_TURNS
-    elif solution.is_fixed_point and coincident(map, solution.turn) and not commutes(cycle):
-        failure = Result.COINCIDENCE
-    if failure is not None:
-        cycle = dataclasses.replace(cycle, result=jax.device_put(np.int32(failure)))
+    if solution.is_fixed_point and coincident(map, solution.turn) and not commutes(cycle):
+        failure = jax.device_put(np.int32(Result.COINCIDENCE))
+        cycle = dataclasses.replace(cycle, result=failure)
     keep_turn(cycle, solution.turn)
     code = Result(int(cycle.result))
     checks.check_found(cycle)

@@ -1,7 +1,7 @@
 """Limit cycles of many systems at once: the points of a parameter sweep side by side."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import SupportsIndex
 
 import equinox as eqx
@@ -22,15 +22,15 @@ from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem, copies_of
 from .batches import Rounds, Tiles, tiles_of
-from .checks import check_found, check_periodic, closes_early
+from .checks import check_found, check_periodic
 from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle, require_unchanged
 from .return_map import ReturnMap, turn_product
 
 
-# Cycles that are tested for whether events that coincide commute, and whether the cycle closes
-# early; all are, if one of these fails. More: the test takes longer. Fewer: exceptions are missed.
+# Cycles that are tested for whether events that coincide commute; all are, if one of these fails.
+# More: the test takes longer. Fewer: exceptions are missed.
 _LOOKED_AT = 50
 # Cycles that are tested for jumps and pulses of fields, which takes longer.
 _TESTED = 8
@@ -182,10 +182,7 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
         turn.distance, rounds.steps, rounds.result, rounds.codes, map.settings, map.conserved,
         map.multiplicity, copies_of(tiles.systems),
     )  # fmt: skip
-    cycles = examined(cycles, rounds.together)
-    if map.multiplicity == 1:
-        return cycles
-    return _marked(cycles, np.flatnonzero(cycles.ok), closes_early, Result.EXTRA_TURNS)
+    return examined(cycles, rounds.together)
 
 
 def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
@@ -198,18 +195,11 @@ def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycl
     for k in np.unique(np.linspace(0, len(good) - 1, min(len(good), _TESTED)).astype(int)):
         check_found(cycles[int(good[k])])
     rows = np.flatnonzero(together & cycles.ok)
-    return _marked(cycles, rows, lambda cycle: not commutes(cycle), Result.COINCIDENCE)
-
-
-def _marked(
-    cycles: LimitCycles, rows: Int[np.ndarray, " R"], fails: Callable, code: Result
-) -> LimitCycles:
-    """The cycles, with this result where one fails a test; all are tested if one of few fails."""
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
-    if not any(fails(cycles[i]) for i in few):
+    if all(commutes(cycles[i]) for i in few):
         return cycles
     result = cycles.result.copy()
-    result[[i for i in rows if fails(cycles[i])]] = code
+    result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
     return dataclasses.replace(cycles, result=result)
 
 

@@ -294,6 +294,11 @@ class ReturnMap(eqx.Module):
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
             code = xp.where(turn.closed & still, Result.EQUILIBRIUM, code)
+        for d in (d for d in range(1, self.multiplicity) if self.multiplicity % d == 0):
+            sooner = self.expected * (d / self.multiplicity)
+            part = dataclasses.replace(self, multiplicity=d, expected=sooner).turn(q)
+            early = xp.max(xp.abs(part.residual) / sizes, axis=-1) <= CLOSED
+            code = xp.where(turn.closed & early, Result.EXTRA_TURNS, code)
         return code.astype(np.int32)
 
     def held(

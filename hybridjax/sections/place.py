@@ -14,7 +14,7 @@ from .._core.compilation import at_ease, host_first, quick_jit
 from .._core.executor import Array, is_traced, namespace, on_host, put, stop_gradient, to_host
 from .._core.host_derivatives import NotOnHostError, by_columns, require_program
 from .._core.precision import require_x64
-from .._core.results import Result
+from .._core.results import Result, update_result
 from ..engine import kernels
 from ..engine.cubic import interpolate
 from ..engine.lanes import IDLE, Lanes, for_each_chart, only, side_by_side
@@ -153,8 +153,11 @@ def _locate(map: ReturnMap, family: AbstractSections, turn: Any, flows: list) ->
     flat = xp.max(share, axis=0) == 0
     drop = xp.where(flat, -1, xp.argmax(share, axis=0))
     dims = xp.asarray(s.dims)[lanes.chart] + (xp.isinf(bound.time) & (map.base is None)) - ~flat
-    duration = moved.lanes.t - lanes.t
-    return first, (bound, lanes, tape, duration, moved.result, drop, dims, normal)
+    duration, result = moved.lanes.t - lanes.t, moved.result
+    if not on_host(period):  # (on the host `_check` says more)
+        turns = xp.abs(xp.sum(duration) / period - 1) > SAME
+        result = update_result(result, turns, Result.SECTION_MISSED)
+    return first, (bound, lanes, tape, duration, result, drop, dims, normal)
 
 
 def place_along(
@@ -299,6 +302,8 @@ def _check(placed: PlacedSections, first: int) -> None:
             if code == Result.STEP_LIMIT:
                 hint = ". Give them to the search for the cycle, or place more sections."
             raise ComputationError(f"{text}: {Result(code).message}{hint}")
+    if isinstance(anchor, Crossing) and len(_met(placed, 0)[2]) > 1:
+        raise ComputationError(f"{name(0)} lies at {anchor}, which {again}{_remedy(placed, 0)}")
     moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
     if not placed.cycle.clocked and len(moving):
         raise ComputationError(
@@ -335,26 +340,34 @@ def _check(placed: PlacedSections, first: int) -> None:
             raise ComputationError(f"{name(i)} {again}{_remedy(placed, i)}")
 
 
-def _remedy(placed: PlacedSections, i: int) -> str:
-    """Where the cycle crosses section i, the values through which the function of a `Crossing`
-    goes in its direction, and what to change."""
+def _met(placed: PlacedSections, i: int) -> tuple[Any, np.ndarray, np.ndarray, str]:
+    """Section i as a `Crossing`, if it is one; the ends (2, n) of parts of the cycle in which its
+    level falls; and which of these cross it, and where."""
     cycle, N, levels = placed.cycle, placed.n_sections, placed.bound.levels
     items = getattr(placed.family, "items", (placed.family.anchor,))
-    section = items[i] if i < len(items) else None
-    if isinstance(section, Crossing):
+    section = items[i] if i < len(items) and isinstance(items[i], Crossing) else None
+    if section is not None:
         i, N, levels = 0, 1, ListLevels((section,))
     s, (t, chart, q) = cycle.structure, cycle.trajectory().dense()
     level = levels_at(s, levels, N, t, chart, q.T)[0, i]
     level[-1] = level[0]  # (the same point, but for rounding)
-    falls = (np.diff(level) < 0) & (np.diff(t) > 0)
-    crossed = np.flatnonzero(falls & (level[:-1] > 0) & (level[1:] <= 0))
+    falls = np.flatnonzero((np.diff(level) < 0) & (np.diff(t) > 0))
+    high, low = ends = np.stack([level[falls], level[falls + 1]])
+    crossed = falls[(high > 0) & (low <= 0)]
     points = " and ".join(f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed)
+    return section, ends, crossed, points
+
+
+def _remedy(placed: PlacedSections, i: int) -> str:
+    """Where the cycle crosses section i, the values through which the function of a `Crossing`
+    goes in its direction, and what to change."""
+    section, ends, _, points = _met(placed, i)
     hint = f", at {points}" * bool(points)
-    if not isinstance(section, Crossing):
+    if section is None:
         return f"{hint}. Choose a phase that rises through each section once in a period."
     sign, span = 1 if section.direction == "falling" else -1, "nowhere"
-    if falls.any():
-        ends = level[:-1][falls].max(), level[1:][falls].min()
+    if ends.size:
+        ends = ends[0].max(), ends[1].min()
         span = "from {:.4g} to {:.4g}".format(*(float(section.value) + sign * x for x in ends))
     change = "choose another function, `value`, `direction` or `charts`, not at an event"
     return f"{hint}. Values of {section} on the cycle: {span}; {change}."

@@ -45,8 +45,8 @@ class Quotient(Derived):
         both are listed in the same order.
     - `relabel`: states that are exchanged in the mirror, {name: name}, in either order.
     - `flipped`: states that change their sign in the mirror.
-    - `translation`: states that have no effect on others, such as the position along the floor.
-        They are left out.
+    - `translation`: states that have no effect on others, nor on outputs, such as the position
+        along the floor. They are left out.
     - `half_period`: for cycles with x(t + T/2) = S x(t), with S from the arguments above. True if a
         clock drives the system; otherwise the name of a state, or a function of (t, q), that S
         multiplies by -1 and that rises through zero once in half a period. There, or after half a
@@ -223,16 +223,18 @@ class Quotient(Derived):
             for (what, function), (name, image) in zip(ours, theirs, strict=False):
                 yield f"the {name} is not the mirror image of the {what}", function, image
 
-    def _parts(self, name, images, sizes, shift=0.0, later=0.0, back=False):
+    def _parts(self, name, images, sizes, shift=None, later=0.0, back=False):
         """All functions of a chart, of points of the reduced one, with rates and states mirrored if
-        the chart is among the `images`; transitions in the order of their list, or `back`."""
+        the chart is among the `images`; transitions in the order of their list, or `back`; under a
+        translation by `shift`, outputs, too."""
         kept = images.get(name, name)
         chart, mirrored = self._reduced(kept), self._mirrored if name in images else _same
         n, moves = len(chart.kept), np.isin(chart.chart.states, self.translation)
         size = sizes[kept][:n]
-        state = lambda q: mirrored(kept, chart.full(size * q[:n], shift))  # noqa: E731
-        at = lambda f: lambda t, q, u: f(t + later, state(q), u)  # noqa: E731
-        field = self.system.charts()[name].field
+        state = lambda q: mirrored(kept, chart.full(size * q[:n], shift or 0.0))  # noqa: E731
+        field, used = (getattr(self.system.charts()[name], x) for x in ("field", "inputs"))
+        used = slice(None if used is None else len(used))
+        at = lambda f: lambda t, q, u: f(t + later, state(q), u[used])  # noqa: E731
         rates = lambda *point: mirrored(kept, as_vector(field(*point)), back=True)  # noqa: E731
         yield f"field of chart '{name}'", at(lambda *point: chart.less(rates(*point)) / size)
         yield f"field of chart '{name}'", at(lambda *point: rates(*point)[moves])
@@ -244,6 +246,10 @@ class Quotient(Derived):
                 into = sizes[target][: len(self._reduced(target).kept)]
                 yield f"transition '{x.name}'", at(lambda *y, r=reset, c=into: r(*y) / c)
                 yield f"transition '{x.name}'", at(lambda *y, g=guard, x=x: x.sign * g(*y))
+        for x in self.system.outputs() if shift is not None else ():
+            function = x.function if callable(x.function) else x.function.get(name)
+            if function is not None:
+                yield f"output '{x.name}'", at(function)
         sign = -1.0 if name in images else 1.0
         for x in self._halves() if self.system.period() is None else ():
             if x.source == name and callable(x.guard):

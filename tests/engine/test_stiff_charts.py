@@ -11,20 +11,7 @@ import pytest
 from scipy.optimize import brentq
 
 import hybridjax as hj
-
-
-class Room(hj.Chart):
-    states = ("x", "z")
-    heat: float
-    rate: hj.Parameter
-
-    def field(self, t, q, u):
-        x, z = q
-        return self.heat - x + u[0], self.rate * (x - z)
-
-
-class Heated(Room):
-    solver = hj.Radau()
+from hybridjax.systems.chart import FieldChart
 
 
 class Thermostat(hj.HybridSystem):
@@ -32,7 +19,9 @@ class Thermostat(hj.HybridSystem):
     slow: hj.Parameter = hj.parameter(5.0)
 
     def charts(self):
-        return {"on": Heated(1.0, self.fast), "off": Room(0.0, self.slow)}
+        sensed = lambda heat, rate: lambda t, q, u: (heat - q[0] + u[0], rate * (q[0] - q[1]))  # noqa: E731
+        heated = FieldChart(sensed(1.0, self.fast), ("x", "z"), solver=hj.Radau())
+        return {"on": heated, "off": FieldChart(sensed(0.0, self.slow), ("x", "z"))}
 
     def transitions(self):
         return [

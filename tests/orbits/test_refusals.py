@@ -1,12 +1,13 @@
 """Cycles that are not what they seem to be are refused, never used."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hybridjax as hj
 
-from ..toys import Field, toy
+from ..toys import Field, Toys, toy
 
 
 def kicked(beat=1.0, schedule=0.0):
@@ -39,6 +40,19 @@ def test_what_is_no_cycle(system, guess, options, message):
     x, *time = guess
     with pytest.raises(hj.HybridJaxError, match=message):
         hj.find_limit_cycle(system, hj.Guess("a", (x,), *time), **options)
+
+
+def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
+    """Of the logistic map, of which each period of a clock makes a step."""
+
+    def make(r):
+        grow = lambda t, q, u: (r * q[0] * (1 - q[0]),)  # noqa: E731
+        still = {"a": Field(("x",), lambda t, q, u: (0.0 * jnp.sin(2 * jnp.pi * t),))}
+        return still, [hj.Transition("grow", "a", "a", hj.Scheduled(1, 0.5), reset=grow)], 1.0
+
+    cycle = hj.find_limit_cycle(Toys(make, [3.2]), hj.Guess("a", (0.8,)), multiplicity=2)
+    result = jax.jit(lambda r: hj.find_limit_cycle(Toys(make, r), cycle).result)
+    assert [result(np.array([r])) for r in (3.3, 2.8)] == [hj.Result.OK, hj.Result.EXTRA_TURNS]
 
 
 def test_outputs_of_a_call_have_the_period_of_the_clock():

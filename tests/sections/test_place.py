@@ -81,6 +81,7 @@ TOP = Crossing("v", "falling")
             [TOP, Crossing(hj.Output("xv", lambda t, q, u: q[0] * q[1]), "falling")],
             r"1 \(xv falling\) is crossed more than once .*, at t = \S+ .* and t = \S+ in osc",
         ),
+        (hj.ClockPhase(4, Crossing(lambda t, q: q[0] * q[1], "falling")), "lies at .* once in one"),
         ([Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / 6.6633), "falling")], "depends on time"),
         (hj.ClockPhase(4, Crossing("x", "rising", 9.0)), "on the cycle: from -2.009 to 2.009"),
         ([TOP, Crossing("x", "rising"), TOP], r"section 2 \(v falling\) coincides with section 0"),
@@ -99,6 +100,13 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
         hj.place_sections(hopper_cycle, Crossing(twice, "falling"))
     with pytest.raises(hj.DefinitionError, match=r"'function falling' .*`Crossing`.* \(t, q\)"):
         hj.place_sections(hopper_cycle, Crossing(lambda t, q, u: q[0], "falling"))
+
+
+def test_sections_out_of_order_have_no_matrices_in_programs(vanderpol_cycle):
+    """Their round takes two periods, and would give squares of multipliers."""
+    levels = lambda x: [Crossing("x", "rising", y) for y in (0.2, 0.4, x)]  # noqa: E731
+    A = jax.jit(lambda x: hj.linearize(vanderpol_cycle, levels(x)).A)
+    assert np.isfinite(A(0.6)).all() and np.isnan(A(0.3)).all()
 
 
 @pytest.mark.slow

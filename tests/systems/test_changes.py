@@ -18,13 +18,6 @@ TURN = hj.Crossing("v", "falling")
 drag = jax.jit(lambda speed: -DRAG * speed)  # whose trace JAX keeps
 
 
-class Slowing(hj.Chart):
-    states = ("x",)
-
-    def field(self, t, q, u):
-        return (drag(q[0]) + jnp.cos(2 * jnp.pi * t) + u[0],)
-
-
 class Slowed(hj.HybridSystem):
     wind: hj.Parameter = hj.parameter(0.0)
 
@@ -32,7 +25,8 @@ class Slowed(hj.HybridSystem):
         return 1.0
 
     def charts(self):
-        return {"air": Slowing()}
+        slows = lambda t, q, u: (drag(q[0]) + jnp.cos(2 * jnp.pi * t) + u[0],)  # noqa: E731
+        return {"air": Field(("x",), slows)}
 
     def guess(self):
         return hj.Guess("air", (0.1,))

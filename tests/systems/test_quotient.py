@@ -66,6 +66,8 @@ class Full(hj.HybridSystem):  # Nothing is relabeled in the resets.
         return hj.Guess("left stands", told(0, th, phi, w, p, 0.0))
 
 
+FAR = hj.Output("far", {"left stands": lambda t, q, u: q[4] + q[0]})
+PLACED = type("Placed", (Full,), {"outputs": lambda self: [FAR]})()
 PARTNERS = {"left": "right", "left_rate": "right_rate"}
 MIRROR = {"swap": {"left stands": "right stands"}, "relabel": PARTNERS}
 ODD, SIZES = {"flipped": ("x", "v"), "half_period": True}, np.r_[1, 1, 1, 1, 1e-9]
@@ -88,6 +90,7 @@ def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section
     [
         (Full(drag=0.1), {**MIRROR, "translation": ("x",)}, "field of chart 'left stands' changes"),
         (Full(skew=0.1), MIRROR, "chart 'right stands' is not the mirror image"),
+        (PLACED, {"translation": ("x",)}, "output 'far' changes under the translation"),
         (Full(early=0.1), MIRROR, "'left lands' is not the mirror image of .* 'right lands'"),
     ],
 )

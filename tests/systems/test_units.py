@@ -5,6 +5,9 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.signal import unit_of
+from hybridjax.systems.chart import FieldChart
+
+from ..toys import toy
 
 
 def units(names):
@@ -35,23 +38,8 @@ def test_what_has_other_units_is_not_compared():
     assert small_htf(outputs={"y": "m"}).error(small_htf(outputs="y")) == 0
 
 
-class Chart(hj.Chart):
-    states = ("y", "v")
-    units = ("m", "m/s")
-
-    def field(self, t, q, u):
-        return q[1], -q[0]
-
-
-class Other(Chart):
-    units = ("mm", "m/s")
-
-
-class System(hj.HybridSystem):
-    def charts(self):
-        return {"a": Chart(), "b": Other()}
-
-
 def test_units_that_do_not_fit_are_refused():
+    still = lambda t, q, u: q  # noqa: E731
+    charts = {unit: FieldChart(still, ("y",), (unit,)) for unit in ("m", "mm")}
     with pytest.raises(hj.DefinitionError, match=r"two units: 'y' \(m\), .*'y' \(mm\)"):
-        hj.simulate(System(), "a", (1.0, 0.0), 1.0)
+        hj.simulate(toy(charts), "m", (1.0,), 1.0)
