@@ -18,7 +18,8 @@ from .._core.progress import working
 from .._core.results import Result
 from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError
-from ..orbits.cycle import LimitCycle, rough
+from ..orbits.cycle import LimitCycle
+from ..orbits.limit_cycles import rough
 from ..sections.placed import SectionsLike
 from ..systems.system import OutputNames, describe
 from .data import ExperimentData, Simulated, summary

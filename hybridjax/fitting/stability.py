@@ -39,7 +39,7 @@ def spectral_radius(model: LDTP | LimitCycle, smoothing: Probability = 1e-3) -> 
     `smoothing`: $\epsilon$, between 0 and 1; the larger, the smoother.
     """
     if isinstance(model, LimitCycle):
-        model.require_current()
+        model.require_found()
     power = monodromy(model.A if isinstance(model, LDTP) else model.factors)
     return _smooth_radius(power, jnp.asarray(smoothing, float))
 

@@ -58,7 +58,8 @@ def _turn(map: ReturnMap, wanted):
     """The anchor, the expected period, and one turn with its Jacobian if it is `wanted`, of a
     system, or of systems side by side on the host."""
     turn = map.turn_with_jacobian(map.each(map.anchor.q.T), wanted)
-    return _apart(map, map.anchor), map.expected, turn._replace(record=None, tapes=None)
+    turn = turn._replace(record=None, tapes=None, end=_apart(map, turn.end))
+    return _apart(map, map.anchor), map.expected, turn
 
 
 def _verdict(map: ReturnMap, turn: Turn):
@@ -87,8 +88,8 @@ def _turns(systems, map: ReturnMap, anchor: Lanes, period, wanted):
     """`_turn` of every system from its anchor, in JAX."""
 
     def of_one(system, anchor, expected):
-        replaced = dict(system=system, anchor=anchor, expected=expected)
-        return _turn(dataclasses.replace(map, **replaced), wanted)
+        other = dataclasses.replace(map, system=system, anchor=anchor, expected=expected)
+        return _turn(other, wanted)
 
     return eqx.filter_vmap(of_one)(systems, anchor, period)
 
@@ -168,16 +169,14 @@ class Tiles(NamedTuple):
             near, cycles = _join(*sources)
             return self._by_neighbors(near, cycles, parameters[rows], moved)
 
+        out: Rounds | None = None
         with working("cycles", S) as call:
             if self.known is None:
                 call.done, rows = 0, order[: min(self.size, WIDE)]
                 with uncollected():  # the programs are compiled during this call
                     out = self._newton(rows, *self._given(rows), FEW_STEPS)
-                    out = self._again(rows, out, self._given, _SETTLE[:1])
                     if not (out.result == Result.OK).any():
-                        out = self._again(rows, out, self._given, _SETTLE[1:])
-            else:
-                out = None
+                        out = self._again(rows, out, self._given, _SETTLE)
             while (done := 0 if out is None else len(out.result)) < S:
                 call.done = done
                 more = slice(done, max(4 * done, self.size))
@@ -190,10 +189,9 @@ class Tiles(NamedTuple):
                 part = part._replace(steps=part.steps + 1)
                 out = part if out is None else _join(out, part)
         assert out is not None
-        nearest = ft.partial(neighbors, out=out, moved=False)
         near = self.known is not None or (out.result == Result.OK).any()
-        out = self._again(order, out, nearest, (0, *_SETTLE) if near else _SETTLE[1:])
-        return _pick(out, np.argsort(order))
+        settle, nearest = (0, *_SETTLE) if near else (), ft.partial(neighbors, out=out, moved=False)
+        return _pick(self._again(order, out, nearest, settle), np.argsort(order))
 
     def _given(self, rows) -> tuple[Lanes, Float[np.ndarray, " S"]]:
         given = self.map.anchor, self.map.expected
@@ -212,8 +210,7 @@ class Tiles(NamedTuple):
             arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
             if arrived.any():
                 failed, (anchor, period) = failed[arrived], _pick(begin, arrived)
-                steps = USUAL_STEPS if periods == _SETTLE[0] else FEW_STEPS
-                part = self._newton(rows[failed], anchor, period, steps)
+                part = self._newton(rows[failed], anchor, period, FEW_STEPS)
                 part = part._replace(steps=part.steps + out.steps[failed])
                 out = _replace(out, failed, part)
         return out
@@ -248,8 +245,6 @@ class Tiles(NamedTuple):
 
     def _first_step(self, rows, anchor: Lanes, period, jacobian):
         """The first Newton step, with Jacobians that are guessed, for systems with a small one."""
-        if not np.isfinite(jacobian).any():
-            return anchor, period
         anchor, period, turn, *_ = self._turn(rows, anchor, period, wanted=False)
         sizes, step = self._step_from(anchor, turn.residual, jacobian)
         small = (np.abs(step) <= _NEAR).all(axis=1, keepdims=True)
@@ -277,9 +272,12 @@ class Tiles(NamedTuple):
         # A turn that closes but met its section too often was given too long a period.
         extra = turn.closed & (turn.meetings > self.map.multiplicity)
         period[extra] = self.map.multiplicity * turn.period[extra] / turn.meetings[extra]
-        size[extra] = np.inf
-        once = np.ones(len(rows), int)
+        # (Newton's method does not lead to a cycle that begins in another chart: turns do.)
+        other = (turn.result == Result.OK) & (turn.end.chart != anchor.chart)[:, 0]
         anchor = anchor._replace(q=q[..., None])
+        anchor.q[other], anchor.chart[other] = turn.end.q[other], turn.end.chart[other]
+        size[extra | other] = np.inf
+        once = np.ones(len(rows), int)
         return Rounds(anchor, size, period, turn, codes, coincide, -once, once)
 
     def _step_from(self, anchor: Lanes, residual, jacobian):

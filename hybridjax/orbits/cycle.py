@@ -44,6 +44,8 @@ from .sensitivity import Sensitivity, sensitivity
 Matrix = Float[np.ndarray, "_ _"]
 _trajectories = Memory()
 
+# Codes of searches that end on a cycle.
+_FOUND = Result.OK, Result.SINGULAR
 # A piece of a turn is computed in factors of its own steps if its weakest direction keeps less than
 # this, and these are multiplied as long as their product keeps as much. Larger: more factors, for
 # more cycles. Smaller: small multipliers lose digits.
@@ -107,6 +109,13 @@ class LimitCycle(eqx.Module):
             require_unchanged(self.system, self.numbers)
         whole_call().compared = self
 
+    def require_found(self) -> None:
+        """**Raises:** `DefinitionError` if the search failed, and as `require_current`."""
+        self.require_current()
+        code = Result.OK if is_traced(self.result) else Result(int(self.result))
+        if code not in _FOUND:
+            raise DefinitionError(f"no cycle was found ({code.message}): take another guess.")
+
     @property
     def structure(self) -> Structure:
         """The system in its normal form, with indices of charts and transitions. (It is computed at
@@ -143,7 +152,7 @@ class LimitCycle(eqx.Module):
         exactly 1.
         """
         _require_values(self, "multipliers")
-        self.require_current()
+        self.require_found()
         # The factors in sizes of the states, without padding.
         dims, scale = self.dims, np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
         after = np.roll(np.arange(len(dims)), -1)
@@ -303,13 +312,13 @@ class LimitCycle(eqx.Module):
 
     def _checked(self) -> "LimitCycle":
         require_x64()
-        self.require_current()
+        self.require_found()
         return hosted(self)
 
     def __repr__(self):
         if is_traced(self):
             return f"LimitCycle({type(self.system).__name__}, traced)"
-        if what_changed(self.system, self.numbers):
+        if what_changed(self.system, self.numbers) or int(self.result) not in _FOUND:
             return f"LimitCycle({self._title()})"
         least = "1e-10" if has_implicit(self.structure) else "1e-308"
         shown = (number(z, 9) if z else f"below {least}" for z in self.multipliers)
@@ -400,18 +409,6 @@ def _differ(x: Any, y: Any) -> bool:
     if is_tracer(x) or is_tracer(y):  # (a parameter alone is, if it was replaced in there)
         return not is_tracer(y)
     return x is not y and np.asarray(x).tobytes() != np.asarray(y).tobytes()
-
-
-def rough(cycle: LimitCycle) -> dict[str, Any]:
-    """The period and the anchor, in sizes of the states, in digits on which two searches agree."""
-    chart = int(np.asarray(cycle.anchor.chart)[0])
-    q, size = np.asarray(cycle.anchor.q)[:, 0], np.asarray(cycle.settings.scale)[chart]
-    return {
-        "period": f"{float(cycle.period):.5g}",
-        "time": f"{float(cycle.anchor.t[0]):.5g}",
-        "chart": chart,
-        "state": [f"{x:.4f}" for x in (q / size).round(4) + 0.0],
-    }
 
 
 def orbit_picture(

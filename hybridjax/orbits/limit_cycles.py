@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import SupportsIndex
+from typing import Any, SupportsIndex
 
 import equinox as eqx
 import jax
@@ -221,3 +221,12 @@ def _stacked(systems) -> HybridSystem:
     columns = zip(*(leaves for leaves, _ in parts), strict=True)
     stacked = [stack(x) if eqx.is_array(x[0]) else x[0] for x in columns]
     return jax.tree_util.tree_unflatten(parts[0][1], stacked)
+
+
+def rough(cycle: LimitCycle) -> dict[str, Any]:
+    """The period and the anchor, in sizes of the states, in digits on which two searches agree."""
+    chart = int(np.asarray(cycle.anchor.chart)[0])
+    q, size = np.asarray(cycle.anchor.q)[:, 0], np.asarray(cycle.settings.scale)[chart]
+    state = [f"{x:.4f}" for x in (q / size).round(4) + 0.0]
+    period, time = (f"{float(x):.5g}" for x in (cycle.period, cycle.anchor.t[0]))
+    return {"period": period, "time": time, "chart": chart, "state": state}

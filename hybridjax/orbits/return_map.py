@@ -68,13 +68,17 @@ class Return(NamedTuple):
     """Duration of the turn."""
     result: Int[Array, ""]
     """`Result` code of the flow."""
+    end: Lanes
+    """The lane there."""
 
 
 class Turn(NamedTuple):
-    """One turn with its derivatives, for Newton's method."""
+    """One turn with its derivatives, for Newton's method: first all of its `Return`."""
 
     residual: Float[Array, " d"]
-    """As in `Return`."""
+    period: Float[Array, ""]
+    result: Int[Array, ""]
+    end: Lanes
     jacobian: Float[Array, "d n"]
     """Derivative of the residual with respect to the state, and along the parameters if asked."""
     legs: Lanes
@@ -86,10 +90,8 @@ class Turn(NamedTuple):
     """Events of each piece, by index of the transition; negative for none. (None in sweeps.)"""
     times: Float[Array, "K R"]
     """Times of these events. (None in sweeps.)"""
-    period: Float[Array, ""]
     distance: Float[Array, ""]
     """Largest part of the residual in sizes of the states."""
-    result: Int[Array, ""]
     meetings: Int[Array, ""]
     """Number of crossings of the section on which the turn ended, as far as its pieces show."""
     record: Recorded | None
@@ -212,7 +214,7 @@ class ReturnMap(eqx.Module):
         wanted: Bool[Array, ""] | bool = True,
         record: Recorded | None = None,
         varied: Varied | None = None,
-        travelled: tuple | None = None,
+        travelled: tuple[Return, Any, Any] | None = None,
     ) -> Turn:
         """One turn from a state on the section, with its derivatives.
 
@@ -235,10 +237,11 @@ class ReturnMap(eqx.Module):
 
         if on_host(q):  # (all pieces are linearized together)
             options = Options(True, new_input=False, tangents=wanted, at_once=varied is not None)
-            end, (legs, _, tapes), *gap = travelled or self.travel(q, options)
-            recorded = None
+            travelled = travelled or (*self.travel(q, options), 0.0)
+            end, (legs, _, tapes), gap = travelled
+            record = None
         else:
-            (end, (legs, factors, tapes, recorded)), gap = self.travel(q, flow, record), []
+            (end, (legs, factors, tapes, record)), gap = self.travel(q, flow, record), 0.0
         (ends, levels), d = self.ends().split(), s.d
         lanes, tape, ends = side_by_side((legs, tapes, ends))
         if on_host(q):
@@ -254,13 +257,11 @@ class ReturnMap(eqx.Module):
         if self.base is not None:
             f, scale = self.slopes(lanes).T, self.scale[lanes.chart]
             factors = across(f.reshape(LEGS, *q.shape), scale.reshape(LEGS, *q.shape), factors)
-        defect = xp.abs(end.residual) + xp.abs(off)
+        distance = xp.max((xp.abs(end.residual) + xp.abs(off)) / self.sizes, axis=-1) + gap
         times, meetings = each(xp.moveaxis(tapes.t, -1, 0)), self._meetings(lanes, codes)
         legs = jax.tree_util.tree_map(lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs)
-        return Turn(
-            end.residual, jacobian, legs, xp.moveaxis(factors, 0, -3), codes, times, end.period,
-            xp.max(defect / self.sizes, axis=-1) + sum(gap), end.result, meetings, recorded, tapes,
-        )  # fmt: skip
+        factors = xp.moveaxis(factors, 0, -3)
+        return Turn(*end, jacobian, legs, factors, codes, times, distance, meetings, record, tapes)
 
     def _by_parameter(
         self, varied: Varied, by: Float[np.ndarray, "K d m"], ends: Float[np.ndarray, "n K"]
@@ -363,7 +364,7 @@ class ReturnMap(eqx.Module):
         same = each((result == Result.OK) & (end.chart == self.anchor.chart))
         residual = xp.where(self.valid, each(end.q.T), 0.0) - q - self.held(q)[0]
         residual = xp.where(same[..., None], residual, np.nan)
-        return Return(residual, each(end.t - self.anchor.t), each(result)), extra
+        return Return(residual, each(end.t - self.anchor.t), each(result), end), extra
 
     def pieces(self) -> tuple[Lanes, Tape]:
         """The starts and tapes of the pieces of one turn."""

@@ -111,7 +111,7 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple
     end = jax.tree_util.tree_map(lambda x: x[..., -1], moved.lanes)
     residual = np.where(map.valid, end.q, 0.0) - q - map.held(q)[0]
     residual = np.where(end.chart == map.anchor.chart, residual, np.nan)
-    turn = Return(residual, end.t - map.anchor.t[0], np.asarray(moved.result[-1]))
+    turn = Return(residual, end.t - map.anchor.t[0], np.asarray(moved.result[-1]), end)
     return turn, jax.tree_util.tree_map(one_by_one, (legs, None, tape)), gap
 
 

@@ -206,8 +206,7 @@ def explore(
     """
     with searching("as `system`", (ComputationError, DefinitionError)):
         cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)
-    if int(cycle.result) != Result.OK:
-        raise DefinitionError("`system` is a cycle that was not found: explore another one.")
+    cycle.require_found()
     sliders, ranges = [], ranges or {}
     for name in dict.fromkeys((*parameters, *ranges)):
         value = float(parameter_of(cycle.system, name))

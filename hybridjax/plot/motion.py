@@ -18,7 +18,6 @@ from matplotlib.patches import Circle
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, Positive, SignalNames
 from .._core.executor import to_host
-from .._core.results import Result
 from .._core.signal import SECONDS
 from .._core.writing import replacing
 from ..engine.trajectory import Trajectory, observed
@@ -175,8 +174,8 @@ def animate(
     if isinstance(motion, Branch):
         return _of_branch(motion, x, y, 1 / rate / (speed or 1.0))
     cycle = motion if isinstance(motion, LimitCycle) else None
-    if cycle is not None and (code := Result(int(cycle.result))) != Result.OK:
-        raise DefinitionError(f"a cycle that was not found cannot be animated ({code.message}).")
+    if cycle is not None:
+        cycle.require_found()
     if isinstance(perturbed, ExperimentData):
         if cycle is None or sections is None:
             raise DefinitionError("data of experiments need a limit cycle and their `sections`.")

@@ -21,9 +21,9 @@ from .._core.progress import say, working
 from ..engine.settings import SWEEP, Settings
 from ..errors import ComputationError, DefinitionError
 from ..orbits.batches import BATCH, SMALL, Known, Tiles, tiles_of
-from ..orbits.cycle import LimitCycle, rough
+from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
-from ..orbits.limit_cycles import LimitCycles, as_cycles, map_for_sweep
+from ..orbits.limit_cycles import LimitCycles, as_cycles, map_for_sweep, rough
 from ..orbits.return_map import ReturnMap
 from ..systems.system import HybridSystem
 from .family import Axes, Family, Points, Space

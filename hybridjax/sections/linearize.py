@@ -70,7 +70,7 @@ def linearize(
     """
     if delay is not None:
         return Delayed.of(cycle, sections, outputs, inputs, delay).to_ldtp()
-    cycle.require_current()
+    cycle.require_found()
     s, traced = cycle.structure, is_traced(cycle, sections)
     of_family = traced and not isinstance(sections, PlacedSections)
     placed: Any = sections if of_family else as_placed(cycle, sections)

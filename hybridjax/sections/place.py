@@ -64,7 +64,7 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     """
     family = as_family(sections)
     require_x64(cycle, family)
-    cycle.require_current()
+    cycle.require_found()
     for placed in () if is_traced((cycle, family)) else list(_recent):
         if placed.cycle is cycle and eqx.tree_equal(*jax.device_get((placed.family, family))):
             return placed
@@ -97,7 +97,7 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
     if not isinstance(sections, PlacedSections):
         return place_sections(cycle, sections)
     require_x64(cycle)
-    cycle.require_current()
+    cycle.require_found()
     if sections.cycle is cycle:
         return sections
     both = [(c.system, c.anchor, c.period) for c in (cycle, sections.cycle)]

@@ -33,13 +33,9 @@ def test_the_hopper_and_its_events(reference, hopper_cycle):
     assert (liftoff.name, touchdown.name) == ("liftoff", "touchdown")
     np.testing.assert_allclose(liftoff.time % 1, data["liftoff_clock"], atol=1e-10)
     np.testing.assert_allclose(touchdown.time % 1, data["touchdown_clock"], atol=1e-10)
-    for found, name in (
-        (liftoff.before, "liftoff_pre"),
-        (liftoff.after, "liftoff_post"),
-        (touchdown.before, "touchdown_pre"),
-        (touchdown.after, "touchdown_post"),
-    ):
-        np.testing.assert_allclose(list(found.values()), data[name], atol=1e-10)
+    for event in (liftoff, touchdown):
+        for x, when in ((event.before, "pre"), (event.after, "post")):
+            np.testing.assert_allclose(list(x.values()), data[f"{event.name}_{when}"], atol=1e-10)
     (before, _), (after, _) = map(last_turn, (hopper_cycle, begin_later(hopper_cycle, 2)))
     np.testing.assert_array_equal(after.t, np.append(before.t[2:], before.t[:2] + 1.0))
     text = repr(hopper_cycle)
@@ -72,9 +68,8 @@ def test_the_two_legged_bar():
     truth = [first, np.conj(first), second, np.conj(second)]
     np.testing.assert_allclose(bar_cycle.multipliers, truth, atol=1e-9)
     events = bar_cycle.trajectory().events
-    assert [e.name.split(" (")[0] for e in events] == [
-        "front lifts", "hind lifts", "front lands", "hind lands"
-    ]  # fmt: skip
+    names = ", ".join(e.name.split(" (")[0] for e in events)
+    assert names == "front lifts, hind lifts, front lands, hind lands"
     times = [0.485372036855771, 0.520707713616307, 0.745498454894426, 0.759897208341559]
     np.testing.assert_allclose([e.time for e in events], times, atol=1e-9)
     landed = [0.788200918259240, -1.71180954225949, -0.0243713338437363, -0.268770117871700]
@@ -110,6 +105,11 @@ def test_an_equilibrium_is_no_cycle():
     far = hj.Crossing("x", "falling", value=10.0)
     with pytest.raises(hj.ComputationError, match=r"looking for the section \(x falling\) failed"):
         vanderpol(1.0, section=far, max_period=20.0)
+    still = vanderpol(-0.5, (0.1, 0.0), throw=False)
+    linearize = lambda: hj.linearize(still, far)  # noqa: E731
+    for use in (still.responses, linearize, lambda: still.multipliers, lambda: still.htf(0.1)):
+        with pytest.raises(hj.DefinitionError, match="no cycle was found"):
+            use()
 
 
 def test_a_lossy_ball_has_no_cycle():

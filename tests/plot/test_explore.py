@@ -52,14 +52,13 @@ def test_the_widget_sends_pictures():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("names", "options", "message"),
     [
-        (((), {}), "name one parameter"),
-        ((("stiffness",), {}), "no parameter 'stiffness'"),
-        (((), {"ranges": {"mu": (7.0, 9.0)}}), "around its present value"),
+        ((), {}, "name one parameter"),
+        (("stiffness",), {}, "no parameter 'stiffness'"),
+        ((), {"ranges": {"mu": (7.0, 9.0)}}, "around its present value"),
     ],
 )
-def test_what_is_refused(arguments, message):
-    names, options = arguments
+def test_what_is_refused(names, options, message):
     with pytest.raises(hj.DefinitionError, match=message):
         hj.explore(hj.models.VanDerPol(), *names, **options)

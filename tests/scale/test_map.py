@@ -154,9 +154,10 @@ def test_sweep_draws_a_map(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_each_is_the_cycle_that_is_found_alone(hopper_cycle):
-    """Three hoppers near the paper's, one that is in the air when its clock is at 0.5, and one
-    that has no cycle with a touchdown: its spring pushes nothing."""
+def test_each_is_the_cycle_that_is_found_alone(hopper_cycle, monkeypatch):
+    """Three hoppers near the paper's, one that is in the air when its clock is at 0.5, to which
+    turns lead, and one that has no cycle with a touchdown: its spring pushes nothing."""
+    monkeypatch.setattr(batches, "_SETTLE", ())
     k, b = jnp.array([8.0, 10.0, 13.0, 13.0, 0.0]), jnp.array([3.0, 5.0, 7.0, 3.0, 5.0])
     hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
     found = hj.find_limit_cycles(hoppers, hopper_cycle)
