@@ -70,9 +70,9 @@ class Identifiability(eqx.Module):
         lost = ", ".join(f"{x:.1g}" for x in self.singular_values[self.rank :])
         lines = [
             f"Identifiability: {self.rank} of {len(self.names)} combinations of "
-            f"({', '.join(self.names)}) are seen"
+            f"({', '.join(self.names)}) are identified"
         ]
-        lines += [f"  not seen: {text}" for text in self.descriptions()]
+        lines += [f"  not identified: {text}" for text in self.descriptions()]
         lines.append(f"  singular values {nonzero}" + (f"; zero: {lost}" if lost else ""))
         return "\n".join(lines)
 
@@ -217,7 +217,7 @@ class ModelFit(eqx.Module):
         lines.append(f"  {self._cost()}\n  standard errors include noise, but no distortion:")
         for name, value, error, unit in self._rows():
             lines.append(f"  {name:{width}}  {value:<14} {error} {unit * ('±' in error)}".rstrip())
-        lines += [f"  not seen: {text}" for text in self.identifiability.descriptions()]
+        lines += [f"  not identified: {text}" for text in self.identifiability.descriptions()]
         return "\n".join(lines)
 
     def _cost(self) -> str:
@@ -230,13 +230,13 @@ class ModelFit(eqx.Module):
     def _rows(self) -> Iterator[tuple[str, str, str, str]]:
         """Yield each name with its value, standard error and unit."""
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            shown = f"± {error:.2g}" if np.isfinite(error) else "not seen by itself"
+            shown = f"± {error:.2g}" if np.isfinite(error) else "not identified alone"
             system = self.system
             unit = system.time_unit if name in DELAYS else unit_of_parameter(system, name)
             yield name, f"{value:.9g}", shown, unit
 
     def _repr_html_(self) -> str:
         parameters = table(("parameter", "value", "standard error", "unit"), self._rows())
-        unseen = [f"not seen: {x}" for x in self.identifiability.descriptions()]
+        unseen = [f"not identified: {x}" for x in self.identifiability.descriptions()]
         of = f"of {type(self.system).__name__}: {Result(self.result).message}"
         return card("ModelFit", of, parameters, text("\n".join([self._cost(), *unseen])))

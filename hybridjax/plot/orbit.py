@@ -71,9 +71,9 @@ def cycle(
             panel.plot(*line, color=CHARTS[a % len(CHARTS)], label=s.names[a], **look)
         t, px, py = orbit(x, y)
         center = np.array([(np.nanmin(v) + np.nanmax(v)) / 2 for v in (px, py)])
-        # An arrow of the direction, in the middle of the longest step.
-        longest = int(np.argmax(np.diff(orbit.t)))
-        k = int(np.searchsorted(t, orbit.t[longest : longest + 2].mean()))
+        # An arrow of the direction, in the middle of the longest time without events.
+        ends = np.union1d(orbit.t[orbit.event >= 0], orbit.t[[0, -1]])
+        k = int(np.searchsorted(t, (ends[:-1] + np.diff(ends) / 2)[np.argmax(np.diff(ends))]))
         arrow = {"arrowstyle": "-|>", "mutation_scale": 16, "color": "black", "lw": 0}
         panel.annotate("", (px[k + 1], py[k + 1]), (px[k], py[k]), arrowprops=arrow, zorder=6)
         panel.margins(0.1)

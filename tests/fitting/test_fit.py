@@ -45,7 +45,7 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     assert fit.identifiability.descriptions() == ["p and q apart, only their product"]
     assert np.isinf(fit.standard_errors).tolist() == [True, True, False]
     assert float(fit.cycle.period) == pytest.approx(float(oscillation.period), rel=1e-9)
-    assert "not seen: p and q apart" in repr(fit) and "1 of 1 guesses" in repr(fit)
+    assert "not identified: p and q apart" in repr(fit) and "1 of 1 guesses" in repr(fit)
 
 
 @pytest.mark.slow

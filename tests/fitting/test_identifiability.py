@@ -31,7 +31,7 @@ def test_directions_are_said_in_words(rows, words):
     found = diagnose(tuple("abcd"), blind(rows, 300_000))  # (whose square no memory holds)
     assert found.rank == 4 - len(rows) and not found.complete
     assert sorted(found.descriptions()) == sorted(words)
-    assert all(f"not seen: {text}" in repr(found) for text in words)
+    assert all(f"not identified: {text}" in repr(found) for text in words)
 
 
 @given(st.lists(st.lists(st.integers(-3, 3), min_size=5, max_size=5), min_size=1, max_size=3))

@@ -1,4 +1,4 @@
-"""Simulators of others against models of this package, and against each other."""
+"""External simulators against models of this package, and against each other."""
 
 import math
 import pathlib

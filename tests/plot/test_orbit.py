@@ -15,6 +15,7 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
     assert set(lines) == {"stance", "flight", "sections (32)", "perturbed"}
     arrow, *texts = ax.texts
     assert (arrow.xy[0] - arrow.xyann[0]) * arrow.xy[1] > 0  # x moves as its velocity says
+    assert arrow.xy[1] < -1  # (both events lie above)
     assert [t.get_text() for t in texts] == ["liftoff", "touchdown", *map(str, range(0, 32, 4))]
 
     # Bars lie on their sections: rays from the center of the kinematic phase, in equal angles.

@@ -90,7 +90,7 @@ class PhaseResponse(PhaseCurve):
     def __repr__(self) -> str:
         mean, error = self.coefficients[0], np.sqrt(self.covariance[0, 0])
         return (
-            f"PhaseResponse(detail of {self.detail:.1f} numbers, {self.intervals} intervals of "
+            f"PhaseResponse({self.detail:.1f} effective parameters, {self.intervals} intervals of "
             f"{len(self.rates)} trials, {self.miscounted} of them miscounted)\n"
             f"  mean {with_unit('Z', self.unit)}  {mean:.4g} ± {error:.2g} (standard error); from "
             f"{self.values.min():.4g} to {self.values.max():.4g}\n"

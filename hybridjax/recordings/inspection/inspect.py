@@ -290,8 +290,8 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
     times = np.concatenate(late)
     follows = abs(times[1:] @ times[:-1]) / max(times @ times, np.finfo(float).tiny)
     if left < (1 - _SHIFTED) * whole and follows < 0.5:
-        text = f"the starts of cycles seem to scatter by {times.std():.2g} of a cycle: define the "
-        yield Finding("inexact events", f"{text}phase by the crossing of a signal, or by an angle.")
+        text = f"the starts of cycles seem to scatter by {times.std():.2g} of a cycle: use an angle"
+        yield Finding("inexact events", f"{text}, or a crossing where the signal changes fast.")
 
 
 def feedback(data: SectionData) -> Iterator[Finding]:
