@@ -205,7 +205,8 @@ class ExperimentData(eqx.Module):
         plus, minus = self.u[::2], self.u[1::2]
         if len(self.u) % 2:
             raise DefinitionError(f"{len(self.u)} experiments are not pairs: leave one out.")
-        total, size = (np.abs(x).max(axis=(1, 2)) for x in (plus + minus, plus))
+        unit = np.maximum(np.abs(self.u[self.ok]).max(axis=(0, 1), initial=0), np.finfo(float).tiny)
+        total, size = (np.abs(x / unit).max(axis=(1, 2)) for x in (plus + minus, plus))
         apart = ~(total <= _OPPOSITE * size)
         if apart.any():
             k = 2 * int(np.argmax(apart))

@@ -79,8 +79,8 @@ def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> in
     At most a quarter of a record.
     """
     slowest = np.clip(np.abs(multipliers).max(), _FORGOTTEN, SLOWEST)
-    needed = np.ceil(np.log(_FORGOTTEN) / np.log(slowest))
-    return int(min(needed, cycles // 4))  # (sums over fewer pairs scatter more)
+    # (Sums over fewer pairs scatter more.)
+    return int(min(np.ceil(np.log(_FORGOTTEN) / np.log(slowest)), cycles // 4))
 
 
 def fading(c: Coefficients) -> Coefficients:

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Int
+from jaxtyping import Complex, Float, Int
 
 from .._core.arguments import require_among, require_same
 from ..errors import DefinitionError
@@ -101,6 +101,8 @@ class Sums(NamedTuple):
     """Sums of the covariances of these means between windows."""
     experiments: int
     setup: Setup
+    unit: Float[np.ndarray, " signals"]
+    """Sizes of the signals, in which they are measured: each has a unit of its own."""
 
     def rows(self, names: Sequence[str]) -> Int[np.ndarray, " a"]:
         """Return the rows of signals, for all components."""
@@ -109,9 +111,12 @@ class Sums(NamedTuple):
         return np.add.outer(np.arange(self.setup.n_sections) * len(signals), columns).ravel()
 
 
-def spectral_products(data: ExperimentData, repeats: int) -> Sums:
+def spectral_products(data: ExperimentData, repeats: int, like: Sums | None = None) -> Sums:
     N, P = data.n_sections, data.periods
     z = np.concatenate([data.y, data.u], axis=2)[data.ok]
+    size = np.linalg.norm(z, axis=(0, 1))
+    unit = like.unit if like else np.where(size > 0, size, 1.0)
+    z = z / unit
     bins = (np.arange(P // 2 + 1)[:, None] + P * np.arange(N)) % (N * P)
     spectra = np.stack([np.fft.fft(z[:, w], axis=1)[:, bins] for w in data.windows(repeats)])
     # (windows, S, K, N, signals) to (windows, K, N * signals, S), components first
@@ -121,7 +126,7 @@ def spectral_products(data: ExperimentData, repeats: int) -> Sums:
     apart = spectra - mean
     between = (apart @ apart.conj().swapaxes(2, 3)).sum(axis=0) / max(repeats - 1, 1) / repeats
     setup = Setup(N, P, data.inputs, data.outputs)
-    return Sums(mean @ mean.conj().swapaxes(1, 2), between, len(z), setup)
+    return Sums(mean @ mean.conj().swapaxes(1, 2), between, len(z), setup, unit)
 
 
 def htf_by_reference(
@@ -140,11 +145,11 @@ def htf_by_reference(
     for part in [data] if isinstance(data, ExperimentData) else data:
         roles = Roles.of(part.inputs, reference)
         require_loop(roles, [part.u], part.inputs)
-        sums = spectral_products(part, repeats)
+        sums = spectral_products(part, repeats, total)
         if total is not None:
             require_same("experiments", total, sums, ("setup",))
             both = (total.total + sums.total, total.between + sums.between)
-            sums = Sums(*both, total.experiments + sums.experiments, sums.setup)
+            sums = Sums(*both, total.experiments + sums.experiments, *sums[3:])
         total = sums
     if total is None or not total.experiments:
         raise DefinitionError("`data` holds no experiment that ran well: see `data.summary()`.")
@@ -189,6 +194,8 @@ def solve(
     **Raises:** `DefinitionError` if there are none, or the inputs do not answer the references.
     """
     y, u, r = map(sums.rows, (outputs, inputs, references))
+    unit = np.tile(sums.unit, sums.setup.n_sections)
+    unit = unit[y][:, None] / unit[u]
     classes, (N, P, *_) = excited_classes(sums, r, threshold), sums.setup
     G, (repeats, kind) = sums.total[classes], how
 
@@ -244,12 +251,12 @@ def solve(
     lines = Lines.of(f, N)
 
     def entries(x):
-        return None if x is None else lines.entries(x).real
+        return None if x is None else lines.entries(x * unit**2).real
 
     by_line = np.zeros(len(f))
     by_line[lines.row] = freedom[:, None]
     scatter = None if total is None else Scatter(by_line, shared=True)
     return HTF(
-        f, lines.entries(H), check_harmonics(None, N), N, inputs, outputs, "estimate",
+        f, lines.entries(H * unit), check_harmonics(None, N), N, inputs, outputs, "estimate",
         variance=entries(total), noise_variance=entries(noise), scatter=scatter,
     )  # fmt: skip

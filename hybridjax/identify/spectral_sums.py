@@ -184,17 +184,18 @@ def _excited(data: ExperimentData, windows: list[slice], threshold: float, first
     u = np.where(np.isfinite(data.u).all(axis=(1, 2), keepdims=True), data.u, 0.0)
     spectra = np.stack([np.fft.rfft(u[:, window], axis=1) for window in windows])
     U = spectra.sum(axis=0) / len(spectra)
-    size = np.abs(U)
+    # Inputs have units of their own.
+    unit = np.maximum(np.abs(U).max(axis=(0, 1)), np.finfo(float).tiny)
+    size = np.abs(U) / unit
     peak = size.max(axis=(1, 2), keepdims=True)
-    worst = float(np.max(np.abs(spectra - U) / np.where(peak > 0, peak, 1)))
+    worst = float(np.max(np.abs(spectra - U) / unit / np.where(peak > 0, peak, 1)))
     if worst > max(threshold, _REPEATS):
         raise DefinitionError(
             f"the input does not repeat: its last {len(windows)} windows of P = {data.periods} "
             f"periods differ by {worst:.2g} of the largest line. Take fewer `repeats`, or the "
             "right number of periods."
         )
-    excited = ((size > threshold * peak) & (size > ROUNDING * peak.max())).any(axis=2)
-    experiment, line = np.nonzero(excited)
+    experiment, line = np.nonzero(((size > threshold * peak) & (size > ROUNDING)).any(axis=2))
     check_sharing(experiment + first, line, data.periods)
     return experiment, line, U[experiment, line]
 

@@ -83,9 +83,11 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
             f"window of P = {P} and the one before it, which is cut off: record some more."
         )
     data.require_ok()
-    change = np.abs(data.u[data.ok, N * P :] - data.u[data.ok, : -N * P]).max(axis=(1, 2))
+    # Inputs have units of their own.
+    u = data.u[data.ok] / np.maximum(np.abs(data.u[data.ok]).max(axis=(0, 1)), np.finfo(float).tiny)
+    change = np.abs(u[:, N * P :] - u[:, : -N * P]).max(axis=(1, 2))
     worst = int(np.argmax(change))
-    if change[worst] > SILENT_LINE * np.abs(data.u[data.ok][worst]).max():
+    if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
         raise DefinitionError(
             f"the input of experiment {np.flatnonzero(data.ok)[worst]} does not repeat after P = "
             f"{P} periods over all of the record: cut off the part in which it does not."
@@ -98,7 +100,7 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     if everything:
         free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(good)
     else:
-        size_of = np.abs(np.fft.rfft(data.u[good][:, data.window], axis=1)).max(axis=2)
+        size_of = np.abs(np.fft.rfft(u[:, data.window], axis=1)).max(axis=2)
         excited = map(np.flatnonzero, size_of > SILENT_LINE * size_of.max(axis=1, keepdims=True))
         free = [_free(np.unique(np.append(line_class(x, P), 0)), P, cycles) for x in excited]
     left = [Q @ record for Q, record in zip(free, y, strict=True)]

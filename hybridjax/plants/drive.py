@@ -174,17 +174,17 @@ class Drive:
         section if its time is known, or if the state can be set; steps of fixed length end after
         it. A crossing counts after a step that ends before it, so that none is counted twice."""
         phase, began, armed = self.phase, self.t, not self.phase.crossings
-        timed = not phase.axes and armed and not self.fixed
-        lands = self.sets and not self.fixed and not timed
+        clock = not phase.axes and armed
+        lands = self.sets and not self.fixed and not clock
         last = self.last if self.last.z else At(self.t, self.z)  # (a step may cross two sections)
         x, y = phase.level(k, last.t, last.z), phase.level(k, self.t, self.z)
-        while y > 1e-9 * self.dt * timed or not armed:
+        while y > 1e-9 * self.dt * clock or not armed:  # (rounding is no step)
             if self.t - began > self.longest:
                 raise ComputationError(f"a section was not reached within {self.longest:.4g}")
             last, x = self.here() if lands or points is not None else At(self.t, self.z), y
             if points is not None:
                 points.append(last)
-            self.step(u, min(y, self.dt) if timed else self.dt)
+            self.step(u, min(y, self.dt) if clock and not self.fixed else self.dt)
             y = phase.level(k, self.t, self.z)
             armed = armed or y > 0
         if lands and y < 0 < x:

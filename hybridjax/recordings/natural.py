@@ -234,8 +234,7 @@ def _principal(
     """Return both in the combinations along which the first varies most, with its variance 1."""
     mean = x.mean(axis=0)
     _, s, axes = np.linalg.svd(x - mean, full_matrices=False)
-    size = np.maximum(s[:count], 1e-9 * s[0]) / np.sqrt(len(x))  # below: rounding
-    onto = axes[:count].T / size
+    onto = axes[:count].T / np.maximum(s[:count], 1e-9 * s[0]) * np.sqrt(len(x))  # below: rounding
     return (x - mean) @ onto, (other - other.mean(axis=0)) @ onto
 
 

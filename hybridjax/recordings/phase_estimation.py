@@ -237,7 +237,8 @@ def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
     """
     period = _period(intervals)
     length = np.sort(intervals / period)
-    up, down = length[len(length) // 2 :], length[len(length) // 2 :: -1]
+    middle = int(np.searchsorted(length, 1.0))
+    up, down = length[middle:], length[middle::-1]
     longest = up[np.argmax(np.diff(up, append=np.inf) > 0.25)]
     shortest = down[np.argmax(np.diff(down, append=-np.inf) < -0.1)]
     missed, doubled = max(1.5, 1.01 * float(longest)), min(0.5, 0.99 * float(shortest))
@@ -249,5 +250,8 @@ def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
 
 
 def _period(intervals: Float[np.ndarray, " n"]) -> float:
-    """Return the median of the intervals without short ones, of which a doubled event makes one."""
-    return float(np.median(intervals[intervals > np.median(intervals) / 4]))
+    """Return the median of the intervals without short ones, of which a doubled event makes one:
+    less than a quarter of the interval that half of the time is spent below."""
+    longer = np.sort(intervals)
+    usual = longer[np.searchsorted(np.cumsum(longer), longer.sum() / 2)]
+    return float(np.median(intervals[intervals > usual / 4]))

@@ -210,8 +210,7 @@ def _sample(
             continue
         t = np.clip(w.when(k / N), *w.time[[0, -1]])
         start, end = t[:-1], t[1:]
-        unobserved = w.gaps[np.diff(w.gaps, axis=1)[:, 0] > period / N]
-        observed = ~inside(unobserved, start, start)
+        observed = ~inside(w.gaps[np.diff(w.gaps, axis=1)[:, 0] > period / N], start, start)
         values, change = (np.zeros((len(start), signals.shape[1] - k)) for k in (0, nu))
         for i, x in enumerate(signals.T):
             finite = np.isfinite(x)

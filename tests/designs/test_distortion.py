@@ -71,8 +71,7 @@ SHORT = hj.multisine(4, periods=8, inputs=("push", "pull")).scaled(1e-3)
 
 
 def about(system):
-    guess = hj.Guess("rest", (0.0,), time=0.5)
-    cycle = hj.find_limit_cycle(system, guess, scale={"x": 1.0})
+    cycle = hj.find_limit_cycle(system, hj.Guess("rest", (0.0,), time=0.5), scale={"x": 1.0})
     sections = hj.ClockPhase(4)
     return cycle, sections, hj.linearize(cycle, sections, "x")
 

@@ -138,8 +138,7 @@ def test_several_models(robust, exponent):
 def test_draws_have_the_covariance_of_the_fit():
     model, design = with_angle(1.0), hj.multisine(N, 32, band=(0, 2), amplitude=0.05)
     fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
-    drawn = hj.designs.draws(fit, 400)
-    c = np.array([np.poly(draw.multipliers).real[1:] for draw in drawn])
+    c = np.array([np.poly(draw.multipliers).real[1:] for draw in hj.designs.draws(fit, 400)])
     np.testing.assert_allclose(np.cov(c.T), fit.covariance, atol=0.3 * fit.covariance.max())
 
 

@@ -64,8 +64,7 @@ def test_the_hopper_with_deviations_limited(isochron_ldtp, usual):
 
 def test_experiments_are_as_promised(plan, isochron_ldtp):
     """Power and deviations are those of the signals themselves, the same in all experiments."""
-    u = plan.design.inputs()
-    powers = np.mean(u**2, axis=(1, 2))
+    powers = np.mean(plan.design.inputs() ** 2, axis=(1, 2))
     np.testing.assert_allclose(powers, plan.rms["u"] ** 2, rtol=1e-3)
     data = hj.experiments.simulate_experiments(isochron_ldtp, plan.design, start="periodic")
     rms = np.sqrt(np.mean(data.y**2, axis=(0, 1)))

@@ -193,8 +193,7 @@ def test_realizations_pairs_and_scales():
     pairs = design.with_negatives().inputs()
     np.testing.assert_allclose(pairs[::2], design.inputs(), atol=1e-14)
     np.testing.assert_allclose(pairs[1::2], -design.inputs(), atol=1e-14)
-    rms = np.sqrt(np.mean(design.scaled(0.3).inputs() ** 2, axis=1))
-    np.testing.assert_allclose(rms, 0.3)
+    np.testing.assert_allclose(np.sqrt(np.mean(design.scaled(0.3).inputs() ** 2, axis=1)), 0.3)
     for bad in (lambda: design.scaled(0.0), lambda: design.realizations(0)):
         with pytest.raises(hj.DefinitionError):
             bad()

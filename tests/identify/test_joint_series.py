@@ -92,8 +92,7 @@ def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
 def test_series_without_noise_are_met_exactly(small, start):
     x0 = np.ones(3) if start == "free" else None
     data = with_gaps(record(small, 4 * 60 + 3, 0, first_section=1, x0=x0), 0.02, 0)
-    shaken = eqx.tree_at(lambda m: m.B, small, 1.05 * small.B)
-    fit = hj.fit_ldtp(data, shaken, start=start)
+    fit = hj.fit_ldtp(data, eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start=start)
     assert fit.compare(small.multipliers).max_error < 1e-9
     f = np.array([0.1, 0.4])
     assert fit.htf(f).error(small.htf(f)).max() < 1e-9
@@ -105,8 +104,7 @@ def test_a_drift_is_found_where_samples_are_missing(small):
     whole = record(small, 4 * 60, 0)
     y = whole.y + np.tile(np.arange(8.0).reshape(4, 2), (60, 1))
     data = with_gaps(hj.Record(whole.u, y, n_sections=4, drift=np.inf), 0.05, 0)
-    shaken = eqx.tree_at(lambda m: m.B, small, 1.05 * small.B)
-    fit = hj.fit_ldtp(data, shaken, start="cycle")
+    fit = hj.fit_ldtp(data, eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start="cycle")
     assert fit.compare(small.multipliers).max_error < 1e-9
     # As many numbers less as there are constants.
     assert fit.freedom == np.isfinite(data.y).sum() - 8 - fit.unknowns

@@ -80,8 +80,7 @@ def record(*cosines, n_sections=8, periods=8, cycles=8):
 
 
 def test_half_integers_need_two_phases():
-    one = record([(1.5, 0.3), (0.25, 0.0)])
-    np.testing.assert_array_equal(hj.estimate_htf(one).f, [0.25])
+    np.testing.assert_array_equal(hj.estimate_htf(record([(1.5, 0.3), (0.25, 0.0)])).f, [0.25])
     opposite = record([(1.5, 0.3)], [(1.5, 0.3 + np.pi)])
     with pytest.raises(hj.DefinitionError, match="a multiple of 1/2 with two phases"):
         hj.estimate_htf(opposite)

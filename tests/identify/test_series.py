@@ -285,7 +285,18 @@ def test_inputs_have_units_of_their_own(unit):
     two_inputs = scaled(0, (2, 2, 2, 2), 2, 2)
     y = np.asarray(two_inputs.simulate(u)) + 1e-3 * np.random.default_rng(1).normal(size=(400, 2))
     units = np.array([1, unit])
-    htfs = [hj.fit_series(hj.Record(v, y, n_sections=4), 2).htf([0.3]).H for v in (u, u * units)]
+    fits = [hj.fit_series(hj.Record(v, y, n_sections=4), 2) for v in (u, u * units)]
+    htfs = [fit.htf([0.3]).H for fit in fits]
     np.testing.assert_allclose(htfs[1] * units, htfs[0], rtol=1e-6)
+    found = [hj.identify.realize(fit, order=2).multipliers for fit in fits]
+    np.testing.assert_allclose(*found, rtol=1e-6)
+    design = hj.multisine(4, 8, lines="odd", inputs=2)
+    data = hj.experiments.simulate_experiments(two_inputs, design, discard=2)
+    data = hj.identify.remove_transient(dataclasses.replace(data, u=data.u * units), 2).data
+    htf = hj.estimate_htf(data)
+    np.testing.assert_allclose(htf.f, design.frequencies)
+    np.testing.assert_allclose(htf.H * units, two_inputs.htf(htf.f).H, atol=1e-9)
+    with pytest.raises(hj.DefinitionError, match="are no pair"):
+        hj.ExperimentData(units * [u, [-1, 1] * u], [y, y], n_sections=4, periods=8).odd_part()
     with pytest.raises(hj.DefinitionError, match="u0, u1 cannot be told apart"):
         hj.fit_series(hj.Record(u[:, :1] * units, y, n_sections=4), 2)

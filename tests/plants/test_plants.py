@@ -97,8 +97,7 @@ def test_an_unstable_cycle_is_found_from_a_guess():
 
 def test_failures_are_named_and_the_others_go_on():
     cycle = hj.plants.settle(Troubled(), ANGLE, "x", cycles=20)
-    u = np.zeros((9, 24, 1))
-    data = cycle.run_experiments(u, discard=0, processes=2, limit=4.0)
+    data = cycle.run_experiments(np.zeros((9, 24, 1)), discard=0, processes=2, limit=4.0)
     assert data.ok.tolist() == [True] + 7 * [False] + [True]
     causes = data.simulated.causes
     expected = (
@@ -132,8 +131,7 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
     data = circle.run_experiments(u, **options)
     assert seeds == [*range(1, 10), 9, 10]
     assert np.array_equal(data.y, whole.y) and data.simulated.causes == 10 * ("",)
-    other = circle.run_experiments(2 * u[:1], **options)
-    assert not np.array_equal(other.y, data.y[:1])
+    assert not np.array_equal(circle.run_experiments(2 * u[:1], **options).y, data.y[:1])
     monkeypatch.setattr(circle.drive.plant, "rate", 0.4)  # around the same cycle
     assert np.abs(circle.run_experiments(u, **options).y - data.y).max() > 1e-3
     hj.save(tmp_path / "data.npz", data)

@@ -123,8 +123,7 @@ def test_an_order_that_is_too_low_is_named():
     names = {"inputs": "f", "outputs": ("x", "v"), "n_sections": 8, "order": 1}
     for recording, named in ((made_up(0), 0), (mishandle(made_up(0), filtered, **NAMES), 1)):
         result = hj.identify_recording(recording, TOP, **names)
-        order = [x for x in result.advice.warnings if "Compare order=2" in x.text]
-        assert len(order) == named
+        assert len([x for x in result.advice.warnings if "Compare order=2" in x.text]) == named
     names |= {"order": None, "n_sections": 32}
     with pytest.warns(hj.errors.FindingWarning) as seen:
         twice = hj.Recording.join([made_up(0), made_up(0).with_trials(made_up(0).trials[:1])])

@@ -54,7 +54,8 @@ def needs_two_phases(
 def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
     """Return whether normal equations can be solved, for unknowns of any magnitude."""
     size = np.sqrt(np.einsum("kii->ki", gram).real)
-    even = size.min(axis=1) > SINGULAR * size.max(axis=1)
+    unit = np.maximum(size.max(axis=0, initial=0), np.finfo(float).tiny)
+    even = (size / unit).min(axis=1) > SINGULAR * (size / unit).max(axis=1)
     size = np.where(even[:, None], size, 1.0)
     least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
     return even & (least > SINGULAR)

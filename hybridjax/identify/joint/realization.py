@@ -66,22 +66,25 @@ def realize(
     if isinstance(source, HTF):
         source.require_sampled("`realize`")
         return _from_htf(source, dims, order)
-    spread = inputs = outputs = None
+    inputs = outputs = None
     if isinstance(source, SeriesFit):
         N, inputs, outputs = source.n_sections, source.inputs, source.outputs
         p = default_horizon(N)
         markov = source.impulse_response(2 * p + 1)
-        spread = np.sqrt((source.roots**2).sum(axis=4).mean(axis=(0, 2, 3))) * source.noise
+        spread = (source.roots**2).sum(axis=4).mean(axis=(0, 2)) * source.noise[:, None] ** 2
     else:
         markov = np.asarray(source)
         N, lags = markov.shape[:2]
         p = min(default_horizon(N), (lags - 1) // 2)
         if p < 1:
             raise DefinitionError(f"{lags} lags are too few: 3 or more are needed.")
+        spread = np.mean(markov**2, axis=(0, 1))
     ny, nu = markov.shape[2:]
-    scale = _scale(np.sqrt(np.mean(markov**2, axis=(0, 1, 3))) if spread is None else spread)
-    markov = markov / scale[:, None]
-    edge = 0.0 if spread is None else _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(p * nu))
+    edge = 0.0 if inputs is None else _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(p * nu))
+    # Outputs and inputs in units of their noise, or else of the responses.
+    unit = _scale(np.sqrt(spread.mean(axis=0)))
+    scale = _scale(np.sqrt((spread / unit**2).mean(axis=1)))
+    markov = markov / scale[:, None] / unit
 
     hankels = [
         np.block([[markov[(n + i) % N, i + j + 1] for j in range(p)] for i in range(p + 1)])
@@ -89,9 +92,8 @@ def realize(
     ]
     bases = _bases(hankels, given_dims(dims, N), order, edge, ny)
     A, C = _shifted(bases, ny)
-    after = [(n + 1) % N for n in range(N)]
-    B = [bases[n].T @ hankels[n][:, :nu] for n in after]
-    C, D = [scale[:, None] * c for c in C], list(scale[:, None] * markov[:, 0])
+    B = [bases[(n + 1) % N].T @ hankels[(n + 1) % N][:, :nu] * unit for n in range(N)]
+    C, D = [scale[:, None] * c for c in C], list(scale[:, None] * markov[:, 0] * unit)
     return LDTP.from_blocks(A, B, C, D, inputs, outputs)
 
 

@@ -333,9 +333,8 @@ def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
 def missing_cycles(problem: OutputErrorProblem, solution: Linearization, least: int) -> int:
     """Return how many more cycles would leave this number of degrees of freedom, about."""
     n, i = np.unravel_index(np.argmin(solution.freedom), solution.freedom.shape)
-    left = int(solution.freedom[n, i])
-    if not left:  # more lags than samples would use up more of them
-        left = problem.freedom_left(int(n), int(i))
+    # (More lags than samples would use up more of them.)
+    left = int(solution.freedom[n, i]) or problem.freedom_left(int(n), int(i))
     return max(least - left, 0)
 
 

@@ -31,7 +31,7 @@ from ..multiplier_estimate import RoughFit
 from .output_error import RANK, SectionRegression
 from .prediction import Predictor
 from .records import PreparedRecords, delay_cycles, lagged_inputs
-from .subspace import subspace_model
+from .subspace import subspace_model, without_drift
 
 
 # Signal-to-noise ratio of a combination of lagged inputs, above which its coefficient is estimated.
@@ -61,10 +61,12 @@ def predicted(
         for r, p in zip(drive, plant, strict=True)
     ]
     records = PreparedRecords(closed)
+    grid = without_drift(records.whole())
+    # (In units of what is left, or large drifts decide what the model explains.)
+    records.scale = np.maximum(np.sqrt((grid.y**2).mean(axis=(0, 1, 2))), RANK * records.scale)
     model = subspace_model(records, [order] * records.n_sections, False)
     predictor = Predictor(model, np.tile(np.eye(len(records.outputs)), (len(model.A), 1, 1)))
-    grid = records.whole()
-    return predictor.predict(grid._replace(drift=grid.drift[..., :0]), False) * records.scale
+    return predictor.predict(grid, False) * records.scale
 
 
 class SectionEquations(NamedTuple):
@@ -220,9 +222,8 @@ class LoopEquations:
             )
         if told < d:
             return c, Covariance.unknown(d), scale
-        T = self.records.cycles
-        cycles = max(denominator.correlated_cycles(multipliers_of(c), T) + 1, _BLOCK)
-        blocks = max(1, T // cycles)
+        cycles = denominator.correlated_cycles(multipliers_of(c), self.records.cycles) + 1
+        blocks = max(1, self.records.cycles // max(cycles, _BLOCK))
         score = np.sum([self._scores(x, c, scale, blocks) for x in self.sections], axis=0)
         score = score[score.any(axis=1)]
         half = np.linalg.solve(along, score.T)

@@ -211,6 +211,5 @@ def minimize(
             last[:] = [linearize(problem, c)]
         return last[0]
 
-    rules = ROUGH if rough else {}
-    c, converged = least_squares(lambda c: at(c).as_residuals(), start, **rules)
+    c, converged = least_squares(lambda c: at(c).as_residuals(), start, **(ROUGH if rough else {}))
     return at(c), converged

@@ -366,8 +366,7 @@ class Predictor(NamedTuple):
         path = SeriesProblem([part], self.S, True, free_start, 0).path(self.model, part)
         states = zip(path.x, self.model.C, part.u, self.model.D, strict=True)
         outputs = np.stack([x @ C.T + u @ D.T for x, C, u, D in states])
-        expected = np.where(part.sampled, part.y - np.stack(path.error), outputs)
-        return np.moveaxis(expected, 0, 2)
+        return np.moveaxis(np.where(part.sampled, part.y - np.stack(path.error), outputs), 0, 2)
 
     def errors(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "R T N ny"]:
         """Return the errors of `predict`; NaN where an output was not sampled."""

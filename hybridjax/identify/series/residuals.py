@@ -48,8 +48,7 @@ def whitened(
         for i in range(error.shape[3]):
             at = np.isfinite(error[:, :, n, i])
             left, s, _ = np.linalg.svd(root[:, :, i][at], full_matrices=False)
-            along = left.T @ error[at, n, i]
-            error[at, n, i] -= left @ (along * (1 - 1 / np.sqrt(1 + s**2)))
+            error[at, n, i] -= left @ ((left.T @ error[at, n, i]) * (1 - 1 / np.sqrt(1 + s**2)))
     return error
 
 

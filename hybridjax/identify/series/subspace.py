@@ -45,14 +45,7 @@ def subspace_model(
     **Raises:** `DefinitionError` for too few cycles for a past as long as the states need.
     """
     N, ny, most = len(dims), len(records.outputs), int(max(dims))
-    grid = records.whole()
-    y, sampled = grid.y / records.scale, np.asarray(grid.sampled.all(axis=3))
-    for n in range(N):
-        waves = grid.drift[..., :0], grid.drift[..., :0], grid.drift
-        without_drift = SectionRegression.make(*waves, sampled[:, :, n])
-        y[:, :, n] = without_drift.reduced(y[:, :, n]).reshape(y[:, :, n].shape)
-    z, columns = np.concatenate([grid.u, y], axis=3), grid.u.shape[3] + ny
-    sections = [_Section(z, sampled, n, ny) for n in range(N)]
+    sections, columns = _sections(records), len(records.inputs) + ny
     samples = min(len(section.y) for section in sections)
     past = min(samples // (_ROWS * columns), default_horizon(N))
     needed = -(-most // columns) + 1
@@ -62,7 +55,9 @@ def subspace_model(
             f"about {_ROWS * columns * needed} are needed. Record more, or give `fit_ldtp` a "
             "model as `guess`, as of `hj.identify.realize(hj.fit_series(...))`."
         )
-    rules = [section.regression(past, direct) for section in sections]
+    rows = (np.concatenate([x.u * direct, x.past(past)], axis=1) for x in sections)
+    # The effect of the past of each section on its outputs.
+    rules = [_regress(x, s.y)[s.u.shape[1] :] for x, s in zip(rows, sections, strict=True)]
     horizon = max(-(-most // ny) + 1, min(past, N, default_horizon(0)))
     to_state = []
     for n, section in enumerate(sections):
@@ -91,16 +86,11 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
     **Raises:** `DefinitionError` if both answer each other at once: no model of the noise tells
     them apart.
     """
-    grid = records.whole()
-    # (A controller answers outputs as they are measured, with their drift.)
-    z = np.concatenate([drive.whole().u, grid.u, grid.y / records.scale], axis=3)
-    ny, nr = len(records.outputs), len(drive.inputs)
-    statistic, left, whole = 0.0, 0.0, 0.0
-    for n in range(records.n_sections):
-        section = _Section(z, np.asarray(grid.sampled.all(axis=3)), n, ny)
+    N, ny, nr = records.n_sections, len(records.outputs), len(drive.inputs)
+    columns, statistic, left, whole = nr + len(records.inputs) + ny, 0.0, 0.0, 0.0
+    for section in _sections(records, without_drift(drive.whole()).u):
         count = len(section.y)
-        length = max(min(count // (_ROWS * z.shape[3]), default_horizon(len(z[0, 0]))), 1)
-        past = section.past(length)
+        past = section.past(max(min(count // (_ROWS * columns), default_horizon(N)), 1))
         r, u = section.u[:, :nr], section.u[:, nr:]
         rows = np.concatenate([past, r], axis=1)
         errors = [section.y - x @ _regress(x, section.y) for x in (past, rows)]
@@ -109,7 +99,8 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
         statistic += max(count - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (sizes[0] - sizes[1])
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
-    if special.gammaincc(records.n_sections * ny * nr / 2, statistic / 2) > ANSWER:
+    # (Rounding makes the statistic of a reference that its past predicts negative.)
+    if special.gammaincc(N * ny * nr / 2, max(statistic, 0.0) / 2) > ANSWER:
         return False
     if left > _SHRINKAGE * whole:
         raise DefinitionError(
@@ -118,6 +109,31 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
             "apart. Pass a model with D = 0 as `guess` if outputs do not respond at once."
         )
     return True
+
+
+def without_drift(grid: CycleGrid) -> CycleGrid:
+    """Return records without the drift of each section, in outputs and inputs.
+
+    Offsets of inputs drive a drift of outputs, which a controller answers: without the drift of all
+    signals, the rest is the response to the rest.
+    """
+    none, make = grid.drift[..., :0], SectionRegression.make
+
+    def left(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        pairs = zip(np.moveaxis(x, 2, 0), np.moveaxis(weight, 2, 0), strict=True)
+        parts = [(make(none, none, grid.drift, w).reduced(z), z.shape) for z, w in pairs]
+        return np.stack([z.reshape(shape) for z, shape in parts], axis=2)
+
+    y = left(grid.y, np.asarray(grid.sampled.all(axis=3)))
+    return grid._replace(u=left(grid.u, grid.inside), y=y, drift=none)
+
+
+def _sections(records: PreparedRecords, *more: Float[np.ndarray, "S T N k"]) -> "list[_Section]":
+    """Return the samples of more signals, the inputs and the outputs at each section."""
+    grid, ny = without_drift(records.whole()), len(records.outputs)
+    z = np.concatenate([*more, grid.u, grid.y / records.scale], axis=3)
+    sampled = np.asarray(grid.sampled.all(axis=3))
+    return [_Section(z, sampled, n, ny) for n in range(records.n_sections)]
 
 
 class _Section:
@@ -141,11 +157,6 @@ class _Section:
         back = self.time[:, None] + later - 1 - np.arange(length)
         rows = self._z[self.record[:, None], np.maximum(back, 0)]
         return np.where((back >= 0)[..., None], rows, 0.0).reshape(len(back), -1)
-
-    def regression(self, length: int, direct: bool) -> Float[np.ndarray, "columns ny"]:
-        """Return the effect of the past on the output."""
-        rows = np.concatenate([self.u * direct, self.past(length)], axis=1)
-        return _regress(rows, self.y)[self.u.shape[1] :]
 
 
 def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:

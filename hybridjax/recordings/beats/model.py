@@ -108,8 +108,7 @@ def basis(
 ) -> Float[np.ndarray, "n p"]:
     """Return 1 and half waves cos(pi k phase), as they act on a phase with this jitter."""
     angle = np.pi * np.arange(waves + 1)
-    spread = (jitter * angle) ** 2 / 2
-    return np.cos(angle * phase[:, None]) * np.exp(-spread * phase[:, None])
+    return np.cos(angle * phase[:, None]) * np.exp(-((jitter * angle) ** 2) / 2 * phase[:, None])
 
 
 def tabulated(waves: int, jitter: float) -> Table:

@@ -309,10 +309,8 @@ def feedback(data: SectionData) -> Iterator[Finding]:
         repeated = float(np.nanvar(data.cycle_inputs[:, i]))
         share = repeated / max(repeated + float(deviations[i]) ** 2, np.finfo(float).tiny)
         if share > 0.5:
-            text = (
-                f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: fits are "
-            )
-            yield Finding("feedback", f"{text}biased. {NAME_REFERENCE}")
+            text = f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: "
+            yield Finding("feedback", f"{text}fits are biased. {NAME_REFERENCE}")
         elif share > CLEAR**2 / data.cycles and data.n_sections > 2 * shapes.shape[1]:
             mean = np.nan_to_num(data.cycle_inputs[:, i] - np.nanmean(data.cycle_inputs[:, i]))
             left = mean - shapes @ np.linalg.lstsq(shapes, mean)[0]
