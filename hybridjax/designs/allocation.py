@@ -140,8 +140,7 @@ def worthwhile(cosines: Candidates, gain: Powers, experiments: int) -> Kept:
     classes = line_class(cosines.line, cosines.periods)
     for number in np.unique(classes):
         members = np.flatnonzero(kept & (classes == number))
-        weakest = members[np.argsort(gain[members])]
-        kept[weakest[: max(len(members) - experiments, 0)]] = False
+        kept[members[np.argsort(gain[members])][: max(len(members) - experiments, 0)]] = False
     return np.flatnonzero(kept)
 
 

@@ -235,8 +235,7 @@ def summary(
     for s in failed[:limit]:
         cycle, section = divmod(int(failed_at[s]), n_sections)
         where = f"section {section}, cycle {cycle}: " if failed_at[s] >= 0 else ""
-        cause = causes[s] if causes else Result(int(result[s])).message
-        text.append(f"#{s}: {where}{cause}")
+        text.append(f"#{s}: {where}{causes[s] if causes else Result(int(result[s])).message}")
     if len(failed) > limit:
         text.append(f"and {len(failed) - limit} more")
     return "; ".join(text)

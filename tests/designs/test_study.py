@@ -29,8 +29,7 @@ def studies(model, first):
     """One, after each of its blocks."""
     found = [hj.designs.Study(first, order=2, standard_error=ASKED)]
     while not found[-1].done:
-        data = measured(model, found[-1].design, seed=len(found))
-        found.append(found[-1].add(data))
+        found.append(found[-1].add(measured(model, found[-1].design, seed=len(found))))
     return found
 
 

@@ -290,7 +290,7 @@ def test_inputs_have_units_of_their_own(unit):
     np.testing.assert_allclose(htfs[1] * units, htfs[0], rtol=1e-6)
     found = [hj.identify.realize(fit, order=2).multipliers for fit in fits]
     np.testing.assert_allclose(*found, rtol=1e-6)
-    design = hj.multisine(4, 8, lines="odd", inputs=2)
+    design = hj.multisine(4, 8, lines="odd", inputs=2, division="disjoint")
     data = hj.experiments.simulate_experiments(two_inputs, design, discard=2)
     data = hj.identify.remove_transient(dataclasses.replace(data, u=data.u * units), 2).data
     htf = hj.estimate_htf(data)

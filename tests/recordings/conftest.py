@@ -55,8 +55,7 @@ def rhythm():
         a = field(z, f[0], t[0])
         b = field(z + h / 2 * a, f[1], t[1])
         c = field(z + h / 2 * b, f[1], t[1])
-        d = field(z + h * c, f[2], t[2])
-        z = z + h / 6 * (a + 2 * b + 2 * c + d)
+        z = z + h / 6 * (a + 2 * b + 2 * c + field(z + h * c, f[2], t[2]))
     z = np.array(out)
     time = np.arange(len(force)) / RATE
     return hj.Recording(time, {"force": force, "x": z.real, "v": z.imag})

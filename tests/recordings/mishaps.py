@@ -129,8 +129,7 @@ def overflow(bits):
 
 def renumbered(trial, s):
     n, step = len(trial.time), np.median(np.diff(trial.time))
-    lost = s.rng.choice(n // 32, 3, replace=False)
-    t = kept(trial, ~np.isin(np.arange(n) // 32, lost))
+    t = kept(trial, ~np.isin(np.arange(n) // 32, s.rng.choice(n // 32, 3, replace=False)))
     time = trial.time[0] + step * np.arange(len(t.time))
     events = {k: np.interp(at, t.time, time) for k, at in t.events.items()}
     return replace(t, time=time, events=events)
