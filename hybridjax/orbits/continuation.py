@@ -271,17 +271,18 @@ class _Trace(NamedTuple):
 
     def between(self, a: Point, b: Point) -> list[Point]:
         """Changes of stability and values after a point until its neighbor, which comes last."""
-        marked = []
-        for kind in KINDS:
-            before, after = a.tests[kind], b.tests[kind]
+        marked: dict[tuple[float, str], Point] = {}
+        for kind, before in a.tests.items():
+            after = b.tests[kind]
             if max(abs(before), abs(after)) < SINGULAR or before * after >= 0:
                 continue
             if kind == "branch point" and a.tests["fold"] * b.tests["fold"] < 0:
                 continue  # the parameter turns back
             if (located := self.locate(a, b, kind)) is not None:
-                marked.append(located)
+                where, point = located
+                marked.setdefault((round(where, 9), point.kind), point)  # (once for a pair)
         points, last = [], a
-        for point in [*(point for _, point in sorted(marked, key=lambda x: x[0])), b]:
+        for point in [*(marked[key] for key in sorted(marked)), b]:
             passed = [v for v in self.values if (last.value - v) * (point.value - v) < 0]
             for value in sorted(passed, key=lambda v: abs(v - last.value)):
                 landed = self.curve.land(last, point, value)
@@ -290,7 +291,7 @@ class _Trace(NamedTuple):
             last = point
         return points
 
-    def locate(self, a: Point, b: Point, kind: str) -> tuple[float, Point] | None:
+    def locate(self, a: Point, b: Point, kind: str | int) -> tuple[float, Point] | None:
         """The zero of a test function between two points, and its part of the distance.
 
         On the crossing of two branches itself no point can be computed, but beside it.
@@ -314,10 +315,13 @@ class _Trace(NamedTuple):
             test(where)
         except (KeyError, RuntimeError):
             return None
-        if kind == "Neimark-Sacker" and not points[where].has_pair_on_circle():
-            return None  # two real multipliers with the product 1
-        mark = "branch point" if crossing else kind
-        return where, dataclasses.replace(points[where], kind=mark)
+        point = points[where]
+        if isinstance(kind, int):
+            critical = point.multipliers[kind]
+            if critical.imag == 0 and critical.real > 0:
+                return None  # (a fold, or a branch point)
+            kind = "Neimark-Sacker" if critical.imag else "flip"
+        return where, dataclasses.replace(point, kind="branch point" if crossing else kind)
 
 
 def _stack(curve: Curve, points: list[Point]) -> LimitCycles:

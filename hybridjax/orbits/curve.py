@@ -2,15 +2,14 @@
 
 import dataclasses
 import functools as ft
-import itertools
 from collections.abc import Iterable
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from .._core.compilation import at_ease
-from .._core.executor import on_the_cpu, to_host
+from .._core.executor import on_the_cpu, svdvals, to_host
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..systems.system import HybridSystem
@@ -76,30 +75,21 @@ class Point:
         return self.turn.jacobian * self.size / self.size[:-1, None]
 
     @ft.cached_property
-    def pairs(self) -> list[tuple[complex, complex]]:
-        """All pairs of multipliers."""
-        return list(itertools.combinations(np.linalg.eigvals(self._monodromy).astype(complex), 2))
-
-    @property
-    def _monodromy(self) -> Float[np.ndarray, "d d"]:
-        """Derivative of the return map, padded; for an autonomous system across the flow."""
-        return turn_product(self.turn.factors[None])[0]
+    def multipliers(self) -> Complex[np.ndarray, " d"]:
+        """All multipliers, by decreasing modulus, padded with zeros."""
+        values = np.linalg.eigvals(turn_product(self.turn.factors[None])[0]).astype(complex)
+        return values[np.argsort(-np.abs(values))]
 
     @ft.cached_property
-    def tests(self) -> dict[str, float]:
-        """Functions that change their signs when a multiplier crosses the unit circle."""
-        M = self._monodromy
+    def tests(self) -> dict[str | int, float]:
+        """Functions that change their signs when a multiplier crosses the unit circle: two by
+        names, and moduli less 1, which show each of several that cross together."""
+        rows = np.vstack([self.scaled, self.tangent])
         return {
             "fold": float(self.tangent[-1]),
-            "branch point": float(np.linalg.det(np.vstack([self.scaled, self.tangent]))),
-            "flip": float(np.linalg.det(M + np.eye(len(M)))),
-            "Neimark-Sacker": float(np.real(np.prod([x * y - 1 for x, y in self.pairs]))),
+            "branch point": float(np.sign(np.linalg.det(rows)) * svdvals(rows)[-1]),
+            **dict(enumerate(np.abs(self.multipliers) - 1)),
         }
-
-    def has_pair_on_circle(self) -> bool:
-        """True if the pair of multipliers whose product is closest to 1 is a complex one."""
-        x, y = min(self.pairs, key=lambda pair: abs(pair[0] * pair[1] - 1))
-        return bool(x.imag != 0 and x == np.conj(y))
 
 
 class Curve:

@@ -121,39 +121,6 @@ def test_bad_input(juggling):
         hj.find_limit_cycle(juggling.system, juggling, multiplicity=2)
 
 
-class Spring(eqx.Module):
-    k: hj.Parameter = hj.parameter(1.5)
-
-
-class Pushed(hj.HybridSystem):
-    """x'' + x' / 5 + k x = cos t, with k in a part of the system."""
-
-    spring: Spring = eqx.field(default_factory=Spring)
-
-    def charts(self):
-        def field(t, q, u):
-            return q[1], jnp.cos(t) - 0.2 * q[1] - self.spring.k * q[0] + u[0]
-
-        return {"a": Field(("x", "v"), field)}
-
-    def period(self):
-        return 2 * jnp.pi
-
-
-@pytest.mark.slow
-def test_a_parameter_of_a_part():
-    """A linear oscillator: everything is known. Stiff enough, its multipliers circle the origin."""
-    cycle = hj.find_limit_cycle(Pushed(), hj.Guess("a", (0.0, 0.0)))
-    with pytest.raises(hj.DefinitionError, match="'spring.c'; parameters are spring.k"):
-        hj.continuation(cycle, "spring.c", (1.0, 2.0))
-    branch = hj.continuation(cycle, "spring.k", (1.4, 3.0))
-    assert not branch.points and branch.stable.all()
-    rate = -0.1 + 1j * np.sqrt(branch.values - 0.01)
-    truth = np.exp(2 * np.pi * rate)
-    truth = truth.real + 1j * np.abs(truth.imag)
-    np.testing.assert_allclose(branch.multipliers[:, 0], truth, atol=1e-10)
-
-
 @pytest.mark.slow
 def test_period_2_of_the_buck_converter():
     """It ends in the flip of the cycle of period 1, where the two halves change places."""
@@ -187,3 +154,36 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     assert branch.values[-1] == 30.0 and float(branch[-1].anchor.t[0]) != 0.5
     again = hj.find_limit_cycle(branch[-1].system, branch[-1])
     np.testing.assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)
+
+
+class Growth(eqx.Module):
+    r: hj.Parameter = hj.parameter(1.9)
+
+
+class Maps(hj.HybridSystem):
+    """The logistic map twice, and twice with delay: fixed points are 1 - 1 / r."""
+
+    growth: Growth = eqx.field(default_factory=Growth)
+
+    def charts(self):
+        return {"a": Field(tuple("abcdef"), lambda t, q, u: 0.0 * jnp.sin(2 * jnp.pi * t) * q)}
+
+    def transitions(self):
+        def step(t, q, u):
+            r = self.growth.r + jnp.array([0.0, 0.0, 0.0, 0.01])
+            return *(r * q[:4] * (1 - q[jnp.array([0, 1, 4, 5])])), q[2], q[3]
+
+        return [hj.Transition("step", "a", "a", hj.Scheduled(1.0, 0.5), reset=step)]
+
+    def period(self):
+        return 1.0
+
+
+def test_multipliers_that_cross_the_circle_together_or_beside_others():
+    """Test functions do not change their signs, or are small. The parameter is that of a part."""
+    cycle = hj.find_limit_cycle(Maps(), hj.Guess("a", (0.47,) * 6))
+    with pytest.raises(hj.DefinitionError, match="'growth.c'; parameters are growth.r"):
+        hj.continuation(cycle, "growth.c", (1.0, 2.0))
+    points = hj.continuation(cycle, "growth.r", (1.9, 3.1), step=1.0).points
+    assert [(x.kind[0], len(x.critical)) for x in points] == [("N", 2), ("N", 2), ("f", 2)]
+    np.testing.assert_allclose([x.value for x in points], [1.99, 2.0, 3.0], atol=1e-8)
