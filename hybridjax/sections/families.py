@@ -134,7 +134,7 @@ class ClockPhase(_Anchored):
     origin there, so one multiplier is 1.
 
     **Fields:** `n_sections`, the number N; `anchor`, the position of section 0: a `Crossing` on the
-    cycle, or a phase of the clock in periods. Default: 0.
+    cycle, or a time of the clock in periods of the cycle. Default: 0.
     """
 
     label: ClassVar[str] = "isochron"
