@@ -38,9 +38,9 @@ from .shooting import excess, newton_steps, one_by_one
 SMALL = 8000
 # Systems per compiled call. More: their arrays leave the cache. Fewer: calls cost more.
 BATCH = 250
-# Periods for which a system is simulated before Newton's method tries again, first and at last.
-# Fewer: slow transients remain. More: each failure takes longer.
-_SETTLE = 8, 40
+# Periods for which a system is simulated before each further attempt of Newton's method. (0: for
+# unstable cycles.) Fewer: slow transients remain. More: each failure takes longer.
+_SETTLE = 8, 0, 40
 # Largest step, in sizes of the states, that is taken with a guessed Jacobian. Larger: steps lead
 # astray. Smaller: few are taken.
 _NEAR = 0.06
@@ -155,8 +155,8 @@ class Tiles(NamedTuple):
     def solve(self, S: int) -> Rounds:
         """Newton's method for all systems: first for a few, spread over all, from the known cycles
         or the guess, then for as many again from the cycles of their neighbors, and so on. Systems
-        that fail begin again from the cycle of the nearest one that was found, then from the end of
-        a simulation."""
+        that fail begin again from the end of a simulation, which begins on the cycle of the nearest
+        system, then from that cycle."""
         parameters, before = self.parameters[:S], self.parameters[S:]
         order = np.random.default_rng(0).permutation(S)
 
@@ -190,7 +190,7 @@ class Tiles(NamedTuple):
                 out = part if out is None else _join(out, part)
         assert out is not None
         near = self.known is not None or (out.result == Result.OK).any()
-        settle, nearest = (0, *_SETTLE) if near else (), ft.partial(neighbors, out=out, moved=False)
+        settle, nearest = _SETTLE if near else (), ft.partial(neighbors, out=out, moved=False)
         return _pick(self._again(order, out, nearest, settle), np.argsort(order))
 
     def _given(self, rows) -> tuple[Lanes, Float[np.ndarray, " S"]]:
