@@ -237,15 +237,16 @@ def _lead(placed: PlacedSections, target):
 def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
     """Return the largest later errors that errors of the interval after section k (*K, N, n) cause,
     relative to the scales."""
-    N = len(scale)
-    section, worst = np.arange(N), np.zeros((_PERIODS, *error.shape[:-1]))
+    N, after = len(scale), np.roll(scale, -1, axis=0)
+    # (All errors of a section side by side: one product of matrices for each.)
+    x = (error / after).reshape(-1, *scale.shape).transpose(1, 2, 0)
+    J = J * scale[:, None] / after[:, :, None]
+    section, worst = np.arange(N), np.zeros((_PERIODS, N, x.shape[2]))
     for m in range(_PERIODS * N):
-        at, now = (section + 1 + m) % N, worst[m // N]
-        np.maximum(now, np.max(np.abs(error) / scale[at], axis=-1), out=now)
-        error = np.einsum("kij,...kj->...ki", J[at], error)
-    last, before = worst[-1], worst[-2]
-    ratio = np.clip(last / np.where(before > 0, before, 1.0), 0.0, 0.999)
-    return worst.sum(axis=0) + last * ratio / (1 - ratio)
+        np.maximum(worst[m // N], np.abs(x).max(axis=1), out=worst[m // N])
+        x = J[(section + 1 + m) % N] @ x
+    ratio = np.clip(worst[-1] / np.where(worst[-2] > 0, worst[-2], 1.0), 0.0, 0.999)
+    return (worst.sum(axis=0) + worst[-1] * ratio / (1 - ratio)).T.reshape(error.shape[:-1])
 
 
 def _accumulated(J, error, scale) -> float:
