@@ -256,8 +256,8 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
 
 
-def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
-    """The reason why a search failed that expected this period, with advice."""
+def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> str:
+    """The reason why a search failed that expected this period and has settled, with advice."""
     name, code, s = type(cycle.system).__name__, Result(int(cycle.result)), cycle.structure
     if code == Result.COINCIDENCE and (pair := coincident(cycle.return_map, turn)):
         first, second = (s.transitions[g].name for g in pair)
@@ -276,7 +276,8 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
             "is wanted by the value of the quantity (an output of the system), e.g. "
             f"`conserved={example}`, or take the one nearest to the guess with `throw=False`."
         )
-    reason = code.message + f" from {cycle.settings.max_steps}" * (code == Result.STEP_LIMIT)
+    limit = f" from {cycle.settings.max_steps} (reached: {turn.period:.2g} of {expected:.3g})"
+    reason = code.message + limit * (code == Result.STEP_LIMIT)
     if code == Result.EXTRA_TURNS and cycle.multiplicity > 1:
         return (
             f"the cycle of {name} that was found closes sooner than after the "
@@ -294,11 +295,14 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
         reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
         if cycle.conserved:
             reason += f"; perhaps not all of {', '.join(cycle.conserved)} are conserved"
-    advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn, expected)
+    better = (
+        " Try a better guess, or if the cycle is stable let it settle for longer, e.g. "
+        f"`settle={settle + 60 * expected:.3g}` (with a `Guess`, not a cycle)."
+    )
+    advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn, better)
     if code in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
         advice += _about_decisions(s)
-    advice = advice or _better_guess(expected)
-    return f"no limit cycle of {name} was found: {reason}.{advice}"
+    return f"no limit cycle of {name} was found: {reason}.{advice or better}"
 
 
 def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -> str:
@@ -337,15 +341,7 @@ def _about_decisions(s: Structure) -> str:
     )
 
 
-def _better_guess(expected: float) -> str:
-    """What else to try."""
-    return (
-        " Try a better guess, or if the cycle is stable let it settle first, e.g. "
-        f"`settle={60 * expected:.3g}` (with a `Guess`, not a cycle)."
-    )
-
-
-def _about_guards(s: Structure, turn: Turn, expected: float) -> str:
+def _about_guards(s: Structure, turn: Turn, better: str) -> str:
     """The values of the guards, if none of them led to an event."""
     if events_of(turn) or not s.transitions:
         return ""
@@ -363,4 +359,4 @@ def _about_guards(s: Structure, turn: Turn, expected: float) -> str:
         for g, x in values.items()
     )
     advice = "Check its direction, and that the system does not come to rest."
-    return f" No event happened: {text}. {advice}{_better_guess(expected)}" * bool(text)
+    return f" No event happened: {text}. {advice}{better}" * bool(text)

@@ -173,7 +173,9 @@ def find_limit_cycle(
             say("the same from a phase far from events")
             map = dataclasses.replace(map, anchor=distant.anchor)
             solution = search(map, patient)
-    if patient and int(solution.result) == Result.STEP_LIMIT:
+    # (Where the end is out of reach even for steps that are 256 times as long, more do not help.)
+    reach = float(solution.turn.period) * _ENOUGH
+    if patient and int(solution.result) == Result.STEP_LIMIT and reach > float(map.expected):
         say("the same with more steps")
         settings = dataclasses.replace(map.settings, max_steps=_ENOUGH)
         map = dataclasses.replace(map, settings=settings)
@@ -191,7 +193,7 @@ def find_limit_cycle(
         if conserved:
             checks.check_conserved(cycle)
     if throw and code != Result.OK:
-        raise ComputationError(checks.explain(cycle, solution.turn, float(map.expected)))
+        raise ComputationError(checks.explain(cycle, solution.turn, float(map.expected), settle))
     return cycle
 
 

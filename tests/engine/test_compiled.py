@@ -13,8 +13,7 @@ from ..conftest import APEX, OUTPUTS, compiled
 SECTIONS, EXPERIMENTS, PERIODS = 7, 3, 5
 FAMILY = hj.KinematicPhase(SECTIONS, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 # Kernels, programs (those that are kept have names of their own), and what JAX is asked about
-# itself.
-# Then the hopper's period, which is 2 pi over a parameter.
+# itself. Then the hopper's period, which is 2 pi over a parameter.
 NAMED = {"run", "program", "_bind_program", "_constant", "<lambda>", "true_divide"}
 
 
