@@ -59,8 +59,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The first rows of a table, and how many more there are."""
     rows = list(rows)
     lines = [_row("th", head), *(_row("td", row) for row in rows[:_ROWS])]
-    if len(rows) > _ROWS:
-        lines.append(_row("td", [f"and {len(rows) - _ROWS} more"]))
+    lines += [_row("td", [f"and {len(rows) - _ROWS} more"])] * (len(rows) > _ROWS)
     return f'<table class="plain">{"".join(lines)}</table>'
 
 

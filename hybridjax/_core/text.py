@@ -1,6 +1,7 @@
 """What objects print: numbers with units, arrays by shape and range, modules by their fields."""
 
 import dataclasses
+import re
 import textwrap
 from collections.abc import Iterable
 from typing import Any
@@ -13,9 +14,8 @@ from .executor import is_traced, is_tracer
 from .signal import unit_of, with_unit
 
 
-# Characters up to which a module stands on one line. More: lines wrap in a notebook. Fewer: short
-# modules take a screen.
-_WIDTH = 88
+# Characters of a line. More: lines wrap in a notebook. Fewer: short modules take a screen.
+_WIDTH = 100
 # Numbers of an array up to which they are printed; of more, only shape and range. More: fields of a
 # module no longer stand on one line.
 _FEW = 4
@@ -39,6 +39,16 @@ def columns(rows: Iterable[tuple[str, ...]]) -> str:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join(map(str.ljust, row, widths)) for row in rows)
     return "".join(f"\n  {line.rstrip()}" for line in lines)
+
+
+def folded(text: str, indent: str = "") -> str:
+    """A text of parts between semicolons; where it has more characters than a line, with each part
+    on a line of its own, indented below the first."""
+    if len(text) <= _WIDTH:
+        return text
+    parts = re.split(r";\s+", text.replace(" ± ", "\0±\0"))  # (never apart)
+    lines = (textwrap.fill(x, _WIDTH - 2 - len(indent), subsequent_indent="  ") for x in parts)
+    return ";\n".join(lines).replace("\0", " ").replace("\n", f"\n  {indent}")
 
 
 def value(x: Any) -> str:

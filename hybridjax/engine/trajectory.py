@@ -16,7 +16,7 @@ from .._core.compilation import at_ease, host_first
 from .._core.meaning import current
 from .._core.precision import require_x64
 from .._core.results import Result
-from .._core.text import number
+from .._core.text import folded, number, signal_values
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_system, evaluating
 from ..systems.quotient import check_symmetry
@@ -48,6 +48,11 @@ class Event(NamedTuple):
     """State before the reset, by name."""
     after: dict[str, float]
     """State after the reset, by name."""
+
+    def __repr__(self) -> str:
+        before, after = (signal_values(x, x.values()) for x in (self.before, self.after))
+        event = f"Event({self.name} at t = {number(self.time)}: {self.source} to {self.target}; "
+        return folded(f"{event}before {before}; after {after})")
 
 
 @checked_methods
@@ -146,7 +151,7 @@ class Trajectory(eqx.Module):
         counts = ((np.sum(self.event == g), tr.name) for g, tr in enumerate(s.transitions))
         events = ", ".join(f"{count} {name}" for count, name in counts if count) or "no events"
         span = f"t = {number(self.t[0])} to {number(self.t[-1], unit=system.time_unit)}"
-        return (
+        return folded(
             f"Trajectory({type(system).__name__}: {span}, {len(self.t) - 1} steps; {events}; "
             f"ends in {s.names[self.chart[-1]]}: {self.result.message})"
         )

@@ -12,7 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
 from .._core.boundary.values import Integers, Reals
 from .._core.results import Result
-from .._core.text import fields, listed
+from .._core.text import fields, folded, listed
 from ..errors import DefinitionError
 from .record import Record
 
@@ -187,7 +187,7 @@ class ExperimentData(eqx.Module):
     def __repr__(self) -> str:
         S, n, _ = self.u.shape
         label = f"{self.label}, " if self.label else ""
-        return (
+        return folded(
             f"ExperimentData({label}{self.summary()}; {n // self.n_sections} cycles of "
             f"{self.n_sections} sections each, window P = {self.periods} periods; "
             f"{listed(self.inputs)} -> {listed(self.outputs)})"
@@ -236,6 +236,5 @@ def summary(
         cycle, section = divmod(int(failed_at[s]), n_sections)
         where = f"section {section}, cycle {cycle}: " if failed_at[s] >= 0 else ""
         text.append(f"#{s}: {where}{causes[s] if causes else Result(int(result[s])).message}")
-    if len(failed) > limit:
-        text.append(f"and {len(failed) - limit} more")
-    return "; ".join(text)
+    text += [f"and {len(failed) - limit} more"] * (len(failed) > limit)
+    return folded("; ".join(text))

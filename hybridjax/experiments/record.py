@@ -13,7 +13,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.containers import Stream
 from .._core.boundary.kinds import Index, NewNames, NewOptionalNames, SectionCount
 from .._core.boundary.values import Number, Reals
-from .._core.text import listed
+from .._core.text import folded, listed
 from ..errors import DefinitionError
 
 
@@ -89,7 +89,7 @@ class Record(eqx.Module):
     def __repr__(self) -> str:
         missing = int(np.isnan(self.y).any(axis=1).sum())
         gaps = f", {missing} with gaps" if missing else ""
-        return (
+        return folded(
             f"Record({len(self.u)} samples from section {self.first_section}{gaps}; "
             f"N = {self.n_sections}; {listed(self.inputs)} -> {listed(self.outputs)})"
         )

@@ -14,7 +14,7 @@ from .._core.boundary.kinds import Numbers
 from .._core.boundary.values import Reals
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
-from .._core.text import listed
+from .._core.text import folded, listed
 from ..engine.lanes import Lanes
 from ..engine.move import Options, move
 from ..engine.settings import EXPERIMENT, Settings
@@ -172,7 +172,7 @@ class ResponseFunction(eqx.Module):
     def __repr__(self):
         s = self.placed.structure()
         names = s.resolve_outputs(self.outputs).names
-        return (
+        return folded(
             f"ResponseFunction({type(s.system).__name__}: {listed(s.inputs)} -> {listed(names)}; "
             f"{self.placed.n_sections} sections; accuracy {self.stepping.accuracy:g})"
         )

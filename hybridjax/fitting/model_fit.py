@@ -68,10 +68,8 @@ class Identifiability(eqx.Module):
     def __repr__(self) -> str:
         nonzero = ", ".join(f"{x:.2g}" for x in self.singular_values[: self.rank])
         lost = ", ".join(f"{x:.1g}" for x in self.singular_values[self.rank :])
-        lines = [
-            f"Identifiability: {self.rank} of {len(self.names)} combinations of "
-            f"({', '.join(self.names)}) are identified"
-        ]
+        names, p = ", ".join(self.names), len(self.names)
+        lines = [f"Identifiability: {self.rank} of {p} combinations of ({names}) are identified"]
         lines += [f"  not identified: {text}" for text in self.descriptions()]
         lines.append(f"  singular values {nonzero}" + (f"; zero: {lost}" if lost else ""))
         return "\n".join(lines)

@@ -8,6 +8,7 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, SignalNames
 from .._core.precision import require_x64
+from .._core.text import folded
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..linear.htf import HTF
@@ -33,8 +34,8 @@ class Loop(eqx.Module):
     missing: tuple[str, ...] = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        named = ("plant", "controller", "closed", "sensitivity")
-        lines = [f"  {name:11} {getattr(self, name)!r}" for name in named if getattr(self, name)]
+        htfs = {x: getattr(self, x) for x in ("plant", "controller", "closed", "sensitivity")}
+        lines = [folded(f"  {name:11} {htf!r}", "  ") for name, htf in htfs.items() if htf]
         return "\n".join(["Loop", *lines, *(f"  {text}" for text in self.missing)])
 
 

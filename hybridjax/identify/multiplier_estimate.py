@@ -14,6 +14,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability
 from .._core.boundary.values import Complexes
 from .._core.html import card, multiplier_table, text, unit_circle
+from .._core.text import folded
 from ..errors import DefinitionError, FindingWarning
 from .denominator import Covariance, multipliers_of
 from .descent import Coefficients
@@ -212,7 +213,7 @@ class MultiplierEstimate(eqx.Module):
 
     def __repr__(self) -> str:
         about = "; ".join(filter(None, [self.show_multipliers(), self._about()]))
-        return f"{type(self).__name__}({about})"
+        return folded(f"{type(self).__name__}({about})")
 
     def _repr_html_(self) -> str:
         regions = []
@@ -232,7 +233,7 @@ class MultiplierEstimate(eqx.Module):
             f"{x.real:+.7f}{f'{x.imag:+.7f}i' if x.imag else ''} ± {error:.1e}"
             for x, error in zip(self.multipliers, self.standard_errors, strict=True)
         )
-        return f"multipliers (± standard error) {', '.join(shown)}"
+        return folded(f"multipliers (± standard error) {', '.join(shown)}")
 
     def _radius(self, level: float, degrees: int | np.ndarray) -> np.ndarray | float:
         """Quantile of `distance`."""

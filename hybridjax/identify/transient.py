@@ -16,6 +16,7 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
+from .._core.text import folded
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
@@ -47,8 +48,8 @@ class TransientFit(eqx.Module):
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{x:.4g}" for x in self.multipliers)
-        removed = ", ".join(f"{x:.2g}" for x in np.nanmax(self.removed, axis=0))
-        return f"TransientFit(multipliers {shown}; removed rms up to {removed}; {self.data!r})"
+        size = ", ".join(f"{x:.2g}" for x in np.nanmax(self.removed, axis=0))
+        return folded(f"TransientFit(multipliers {shown}; removed rms up to {size}; {self.data!r})")
 
 
 @checked

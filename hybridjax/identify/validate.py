@@ -12,7 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability, SignalNames
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
-from .._core.text import p_value
+from .._core.text import folded, p_value
 from ..errors import DefinitionError
 from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
@@ -115,11 +115,10 @@ class Validation(eqx.Module):
             f"correlated in time: {verdict[self.white]}; with the input: "
             f"{verdict[self.independent]} (level {self.level:g})"
         )
-        if self.left_out:
-            rows.append(f"records too short to be compared, left out: {self.left_out}")
+        rows += [f"records too short to compare, left out: {self.left_out}"] * bool(self.left_out)
         pairs = zip(self.visible, self.outputs, strict=True)
         visible = ", ".join(f"{100 * x:.2g} % of {name}" for x, name in pairs)
-        rows.append(f"misfits that would be noticed in four of five such data: {visible}")
+        rows.append(folded(f"misfits that would be noticed in four of five such data: {visible}"))
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:

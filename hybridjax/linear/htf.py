@@ -18,7 +18,7 @@ from .._core.executor import from_host, is_traced, namespace, put, to_host
 from .._core.html import COLORS, Curve, card, picture
 from .._core.precision import require_x64
 from .._core.signal import ratio, with_unit
-from .._core.text import listed
+from .._core.text import folded, listed
 from ..errors import DefinitionError
 from . import algebra
 from .algebra import SAME_FREQUENCY
@@ -187,7 +187,7 @@ class HTF(eqx.Module):
         sections = f"{self.n_sections} sections" if self.n_sections else "continuous time"
         dense = number == high - low + 1
         shown = f"{low} to {high}" if dense and number > 3 else ", ".join(map(str, self.harmonics))
-        return (
+        return folded(
             f"HTF({self.source}; harmonics {shown}; {count} frequencies{span} cycles/period; "
             f"{sections}: {listed(self.inputs)} -> {listed(self.outputs)})"
         )
@@ -207,7 +207,7 @@ class HTF(eqx.Module):
             ]
             name = with_unit(f"|H|, {u} to {y}", ratio(y, u))
             drawn.append(picture(curves, "f (cycles/period)", name, log=True))
-        of = f"({self.source}): {repr(self).partition('; ')[2].removesuffix(')')}"
+        of = f"({self.source}):{repr(self).partition(';')[2].removesuffix(')')}"
         return card("HTF", of, *drawn)
 
     def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]:

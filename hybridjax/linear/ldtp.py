@@ -16,7 +16,7 @@ from .._core.executor import from_host, is_traced, namespace, to_host
 from .._core.html import card, facts, multiplier_table, unit_circle
 from .._core.memo import remembered
 from .._core.precision import require_x64
-from .._core.text import listed
+from .._core.text import folded, listed
 from ..errors import DefinitionError
 from . import algebra, time_response
 from .frequency_response import Frequencies, Harmonics, check_harmonics, harmonic_transfer
@@ -149,7 +149,7 @@ class LDTP(eqx.Module):
 
     def __repr__(self) -> str:
         ports = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        return f"LDTP({self.n_sections} sections, dimension {self._dimension()}: {ports})"
+        return folded(f"LDTP({self.n_sections} sections, dimension {self._dimension()}: {ports})")
 
     def _dimension(self) -> str:
         if is_traced(self.dims):

@@ -17,6 +17,7 @@ from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import working
 from .._core.results import Result
+from .._core.text import folded
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
@@ -114,12 +115,11 @@ class LimitCycles(eqx.Module):
         """`10000/10000 found`, or the reasons of the first `limit` failures. Default: 5."""
         text = [f"{self.ok.sum()}/{len(self)} found"]
         text += [f"#{i}: {Result(int(self.result[i])).message}" for i in self.failed[:limit]]
-        if len(self.failed) > limit:
-            text.append(f"and {len(self.failed) - limit} more")
-        return "; ".join(text)
+        text += [f"and {len(self.failed) - limit} more"] * (len(self.failed) > limit)
+        return folded("; ".join(text))
 
     def __repr__(self):
-        return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
+        return folded(f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})")
 
 
 @checked

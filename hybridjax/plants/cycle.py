@@ -19,7 +19,7 @@ from .._core.pieces.description import digest_of
 from .._core.progress import counted, working
 from .._core.results import Result
 from .._core.signal import Signal, signals
-from .._core.text import listed
+from .._core.text import folded, listed
 from ..engine.trajectory import Trajectory
 from ..errors import ComputationError, DefinitionError
 from ..experiments.data import ExperimentData, Simulated
@@ -321,7 +321,7 @@ class SettledCycle:
     def __repr__(self) -> str:
         names = f"{listed(self.inputs)} -> {listed(self.outputs)}"
         about = f"period {self.period:.9g}, {len(self.cycle_outputs)} sections, {names}"
-        return f"SettledCycle({type(self.plant).__name__}: {about})"
+        return folded(f"SettledCycle({type(self.plant).__name__}: {about})")
 
 
 @checked

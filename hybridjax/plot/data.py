@@ -199,8 +199,7 @@ def experiment(data: ExperimentData, index: int = 0, *, ax: AxesLike | None = No
             panel.margins(x=0)
         axes[-1, 0].set_xlabel("time (cycles)")
         title = f"experiment {index}"
-        if not data.ok[index]:
-            title += f": {Result(int(data.result[index])).message}"
+        title += f": {Result(int(data.result[index])).message}" * (not data.ok[index])
         axes[0, 0].set_title(title, wrap=True)
     return Plot(axes)
 

@@ -12,6 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
+from .._core.text import folded
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record, uninterrupted_records
 
@@ -129,7 +130,7 @@ class SectionData(eqx.Module):
         lost = f", {100 * self.missing:.2g} % missing" if self.missing else ""
         struck = [f"{n} {k}" for n, k in zip(self.signals, self.spikes, strict=True) if k]
         spikes = f"; spikes left out: {', '.join(struck)}" if struck else ""
-        return (
+        return folded(
             f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
             f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: "
             f"{sizes}{spikes})"

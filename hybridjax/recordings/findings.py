@@ -42,7 +42,8 @@ class Finding(eqx.Module):
 
     def __repr__(self) -> str:
         action = "" if self.action == "warned" else f" ({self.action})"
-        return f"{self.cause[0].upper()}{self.cause[1:]}{action}: {self.text}"
+        text = f"{self.cause[0].upper()}{self.cause[1:]}{action}: {self.text}"
+        return textwrap.fill(text, 98, subsequent_indent="  ")
 
 
 class Inspection(eqx.Module):
@@ -71,7 +72,7 @@ def refuse(findings: Iterable[Finding]) -> None:
 def warn_of(findings: Iterable[Finding]) -> None:
     """Emit a `FindingWarning` for each finding."""
     for finding in findings:
-        warnings.warn(repr(finding), FindingWarning, stacklevel=4)
+        warnings.warn(" ".join(repr(finding).split()), FindingWarning, stacklevel=4)
 
 
 def untried_orders(order: int, obstacle: str) -> list[Finding]:
@@ -81,11 +82,8 @@ def untried_orders(order: int, obstacle: str) -> list[Finding]:
 
 
 def print_findings(findings: Iterable[Finding], indent: str = "") -> str:
-    """Return the findings as text, wrapped at 100 columns."""
-    return "\n".join(
-        textwrap.fill(repr(x), 100, initial_indent=indent, subsequent_indent=f"{indent}  ")
-        for x in findings
-    )
+    """Return the findings as text of at most 100 columns."""
+    return textwrap.indent("\n".join(map(repr, findings)), indent)
 
 
 def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " _"]]) -> str:

@@ -89,10 +89,8 @@ class NaturalMultipliers(eqx.Module):
         return tuple(about_natural_multipliers(self))
 
     def __repr__(self) -> str:
-        lines = [
-            f"NaturalMultipliers({self.cycles} cycles, order {len(self.multipliers)}, blocks of "
-            f"{self.block} cycles)"
-        ]
+        d, b = len(self.multipliers), self.block
+        lines = [f"NaturalMultipliers({self.cycles} cycles, order {d}, blocks of {b} cycles)"]
         for plain, values in enumerate((self.multipliers, self.plain)):
             for z, (low, high) in zip(values, self.interval(plain=bool(plain)), strict=True):
                 name = "least squares" if plain else "by instruments"

@@ -8,6 +8,7 @@ from scipy.interpolate import PchipInterpolator
 
 from .._core.arguments import require_equal
 from .._core.memo import remembered
+from .._core.text import folded
 from ..errors import DefinitionError
 from .recording import Recording, Trial
 
@@ -115,15 +116,11 @@ class Phase(eqx.Module):
         return float(np.sqrt(sum(x @ x for x in off) / max(freedom, 1))) / self.period
 
     def __repr__(self) -> str:
-        notes = ""
-        if self.backwards:
-            notes += f"; {100 * self.backwards:.2g} % of samples ran backwards"
-        if self.dropped:
-            notes += f"; {self.dropped} doubled events left out"
-        if self.missed:
-            notes += f"; {self.missed} cycles with missed events left out"
+        notes = f"; {100 * self.backwards:.2g} % of samples ran backwards" * bool(self.backwards)
+        notes += f"; {self.dropped} doubled events left out" * bool(self.dropped)
+        notes += f"; {self.missed} cycles with missed events left out" * bool(self.missed)
         pieces = sum(len(s) for s in self.stretches)
-        return (
+        return folded(
             f"Phase({self.cycles} cycles in {pieces} stretches of {len(self.stretches)} trials; "
             f"period {self.period:.6g}, jitter {100 * self.jitter:.2g} %, drift "
             f"{100 * self.drift:.2g} % per cycle{notes})"

@@ -13,6 +13,7 @@ from .._core import limits
 from .._core.arguments import require_among, require_equal
 from .._core.boundary.checked import checked
 from .._core.signal import with_unit
+from .._core.text import folded
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
 from .formats.columns import Columns, numbers, parse_table, require_aligned
@@ -254,12 +255,12 @@ class Recording(eqx.Module):
             step = np.diff(t.time)
             middle = float(np.median(step))
             missing = int(np.isnan(t.values).any(axis=1).sum())
-            lines.append(
+            lines.append(folded(
                 f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g} s, every "
-                f"{middle:.4g} s ({1 / middle:.4g} Hz; longest {step.max():.4g} s)"
-                + (f", {missing} with gaps" if missing else "")
-                + "".join(f", {len(at)} {name}" for name, at in t.events.items())
-            )
+                f"{middle:.4g} s ({1 / middle:.4g} Hz, longest {step.max():.4g} s)"
+                + (f"; {missing} with gaps" if missing else "")
+                + "".join(f"; {len(at)} {name}" for name, at in t.events.items()), "  "
+            ))  # fmt: skip
         return "\n".join([*lines, *(f"  ({note})" for note in self.notes)])
 
 

@@ -12,7 +12,7 @@ from .._core.executor import Array, is_hidden, is_traced, namespace, on_host, to
 from .._core.html import card, facts
 from .._core.precision import require_x64
 from .._core.results import Result
-from .._core.text import number
+from .._core.text import folded, number
 from ..engine import kernels
 from ..engine.lanes import Lanes, Tape, for_each_chart, needed, only
 from ..engine.move import tape_jacobian
@@ -68,7 +68,7 @@ class PlacedSections(eqx.Module):
         if is_traced(self):
             return f"{head}, traced)"
         sections, dimension, start, _ = self._facts().values()
-        return f"{head}: {sections}; dimension {dimension}; section 0 at t = {start})"
+        return folded(f"{head}: {sections}; dimension {dimension}; section 0 at t = {start})")
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
