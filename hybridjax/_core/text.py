@@ -93,8 +93,8 @@ def fields(self: Any) -> str:
     kind, line = type(self).__name__, ", ".join(shown)
     if len(kind) + len(line) + 2 <= _WIDTH:
         return f"{kind}({line})"
-    inside = textwrap.indent(",\n".join(shown), "  ")
-    return f"{kind}(\n{inside},\n)"
+    inside = (textwrap.fill(x, _WIDTH - 3, subsequent_indent="  ") for x in shown)
+    return f"{kind}(\n  " + ",\n".join(inside).replace("\n", "\n  ") + ",\n)"
 
 
 def _array(x: np.ndarray) -> str:

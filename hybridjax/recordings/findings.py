@@ -42,8 +42,7 @@ class Finding(eqx.Module):
 
     def __repr__(self) -> str:
         action = "" if self.action == "warned" else f" ({self.action})"
-        text = f"{self.cause[0].upper()}{self.cause[1:]}{action}: {self.text}"
-        return textwrap.fill(text, 98, subsequent_indent="  ")
+        return f"{self.cause[0].upper()}{self.cause[1:]}{action}: {self.text}"
 
 
 class Inspection(eqx.Module):
@@ -72,7 +71,7 @@ def refuse(findings: Iterable[Finding]) -> None:
 def warn_of(findings: Iterable[Finding]) -> None:
     """Emit a `FindingWarning` for each finding."""
     for finding in findings:
-        warnings.warn(" ".join(repr(finding).split()), FindingWarning, stacklevel=4)
+        warnings.warn(repr(finding), FindingWarning, stacklevel=4)
 
 
 def untried_orders(order: int, obstacle: str) -> list[Finding]:
@@ -82,8 +81,9 @@ def untried_orders(order: int, obstacle: str) -> list[Finding]:
 
 
 def print_findings(findings: Iterable[Finding], indent: str = "") -> str:
-    """Return the findings as text of at most 100 columns."""
-    return textwrap.indent("\n".join(map(repr, findings)), indent)
+    """Return the findings as text, wrapped at 100 columns."""
+    wrapped = (textwrap.fill(repr(x), 98, subsequent_indent="  ") for x in findings)
+    return textwrap.indent("\n".join(wrapped), indent)
 
 
 def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " _"]]) -> str:

@@ -15,6 +15,7 @@ from .._core.compilation import host_first
 from .._core.executor import is_traced, namespace, put
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
+from .._core.text import folded
 from ..engine.move import move
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
@@ -52,10 +53,9 @@ class SectionMap(eqx.Module):
     """Dimensions n_i and n_j."""
 
     def __repr__(self):
-        (n, m), family = self.dims, self.placed.family
         system = type(self.placed.cycle.system).__name__
-        ends = f"{family.describe(self.i)} to {family.describe(self.j)}"
-        return f"SectionMap({system}: from {ends}; {n} states to {m})"
+        ends = " to ".join(map(self.placed.family.describe, (self.i, self.j)))
+        return folded(f"SectionMap({system}: from {ends}; {self.dims[0]} states to {self.dims[1]})")
 
     @property
     def fixed_point(self) -> Float[Array, " n"]:

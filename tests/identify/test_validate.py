@@ -97,7 +97,7 @@ def test_records_shorter_than_the_lags(small):
     whole = record(small, 4 * 100, 0, 0.3)
     pieces = [whole.part(0, 103), whole.part(103, 106), whole.part(106, 400)]
     found = hj.validate(small, pieces)
-    assert found.left_out == 1 and "compared, left out: 1\n" in repr(found)
+    assert found.left_out == 1 and "compare, left out: 1\n" in repr(found)
     np.testing.assert_array_equal(found.measured, whole.y[106:])
     assert found.white and found.independent
     assert hj.validate(small, pieces, start="cycle").left_out == 0

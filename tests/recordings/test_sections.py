@@ -44,7 +44,7 @@ def test_a_circle(wave):
         sample(wave, n_sections=16)
     with pytest.raises(hj.DefinitionError, match="events alone determine no multipliers"):
         sample(wave, inputs=(), outputs=())
-    assert "SectionData(19.75 cycles of 8 sections in 1 records; period 1;" in repr(data)
+    assert "SectionData(19.75 cycles of 8 sections in 1 records;" in repr(data)
 
 
 def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
@@ -95,7 +95,7 @@ def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     assert found.phase.dropped == 10 and len(found.phase.stretches[0]) == 12
     assert found.phase.cycles + found.phase.missed == 199
     held = found.held_out.validation
-    assert f"compared, left out: {held.left_out}" in repr(found)
+    assert f"compare, left out: {held.left_out}" in repr(found)
     assert held.independent and held.fit.min() > 50
 
 

@@ -91,6 +91,6 @@ def test_impacts_are_part_of_the_motion(wave):
 
     assert sampled(impact).spikes == (0, 0, 0)
     both = sampled(impact + spikes)
-    assert both.spikes == (0, 3, 0) and "; spikes left out: x 3)" in repr(both)
+    assert both.spikes == (0, 3, 0) and "spikes left out: x 3)" in repr(both)
     np.testing.assert_allclose(both.cycle_outputs, sampled(impact).cycle_outputs, atol=5e-3)
     assert np.ptp(both.cycle_outputs[:, 0] - sampled(0 * t).cycle_outputs[:, 0]) > 0.05
