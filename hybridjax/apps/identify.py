@@ -96,7 +96,7 @@ def steps_of(options: Any) -> tuple[tuple[str, ...], Callable[[Recording], Ident
 
 @checked
 def write_report(
-    folder: FilePath, found: Identification, formats: Sequence[Format] = ("png",)
+    folder: FilePath, result: Identification, formats: Sequence[Format] = ("png",)
 ) -> Path:
     """Write all results of a recording into a folder. They appear when all of them are ready.
 
@@ -114,8 +114,8 @@ def write_report(
     **Raises:** `DefinitionError` if a file that is not of an earlier report has one of these names,
     or the folder cannot be written.
     """
-    with report_folder(folder, found.data.inputs, formats) as new:
-        write_results(new, found, formats)
+    with report_folder(folder, result.data.inputs, formats) as new:
+        write_results(new, result, formats)
     return Path(folder) / PAGE
 
 
@@ -142,19 +142,19 @@ def _suffixes(inputs: Sequence[str]) -> list[str]:
     return [f"_{x.replace('/', '-')}" for x in inputs] if len(inputs) > 1 else [""]
 
 
-def write_results(folder: Path, found: Identification, formats: Sequence[Format]) -> None:
+def write_results(folder: Path, result: Identification, formats: Sequence[Format]) -> None:
     """Write all results into a folder that is new."""
     (folder / "figures").mkdir()
-    data, recording = found.data, found.recording
+    data, recording = result.data, result.recording
     # 240 frequencies, up to the edge of the band that the inputs excited.
-    edge = min(max(found.advice.band), data.n_sections / 2)
-    htf = found.fit.htf(np.linspace(0, edge, 241)[1:])
+    edge = min(max(result.advice.band), data.n_sections / 2)
+    htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
     images = {}
-    for name, drawn in _figures(found, htf).items():
+    for name, drawn in _figures(result, htf).items():
         image, *_ = look.save_and_close(folder / "figures" / name, drawn, with_png(formats))
         images[name] = base64.b64encode(image.read_bytes()).decode()
     save(folder / "htf.npz", htf)
-    save(folder / "fit.npz", found.fit)
+    save(folder / "fit.npz", result.fit)
     header = [f"{n} ({u})" if u else n for n, u in zip(data.signals, data.units, strict=True)]
     records = zip(data.records, data.times, data.trials, strict=True)
     rows = (
@@ -167,8 +167,8 @@ def write_results(folder: Path, found: Identification, formats: Sequence[Format]
     cycle = enumerate(_written(data.cycle_inputs, data.cycle_outputs))
     average = ((n, n / data.n_sections, *row) for n, row in cycle)
     _write_table(folder / "cycle.csv", ["section", "phase (cycles)", *header], average)
-    (folder / "summary.json").write_text(json.dumps(summarize(found), indent=1) + "\n")
-    (folder / PAGE).write_text(_page(found, images), encoding="utf-8")
+    (folder / "summary.json").write_text(json.dumps(summarize(result), indent=1) + "\n")
+    (folder / PAGE).write_text(_page(result, images), encoding="utf-8")
 
 
 def off_screen() -> contextlib.AbstractContextManager:
@@ -198,16 +198,16 @@ def _write_table(path: Path, header: list[str], rows: Iterable[Sequence]) -> Non
         csv.writer(file).writerows([header, *rows])
 
 
-def summarize(found: Identification) -> dict[str, Any]:
+def summarize(result: Identification) -> dict[str, Any]:
     """Return the numbers of the report, ready for JSON."""
-    data, fit, held = found.data, found.fit, found.held_out
-    periods = np.concatenate(found.phase.periods)
+    data, fit, held = result.data, result.fit, result.held_out
+    periods = np.concatenate(result.phase.periods)
     return {
         "version": __version__,
-        "trials": [t.name for t in found.recording.trials],
-        "sampling_rates": [float(1 / np.median(np.diff(t.time))) for t in found.recording.trials],
-        "left_out": _left_out(found),
-        "notes": list(found.recording.notes),
+        "trials": [t.name for t in result.recording.trials],
+        "sampling_rates": [float(1 / np.median(np.diff(t.time))) for t in result.recording.trials],
+        "left_out": _left_out(result),
+        "notes": list(result.recording.notes),
         "units": {"time": "s"} | dict(zip(data.signals, data.units, strict=True)),
         "inputs": list(data.inputs),
         "references": list(fit.reference),
@@ -216,65 +216,65 @@ def summarize(found: Identification) -> dict[str, Any]:
         "cycles": round(data.cycles, 2),
         "records": len(data.records),
         "period": data.period,
-        "period_jitter": found.phase.jitter,
+        "period_jitter": result.phase.jitter,
         "period_mean": float(periods.mean()),
         "period_standard_error": float(periods.std() / np.sqrt(max(len(periods) - 1, 1))),
-        "period_drift_per_cycle": found.phase.drift,
+        "period_drift_per_cycle": result.phase.drift,
         "multipliers": complex_pairs(fit.multipliers),
         "standard_errors": fit.standard_errors.tolist(),
         "covariance_of_coefficients": fit.covariance.tolist(),
-        "multipliers_of_plain_regression": complex_pairs(found.advice.plain),
+        "multipliers_of_plain_regression": complex_pairs(result.advice.plain),
         "multipliers_of_held_out_fit": complex_pairs(held.fit.multipliers),
         "held_out_fit_percent": held.validation.fit.tolist(),
-        "input_band": list(found.advice.band),
-        "warnings": list(map(repr, found.advice.warnings)),
+        "input_band": list(result.advice.band),
+        "warnings": list(map(repr, result.advice.warnings)),
     }
 
 
-def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
+def _figures(result: Identification, htf: HTF) -> dict[str, look.Plot]:
     with off_screen():
         figures = {
-            "multipliers": plot.multipliers(found.fit, {"plain regression": found.advice.plain}),
-            "validation": plot.validation(found.held_out.validation),
-            "impulse_responses": plot.impulse_responses(found.responses),
+            "multipliers": plot.multipliers(result.fit, {"plain regression": result.advice.plain}),
+            "validation": plot.validation(result.held_out.validation),
+            "impulse_responses": plot.impulse_responses(result.responses),
         }
         for i, suffix in enumerate(_suffixes(htf.inputs)):
             figures[f"bode{suffix}"] = plot.bode(htf, input=i)
             figures[f"harmonics{suffix}"] = plot.harmonics({"": htf}, input=i, decades=3)
-        curve = {} if found.curve is None else {"curve": plot.phase_response(found.curve)}
-        figures |= {"phase": plot.phase(found.phase), "sections": plot.section_data(found.data)}
+        curve = {} if result.curve is None else {"curve": plot.phase_response(result.curve)}
+        figures |= {"phase": plot.phase(result.phase), "sections": plot.section_data(result.data)}
     return figures | curve
 
 
-def _page(found: Identification, images: dict[str, str]) -> str:
+def _page(result: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
-    data, recording, warnings = found.data, found.recording, found.advice.warnings
+    data, recording, warnings = result.data, result.recording, result.advice.warnings
     trials = escape(", ".join(t.name for t in recording.trials))
-    loop = found.fit.reference
+    loop = result.fit.reference
     method = f"instrumental variables of {escape(listed(loop))}" if loop else "output-error fit"
-    left_out = {x: f"{amount:.3g}" for x, amount in _left_out(found).items() if amount}
+    left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
-    expected = zip(found.advice.strides, found.advice.expected, strict=True)
+    expected = zip(result.advice.strides, result.advice.expected, strict=True)
     parts = [
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",
         f"<p>A controller makes {escape(listed(data.inputs))}. These are the dynamics without it, "
         f"as {escape(listed(loop))} tells, which acts from outside.</p>" * bool(loop),
-        found.fit._repr_html_(),
+        result.fit._repr_html_(),
         *(f'<p class="warn">{_sentence(repr(w))}</p>' for w in warnings),
         *([] if warnings else ['<p class="fine">Nothing speaks against the fit.</p>']),
         html.card("Left out", "" if left_out else "nothing", html.facts(left_out)),
         f"<ul>{notes}</ul>" if notes else "",
-        html.card("Phase", "", html.text(repr(found.phase))),
+        html.card("Phase", "", html.text(repr(result.phase))),
         data._repr_html_(),
         html.card(
             "Standard errors to be expected from more strides", "", html.table(
-                ("strides", *map(html.complex_number, found.fit.multipliers)),
+                ("strides", *map(html.complex_number, result.fit.multipliers)),
                 [(str(n), *(f"{e:.1e}" for e in x)) for n, x in expected if np.isfinite(x).all()],
             ),
         ),
         *(f"<p>{text}</p>" for text in MEANING),
-        found.held_out.validation._repr_html_(),
+        result.held_out.validation._repr_html_(),
         *(
             f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{image}">'
             f"<figcaption>{escape(caption)}</figcaption></figure>"
@@ -283,20 +283,20 @@ def _page(found: Identification, images: dict[str, str]) -> str:
             if name.startswith(figure)
         ),
         f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
-        f"{data.bandwidth:.3g} Hz; {method} with {found.fit.numerators.shape[1]} lags; "
+        f"{data.bandwidth:.3g} Hz; {method} with {result.fit.numerators.shape[1]} lags; "
         "regions from the residuals, cycle by cycle.</p>",
     ]  # fmt: skip
     return page_of("Floquet multipliers from a recording", parts)
 
 
-def _left_out(found: Identification) -> dict[str, Any]:
+def _left_out(result: Identification) -> dict[str, Any]:
     """Return the amounts of data that were not used, by their causes."""
     return {
-        "doubled events (less than half a period after the one before)": found.phase.dropped,
-        "cycles whose beginning or end is unknown (a missed event, a gap)": found.phase.missed,
-        "fraction of the samples at sections (gaps longer than a section)": found.data.missing,
-        "fraction of the samples whose phase ran backwards (replaced)": found.phase.backwards,
-        "stretches too short to validate (used in the fit)": found.held_out.validation.left_out,
+        "doubled events (less than half a period after the one before)": result.phase.dropped,
+        "cycles whose beginning or end is unknown (a missed event, a gap)": result.phase.missed,
+        "fraction of the samples at sections (gaps longer than a section)": result.data.missing,
+        "fraction of the samples whose phase ran backwards (replaced)": result.phase.backwards,
+        "stretches too short to validate (used in the fit)": result.held_out.validation.left_out,
     }
 
 

@@ -103,9 +103,9 @@ def loop(
     return Loop(plant, controller, closed, sensitivity, tuple(missing))
 
 
-def _without(sums: Sums, known: np.ndarray) -> Sums:
-    """Return products of what is left of all signals without what known references explain."""
+def _without(sums: Sums, rows: np.ndarray) -> Sums:
+    """Return products of what is left of all signals without what those in these rows explain."""
     total = sums.total
-    power = total[:, known[:, None], known]
-    left = total[:, :, known] @ np.linalg.pinv(power, hermitian=True) @ total[:, known]
-    return sums._replace(total=total - left, experiments=sums.experiments - len(known))
+    power = total[:, rows[:, None], rows]
+    left = total[:, :, rows] @ np.linalg.pinv(power, hermitian=True) @ total[:, rows]
+    return sums._replace(total=total - left, experiments=sums.experiments - len(rows))

@@ -85,7 +85,7 @@ def identify_recording(
     **Arguments:** those of `section_data`, and
 
     - `order`: the number of multipliers. Default: the result of `choose_order`; in a loop, the most
-      that the reference tells, up to 4.
+      that the reference determines, up to 4.
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
@@ -133,8 +133,8 @@ def identify_recording(
     if order is None:
         order, findings = best, (*findings, *untried_orders(best, obstacle))
     elif best > order:
-        text = f"held-out strides are predicted better with {best} multipliers than with {order}: "
-        text = text if outside is None else f"the reference tells {best} multipliers, not {order}: "
+        text = "the reference determines" if outside else "held-out strides are predicted better by"
+        text = f"{text} {best} multipliers, not {order}: "
         text += f"{order} may be biased, and their intervals too narrow. Compare order={best}"
         slow = outside is None and split(whole.with_drift(SLOW)).best_order(most)[0] <= order
         text += f", and drift={SLOW:g}, with which {order} are as good." if slow else "."

@@ -141,7 +141,7 @@ def test_instruments_of_series_hold_in_the_loop(plant):
     moved.y[:, 0] += 30 * np.sin(np.arange(600) / 38)
     moved.u[:] += 1e3  # (offsets of inputs make a drift, too)
     assert hj.fit_series(moved, 2, reference="r").standard_errors[0] < 0.2
-    with pytest.raises(hj.DefinitionError, match="the reference tells 2 multipliers, not 3"):
+    with pytest.raises(hj.DefinitionError, match="the reference determines 2 multipliers, not 3"):
         hj.fit_series(series(plant, 0, noise=0.7), 3, reference="r")
     assert best_order(series(plant, 0), ("r",), 4) == (2, "")
     assert "3 times too few" in best_order(series(plant, 0, 20, noise=0.1), ("r",), 4)[1]

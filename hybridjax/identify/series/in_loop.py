@@ -40,9 +40,9 @@ _EXCITED = 5.0
 # Cycles of a block, at least. Fewer: errors of neighboring cycles count as independent, which they
 # are not. More: few blocks.
 _BLOCK = 10
-# Least squared signal-to-noise ratio with which the instruments tell each multiplier. Smaller:
+# Least squared signal-to-noise ratio with which the instruments determine each multiplier. Smaller:
 # noise makes multipliers. Larger: weak ones are refused.
-_TOLD = 10.0
+_DETERMINED = 10.0
 
 
 def predicted(
@@ -92,17 +92,17 @@ class Solution(NamedTuple):
     """Products of instruments and earlier outputs."""
     scale: Float[np.ndarray, " ny"]
     """Standard deviations of the outputs' errors."""
-    told: int
-    """The number of multipliers that the references tell."""
+    determined: int
+    """The number of multipliers that the references determine."""
 
 
 def best_order(data: RecordedData, reference: Sequence[str], most: int) -> tuple[int, str]:
-    """Return the largest number of multipliers, up to `most`, all of which the references tell, and
+    """Return the largest number of multipliers, up to `most`, that the references determine, and
     the obstacle to a larger number, if there was one."""
     obstacle = ""
     for order in range(most, 1, -1):
         try:
-            if LoopEquations(*in_loop(data, reference), order, None).solution.told >= order:
+            if LoopEquations(*in_loop(data, reference), order, None).solution.determined >= order:
                 return order, obstacle
             obstacle = ""
         except DefinitionError as error:  # too few cycles for so many: a finding shows its text
@@ -205,8 +205,8 @@ class LoopEquations:
         part = along.T @ np.linalg.lstsq(W.T @ W, along)[0]
         part = np.linalg.pinv(y[:, 1:].T @ y[:, 1:], RANK) @ part
         part = np.clip(np.linalg.eigvals(part).real, 0, 1)
-        told = int((part * freedom * len(scale) > _TOLD * (1 - part)).sum())
-        return Solution(c, along, scale, told)
+        determined = int((part * freedom * len(scale) > _DETERMINED * (1 - part)).sum())
+        return Solution(c, along, scale, determined)
 
     def solve(self, check: bool) -> tuple[Coefficients, Covariance, Float[np.ndarray, " ny"]]:
         """Return c, its covariance, and the standard deviations of the outputs' errors.
@@ -214,13 +214,13 @@ class LoopEquations:
         **Raises:** `DefinitionError` for too few cycles, or, with `check`, for an order of which
         the reference does not tell all multipliers.
         """
-        (c, along, scale, told), d = self.solution, self.order
-        if check and told < d:
+        (c, along, scale, determined), d = self.solution, self.order
+        if check and determined < d:
             raise DefinitionError(
-                f"the reference tells {told} multipliers, not {d}: lower `order`, record longer, "
-                "excite more, or pass check=False."
+                f"the reference determines {determined} multipliers, not {d}: lower `order`, "
+                "record longer, excite more, or pass check=False."
             )
-        if told < d:
+        if determined < d:
             return c, Covariance.unknown(d), scale
         cycles = denominator.correlated_cycles(multipliers_of(c), self.records.cycles) + 1
         blocks = max(1, self.records.cycles // max(cycles, _BLOCK))
