@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DefinitionError
-from ..plot.look import save
+from ..plot.look import save_and_close
 from ..plot.over_parameters import sweep as plot_sweep
 from ..scale.sweep import sweep
 
@@ -21,13 +21,13 @@ def run(options: Any) -> int:
     over = {name: np.linspace(low, high, count) for name, low, high, count in options.over}
     if len(over) < len(options.over):
         raise DefinitionError("a parameter has two axes: give each `--over` another name.")
-    file, name = options.model
-    maps = sweep(_load(file, name), over, options.want, store=options.out)
+    maps = sweep(_load(*options.model), over, options.want, store=options.out)
     print(maps)
     print(f"{int((maps.result == 0).sum())} of {maps.result.size} points have a limit cycle")
     for name in options.want:
         if maps[name].dims == tuple(over) and len(over) <= 2:
-            print(*save(f"{Path(options.out).with_suffix('')}-{name}", plot_sweep(maps, name)))
+            path = f"{Path(options.out).with_suffix('')}-{name}"
+            print(*save_and_close(path, plot_sweep(maps, name), ("png",)))
     return 0
 
 
