@@ -137,6 +137,13 @@ def forget_programs():
         jax.clear_caches()
 
 
+@pytest.fixture(autouse=True)
+def figures_are_closed():
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
+
+
 @contextlib.contextmanager
 def compiled():
     """The names of all that is compiled in this context, where functions of few lanes stay on the

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from matplotlib import pyplot
 
 import hybridjax as hj
 
@@ -59,10 +58,8 @@ def test_python_control(model):
     np.testing.assert_array_equal(data(1j * data.omega)[1], np.asarray(H[-1])[:, 0].T)
     np.testing.assert_allclose(data.omega, np.pi * f)
     assert isinstance(data, control.FrequencyResponseData)
-    pyplot.close("all")
     lines = control.bode_plot(convert.to_control(H.select([0]))[0, 0]).lines
     np.testing.assert_allclose(lines[0, 0][0].get_ydata(), np.abs(H[0][:, 0, 0]))
-    pyplot.close("all")
 
 
 def test_scipy(model):

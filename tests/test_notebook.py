@@ -8,7 +8,6 @@ import types
 
 import numpy as np
 import pytest
-from matplotlib import pyplot
 
 
 NOTEBOOKS = pathlib.Path(__file__).parents[1] / "notebooks"
@@ -119,5 +118,4 @@ def test_the_notebook_runs(name, monkeypatch):
     module = types.ModuleType(name)
     monkeypatch.setitem(sys.modules, module.__name__, module)
     exec(compile(code, f"{name}.py", "exec"), vars(module))
-    pyplot.close("all")
     globals()[name](module)  # the function above of the same name

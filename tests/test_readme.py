@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib import pyplot
 
 from hybridjax.apps.cli import main
 
@@ -35,7 +34,6 @@ def test_sessions_print_what_the_readme_shows(capsys, tmp_path, monkeypatch):
         printed = capsys.readouterr().out
         differ = f"README.md shows\n{shown}\nbut this is printed\n{printed}"
         assert same_output(shown, printed), differ
-    pyplot.close("all")
     assert (tmp_path / "bode.png").stat().st_size > 10_000
 
 
@@ -61,7 +59,6 @@ def read_section(tmp_path_factory):
         read("A session")
         read("Your own system")
         yield read
-    pyplot.close("all")
 
 
 # (What they begin with takes as long as each, so one worker gets them.)
@@ -135,7 +132,6 @@ def test_the_page_runs_and_prints_what_it_shows(page, capsys, tmp_path, monkeypa
             printed = capsys.readouterr().out
         elif language == "text":
             assert same_output(text, printed), f"{page} shows\n{text}\nbut prints\n{printed}"
-    pyplot.close("all")
 
 
 @pytest.mark.slow

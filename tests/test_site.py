@@ -9,7 +9,6 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from matplotlib import pyplot
 
 import hybridjax as hj
 
@@ -68,7 +67,6 @@ def test_the_pictures_of_the_home_page_are_those_that_are_drawn_now(monkeypatch)
         for now, file in zip(pictures.numbers(plot), pictures.drawn(name), strict=True):
             off, size = np.subtract(now["points"], file["points"]), np.abs(file["points"])
             assert np.all(np.abs(off) <= file["within"] * size.max(axis=0, initial=1e-9))
-    pyplot.close("all")
 
 
 @pytest.mark.slow

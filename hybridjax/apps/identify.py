@@ -150,9 +150,10 @@ def write_results(folder: Path, result: Identification, formats: Sequence[Format
     edge = min(max(result.advice.band), data.n_sections / 2)
     htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
     images = {}
-    for name, drawn in _figures(result, htf).items():
-        image, *_ = look.save_and_close(folder / "figures" / name, drawn, with_png(formats))
-        images[name] = base64.b64encode(image.read_bytes()).decode()
+    with off_screen():
+        for name, drawn in _figures(result, htf):
+            image, *_ = look.save_and_close(folder / "figures" / name, drawn, with_png(formats))
+            images[name] = base64.b64encode(image.read_bytes()).decode()
     save(folder / "htf.npz", htf)
     save(folder / "fit.npz", result.fit)
     header = [f"{n} ({u})" if u else n for n, u in zip(data.signals, data.units, strict=True)]
@@ -231,19 +232,18 @@ def summarize(result: Identification) -> dict[str, Any]:
     }
 
 
-def _figures(result: Identification, htf: HTF) -> dict[str, look.Plot]:
-    with off_screen():
-        figures = {
-            "multipliers": plot.multipliers(result.fit, {"plain regression": result.advice.plain}),
-            "validation": plot.validation(result.held_out.validation),
-            "impulse_responses": plot.impulse_responses(result.responses),
-        }
-        for i, suffix in enumerate(_suffixes(htf.inputs)):
-            figures[f"bode{suffix}"] = plot.bode(htf, input=i)
-            figures[f"harmonics{suffix}"] = plot.harmonics({"": htf}, input=i, decades=3)
-        curve = {} if result.curve is None else {"curve": plot.phase_response(result.curve)}
-        figures |= {"phase": plot.phase(result.phase), "sections": plot.section_data(result.data)}
-    return figures | curve
+def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]]:
+    """Yield names and figures, each drawn when the one before was saved."""
+    yield "multipliers", plot.multipliers(result.fit, {"plain regression": result.advice.plain})
+    yield "validation", plot.validation(result.held_out.validation)
+    yield "impulse_responses", plot.impulse_responses(result.responses)
+    for i, suffix in enumerate(_suffixes(htf.inputs)):
+        yield f"bode{suffix}", plot.bode(htf, input=i)
+        yield f"harmonics{suffix}", plot.harmonics({"": htf}, input=i, decades=3)
+    yield "phase", plot.phase(result.phase)
+    yield "sections", plot.section_data(result.data)
+    if result.curve is not None:
+        yield "curve", plot.phase_response(result.curve)
 
 
 def _page(result: Identification, images: dict[str, str]) -> str:

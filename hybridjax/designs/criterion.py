@@ -88,8 +88,7 @@ class LinearCriterion(eqx.Module):
         spread = self.wanted @ half
         influence, variances = spread @ half.T @ rows, (spread**2).sum(axis=1)
         squares = np.bincount(np.concatenate(cosine), (influence**2).sum(axis=0), len(power))
-        each = np.bincount(self.part, variances)
-        return Bound(each, squares / power, float(variances.sum()))
+        return Bound(np.bincount(self.part, variances), squares / power, float(variances.sum()))
 
 
 class Criterion(eqx.Module):

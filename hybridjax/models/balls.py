@@ -73,8 +73,7 @@ class PaddleJuggler(HybridSystem):
         return t, y, v, jnp.stack([trace / 2 + root, trace / 2 - root])
 
     def charts(self):
-        fall = lambda t, q, u: (q[1], -self.g)  # noqa: E731
-        return {"fall": FieldChart(fall, ("y", "v"), ("m", "m/s"))}
+        return {"fall": FieldChart(lambda t, q, u: (q[1], -self.g), ("y", "v"), ("m", "m/s"))}
 
     def transitions(self):
         def bounce(t, q, u):

@@ -83,8 +83,7 @@ class Fluctuations(eqx.Module):
         before, with those `lag` turns before. The sum of all entries is the covariance of periods
         from the last event to the next such event."""
         n = len(self.joint) - len(self.events)
-        power = namespace(self.joint).linalg.matrix_power(self.step, lag)
-        return (power @ self.joint)[n:, n:]
+        return (namespace(self.joint).linalg.matrix_power(self.step, lag) @ self.joint)[n:, n:]
 
     def __repr__(self):
         name, unit = type(self.structure.system).__name__, self.structure.system.time_unit

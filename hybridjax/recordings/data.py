@@ -95,8 +95,7 @@ class SectionData(eqx.Module):
 
     def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""
-        records = tuple(replace(r, drift=float(cycles)) for r in self.records)
-        return replace(self, records=records)
+        return replace(self, records=tuple(replace(r, drift=float(cycles)) for r in self.records))
 
     @checked
     def experiments(self, periods: PeriodCount) -> ExperimentData:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.signal import detrend
 
 from .._core.arguments import require_equal
 from .._core.boundary.checked import checked
@@ -75,9 +76,9 @@ def section_data(
     that remains (`Record.drift`). Drift of sensors also moves the phase: remove it from the signals
     before (`without_drift`), as `identify_recording` does.
 
-    **Raises:** `DefinitionError` for unknown names, no names, constant signals, outputs that repeat
-    from cycle to cycle, another number of sections than the family's, a recording without a whole
-    cycle, and as `estimate_phase`.
+    **Raises:** `DefinitionError` for unknown names, no names, constant signals, outputs or times
+    that repeat from cycle to cycle, another number of sections than the family's, a recording
+    without a whole cycle, and as `estimate_phase`.
     """
     inputs, outputs = tuple(inputs), tuple(outputs)
     for name in (*inputs, *outputs):
@@ -121,6 +122,8 @@ def section_data(
     if timing is not None:
         names.append(Signal("time" if timing == "clock" else "duration", "s"))
         spikes = np.append(spikes, 0)
+        part, trial = max(zip(parts, trials, strict=True), key=lambda pair: len(pair[0].k))
+        _require_times(part, N, float(np.median(np.diff(recording.trials[trial].time))))
     # A smoothing spline averages over neighbors on both sides.
     lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
     change = np.median(np.concatenate([x.change for x in parts]), axis=0)
@@ -187,6 +190,21 @@ def _require_changes(
         raise DefinitionError(f"{text}Record it while it varies, or leave it out.")
 
 
+def _require_times(part: _Sections, N: int, step: float) -> None:
+    """**Raises:** `DefinitionError` for times that deviate by rounding, or by interpolation, whose
+    errors depend on the place of a crossing between samples, which are `step` seconds apart."""
+    at = np.flatnonzero((part.k % N == 0) & np.isfinite(part.values[:, -1]))[3:-3]  # (no ends)
+    if len(at) > 20:  # (of fewer cycles, the seven waves below explain too much)
+        t, late = part.t[at], detrend(part.values[at, -1])
+        waves = np.exp(2j * np.pi / step * np.outer(t - detrend(t), np.arange(4))).view(float)
+        left = late - waves @ np.linalg.lstsq(waves, late)[0]
+        if left.std() <= 0.1 * late.std() + ROUNDING * t[-1]:
+            raise DefinitionError(
+                "the times of sections deviate only by rounding and interpolation between samples, "
+                "as if the phase were the clock's own: leave `timing` out, or choose another phase."
+            )
+
+
 def _sample(
     time: Series,
     signals: Float[np.ndarray, "n nuy"],
@@ -234,7 +252,7 @@ def _with_times(
     parts: list[_Sections], N: int, period: float, timing: Literal["clock", "duration"]
 ) -> list[_Sections]:
     """Append the time of crossing as an output."""
-    late = [np.diff(p.t, prepend=np.nan) for p in parts]
+    late = [np.diff(np.where(p.observed, p.t, np.nan), prepend=np.nan) for p in parts]
     if timing == "clock" and parts:
         # A line through the times of each section, t = T cycle + a[section], all with the same
         # slope T; cycles are counted through gaps.
@@ -245,14 +263,10 @@ def _with_times(
         section = np.concatenate([p.k % N for p in parts])
         both = np.stack([np.concatenate(cycles), np.concatenate([p.t for p in parts])], axis=1)
         x, z = (both - average_cycle(section, both, N)[section]).T
-        late = np.split(z - (x @ z) / (x @ x) * x, np.cumsum([len(p.k) for p in parts])[:-1])
-    sections = []
-    for p, z in zip(parts, late, strict=True):
-        hidden = ~p.observed
-        if timing == "duration":
-            hidden |= np.insert(hidden, 0, True)[:-1]
-        sections.append(p._replace(values=np.column_stack([p.values, np.where(hidden, np.nan, z)])))
-    return sections
+        z = np.where(np.concatenate([p.observed for p in parts]), z - (x @ z) / (x @ x) * x, np.nan)
+        late = np.split(z, np.cumsum([len(p.k) for p in parts])[:-1])
+    pairs = zip(parts, late, strict=True)
+    return [p._replace(values=np.column_stack([p.values, z])) for p, z in pairs]
 
 
 @checked

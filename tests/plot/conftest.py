@@ -1,15 +1,8 @@
 import pytest
-from matplotlib import pyplot
 
 import hybridjax as hj
 
 from ..linear.conftest import hopper as hopper
-
-
-@pytest.fixture(autouse=True)
-def figures_are_closed():
-    yield
-    pyplot.close("all")
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ import io
 
 import numpy as np
 import pytest
-from matplotlib import pyplot
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
@@ -23,7 +22,6 @@ def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     explorer.move({"slope": 0.1})
     assert explorer.message == ""
     np.testing.assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
-    pyplot.close("all")
 
 
 def test_an_event_passes_the_phase_at_which_the_clock_begins():
@@ -48,7 +46,6 @@ def test_the_widget_sends_pictures():
         artist.set_animated(False)
     canvas.draw()
     assert np.mean(np.abs(sent - np.asarray(canvas.buffer_rgba())[..., :3]) > 64) < 1e-3
-    pyplot.close("all")
 
 
 @pytest.mark.parametrize(

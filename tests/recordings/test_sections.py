@@ -7,6 +7,7 @@ import re
 import equinox as eqx
 import numpy as np
 import pytest
+from matplotlib import pyplot
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
@@ -54,6 +55,12 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
         with pytest.raises(hj.DefinitionError, match="^x is the same in all cycles, but for round"):
             exact = hj.Recording(t, {"force": trial.values[:, 0], "x": z.real, "v": -z.imag})
             sample(exact, inputs=inputs)
+    assert sample(rhythm, inputs="force", timing="clock").outputs == ("x", "v", "time")
+    for rate in (1.0, 0.97):  # (with 64 samples in a cycle, all cycles are sampled alike)
+        clock = hj.Recording(t, {"clock": np.sin(2 * np.pi * rate * t)})
+        with pytest.raises(hj.DefinitionError, match="deviate only by rounding and interpolation"):
+            call = {"inputs": "force", "outputs": "x", "timing": "clock"}
+            sample(hj.Recording.beside([rhythm, clock]), hj.Crossing("clock", "rising"), **call)
     for step, few in ((13, True), (5, False)):
         thin = hj.Recording(t[::step], dict(zip(names, trial.values[::step].T, strict=True)))
         data = sample(thin, inputs="force")
@@ -209,7 +216,10 @@ def test_the_command(files, tmp_path, monkeypatch):
     assert len(rows) > 16 * 190
     assert {p.suffix for p in (out / "figures").iterdir()} == {".png"}
     assert (out / "notes.txt").read_text() == "mine"
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    monkeypatch.setattr(hj.plot, "validation", lambda validation: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        identify(files, "../new")
+    assert [p.name for p in tmp_path.iterdir()] == ["out"] and not pyplot.get_fignums()
 
 
 @pytest.mark.parametrize("name", ["summary.json", "figures/bode.png"])

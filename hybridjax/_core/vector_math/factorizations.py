@@ -59,8 +59,7 @@ def solve_positive(
         return jnp.stack(x, axis=-1)
 
     # (Derivatives use the factors, too.)
-    times = lambda x: x @ matrix  # noqa: E731
-    return jax.lax.custom_linear_solve(times, right, by_factors, symmetric=True)
+    return jax.lax.custom_linear_solve(lambda x: x @ matrix, right, by_factors, symmetric=True)
 
 
 @jax.jit

@@ -104,8 +104,7 @@ class SectionRegression(NamedTuple):
         """Return the response to the inputs and to the initial conditions that fit x best."""
         x_columns = x.reshape(*x.shape[:2], -1)
         forced = self.inputs @ a.reshape(len(a), x_columns.shape[2])
-        left = self.weight * (x_columns - forced)
-        free = self.to_starts @ (self.basis.swapaxes(1, 2) @ left)
+        free = self.to_starts @ (self.basis.swapaxes(1, 2) @ (self.weight * (x_columns - forced)))
         return (forced + self.starts @ free).reshape(x.shape)
 
 

@@ -184,10 +184,9 @@ def _from_states(
         A.append(later[:d].T)
         B.append(later[d : d + nu].T)
         K.append(later[d + nu :].T if innovations else np.zeros((later.shape[1], 0)))
-    model = PeriodicModel(A, B, C, D, K)
-    size = np.abs(np.linalg.eigvals(model.monodromy())).max()
+    size = np.abs(np.linalg.eigvals(PeriodicModel(A, B, C, D, K).monodromy())).max()
     shrunk = (SLOWEST / max(size, SLOWEST)) ** (1 / N)
-    model = model._replace(A=[a * shrunk for a in A])
+    model = PeriodicModel([a * shrunk for a in A], B, C, D, K)
     while innovations and _slowest_error(model) > SLOWEST:
         model = model._replace(K=[k / 2 for k in model.K])
     return model

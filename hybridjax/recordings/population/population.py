@@ -97,8 +97,7 @@ class Population:
             z, covariance = complex(fit.multipliers[0]), fit.multiplier_covariances[0]
             polar = np.array([[z.real, z.imag], [-z.imag / abs(z), z.real / abs(z)]]) / abs(z)
             squares = *np.diag(polar @ covariance @ polar.T), *np.diag(fit.covariance)
-            angle = abs(np.angle(z)) if z.imag else np.nan
-            values = abs(z), angle, *fit.coefficients
+            values = abs(z), abs(np.angle(z)) if z.imag else np.nan, *fit.coefficients
             numbers[:, : len(values), row] = values, np.sqrt(squares)
         kinds = ["modulus", "angle", *(f"c{k}" for k in range(1, most + 1))]
         values, errors = (dict(zip(kinds, x, strict=True)) for x in numbers)
