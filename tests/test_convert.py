@@ -16,14 +16,8 @@ N = 5
 @pytest.fixture(scope="module")
 def model():
     """A stable system whose dimension varies, with two inputs and an output."""
-    return _model([2, 3, 2, 1, 3])
-
-
-def _model(dims, nu=2):
-    blocks = blocks_at_random(0, dims, 1, nu)
-    return hj.LDTP.from_blocks(
-        *blocks, inputs={"u": "N", "w": ""} if nu == 2 else "u", outputs={"y": "m"}
-    )
+    blocks = blocks_at_random(0, [2, 3, 2, 1, 3], 1, 2)
+    return hj.LDTP.from_blocks(*blocks, inputs={"u": "N", "w": ""}, outputs={"y": "m"})
 
 
 def test_the_lifted_system_is_the_periodic_one(model):
@@ -141,15 +135,13 @@ def test_pandas(model):
     fit = hj.fit_series(hj.Record(u, model.simulate(u), n_sections=N), order=1)
     table = convert.to_pandas(fit)
     np.testing.assert_array_equal(table["real"] + 1j * table["imaginary"], fit.multipliers)
-    np.testing.assert_array_equal(
-        np.hypot(table["real_error"], table["imaginary_error"]), fit.standard_errors
-    )
+    errors = np.hypot(table["real_error"], table["imaginary_error"])
+    np.testing.assert_array_equal(errors, fit.standard_errors)
     np.testing.assert_array_equal(table["standard_error"], fit.standard_errors)
     rational = hj.fit_rational(model.htf(np.linspace(0.01, 0.4, 20)), input="u")
     table = convert.to_pandas(rational)
-    np.testing.assert_array_equal(
-        table["pole_real"] + 1j * table["pole_imaginary"], rational.poles[0]
-    )
+    poles = table["pole_real"] + 1j * table["pole_imaginary"]
+    np.testing.assert_array_equal(poles, rational.poles[0])
 
 
 def test_what_is_refused(model, monkeypatch):

@@ -149,6 +149,8 @@ def _prepare(
     for name in {*parameters.names} - {*DELAYS}:
         check_symmetry(near.system, near.structure.sizes(near.settings.scale), name)
     prepared = tuple(observation.prepare(near) for observation in observations)
+    if len({bool(observation.weighted) for observation in prepared}) > 1:
+        raise DefinitionError("give standard deviations of all data, or of none.")
     return FitProblem(parameters, prepared), near
 
 
@@ -219,7 +221,7 @@ def _summary(problem: FitProblem, system: HybridSystem, ends: list[End], best: E
     identified = diagnose(parameters.names, sensitivity)
     rank = identified.rank
     freedom = len(residuals) - rank
-    unit = problem.unit(best.cost / max(freedom, 1))
+    unit = problem.unit(best.cost, freedom)
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
     root = left[:, :rank] / singular[:rank] * size[:, None]
     return ModelFit(

@@ -22,8 +22,8 @@ from ..systems.system import HybridSystem, unit_of_parameter
 from .problem import DELAYS, FitProblem, evaluate
 
 
-# Singular values of the sensitivities below this part of the largest one are zero. Larger: badly
-# identified combinations count as unidentifiable. Smaller: rounding identifies them.
+# Singular values of the sensitivities below this, or below this part of the largest one, are zero.
+# Larger: badly identified combinations count as unidentifiable. Smaller: rounding identifies them.
 _RANK = 1e-9
 # Entries of a direction this close to zero, or to ratios of integers with denominators up to the
 # largest one, are replaced by these (they have no unit); a basis is solved for entries whose
@@ -80,7 +80,7 @@ def diagnose(names: tuple[str, ...], sensitivity: Float[np.ndarray, "r p"]) -> I
     of the parameters."""
     _, values, rows = np.linalg.svd(np.linalg.qr(sensitivity, mode="r"))
     values = np.concatenate([values, np.zeros(len(names) - len(values))])
-    rank = int(np.sum(values > _RANK * values[0]))
+    rank = int(np.sum(values > _RANK * max(values[0], 1.0)))
     return Identifiability(names, rank, values, _readable(rows[rank:]), sensitivity)
 
 
@@ -144,7 +144,8 @@ class ModelFit(eqx.Module):
     - `names`, `values` (p,): the free parameters.
     - `covariance` (p, p): of the values, $(J^T J)^+$ with the Jacobian J of the residuals in units
         of their standard deviations (estimated from the residuals where the data have none); zero
-        along combinations that the data do not identify.
+        along combinations that the data do not identify; NaN without standard deviations if
+        `freedom` is 0.
     - `residuals` (r,): weighted, those of all observations one after the other.
     - `cost`: sum of their squares. `freedom`: r less the number of identified combinations; the
         expected cost where all data have standard deviations.
@@ -174,7 +175,8 @@ class ModelFit(eqx.Module):
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " p"]:
-        """Standard error of each value; infinite for a parameter that is not identified alone."""
+        """Standard error of each value; infinite for a parameter that is not identified alone, NaN
+        without standard deviations of the data if `freedom` is 0."""
         lost = np.any(self.identifiability.unseen != 0, axis=0)
         return np.where(lost, np.inf, np.sqrt(np.diag(self.covariance)))
 
@@ -189,25 +191,26 @@ class ModelFit(eqx.Module):
 
         **Arguments:** `true`: a system, or values by name.
 
-        **Raises:** `DefinitionError` if a value is missing.
+        **Raises:** `DefinitionError` if a value is missing, or if the fit has no standard errors.
         """
         if isinstance(true, HybridSystem):
-            named = [name for name in self.names if name not in DELAYS]
-            true = {name: operator.attrgetter(name)(true) for name in named}
+            true = {x: operator.attrgetter(x)(true) for x in self.names if x not in DELAYS}
         missing = [name for name in self.names if name not in true]
         if missing:
             raise DefinitionError(f"`true` must have a value of '{missing[0]}', which was fitted.")
         values = jnp.array([float(true[name]) for name in self.names])
         r, *_ = evaluate(self.problem, self.problem.parameters.encode(values), self.cycle)
-        return (float(r @ r) - self.cost) / self.problem.unit(self.cost / max(self.freedom, 1))
+        unit = self.problem.unit(self.cost, self.freedom)
+        if np.isnan(unit):
+            raise DefinitionError("give `std`: no residual is left to estimate standard errors.")
+        return (float(r @ r) - self.cost) / unit
 
     @checked
     def contains(self, true: HybridSystem | Mapping[str, float], level: Probability = 0.95) -> bool:
         """Test whether other values lie in the joint confidence region."""
-        rank = self.identifiability.rank
-        if self.weighted:
-            return bool(self.chi_square(true) <= stats.chi2(rank).ppf(level))
-        return bool(self.chi_square(true) <= rank * stats.f(rank, self.freedom).ppf(level))
+        rank = max(self.identifiability.rank, 1)
+        region = stats.chi2(rank) if self.weighted else stats.f(rank, self.freedom, scale=rank)
+        return bool(self.chi_square(true) <= region.ppf(level))
 
     def __repr__(self) -> str:
         width = max(map(len, self.names))
@@ -228,9 +231,8 @@ class ModelFit(eqx.Module):
     def _rows(self) -> Iterator[tuple[str, str, str, str]]:
         """Yield each name with its value, standard error and unit."""
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            shown = f"± {error:.2g}" if np.isfinite(error) else "not identified alone"
-            system = self.system
-            unit = system.time_unit if name in DELAYS else unit_of_parameter(system, name)
+            shown = "not identified alone" if np.isinf(error) else f"± {error:.2g}"
+            unit = self.system.time_unit if name in DELAYS else unit_of_parameter(self.system, name)
             yield name, f"{value:.9g}", shown, unit
 
     def _repr_html_(self) -> str:

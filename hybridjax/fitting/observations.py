@@ -213,10 +213,10 @@ class ObservedCycle(AbstractObservation):
 
     Times of events are times of their sections: `ObservedCycle([hj.AtEvent("liftoff"),
     hj.AtEvent("touchdown")], times=(0.5163, 1.3510))`. Times of a clocked system are its clock's,
-    modulo the period; those of an autonomous one count from section 0.
+    modulo the period; those of an autonomous one count from any moment.
 
     Residuals are in units of the standard deviations where these are given, otherwise relative to
-    the rms of each output and to the period.
+    the rms of each output and of the times, and to the period.
     """
 
     sections: AbstractSections
@@ -247,7 +247,8 @@ class ObservedCycle(AbstractObservation):
           `period_std`.
 
         **Raises:** `DefinitionError` without any measurement, for shapes that do not fit, NaN,
-        standard deviations that are not positive, or none for something that is zero throughout.
+        standard deviations that are not positive or not given for all, or none for something that
+        is zero throughout.
         """
         self.sections = as_family(sections)
         self.outputs = tuple(outputs)
@@ -264,11 +265,11 @@ class ObservedCycle(AbstractObservation):
         for name, (x, _, axes) in given.items():
             require_axes(f"`{name}`", x, axes)
         self.measured = tuple(jnp.asarray(x, float) for x, *_ in given.values())
-        self.scales = tuple(
-            _scale(name, std, x)
-            for x, (name, (_, std, _)) in zip(self.measured, given.items(), strict=True)
-        )
-        self.weighted = jnp.asarray(all(std is not None for _, std, _ in given.values()))
+        self.scales = tuple(_scale(k, std, jnp.asarray(x)) for k, (x, std, _) in given.items())
+        weights = {std is not None for _, std, _ in given.values()}
+        if len(weights) > 1:
+            raise DefinitionError("give standard deviations of all measurements, or of none.")
+        self.weighted = jnp.asarray(weights.pop())
 
     @classmethod
     def of(
@@ -280,17 +281,18 @@ class ObservedCycle(AbstractObservation):
         """
         placed = place_sections(cycle, sections)
         values = placed.observe(outputs) if outputs else None
-        times = _times(cycle, placed.lanes.t)
-        times = times if np.any(times) else None
+        t = placed.lanes.t if cycle.clocked else placed.lanes.t - placed.lanes.t[0]
+        times = t if np.any(t) else None
         return cls(placed.family, outputs, values, times=times, period=cycle.period)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         t, y = observed_at(cycle, self.sections, self.outputs, last_turn(cycle))
-        predicted = {"values": y, "times": _times(cycle, t), "period": cycle.period}
+        predicted = {"values": y, "times": t, "period": cycle.period}
         parts = []
         for name, measured, scale in zip(self.which, self.measured, self.scales, strict=True):
             error = predicted[name] - measured
-            if name == "times" and cycle.clocked:
+            if name == "times":
+                error = error if cycle.clocked else error[1:] - error[0]
                 turns = jnp.round(error / cycle.period)
                 error = error - jax.lax.stop_gradient(turns) * cycle.period
             parts.append((error / scale).ravel())
@@ -305,10 +307,6 @@ class ObservedCycle(AbstractObservation):
 def _real(H: Array, measured: Array, weights: Array) -> Float[Array, " r"]:
     error = ((H - measured) * weights).ravel()
     return jnp.concatenate([error.real, error.imag])
-
-
-def _times(cycle: LimitCycle, t: Float[Array, " N"]) -> Float[Array, " N"]:
-    return t if cycle.clocked else t - t[0]
 
 
 def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:

@@ -32,8 +32,9 @@ _TOLERANCE = 1e-9
 # Evaluations of the model from one guess. Fewer: distant guesses do not converge. More: hopeless
 # ones take longer.
 MAX_STEPS = 64
-# No step is taken along directions whose sensitivity is below this part of the largest one. Larger:
-# badly identified parameters keep their initial values. Smaller: unidentifiable ones wander off.
+# No step is taken along directions whose sensitivity is below this part of the largest one, and
+# none can improve the fit if it is below this. Larger: badly identified parameters keep their
+# initial values. Smaller: unidentifiable ones wander off.
 _RCOND = 1e-8
 # A step is accepted if the cost falls by this part of the predicted reduction; beyond a larger part
 # the damping falls. Lower: steps that gain nothing count. Higher: good ones are repeated.
@@ -131,8 +132,7 @@ def free_parameters(
     **Raises:** `DefinitionError` for names that are no numbers of the system, or bounds that do not
     enclose the values that it has.
     """
-    free = (free,) if isinstance(free, str) else free
-    names = tuple(free)
+    names = (free,) if isinstance(free, str) else tuple(free)
     if not names or len(set(names)) < len(names):
         raise DefinitionError(f"`free` must name one parameter or more, each once, not {names}.")
     rows = []
@@ -194,11 +194,13 @@ class FitProblem(eqx.Module):
         """True if all data have standard deviations."""
         return all(bool(observation.weighted) for observation in self.observations)
 
-    def unit(self, misfit: float) -> float:
-        """Return the factor of covariances for a misfit, the cost relative to its expected value:
-        that of variances that are estimated, or the misfit where there are none."""
+    def unit(self, cost: float, freedom: int) -> float:
+        """Return the factor of covariances for the cost of a fit, from the cost relative to its
+        expected value: that of variances that are estimated, or this misfit where there are none
+        (NaN if no residual is left to estimate it)."""
+        misfit = cost / max(freedom, 1)
         if not self.weighted:
-            return max(misfit, np.finfo(float).tiny)
+            return max(misfit, np.finfo(float).tiny) if freedom else np.nan
         htfs = [x for x in self.observations if isinstance(x, ObservedHTF)]
         return estimated_noise(max((float(x.most) for x in htfs), default=1.0), misfit)[1] ** 2
 
@@ -260,31 +262,31 @@ def descend(
     Steps are accepted and their damping changes as in `optimistix.LevenbergMarquardt`. Here the
     iteration runs on the host, so that only the model is compiled.
     """
-    trial, damping = x, 1.0
+    damping, steps = 1.0, 1
     r, J, near = evaluate(problem, x, guess)
-    for steps in range(1, MAX_STEPS + 1):
-        if steps > 1:
-            change = trial - x
-            r_new, J_new, nearer = evaluate(problem, trial, near)
-            predicted = (J @ change) @ (J @ change + 2 * r)
-            gain = (r_new - r) @ (r_new + r)
-            is_better = gain <= _ACCEPTED * predicted
-            # (Rounding decides whether a step of this size is accepted.)
-            done = _small(change, trial) and (_small(r_new - r, r_new) or not is_better)
-            if is_better:
-                damping /= _LESS if gain < _GOOD * predicted < 0 else 1.0
-                x, r, J, near = trial, r_new, J_new, nearer
-            else:
-                damping *= _MORE
-            if done:
-                # (Steps become short, too, where none helps: beside parameters without a cycle.)
-                gain = r @ J @ np.linalg.lstsq(J, r, rcond=_RCOND)[0]
-                return x, r, J, near, steps, bool(gain <= _TOLERANCE * (1 + r @ r))
-        if not (np.isfinite(r).all() and np.isfinite(J).all()):
-            break
+
+    def step(damping):
         damped = np.concatenate([J, np.sqrt(damping) * np.eye(len(x))])
-        short = np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
-        trial = x - short
+        return np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
+
+    while steps < MAX_STEPS and np.isfinite(r).all() and np.isfinite(J).all():
+        trial, steps = x - step(damping), steps + 1
+        change = trial - x
+        r_new, J_new, nearer = evaluate(problem, trial, near)
+        predicted = (J @ change) @ (J @ change + 2 * r)
+        gain = (r_new - r) @ (r_new + r)
+        is_better = gain <= _ACCEPTED * predicted
+        # (Rounding decides whether a step of this size is accepted.)
+        done = _small(change, trial) and (_small(r_new - r, r_new) or not is_better)
+        if is_better:
+            damping /= _LESS if gain < _GOOD * predicted < 0 else 1.0
+            x, r, J, near = trial, r_new, J_new, nearer
+        else:
+            damping *= _MORE
+        if done:
+            # (Steps become short, too, where none helps: beside parameters without a cycle.)
+            gain = r @ J @ step(_RCOND**2)
+            return x, r, J, near, steps, bool(gain <= _TOLERANCE * (1 + r @ r))
     return x, r, J, near, steps, False
 
 

@@ -45,6 +45,9 @@ class Impact(NamedTuple):
     """Of the contacts on the mechanism, along the k coordinates of the contacts."""
 
 
+_DEPENDENT = "the coordinates of `contact` must be independent; their inverse mass matrix is"
+
+
 def _no_potential(q):
     return 0.0
 
@@ -70,9 +73,9 @@ class Mechanism(eqx.Module):
         meters. Default: none.
 
     Methods take one state, in fields, guards, resets and outputs. They compile to plain arithmetic
-    operations without LAPACK. If the mass matrix is singular or not positive, methods raise
-    `DefinitionError` for arrays of numbers. In fields and resets they return NaN, and the
-    trajectory ends with `Result.FIELD_NOT_FINITE`.
+    operations without LAPACK. If the mass matrix is singular or not positive, or contacts are not
+    independent, methods raise `DefinitionError` for arrays of numbers. In fields and resets they
+    return NaN, and the trajectory ends with `Result.FIELD_NOT_FINITE`.
     """
 
     kinetic: Callable[[Any, Any], Any]
@@ -129,10 +132,13 @@ class Mechanism(eqx.Module):
         States should satisfy c = const. and J v = 0. An error in these is not corrected: J v keeps
         its value up to rounding, and c drifts accordingly.
         """
-        mass, (jacobian, drift) = self.mass(q), _moving(contact, q, v)
-        solved = _solve(mass, jnp.concatenate([(force - self.bias(q, v))[None], jacobian]))
+        place = lambda q: as_vector(contact(q))  # noqa: E731
+        speed = lambda q: jax.jvp(place, (q,), (v,))[1]  # noqa: E731
+        # (The drift is the part of the contact's acceleration that the velocities make.)
+        jacobian, drift = jax.jacfwd(place)(q), jax.jvp(speed, (q,), (v,))[1]
+        solved = _solve(self.mass(q), jnp.concatenate([(force - self.bias(q, v))[None], jacobian]))
         free, by_force = solved[0], solved[1:].T
-        constraint = solve_positive(jacobian @ by_force, -(drift + jacobian @ free))
+        constraint = _solve(jacobian @ by_force, -(drift + jacobian @ free), _DEPENDENT)
         return Constrained(free + by_force @ constraint, constraint)
 
     def impact(
@@ -154,7 +160,7 @@ class Mechanism(eqx.Module):
         """
         jacobian = jax.jacfwd(lambda q: as_vector(contact(q)))(q)
         by_impulse = _solve(self.mass(q), jacobian).T
-        impulse = solve_positive(jacobian @ by_impulse, -(1 + restitution) * (jacobian @ v))
+        impulse = _solve(jacobian @ by_impulse, -(1 + restitution) * (jacobian @ v), _DEPENDENT)
         return Impact(v + by_impulse @ impulse, impulse)
 
     def along(self, placement: Callable[[Any], Any]) -> "Mechanism":
@@ -172,15 +178,9 @@ class Mechanism(eqx.Module):
         )
 
 
-def _solve(mass, right):
-    """**Raises:** `DefinitionError` for a mass matrix that is singular or not positive."""
-    if not is_traced(mass) and not np.all(np.linalg.eigvalsh(mass) > 0):
-        raise DefinitionError(f"the kinetic energy must be positive; its mass matrix is {mass}.")
-    return solve_positive(mass, right)
-
-
-def _moving(contact, q, v):
-    """The Jacobian of a contact, and the part of its acceleration that the velocities make."""
-    place = lambda q: as_vector(contact(q))  # noqa: E731
-    speed = lambda q: jax.jvp(place, (q,), (v,))[1]  # noqa: E731
-    return jax.jacfwd(place)(q), jax.jvp(speed, (q,), (v,))[1]
+def _solve(mass, right, text="the kinetic energy must be positive; its mass matrix is"):
+    """**Raises:** `DefinitionError` for a matrix of mass that is singular or not positive."""
+    solution = solve_positive(mass, right)
+    if not is_traced(solution) and np.isnan(solution).any():
+        raise DefinitionError(f"{text} {mass}.")
+    return solution

@@ -163,7 +163,8 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
     whole = xp.einsum("ij,pjab->piab", integral, rate)
     C = free @ (C[:, None, :d, :d] + whole) @ xp.swapaxes(free, -1, -2)
     off = xp.max(xp.abs(C[:, -1] - after[:, :d, :d]), axis=0)
-    unresolved = xp.max(off / xp.maximum(xp.max(xp.abs(C), axis=(0, 1)), 1e-300))
+    size = xp.sqrt(xp.max(xp.abs(xp.diagonal(C, axis1=2, axis2=3)), axis=(0, 1)))
+    unresolved = xp.max(off / xp.maximum(size[:, None] * size, 1e-300))
     C = across @ C @ xp.swapaxes(across, -1, -2)
     to_end = last[:d, :d] @ xp.swapaxes(to_end, -1, -2)
     return Fluctuations(

@@ -36,7 +36,7 @@ def test_a_parameter_keeps_its_sign_by_default():
 
 
 H = np.ones((1, 3, 1, 1), complex)
-F = np.array([0.1, 0.2, 0.3])
+F, TIMES = np.array([0.1, 0.2, 0.3]), np.arange(8.0)
 
 
 def records(**options):
@@ -60,11 +60,9 @@ def records(**options):
         (lambda: hj.ObservedSeries(records(begin=0.8), SECTIONS, 0.1), "do not begin on the cycle"),
         (lambda: hj.ObservedCycle(SECTIONS), "`times`, or a `period`"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM"), "`outputs` with their `values`"),
-        (
-            lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))),
-            r"of shape \(8 sections, 1 outputs\)",
-        ),
+        (lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))), r"shape \(8 sections, 1 out"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))), "zero throughout"),
+        (lambda: hj.ObservedCycle(SECTIONS, times=TIMES, period=1.0, period_std=0.1), "or of none"),
     ],
 )
 def test_bad_data_are_refused(make, message):

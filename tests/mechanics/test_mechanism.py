@@ -90,5 +90,8 @@ def test_a_singular_mass_matrix_ends_the_trajectory_with_its_cause():
     found = hj.simulate(system, "move", (0.0, 0.0, 1.5, 0.0), 5.0, throw=False)
     assert found.result == hj.Result.FIELD_NOT_FINITE
     np.testing.assert_allclose(found.t[-1], 2 / 3, rtol=1e-6)
+    for method, force in ((free_ball().impact, ()), (free_ball().constrained, (0.0,))):
+        with pytest.raises(hj.DefinitionError, match="`contact` must be independent"):
+            method(jnp.ones(2), jnp.ones(2), *force, lambda q: [q[1], 2 * q[1]])
     with pytest.raises(hj.DefinitionError, match="kinetic energy must be positive"):
         hj.Mechanism(lambda q, v: -0.5 * v @ v).acceleration(jnp.zeros(2), jnp.zeros(2))

@@ -62,6 +62,11 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     np.testing.assert_allclose(both, noisy.diffusion * noisy.period, rtol=1e-11)
 
 
+def test_states_may_have_no_correlation():
+    noisy = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0)).fluctuations({"u": 0.2})
+    np.testing.assert_allclose(noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12)
+
+
 def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     """The chain of times, heights and speeds (t, y, v) after bounces."""
     noisy, (t, v) = juggler.fluctuations(**NOISE), _at_impact(juggler)
