@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import kernel
-from .._core.executor import from_host, on_host
+from .._core.executor import from_host, is_traced, on_host
 from .._core.lanes import PerLane, by_lane
 from ..systems.solver import Method
 from ..systems.structure import Kind, Member, Structure, stacked
@@ -109,8 +109,10 @@ def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
     return s.kernel(_due, _expanded, g)(t, q, u)
 
 
-def by_parameter_of_period(s: Structure) -> float:
+def by_parameter_of_period(s: Structure) -> Any:
     """The derivative of the period of a clock by the only input, which is added to a parameter."""
+    if is_traced(s):
+        return jax.jacfwd(lambda u: _period(s, 0.0, 0.0, u))(jnp.zeros(1))[0, 0]
     return s.kernel(_period, _expanded)(*(np.zeros(x) for x in [1, (0, 1), (1, 1)]))[0, -1, 0]
 
 

@@ -104,7 +104,7 @@ def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
     over a scheduled one."""
     s, period, events = map.structure, float(turn.period), events_of(turn)
     if map.event >= 0:  # the turn begins with the event that ends it
-        events = [(map.event, float(turn.legs.t[0])), *events]
+        events = [(map.event, float(np.asarray(turn.legs.t)[0])), *events]
     for (g, t), (other, later) in itertools.pairwise(events):
         if later - t <= TOGETHER * period:
             return g, other

@@ -16,11 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import at_ease
-from .._core.executor import Array, namespace, on_host, put, scan, stop_gradient, svdvals
+from .._core.executor import namespace, on_host, put, scan, stop_gradient, svdvals, to_host
 from .._core.lanes import PerLane
 from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
+from ..engine.arrays import Array
 from ..engine.events import arm
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
@@ -166,9 +167,10 @@ class ReturnMap(eqx.Module):
         """The map of another system; a clocked one begins at the same phase of its own clock."""
         if self.base is not None:
             return dataclasses.replace(self, system=system)
-        expected = self.multiplicity * jnp.asarray(system.period(), float)
-        anchor = self.anchor._replace(t=self.anchor.t * (expected / self.expected))
-        return dataclasses.replace(self, system=system, anchor=anchor, expected=expected)
+        new, old, t = to_host((jnp.asarray(system.period(), float), self.expected, self.anchor.t))
+        new = namespace(new).asarray(self.multiplicity * new)
+        anchor = self.anchor._replace(t=t * (new / old))
+        return dataclasses.replace(self, system=system, anchor=anchor, expected=new)
 
     def watch(self, lanes: Lanes, target: Target) -> Watch:
         """Guards and levels at lanes, without input."""
@@ -443,8 +445,3 @@ def with_derivatives(
 def turn_product(factors: Float[np.ndarray, "S K d d"]) -> Float[np.ndarray, "S d d"]:
     """Products of the factors of S turns, on the host."""
     return ft.reduce(lambda product, factor: factor @ product, np.moveaxis(factors, 1, 0))
-
-
-def derivative_at_zero(function: Callable[[Array], Array]) -> Array:
-    """The derivative of a function of one number, at zero."""
-    return jax.jvp(function, (jnp.zeros(()),), (jnp.ones(()),))[1]

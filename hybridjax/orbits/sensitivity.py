@@ -8,7 +8,6 @@ Wang, J. P. Gill, H. J. Chiel, P. J. Thomas, SIAM J. Appl. Dyn. Syst. 20, 2021).
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -24,7 +23,7 @@ from ..systems.varied import Varied
 from .crossing import AtEvent, ListLevels
 from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
 from .responses import Phases, loop
-from .return_map import SINGULAR, ReturnMap, derivative_at_zero, with_derivatives
+from .return_map import SINGULAR, ReturnMap, with_derivatives
 
 
 @checked_methods
@@ -85,10 +84,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     closed, Z = loop(map, whole, f0)
     longer = -(Z @ total[:, 0])
     if clocked:
-        period_at = lambda k: jnp.asarray(varied.under(k[None]).system.period(), float)  # noqa: E731
-        longer = map.multiplicity * derivative_at_zero(period_at)
-        scaled = closed * map.sizes / map.sizes[:, None]
-        if on_host(whole) and svdvals(scaled)[-1] < SINGULAR:
+        longer = map.multiplicity * kernels.by_parameter_of_period(varied)
+        if on_host(whole) and svdvals(closed * map.sizes / map.sizes[:, None])[-1] < SINGULAR:
             raise ComputationError(
                 "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
                 "branch by `continuation`."
