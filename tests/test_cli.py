@@ -80,6 +80,7 @@ WRONG = {
         "--phase y,v --center 1": "--center: '1' is not two numbers",
         "--phase y,v --scale 1,-2": "--scale: '1,-2' is not two positive numbers",
         "--event e --order 1000000000000": "--order: '1000000000000' is not a whole number",
+        "--event e --drift 2": "--drift: '2' is not a number of cycles, four or more",
         "--event e --bandwidth 0": "--bandwidth: '0' is not a positive number",
         "--event e --sections 8.5": "--sections: '8.5' is not a whole number from 1 to",
         "--crossing y:up": "'y:up' is not a signal, a direction and a value",

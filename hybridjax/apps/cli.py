@@ -56,6 +56,7 @@ _place = _option("a name", "(.+)", str)
 _count = _option(f"a whole number from 1 to {limits.PERIODS}", "(.*)", _COUNT)
 _seed = _option("a whole number from 0 on", "(.*)", _between(int, 0))
 _positive = _option("a positive number", "(.*)", _POSITIVE)
+_cycles = _option("a number of cycles, four or more", "(.*)", _between(float, 4))
 _names = _option("a list of different names", "(.*)", _different)
 _two_names = _option("two names with a comma in between", "([^,]*,[^,]*)", _different)
 _two_numbers = _option("two numbers as in 1.5,0", "([^,]*),([^,]*)", _FINITE, _FINITE)
@@ -168,7 +169,7 @@ def _add_identify(commands) -> None:
         help="column with the times (default: %(default)s)")  # fmt: skip
     add("--timing", choices=("clock", "duration"), help="an extra output, from when "
         "sections are crossed: for systems with a clock, or without")  # fmt: skip
-    add("--drift", type=_positive, metavar="CYCLES", help="remove changes of the cycle that take "
+    add("--drift", type=_cycles, metavar="CYCLES", help="remove changes of the cycle that take "
         "longer than this")  # fmt: skip
     _add_results(identify)
     identify.set_defaults(run=_identify, parser=identify)

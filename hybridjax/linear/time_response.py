@@ -71,8 +71,7 @@ def periodic_states(
     w = xp.tensordot(u, after[::-1] @ B, ((2, 3), (0, 2)))
     z_N = np.exp(2j * np.pi * np.arange(periods) / periods)
     resolvent = z_N[:, None, None] * identity - phi
-    x = solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1))
-    return xp.mean(x, axis=0).real.T
+    return solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1)).mean(axis=0).real.T
 
 
 @jax.jit
