@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import at_ease
-from .._core.executor import namespace, on_host, put, scan, stop_gradient, svdvals, to_host
+from .._core.executor import namespace, on_host, put, scan, stop_gradient, svdvals
 from .._core.lanes import PerLane
 from .._core.memo import remembered
 from .._core.results import Result
@@ -167,10 +167,9 @@ class ReturnMap(eqx.Module):
         """The map of another system; a clocked one begins at the same phase of its own clock."""
         if self.base is not None:
             return dataclasses.replace(self, system=system)
-        new, old, t = to_host((jnp.asarray(system.period(), float), self.expected, self.anchor.t))
-        new = namespace(new).asarray(self.multiplicity * new)
-        anchor = self.anchor._replace(t=t * (new / old))
-        return dataclasses.replace(self, system=system, anchor=anchor, expected=new)
+        expected = self.multiplicity * jnp.asarray(system.period(), float)
+        anchor = self.anchor._replace(t=self.anchor.t * (expected / self.expected))
+        return dataclasses.replace(self, system=system, anchor=anchor, expected=expected)
 
     def watch(self, lanes: Lanes, target: Target) -> Watch:
         """Guards and levels at lanes, without input."""
