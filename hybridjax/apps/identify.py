@@ -150,10 +150,9 @@ def write_results(folder: Path, result: Identification, formats: Sequence[Format
     edge = min(max(result.advice.band), data.n_sections / 2)
     htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
     images = {}
-    with off_screen():
-        for name, drawn in _figures(result, htf):
-            image, *_ = look.save_and_close(folder / "figures" / name, drawn, with_png(formats))
-            images[name] = base64.b64encode(image.read_bytes()).decode()
+    for name, drawn in _figures(result, htf):
+        image, *_ = look.save_and_close(folder / "figures" / name, drawn, with_png(formats))
+        images[name] = base64.b64encode(image.read_bytes()).decode()
     save(folder / "htf.npz", htf)
     save(folder / "fit.npz", result.fit)
     header = [f"{n} ({u})" if u else n for n, u in zip(data.signals, data.units, strict=True)]
@@ -170,13 +169,6 @@ def write_results(folder: Path, result: Identification, formats: Sequence[Format
     _write_table(folder / "cycle.csv", ["section", "phase (cycles)", *header], average)
     (folder / "summary.json").write_text(json.dumps(summarize(result), indent=1) + "\n")
     (folder / PAGE).write_text(_page(result, images), encoding="utf-8")
-
-
-def off_screen() -> contextlib.AbstractContextManager:
-    """Return a context in which figures need no window."""
-    import matplotlib
-
-    return matplotlib.rc_context({"backend": "agg"})
 
 
 def page_of(title: str, parts: Iterable[str]) -> str:

@@ -31,7 +31,7 @@ from ..plot.look import save_and_close
 from ..recordings.population.population import Population
 from ..recordings.population.tables import factors_of, table_of
 from ..recordings.read import read_recording
-from .identify import PAGE, off_screen, page_of, report_folder, steps_of, with_png, write_results
+from .identify import PAGE, page_of, report_folder, steps_of, with_png, write_results
 
 
 # Columns of the table of a study, and their names in the summaries.
@@ -220,7 +220,7 @@ def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) ->
         *(f"<p>{escape(x)}</p>" for x in methods),
     ]
     with results_folder(study.folder, "population", _FILES) as new:
-        with off_screen(), contextlib.suppress(DefinitionError):  # for too few subjects
+        with contextlib.suppress(DefinitionError):  # for too few subjects
             save_and_close(new / "forest", plot.forest(population, "modulus"), with_png(formats))
             parts.append('<img alt="Modulus of the leading multiplier" src="forest.png">')
         population.table.assign(**population.values, **errors).to_csv(new / _FILES[0], index=False)

@@ -189,7 +189,7 @@ class ModelFit(eqx.Module):
         depend on the parametrization, and follows curved regions. Where the data have no standard
         deviations, or estimated ones, it is in units that the residuals show.
 
-        **Arguments:** `true`: a system, or values by name.
+        **Arguments:** `true`: values by name, or a system, of which the fitted parameters count.
 
         **Raises:** `DefinitionError` if a value is missing, or if the fit has no standard errors.
         """
