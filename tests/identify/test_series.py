@@ -168,7 +168,7 @@ def test_an_order_that_is_too_low_is_noticed(small):
         with pytest.warns(FindingWarning, match=text) as caught:
             fit = hj.fit_series(data, 1)
         assert caught[0].filename == __file__
-        assert fit.doubt in repr(fit) and "may be too low" in fit._repr_html_()
+        assert fit.doubt in " ".join(repr(fit).split()) and "too low" in fit._repr_html_()
         bent = with_outputs(data, data.y + 0.1 * data.y**2 / data.y.std())
         assert not hj.fit_series(bent, 2).doubt
     design = hj.multisine(4, 8, amplitude=1.0).realizations(4)
