@@ -59,7 +59,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The first rows of a table, and how many more there are."""
     rows = list(rows)
     lines = [_row("th", head), *(_row("td", row) for row in rows[:_ROWS])]
-    lines += [_row("td", [f"and {len(rows) - _ROWS} more"])] * (len(rows) > _ROWS)
+    if len(rows) > _ROWS:
+        lines.append(_row("td", [f"and {len(rows) - _ROWS} more"]))
     return f'<table class="plain">{"".join(lines)}</table>'
 
 

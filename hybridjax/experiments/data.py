@@ -236,5 +236,6 @@ def summary(
         cycle, section = divmod(int(failed_at[s]), n_sections)
         where = f"section {section}, cycle {cycle}: " if failed_at[s] >= 0 else ""
         text.append(f"#{s}: {where}{causes[s] if causes else Result(int(result[s])).message}")
-    text += [f"and {len(failed) - limit} more"] * (len(failed) > limit)
+    if len(failed) > limit:
+        text.append(f"and {len(failed) - limit} more")
     return folded("; ".join(text))

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
+from scipy.linalg import helmert
 
 from .._core.arguments import Numbers, require_axes, require_same
 from .._core.boundary.checked import checked
@@ -281,8 +282,7 @@ class ObservedCycle(AbstractObservation):
         """
         placed = place_sections(cycle, sections)
         values = placed.observe(outputs) if outputs else None
-        t = placed.lanes.t if cycle.clocked else placed.lanes.t - placed.lanes.t[0]
-        times = t if np.any(t) else None
+        times = placed.lanes.t if np.any(placed.lanes.t) else None
         return cls(placed.family, outputs, values, times=times, period=cycle.period)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
@@ -292,9 +292,10 @@ class ObservedCycle(AbstractObservation):
         for name, measured, scale in zip(self.which, self.measured, self.scales, strict=True):
             error = predicted[name] - measured
             if name == "times":
-                error = error if cycle.clocked else error[1:] - error[0]
-                turns = jnp.round(error / cycle.period)
+                turns = jnp.round((error if cycle.clocked else error - error[0]) / cycle.period)
                 error = error - jax.lax.stop_gradient(turns) * cycle.period
+                if not cycle.clocked:  # any moment may be zero: only differences count
+                    error = helmert(len(error)) @ error
             parts.append((error / scale).ravel())
         return jnp.concatenate(parts)
 

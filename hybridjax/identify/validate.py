@@ -115,7 +115,8 @@ class Validation(eqx.Module):
             f"correlated in time: {verdict[self.white]}; with the input: "
             f"{verdict[self.independent]} (level {self.level:g})"
         )
-        rows += [f"records too short to compare, left out: {self.left_out}"] * bool(self.left_out)
+        if self.left_out:
+            rows.append(f"records too short to compare, left out: {self.left_out}")
         pairs = zip(self.visible, self.outputs, strict=True)
         visible = ", ".join(f"{100 * x:.2g} % of {name}" for x, name in pairs)
         rows.append(folded(f"misfits that would be noticed in four of five such data: {visible}"))

@@ -114,7 +114,10 @@ class LimitCycle(eqx.Module):
         self.require_current()
         code = Result.OK if is_traced(self.result) else Result(int(self.result))
         if code not in _FOUND:
-            raise DefinitionError(f"no cycle was found ({code.message}): take another guess.")
+            raise DefinitionError(
+                f"the search for this cycle failed ({code.message}): `find_limit_cycle` of its "
+                "system raises an error that says what to do."
+            )
 
     @property
     def structure(self) -> Structure:

@@ -115,7 +115,8 @@ class LimitCycles(eqx.Module):
         """`10000/10000 found`, or the reasons of the first `limit` failures. Default: 5."""
         text = [f"{self.ok.sum()}/{len(self)} found"]
         text += [f"#{i}: {Result(int(self.result[i])).message}" for i in self.failed[:limit]]
-        text += [f"and {len(self.failed) - limit} more"] * (len(self.failed) > limit)
+        if len(self.failed) > limit:
+            text.append(f"and {len(self.failed) - limit} more")
         return folded("; ".join(text))
 
     def __repr__(self):

@@ -260,7 +260,8 @@ class Responses(eqx.Module):
             return f"Responses({name}, traced)"
         kinds = ["no phase (driven by a clock)" if self.of_phase is None else "phase"]
         kinds += [f"amplitude {k}: exponent {number(x)}" for k, x in enumerate(self.exponents)]
-        kinds += [f"{self.left_out} faster modes left out"] * bool(self.left_out)
+        if self.left_out:
+            kinds.append(f"{self.left_out} faster modes left out")
         acting = self.flow.event[np.any(self.flow.jumps.by_input, axis=(1, 2))]
         if len(acting):
             names = dict.fromkeys(self.structure.transitions[g].name for g in acting)

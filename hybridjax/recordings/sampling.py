@@ -198,6 +198,7 @@ def _require_times(part: _Sections, N: int, step: float) -> None:
         t, late = part.t[at], detrend(part.values[at, -1])
         waves = np.exp(2j * np.pi / step * np.outer(t - detrend(t), np.arange(4))).view(float)
         left = late - waves @ np.linalg.lstsq(waves, late)[0]
+        # (Of interpolation errors 0.4 % are left, of deviations by the rhythm 95 %.)
         if left.std() <= 0.1 * late.std() + ROUNDING * t[-1]:
             raise DefinitionError(
                 "the times of sections deviate only by rounding and interpolation between samples, "

@@ -264,7 +264,8 @@ class Reals(Kind):
         if sign != "any":
             self.single, self.items = f"a {sign} number", f"{sign} numbers"
         self.allowed = self.single if self.shape == () else f"an array of {self.items}"
-        self.allowed += f" with shape {self._written()}" * (self.shape not in ((), ("...",)))
+        if self.shape not in ((), ("...",)):
+            self.allowed += f" with shape {self._written()}"
 
     def take(self, value):
         array = value if isinstance(value, jax.Array) else self._array(value)

@@ -212,7 +212,7 @@ class LoopEquations:
         """Return c, its covariance, and the standard deviations of the outputs' errors.
 
         **Raises:** `DefinitionError` for too few cycles, or, with `check`, for an order of which
-        the reference does not tell all multipliers.
+        the reference does not determine all multipliers.
         """
         (c, along, scale, determined), d = self.solution, self.order
         if check and determined < d:

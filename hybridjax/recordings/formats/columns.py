@@ -190,7 +190,8 @@ def check_rows(path: Path, rows: int, declared: Any, what: str) -> None:
 
 @contextmanager
 def reading(path: Path, kind: str) -> Iterator[None]:
-    """Turn whatever a library raises about broken bytes into a `FileFormatError`."""
+    """Turn whatever a library raises about broken bytes into a `FileFormatError`. (The library's
+    text is for the user, and nothing reads it.)"""
     try:
         yield
     except HybridJaxError:

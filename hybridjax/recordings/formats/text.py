@@ -133,7 +133,8 @@ def read_table(
         values = _by_line(path, headers, lines, start, sep)
     if not values.size:
         raise FileFormatError(f"'{path}' has a header, but no samples.")
-    notes += ["columns without a name were left out"] * (not all(headers))
+    if not all(headers):
+        notes.append("columns without a name were left out")
     columns = zip(headers, values.T, strict=True)
     return Columns({name: column for name, column in columns if name}, tuple(notes))
 
