@@ -406,6 +406,7 @@ def refuse_invented(values: Float[np.ndarray, " d1"], spread: float, cause: str 
         raise DefinitionError(
             f"the data support {carried} multipliers, not {order}: the weakest is "
             f"{np.sqrt(max(values[1], 0.0)):.3g} times the noise, which may be noise alone. Lower "
-            "`order` (`select_order` compares orders), measure longer, or pass check=False. "
+            "`order` (for HTFs `select_order` compares orders, for section data "
+            "`recordings.choose_order`), measure longer, or pass check=False. "
             f"{cause and cause[0].upper() + cause[1:] + '.'}".rstrip()
         )

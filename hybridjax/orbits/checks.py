@@ -359,4 +359,4 @@ def _about_guards(s: Structure, turn: Turn, better: str) -> str:
         for g, x in values.items()
     )
     advice = "Check its direction, and that the system does not come to rest."
-    return f" No event happened: {text}. {advice}{better}" * bool(text)
+    return f" In the last turn tried no event happened: {text}. {advice}{better}" * bool(text)

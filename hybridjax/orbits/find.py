@@ -183,8 +183,7 @@ def find_limit_cycle(
     map, solution = _in_own_sizes(map, solution, given)
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
     if solution.is_fixed_point and coincident(map, solution.turn) and not commutes(cycle):
-        failure = jax.device_put(np.int32(Result.COINCIDENCE))
-        cycle = dataclasses.replace(cycle, result=failure)
+        cycle = dataclasses.replace(cycle, result=jax.device_put(np.int32(Result.COINCIDENCE)))
     keep_turn(cycle, solution.turn)
     code = Result(int(cycle.result))
     checks.check_found(cycle)

@@ -115,7 +115,8 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
         q, sizes, s = map.anchor.q[:, 0], map.sizes, map.structure
         turn = map.turn_with_jacobian(q)
         x, expected = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), q / sizes)
-        monkeypatch.setattr(shooting, "arm", lambda s, lanes, *_: lanes)  # (moves arm later ones)
+        if name == "VerticalHopper":  # (moves arm later ones)
+            monkeypatch.setattr(shooting, "arm", lambda s, lanes, *_: lanes)
         assert (travelled := travel(map, x * sizes, expected)) is not None
         again = map.turn_with_jacobian(x * sizes, travelled=travelled)
         # Refused: a gap before a move, another first time, an event (not the last) overlooked.
@@ -129,9 +130,8 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
             assert travel(map, x * sizes, other) is None
     assert int(cycle.iterations) < 8  # (gaps between moves do not keep a search from ending)
     assert name != "VerticalHopper" or cycle.residual > 0  # (where only gaps are left, they count)
-    assert [x for x in np.ravel(again.codes) if x >= 0] == [
-        x for x in np.ravel(turn.codes) if x >= 0
-    ]
+    codes = [[x for x in np.ravel(both.codes) if x >= 0] for both in (again, turn)]
+    assert codes[0] == codes[1]
     guards = [s.chart_index(transition.source) for transition in s.transitions]
     for legs in (again.legs, turn.legs):
         legs.armed[np.array(guards, int)[:, None] != legs.chart] = False  # (of other charts)

@@ -273,7 +273,7 @@ def testing(t):
 def files(t):
     yield hj.save, dict(path="missing/thing.npz", thing=t.model)
     yield hj.load, dict(path="thing.npz")
-    yield hj.write_report, dict(folder="report", found=t.found)
+    yield hj.write_report, dict(folder="report", result=t.found)
 
 
 def conversions(t):

@@ -15,7 +15,7 @@ from ...experiments.record import Record, RecordedData, require_deviations, unin
 # Cycles of the fastest drift that fits try, to see whether it changes their multipliers. More: a
 # faster one passes for a multiplier. Fewer: drifts explain so much that multipliers become vague.
 SLOW = 20.0
-MAY_DRIFT = f"outputs may drift: records with `drift={SLOW:g}` give other multipliers; compare fits"
+MAY_DRIFT = f"outputs may drift: `with_drift({SLOW:g})`, or `Record(drift=)`, changes multipliers"
 
 
 class CycleGrid(NamedTuple):
