@@ -90,7 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_reproduce(commands)
     _add_identify(commands)
     _add_sweep(commands)
-    options = parser.parse_args(arguments)
+    options, more = parser.parse_known_args(arguments)
+    if more:
+        text = f"unrecognized arguments: {' '.join(more)} (several names of an option need commas)"
+        options.parser.error(text)
     # XLA reports, as errors, that cached programs name CPU features of its own; and for small
     # matrices more BLAS threads than one only wait for each other.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -120,7 +123,7 @@ def _add_reproduce(commands) -> None:
     add("--quick", action="store_true", help="a short form: 20 experiments of 36 cycles, of which "
         "16 are used, in place of 80 experiments of 84, of which 64 are used")  # fmt: skip
     _add_results(reproduce)
-    reproduce.set_defaults(run=_reproduce)
+    reproduce.set_defaults(run=_reproduce, parser=reproduce)
 
 
 def _add_results(command) -> None:
@@ -134,7 +137,7 @@ def _add_identify(commands) -> None:
     identify = commands.add_parser(
         "identify",
         help="find the multipliers of a recorded rhythm",
-        description="From recorded signals (CSV, NPZ or Parquet, a trial in each file) to Floquet "
+        description="From recorded signals, a trial in each file, to Floquet "
         "multipliers, harmonic transfer functions and impulse responses, with a report.",
     )
     add = identify.add_argument
@@ -217,6 +220,10 @@ def _sweep(options) -> int:
 def _identify(options) -> int:
     if options.phase is None and (options.center or options.scale):
         options.parser.error("--center and --scale are of the angle of --phase, which is not given")
+    named = [*options.input, *options.reference, *options.outputs]
+    if twice := sorted(x for x in set(named) if named.count(x) > 1):
+        text = f"{', '.join(twice)}: name each signal in one of --input, --reference and --outputs"
+        options.parser.error(f"{text} (no --reference unless a controller makes the input)")
     if bool(options.files) == bool(options.table):
         options.parser.error("give either files of one subject or --table TABLE.csv")
     if not (options.outputs or options.event or options.timing):

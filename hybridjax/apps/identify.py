@@ -78,10 +78,9 @@ def steps_of(options: Any) -> tuple[tuple[str, ...], Callable[[Recording], Ident
     named += options.phase or (options.crossing or ())[:1]
     if options.phase is not None:
         position, velocity = options.phase
-        sections: Any = KinematicPhase(
-            options.sections, position=position, velocity=velocity,
-            center=options.center, scale=options.scale,
-        )  # fmt: skip
+        plane: Any = {"position": position, "velocity": velocity}
+        plane |= {"center": options.center, "scale": options.scale}
+        sections: Any = KinematicPhase(options.sections, **plane)
     elif options.crossing is not None:
         sections = Crossing(*options.crossing)
     else:

@@ -73,24 +73,15 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
 
     iso, kin = families["isochron"], families["kinematic"]
     ratio = top(iso, 0) / top(kin, 0)
-    note(
-        "the gain of H_0 is doubled with isochrons",
-        np.all((ratio > 1.6) & (ratio < 2.5)),
-        f"max|H_0| isochron / kinematic: {_pairs(ratio)}",
-    )
+    text = f"max|H_0| isochron / kinematic: {_pairs(ratio)}"
+    note("the gain of H_0 is doubled with isochrons", np.all((ratio > 1.6) & (ratio < 2.5)), text)
     a, b = iso.rational, kin.rational
     moved = np.max(np.abs(np.sort_complex(a.poles) - np.sort_complex(b.poles)), axis=1)
-    note(
-        "the choice of phase leaves the poles where they are",
-        np.all(moved < 1e-3),
-        f"distance of the fitted poles in z: {_pairs(moved)}",
-    )
+    text = f"distance of the fitted poles in z: {_pairs(moved)}"
+    note("the choice of phase leaves the poles where they are", np.all(moved < 1e-3), text)
     moved = np.max(np.abs(a.zeros - b.zeros), axis=1)
-    note(
-        "the choice of phase moves the zeros",
-        np.any(moved > 1e-2),
-        f"distance of the fitted zeros in z: {_pairs(moved)}",
-    )
+    text = f"distance of the fitted zeros in z: {_pairs(moved)}"
+    note("the choice of phase moves the zeros", np.any(moved > 1e-2), text)
     for name, family in families.items():
         f = np.asarray(family.exact.f)
         size = np.log(np.abs(np.asarray(family.exact[0])[:, :, 0]))
@@ -98,34 +89,23 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
         peaks = [p[(p > 1.5) & (p < 2.5)] for p in peaks]
         places = [", ".join(f"{x:.3g}" for x in p) or "none" for p in peaks]
         places = [f"{place} ({output})" for output, place in zip(OUTPUTS, places, strict=True)]
-        note(
-            f"{name}: bumps of H_0 around f = 2",
-            any(len(p) for p in peaks),
-            f"local maxima of |H_0| for f in (1.5, 2.5): {'; '.join(places)}",
-        )
+        text = f"local maxima of |H_0| for f in (1.5, 2.5): {'; '.join(places)}"
+        note(f"{name}: bumps of H_0 around f = 2", any(map(len, peaks)), text)
         power = np.sum(np.abs(np.asarray(family.estimate.H)[..., 0]) ** 2, axis=1)
         order = np.abs(np.array(family.estimate.harmonics))
         within = [power[order <= m].sum(axis=0) / power.sum(axis=0) for m in (1, 2)]
         second = np.maximum(top(family, 2), top(family, -2)) / top(family, 0)
-        note(
-            f"{name}: |H_m| is negligible for |m| >= 2",
-            np.all(second < 0.1),
-            f"max|H_+-2| / max|H_0|: {_pairs(second)}; part of the sum of "
-            f"|H_m|^2 with |m| <= 1: {_pairs(within[0])}, with |m| <= 2: {_pairs(within[1])}",
-        )
+        text = f"max|H_+-2| / max|H_0|: {_pairs(second)}; part of the sum of |H_m|^2 with "
+        text += f"|m| <= 1: {_pairs(within[0])}, with |m| <= 2: {_pairs(within[1])}"
+        note(f"{name}: |H_m| is negligible for |m| >= 2", np.all(second < 0.1), text)
         close = [family.rational.compare(family.ldtp.multipliers, k).max_error for k in OUTPUTS]
-        note(
-            f"{name}: eigenvalues from the fits are right up to the third significant digit",
-            max(close) < 5e-3,
-            f"|error|: {_pairs(close)}",
-        )
+        text = f"{name}: eigenvalues from the fits are right up to the third significant digit"
+        note(text, max(close) < 5e-3, f"|error|: {_pairs(close)}")
     exact = next(iter(families.values())).ldtp.multipliers
-    note(
-        "the multipliers are 0.25 +- 0.70i",
-        np.all(np.abs(exact - (0.25 + np.array([0.7j, -0.7j]))) < 1e-2),
-        f"{', '.join(f'{z:.6f}' for z in exact)}: with the paper's parameters the real part is "
-        "negative, the printed sign was lost",
-    )
+    text = ", ".join(f"{z:.6f}" for z in exact)
+    text += ": with the paper's parameters the real part is negative, the printed sign was lost"
+    printed = 0.25 + np.array([0.7j, -0.7j])
+    note("the multipliers are 0.25 +- 0.70i", np.all(np.abs(exact - printed) < 1e-2), text)
     return observations
 
 

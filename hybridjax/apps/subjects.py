@@ -199,9 +199,8 @@ def _rows(path: Path) -> Any:
     except (OSError, ValueError) as why:
         raise DefinitionError(f"cannot read '{path}': {getattr(why, 'strerror', why)}.") from None
     if not all(name in rows and len(rows) and rows[name].all() for name in ("file", "subject")):
-        raise DefinitionError(
-            f"the table '{path}' needs 'file' and 'subject' in each row, separated by commas."
-        )
+        text = "'file' and 'subject' in each row, separated by commas."
+        raise DefinitionError(f"the table '{path}' needs {text}")
     rows = table_of(rows, len(rows))
     names = rows[["subject", *factors_of(rows)]].agg("-".join, axis=1)
     rows.insert(0, "report", [re.sub(r"[^\w.+-]+", "_", name) for name in names])

@@ -85,9 +85,8 @@ def from_xarray(dataset: Any) -> Saved:
         header = json.loads(dataset.attrs[_HEADER])
         kind = KINDS[header["kind"]]
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise DefinitionError(
-            f"`dataset` must be an xarray.Dataset that `to_xarray` made of a {', '.join(KINDS)}."
-        ) from None
+        text = f"an xarray.Dataset that `to_xarray` made of a {', '.join(KINDS)}."
+        raise DefinitionError(f"`dataset` must be {text}") from None
     static = restored(header["static"], header["units"])
     try:
         for dimension, size in header["sizes"].items():

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from .._core.boundary.checked import checked
 from .._core.compilation import host_first
 from .._core.executor import to_host
+from .._core.results import Result
 from ..engine import kernels
 from ..engine.target import until
 from ..errors import ComputationError
@@ -63,6 +64,7 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
     as ok; otherwise its result is `Result.COINCIDENCE` (`find_limit_cycle` returns it with
     `throw=False`). A group contains at least one event that is not scheduled.
     """
+    cycle.require_found(Result.COINCIDENCE)
     cycle = to_host(cycle)
     # (A little more than one turn, for events at its end. Rounding may spoil another one, where
     # events coincide.)

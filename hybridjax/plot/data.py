@@ -24,20 +24,20 @@ from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, axis_of, legend, 
 
 
 @checked
-def phase(found: Phase, *, ax: AxesLike | None = None) -> Plot:
+def phase(phase: Phase, *, ax: AxesLike | None = None) -> Plot:
     """Periods of the cycles, one after the other, and how they are distributed."""
     with panels(ax, 1, 2, width=PAGE, height=2.2, width_ratios=(3, 1)) as axes:
         left, right = axes[0]
         first = 0
-        for k, periods in enumerate(found.periods):
+        # Without rounding errors: they are too narrow for bins.
+        rounded = [phase.period * np.round(x / phase.period, 9) for x in phase.periods]
+        for k, periods in enumerate(rounded):
             at = first + np.arange(len(periods))
             left.plot(at, periods, ".", ms=2, color=CYCLE[k % len(CYCLE)])
             first += len(periods)
-        left.axhline(found.period, color="black", lw=0.6)
+        left.axhline(phase.period, color="black", lw=0.6)
         left.set(xlabel="cycle (trials in different colors)", ylabel="period (s)")
-        right.hist(
-            np.concatenate(found.periods), bins=30, orientation="horizontal", color=COLORS["gray"]
-        )
+        right.hist(np.concatenate(rounded), 30, orientation="horizontal", color=COLORS["gray"])
         right.tick_params(labelleft=False)
         right.set(xlabel="cycles", ylim=left.get_ylim())
         letters(axes)
@@ -93,7 +93,7 @@ def _powers_of_ten(ax: Axes) -> None:
 
 @checked
 def impulse_responses(
-    found: ImpulseResponses,
+    responses: ImpulseResponses,
     *,
     model: LDTP | None = None,
     input: str | int = 0,
@@ -101,28 +101,28 @@ def impulse_responses(
 ) -> Plot:
     """Left: responses to a push against its phase and the time since. Right: those at the phases
     marked left, with bands of 95 %; dashed, those of a model with the same sections."""
-    ny, N = len(found.outputs), len(found.phase)
-    pushing = channel_index("input", input, found.inputs)
-    theory = None if model is None else found.of_model(model)
+    ny, N = len(responses.outputs), len(responses.phase)
+    pushing = channel_index("input", input, responses.inputs)
+    theory = None if model is None else responses.of_model(model)
     with panels(ax, ny, 2, width=PAGE, height=0.4 + 1.9 * ny) as axes:
-        for i, name in enumerate(found.outputs):
+        for i, name in enumerate(responses.outputs):
             plane, curves = axes[i]
-            values = found.values[:, :, i, pushing]
-            pushed = found.inputs[pushing]
+            values = responses.values[:, :, i, pushing]
+            pushed = responses.inputs[pushing]
             impulse = Signal(pushed, unit_of(pushed) and f"{unit_of(pushed)} s")
             label = with_unit(f"{name} / impulse\n", ratio(name, impulse))
-            look.colored(plane, found.lag, found.phase, values, label)
+            look.colored(plane, responses.lag, responses.phase, values, label)
             plane.set_ylabel("phase of the push")
             for k, m in enumerate(dict.fromkeys([0, N // 4, N // 2, 3 * N // 4])):
-                band = 1.96 * found.errors[m, :, i, pushing]
+                band = 1.96 * responses.errors[m, :, i, pushing]
                 line = {"color": CYCLE[k % len(CYCLE)]}
                 arrow = {"marker": 9, "clip_on": False, "transform": plane.get_yaxis_transform()}
-                plane.plot(1.0, found.phase[m], **line, **arrow)
-                curves.plot(found.lag, values[m], label=f"{found.phase[m]:.2f}", **line)
+                plane.plot(1.0, responses.phase[m], **line, **arrow)
+                curves.plot(responses.lag, values[m], label=f"{responses.phase[m]:.2f}", **line)
                 if theory is not None:
-                    curves.plot(found.lag, theory[m, :, i, pushing], "k--", lw=0.8)
+                    curves.plot(responses.lag, theory[m, :, i, pushing], "k--", lw=0.8)
                 curves.fill_between(
-                    found.lag, values[m] - band, values[m] + band, alpha=0.25, lw=0, **line
+                    responses.lag, values[m] - band, values[m] + band, alpha=0.25, lw=0, **line
                 )
             curves.axhline(0, color="black", lw=0.4)
         if theory is not None:
@@ -137,7 +137,7 @@ def impulse_responses(
 
 @checked
 def phase_response(
-    found: PhaseCurve, *, model: PhaseCurve | None = None, ax: AxesLike | None = None
+    curve: PhaseCurve, *, model: PhaseCurve | None = None, ax: AxesLike | None = None
 ) -> Plot:
     """The curve; an estimate with its 95 % band. Dotted lines are events of a model.
 
@@ -146,25 +146,25 @@ def phase_response(
 
     **Raises:** `DefinitionError` for inputs in different units.
     """
-    curves = [found] if model is None else [found, model]
+    curves = [curve] if model is None else [curve, model]
     if all(units := [unit_of(x.input) for x in curves]):
         require_equal("the inputs of both curves", "units", units[0], units[-1])
     with panels(ax, height=2.8) as axes:
         panel = axes[0, 0]
-        for curve, color in zip(curves, CYCLE, strict=False):
-            seconds = [SECONDS.get(x.time_unit, 0.0) for x in (found, curve)]
+        for drawn, color in zip(curves, CYCLE, strict=False):
+            seconds = [SECONDS.get(x.time_unit, 0.0) for x in (curve, drawn)]
             scale = seconds[0] / seconds[1] if all(seconds) else 1.0
             label = "model"
-            if isinstance(curve, PhaseResponse):
-                low, high = (scale * x for x in curve.interval(curve.phase))
-                panel.fill_between(curve.phase, low, high, color=color, alpha=0.25, lw=0)
+            if isinstance(drawn, PhaseResponse):
+                low, high = (scale * x for x in drawn.interval(drawn.phase))
+                panel.fill_between(drawn.phase, low, high, color=color, alpha=0.25, lw=0)
                 label = "estimated, 95 %"
-            panel.plot(curve.phase, scale * curve.values, color=color, label=label)
-            for phase in curve.phase[np.isnan(curve.values)]:
+            panel.plot(drawn.phase, scale * drawn.values, color=color, label=label)
+            for phase in drawn.phase[np.isnan(drawn.values)]:
                 panel.axvline(phase, color=color, lw=0.8, ls=":")
         panel.axhline(0, color="black", lw=0.4)
-        name = f"response to {found.input}"
-        panel.set(xlabel="phase (cycles)", ylabel=f"{name}\n({found.unit})", xlim=(0, 1))
+        name = f"response to {curve.input}"
+        panel.set(xlabel="phase (cycles)", ylabel=f"{name}\n({curve.unit})", xlim=(0, 1))
         panel.legend()
     return Plot(axes)
 
@@ -205,7 +205,9 @@ def experiment(data: ExperimentData, index: int = 0, *, ax: AxesLike | None = No
 
 
 @checked
-def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | None = None) -> Plot:
+def validation(
+    validation: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | None = None
+) -> Plot:
     """Measured and simulated outputs, and correlations of the residuals; one row per output.
 
     Left: the last cycles of the first record. Middle: correlations of the residuals with earlier
@@ -215,27 +217,28 @@ def validation(found: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | Non
 
     **Arguments:** `cycles`: number of cycles to show. Default: 4.
     """
-    N, ny = found.n_sections, len(found.outputs)
-    shown = slice(max(len(found.measured) - cycles * N, 0), None)
-    time = (found.first_section + np.arange(len(found.measured)))[shown] / N
+    N, ny = validation.n_sections, len(validation.outputs)
+    shown = slice(max(len(validation.measured) - cycles * N, 0), None)
+    time = (validation.first_section + np.arange(len(validation.measured)))[shown] / N
     limit = float(stats.norm.isf(0.005))
     with panels(ax, ny, 3, width=PAGE, height=0.6 + 1.6 * ny) as axes:
-        for i, name in enumerate(found.outputs):
+        for i, name in enumerate(validation.outputs):
             signal, auto, cross = axes[i]
-            signal.plot(time, found.simulated[shown, i], color=CYCLE[0], label="simulated")
+            signal.plot(time, validation.simulated[shown, i], color=CYCLE[0], label="simulated")
             measured = dict(ls="", marker=".", ms=3, color="black", label="measured")
-            signal.plot(time, found.measured[shown, i], **measured)
+            signal.plot(time, validation.measured[shown, i], **measured)
             signal.set_ylabel(axis_of(name, deviation=True))
-            signal.set_title(f"fit {found.fit[i]:.3g} %\n", loc="right")  # (above the power of ten)
+            # (The line below the title has room for the power of ten.)
+            signal.set_title(f"fit {validation.fit[i]:.3g} %\n", loc="right")
             signal.margins(x=0.02)
             _powers_of_ten(signal)
             auto.set_ylabel("standard deviations")
-            _stems(auto, 1.0, found.autocorrelation[:, :, i], CYCLE[0], limit)
-            auto.set_title(f"residuals\n{p_value(found.whiteness[i])}", loc="right")
-            for j, _ in enumerate(found.inputs):
+            _stems(auto, 1.0, validation.autocorrelation[:, :, i], CYCLE[0], limit)
+            auto.set_title(f"residuals\n{p_value(validation.whiteness[i])}", loc="right")
+            for j, _ in enumerate(validation.inputs):
                 color = CYCLE[(1 + j) % len(CYCLE)]
-                _stems(cross, 0.2 * j, found.cross_correlation[:, :, i, j], color, limit)
-            cross.set_title(f"with the input\n{p_value(found.independence[i])}", loc="right")
+                _stems(cross, 0.2 * j, validation.cross_correlation[:, :, i, j], color, limit)
+            cross.set_title(f"with the input\n{p_value(validation.independence[i])}", loc="right")
         if ax is None:
             axes[0, 0].fill_between([], [], color="0.9", label="99 % band without correlation")
             legend(axes[0, 0], "upper left", ncols=3)

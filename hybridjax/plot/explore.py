@@ -212,9 +212,8 @@ def explore(
         value = float(parameter_of(cycle.system, name))
         low, high = map(float, ranges.get(name, sorted((0.5 * value, 1.5 * value))))
         if not low <= value <= high or low == high:
-            raise DefinitionError(
-                f"`ranges` of '{name}' must be two numbers around its present value {value:.6g}."
-            )
+            text = f"two numbers around its present value {value:.6g}."
+            raise DefinitionError(f"`ranges` of '{name}' must be {text}")
         sliders.append([name, with_unit(name, unit_of_parameter(cycle.system, name)), low, high])
     if not sliders:
         raise DefinitionError("explore: name one parameter or more, such as 'k'.")

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
 from .._core.boundary.checked import checked
+from .._core.results import Result
 from ..engine import kernels
 from ..engine.trajectory import Trajectory, observed
 from ..errors import DefinitionError
@@ -52,8 +53,10 @@ def cycle(
     - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
     - `ax`: where to draw; a new figure of one column's width by default.
 
-    **Raises:** `DefinitionError` for a name that does not exist, or sections of another system.
+    **Raises:** `DefinitionError` for a name that does not exist, sections of another system, or a
+    cycle that was not found.
     """
+    cycle.require_found(Result.COINCIDENCE)
     s = cycle.structure
     x, y = plane_of(s, x, y)
     require_same_system(s, sections, perturbed)

@@ -64,7 +64,7 @@ def refuse(findings: Iterable[Finding]) -> None:
     findings = list(findings)
     for finding in findings:
         if finding.action == "refused":
-            also = listed([x.text for x in findings if x.action == "warned"])
+            also = listed([x.text for x in findings if x.action != "refused"])
             raise DefinitionError(finding.text + f" (Found, too: {also})" * bool(also))
 
 

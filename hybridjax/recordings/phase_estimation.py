@@ -11,6 +11,7 @@ from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..orbits.crossing import AtEvent, Crossing
 from ..sections.families import KinematicPhase
+from . import smoothing
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
 from .recording import Recording, signal_of
 from .smoothing import FEWEST, Bandwidth, Series, bridgeable, gaps, inside, spline, without_spikes
@@ -66,7 +67,10 @@ def estimate_phase(
         if bandwidth is None:  # noise adds crossings of the samples themselves
             rough = _from_events(recording.mark(event.name, definition), event.name)
             bandwidth = HARMONICS / 2 / rough.period
-        return _from_events(recording.mark(event.name, definition, bandwidth=bandwidth), event.name)
+        marked = recording.mark(event.name, definition, bandwidth=bandwidth)
+        phase = _from_events(marked, event.name)
+        smoothing.require_passing(bandwidth, 1 / phase.period)
+        return phase
     if bandwidth is not None:
         raise DefinitionError("events are not smoothed: leave `bandwidth` out.")
     return _from_events(recording, definition.name)
@@ -132,6 +136,7 @@ def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | Non
 
     rate = abs(_turns_per_time([angle_of(*sample) for sample in samples]))
     bandwidth = bandwidth or HARMONICS * rate
+    smoothing.require_passing(bandwidth, rate)
     angles = []
     for time, z in samples:
         smooth = [spline(time, x, bandwidth)(time) for x in z.T]
@@ -209,7 +214,7 @@ def _from_events(recording: Recording, name: str) -> Phase:
         times.append(trial.events[name])
     intervals = np.concatenate([np.diff(t) for t in times])
     if len(intervals) < 2:
-        raise DefinitionError(f"two cycles need three events '{name}' in a trial: record longer.")
+        raise DefinitionError(f"two cycles need three events '{name}' in a trial: record more.")
     common, dropped, missed, stretches = _period(intervals), 0, 0, []
     for trial, t in zip(recording.trials, times, strict=True):
         period, doubled, longest = common, 0.5, 1.5

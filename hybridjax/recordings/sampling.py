@@ -77,14 +77,14 @@ def section_data(
     before (`without_drift`), as `identify_recording` does.
 
     **Raises:** `DefinitionError` for unknown names, no names, constant signals, outputs or times
-    that repeat from cycle to cycle, another number of sections than the family's, a recording
-    without a whole cycle, and as `estimate_phase`.
+    that repeat from cycle to cycle, a bandwidth below the rate of the rhythm, another number of
+    sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
     inputs, outputs = tuple(inputs), tuple(outputs)
     for name in (*inputs, *outputs):
         values = [x[np.isfinite(x)] for _, x in recording.samples(name)]
         if not any(len(x) and np.ptp(x) for x in values):
-            raise DefinitionError(f"{name} is constant in all trials: leave it out.")
+            raise DefinitionError(f"{name} is constant in all trials: mend or leave it out.")
     if not (inputs or outputs):
         raise DefinitionError("events alone determine no multipliers: name inputs or outputs.")
     if not outputs and timing is None:
@@ -95,6 +95,7 @@ def section_data(
         require_equal("`n_sections` and phase", "n_sections", n_sections, phase.n_sections)
     N = n_sections or phase.n_sections or HARMONICS
     bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
+    smoothing.require_passing(bandwidth, 1 / phase.period)
     nu, columns = len(inputs), [recording.column(x) for x in (*inputs, *outputs)]
     parts, trials, cycles, spikes = [], [], [], np.zeros(len(columns), int)
     for number, (trial, stretches) in enumerate(phase.by_trial(recording)):
@@ -202,7 +203,7 @@ def _require_times(part: _Sections, N: int, step: float) -> None:
         if left.std() <= 0.1 * late.std() + ROUNDING * t[-1]:
             raise DefinitionError(
                 "the times of sections deviate only by rounding and interpolation between samples, "
-                "as if the phase were the clock's own: leave `timing` out, or choose another phase."
+                "as if the phase were the clock's own: use outputs, not times, or another phase."
             )
 
 

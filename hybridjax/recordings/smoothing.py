@@ -77,6 +77,13 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     return CubicSpline(time, smooth, bc_type="natural")
 
 
+def require_passing(bandwidth: float, rate: float) -> None:
+    """**Raises:** `DefinitionError` for a bandwidth that removes a rhythm of this rate (Hz)."""
+    if bandwidth < rate:
+        text = f"`bandwidth`, {bandwidth:.3g} Hz, removes the rhythm of {rate:.3g} Hz: leave it out"
+        raise DefinitionError(f"{text}, or take more.")
+
+
 def bridgeable(time: Series, longest: int | float = 0.0) -> float:
     """Return the longest gap that a spline bridges: `longest`, but not less than three samples."""
     return max(longest, 3.001 * float(np.median(np.diff(time))))

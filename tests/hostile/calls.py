@@ -302,10 +302,10 @@ def plots(t):
     yield plot.experiment, dict(data=t.data)
     yield plot.multipliers, dict(true=np.array([0.5]))
     yield plot.poles_zeros, dict(fits={"a": t.rational})
-    yield plot.impulse_responses, dict(found=t.found.responses)
-    yield plot.phase, dict(found=t.phase)
+    yield plot.impulse_responses, dict(responses=t.found.responses)
+    yield plot.phase, dict(phase=t.phase)
     yield plot.section_data, dict(data=t.section_data)
-    yield plot.validation, dict(found=t.validation)
+    yield plot.validation, dict(validation=t.validation)
     yield plot.save, dict(path="missing/figure", plot=t.plot)
 
 
@@ -319,7 +319,7 @@ def rhythms(t):
     yield hj.coincidences, dict(cycle=t.cycle)
     about = dict(recording=t.recording, phase=BEAT, input="f")
     yield hj.recordings.phase_response, about
-    yield hj.plot.phase_response, dict(found=t.beats)
+    yield hj.plot.phase_response, dict(curve=t.beats)
     at = dict(phase=[0.1, 0.2])
     yield t.beats, at
     yield t.beats.interval, at

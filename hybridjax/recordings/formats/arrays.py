@@ -49,9 +49,7 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
         text = "MATLAB_empty" in node.attrs or node.attrs.get("MATLAB_class") == b"char"
         if node.dtype.kind in "fiu" and not text:
             if node.external or node.is_virtual:
-                raise FileFormatError(
-                    f"'{path}': '{name}' lies in other files: copy its values into this file."
-                )
+                raise FileFormatError(f"'{path}': '{name}' lies in other files: copy it into this.")
             unit = node.attrs.get("units", "")
             leaves[place] = Leaf(node, unit.decode() if isinstance(unit, bytes) else str(unit))
 
@@ -74,7 +72,9 @@ def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
             return read_hdf5(path, wanted, ".")
         shapes = {name: shape for name, shape, _ in whosmat(path)}
         check_declared(path, 8 * sum(int(np.prod(shape)) for shape in shapes.values()))
-        chosen = [x for x in shapes if wanted.includes(x) or wanted.reaches(x)]
+        # (If a name is wrong, all are read, for the message.)
+        wrong = not {x.split(".")[0] for x in wanted.signals or ()} <= set(shapes)
+        chosen = [x for x in shapes if wrong or wanted.includes(x) or wanted.reaches(x)]
         content = loadmat(path, simplify_cells=True, variable_names=chosen)
     variables = {name: value for name, value in content.items() if not name.startswith("__")}
     return _read_tree(path, dict(_leaves(path, (), variables, wanted)), ".", wanted)
@@ -116,7 +116,7 @@ def _read_tree(
             continue
         around = next((place[:k] for k in range(len(place), -1, -1) if place[:k] in clocks), None)
         if around is None:
-            text = "in its group or one around it: name them by `time`, or choose `signals`."
+            text = "in its group or one around it: add or name them (`time`), or choose `signals`."
             raise DefinitionError(f"'{path}' has no times '{wanted.time}' for '{name}' {text}")
         if around not in tables:
             clock = leaves[clocks[around]]

@@ -65,10 +65,11 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
     exact = [x for x, (name, _) in headers.items() if time in (x, name)]
     clocks = exact or [x for x, (name, _) in headers.items() if name.lower() == time.lower()]
     if len(clocks) > 1:
-        raise FileFormatError(f"{where} has two columns '{time}'.")
+        raise FileFormatError(f"{where} has two columns '{time}': rename one.")
     if not clocks:
         names = ", ".join(name for name, _ in headers.values())
-        raise DefinitionError(f"{where} has no column '{time}': choose `time` from {names}.")
+        text = f"choose `time` from {names}, or add a column of times."
+        raise DefinitionError(f"{where} has no column '{time}': {text}")
     clock = clocks[0]
     unit = time_unit(clock) or "s"
     if unit not in SECONDS:
@@ -89,7 +90,7 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
         if unit.lower() == "nan":
             raise FileFormatError(f"{where}: the unit of '{name}' is nan: write it, or nothing.")
         if name in signals:
-            raise FileFormatError(f"{where} has two columns '{name}'.")
+            raise FileFormatError(f"{where} has two columns '{name}': rename one.")
         signals[name] = columns.values[header]
         units |= {name: unit} if unit else {}
     return Table(times, signals, units, events, clock)
@@ -179,7 +180,7 @@ def two_columns(path: Path, names: Sequence[str]) -> None:
     """**Raises:** `FileFormatError` if a name occurs twice."""
     if len(set(names)) < len(names):
         twice = next(x for x in names if names.count(x) > 1)
-        raise FileFormatError(f"'{path}' has two columns '{twice}'.")
+        raise FileFormatError(f"'{path}' has two columns '{twice}': rename one.")
 
 
 def check_rows(path: Path, rows: int, declared: Any, what: str) -> None:

@@ -97,11 +97,12 @@ def inspect(
         elif not rows.all():
             text = f"trial '{trial.name}' has no samples of {outputs[int(np.argmax(lost))]}."
             findings.append(Finding("an empty trial", text, "left out"))
-    if not kept:
+    if kept:
+        clean = clean.with_trials(kept)
+        findings += [*faults.other_settings(clean, names, outputs), *faults.clocks(clean)]
+    else:
         text = "no trial has samples of all outputs that can be used."
         findings.append(Finding("an empty recording", text, "refused"))
-    clean = clean.with_trials(kept or clean.trials)
-    findings += [*faults.other_settings(clean, names, outputs), *faults.clocks(clean)]
     if phase is not None and data is not None:
         same = len(phase.stretches) == len(recording.trials)
         findings += inspect_cycles(recording if same else clean, phase, data)
