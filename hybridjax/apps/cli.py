@@ -92,8 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_sweep(commands)
     options, more = parser.parse_known_args(arguments)
     if more:
-        text = f"unrecognized arguments: {' '.join(more)} (several names of an option need commas)"
-        options.parser.error(text)
+        options.parser.error(f"unrecognized arguments: {' '.join(more)} (names need commas)")
     # XLA reports, as errors, that cached programs name CPU features of its own; and for small
     # matrices more BLAS threads than one only wait for each other.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -159,10 +158,8 @@ def _add_identify(commands) -> None:
     phase.add_argument("--crossing", type=_crossing, metavar="X:DIRECTION[:VALUE]",
         help="a cycle begins where signal X crosses a value, rising or falling")  # fmt: skip
     phase.add_argument("--event", metavar="NAME", help="event at which a cycle begins")
-    add("--center", type=_two_numbers, metavar="X,V",
-        help="of the angle of --phase; estimated by default")  # fmt: skip
-    add("--scale", type=_two_positive, metavar="X,V",
-        help="of the angle of --phase; estimated by default")  # fmt: skip
+    for name, kind in {"--center": _two_numbers, "--scale": _two_positive}.items():
+        add(name, type=kind, metavar="X,V", help="of the angle of --phase; estimated by default")
     add("--sections", type=_count, default=32, metavar="N",
         help="sections in each cycle (default: %(default)s)")  # fmt: skip
     add("--order", type=_count, metavar="D", help="number of multipliers; found by default")
@@ -221,9 +218,8 @@ def _identify(options) -> int:
     if options.phase is None and (options.center or options.scale):
         options.parser.error("--center and --scale are of the angle of --phase, which is not given")
     named = [*options.input, *options.reference, *options.outputs]
-    if twice := sorted(x for x in set(named) if named.count(x) > 1):
-        text = f"{', '.join(twice)}: name each signal in one of --input, --reference and --outputs"
-        options.parser.error(f"{text} (no --reference unless a controller makes the input)")
+    if twice := ", ".join(x for x in dict.fromkeys(named) if named.count(x) > 1):
+        options.parser.error(f"{twice}: name it once (omit --reference without a controller)")
     if bool(options.files) == bool(options.table):
         options.parser.error("give either files of one subject or --table TABLE.csv")
     if not (options.outputs or options.event or options.timing):

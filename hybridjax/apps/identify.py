@@ -225,12 +225,13 @@ def summarize(result: Identification) -> dict[str, Any]:
 
 def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]]:
     """Yield names and figures, each drawn when the one before was saved."""
+    shown = [m for m in (0, 1, -1) if m in htf.harmonics]
     yield "multipliers", plot.multipliers(result.fit, {"plain regression": result.advice.plain})
     yield "validation", plot.validation(result.held_out.validation)
     yield "impulse_responses", plot.impulse_responses(result.responses)
     for i, suffix in enumerate(_suffixes(htf.inputs)):
         yield f"bode{suffix}", plot.bode(htf, input=i)
-        yield f"harmonics{suffix}", plot.harmonics({"": htf}, input=i, decades=3)
+        yield f"harmonics{suffix}", plot.harmonics({"": htf}, shown, input=i, decades=3)
     yield "phase", plot.phase(result.phase)
     yield "sections", plot.section_data(result.data)
     if result.curve is not None:

@@ -31,12 +31,10 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
         biases = [family.rational_exact.compare(true, name).max_error for name in OUTPUTS]
         errors = family.estimate.harmonic_errors(family.ldtp.htf(family.estimate.f))
         at = {m: k for k, m in enumerate(family.estimate.harmonics)}
+        results = family.structured.result, *np.ravel(family.rational.result)
         summary["families"][name] = {
             "experiments": family.experiments,
-            "converged": bool(
-                family.structured.result == Result.OK
-                and np.all(family.rational.result == Result.OK)
-            ),
+            "converged": all(x == Result.OK for x in results),
             "multipliers_from_linearization": complex_pairs(family.ldtp.multipliers),
             "multipliers_fit_structured": complex_pairs(family.structured.multipliers),
             "multipliers_fit_structured_error": family.structured.compare(true).max_error,

@@ -40,8 +40,7 @@ def _load(file: str, name: str) -> Any:
     module = importlib.import_module(path.stem)
     if Path(module.__file__ or "").resolve() != path.resolve():
         raise DefinitionError(f"another module is called '{path.stem}': rename '{file}'.")
-    try:
-        system = getattr(module, name)
-    except AttributeError as error:
-        raise DefinitionError(f"'{file}' has no '{name}'.") from error
+    if not hasattr(module, name):
+        raise DefinitionError(f"'{file}' has no '{name}'.")
+    system = getattr(module, name)
     return system() if isinstance(system, type) else system

@@ -158,10 +158,8 @@ def to_harmonic_state_space(
     sizes = flow.size[:, None] / np.roll(flow.size, -1, axis=0)[:, :, None]
     jumps = (flow.jumps.by_state - np.eye(s.d)) * sizes
     if np.abs(jumps).max() > 1e-9 or flow.jumps.by_input.any():
-        raise DefinitionError(
-            f"{type(s.system).__name__} has events at which deviations jump, which no finite "
-            "number of harmonics represents: use `cycle.htf`, which is exact."
-        )
+        text = "events at which deviations jump, which no finite number of harmonics represents"
+        raise DefinitionError(f"{type(s.system).__name__} has {text}: use `cycle.htf` (exact).")
     _, by_state, by_input = linear_outputs(s, flow, z)
     series = flow.by_state, flow.by_input[..., columns], by_state, by_input[..., columns]
     for n in [order] if order else _ORDERS:

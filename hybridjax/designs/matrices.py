@@ -71,9 +71,8 @@ def ldtp_matrices(
     **Raises:** `DefinitionError` for a model that is no `LDTP`.
     """
     if not isinstance(model, LDTP):
-        raise DefinitionError(
-            "a goal of `fit_ldtp` needs an `LDTP`: `fit_ldtp(...).model`, or `hj.identify.realize`."
-        )
+        text = "needs an `LDTP`: `fit_ldtp(...).model`, or `hj.identify.realize`."
+        raise DefinitionError(f"a goal of `fit_ldtp` {text}")
     lags = 2 * default_horizon(model.n_sections) + 1
     response = np.asarray(model.impulse_response(lags))[:, :, noise.outputs]
     htfs = list(measured_htfs(model, cosines, harmonics, noise))

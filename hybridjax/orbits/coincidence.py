@@ -64,8 +64,9 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
     as ok; otherwise its result is `Result.COINCIDENCE` (`find_limit_cycle` returns it with
     `throw=False`). A group contains at least one event that is not scheduled.
     """
-    cycle.require_found(Result.COINCIDENCE)
     cycle = to_host(cycle)
+    if cycle.result != Result.COINCIDENCE:
+        cycle.require_found()
     # (A little more than one turn, for events at its end. Rounding may spoil another one, where
     # events coincide.)
     s, period, path, groups = cycle.structure, float(cycle.period), cycle.trajectory(1.01), []

@@ -109,11 +109,11 @@ class LimitCycle(eqx.Module):
             require_unchanged(self.system, self.numbers)
         whole_call().compared = self
 
-    def require_found(self, *others: Result) -> None:
-        """**Raises:** `DefinitionError` for results but success and `others`; `require_current`."""
+    def require_found(self) -> None:
+        """**Raises:** `DefinitionError` if the search failed, and as `require_current`."""
         self.require_current()
         code = Result.OK if is_traced(self.result) else Result(int(self.result))
-        if code not in (*_FOUND, *others):
+        if code not in _FOUND:
             raise DefinitionError(
                 f"the search for this cycle failed ({code.message}): `find_limit_cycle` of its "
                 "system raises an error that says what to do."

@@ -121,9 +121,8 @@ def impulse_responses(
                 curves.plot(responses.lag, values[m], label=f"{responses.phase[m]:.2f}", **line)
                 if theory is not None:
                     curves.plot(responses.lag, theory[m, :, i, pushing], "k--", lw=0.8)
-                curves.fill_between(
-                    responses.lag, values[m] - band, values[m] + band, alpha=0.25, lw=0, **line
-                )
+                low, high = values[m] - band, values[m] + band
+                curves.fill_between(responses.lag, low, high, alpha=0.25, lw=0, **line)
             curves.axhline(0, color="black", lw=0.4)
         if theory is not None:
             axes[0, 1].plot([], [], "k--", lw=0.8, label="model")

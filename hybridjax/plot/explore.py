@@ -212,8 +212,7 @@ def explore(
         value = float(parameter_of(cycle.system, name))
         low, high = map(float, ranges.get(name, sorted((0.5 * value, 1.5 * value))))
         if not low <= value <= high or low == high:
-            text = f"two numbers around its present value {value:.6g}."
-            raise DefinitionError(f"`ranges` of '{name}' must be {text}")
+            raise DefinitionError(f"`ranges` of '{name}' must enclose its value, {value:.6g}.")
         sliders.append([name, with_unit(name, unit_of_parameter(cycle.system, name)), low, high])
     if not sliders:
         raise DefinitionError("explore: name one parameter or more, such as 'k'.")

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
 from .._core.boundary.checked import checked
-from .._core.results import Result
 from ..engine import kernels
 from ..engine.trajectory import Trajectory, observed
 from ..errors import DefinitionError
@@ -56,7 +55,7 @@ def cycle(
     **Raises:** `DefinitionError` for a name that does not exist, sections of another system, or a
     cycle that was not found.
     """
-    cycle.require_found(Result.COINCIDENCE)
+    cycle.require_found()
     s = cycle.structure
     x, y = plane_of(s, x, y)
     require_same_system(s, sections, perturbed)

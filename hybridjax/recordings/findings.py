@@ -44,6 +44,9 @@ class Finding(eqx.Module):
         action = "" if self.action == "warned" else f" ({self.action})"
         return f"{self.cause[0].upper()}{self.cause[1:]}{action}: {self.text}"
 
+    def __str__(self) -> str:
+        return textwrap.fill(repr(self), 98, subsequent_indent="  ")
+
 
 class Inspection(eqx.Module):
     """The result of `inspect`. Printing it shows the findings.
@@ -82,8 +85,7 @@ def untried_orders(order: int, obstacle: str) -> list[Finding]:
 
 def print_findings(findings: Iterable[Finding], indent: str = "") -> str:
     """Return the findings as text, wrapped at 100 columns."""
-    wrapped = (textwrap.fill(repr(x), 98, subsequent_indent="  ") for x in findings)
-    return textwrap.indent("\n".join(wrapped), indent)
+    return textwrap.indent("\n".join(map(str, findings)), indent)
 
 
 def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " _"]]) -> str:

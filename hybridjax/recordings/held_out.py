@@ -36,6 +36,9 @@ class HeldOut(NamedTuple):
     fit: SeriesFit
     validation: Validation
 
+    def __repr__(self) -> str:
+        return f"{self.fit}\n{self.validation}"
+
 
 class Split(NamedTuple):
     """Records to be fitted, prepared once for all fits, and records that are held out."""

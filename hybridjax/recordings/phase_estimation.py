@@ -63,12 +63,11 @@ def estimate_phase(
     if isinstance(definition, KinematicPhase):
         return _from_angles(_angles(recording, definition, bandwidth), definition.n_sections)
     if isinstance(definition, Crossing):
-        event = AtEvent(str(definition))
+        name = str(definition)
         if bandwidth is None:  # noise adds crossings of the samples themselves
-            rough = _from_events(recording.mark(event.name, definition), event.name)
+            rough = _from_events(recording.mark(name, definition), name)
             bandwidth = HARMONICS / 2 / rough.period
-        marked = recording.mark(event.name, definition, bandwidth=bandwidth)
-        phase = _from_events(marked, event.name)
+        phase = _from_events(recording.mark(name, definition, bandwidth=bandwidth), name)
         smoothing.require_passing(bandwidth, 1 / phase.period)
         return phase
     if bandwidth is not None:

@@ -84,7 +84,7 @@ def section_data(
     for name in (*inputs, *outputs):
         values = [x[np.isfinite(x)] for _, x in recording.samples(name)]
         if not any(len(x) and np.ptp(x) for x in values):
-            raise DefinitionError(f"{name} is constant in all trials: mend or leave it out.")
+            raise DefinitionError(f"{name} is constant in all trials: repair it, or leave it out.")
     if not (inputs or outputs):
         raise DefinitionError("events alone determine no multipliers: name inputs or outputs.")
     if not outputs and timing is None:

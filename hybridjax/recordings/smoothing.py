@@ -80,8 +80,7 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
 def require_passing(bandwidth: float, rate: float) -> None:
     """**Raises:** `DefinitionError` for a bandwidth that removes a rhythm of this rate (Hz)."""
     if bandwidth < rate:
-        text = f"`bandwidth`, {bandwidth:.3g} Hz, removes the rhythm of {rate:.3g} Hz: leave it out"
-        raise DefinitionError(f"{text}, or take more.")
+        raise DefinitionError(f"`bandwidth` removes the rhythm of {rate:.3g} Hz: raise or omit it.")
 
 
 def bridgeable(time: Series, longest: int | float = 0.0) -> float:

@@ -204,9 +204,8 @@ def test_beside_other_limits(quadratic):
     usual = hj.multisine(4, periods=16).scaled(0.01)
     distortion = Distortion(cycle, sections, {"x": 1e-3})
     options = dict(noise={"x": 1e-4}, goal=GOAL)
-    peaked = hj.optimal_design(
-        model, usual, limit=Limits(peak={"u": 0.05}, distortion=distortion), **options
-    )
+    limit = Limits(peak={"u": 0.05}, distortion=distortion)
+    peaked = hj.optimal_design(model, usual, limit=limit, **options)
     assert np.abs(peaked.design.inputs()).max() <= 0.05 * (1 + 1e-9)
     assert peaked.rms["distortion of x"] <= 1e-3 * (1 + 1e-9)
     assert peaked.certificate >= 1

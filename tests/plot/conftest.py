@@ -8,9 +8,8 @@ from ..linear.conftest import hopper as hopper
 @pytest.fixture(scope="session")
 def estimate(hopper):
     design = hj.multisine(periods=16, band=(0, 4.0))
-    return hj.estimate_htf(
-        hj.experiments.simulate_experiments(hopper, design, start="periodic"), (-1, 0, 1)
-    )
+    data = hj.experiments.simulate_experiments(hopper, design, start="periodic")
+    return hj.estimate_htf(data, (-1, 0, 1))
 
 
 @pytest.fixture(scope="session")

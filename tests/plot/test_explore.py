@@ -53,7 +53,7 @@ def test_the_widget_sends_pictures():
     [
         ((), {}, "name one parameter"),
         (("stiffness",), {}, "no parameter 'stiffness'"),
-        ((), {"ranges": {"mu": (7.0, 9.0)}}, "around its present value"),
+        ((), {"ranges": {"mu": (7.0, 9.0)}}, "must enclose its value, 1"),
     ],
 )
 def test_what_is_refused(names, options, message):

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 import hybridjax as hj
 
@@ -25,6 +26,14 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
     np.testing.assert_allclose(angle[:, 0], angle[:, 1], atol=1e-9)
     np.testing.assert_allclose(np.diff(angle[:, 0]), -2 * np.pi / 32, atol=1e-9)
     np.testing.assert_allclose(bars.mean(axis=1).T, lanes.q[:2], atol=1e-9)
+
+
+def test_a_cycle_that_was_not_found_is_refused():
+    far = hj.Guess("flight", (1e3, 30.0, 1.0, 5.0))
+    failed = hj.find_limit_cycle(hj.models.VerticalHopper(), far, throw=False)
+    for function in (hj.plot.cycle, hj.coincidences):
+        with pytest.raises(hj.DefinitionError, match="the search for this cycle failed"):
+            function(failed)
 
 
 def test_resets_that_jump_are_dashed(hopper_cycle):

@@ -125,9 +125,6 @@ def test_poles_and_zeros(rational):
         hj.plot.poles_zeros({})
 
 
-# Experiments
-
-
 def test_experiment(hopper):
     design = hj.multisine(periods=4, band=(0, 2.0))
     data = hj.experiments.simulate_experiments(hopper, design, discard=2)
@@ -139,9 +136,6 @@ def test_experiment(hopper):
     assert "cycles" in figure.axes[2].get_xlabel()
     with pytest.raises(hj.DefinitionError, match="no experiment 99"):
         hj.plot.experiment(data, 99)
-
-
-# The look
 
 
 def test_saved_in_several_formats(tmp_path):
@@ -169,9 +163,6 @@ def test_bands_hold_the_values(estimate):
     known = np.isfinite(lower.get_lines()[0].get_ydata())
     np.testing.assert_array_equal(known, np.abs(sure[0][:, 0, 0]) > radius)
     assert len(upper.collections) == len(lower.collections) == 1
-
-
-# Validation and regions
 
 
 @pytest.fixture(scope="module")

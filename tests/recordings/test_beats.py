@@ -91,7 +91,7 @@ def test_intervals_of_all_lengths_are_no_missed_events():
 
 
 def test_events_alone_are_identified(noisy, tmp_path):
-    found = hj.identify_recording(noisy, BEAT, inputs="u", outputs=(), order=1, n_sections=4)
+    found = hj.identify_recording(noisy, BEAT, inputs="u", outputs=(), order=1, n_sections=1)
     assert found.fit.outputs == ("duration",) and np.isfinite(found.fit.numerators).all()
     assert (hj.write_report(tmp_path, found).parent / "figures" / "curve.png").exists()
     assert any("Resolution: the jitter" in repr(x) for x in found.advice.warnings)

@@ -57,9 +57,8 @@ def write_v73(path, variables):
                 group[name] = np.frombuffer(value.encode("utf-16-le"), np.uint16)[:, None]
                 group[name].attrs["MATLAB_class"] = np.bytes_("char")
             else:
-                group[name] = (
-                    np.atleast_2d(value).T if np.ndim(value) == 2 else np.atleast_2d(value)
-                )
+                array = np.atleast_2d(value)
+                group[name] = array.T if np.ndim(value) == 2 else array
                 group[name].attrs["MATLAB_class"] = np.bytes_("double")
 
     with h5py.File(path, "w", userblock_size=512) as file:
@@ -91,7 +90,8 @@ def test_matlab(tmp_path, write):
     only = hj.read_recording(tmp_path / "x.mat", signals="pair", units={"pair.0": "m"})
     assert only.signals == ("pair.0", "pair.1") and only.unit("pair.0") == "m"
     assert len(only.trials[0].time) == len(SLOW)
-    refused("no signal 'y'; it has ", tmp_path / "x.mat", signals="y", kind=hj.DefinitionError)
+    says = "no signal 'f'; it has .*force.f"
+    refused(says, tmp_path / "x.mat", signals="f", kind=hj.DefinitionError)
 
 
 def test_arrays_of_structs(tmp_path):
@@ -310,16 +310,9 @@ def test_bags(tmp_path, version):
         refused("no bag of ROS, or damaged", path)
 
 
-# All of them
-
-
 def test_libraries_that_are_not_there(tmp_path, monkeypatch):
-    for suffix, library, extra in [
-        (".c3d", "ezc3d", "c3d"),
-        (".h5", "h5py", "mat"),
-        (".feather", "pyarrow.dataset", "tables"),
-        (".mcap", "rosbags.highlevel", "ros"),
-    ]:
+    tables, bags = (".feather", "pyarrow.dataset", "tables"), (".mcap", "rosbags.highlevel", "ros")
+    for suffix, library, extra in (".c3d", "ezc3d", "c3d"), (".h5", "h5py", "mat"), tables, bags:
         monkeypatch.setitem(sys.modules, library, None)
         (tmp_path / f"x{suffix}").write_bytes(b"x")
         with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{extra}\]'"):

@@ -58,6 +58,5 @@ def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
     assert fit.contains(multipliers).all() and fit.standard_errors.max() < 0.2
     data = hj.Recording(recording["time"], {k: x for k, x in recording.items() if k != "time"})
     with pytest.raises(hj.DefinitionError, match="must name other signals"):
-        hj.identify_recording(
-            data, hj.Crossing("clock", "rising"), inputs="u", outputs="x", reference="u"
-        )
+        names = {"inputs": "u", "outputs": "x", "reference": "u"}
+        hj.identify_recording(data, hj.Crossing("clock", "rising"), **names)

@@ -130,6 +130,10 @@ def test_an_order_that_is_too_low_is_named():
         untried = hj.identify_recording(twice, TOP, **names)
     told = Counter(str(x.message) for x in seen)
     assert set(told.values()) == {1} and set(told) >= {repr(x) for x in untried.findings}
+    assert max(map(len, "\n".join(map(str, untried.findings)).split("\n"))) <= 100
+    constant = mishandle(twice, signals("y0", lambda x, s: 0 * x + 1), **NAMES)
+    with pytest.raises(hj.DefinitionError, match="no trial has samples of all .*x does not change"):
+        hj.identify_recording(constant, TOP, **names)
     with pytest.raises(hj.DefinitionError, match="'f' is in `inputs` and in `outputs`"):
         hj.identify_recording(twice, TOP, inputs="f", outputs=("f", "x"))
     text = "129 cycles (a quarter is held out) are too few for order 2 with 32 sections: record 28"

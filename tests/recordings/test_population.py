@@ -160,6 +160,8 @@ def test_trials_and_strides_have_the_smallest_variance_for_their_cost():
     y = np.repeat(RNG.normal(size=12), 3) + 0.8 * RNG.normal(size=36)
     table = {"subject": np.repeat(np.arange(12), 3), "strides": np.full(36, 100)}
     people = Population(table, {"gain": y}, {"gain": np.full(36, 0.1)})
+    wide = study([1.0, 2], [1.0, 1], condition=["a" * 60, "b" * 60])
+    assert max(map(len, repr(wide).splitlines())) <= 100
     row = people.allocation("gain", subject_cost=4, trial_cost=0.5, stride_cost=0.01).iloc[0]
     y = y.reshape(12, 3)
     trials = y.var(axis=1, ddof=1).mean() - 0.01

@@ -45,6 +45,10 @@ def test_a_circle(wave):
         sample(wave, n_sections=16)
     with pytest.raises(hj.DefinitionError, match="events alone determine no multipliers"):
         sample(wave, inputs=(), outputs=())
+    for phase in (CIRCLE, hj.Crossing("v", "rising")):
+        for call in (sample, hj.recordings.estimate_phase):
+            with pytest.raises(hj.DefinitionError, match="`bandwidth` removes the rhythm of 1 Hz"):
+                call(wave, phase, bandwidth=0.9)
     assert "SectionData(19.75 cycles of 8 sections in 1 records;" in repr(data)
 
 
@@ -102,6 +106,7 @@ def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     assert found.phase.cycles + found.phase.missed == 199
     held = found.held_out.validation
     assert f"compare, left out: {held.left_out}" in repr(found)
+    assert max(map(len, repr(found.held_out).splitlines())) <= 100
     assert held.independent and held.fit.min() > 50
 
 
@@ -234,13 +239,8 @@ def test_the_command_computes_nothing_where_a_file_is_in_the_way(files, tmp_path
 def test_signals_with_clocks_of_their_own(rhythm):
     """Position and velocity are never sampled together, the input more often than either."""
     t, (force, x, v) = rhythm.trials[0].time, rhythm.trials[0].values.T
-    own = hj.Recording.beside(
-        [
-            hj.Recording(t, {"force": force}),
-            hj.Recording(t[::2], {"x": x[::2]}),
-            hj.Recording(t[1::2], {"v": v[1::2]}),
-        ]
-    )
+    parts = (t, {"force": force}), (t[::2], {"x": x[::2]}), (t[1::2], {"v": v[1::2]})
+    own = hj.Recording.beside([hj.Recording(*part) for part in parts])
     angle = hj.KinematicPhase(16, position="x", velocity="v", center=(0, 0), scale=(1, 1))
     data = [sample(r, angle, inputs="force") for r in (rhythm, own)]
     assert data[1].missing == 0 and data[1].cycles == data[0].cycles
@@ -252,9 +252,8 @@ def test_signals_with_clocks_of_their_own(rhythm):
 def test_responses_of_a_model_are_by_the_section_of_the_push():
     """One state: a push of area 1 at section m decays by A; sections last 0.2, ..., 0.8."""
     N, a, b, c = 4, 0.8, np.array([1.0, 2.0, 3.0, 4.0]), np.array([5.0, 7.0, 11.0, 13.0])
-    model = hj.LDTP(
-        np.full((N, 1, 1), a), b[:, None, None], c[:, None, None], inputs="f", outputs="x"
-    )
+    columns = (x[:, None, None] for x in (b, c))
+    model = hj.LDTP(np.full((N, 1, 1), a), *columns, inputs="f", outputs="x")
     zero, grid = np.zeros((N, 7, 1, 1)), (np.arange(N) / N, np.arange(7) / N)
     steps = np.array([0.2, 0.4, 0.6, 0.8])
     times = np.cumsum(np.tile(np.roll(steps, 1), 60))

@@ -51,6 +51,7 @@ def read_plain(path: Path, lines: list[str]) -> Columns:
     content = [k for k in filled if not lines[k].lstrip().startswith(_COMMENTS)]
     if not content:
         raise FileFormatError(f"'{path}' has no line with the names of its columns.")
+    whole, content = content, _from_names(lines, content)
     first = content[0]
     below = lines[content[1]] if len(content) > 1 else ""
     separator = _separator(lines[first], below)
@@ -69,7 +70,21 @@ def read_plain(path: Path, lines: list[str]) -> Columns:
         below_names = zip_longest(names, fields[: len(names)], fillvalue="")
         names = [with_unit(x, split_header(y)[1] or y) if x else "" for x, y in below_names]
         start = content[1] + 1
-    return read_table(path, names, lines, start, separator)
+    table = read_table(path, names, lines, start, separator)
+    skipped = ("lines above the names were left out",) * (content != whole)
+    return table._replace(notes=table.notes + skipped)
+
+
+def _from_names(lines: Sequence[str], content: list[int]) -> list[int]:
+    """Return the lines from the names on, which are the first of the widest lines. Lines about the
+    recording may stand above them."""
+    for separator in "\t;,":
+        fields = [split_names(lines[k], separator) for k in content[:100]]
+        n = int(np.argmax([len(x) for x in fields]))
+        if len(fields[-1]) > 1:
+            is_data = any(x and to_number(x.replace(",", ".")) is not None for x in fields[n])
+            return content if is_data else content[n:]
+    return content
 
 
 def _separator(names: str, below: str) -> str:

@@ -164,7 +164,7 @@ def repeated_rows(recording: Recording, names: Sequence[str]) -> tuple[list[Rows
     """
     columns, trials = [recording.column(name) for name in names], recording.trials
     values = [t.values[:, columns] for t in trials]
-    size = _SAME * np.nanstd(np.concatenate(values), axis=0)
+    size = _SAME * np.ma.masked_invalid(np.concatenate(values)).std(axis=0).filled(0.0)
     keys = [_keys(x / np.where(size > 0, size, 1.0)) for x in values]
     repeated, findings = [np.zeros(len(x), bool) for x in values], []
     for i, j in combinations(range(len(trials)), 2):

@@ -290,7 +290,8 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
         whole, left = whole + (y**2).sum(), left + ((y - late[-1][:, None] * slope) ** 2).sum()
     times = np.concatenate(late)
     follows = abs(times[1:] @ times[:-1]) / max(times @ times, np.finfo(float).tiny)
-    if left < (1 - _SHIFTED) * whole and follows < 0.5:
+    # (Times beyond a cycle are those of outputs that do not change along it.)
+    if left < (1 - _SHIFTED) * whole and follows < 0.5 and times.std() < 1:
         text = f"the starts of cycles seem to scatter by {times.std():.2g} of a cycle: use an angle"
         yield Finding("inexact events", f"{text}, or a crossing where the signal changes fast.")
 

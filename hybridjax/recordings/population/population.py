@@ -10,6 +10,7 @@ from ..._core.arguments import Numbers, package, require_equal
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, OptionalNames, Positive, Seed
 from ..._core.boundary.values import Reals
+from ..._core.text import folded
 from ...errors import DefinitionError
 from ...identify.multiplier_estimate import MultiplierEstimate
 from ...scale.draws import monte_carlo
@@ -105,8 +106,9 @@ class Population:
 
     def __repr__(self) -> str:
         count = self.table.assign(cell=cells_of(self.table)).groupby("cell", sort=False)["subject"]
-        listed = "; ".join(f"{c}: {n} subjects" for c, n in count.nunique().items())
-        return f"Population({', '.join(self.values)}; {listed}; {len(self.table)} estimates)"
+        cells = "; ".join(f"{c}: {n} subjects" for c, n in count.nunique().items())
+        names = ", ".join(self.values)
+        return folded(f"Population({names}; {cells}; {len(self.table)} estimates)")
 
     def mean(self, quantity: str, *, covariates: OptionalNames = ()) -> Any:
         """Return the mean over subjects, and the spread between them, in each group and condition.

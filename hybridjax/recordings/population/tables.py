@@ -36,10 +36,8 @@ def table_of(table: Columns, rows: int) -> Any:
     frame = frame.astype(dict.fromkeys(labels, str))
     for subject, groups in frame.groupby("subject")["group"] if "group" in frame else ():
         if len(groups.unique()) > 1:
-            text = f"in the groups {' and '.join(map(repr, groups.unique()))}"
-            raise DefinitionError(
-                f"subject '{subject}' is {text}: conditions may differ, not groups."
-            )
+            text = f"{' and '.join(map(repr, groups.unique()))}: conditions may differ, not groups."
+            raise DefinitionError(f"subject '{subject}' is in the groups {text}")
     return frame
 
 
