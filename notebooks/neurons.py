@@ -28,8 +28,9 @@ import hybridjax as hj
 
 
 hj.enable_x64()
-files = [folder / "pacemaker_neurons.npz" for folder in (Path("data"), Path("notebooks/data"))]
-data = dict(np.load(next(path for path in files if path.exists())))
+# (Run this in the repository, or in its folder notebooks.)
+folder = Path("data" if Path("data/pacemaker_neurons.npz").exists() else "notebooks/data")
+data = dict(np.load(folder / "pacemaker_neurons.npz"))
 
 # %% [markdown]
 # ## A recording of events

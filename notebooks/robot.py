@@ -26,8 +26,9 @@ import hybridjax as hj
 
 
 hj.enable_x64()
-files = [folder / "compass_gait_robot.npz" for folder in (Path("data"), Path("notebooks/data"))]
-data = dict(np.load(next(path for path in files if path.exists())))
+# (Run this in the repository, or in its folder notebooks.)
+folder = Path("data" if Path("data/compass_gait_robot.npz").exists() else "notebooks/data")
+data = dict(np.load(folder / "compass_gait_robot.npz"))
 
 # %%
 runs = []

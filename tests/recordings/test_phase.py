@@ -73,7 +73,7 @@ def test_irregular_events(seed, jitter):
         own = t[(t >= w.time[0]) & (t <= w.time[-1])]
         at = np.interp(own, w.time, w.phase)
         assert np.abs(at - at[0] - np.arange(len(own))).max() <= 1e-9
-    exact = hj.Recording(t, {"x": t}, events={"e": 0.3 + 0.1 * np.arange(500)})
+    exact = hj.Recording(t, {"x": t}, events={"e": 0.3 + np.arange(15)})
     hj.plot.phase(hj.recordings.estimate_phase(exact, hj.AtEvent("e")))
     twice = hj.Recording(np.arange(62), {"x": np.zeros(62)}, events={"e": [*t, *(t + 0.02)]})
     assert hj.recordings.estimate_phase(twice, hj.AtEvent("e")).dropped == 60
