@@ -4,10 +4,12 @@
 A picture holds numbers that it draws, with which a test compares new ones.
 """
 
+import contextlib
 import itertools
 import json
 import re
 import sys
+import tempfile
 from pathlib import Path
 
 import matplotlib
@@ -159,6 +161,21 @@ def drawn(name: str) -> list[dict]:
         return json.loads(picture.info["Comment"])
 
 
+def of_pages() -> None:
+    """Draw what how-to pages save, with a palette, which takes a third of the size."""
+    pages = {
+        "find-a-cycle": "cycle", "design-experiments": "bode", "optimal-designs": "spectrum",
+        "identify-from-recordings": "multipliers", "populations": "paired",
+    }  # fmt: skip
+    for page, name in pages.items():
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            text = (IMAGES.parent / f"how-to/{page}.md").read_text()
+            exec("".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})
+            with Image.open(f"{name}.png") as picture:
+                small = picture.convert("RGB").quantize(64)
+                small.save(IMAGES / f"{name}.png", optimize=True, dpi=picture.info["dpi"])
+
+
 def of_page() -> pyplot.Figure:
     """The figure that the page on responses draws."""
     text = (IMAGES.parent / "how-to" / "responses.md").read_text()
@@ -183,6 +200,7 @@ if __name__ == "__main__":
         for name in sys.argv[2:] or codes():
             (IMAGES / f"gallery/{name}.svg").write_text(thumbnail(*run(name)))
         sys.exit()
+    of_pages()
     for name, figure in (("converter", of_page()), ("loop", of_notebook())):
         figure.savefig(IMAGES / f"{name}.png", metadata={"Software": None})
     walk().save(IMAGES / "walk.gif")

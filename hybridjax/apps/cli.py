@@ -245,8 +245,6 @@ def _reproduce(options) -> int:
 
 def _status(converged: bool) -> int:
     if not converged:
-        print(
-            "hybridjax: a fit did not converge: do not rely on its numbers, which were written.",
-            file=sys.stderr,
-        )
+        text = "a fit did not converge: do not rely on its numbers, which were written."
+        print(f"hybridjax: {text}", file=sys.stderr)
     return 0 if converged else 1

@@ -59,9 +59,11 @@ class Split(NamedTuple):
             except TooFewCycles as error:
                 missing = error.missing + d
             if missing:
-                obstacle = f"{self.early.sampled.max()} cycles (a quarter is held out) are too few "
-                obstacle += f"for order {d} with {N} sections: record {4 * missing / 3:.0f} more"
-                obstacle += ", or take fewer sections." if N > 1 else "."
+                have = int(self.early.sampled.max())
+                # (A quarter of the cycles is for unknowns whose number does not grow with N.)
+                fewer = f", or take {max(0.75 * N * have / (have + missing), 1):.0f} sections"
+                obstacle = f"{have} cycles (a quarter is held out) are too few for order {d} with "
+                obstacle += f"{N} sections: record {4 * missing / 3:.0f} more{fewer * (N > 1)}."
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]

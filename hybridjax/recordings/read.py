@@ -26,11 +26,12 @@ def read_recording(
 ) -> Recording:
     """Read a recording from files, given one by one or in a list, one trial in each.
 
-    - *Text* (`.csv`, `.txt`, `.tsv`): a first line with the names of the columns, separated by
-      commas, semicolons, tabs or blanks, and numbers below. A unit may follow a name in parentheses
-      or brackets, `force (N)`, or stand in a row below the names. Empty fields, `nan` and `NA` are
-      missing samples. Decimal commas are read where another character separates; lines that begin
-      with `#`, `%` or `//` are comments. UTF-8, UTF-16 or Latin-1.
+    - *Text* (`.csv`, `.txt`, `.tsv`): a line with the names of the columns, separated by commas,
+      semicolons, tabs or blanks, and numbers below. Lines above the names are left out if they have
+      fewer fields. A unit may follow a name in parentheses or brackets, `force (N)`, or stand in a
+      row below the names. Empty fields, `nan` and `NA` are missing samples. Decimal commas are read
+      where another character separates; lines that begin with `#`, `%` or `//` are comments. UTF-8,
+      UTF-16 or Latin-1.
     - *Excel* (`.xlsx`, `.xlsm`): the first sheet, in the same way.
     - *Parquet*, *Feather*, *NPZ*: an array for each column.
     - *MATLAB* (`.mat`, of all versions) and *HDF5* (`.h5`, `.hdf5`): arrays by their names in

@@ -137,7 +137,7 @@ def test_an_order_that_is_too_low_is_named():
     with pytest.raises(hj.DefinitionError, match="'f' is in `inputs` and in `outputs`"):
         hj.identify_recording(twice, TOP, inputs="f", outputs=("f", "x"))
     text = "129 cycles (a quarter is held out) are too few for order 2 with 32 sections: record 28"
-    assert f"since {text} more, or take fewer sections." in untried.advice.warnings[1].text
+    assert f"since {text} more, or take 21 sections." in untried.advice.warnings[1].text
     with pytest.warns(hj.errors.FindingWarning, match="orders above 1 could not be tried"):
         hj.recordings.choose_order(untried.data)
 
