@@ -41,7 +41,7 @@ LIMITS = {
     "structure": 13,
     "fragments": 9,
     "pronouns": 17,
-    "test_lines": 18_095,
+    "test_lines": 18_093,
     "doc_words": 38_868,
 }
 

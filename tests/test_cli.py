@@ -83,6 +83,7 @@ WRONG = {
         "--event e --drift 2": "--drift: '2' is not a number of cycles, four or more",
         "--event e --bandwidth 0": "--bandwidth: '0' is not a positive number",
         "--event e --sections 8.5": "--sections: '8.5' is not a whole number from 1 to",
+        "--crossing u:falling": "u is an input: define the phase by another signal",
         "--event e z": "unrecognized arguments: z (names need commas)",
         "--event e --reference u": "u: name it once (omit --reference without a controller)",
         "--crossing y:up": "'y:up' is not a signal, a direction and a value",

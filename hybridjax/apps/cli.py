@@ -65,7 +65,7 @@ _model = _option("FILE.py:NAME", r"(.*\.py):([^\W\d]\w*)", str, str)
 _axis = _option("NAME=LOW:HIGH:COUNT", "([^=]+)=(.*):(.*):(.*)", str, _FINITE, _FINITE, _COUNT)
 _crossing = _option(
     "a signal, a direction and a value, as in x:falling:0.2",
-    r"\s*([^:]*[^:\s])\s*(?::(rising|falling)(?::(.*))?)?",
+    r"\s*([^:]*[^:\s])\s*(?::\s*(rising|falling)\s*(?::(.*))?)?",
     str, lambda direction: direction or "rising", lambda value: _FINITE(value or "0"),
 )  # fmt: skip
 _format = "|".join(get_args(Format))
@@ -117,8 +117,7 @@ def _add_reproduce(commands) -> None:
         "hopper: figures, numbers, and models for hj.load, laid over the exact answer.",
     )
     add = reproduce.add_argument
-    add("--seed", type=_seed, default=0,
-        help="of the random subsets and phases (default: %(default)s)")  # fmt: skip
+    add("--seed", type=_seed, default=0, help="of random subsets and phases (default: %(default)s)")
     add("--quick", action="store_true", help="a short form: 20 experiments of 36 cycles, of which "
         "16 are used, in place of 80 experiments of 84, of which 64 are used")  # fmt: skip
     _add_results(reproduce)
@@ -165,8 +164,7 @@ def _add_identify(commands) -> None:
     add("--order", type=_count, metavar="D", help="number of multipliers; found by default")
     add("--bandwidth", type=_positive, metavar="HZ", help="of the splines through the outputs; by "
         "default N per period")  # fmt: skip
-    add("--time", default="time", metavar="NAME",
-        help="column with the times (default: %(default)s)")  # fmt: skip
+    add("--time", default="time", metavar="NAME", help="column of times (default: %(default)s)")
     add("--timing", choices=("clock", "duration"), help="an extra output, from when "
         "sections are crossed: for systems with a clock, or without")  # fmt: skip
     add("--drift", type=_cycles, metavar="CYCLES", help="remove changes of the cycle that take "
@@ -220,6 +218,8 @@ def _identify(options) -> int:
     named = [*options.input, *options.reference, *options.outputs]
     if twice := ", ".join(x for x in dict.fromkeys(named) if named.count(x) > 1):
         options.parser.error(f"{twice}: name it once (omit --reference without a controller)")
+    if beside := {*options.input} & {*(options.phase or (options.crossing or ())[:1])}:
+        options.parser.error(f"{', '.join(beside)} is an input: define the phase by another signal")
     if bool(options.files) == bool(options.table):
         options.parser.error("give either files of one subject or --table TABLE.csv")
     if not (options.outputs or options.event or options.timing):

@@ -18,9 +18,6 @@ def labeled(ax):
     return {line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"}
 
 
-# Transfer functions
-
-
 def test_magnitude_draws_the_values(estimate, exact):
     ax = hj.plot.magnitude(estimate, exact, output="vM").ax
     lines = labeled(ax)
