@@ -23,6 +23,7 @@ from .._core.pieces.run import DaskClient
 from .._core.precision import enable_x64
 from .._core.progress import counted, working
 from .._core.results import Result
+from .._core.text import folded
 from .._core.writing import Format, results_folder
 from ..errors import ComputationError, DefinitionError, HybridJaxError
 from ..identify.series.fit import SeriesFit
@@ -64,7 +65,7 @@ class Study:
 
     def __repr__(self) -> str:
         lines = [f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"]
-        lines += [f"  {text}" for text in self.remarks]
+        lines += [folded(f"  {text}", "  ") for text in self.remarks]
         if len(self.results):
             lines.append(self.results.T.to_string(header=False, float_format="{:.4g}".format))
         return "\n".join(lines)
@@ -169,8 +170,7 @@ def identify_subjects(
     failures = {name: text for name, text in causes.items() if text}
     frame = rows[~rows["report"].isin(failures)].drop_duplicates("report", ignore_index=True)
     if not len(frame):
-        text = "; ".join(map(": ".join, failures.items()))
-        raise ComputationError(f"all subjects failed: {text}")
+        raise ComputationError("all subjects fail: " + "; ".join(map(": ".join, failures.items())))
     fits: Any = tuple(load(root / name / "fit.npz") for name in frame["report"])
     texts = [(root / name / "summary.json").read_text() for name in frame["report"]]
     for name, key in _COLUMNS.items():

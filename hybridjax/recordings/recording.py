@@ -250,7 +250,7 @@ class Recording(eqx.Module):
 
     def __repr__(self) -> str:
         names = ", ".join(map(with_unit, self.signals, self.units))
-        lines = [f"Recording({len(self.trials)} trials: {names})"]
+        lines = [folded(f"Recording({len(self.trials)} trials: {names})")]
         for t in self.trials:
             step = np.diff(t.time)
             middle = float(np.median(step))
