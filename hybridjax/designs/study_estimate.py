@@ -11,7 +11,7 @@ from .._core.executor import from_host, to_host
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import require_deviations
-from ..identify.multipliers import StructuredFit, fit_multipliers, require_order
+from ..identify.multipliers import StructuredFit, fit_multipliers, noise_ratios, unsupported
 from ..identify.spectral_sums import spectral_sums
 from ..identify.variable_projection import HTFGroup, grouped, maximum_likelihood, misfit_of
 from ..linear.htf import HTF
@@ -121,9 +121,8 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     by_level = fit_multipliers(htf, order, overhang=goal.overhang, check=False, errors="variance")
     fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
     objection = ""
-    try:
-        require_order(groups, htf, order, fit.cost / fit.freedom, fit.residual)
-    except DefinitionError:  # (with advice for a single fit)
+    if unsupported(lambda _: noise_ratios(groups, htf, fit.coefficients), order):
+        # (The sentence advises on a single fit.)
         objection = f"the data do not support {order} multipliers (lower `order` in a new study)"
     if not objection and (np.abs(fit.multipliers) >= 1).any():
         objection = "the estimate is unstable, and an unstable system has no periodic response"

@@ -14,6 +14,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability
 from .._core.boundary.values import Complexes
 from .._core.html import card, multiplier_table, text, unit_circle
+from .._core.results import Result
 from .._core.text import folded
 from ..errors import DefinitionError, FindingWarning
 from .denominator import Covariance, multipliers_of
@@ -186,7 +187,8 @@ class MultiplierEstimate(eqx.Module):
         return compare_multipliers(self.multipliers, true)
 
     def contradiction(self, others: Iterable[Callable[[], RoughFit]], drift: str = "") -> str:
-        """Return a sentence if another fit contradicts the multipliers; else "".
+        """Return a sentence if the data do not determine the multipliers, or another fit
+        contradicts them; else "".
 
         It does if a multiplier is outside of its confidence regions, and its nearest one outside of
         those of this fit. (Of 95 %: at 99 % half as many right orders are doubted, and a few more
@@ -195,6 +197,8 @@ class MultiplierEstimate(eqx.Module):
         **Arguments:** `others`: the fits; a `DefinitionError` means too few data. `drift`: the
         sentence, for fits that allow for drift. Default: a sentence about their order.
         """
+        if not np.isfinite(self.covariance).all():
+            return "the data do not determine all multipliers, some may be spurious: lower `order`"
         level = 0.999 if drift else 0.95
         for fit in others:
             with suppress(DefinitionError):
@@ -216,6 +220,8 @@ class MultiplierEstimate(eqx.Module):
         return folded(f"{type(self).__name__}({about})")
 
     def _repr_html_(self) -> str:
+        if getattr(self, "result", Result.OK) != Result.OK:
+            return card(type(self).__name__, "", text(repr(self)))
         regions = []
         if np.isfinite(self.multiplier_covariances).all():
             regions = [self.ellipse(k) for k in range(len(self.multipliers))]
@@ -228,7 +234,9 @@ class MultiplierEstimate(eqx.Module):
         return ""
 
     def show_multipliers(self) -> str:
-        """Return the multipliers and their standard errors, for a `repr`."""
+        """Return the multipliers of a minimum and their standard errors, for a `repr`."""
+        if (code := getattr(self, "result", Result.OK)) != Result.OK:
+            return f"no multipliers: {Result(code).message} (`multipliers` holds its last step)"
         shown = (
             f"{x.real:+.7f}{f'{x.imag:+.7f}i' if x.imag else ''} ± {error:.1e}"
             for x, error in zip(self.multipliers, self.standard_errors, strict=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
@@ -17,21 +18,10 @@ from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
-from . import variable_projection as varpro
+from . import variable_projection as varpro, weights
 from .denominator import chi, multipliers_of
-from .descent import ROUNDING
+from .descent import ROUNDING, Coefficients
 from .multiplier_estimate import MultiplierEstimate, RoughFit, warned
-from .variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of, numerator_size
-from .weights import (
-    SMALLEST_ERROR,
-    check_values,
-    error_weights,
-    estimated_noise,
-    largest_misfit,
-    line_variances,
-    neighbor_correlation,
-    weights_of,
-)
 
 
 # Fits of HTFs without variances whose weights come from the last misfit. Fewer: weights of the
@@ -92,12 +82,9 @@ class StructuredFit(MultiplierEstimate):
 
     def _about(self) -> str:
         misfit = ", ".join(f"{n} {x:.1e}" for n, x in zip(self.outputs, self.residual, strict=True))
-        state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
-        state += self.doubt and f"; {self.doubt}"
-        return (
-            f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
-            f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}{state}"
-        )
+        about = f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
+        about += f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
+        return "; ".join(filter(None, [about, self.doubt]))
 
 
 def _evaluate(numerators, c, f, n_sections: int) -> Complex[np.ndarray, "M F ny nu"]:
@@ -147,28 +134,37 @@ def fit_multipliers(
     message gives the number needed), or an order that the data do not support.
     """
     order = order.rank() if isinstance(order, LDTP) else order
-    rms = check_values(htf)
+    rms = weights.check_values(htf)
     if errors == "variance" and htf.variance is None:
         raise DefinitionError("errors='variance' needs HTFs with variances: take 'residuals'.")
-    size = numerator_size(htf, order, overhang)
     f, H = np.asarray(htf.f), np.asarray(htf.H)
-    weights = error_weights(htf, rms)
-    groups = group_htf(htf, weights, size)
-    c, converged = maximum_likelihood(groups, order)
-    if htf.variance is None:
-        for _ in range(_REWEIGHTINGS):
-            variance = varpro.error_spectrum(groups, c, f, line_variances(htf), len(rms))
-            weights = np.broadcast_to(weights_of(variance, rms), H.shape)
-            groups = group_htf(htf, weights, size)
-            c, converged = maximum_likelihood(groups, order, c)
+
+    def weighted(order: int):
+        size, weight = varpro.numerator_size(htf, order, overhang), weights.error_weights(htf, rms)
+        groups = varpro.group_htf(htf, weight, size)
+        c, converged = varpro.maximum_likelihood(groups, order)
+        for _ in range(_REWEIGHTINGS * (htf.variance is None)):
+            variance = varpro.error_spectrum(groups, c, f, weights.line_variances(htf), len(rms))
+            weight = np.broadcast_to(weights.weights_of(variance, rms), H.shape)
+            groups = varpro.group_htf(htf, weight, size)
+            c, converged = varpro.maximum_likelihood(groups, order, c)
+        return groups, weight, size, c, converged
+
+    groups, weight, size, c, converged = weighted(order)
     covariance, cost, freedom = varpro.summarize(groups, c, errors)
     B = varpro.unfold(htf, groups, [varpro.numerators_of(group, c) for group in groups])
     misfit, scale = _evaluate(B, c, f, htf.n_sections) - H, rms[:, None]
     residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
-    if check:
-        require_order(groups, htf, order, cost / freedom, residual)
 
-    correlation = neighbor_correlation(misfit / scale, H / scale, f)
+    def ratios(k: int) -> NoiseRatios:
+        some, *_, fitted, _ = (groups, c, True) if k == order else weighted(k)
+        return noise_ratios(some, htf, fitted, htf.variance is None and residual.max() < ROUNDING)
+
+    surplus = unsupported(ratios, order)
+    if check and surplus:
+        raise DefinitionError(f"{surplus}, or pass check=False.")
+
+    correlation = weights.neighbor_correlation(misfit / scale, H / scale, f)
     result = Result.OK if converged else Result.NOT_CONVERGED
     fit = StructuredFit(
         multipliers_of(c), c, *covariance, residual, correlation, B, cost, freedom, result,
@@ -178,14 +174,14 @@ def fit_multipliers(
     def of_order(order: int) -> RoughFit:
         # No larger numerators, if possible: without zero multipliers they are large enough.
         fewer = max(size - 1 - order * htf.n_sections, 0)
-        groups = group_htf(htf, weights, numerator_size(htf, order, fewer))
+        groups = varpro.group_htf(htf, weight, varpro.numerator_size(htf, order, fewer))
         start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
-        c, _ = maximum_likelihood(groups, order, start, rough=True)
+        c, _ = varpro.maximum_likelihood(groups, order, start, rough=True)
         return c, lambda: varpro.summarize(groups, c, errors)[0]
 
     # One more multiplier, or a pair.
     more = [functools.partial(of_order, order + k) for k in (1, 2) if check]
-    return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), check))
+    return dataclasses.replace(fit, doubt=warned(surplus or fit.contradiction(more), check))
 
 
 @checked
@@ -212,7 +208,7 @@ def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> Mu
     exact, multipliers = exact_htf(model, htf), model.multipliers
     d, c = len(multipliers), np.poly(multipliers).real[1:]
     groups = varpro.grouped(exact, d, overhang)
-    J = np.concatenate([misfit_of(x, c).jacobian.reshape(d, -1) for x in groups], axis=1)
+    J = np.concatenate([varpro.misfit_of(x, c).jacobian.reshape(d, -1) for x in groups], axis=1)
     return MultiplierEstimate(multipliers, c, np.linalg.inv(J @ J.T), np.inf)
 
 
@@ -252,8 +248,8 @@ class OrderSelection(eqx.Module):
     - `by_rank`, `by_mdl`: the order that each criterion selects.
     - `order`: `by_rank` where variances were given: a longer denominator adds many coefficients
       of numerators, which `mdl` penalizes, so that it selects too few multipliers where
-      noise is strong. Without variances `by_mdl`, which small errors that are not random do not
-      mislead.
+      noise is strong; and for exact HTFs, of which `mdl` counts rounding. Without variances
+      `by_mdl`, which small errors that are not random do not mislead.
     """
 
     orders: Int[np.ndarray, " k"]
@@ -310,60 +306,43 @@ def select_order(
 
     **Raises:** `DefinitionError` as `fit_multipliers`.
     """
-    rms = check_values(htf)
-    size = numerator_size(htf, max_order, overhang)
-    weights = error_weights(htf, rms)
-    largest = group_htf(htf, weights, size)
+    rms = weights.check_values(htf)
+    size = varpro.numerator_size(htf, max_order, overhang)
+    weight = weights.error_weights(htf, rms)
+    largest = varpro.group_htf(htf, weight, size)
     noise = np.ones(len(rms))
     if htf.variance is None:
-        c, _ = maximum_likelihood(largest, max_order)
+        c, _ = varpro.maximum_likelihood(largest, max_order)
         square, number = np.zeros((2, len(rms)))
         for group in largest:
-            residual = misfit_of(group, c).residual
+            residual = varpro.misfit_of(group, c).residual
             np.add.at(square, group.channel[:, 0], (residual**2).sum(axis=(0, 1)))
             np.add.at(number, group.channel[:, 0], group.freedom)
-        noise = np.maximum(np.sqrt(square / number), SMALLEST_ERROR)
-        weights = weights / noise[:, None]
-        largest = group_htf(htf, weights, size)
-    values, deviation = _noise_ratios(largest, max_order, noise)
-
+        noise = np.maximum(np.sqrt(square / number), weights.SMALLEST_ERROR)
+        weight = weight / noise[:, None]
+        largest = varpro.group_htf(htf, weight, size)
     costs, freedoms = [], []
     for d in range(max_order + 1):
-        groups = group_htf(htf, weights, size - (max_order - d) * htf.n_sections)
-        c = maximum_likelihood(groups, d)[0] if d else np.zeros(0)
-        costs.append(sum(float((misfit_of(g, c).residual ** 2).sum()) for g in groups))
-        freedoms.append(sum(g.freedom * g.size for g in groups) - d)
+        groups = varpro.group_htf(htf, weight, size - (max_order - d) * htf.n_sections)
+        c = varpro.maximum_likelihood(groups, d)[0] if d else np.zeros(0)
+        cost, freedom = varpro.cost_of(groups, c)
+        costs.append(cost)
+        freedoms.append(freedom - d)
     cost, freedom, data = np.array(costs), np.array(freedoms), 2 * htf.H.size
-    level, tails = estimated_noise(largest_misfit(htf), cost[-1] / freedom[-1])
+    level, _ = weights.estimated_noise(weights.largest_misfit(htf), cost[-1] / freedom[-1])
     likelihood = data * np.log(np.maximum(cost, 1e-300)) if htf.variance is None else cost / level
-    left = values[::-1] / level
+    exact = bool(noise.max() < ROUNDING)
+    values, spread = noise_ratios(largest, htf, c, exact)
     return OrderSelection(
         orders=np.arange(max_order + 1),
-        strength=np.sqrt(left),
-        deviation=(left - 1) / (tails * deviation),
+        strength=np.sqrt(values[::-1]),
+        deviation=(values[::-1] - 1) / spread,
         threshold=np.array([_largest_of_noise(max_order + 1 - d) for d in range(max_order + 1)]),
         cost=cost,
         freedom=freedom,
         mdl=likelihood + np.log(data) * (data - freedom),
-        variances=htf.variance is not None,
+        variances=htf.variance is not None or exact,
     )
-
-
-def _noise_ratios(
-    groups: list[HTFGroup], order: int, noise: Float[np.ndarray, " ny"]
-) -> tuple[Float[np.ndarray, " d1"], float]:
-    """Return the squared singular values of the numerators' residuals of $z^{-jN} H$, j = 0..d.
-
-    They ascend, in units of the noise (1 where only noise is left); then the standard deviation of
-    each where it is noise.
-
-    **Arguments:** `noise`: that of each output, relative to its rms.
-    """
-    whitened, _ = varpro.delayed_responses(groups, np.zeros(order))
-    values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2
-    if noise.max() < ROUNDING:  # rounding errors differ by orders of magnitude
-        values = values / _ROUNDING_VARIES
-    return values, float(np.sqrt(2 / sum(group.freedom * group.size for group in groups)))
 
 
 @functools.lru_cache
@@ -378,35 +357,40 @@ def _largest_of_noise(size: int) -> float:
     return float(np.quantile(np.linalg.eigvalsh(symmetric)[:, -1], 1 - _FALSE_ALARMS))
 
 
-def require_order(
-    groups: list[HTFGroup], htf: HTF, order: int, misfit: float, residual: Float[np.ndarray, " ny"]
-) -> None:
-    """Check that HTFs carry so many multipliers.
+NoiseRatios = tuple[Float[np.ndarray, " d1"], float]
+"""Of a fit of order d: d + 1 ratios, ascending, one of which is noise, that of chi itself; and the
+standard deviation of each where it is noise."""
 
-    **Arguments:** `misfit`: cost of the fit relative to its expected value. `residual`: the rms
-    misfit of each output's HTFs relative to their rms.
 
-    **Raises:** `DefinitionError` if noise alone could account for one of the multipliers.
+def noise_ratios(
+    groups: list[varpro.HTFGroup], htf: HTF, c: Coefficients, exact: bool = False
+) -> NoiseRatios:
+    """Return squared singular values of the residuals of numerators of $z^{-jN} H$, j = 0..d, in
+    units of the noise, for a fit to HTFs.
+
+    **Arguments:** `exact`: whether the noise is rounding, which differs by orders of magnitude.
     """
-    level, tails = estimated_noise(largest_misfit(htf), misfit)
-    noise = residual if htf.variance is None else np.ones(len(residual))
-    values, deviation = _noise_ratios(groups, order, noise)
-    refuse_invented(values / level, tails * deviation)
+    cost, freedom = varpro.cost_of(groups, c)
+    level, tails = weights.estimated_noise(weights.largest_misfit(htf), cost / freedom)
+    whitened, _ = varpro.delayed_responses(groups, np.zeros(len(c)))
+    values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2
+    return values / level / _ROUNDING_VARIES**exact, tails * float(np.sqrt(2 / freedom))
 
 
-def refuse_invented(values: Float[np.ndarray, " d1"], spread: float, cause: str = "") -> None:
-    """Check the d + 1 ratios of a fit of order d, ascending: one is noise, that of chi itself.
+def unsupported(ratios: Callable[[int], NoiseRatios], order: int) -> str:
+    """Return a sentence if noise alone may account for multipliers of a fit; else "".
 
-    **Raises:** `DefinitionError` if more of them may be noise.
+    The number that it names is supported by a fit of that order, too.
+
+    **Arguments:** `ratios(k)`: those of a fit of order k.
     """
-    order = len(values) - 1
-    deviations = (values - 1) / spread
-    carried = sum(deviations[k] > _largest_of_noise(k + 1) for k in range(1, order + 1))
-    if carried < order:
-        raise DefinitionError(
-            f"the data support {carried} multipliers, not {order}: the weakest is "
-            f"{np.sqrt(max(values[1], 0.0)):.3g} times the noise, which may be noise alone. Lower "
-            "`order` (for HTFs `select_order` compares orders, for section data "
-            "`recordings.choose_order`), measure longer, or pass check=False. "
-            f"{cause and cause[0].upper() + cause[1:] + '.'}".rstrip()
-        )
+    most, weakest = order, 0.0
+    while most:
+        values, spread = ratios(most)
+        sizes, limits = (values - 1) / spread, [_largest_of_noise(k + 1) for k in range(most + 1)]
+        if (sizes[1:] > limits[1:]).all():
+            break
+        most, weakest = int((sizes[1:] > limits[1:]).sum()), np.sqrt(max(values[1], 0.0))
+    text = f"the data support {most} multipliers, not {order}: the weakest is {weakest:.3g} times "
+    remedy = f"lower `order` to {most}, measure longer" if most else "measure longer, excite more"
+    return f"{text}the noise, and may be noise alone; {remedy}" * (most < order)

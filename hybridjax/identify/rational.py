@@ -93,12 +93,17 @@ class RationalFit(eqx.Module):
             self.outputs, self.multipliers, self.residual, self.result, strict=True
         ):
             shown = ", ".join(f"{x.real:+.5f}{x.imag:+.5f}i" for x in multipliers)
-            state = "" if code == Result.OK else f" ({Result(int(code)).message})"
-            rows.append(f"  {name}: multipliers {shown}; residual {residual:.2e}{state}")
+            shown = shown if code == Result.OK else f"none: {Result(int(code)).message}"
+            rows.append(f"  {name}: multipliers {shown}; residual {residual:.2e}")
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        return card("RationalFit", "", text(repr(self)), unit_circle(self.multipliers.ravel()))
+        return card(
+            "RationalFit",
+            "",
+            text(repr(self)),
+            unit_circle(self.multipliers[self.result == Result.OK].ravel()),
+        )
 
 
 @checked

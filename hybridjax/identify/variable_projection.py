@@ -166,6 +166,12 @@ def residuals_of(
     return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
 
 
+def cost_of(groups: list[HTFGroup], c: Coefficients) -> tuple[float, int]:
+    """Return the sum of squares of the misfit, and its expectation for errors of variance 1."""
+    cost = sum(float((misfit_of(group, c).residual ** 2).sum()) for group in groups)
+    return cost, sum(group.freedom * group.size for group in groups)
+
+
 def maximum_likelihood(
     groups: list[HTFGroup], order: int, start: Coefficients | None = None, rough: bool = False
 ) -> tuple[Coefficients, bool]:

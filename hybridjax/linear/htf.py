@@ -323,7 +323,8 @@ class HTF(eqx.Module):
         # A real system responds to -f with the conjugate of its response to f.
         mirror = np.array([self._index(-m) for m in self.harmonics])
         f = np.concatenate([self.f, -np.asarray(self.f)])
-        H = jnp.concatenate([self.H, jnp.conj(self.H[mirror])], axis=1)
+        H, xp = to_host(self.H), namespace(to_host(self.H))
+        H = xp.concatenate([H, H[mirror].conj()], axis=1)
         U, periods = np.fft.fft(u, axis=0), n // N
         lines = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
         distance = np.abs(self._circle(lines[:, None] / periods - f))
@@ -333,10 +334,11 @@ class HTF(eqx.Module):
                 f"`u` holds the frequency f = {abs(self._circle(lines[lost][0] / periods)):g} "
                 "cycles per period, at which there are no HTFs: compute or estimate them there."
             )
-        parts = jnp.einsum("mkij,kj->mki", H[:, distance.argmin(axis=1)], U[lines])
-        places = (lines + periods * np.array(self.harmonics)[:, None]) % n
-        Y = jnp.zeros((n, len(self.outputs)), complex).at[places].add(parts)
-        return jnp.fft.ifft(Y, axis=0).real
+        parts = xp.einsum("mkij,kj->mki", H[:, distance.argmin(axis=1)], U[lines])
+        Y = xp.zeros((n, len(self.outputs)), complex)
+        for m, part in zip(self.harmonics, parts, strict=True):
+            Y = put(Y, at := (lines + periods * m) % n, Y[at] + part)
+        return from_host(xp.fft.ifft(Y, axis=0).real)
 
     def harmonic_errors(self, other: "HTF") -> Float[Array, "M ny"]:
         """Largest difference from `other` over frequencies and inputs, per harmonic and output.

@@ -14,8 +14,7 @@ from jaxtyping import Complex, Float
 from .._core.boundary.checked import checked
 from .._core.results import Result
 from .._core.text import p_value
-from ..errors import DefinitionError
-from ..identify.series.fit import SeriesFit, refuse_order
+from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import MAY_DRIFT, CycleGrid, PreparedRecords
 from ..identify.series.subspace import late_outputs, ordinary_least_squares
@@ -93,20 +92,16 @@ def advise(
     if sampled - unknowns < _FEW * sampled:
         text = f"a section was sampled {sampled} times for {unknowns} unknowns; record more, take "
         warnings.append(Finding("few strides", f"{text}fewer sections, or excite fewer inputs."))
-    try:
-        refuse_order(delayed, fit.noise / problem.scale)
-    except DefinitionError:
-        text = f"the data do not carry {d} multipliers: some may be noise. Compare lower orders."
-        warnings.append(Finding("order", text))
     if fit.doubt:
-        warnings.append(Finding("drift" if fit.doubt == MAY_DRIFT else "order", f"{fit.doubt}."))
+        kind = "drift" if fit.doubt == MAY_DRIFT else "order"
+        warnings.append(Finding(kind, f"{fit.doubt}."))
     band = input_band(data)
     for name in fit.feedback:
         text = f"{name} answers earlier residuals of the outputs: fits are biased. {NAME_REFERENCE}"
         warnings.append(Finding("feedback", text))
     warnings += [*_about_excitation(data, fit, band), *_about_outputs(grid, fit)]
     for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
-        if z.imag >= 0 and abs(z) + 2 * error > 1:
+        if fit.result == Result.OK and z.imag >= 0 and abs(z) + 2 * error > 1:
             text = f"the interval of the multiplier {z:.3g} reaches the unit circle."
             warnings.append(Finding("stability", text))
     if fit.result != Result.OK:
@@ -147,8 +142,9 @@ def slow_sampling(data: SectionData) -> list[Finding]:
 def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:
     """Find multipliers of modes that decay so little that they may be tones or drift."""
     cycles = max(len(r.u) for r in data.records) / data.n_sections
+    least = max(_DAMPED, _DECAYED ** (1 / cycles))
     for z in fit.multipliers:
-        if z.imag >= 0 and abs(z) > max(_DAMPED, _DECAYED ** (1 / cycles)):
+        if fit.result == Result.OK and z.imag >= 0 and abs(z) > least:
             text = f"the mode of the multiplier {z:.3g} hardly decays in {cycles:.0f} cycles, as "
             text += "hum or drift, which spoil the others: look for them in the spectra of outputs."
             yield Finding("no decay", text)

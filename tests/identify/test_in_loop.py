@@ -186,7 +186,7 @@ def test_whether_outputs_answer_at_once_is_found(plant):
     r = np.sin(0.2 * np.pi * np.arange(60 * N))[None]  # (a statistic of -5e-4, by rounding)
     u, y = run(plant, r, 0 * r, np.random.default_rng(0), waits=True)
     data = hj.Record(np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r"))
-    assert not np.asarray(hj.fit_ldtp(data, 2, reference="r", check=False).model.D).any()
+    assert "not determine D" in repr(hj.fit_ldtp(data, 2, reference="r", check=False))
     data = series(plant, 5, noise=0.5, waits=True, through=1.0)
     with pytest.raises(hj.DefinitionError, match="tells the two directions apart"):
         hj.fit_ldtp(data, 2, reference="r")

@@ -5,11 +5,12 @@ import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cached_property
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy import special
 
 from ..._core.arguments import Numbers, require_same
 from ..._core.boundary.checked import checked
@@ -28,12 +29,11 @@ from ..denominator import Covariance, multipliers_of
 from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate, RoughFit
-from ..multipliers import exact_htf
 from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from ..series import prediction, residuals
 from ..series.prediction import Predictor, SeriesPart, SeriesProblem
 from ..series.records import MAY_DRIFT, CycleGrid, PreparedRecords, with_drift
-from ..series.subspace import answers_at_once, default_horizon, subspace_model
+from ..series.subspace import answers_at_once, subspace_model
 from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .realization import given_dims, realize
 
@@ -168,8 +168,15 @@ class LDTPFit(MultiplierEstimate):
         D = np.asarray(self.noise.D)
         return Predictor(self._coordinates.model.times(self._scale), D @ D.swapaxes(1, 2))
 
+    @property
+    def determines_direct(self) -> bool:
+        """Whether the data determine D, unless it was taken as zero."""
+        coordinates = self._coordinates
+        places = [np.r_[x["D"]] for x in coordinates.places if coordinates.direct]
+        slopes = np.eye(coordinates.size)[:, np.concatenate([np.r_[:0], *places])]
+        return bool(np.isfinite(self._spread.variance(slopes)).all())
+
     def _about(self) -> str:
-        state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         about = f"misfit {self.cost:.6g}, expected {self.freedom}"
         if self.cost > 2 * self.freedom or weights.are_alike(self.correlation or 0.0, self.freedom):
             about += (
@@ -179,8 +186,9 @@ class LDTPFit(MultiplierEstimate):
         if self.noise is not None:
             size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
             about = f"errors one step ahead {signal_values(self.outputs, size)}"
-        about = f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
-        return "; ".join(filter(None, [about, self.doubt, self.feedback]))
+        about = f"{about}; {self.unknowns} unknowns, {self.n_sections} sections"
+        unknown = "" if self.determines_direct else "the data do not determine D: excite more lines"
+        return "; ".join(filter(None, [about, unknown, self.doubt, self.feedback]))
 
 
 @checked
@@ -260,7 +268,8 @@ def fit_ldtp(
         if innovations and not isinstance(guess, LDTP):
             direct = answers_at_once(records, outside)
         how = (innovations, start == "free", check)
-        fit = _fit_to_series(records, guess, *how, direct)
+        fit = (_likelier if direct is None else _fit_to_series)(records, guess, *how, direct)
+        direct = fit._coordinates.direct
         grid = records.whole()
         errors = lambda: cast(Predictor, fit.predictor).errors(grid, start == "free")  # noqa: E731
         feedback = residuals.UNSEEN * (innovations and direct and drive is None)
@@ -316,6 +325,23 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
     if check:
         _require_answer(point)
     return _finished(point, converged, htf, scale, freedom)
+
+
+def _likelier(records: PreparedRecords, guess: Guess, *how: Any) -> LDTPFit:
+    """Return a fit with D = 0 if data that determine D do not contradict it; else one with D."""
+    fit = _fit_to_series(records, guess, *how[:-1], True)
+    model = fit._coordinates.model
+    if not fit.determines_direct:
+        return fit
+    for start in (guess, model._replace(D=[0.0 * D for D in model.D])):  # (may differ in minima)
+        zero = _fit_to_series(records, start, *how[:-1], False)
+        sizes = [np.linalg.slogdet(cast(Predictor, x.predictor).S)[1] for x in (zero, fit)]
+        ratio = max(float(records.sampled.mean(axis=1) @ (sizes[0] - sizes[1])), 0.0)
+        # (At 5 %: a D that is fitted in vain enlarges errors a little, a missing one is a bias.)
+        degrees = fit.unknowns - zero.unknowns
+        if zero.result == Result.OK and special.gammaincc(degrees / 2, ratio / 2) > 0.05:
+            return zero
+    return fit
 
 
 def _fit_to_series(
@@ -470,31 +496,3 @@ def _finished(
         _spread=spread,
         _scale=scale,
     )
-
-
-@checked
-def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
-    r"""Return the Cramer-Rao bound of the multipliers for known dimensions of the states.
-
-    The errors of the HTFs are independent, circular and Gaussian, as for `multiplier_bound`. The
-    unknowns are the matrices A[n], B[n], C[n] (and D[n], if the model has any) instead of free
-    numerators: this is the bound of `fit_ldtp`. The squared ratio of the standard errors of
-    `multiplier_bound` to these is the factor by which the structure reduces the amount of data.
-
-    **Arguments:**
-
-    - `model`: the true model, of which the minimal part counts. `htf`: HTFs with the frequencies,
-      harmonics and `variance` of the experiment; H is not used.
-
-    **Returns:** as many multipliers as the smallest state of the minimal model has coordinates.
-
-    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
-    """
-    exact = exact_htf(model, htf)
-    minimal = realize(np.asarray(model.impulse_response(2 * default_horizon(model.n_sections) + 1)))
-    scale = weights.check_values(exact)
-    problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
-    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), _is_direct(model))
-    c, slopes = characteristic_slopes(coordinates)
-    spread = problem.linearize(coordinates).spread()
-    return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)

@@ -26,7 +26,7 @@ from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sa
 from ..descent import Coefficients
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate, RoughFit, warned
-from ..multipliers import refuse_invented
+from ..multipliers import NoiseRatios, unsupported
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
 from .in_loop import LoopEquations
@@ -131,11 +131,10 @@ class SeriesFit(MultiplierEstimate):
         return HTF(f, H, harmonics, N, self.inputs, self.outputs, "series fit", variance=variance)
 
     def _about(self) -> str:
-        state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         noise = signal_values(self.outputs, self.noise)
         loop = f"in a loop, by {', '.join(self.reference)}; " if self.reference else ""
         about = f"{loop}noise {noise}; {self.n_sections} sections, "
-        about += f"{self.numerators.shape[1]} lags{state}"
+        about += f"{self.numerators.shape[1]} lags"
         feedback = about_answering(self.feedback, _BIASED)
         return "; ".join(filter(None, [about, self.doubt, feedback]))
 
@@ -219,23 +218,33 @@ def fit_series(
         return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), check))
     records = data if isinstance(data, PreparedRecords) else PreparedRecords(data, start == "free")
     overhang = records.n_sections if overhang is None else overhang
-    problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
-    delayed = late_outputs(problem, order)
-    solution, _ = minimize(problem, total_least_squares(delayed))
-    _require_freedom(problem, solution)
-    noise = _noise(solution)  # the weights that the residuals suggest
-    problem = problem._replace(scale=problem.scale * noise)
-    solution, converged = minimize(problem, solution.c)
+
+    def weighted(order: int):
+        problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
+        delayed = late_outputs(problem, order)
+        solution, _ = minimize(problem, total_least_squares(delayed))
+        _require_freedom(problem, solution)
+        noise = _noise(solution)  # the weights that the residuals suggest
+        problem = problem._replace(scale=problem.scale * noise)
+        solution, converged = minimize(problem, solution.c)
+        ratios = _noise_ratios(delayed, noise * _noise(solution))
+        return ratios, problem, solution, converged
+
+    ratios, problem, solution, converged = weighted(order)
     fit = assemble(problem, solution, coefficient_covariance(problem, solution), converged)
     grid = records.whole()
     error = np.where(grid.sampled, grid.y - fit.predict(grid, start == "free"), 0.0)
     feedback = answering(grid, error, records.inputs)
     doubt = _about_drift(fit, records, start == "free")
-    if check:
-        refuse_order(delayed, noise * _noise(solution), about_answering(feedback, _BIASED) or doubt)
+    surplus = unsupported(lambda k: ratios if k == order else weighted(k)[0], order)
+    if surplus and check:
+        cause = about_answering(feedback, _BIASED) or doubt
+        cause = cause and f" {cause[0].upper()}{cause[1:]}."
+        raise DefinitionError(f"{surplus}, or pass check=False.{cause}")
     # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
     more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
-    doubt = warned(doubt or fit.contradiction(more), check)
+    doubt = "; ".join(filter(None, [surplus, doubt])) or fit.contradiction(more)
+    doubt = warned(doubt, check)
     return dataclasses.replace(fit, feedback=feedback, doubt=doubt)
 
 
@@ -345,12 +354,11 @@ def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> No
         raise TooFewCycles(problem, n, i, missing)
 
 
-def refuse_order(delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"], cause: str = "") -> None:
-    """**Raises:** `DefinitionError` if the outputs, with noise of this standard deviation, do not
-    support so many multipliers; it names the `cause`."""
+def _noise_ratios(delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"]) -> NoiseRatios:
+    """Return the ratios of a fit to outputs with noise of this standard deviation."""
     rows = max(delayed.freedom, 1)
     gram = (delayed.gram / noise[:, None, None] ** 2).sum(axis=0)
-    refuse_invented(np.linalg.eigvalsh(gram) / rows, np.sqrt(2 / rows), cause)
+    return np.linalg.eigvalsh(gram) / rows, float(np.sqrt(2 / rows))
 
 
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered

@@ -76,39 +76,48 @@ def subspace_model(
     return _from_states(sections, to_state, past, innovations, direct)
 
 
-def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool:
+def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | None:
     """Test whether the outputs answer the inputs of a loop at their own section.
 
     If so, they answer a reference at once, given the past of all signals: the likelihood-ratio
     test, section by section (Anderson, *Multivariate Statistical Analysis*, 2003, section 8.4),
     which holds for any controller. Inputs that answer outputs at once look the same in the inputs.
 
+    **Returns:** None if they seem not to, and nothing but the reference and the past make the
+    inputs: their past may then determine them, and a fit shows more.
+
     **Raises:** `DefinitionError` if both answer each other at once: no model of the noise tells
     them apart.
     """
     N, ny, nr = records.n_sections, len(records.outputs), len(drive.inputs)
     columns, statistic, left, whole = nr + len(records.inputs) + ny, 0.0, 0.0, 0.0
+    age = records.whole().age.reshape(len(records.records), -1)
     for section in _sections(records, without_drift(drive.whole()).u):
-        count = len(section.y)
-        past = section.past(max(min(count // (_ROWS * columns), default_horizon(N)), 1))
-        r, u = section.u[:, :nr], section.u[:, nr:]
+        length = max(min(len(section.y) // (_ROWS * columns), default_horizon(N)), 1)
+        # (Zeros before a record are no past that determines inputs.)
+        later = age[section.record, section.time] > length
+        if later.sum() <= columns * length + nr:
+            continue
+        past, y, inputs = (x[later] for x in (section.past(length), section.y, section.u))
+        r, u = inputs[:, :nr], inputs[:, nr:]
         rows = np.concatenate([past, r], axis=1)
-        errors = [section.y - x @ _regress(x, section.y) for x in (past, rows)]
-        floor = _SHRINKAGE * section.y.T @ section.y  # errors of the regressions, without noise
+        errors = [y - x @ _regress(x, y) for x in (past, rows)]
+        floor = _SHRINKAGE * y.T @ y  # errors of the regressions, without noise
         sizes = [np.linalg.slogdet(e.T @ e + floor)[1] for e in errors]
-        statistic += max(count - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (sizes[0] - sizes[1])
+        statistic += max(len(y) - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (sizes[0] - sizes[1])
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
     # (Rounding makes the statistic of a reference that its past predicts negative.)
-    if special.gammaincc(N * ny * nr / 2, max(statistic, 0.0) / 2) > ANSWER:
-        return False
-    if left > _SHRINKAGE * whole:
+    answer = bool(special.gammaincc(N * ny * nr / 2, max(statistic, 0.0) / 2) <= ANSWER)
+    if left <= _SHRINKAGE * whole:
+        return answer or None
+    if answer:
         raise DefinitionError(
             "outputs answer inputs at the same section, where the inputs have a part that neither "
             "the reference nor the past explains: no model of the noise tells the two directions "
             "apart. Pass a model with D = 0 as `guess` if outputs do not respond at once."
         )
-    return True
+    return False
 
 
 def without_drift(grid: CycleGrid) -> CycleGrid:
@@ -187,7 +196,9 @@ def _from_states(
     size = np.abs(np.linalg.eigvals(PeriodicModel(A, B, C, D, K).monodromy())).max()
     shrunk = (SLOWEST / max(size, SLOWEST)) ** (1 / N)
     model = PeriodicModel([a * shrunk for a in A], B, C, D, K)
-    while innovations and _slowest_error(model) > SLOWEST:
+    # (The largest modulus of A may be above SLOWEST by rounding, for any K.)
+    most = max(SLOWEST, _slowest_error(model._replace(K=[0 * k for k in K])))
+    while innovations and _slowest_error(model) > most:
         model = model._replace(K=[k / 2 for k in model.K])
     return model
 
