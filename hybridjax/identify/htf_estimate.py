@@ -89,9 +89,8 @@ def estimate_htf(
     setup, (tried, ran) = sums.setup, sums.experiments
     if len(rows) == 0:
         raise DefinitionError(
-            f"no frequency can be estimated from these {ran} experiments ({tried - ran} failed): "
-            f"excite each frequency by each of the {len(setup.inputs)} inputs, and a multiple of "
-            "1/2 with two phases."
+            f"no frequency can be estimated from {ran} experiments ({tried - ran} failed): excite "
+            f"each by each of the {len(setup.inputs)} inputs, multiples of 1/2 with two phases."
         )
     f, lines = sums.f[rows], _solve_lines(sums, rows)
     why_not = _why_not_total(sums, rows)
@@ -99,9 +98,8 @@ def estimate_htf(
         raise DefinitionError(why_not)
     if variance == "total" and (lines.realizations < 1).any():
         raise DefinitionError(
-            f"f = {f[lines.realizations < 1][0]:.10g} was measured in one realization only, which "
-            "does not show the distortion: apply several (`Design.realizations`), or pass "
-            "variance='noise'."
+            f"one realization at f = {f[lines.realizations < 1][0]:.10g} shows no distortion: "
+            "apply several (`Design.realizations`), or pass variance='noise'."
         )
     total, noise, scatter = lines.noise, None, None
     if variance != "noise" and np.median(lines.realizations) > 0 and not why_not:
@@ -215,15 +213,12 @@ def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
     tested, low = sums.crest_factors
     if several.any() and alike.sum() > several.sum() / 2:
         return (
-            "the experiments repeat the same phases, so that their scatter is noise alone and does "
-            "not show the distortion: apply realizations with new random phases "
-            "(`Design.realizations`)."
+            "the experiments repeat the same phases, so that their scatter does not show the "
+            "distortion: apply realizations with new random phases (`Design.realizations`)."
         )
     if low >= max(2, tested / 2):  # by chance once in 10 000 times or less
         return (
-            f"the phases are not random: {low} of {tested} signals "
-            "have a crest factor below that of 200 random draws. The scatter of optimized phases "
-            "does not show the distortion of a class of signals: pass variance='noise', or use "
-            "random phases."
+            f"the phases are not random ({low} of {tested} crest factors are below those of 200 "
+            "draws) and do not show the distortion: redraw them, or pass variance='noise'."
         )
     return ""

@@ -176,8 +176,7 @@ def excited_classes(
     raise DefinitionError(
         f"the reference excites too little: at f = {best / sums.setup.periods:g} + integers it "
         f"tells {int(np.linalg.matrix_rank(power[best], SILENT_LINE * size.max() ** 2, True))} of "
-        f"{len(r)} components apart. Excite all lines up to N/2 (`hj.multisine(N, P, band=(0, "
-        "N / 2))`), or use `fit_ldtp` with `reference`, which takes any signal."
+        f"{len(r)} components apart. Excite all lines up to N/2, or use `fit_ldtp(reference=)`."
     )
 
 
@@ -209,10 +208,9 @@ def solve(
     weak = size[:, -1] < _ANSWERS**2 * np.maximum(size[:, 0], SILENT_LINE * drive)
     if weak.any():
         raise DefinitionError(
-            f"the inputs do not answer the references in {len(u)} independent ways at f = "
-            f"{classes[weak][0] / P:g} + integers (the singular values of T_ur fall to "
-            f"{np.sqrt(size[weak][0, -1] / size[weak][0, 0]):.1e} of the largest): choose "
-            "references that move each input."
+            f"the references do not move each input: singular values of T_ur at f = "
+            f"{classes[weak][0] / P:g} + integers fall to "
+            f"{np.sqrt(size[weak][0, -1] / size[weak][0, 0]):.1e} of the largest. Choose others."
         )
     H = np.linalg.solve(power, to_r.conj().swapaxes(1, 2) @ block(r, y)).conj().swapaxes(1, 2)
     spread = np.linalg.inv(power)

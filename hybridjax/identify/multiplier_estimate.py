@@ -198,7 +198,7 @@ class MultiplierEstimate(eqx.Module):
         sentence, for fits that allow for drift. Default: a sentence about their order.
         """
         if not np.isfinite(self.covariance).all():
-            return "the data do not determine all multipliers, some may be spurious: lower `order`"
+            return "the data do not determine all multipliers, some may be spurious: fit fewer"
         level = 0.999 if drift else 0.95
         for fit in others:
             with suppress(DefinitionError):

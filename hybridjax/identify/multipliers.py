@@ -392,5 +392,5 @@ def unsupported(ratios: Callable[[int], NoiseRatios], order: int) -> str:
             break
         most, weakest = int((sizes[1:] > limits[1:]).sum()), np.sqrt(max(values[1], 0.0))
     text = f"the data support {most} multipliers, not {order}: the weakest is {weakest:.3g} times "
-    remedy = f"lower `order` to {most}, measure longer" if most else "measure longer, excite more"
-    return f"{text}the noise, and may be noise alone; {remedy}" * (most < order)
+    remedy = f"lower `order` to {most}" if most else "excite more"
+    return f"{text}the noise, and may be noise alone; {remedy}, or measure longer" * (most < order)

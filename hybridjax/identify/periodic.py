@@ -209,8 +209,7 @@ def _root(n: int, gramian: Float[np.ndarray, "d d"]) -> tuple[np.ndarray, np.nda
     values, vectors = np.linalg.eigh(gramian)
     if not values[0] > ROUNDING * values[-1]:
         raise DefinitionError(
-            f"a state at section {n} of the model has no effect on the outputs: give a minimal "
-            "model, such as one of `hj.identify.realize`."
+            f"a state of section {n} has no effect on the outputs: give a minimal one (`realize`)."
         )
     return vectors * np.sqrt(values), vectors / np.sqrt(values)
 

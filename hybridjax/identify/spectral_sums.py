@@ -192,8 +192,7 @@ def _excited(data: ExperimentData, windows: list[slice], threshold: float, first
     if worst > max(threshold, _REPEATS):
         raise DefinitionError(
             f"the input does not repeat: its last {len(windows)} windows of P = {data.periods} "
-            f"periods differ by {worst:.2g} of the largest line. Take fewer `repeats`, or the "
-            "right number of periods."
+            f"differ by {worst:.2g} of the largest line. Take fewer `repeats`, or another P."
         )
     experiment, line = np.nonzero(((size > threshold * peak) & (size > ROUNDING)).any(axis=2))
     check_sharing(experiment + first, line, data.periods)

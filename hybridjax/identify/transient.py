@@ -108,9 +108,8 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     least = min(map(len, free))
     if least <= (order or 1):
         raise DefinitionError(
-            f"{cycles} cycles with {cycles - least} lines per section leave nothing to tell the "
-            "transient from the response: record more cycles, or excite half of the lines "
-            "(`multisine(lines='odd')`)."
+            f"{cycles} cycles with {cycles - least} lines per section do not tell the transient "
+            "from the response: record more, or excite half of the lines (`lines='odd'`)."
         )
     tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
     # Pairs (Q, z) with no more columns of z than rows, and the same residuals.

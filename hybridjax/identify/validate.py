@@ -190,9 +190,8 @@ def validate(
     N, outputs, ny = records[0].n_sections, records[0].outputs, len(records[0].outputs)
     if not compared:
         raise DefinitionError(
-            f"the longest of {len(records)} uninterrupted records has "
-            f"{max(len(r.u) for r in records) / N:.3g} cycles, too few for an unknown initial "
-            "state: record longer without gaps, or use start='cycle'."
+            f"{max(len(r.u) for r in records) / N:.3g} cycles without gaps are too few for an "
+            "unknown initial state: record longer, or use start='cycle'."
         )
     prepared = PreparedRecords(compared)
     grid, sampled = prepared.whole(), prepared.sampled
@@ -209,8 +208,7 @@ def validate(
     lags = max((k for k in tried if count(k).min() >= FEWEST_SAMPLES), default=1)
     if (count(lags).max(axis=0) < FEWEST_SAMPLES).any():
         raise DefinitionError(
-            "the records are too short: record longer without gaps, until each section was sampled "
-            f"{FEWEST_SAMPLES} times with {lags} samples before it in its record."
+            f"the records are too short: {lags} samples must precede {FEWEST_SAMPLES} of a section."
         )
     roots = [] if isinstance(model, LDTP) or isinstance(tested, LDTP) else list(model.spread(grid))
     if isinstance(tested, LDTP):  # outputs in units of their size, so that none is neglected

@@ -87,6 +87,11 @@ def split(values: Complex[np.ndarray, "*d E n"]) -> Float[np.ndarray, "*d 2*E n"
     return np.concatenate([np.real(values), np.imag(values)], axis=-2)
 
 
+Groups = Sequence[HTFGroup]
+Gradient = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d"]]
+"""Residuals, and their Jacobian."""
+
+
 class Misfit(NamedTuple):
     """The residual of one group at some c, with the best numerators."""
 
@@ -138,9 +143,7 @@ def late_columns(
     return columns, left / np.abs(chi(group.period_delay, c)) ** 2
 
 
-def delayed_responses(
-    groups: list[HTFGroup], c: Coefficients
-) -> tuple[Float[np.ndarray, "d1 r"], Float[np.ndarray, "d1 d1"]]:
+def delayed_responses(groups: Groups, c: Coefficients) -> tuple[np.ndarray, np.ndarray]:
     """Return roots of two Gram matrices of the delayed responses of all groups.
 
     The first root is in units of the second, which is that of the Gram matrix that is expected from
@@ -157,16 +160,14 @@ def delayed_responses(
     return np.linalg.solve(noise, triangle.T), noise
 
 
-def residuals_of(
-    groups: list[HTFGroup], c: Coefficients
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d"]]:
+def residuals_of(groups: Groups, c: Coefficients) -> Gradient:
     """Return the residuals of all groups, and their Jacobian."""
     parts = [misfit_of(group, c) for group in groups]
     jacobian = np.concatenate([p.jacobian.reshape(len(c), -1) for p in parts], axis=1)
     return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
 
 
-def cost_of(groups: list[HTFGroup], c: Coefficients) -> tuple[float, int]:
+def cost_of(groups: Groups, c: Coefficients) -> tuple[float, int]:
     """Return the sum of squares of the misfit, and its expectation for errors of variance 1."""
     cost = sum(float((misfit_of(group, c).residual ** 2).sum()) for group in groups)
     return cost, sum(group.freedom * group.size for group in groups)

@@ -10,6 +10,8 @@ from ..errors import DefinitionError
 from ..linear.htf import HTF
 
 
+Entries = Float[np.ndarray, "... ny _"]
+
 # Smallest error that an HTF is supposed to have, relative to the rms of its output: that of
 # rounding. Smaller: infinite weights; larger: exact outputs count too little beside noisy ones.
 SMALLEST_ERROR = 1e-15
@@ -34,9 +36,8 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
         if len(bad):
             m, k, i, _ = (int(x) for x in bad[0])
             raise DefinitionError(
-                f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = "
-                f"{float(htf.f[k]):g} is not a positive number: estimate it from several "
-                "realizations (`Design.realizations`) or windows (`repeats` of estimate_htf)."
+                f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = {htf.f[k]:g} is "
+                "not a positive number: leave f out, or measure several realizations or windows."
             )
     return rms
 
@@ -74,9 +75,7 @@ def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
     return variance / variance.mean()
 
 
-def weights_of(
-    variance: Float[np.ndarray, "... ny _"], rms: Float[np.ndarray, " ny"]
-) -> Float[np.ndarray, "... ny _"]:
+def weights_of(variance: Entries, rms: Float[np.ndarray, " ny"]) -> Entries:
     """Return one over the standard deviation of real and imaginary part."""
     return np.sqrt(2 / np.maximum(variance, (SMALLEST_ERROR * rms[:, None]) ** 2))
 

@@ -90,9 +90,8 @@ def require_well_posed(D: Float[Array, "N ny nu"], F: Float[Array, "N nu ny"]) -
     values = np.linalg.svd(np.eye(D.shape[1]) + np.asarray(D) @ np.asarray(F), compute_uv=False)
     if len(bad := np.flatnonzero(values[:, -1] < _WELL_POSED * np.maximum(values[:, 0], 1))):
         raise DefinitionError(
-            f"the loop has no response at section {bad[0]}, where direct feed-through answers "
-            "itself (I + D of plant times D of controller is singular): let the controller wait a "
-            "section."
+            f"direct feed-through answers itself at section {bad[0]} (I + D of plant times D of "
+            "controller is singular): let the controller wait a section."
         )
 
 

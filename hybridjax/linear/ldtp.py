@@ -403,9 +403,8 @@ class LDTP(eqx.Module):
             why = "Leave this frequency out."
             if abs(multipliers[index] - 1) < _RESONANCE:
                 why = (
-                    "A multiplier of exactly 1 stems from a conserved quantity, or from an "
-                    "autonomous system that is sampled at fixed times, where nothing brings its "
-                    "phase back: use sections that depend on the state, or leave whole f out."
+                    "Conserved quantities, and autonomous systems at clock sections, have the "
+                    "multiplier 1: use state-based sections, or leave whole f out."
                 )
             raise DefinitionError(
                 f"The response at f = {f[line]:g} cycles per period is unbounded: the multiplier "

@@ -111,9 +111,8 @@ def advise(
     # the test sees the distortion of small pushes if there is little noise.
     p = np.ones(1) if validation is None else validation.independence
     if validation and not validation.independent and validation.fit[p.argmin()] < 99:
-        text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}), more "
-        text += "than by errors of the fit: raise `order`, sample faster, or push less."
-        warnings.append(Finding("left over", text))
+        text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}): raise "
+        warnings.append(Finding("left over", f"{text}`order`, sample faster, or push less."))
     if data.missing > _FEW:
         warnings.append(Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing."))
     for name, count in zip(data.signals, data.spikes, strict=True):
@@ -145,9 +144,8 @@ def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:
     least = max(_DAMPED, _DECAYED ** (1 / cycles))
     for z in fit.multipliers:
         if fit.result == Result.OK and z.imag >= 0 and abs(z) > least:
-            text = f"the mode of the multiplier {z:.3g} hardly decays in {cycles:.0f} cycles, as "
-            text += "hum or drift, which spoil the others: look for them in the spectra of outputs."
-            yield Finding("no decay", text)
+            text = f"the mode of the multiplier {z:.3g} hardly decays in {cycles:.0f} cycles: look "
+            yield Finding("no decay", f"{text}for hum or drift in the spectra of outputs.")
 
 
 def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> Iterator[Finding]:
@@ -174,9 +172,8 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
         with np.errstate(invalid="ignore"):  # of an output that is constant at a section
             matrices = [np.corrcoef(y[both[:, n], n].T) for n in range(N)]
         if np.median(np.nan_to_num(np.abs(matrices)[:, 0, 1])) > _SAME_OUTPUTS:
-            text = f"where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} carry the "
-            text += "same information, as signals are whose angle is the phase: cycles from "
-            yield Finding("outputs", f"{text}crossing to crossing may have smaller errors.")
+            text = f"{fit.outputs[i]} and {fit.outputs[j]} carry the same information at sections: "
+            yield Finding("outputs", f"{text}cycles between crossings may have smaller errors.")
 
 
 def about_natural_multipliers(result: Any) -> Iterator[Finding]:

@@ -174,7 +174,7 @@ def test_crest_factors(hopper):
     )  # fmt: skip
     data = hj.experiments.simulate_experiments(hopper, again, start="periodic", discard=32)
     data = hj.experiments.add_noise(data, snr=20)
-    with pytest.raises(hj.DefinitionError, match="the phases are not random: 12 of 12 signals"):
+    with pytest.raises(hj.DefinitionError, match=r"the phases are not random \(12 of 12"):
         hj.estimate_htf(data, 0, repeats=2, variance="total")
     auto = hj.estimate_htf(data, 0, repeats=2)
     assert auto.noise_variance is None

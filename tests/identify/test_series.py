@@ -202,7 +202,7 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
         fit = hj.fit_ldtp(data, small.dims, noise="innovations")
         assert fit.result == hj.Result.OK and not fit.doubt
     assert first.call_count == 4  # (Trials of a drift begin at the fit.)
-    with pytest.raises(hj.DefinitionError, match="not 2.*Outputs may drift: `with_drift"):
+    with pytest.raises(hj.DefinitionError, match="not 2.*outputs may drift: `with_drift"):
         hj.fit_series(moved(3 * slow.repeat(4), seed=0), 2)
     (begun,) = with_drift([record(small, 4100)])  # (Longer ones take too long.)
     assert (len(begun.u), begun.drift, with_drift([begun])) == (4000, 20, [])

@@ -101,7 +101,7 @@ def test_records_shorter_than_the_lags(small):
     np.testing.assert_array_equal(found.measured, whole.y[106:])
     assert found.white and found.independent
     assert hj.validate(small, pieces, start="cycle").left_out == 0
-    with pytest.raises(hj.DefinitionError, match="longest of 2 uninterrupted records has 0.75"):
+    with pytest.raises(hj.DefinitionError, match="0.75 cycles without gaps are too few"):
         hj.validate(small, [whole.part(0, 3), whole.part(3, 6)])
     with pytest.raises(hj.DefinitionError, match="^u is zero or missing"):
         hj.validate(small, hj.Record(0 * whole.u, whole.y, n_sections=4, outputs=whole.outputs))

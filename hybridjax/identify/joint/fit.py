@@ -2,9 +2,8 @@
 
 import dataclasses
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from functools import cached_property
 from typing import Annotated, Any, Literal, cast
 
 import equinox as eqx
@@ -26,31 +25,21 @@ from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .. import weights
 from ..denominator import Covariance, multipliers_of
-from ..descent import FIRST_DAMPING, NormalEquations, Point, Spread, descend
+from ..descent import FIRST_DAMPING, Spread, descend
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate, RoughFit
+from ..multipliers import exact_htf
 from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 from ..series import prediction, residuals
 from ..series.prediction import Predictor, SeriesPart, SeriesProblem
 from ..series.records import MAY_DRIFT, CycleGrid, PreparedRecords, with_drift
-from ..series.subspace import answers_at_once, subspace_model
-from .frequency import FrequencyProblem, transfer, transfer_slopes
+from ..series.subspace import answers_at_once, default_horizon, subspace_model
+from .frequency import FrequencyProblem, ModelPoint, transfer, transfer_slopes
 from .realization import given_dims, realize
 
 
-Problem = FrequencyProblem | SeriesProblem
 Guess = LDTP | Order | Annotated[Numbers, Integers("sections", sign="positive")]
 
-# Expected decrease of the cost at the minimum, for each unknown, in units of the errors' variance.
-# Larger: rms errors grow, by 0.5 % for 2e-2; smaller: steps without effect.
-_SETTLED_GAIN = 1e-2
-# Expected squared change of the characteristic polynomial's coefficients there, in units of their
-# variance. Larger: multipliers miss the minimum, at 1e-3 by 3 % of their standard errors.
-_SETTLED_SHIFT = 1e-3
-# If no step lowers the cost: the gain, relative to the cost, or the largest entry of the step, that
-# rounding explains (slow states multiply it by up to 1e6). Larger: stalled descents count as
-# converged; smaller: minima of exact data do not.
-_STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
 # Least decrease of the cost by the inputs, for each unknown, in units of the errors' variance (1 if
 # errors are white and nothing answers). Smaller: multipliers of noise that is filtered by the
 # system, which looks like a response. Larger: weak responses are refused.
@@ -224,10 +213,6 @@ def fit_ldtp(
     The iteration is Levenberg-Marquardt's, with exact derivatives, in local coordinates that leave
     out changes of the state coordinates (McKelvey, Helmersson and Ribarits 2004).
 
-    ```python
-    fit = hj.fit_ldtp(estimate, dims)
-    ```
-
     **Arguments:**
 
     - `data`: estimated HTFs, with as many harmonics as possible: few harmonics determine few
@@ -258,7 +243,14 @@ def fit_ldtp(
     than unknowns, outputs that do not respond to the inputs, or records with `lead`.
     """
     require_x64()
-    if not isinstance(data, HTF):
+    if isinstance(data, HTF):
+        if reference is not None or noise == "innovations" or start == "cycle":
+            raise DefinitionError(
+                "`reference`, `noise` and `start` are for time series: give the data, not HTFs, or "
+                "leave these arguments out (and pass `reference` to `estimate_htf`)."
+            )
+        fit = _fit_to_htf(data, guess, check)
+    else:
         drive = None
         if reference is not None:
             data, drive = in_loop(data, reference)
@@ -279,26 +271,20 @@ def fit_ldtp(
             remedy = residuals.REMEDIES[innovations + (innovations and not direct)]
             feedback = residuals.about_answering(answers, remedy)
 
-        fit = dataclasses.replace(fit, feedback=feedback)
-        if not check or residuals.is_exact(grid, error := errors()).all():
-            return fit
-
         def drifting() -> RoughFit:  # (from the fit on: half of the steps)
             begun = PreparedRecords(with_drift(records.records))
             model = fit._coordinates.model.times(fit._scale / begun.scale)
-            slow = _fit_to_series(begun, model, *how, direct)
+            slow = _fit_to_series(begun, model, *how[:2], False, direct)
             return slow.coefficients, lambda: Covariance(slow.covariance, slow.covariance_freedom)
 
-        misfit = residuals.about_misfit(outside.whole(), grid, error, innovations)
-        if doubt := fit.contradiction([drifting], MAY_DRIFT) or misfit:
-            warnings.warn(f"Fit: {doubt}.", FindingWarning, stacklevel=3)
-        return dataclasses.replace(fit, doubt=doubt)
-    if reference is not None or noise == "innovations" or start == "cycle":
-        raise DefinitionError(
-            "`reference`, `noise` and `start` are for time series: give the data, not HTFs, or "
-            "leave these arguments out (and pass `reference` to `estimate_htf`)."
-        )
-    return _fit_to_htf(data, guess, check)
+        doubt = fit.doubt
+        if check and not residuals.is_exact(grid, error := errors()).all():
+            misfit = residuals.about_misfit(outside.whole(), grid, error, innovations)
+            doubt = fit.contradiction([drifting], MAY_DRIFT) or misfit or doubt
+        fit = dataclasses.replace(fit, feedback=feedback, doubt=doubt)
+    if fit.doubt:
+        warnings.warn(f"Fit: {fit.doubt}.", FindingWarning, stacklevel=3)
+    return fit
 
 
 def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
@@ -324,7 +310,9 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
         point, converged = descend(ModelPoint(problem, point.model, direct), FIRST_DAMPING)
     if check:
         _require_answer(point)
-    return _finished(point, converged, htf, scale, freedom)
+    fit = _finished(point, converged, htf, scale, freedom)
+    smaller = lambda dims: PeriodicModel.of(realize(htf, np.array(dims)), scale)  # noqa: E731
+    return dataclasses.replace(fit, doubt=_surplus(fit, point, smaller) if check else "")
 
 
 def _likelier(records: PreparedRecords, guess: Guess, *how: Any) -> LDTPFit:
@@ -389,56 +377,9 @@ def _fit_to_series(
     point, converged = descend(ModelPoint(problem.reweighted(model), model, direct), FIRST_DAMPING)
     if check and not innovations:
         _require_answer(point)
-    return _finished(point, converged, records, scale, freedom)
-
-
-class ModelPoint(Point):
-    """A model of a descent."""
-
-    def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
-        self.problem, self.direct, self.model = problem, direct, model
-        # A resonant model stays as it is; one that overflows has no finite cost.
-        with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
-            self.model = model.refined(direct, problem.linearize)
-        self.cost = problem.cost(self.model)
-
-    @cached_property
-    def coordinates(self) -> LocalCoordinates:
-        return local_coordinates(self.model, self.direct)
-
-    @cached_property
-    def equations(self) -> NormalEquations:
-        return self.problem.linearize(self.coordinates)
-
-    def step(self, damping: float) -> tuple[Float[np.ndarray, " P"], float]:
-        return self.equations.step(damping)
-
-    def moved(self, step: Float[np.ndarray, " P"]) -> "ModelPoint":
-        return ModelPoint(self.problem, self.coordinates.moved(step), self.direct)
-
-    def accepted(self) -> "ModelPoint":
-        """Return the point with new weights.
-
-        The log determinant of the errors' covariance is concave, so that a step that lowers the
-        cost with the old weights raises the likelihood, where no sample is missing. With gaps the
-        covariance is that of the pairs that are sampled, which is nearly the likelihood's.
-        """
-        if isinstance(self.problem, SeriesProblem):
-            self.problem = self.problem.reweighted(self.model)
-            self.cost = self.problem.cost(self.model)
-        return self
-
-    def settled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
-        size = self.coordinates.size
-        unit = min(1.0, self.cost / max(self.problem.residuals - size, 1))
-        if gain > _SETTLED_GAIN * size * unit:
-            return False
-        _, slopes = characteristic_slopes(self.coordinates)
-        change = np.linalg.lstsq(slopes @ self.equations.spread().root, slopes @ step)[0]
-        return bool(change @ change <= _SETTLED_SHIFT * unit * len(slopes))
-
-    def stalled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
-        return bool(gain <= _STALLED_GAIN * self.cost or np.abs(step).max() < _STALLED_STEP)
+    fit = _finished(point, converged, records, scale, freedom)
+    smaller = lambda dims: subspace_model(records, dims, innovations, direct)  # noqa: E731
+    return dataclasses.replace(fit, doubt=_surplus(fit, point, smaller) if check else "")
 
 
 def _require_answer(point: ModelPoint) -> None:
@@ -450,6 +391,25 @@ def _require_answer(point: ModelPoint) -> None:
             "the outputs do not answer the inputs: they show nothing but noise. Look for inputs "
             "that were not applied or not recorded with these outputs, or pass check=False."
         )
+
+
+def _surplus(fit: LDTPFit, point: ModelPoint, smaller: Callable[[Any], PeriodicModel]) -> str:
+    """Return a sentence if a model with one dimension less at each section is nearly as good, or
+    the data do not determine the multipliers; else "".
+
+    **Arguments:** `smaller`: a first model with these dimensions.
+    """
+    dims, unknown = [d - 1 for d in point.model.dims], fit.contradiction([])
+    with suppress(DefinitionError):
+        if min(dims) > 0 and not unknown:
+            start = ModelPoint(point.problem, smaller(dims), point.direct)
+            fewer, _ = descend(start, FIRST_DAMPING, max_steps=10)  # (enough to come near)
+            unit = 1.0 if fit.covariance_freedom == np.inf else point.cost / fit.freedom
+            rise = max(point.problem.cost(fewer.model) - point.cost, 0.0) / unit
+            degrees = point.coordinates.size - fewer.coordinates.size
+            if special.gammaincc(degrees / 2, rise / 2) > residuals.ANSWER:
+                return "one dimension less explains the data, so a multiplier may be spurious"
+    return unknown
 
 
 def _is_direct(guess: Guess) -> bool:
@@ -496,3 +456,33 @@ def _finished(
         _spread=spread,
         _scale=scale,
     )
+
+
+@checked
+def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
+    r"""Return the Cramer-Rao bound of the multipliers for known dimensions of the states.
+
+    The errors of the HTFs are independent, circular and Gaussian, as for `multiplier_bound`. The
+    unknowns are the matrices A[n], B[n], C[n] (and D[n], if the model has any) instead of free
+    numerators: this is the bound of `fit_ldtp`. The squared ratio of the standard errors of
+    `multiplier_bound` to these is the factor by which the structure reduces the amount of data.
+
+    **Arguments:**
+
+    - `model`: the true model, of which the minimal part counts. `htf`: HTFs with the frequencies,
+      harmonics and `variance` of the experiment; H is not used.
+
+    **Returns:** as many multipliers as the smallest state of the minimal model has coordinates.
+
+    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
+    """
+    exact = exact_htf(model, htf)
+    minimal = realize(np.asarray(model.impulse_response(2 * default_horizon(model.n_sections) + 1)))
+    scale = weights.check_values(exact)
+    problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
+    coordinates = local_coordinates(
+        PeriodicModel.of(minimal, scale), bool(np.asarray(model.D).any())
+    )
+    c, slopes = characteristic_slopes(coordinates)
+    spread = problem.linearize(coordinates).spread()
+    return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)

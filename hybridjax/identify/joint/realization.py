@@ -1,4 +1,4 @@
-"""State-space models from measured responses, and the errors of known ones that are fitted."""
+"""State-space models from measured responses."""
 
 from typing import Annotated, Any
 
@@ -14,14 +14,11 @@ from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..denominator import multipliers_of
 from ..descent import ROUNDING
-from ..multiplier_estimate import MultiplierEstimate
-from ..multipliers import exact_htf
-from ..periodic import PeriodicModel, characteristic_slopes, local_coordinates
+from ..periodic import PeriodicModel
 from ..series.fit import SeriesFit
 from ..series.subspace import default_horizon
-from ..weights import SMALLEST_ERROR, check_values, error_weights
+from ..weights import SMALLEST_ERROR
 from .frequency import FrequencyProblem
 
 
@@ -98,36 +95,6 @@ def realize(
     B = [bases[(n + 1) % N].T @ hankels[(n + 1) % N][:, :nu] * unit for n in range(N)]
     C, D = [scale[:, None] * c for c in C], list(scale[:, None] * markov[:, 0] * unit)
     return LDTP.from_blocks(A, B, C, D, inputs, outputs)
-
-
-@checked
-def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
-    r"""Return the Cramer-Rao bound of the multipliers for known dimensions of the states.
-
-    The errors of the HTFs are independent, circular and Gaussian, as for `multiplier_bound`. The
-    unknowns are the matrices A[n], B[n], C[n] (and D[n], if the model has any) instead of free
-    numerators: this is the bound of `fit_ldtp`. The squared ratio of the standard errors of
-    `multiplier_bound` to these is the factor by which the structure reduces the amount of data.
-
-    **Arguments:**
-
-    - `model`: the true model, of which the minimal part counts. `htf`: HTFs with the frequencies,
-      harmonics and `variance` of the experiment; H is not used.
-
-    **Returns:** as many multipliers as the smallest state of the minimal model has coordinates.
-
-    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
-    """
-    exact = exact_htf(model, htf)
-    minimal = realize(np.asarray(model.impulse_response(2 * default_horizon(model.n_sections) + 1)))
-    scale = check_values(exact)
-    problem = FrequencyProblem.of(exact, error_weights(exact, scale), scale)
-    coordinates = local_coordinates(
-        PeriodicModel.of(minimal, scale), bool(np.asarray(model.D).any())
-    )
-    c, slopes = characteristic_slopes(coordinates)
-    spread = problem.linearize(coordinates).spread()
-    return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)
 
 
 def _scale(scale: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:

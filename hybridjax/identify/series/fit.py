@@ -235,17 +235,15 @@ def fit_series(
     grid = records.whole()
     error = np.where(grid.sampled, grid.y - fit.predict(grid, start == "free"), 0.0)
     feedback = answering(grid, error, records.inputs)
-    doubt = _about_drift(fit, records, start == "free")
+    drift = _about_drift(fit, records, start == "free")
     surplus = unsupported(lambda k: ratios if k == order else weighted(k)[0], order)
     if surplus and check:
-        cause = about_answering(feedback, _BIASED) or doubt
-        cause = cause and f" {cause[0].upper()}{cause[1:]}."
-        raise DefinitionError(f"{surplus}, or pass check=False.{cause}")
+        cause = about_answering(feedback, _BIASED) or drift
+        raise DefinitionError(f"{surplus}, or pass check=False{cause and '; '}{cause}.")
     # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
     more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
-    doubt = "; ".join(filter(None, [surplus, doubt])) or fit.contradiction(more)
-    doubt = warned(doubt, check)
-    return dataclasses.replace(fit, feedback=feedback, doubt=doubt)
+    doubt = "; ".join(filter(None, [surplus, drift])) or fit.contradiction(more)
+    return dataclasses.replace(fit, feedback=feedback, doubt=warned(doubt, check))
 
 
 def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> str:

@@ -17,8 +17,13 @@ from ..._core.execution import on_all_cores
 from ..._core.text import listed
 from ...errors import DefinitionError
 from ..descent import ROUNDING
-from .records import CycleGrid, PreparedRecords, lagged_inputs
+from .records import Columns, CycleGrid, PreparedRecords, lagged_inputs
 
+
+ByInput = Float[np.ndarray, "r *columns"]
+"""Coefficients of the inputs, for each column."""
+Rows = Float[np.ndarray, "rows *columns"]
+"""Columns of all records, one below the other."""
 
 # Singular values of regressors, relative to the largest, below which they are rounding errors.
 # Larger: weakly excited combinations are dropped; smaller: rounding errors are fitted.
@@ -81,26 +86,22 @@ class SectionRegression(NamedTuple):
         """Samples less unknown initial conditions and drift."""
         return float((self.weight > 0).sum() - (self.basis**2).sum())
 
-    def reduced(self, x: Float[np.ndarray, "S T *columns"]) -> Float[np.ndarray, "rows *columns"]:
+    def reduced(self, x: Columns) -> Rows:
         """Return outputs, weighted, without the part in the basis."""
         left = self.weight * x.reshape(*x.shape[:2], -1)
         for _ in range(2):  # the second time removes rounding errors
             left = left - self.basis @ (self.basis.swapaxes(1, 2) @ left)
         return left.reshape(len(self.remainder), *x.shape[2:])
 
-    def residual(
-        self, a: Float[np.ndarray, "r *columns"], x: Float[np.ndarray, "S T *columns"]
-    ) -> Float[np.ndarray, "rows *columns"]:
+    def residual(self, a: ByInput, x: Columns) -> Rows:
         """Return the weighted residuals of outputs x, given coefficients of the inputs."""
         return self.reduced(x) - np.tensordot(self.remainder, a, 1)
 
-    def along(self, rows: Float[np.ndarray, "rows *columns"]) -> Float[np.ndarray, "r *columns"]:
+    def along(self, rows: Rows) -> ByInput:
         """Return the products of the inputs with weighted rows."""
         return np.tensordot(self.remainder.T, rows, 1)
 
-    def response(
-        self, a: Float[np.ndarray, "r *columns"], x: Float[np.ndarray, "S T *columns"]
-    ) -> Float[np.ndarray, "S T *columns"]:
+    def response(self, a: ByInput, x: Columns) -> Columns:
         """Return the response to the inputs and to the initial conditions that fit x best."""
         x_columns = x.reshape(*x.shape[:2], -1)
         forced = self.inputs @ a.reshape(len(a), x_columns.shape[2])
@@ -165,8 +166,7 @@ class OutputErrorProblem(NamedTuple):
         # (Ranks of inputs in a narrow band are not exact.)
         if to_lags[0].shape[1] < min(len(triangles[0]), sum(alone) - min(alone) / 2):
             raise DefinitionError(
-                f"{listed(records.inputs)} cannot be told apart, because some are functions of the "
-                "others: keep only inputs that are not."
+                f"{listed(records.inputs)} cannot be told apart: leave out functions of the others."
             )
         return cls(records, lags, free, to_lags, alike, records.scale)
 

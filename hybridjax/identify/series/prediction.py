@@ -63,9 +63,7 @@ class SeriesPart(NamedTuple):
         """R, T."""
         return self.u.shape[1], self.u.shape[2]
 
-    def without_drift(
-        self, n: int, x: Float[np.ndarray, "R T ny columns"]
-    ) -> Float[np.ndarray, "R T ny columns"]:
+    def without_drift(self, n: int, x: Columns) -> Columns:
         """Return columns at the samples of section n without the part that a drift explains."""
         x = x * self.sampled[n][..., None]
         if not self.drift.shape[-1]:
@@ -240,9 +238,7 @@ def recursion(
         drive(n, x)
 
 
-def slopes_of(
-    coordinates: LocalCoordinates, part: SeriesPart, path: Path
-) -> Iterator[Float[np.ndarray, "_ _ ny P"]]:
+def slopes_of(coordinates: LocalCoordinates, part: SeriesPart, path: Path) -> Iterator[Columns]:
     """Iterate over the derivatives of the predictions at each section."""
     model, places = coordinates.model, coordinates.places
 
@@ -318,8 +314,7 @@ def noise_spectrum(
     harmonics = check_harmonics(harmonics, N)
     if len(noise.multipliers) and np.abs(noise.multipliers[0]) >= 1:
         raise DefinitionError(
-            f"the noise grows without bound: its model has a multiplier of modulus "
-            f"{np.abs(noise.multipliers[0]):.4g}, which must be below 1."
+            f"noise with a multiplier of modulus {abs(noise.multipliers[0]):.4g} grows for ever."
         )
     k = np.arange(N)
     matrices = (np.asarray(x) for x in (noise.A, noise.B, noise.C, noise.D))

@@ -10,12 +10,19 @@ from scipy.signal import lfilter
 
 from ...errors import DefinitionError
 from ...experiments.record import Record, RecordedData, require_deviations, uninterrupted_records
+from ..descent import Coefficients
 
 
 # Cycles of the fastest drift that fits try, to see whether it changes their multipliers. More: a
 # faster one passes for a multiplier. Fewer: drifts explain so much that multipliers become vague.
 SLOW = 20.0
 MAY_DRIFT = f"outputs may drift: `with_drift({SLOW:g})`, or `Record(drift=)`, changes multipliers"
+
+
+Signals = Float[np.ndarray, "S T N ny"]
+"""Signals of S records in T cycles, by section."""
+Columns = Shaped[np.ndarray, "S T *columns"]
+"""Columns of S records, one row for each of T cycles."""
 
 
 class CycleGrid(NamedTuple):
@@ -153,18 +160,14 @@ def lagged_inputs(
     return windows[..., ::-1].swapaxes(2, 3).reshape(S, T, lags * nu)
 
 
-def delay_cycles(
-    x: Shaped[np.ndarray, "S T *columns"], cycles: int, fill: float | bool = 0
-) -> Shaped[np.ndarray, "S T *columns"]:
+def delay_cycles(x: Columns, cycles: int, fill: float | bool = 0) -> Columns:
     """Delay x by a number of cycles; the first cycles become `fill`."""
     T = x.shape[1]
     cycles = min(cycles, T)
     return np.concatenate([np.full_like(x[:, :cycles], fill), x[:, : T - cycles]], axis=1)
 
 
-def divide_by_chi(
-    c: Float[np.ndarray, " d"], x: Float[np.ndarray, "S T *columns"]
-) -> Float[np.ndarray, "S T *columns"]:
+def divide_by_chi(c: Coefficients, x: Columns) -> Columns:
     """Filter x by 1 / chi from cycle to cycle."""
     return np.asarray(lfilter([1.0], np.append(1.0, c), x, axis=1))
 

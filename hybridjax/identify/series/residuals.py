@@ -9,8 +9,12 @@ from scipy import special, stats
 
 from ..descent import ROUNDING
 from .output_error import RANK
-from .records import CycleGrid, lagged_inputs
+from .records import CycleGrid, Signals, lagged_inputs
 
+
+Root = Float[np.ndarray, "S T ny r"]
+"""A root of the covariance of errors of a section."""
+ByOutput = Float[np.ndarray, " ny"]
 
 # Samples of a section, below which its correlations are not tested. Fewer: their distribution is
 # not normal; more: short records cannot be validated.
@@ -35,9 +39,7 @@ UNSEEN = (
 )
 
 
-def whitened(
-    error: Float[np.ndarray, "S T N ny"], spread: Sequence[Float[np.ndarray, "S T ny r"]]
-) -> Float[np.ndarray, "S T N ny"]:
+def whitened(error: Signals, spread: Sequence[Root]) -> Signals:
     """Return residuals that are white if the noise is, whatever errors a fit to other data has.
 
     **Arguments:** `spread`: for each section, a root of the covariance of these errors, for noise
@@ -52,9 +54,7 @@ def whitened(
     return error
 
 
-def whiteness_test(
-    error: Float[np.ndarray, "S T N ny"], lags: int
-) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
+def whiteness_test(error: Signals, lags: int) -> tuple[Float[np.ndarray, "N lags ny"], ByOutput]:
     """Return correlations of residuals with earlier ones, section by section, and p-values."""
     S, T, N, ny = error.shape
     size = np.sqrt(np.nanmean(error**2, axis=(0, 1)))
@@ -81,11 +81,11 @@ def whiteness_test(
 
 def independence_test(
     u: Float[np.ndarray, "S T N nu"],
-    error: Float[np.ndarray, "S T N ny"],
+    error: Signals,
     lags: int,
     level: float,
-    spread: Sequence[Float[np.ndarray, "S T ny r"]] = (),
-) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
+    spread: Sequence[Root] = (),
+) -> tuple[Float[np.ndarray, "N lags ny nu"], ByOutput, ByOutput]:
     """Test the part of residuals that present and past inputs explain, section by section.
 
     **Arguments:** `error`: NaN where the inputs of so many lags are not known. `spread`: for each
@@ -132,15 +132,13 @@ def independence_test(
     return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
 
 
-def is_exact(grid: CycleGrid, error: Float[np.ndarray, "S T N ny"]) -> Bool[np.ndarray, " ny"]:
+def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
     """Return whether the residuals of each output are only rounding, and tell nothing."""
     left, size = (np.sqrt(np.nansum(x**2, axis=(0, 1, 2))) for x in (error, grid.y))
     return left <= 1e3 * ROUNDING * size  # (iterations leave as much of exact data)
 
 
-def about_misfit(
-    outside: CycleGrid, grid: CycleGrid, error: Float[np.ndarray, "S T N ny"], innovations: bool
-) -> str:
+def about_misfit(outside: CycleGrid, grid: CycleGrid, error: Signals, innovations: bool) -> str:
     """Return a sentence about residuals that depend on inputs of the period before them; empty if
     there are none.
 
@@ -159,9 +157,7 @@ def about_misfit(
     )
 
 
-def answering(
-    grid: CycleGrid, error: Float[np.ndarray, "S T N ny"], inputs: tuple[str, ...]
-) -> tuple[str, ...]:
+def answering(grid: CycleGrid, error: Signals, inputs: tuple[str, ...]) -> tuple[str, ...]:
     """Return the inputs that answer earlier residuals, as by a controller."""
     answers = feedback_test(grid, error) < ANSWER * ~is_exact(grid, error).all()
     return tuple(compress(inputs, answers))
@@ -173,9 +169,7 @@ def about_answering(inputs: Iterable[str], remedy: str) -> str:
     return names and f"inputs answer earlier residuals, as by a controller ({names}): {remedy}"
 
 
-def feedback_test(
-    grid: CycleGrid, error: Float[np.ndarray, "S T N ny"]
-) -> Float[np.ndarray, " nu"]:
+def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
     """Test whether inputs answer residuals of a model of the outputs at earlier sections.
 
     The part of each input that its own past does not explain is regressed on these residuals: it

@@ -13,7 +13,7 @@ from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..periodic import PeriodicModel
 from .linearization import sum_up
 from .output_error import OutputErrorProblem, SectionRegression
-from .records import CycleGrid, PreparedRecords, delay_cycles, lagged_inputs
+from .records import CycleGrid, PreparedRecords, Signals, delay_cycles, lagged_inputs
 from .residuals import ANSWER
 
 
@@ -51,9 +51,8 @@ def subspace_model(
     needed = -(-most // columns) + 1
     if past < needed:
         raise DefinitionError(
-            f"{samples} cycles are too few to begin with {most} dimensions of the state: "
-            f"about {_ROWS * columns * needed} are needed. Record more, or give `fit_ldtp` a "
-            "model as `guess`, as of `hj.identify.realize(hj.fit_series(...))`."
+            f"{samples} cycles are too few to begin with {most} dimensions: record about "
+            f"{_ROWS * columns * needed}, or give a model as `guess`: `realize(fit_series(...))`."
         )
     rows = (np.concatenate([x.u * direct, x.past(past)], axis=1) for x in sections)
     # The effect of the past of each section on its outputs.
@@ -148,13 +147,7 @@ def _sections(records: PreparedRecords, *more: Float[np.ndarray, "S T N k"]) -> 
 class _Section:
     """The samples of a section of all records, where all outputs were sampled."""
 
-    def __init__(
-        self,
-        z: Float[np.ndarray, "R T N columns"],
-        sampled: Bool[np.ndarray, "R T N"],
-        section: int,
-        ny: int,
-    ):
+    def __init__(self, z: Signals, sampled: Bool[np.ndarray, "S T N"], section: int, ny: int):
         self.record, cycle = np.nonzero(sampled[:, :, section])
         self.time = cycle * z.shape[2] + section
         self._z = z.reshape(len(z), -1, z.shape[3])
