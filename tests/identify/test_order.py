@@ -5,6 +5,7 @@ import pytest
 
 import hybridjax as hj
 
+from .conftest import scaled
 from .test_uncertainty import covered, noisy, small as small, variance as variance, with_variance
 
 
@@ -45,4 +46,6 @@ def test_exact_htfs_have_no_more_multipliers(small):
         hj.fit_multipliers(htf, 3)
     spurious = hj.fit_multipliers(htf, 3, check=False)
     assert np.isinf(spurious.standard_errors).all() and "± inf" in repr(spurious)
-    assert spurious.contains(0.5).all()
+    assert spurious.contains(0.5).all() and "support 2 multipliers, not 3" in spurious.doubt
+    model = scaled(12, (1, 1), 1, 1)  # (rounding looks like a second multiplier to MDL)
+    assert hj.select_order(model.htf(np.linspace(0.02, 0.98, 45))).order == 1

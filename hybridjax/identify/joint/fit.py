@@ -264,7 +264,8 @@ def fit_ldtp(
         direct = fit._coordinates.direct
         grid = records.whole()
         errors = lambda: cast(Predictor, fit.predictor).errors(grid, start == "free")  # noqa: E731
-        feedback = residuals.UNSEEN * (innovations and direct and drive is None)
+        unseen = innovations and direct and drive is None and fit.determines_direct
+        feedback = residuals.UNSEEN * unseen
         if drive is None and (answers := residuals.answering(grid, errors(), records.inputs)):
             if innovations and direct and not isinstance(guess, LDTP):
                 fit, direct = _fit_to_series(records, guess, *how, False), False
