@@ -157,8 +157,8 @@ def fit_multipliers(
     residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
 
     def ratios(k: int) -> NoiseRatios:
-        some, *_, fitted, _ = (groups, c, True) if k == order else weighted(k)
-        return noise_ratios(some, htf, fitted, htf.variance is None and residual.max() < ROUNDING)
+        used, *_, fitted, _ = (groups, c, True) if k == order else weighted(k)
+        return noise_ratios(used, htf, fitted, htf.variance is None and residual.max() < ROUNDING)
 
     surplus = unsupported(ratios, order)
     if check and surplus:

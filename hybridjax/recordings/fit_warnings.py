@@ -93,8 +93,7 @@ def advise(
         text = f"a section was sampled {sampled} times for {unknowns} unknowns; record more, take "
         warnings.append(Finding("few strides", f"{text}fewer sections, or excite fewer inputs."))
     if fit.doubt:
-        kind = "drift" if fit.doubt == MAY_DRIFT else "order"
-        warnings.append(Finding(kind, f"{fit.doubt}."))
+        warnings.append(Finding("drift" if fit.doubt == MAY_DRIFT else "order", f"{fit.doubt}."))
     band = input_band(data)
     for name in fit.feedback:
         text = f"{name} answers earlier residuals of the outputs: fits are biased. {NAME_REFERENCE}"

@@ -118,8 +118,7 @@ def test_discs_and_multipliers_of_transfer_functions_hold(plant):
 
 def test_regions_of_series_hold_in_the_loop(plant):
     fits = (hj.fit_ldtp(series(plant, k, noise=0.5), 2, reference="r") for k in range(20))
-    # (Of 20 with 95 %, less are in one of 2500.)
-    assert sum(fit.contains(plant.multipliers)[0] for fit in fits) >= 16
+    assert sum(fit.contains(plant.multipliers)[0] for fit in fits) >= 16  # (less: one in 2500)
 
 
 def test_instruments_of_series_hold_in_the_loop(plant):

@@ -157,8 +157,7 @@ def test_spurious_multipliers_raise_an_error(small):
         data = record(small, 400, seed, 0.3)
         with pytest.raises(hj.DefinitionError, match="the data support 2 multipliers, not 3"):
             hj.fit_series(data, 3)
-    spurious = hj.fit_series(data, 3, check=False)
-    assert len(spurious.multipliers) == 3 and "support 2 multipliers, not 3" in repr(spurious)
+    assert "support 2 multipliers, not 3" in repr(hj.fit_series(data, 3, check=False))
 
 
 def test_an_order_that_is_too_low_is_noticed(small):
@@ -202,7 +201,7 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
         assert not hj.fit_series(data, 2).doubt
         fit = hj.fit_ldtp(data, small.dims, noise="innovations")
         assert fit.result == hj.Result.OK and not fit.doubt
-    assert first.call_count == 4  # (Trials of a drift begin at the fit.)
+    assert first.call_count == 8  # (Fits, smaller ones; trials of a drift begin at the fit.)
     with pytest.raises(hj.DefinitionError, match="not 2.*outputs may drift: `with_drift"):
         hj.fit_series(moved(3 * slow.repeat(4), seed=0), 2)
     (begun,) = with_drift([record(small, 4100)])  # (Longer ones take too long.)

@@ -112,7 +112,7 @@ def test_what_does_not_fit_is_refused(pair):
         P @ system(2, (2, 2), OUT, IN)
     with refused("needs a square and invertible D"):
         system(2, (2, 2, 2, 2), through=0).inverse()
-    with refused("no response at section 2"):
+    with refused("answers itself at section 2"):
         eqx.tree_at(lambda x: x.D, K, K.D.at[2].set(-np.linalg.inv(P.D[2]))).feedback(P)
     with refused(r"of shape \(2 inputs, 2 outputs\) or of shape \(4 sections"):
         P.feedback(np.eye(3))

@@ -24,7 +24,7 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
     by_angle, by_apex = (hj.recordings.advise(*x).warnings for x in zip(data, fits, strict=True))
-    said = "Outputs: where sections are crossed, yM and vM"
+    said = "Outputs: yM and vM carry the same information at sections"
     assert any(repr(w).startswith(said) for w in by_angle) and "199.94 cycles" in repr(data[0])
     assert not any(w.cause == "outputs" for w in by_apex)
 
