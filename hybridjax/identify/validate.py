@@ -22,7 +22,7 @@ from .periodic import PeriodicModel
 from .series.fit import SeriesFit
 from .series.prediction import Predictor
 from .series.records import CycleGrid, PreparedRecords, drift_waves
-from .series.residuals import FEWEST_SAMPLES, independence_test, whitened, whiteness_test
+from .series.residuals import FEWEST_SAMPLES, independence_test, is_exact, whitened, whiteness_test
 
 
 # Samples for each unknown of its initial condition and drift, which a record must exceed. Fewer:
@@ -233,8 +233,8 @@ def validate(
     return Validation(
         fit=100 * (1 - rms / np.nanstd(y, axis=(0, 1, 2))),
         noise=rms,
-        whiteness=whiteness,
-        independence=independence,
+        whiteness=np.maximum(whiteness, is_exact(grid, error)),  # (rounding shows nothing)
+        independence=np.maximum(independence, is_exact(grid, error)),
         visible=np.where(size > 0, visible * rms / np.where(size > 0, size, 1.0), np.inf),
         autocorrelation=auto,
         cross_correlation=cross,
