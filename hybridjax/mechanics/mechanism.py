@@ -66,7 +66,7 @@ class Mechanism(eqx.Module):
 
     **Fields:**
 
-    - `kinetic`: T(q, v) -> number, quadratic in v and positive; from a mass matrix,
+    - `kinetic`: T(q, v) -> number, a polynomial of degree two in v; from a mass matrix,
         `lambda q, v: 0.5 * v @ M(q) @ v`.
     - `potential`: V(q) -> number. Default: 0.
     - `links`: for pictures, a function of q that returns the points (k, 2) of each link by name, in
@@ -102,8 +102,7 @@ class Mechanism(eqx.Module):
 
     def mass(self, q: Float[Array, " n"]) -> Float[Array, "n n"]:
         """The mass matrix M(q)."""
-        # T is quadratic in v: the momentum at a velocity of 1 in one coordinate is a column.
-        return jax.vmap(lambda v: jax.grad(self.kinetic, 1)(q, v))(jnp.eye(len(q), dtype=q.dtype))
+        return jax.hessian(self.kinetic, 1)(q, jnp.zeros_like(q))
 
     def bias(self, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         """h(q, v) = C(q, v) v + G(q): the forces that keep the velocities as they are."""
@@ -132,7 +131,7 @@ class Mechanism(eqx.Module):
         States should satisfy c = const. and J v = 0. An error in these is not corrected: J v keeps
         its value up to rounding, and c drifts accordingly.
         """
-        place = lambda q: as_vector(contact(q))  # noqa: E731
+        place = lambda q: as_vector(contact(q)).ravel()  # noqa: E731
         speed = lambda q: jax.jvp(place, (q,), (v,))[1]  # noqa: E731
         # (The drift is the part of the contact's acceleration that the velocities make.)
         jacobian, drift = jax.jacfwd(place)(q), jax.jvp(speed, (q,), (v,))[1]
@@ -158,7 +157,7 @@ class Mechanism(eqx.Module):
         **Arguments:** `contact`, the coordinates c(q) of the contacts made, k <= n independent ones
         as an array (k,); `restitution`, e: 0 for a contact that sticks; a number, or k of them.
         """
-        jacobian = jax.jacfwd(lambda q: as_vector(contact(q)))(q)
+        jacobian = jax.jacfwd(lambda q: as_vector(contact(q)).ravel())(q)
         by_impulse = _solve(self.mass(q), jacobian).T
         impulse = _solve(jacobian @ by_impulse, -(1 + restitution) * (jacobian @ v), _DEPENDENT)
         return Impact(v + by_impulse @ impulse, impulse)
