@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import core
+from jax.extend.core import get_opaque_trace_state
 
 
 if TYPE_CHECKING:
@@ -174,21 +175,21 @@ def is_traced(*trees: Any) -> bool:
     return any(map(is_tracer, jax.tree_util.tree_leaves(trees)))
 
 
+# The state outside of all transformations, in which nothing else needs to be asked.
+with core.eval_context():
+    _OUTSIDE = get_opaque_trace_state()
+
+
 def is_inside_program() -> bool:
     """Return whether JAX traces a program (of `jit`, `scan`, `cond` ...) at the moment: whatever is
     computed then becomes part of it, even a constant."""
-    return is_traced(_constant())
+    return get_opaque_trace_state() != _OUTSIDE and is_traced(jax.device_put(0.0))
 
 
 def is_hidden(*trees: Any) -> bool:
     """Return whether a transformation of JAX hides the values of `trees`, or of all that is
     computed."""
     return is_traced(*trees) or is_inside_program()
-
-
-@jax.jit
-def _constant():
-    return 0.0
 
 
 def default_device() -> Any:

@@ -101,7 +101,7 @@ class Curve:
         self.value = float(parameter_of(cycle.system, parameter))
 
     def system_at(self, value: float) -> HybridSystem:
-        return with_parameters(self.cycle.system, {self.parameter: value})
+        return with_parameters(self.cycle.system, {self.parameter: np.asarray(value)})
 
     def first(self) -> Point | Result:
         """The cycle itself."""

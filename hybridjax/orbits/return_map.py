@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import at_ease
-from .._core.executor import namespace, on_host, put, scan, stop_gradient, svdvals
+from .._core.executor import namespace, on_host, put, scan, stop_gradient, svdvals, to_host
 from .._core.lanes import PerLane
 from .._core.memo import remembered
 from .._core.results import Result
@@ -167,7 +167,8 @@ class ReturnMap(eqx.Module):
         """The map of another system; a clocked one begins at the same phase of its own clock."""
         if self.base is not None:
             return dataclasses.replace(self, system=system)
-        expected = self.multiplicity * jnp.asarray(system.period(), float)
+        period = jnp.asarray(system.period(), float)
+        expected = self.multiplicity * (to_host(period) if on_host(self.expected) else period)
         anchor = self.anchor._replace(t=self.anchor.t * (expected / self.expected))
         return dataclasses.replace(self, system=system, anchor=anchor, expected=expected)
 

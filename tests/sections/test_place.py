@@ -148,7 +148,7 @@ def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
         hj.place_sections(cycle, hj.ClockPhase(2))
 
 
-@pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("BuckConverter", "VerticalHopper")))
+@pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("VerticalHopper",)))
 def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch):
     """The same places, steps and errors as one section after the other."""
     system = getattr(hj.models, name)()
