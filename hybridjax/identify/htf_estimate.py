@@ -90,7 +90,8 @@ def estimate_htf(
     if len(rows) == 0:
         raise DefinitionError(
             f"no frequency can be estimated from {ran} experiments ({tried - ran} failed): excite "
-            f"each by each of the {len(setup.inputs)} inputs, multiples of 1/2 with two phases."
+            f"each frequency by each of the {len(setup.inputs)} inputs, and multiples of 1/2 with "
+            "two phases."
         )
     f, lines = sums.f[rows], _solve_lines(sums, rows)
     why_not = _why_not_total(sums, rows)
@@ -98,8 +99,8 @@ def estimate_htf(
         raise DefinitionError(why_not)
     if variance == "total" and (lines.realizations < 1).any():
         raise DefinitionError(
-            f"one realization at f = {f[lines.realizations < 1][0]:.10g} shows no distortion: "
-            "apply several (`Design.realizations`), or pass variance='noise'."
+            f"a single realization, as at f = {f[lines.realizations < 1][0]:.10g}, does not show "
+            "distortion: apply several (`Design.realizations`), or pass variance='noise'."
         )
     total, noise, scatter = lines.noise, None, None
     if variance != "noise" and np.median(lines.realizations) > 0 and not why_not:
@@ -218,7 +219,8 @@ def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
         )
     if low >= max(2, tested / 2):  # by chance once in 10 000 times or less
         return (
-            f"the phases are not random ({low} of {tested} crest factors are below those of 200 "
-            "draws) and do not show the distortion: redraw them, or pass variance='noise'."
+            f"the phases are not random ({low} of {tested} signals have crest factors below those "
+            "of 200 random draws), so that their scatter does not show the distortion: use random "
+            "phases, or pass variance='noise'."
         )
     return ""

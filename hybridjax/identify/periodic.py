@@ -209,7 +209,8 @@ def _root(n: int, gramian: Float[np.ndarray, "d d"]) -> tuple[np.ndarray, np.nda
     values, vectors = np.linalg.eigh(gramian)
     if not values[0] > ROUNDING * values[-1]:
         raise DefinitionError(
-            f"a state of section {n} has no effect on the outputs: give a minimal one (`realize`)."
+            f"a state at section {n} of the model has no effect on the outputs: give a minimal "
+            "model (`hj.identify.realize`)."
         )
     return vectors * np.sqrt(values), vectors / np.sqrt(values)
 

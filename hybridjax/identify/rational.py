@@ -98,12 +98,8 @@ class RationalFit(eqx.Module):
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        return card(
-            "RationalFit",
-            "",
-            text(repr(self)),
-            unit_circle(self.multipliers[self.result == Result.OK].ravel()),
-        )
+        shown = self.multipliers[self.result == Result.OK].ravel()
+        return card("RationalFit", "", text(repr(self)), unit_circle(shown))
 
 
 @checked

@@ -208,7 +208,8 @@ def validate(
     lags = max((k for k in tried if count(k).min() >= FEWEST_SAMPLES), default=1)
     if (count(lags).max(axis=0) < FEWEST_SAMPLES).any():
         raise DefinitionError(
-            f"the records are too short: {lags} samples must precede {FEWEST_SAMPLES} of a section."
+            f"the records are too short: each section must be sampled {FEWEST_SAMPLES} times with "
+            f"{lags} samples before it. Record longer without gaps."
         )
     roots = [] if isinstance(model, LDTP) or isinstance(tested, LDTP) else list(model.spread(grid))
     if isinstance(tested, LDTP):  # outputs in units of their size, so that none is neglected

@@ -130,7 +130,7 @@ def test_a_failed_realization_leaves_the_others(model):
     ratio = np.mean(estimate.variance[:, lost]) / np.mean(estimate.variance[:, ~lost])
     assert ratio == pytest.approx(2, rel=0.3)  # of one experiment instead of two
     np.testing.assert_array_equal(estimate.scatter.freedom, np.where(lost, (~lost).sum(), 1))
-    with pytest.raises(hj.DefinitionError, match="one realization at f = .* shows no distortion"):
+    with pytest.raises(hj.DefinitionError, match="single realization, as at f = .* does not show"):
         hj.estimate_htf(data, variance="total")
 
 

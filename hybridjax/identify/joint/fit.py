@@ -228,15 +228,18 @@ def fit_ldtp(
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
     - `check`: whether to raise an error if outputs do not respond to the inputs (not with
-      "innovations"), and to test whether residuals of time series depend on them, or
-      drift explains the multipliers; `doubt` and a `FindingWarning` then say so. Default: True.
+      "innovations"), and to test whether one dimension less explains the data as well, whether
+      residuals of time series depend on the inputs, and whether drift explains the multipliers;
+      `doubt` and a `FindingWarning` then say so. Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, always
       with innovations. The fit is consistent if D is zero at sections where the controller responds
       without delay; the response of the outputs to the reference shows whether D is zero. If the
       reference was not recorded, pass noise="innovations". Then D is zero if outputs do not depend
       on inputs at the same section, or if inputs respond to earlier residuals; otherwise D is
-      fitted, and `feedback` reports that a controller could cause the dependence. Default: None.
+      fitted, and `feedback` reports that a controller could cause the dependence. If the past
+      determines the inputs (few lines), D is zero if a fit with D is not better (at 5 %), and it is
+      free, and printed as not determined, if the data do not determine it. Default: None.
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data
@@ -481,9 +484,8 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     minimal = realize(np.asarray(model.impulse_response(2 * default_horizon(model.n_sections) + 1)))
     scale = weights.check_values(exact)
     problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
-    coordinates = local_coordinates(
-        PeriodicModel.of(minimal, scale), bool(np.asarray(model.D).any())
-    )
+    direct = bool(np.asarray(model.D).any())
+    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
     c, slopes = characteristic_slopes(coordinates)
     spread = problem.linearize(coordinates).spread()
     return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)

@@ -166,7 +166,7 @@ class OutputErrorProblem(NamedTuple):
         # (Ranks of inputs in a narrow band are not exact.)
         if to_lags[0].shape[1] < min(len(triangles[0]), sum(alone) - min(alone) / 2):
             raise DefinitionError(
-                f"{listed(records.inputs)} cannot be told apart: leave out functions of the others."
+                f"{listed(records.inputs)} cannot be told apart: leave out what others determine."
             )
         return cls(records, lags, free, to_lags, alike, records.scale)
 
