@@ -192,8 +192,7 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
     weights = jnp.concatenate([jnp.broadcast_to(r, (r.shape[0], lanes)) for r in rows])
 
     def contract(column):
-        w = weights.reshape(total, *[1] * (column.ndim - 2), lanes)
-        return jnp.sum(column * w, axis=0)
+        return jnp.sum(column * weights.reshape(total, *[1] * (column.ndim - 2), lanes), axis=0)
 
     return end, jax.tree_util.tree_map(contract, columns)
 

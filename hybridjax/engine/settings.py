@@ -102,8 +102,7 @@ class Settings(eqx.Module):
 
 def _kept(x: Any) -> Any:
     """Arrays of the host unchanged, other numbers as arrays of JAX."""
-    kept = x is None or (isinstance(x, np.ndarray) and x.dtype == np.float64)
-    return x if kept else real(x)
+    return x if x is None or (isinstance(x, np.ndarray) and x.dtype == np.float64) else real(x)
 
 
 def size(settings: Settings, a: int, *q: States) -> States:

@@ -171,5 +171,4 @@ def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
 
     fit = least_squares(residual, start, x_scale="jac")
     parameters = len(start) * (series + 1)
-    mean = max(2 * fit.cost, 1e-300) / count
-    return count * np.log(mean) + parameters * np.log(count), fit.x
+    return count * np.log(max(2 * fit.cost, 1e-300) / count) + parameters * np.log(count), fit.x

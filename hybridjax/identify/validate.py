@@ -6,13 +6,13 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import stats
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability, SignalNames
 from .._core.html import COLORS, Curve, card, picture, text
-from .._core.signal import unit_of, with_unit
-from .._core.text import folded, p_value
+from .._core.text import folded, listed, p_value
 from ..errors import DefinitionError
 from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
@@ -58,6 +58,9 @@ class Validation(eqx.Module):
     - `fit` (ny,): normalized root mean square error as a fit in percent,
       $100\,(1 - \|y - \hat y\| / \|y - \bar y\|)$: 100 is perfect, 0 as good as the mean.
     - `noise` (ny,): rms of the residuals.
+    - `no_better` (ny,): p-value of the hypothesis that squared residuals are on average no smaller,
+      from cycle to cycle, than deviations from the mean cycle of all other cycles. Where it is
+      large, the model explains nothing.
     - `whiteness` (ny,): p-value of the hypothesis that the residuals are white: they are not where
       it is small (process noise, or dynamics that the model lacks).
     - `independence` (ny,): p-value of the hypothesis that the residuals do not depend on the
@@ -77,6 +80,7 @@ class Validation(eqx.Module):
 
     fit: Float[np.ndarray, " ny"]
     noise: Float[np.ndarray, " ny"]
+    no_better: Float[np.ndarray, " ny"]
     whiteness: Float[np.ndarray, " ny"]
     independence: Float[np.ndarray, " ny"]
     visible: Float[np.ndarray, " ny"]
@@ -101,15 +105,22 @@ class Validation(eqx.Module):
         """True if the residuals of all outputs may be independent of the inputs."""
         return bool(np.min(self.independence) >= self.level / len(self.outputs))
 
+    @property
+    def unexplained(self) -> tuple[str, ...]:
+        """Outputs that the model predicts no better, beyond chance, than their mean cycle does."""
+        pairs = zip(self.outputs, self.no_better, strict=True)
+        return tuple(name for name, p in pairs if p > self.level / len(self.outputs))
+
     def __repr__(self) -> str:
-        head = f"{'output':>12}  {'fit':>9}  {'rms left':>9}"
+        names = [listed([name]) for name in self.outputs]
+        w = max(12, *map(len, names))
+        head = f"{'output':>{w}}  {'fit':>9}  {'rms left':>9}"
         rows = [f"{head}  {'white':>11}  {'independent':>11}"]
-        for i, name in enumerate(self.outputs):
-            tests = p_value(self.whiteness[i]), p_value(self.independence[i])
-            rows.append(
-                f"{with_unit(name, unit_of(name)):>12}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}"
-                f"  {tests[0]:>11}  {tests[1]:>11}"
-            )
+        for i, name in enumerate(names):
+            tests = f"{p_value(self.whiteness[i]):>11}  {p_value(self.independence[i]):>11}"
+            rows.append(f"{name:>{w}}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}  {tests}")
+        if self.unexplained:
+            rows.append(f"predicted no better than by the mean cycle: {listed(self.unexplained)}")
         verdict = {True: "no sign of it", False: "yes"}
         rows.append(
             f"correlated in time: {verdict[self.white]}; with the input: "
@@ -129,8 +140,8 @@ class Validation(eqx.Module):
             Curve(t, self.measured[k, 0], "measured", COLORS[-1]),
             Curve(t, self.simulated[k, 0], "simulated"),
         ]
-        name = with_unit(self.outputs[0], unit_of(self.outputs[0]))
-        return card("Validation", "", picture(curves, "cycles", name), text(repr(self)))
+        drawn = picture(curves, "cycles", listed(self.outputs[:1]))
+        return card("Validation", "", drawn, text(repr(self)))
 
 
 @checked
@@ -191,7 +202,7 @@ def validate(
     if not compared:
         raise DefinitionError(
             f"{max(len(r.u) for r in records) / N:.3g} cycles without gaps are too few for an "
-            "unknown initial state: record longer, or use start='cycle'."
+            "unknown initial state: record longer without gaps, or use `validate(start='cycle')`."
         )
     prepared = PreparedRecords(compared)
     grid, sampled = prepared.whole(), prepared.sampled
@@ -217,11 +228,16 @@ def validate(
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
     with np.errstate(all="ignore"):
         simulated = tested.predict(grid, free_start)
+        error = y - simulated
+        # Compare with the mean of the other cycles, cycle by cycle (Diebold and Mariano 1995).
+        n = np.maximum(np.isfinite(y).sum(axis=(0, 1)), 2)
+        alone = (y - np.nanmean(y, axis=(0, 1))) * n / (n - 1)
+        gain = np.nansum(alone**2 - error**2, axis=2)[grid.sampled.any(axis=(2, 3))]
+        no_better = stats.norm.sf(gain.mean(axis=0) * np.sqrt(len(gain)), scale=gain.std(axis=0))
     if unstable and (drive or not np.isfinite(simulated[grid.inside]).all()):
         raise DefinitionError(
             "the simulation of an unstable plant grows without bound: validate `fit_ldtp(series)`."
         )
-    error = y - simulated
     rms = np.sqrt(np.nanmean(error**2, axis=(0, 1, 2)))
     size = np.sqrt(np.mean(simulated[grid.inside] ** 2, axis=0))
     auto, whiteness = whiteness_test(whitened(error, roots), lags)
@@ -234,6 +250,7 @@ def validate(
     return Validation(
         fit=100 * (1 - rms / np.nanstd(y, axis=(0, 1, 2))),
         noise=rms,
+        no_better=no_better,
         whiteness=np.maximum(whiteness, is_exact(grid, error)),  # (rounding shows nothing)
         independence=np.maximum(independence, is_exact(grid, error)),
         visible=np.where(size > 0, visible * rms / np.where(size > 0, size, 1.0), np.inf),

@@ -257,8 +257,7 @@ class FiveLinkBiped(HybridSystem):
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:5], state[5:]))
         foot = lambda q: q[5:] + self._swing_foot(q[:5])  # noqa: E731
-        after = self.mechanism().impact(q, v, foot).velocity
-        return jnp.concatenate([q[4::-1], after[4::-1]])
+        return jnp.concatenate([q[4::-1], self.mechanism().impact(q, v, foot).velocity[4::-1]])
 
     def draw(self, chart, t, q):
         return self.mechanism().draw(jnp.stack(list(q.values())[:5]), _GROUND, "stance")

@@ -339,8 +339,7 @@ def tiles_of(
 ) -> Tiles:
     """Systems, of so many in `total`, and how they are solved."""
     arrays, static = eqx.partition(systems, eqx.is_array)
-    first = eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static)
-    require_similar(map, first)
+    require_similar(map, eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
     large, periods = total > SMALL, None
     if map.base is None:
         of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731

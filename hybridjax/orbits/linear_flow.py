@@ -384,8 +384,7 @@ def of_flow(tangents: Any) -> Any:
 
 def _flow_along(arguments: tuple, by: tuple) -> tuple[LinearFlow, LinearFlow]:
     cycle, longest, parameter = arguments
-    flow = _linear_flow(cycle, longest, parameter)
-    return flow, _linear_flow(cycle, longest, parameter, by[0])
+    return _linear_flow(cycle, longest, parameter), _linear_flow(cycle, longest, parameter, by[0])
 
 
 _of_cycle = by_columns(_linear_flow, _flow_along, of_flow, np.inf)

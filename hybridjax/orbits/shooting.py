@@ -37,8 +37,7 @@ def newton_steps(
     NaN for systems that are not finite."""
     step = np.full(residual.shape, np.nan)
     good = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
-    inverse = np.linalg.pinv(jacobian[good], rcond=rcond)
-    step[good] = -(inverse @ residual[good, :, None])[..., 0]
+    step[good] = -(np.linalg.pinv(jacobian[good], rcond=rcond) @ residual[good, :, None])[..., 0]
     return step
 
 
@@ -103,8 +102,7 @@ def _forwards(moves: Moves) -> Moves | None:
 def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple | None:
     """A turn, as by `ReturnMap.travel`, and the largest gap between its moves, in sizes of the
     states; None if it has other moves than expected."""
-    begin = map.departure(q)
-    pieces = follow_moves(map, begin, map.ends(), expected)
+    pieces = follow_moves(map, map.departure(q), map.ends(), expected)
     if pieces is None or pieces[-1] > CLOSED:
         return None
     legs, moved, tape, gap = pieces

@@ -33,8 +33,7 @@ class Pictures:
         moves = np.where((np.diff(t) == 0)[:, None], place[:-1] - place[1:], moves)
         self._origin = np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
         self.period = min(period, t[-1] - t[0])
-        after = self.period - (t[-1] - t[0])
-        self.stride = self._origin[-1] + self._velocity[-1] * after
+        self.stride = self._origin[-1] + self._velocity[-1] * (self.period - (t[-1] - t[0]))
         if np.isinf(period):
             self.stride += place[-1] - place[0]
         places: list[Any] = []  # between which pictures lie, without their ground

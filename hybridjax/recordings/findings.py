@@ -21,7 +21,8 @@ from .recording import Recording, Trial
 CLEAR = 4.0
 
 NAME_REFERENCE = (
-    "Record a signal that acts on the loop from outside, too, and name it as the `reference`."
+    "Are inputs and outputs swapped? If not, record a signal that acts on the loop from outside, "
+    "and name it as the `reference`."
 )
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
 from .._core.results import Result
-from .._core.text import p_value
+from .._core.text import listed, p_value
 from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import MAY_DRIFT, CycleGrid, PreparedRecords
@@ -112,6 +112,9 @@ def advise(
     if validation and not validation.independent and validation.fit[p.argmin()] < 99:
         text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}): raise "
         warnings.append(Finding("left over", f"{text}`order`, sample faster, or push less."))
+    if validation and validation.unexplained:
+        text = f"{listed(validation.unexplained)}: the model predicts held-out strides no better "
+        warnings.append(Finding("no fit", f"{text}than the mean cycle does: it explains nothing."))
     if data.missing > _FEW:
         warnings.append(Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing."))
     for name, count in zip(data.signals, data.spikes, strict=True):

@@ -86,10 +86,10 @@ class Split(NamedTuple):
         """Fit the early part and validate the fit on the late part."""
         try:
             fit = fit_series(self.early, order, check=False, reference=reference)
+            return HeldOut(fit, validate(fit, self.late, reference=reference))
         except DefinitionError as error:
             hint = "A quarter is held out: `fit_series` fits all, without a test."
             raise DefinitionError(f"{error} ({hint})") from error
-        return HeldOut(fit, validate(fit, self.late, reference=reference))
 
 
 @checked

@@ -202,8 +202,7 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
         return lambda x: jax.jvp(work, (x,), (tangent,))[1]
 
     def twice(first, second):
-        tangent = jnp.broadcast_to(second[:, None], x.shape)
-        return jax.jvp(along(first), (x,), (tangent,))
+        return jax.jvp(along(first), (x,), (jnp.broadcast_to(second[:, None], x.shape),))
 
     i, j = np.triu_indices(m)
     first, second = jax.vmap(twice)(jnp.eye(m)[i], jnp.eye(m)[j])

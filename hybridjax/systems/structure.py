@@ -226,7 +226,7 @@ class Structure:
 
     def kernel(self, function: Callable, form, *static: Hashable, trees=(), lanes=1) -> Callable:
         """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
-        compiled (see `_core/compilation/kernel.py`)."""
+        compiled (see `_core/compilation.py`)."""
         name = function, form, static, lanes
         every = self, *trees
         return self.once(name, trees, lambda: kernel(function, form, static, every, lanes))

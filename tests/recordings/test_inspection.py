@@ -151,10 +151,10 @@ def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_c
     validation = result.held_out.validation
     assert validation.independent and validation.fit.min() > 99
     for fit, named in (99.3, False), (70.0, True):
-        tests = np.full(2, fit), np.zeros(2)
-        worse = eqx.tree_at(lambda x: (x.fit, x.independence), validation, tests)
+        tests = np.full(2, fit), np.zeros(2), np.full(2, float(named))
+        worse = eqx.tree_at(lambda x: (x.fit, x.independence, x.no_better), validation, tests)
         causes = [x.cause for x in hj.recordings.advise(result.data, result.fit, worse).warnings]
-        assert ("left over" in causes) == named
+        assert ("left over" in causes) == ("no fit" in causes) == named
     # So many strides as give no finite standard error are left out of the report.
     few = eqx.tree_at(lambda x: x.advice.expected, result, result.advice.expected.copy())
     few.advice.expected[0] = np.inf

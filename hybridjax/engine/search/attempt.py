@@ -212,8 +212,7 @@ def _errors(
         error = xp.maximum(error, xp.where(xp.isfinite(change), change, 0.0))
         gain = flow.method.gain
         error = error**gain * settings.rtol ** (gain - 1) if gain != 1 else error
-    finite = xp.isfinite(step.q).all(axis=0) & ~xp.isnan(error)
-    return allowed, xp.where(finite, error, xp.inf)
+    return allowed, xp.where(xp.isfinite(step.q).all(axis=0) & ~xp.isnan(error), error, xp.inf)
 
 
 def _bent(flow: ChartFlow, before: Watch, after: Watch, start, end, t, moved, span) -> Mask:
@@ -243,8 +242,7 @@ def _clearance(
     far = xp.where(armed, low > NEAR * xp.maximum(xp.abs(ends[0]), xp.abs(ends[1])), high <= 0)
     fastest = xp.maximum(xp.abs(ends[2]), xp.abs(ends[0]))
     # (By rounding, the zero may lie a little before the start.)
-    slow = (judged & (xp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)
-    return far, slow
+    return far, (judged & (xp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)
 
 
 def deviation(s: Structure, lanes: Lanes, settings: Settings) -> Padded:

@@ -227,8 +227,7 @@ def fit_series(
         noise = _noise(solution)  # the weights that the residuals suggest
         problem = problem._replace(scale=problem.scale * noise)
         solution, converged = minimize(problem, solution.c)
-        ratios = _noise_ratios(delayed, noise * _noise(solution))
-        return ratios, problem, solution, converged
+        return _noise_ratios(delayed, noise * _noise(solution)), problem, solution, converged
 
     ratios, problem, solution, converged = weighted(order)
     fit = assemble(problem, solution, coefficient_covariance(problem, solution), converged)
@@ -341,8 +340,7 @@ def missing_cycles(problem: OutputErrorProblem, solution: Linearization, least: 
     """Return how many more cycles would leave this number of degrees of freedom, about."""
     n, i = np.unravel_index(np.argmin(solution.freedom), solution.freedom.shape)
     # (More lags than samples would use up more of them.)
-    left = int(solution.freedom[n, i]) or problem.freedom_left(int(n), int(i))
-    return max(least - left, 0)
+    return max(least - (int(solution.freedom[n, i]) or problem.freedom_left(int(n), int(i))), 0)
 
 
 def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:

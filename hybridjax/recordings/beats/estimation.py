@@ -220,5 +220,4 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float,
         score[k], left_out[k] = x.T @ error, error @ error
     meat = score.T @ score + fit.smoothness.noise * smooth
     covariance = sandwich(curvature, meat, shares + smooth / count)
-    detail = float(np.trace(np.linalg.lstsq(curvature, data)[0]))
-    return covariance, float(left_out.sum()), detail
+    return covariance, float(left_out.sum()), float(np.trace(np.linalg.lstsq(curvature, data)[0]))
