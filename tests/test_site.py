@@ -47,8 +47,7 @@ def test_every_public_name_that_a_user_writes_is_in_an_example():
     code = "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     code += "".join(page.read_text() for page in (ROOT / "notebooks").glob("*.py"))
     written = {name.split(".")[-1] for name in public_names()} - GIVEN
-    missing = {name for name in written if not re.search(rf"\b{name}\b", code)}
-    assert not missing
+    assert not {name for name in written if not re.search(rf"\b{name}\b", code)}
 
 
 @pytest.fixture(scope="module")

@@ -114,8 +114,7 @@ def _from_module(module: eqx.Module) -> Any:
     static, arrays = taken_apart(module)
     coordinates: dict[str, Any] = {}
     for dimension, field in _COORDINATES.items():
-        values = static.pop(field, None)
-        if values is not None:
+        if (values := static.pop(field, None)) is not None:
             coordinates[dimension] = [str(x) if isinstance(x, str) else int(x) for x in values]
             if isinstance(values[0], str):
                 coordinates[f"{dimension}_unit"] = dimension, list(map(unit_of, values))
@@ -219,8 +218,7 @@ def _signals(data: Recording | SectionData, values: np.ndarray) -> dict[str, Any
 
     **Raises:** `DefinitionError` for signals that are called like a coordinate.
     """
-    reserved = _RESERVED & set(data.signals)
-    if reserved:
+    if reserved := _RESERVED & set(data.signals):
         raise DefinitionError(f"'{min(reserved)}' is also the name of a coordinate: rename it.")
     triples = zip(data.signals, data.units, values.T, strict=True)
     return {str(name): _variable("sample", x, unit) for name, unit, x in triples}

@@ -84,8 +84,7 @@ class StoredExperiments:
     def __iter__(self) -> Iterator[ExperimentData]:
         """Read chunk after chunk. **Raises:** `DefinitionError` if one is missing;
         `FileFormatError` if one is damaged."""
-        missing = self.missing()
-        if missing:
+        if missing := self.missing():
             text = f"{len(missing)} of {len(self)} chunks in '{self.address}' are missing"
             raise DefinitionError(f"{text}: make the call that began it again to run them.")
         for k in range(len(self)):

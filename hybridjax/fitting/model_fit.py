@@ -1,7 +1,6 @@
 """The result of a fit of physical parameters, and the combinations that data identify."""
 
 import itertools
-import operator
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import NamedTuple
@@ -18,7 +17,7 @@ from .._core.html import card, table, text
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
-from ..systems.system import HybridSystem, unit_of_parameter
+from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
 from .problem import DELAYS, FitProblem, evaluate
 
 
@@ -189,14 +188,19 @@ class ModelFit(eqx.Module):
         depend on the parametrization, and follows curved regions. Where the data have no standard
         deviations, or estimated ones, it is in units that the residuals show.
 
-        **Arguments:** `true`: values by name, or a system, of which the fitted parameters count.
+        **Arguments:** `true`: values by name, or a system whose other parameters are those of the
+        fit.
 
-        **Raises:** `DefinitionError` if a value is missing, or if the fit has no standard errors.
+        **Raises:** `DefinitionError` if a value is missing or was not fitted, or if the fit has no
+        standard errors.
         """
         if isinstance(true, HybridSystem):
-            true = {x: operator.attrgetter(x)(true) for x in self.names if x not in DELAYS}
-        missing = [name for name in self.names if name not in true]
-        if missing:
+            kept = {x: y for x, y in arrays_of(self.system).items() if x not in self.names}
+            given = arrays_of(true).items()
+            true = {x: y for x, y in given if not np.array_equal(y, kept.get(x, np.nan))}
+        if more := [name for name in true if name not in self.names]:
+            raise DefinitionError(f"`true` has another '{more[0]}', which was not fitted: free it.")
+        if missing := [name for name in self.names if name not in true]:
             raise DefinitionError(f"`true` must have a value of '{missing[0]}', which was fitted.")
         values = jnp.array([float(true[name]) for name in self.names])
         r, *_ = evaluate(self.problem, self.problem.parameters.encode(values), self.cycle)
@@ -215,11 +219,19 @@ class ModelFit(eqx.Module):
     def __repr__(self) -> str:
         width = max(map(len, self.names))
         lines = [f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"]
-        lines.append(f"  {self._cost()}\n  standard errors include noise, but no distortion:")
+        lines += [self._cost(), "standard errors include noise, but no distortion:"]
         for name, value, error, unit in self._rows():
-            lines.append(f"  {name:{width}}  {value:<14} {error} {unit * ('±' in error)}".rstrip())
-        lines += [f"  not identified: {text}" for text in self.identifiability.descriptions()]
-        return "\n".join(lines)
+            lines.append(f"{name:{width}}  {value:<14} {error} {unit * ('±' in error)}".rstrip())
+        return "\n  ".join(lines + self._remarks())
+
+    def _remarks(self) -> list[str]:
+        """Return what is not identified, and bounds that standard errors reach."""
+        remarks = [f"not identified: {x}" for x in self.identifiability.descriptions()]
+        errors = np.where(np.isfinite(self.standard_errors), self.standard_errors, 0.0)
+        for bounds in (self.problem.parameters.low, self.problem.parameters.high):
+            for k in np.flatnonzero(np.abs(np.asarray(bounds) - self.values) < errors):
+                remarks.append(f"{self.names[k]} reaches its bound {bounds[k]:g} within its error")
+        return remarks
 
     def _cost(self) -> str:
         misfit = f"residuals {100 * np.sqrt(np.mean(self.residuals**2)):.2g} % of the data"
@@ -237,6 +249,5 @@ class ModelFit(eqx.Module):
 
     def _repr_html_(self) -> str:
         parameters = table(("parameter", "value", "standard error", "unit"), self._rows())
-        unseen = [f"not identified: {x}" for x in self.identifiability.descriptions()]
         of = f"of {type(self.system).__name__}: {Result(self.result).message}"
-        return card("ModelFit", of, parameters, text("\n".join([self._cost(), *unseen])))
+        return card("ModelFit", of, parameters, text("\n".join([self._cost(), *self._remarks()])))

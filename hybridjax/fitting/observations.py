@@ -217,7 +217,7 @@ class ObservedCycle(AbstractObservation):
     modulo the period; those of an autonomous one count from any moment.
 
     Residuals are in units of the standard deviations where these are given, otherwise relative to
-    the rms of each output and of the times, and to the period.
+    the rms of each output, to the measured period, and for times to the period of the guess.
     """
 
     sections: AbstractSections
@@ -301,7 +301,8 @@ class ObservedCycle(AbstractObservation):
 
     def prepare(self, cycle: LimitCycle) -> "ObservedCycle":
         place_sections(cycle, self.sections)
-        return self
+        scales = tuple(jnp.where(jnp.isnan(x), cycle.period, x) for x in self.scales)
+        return eqx.tree_at(lambda o: o.scales, self, scales)
 
 
 @jax.jit
@@ -311,6 +312,8 @@ def _real(H: Array, measured: Array, weights: Array) -> Float[Array, " r"]:
 
 
 def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
+    if std is None and name == "times":  # (any moment may be zero: `prepare` knows the period)
+        return jnp.asarray(jnp.nan)
     if std is None:
         size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))  # of the shape seen.shape[1:]
         if not jnp.all(size > 0):

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arguments import Numbers
+from .._core.boundary.values import Reals
 from .._core.compilation import kind, quick_jit
 from .._core.executor import is_inside_program, on_the_cpu
 from .._core.host_derivatives import NotOnHostError, only_on_host
@@ -37,17 +39,18 @@ MAX_STEPS = 64
 # initial values. Smaller: unidentifiable ones wander off.
 _RCOND = 1e-8
 # A step is accepted if the cost falls by this part of the predicted reduction; beyond a larger part
-# the damping falls. Lower: steps that gain nothing count. Higher: good ones are repeated.
-_ACCEPTED, _GOOD = 0.01, 0.99
-# Factors of the damping after good and after rejected steps. Nearer to 1: more steps until it fits.
-# Farther: it swings between too much and too little.
-_LESS, _MORE = 3.5, 4.0
+# the damping falls, otherwise it grows. Lower: steps count that gain nothing, or swing about the
+# minimum. Higher: good ones are repeated, or made too short.
+_ACCEPTED, _GOOD = 0.01, 0.5
+# The first damping, and the factor by which it changes. Higher: more steps until it fits. Lower:
+# first steps that go too far, or more steps until it fits.
+_DAMPING, _FACTOR = 3e-3, 4.0
 
 # Names of the entries of `ObservedHTF.delay` among the free parameters.
 DELAYS = "input_delay", "output_delay"
 
 Observations = Sequence[AbstractObservation]
-Bounds = tuple[float | int, float | int]
+Bounds = Annotated[Numbers, Reals("2", infinite=True)]
 Free = str | Sequence[str] | Mapping[str, Bounds | None]
 
 
@@ -141,10 +144,10 @@ def free_parameters(
         bounds = free[name] if isinstance(free, Mapping) else None
         if bounds is None:  # it keeps its sign
             bounds = (0.0 if value > 0 else -jnp.inf, 0.0 if value < 0 else jnp.inf)
-        if len(bounds) != 2 or not bounds[0] < value < bounds[1]:
+        if not bounds[0] < value < bounds[1]:
             raise DefinitionError(
-                f"the bounds of '{name}', {bounds}, must be two numbers that enclose the value at "
-                f"which the fit starts, {value:g}."
+                f"the bounds of '{name}', {bounds[0]:g} and {bounds[1]:g}, must enclose the value "
+                f"at which the fit starts, {value:g}."
             )
         rows.append((*bounds, abs(value) or 1.0))
     return Parameters(names, *map(jnp.asarray, np.transpose(rows)))
@@ -259,14 +262,16 @@ def descend(
     """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals and their
     Jacobian, a guess for their cycle, number of evaluations, and whether it has converged.
 
-    Steps are accepted and their damping changes as in `optimistix.LevenbergMarquardt`. Here the
-    iteration runs on the host, so that only the model is compiled.
+    The damping is relative to the largest sensitivity, so that units of the residuals do not count.
+    The iteration runs on the host, so that only the model is compiled.
     """
-    damping, steps = 1.0, 1
+    damping, steps = _DAMPING, 1
     r, J, near = evaluate(problem, x, guess)
 
     def step(damping):
-        damped = np.concatenate([J, np.sqrt(damping) * np.eye(len(x))])
+        largest = np.linalg.norm(J, 2)
+        size = largest if largest > _RCOND else 1.0  # (rounding is no sensitivity)
+        damped = np.concatenate([J, np.sqrt(damping) * size * np.eye(len(x))])
         return np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
 
     while steps < MAX_STEPS and np.isfinite(r).all() and np.isfinite(J).all():
@@ -279,10 +284,8 @@ def descend(
         # (Rounding decides whether a step of this size is accepted.)
         done = _small(change, trial) and (_small(r_new - r, r_new) or not is_better)
         if is_better:
-            damping /= _LESS if gain < _GOOD * predicted < 0 else 1.0
             x, r, J, near = trial, r_new, J_new, nearer
-        else:
-            damping *= _MORE
+        damping *= 1 / _FACTOR if gain < _GOOD * predicted else _FACTOR
         if done:
             # (Steps become short, too, where none helps: beside parameters without a cycle.)
             gain = r @ J @ step(_RCOND**2)

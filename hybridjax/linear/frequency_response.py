@@ -41,8 +41,7 @@ def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, 
     if harmonics is None:
         return every
     integers = tuple(sorted(harmonics)) if isinstance(harmonics, Iterable) else (harmonics,)
-    outside = [m for m in integers if m not in every] if n_sections else []
-    if outside:
+    if outside := ([m for m in integers if m not in every] if n_sections else []):
         raise DefinitionError(
             f"Harmonic {outside[0]} does not exist: with {n_sections} sections the harmonics are "
             f"{every[0]} to {every[-1]}."

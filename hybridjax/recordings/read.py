@@ -85,8 +85,7 @@ def read_tables(path: Path, wanted: Wanted) -> list[Columns]:
 
     **Raises:** as `read_recording`.
     """
-    reader = read_bag if path.is_dir() else _READERS.get(path.suffix.lower())
-    if reader is None:
+    if (reader := read_bag if path.is_dir() else _READERS.get(path.suffix.lower())) is None:
         kinds = ", ".join(_READERS)
         raise DefinitionError(f"'{path}' ends in '{path.suffix}'; formats are {kinds}.")
     try:

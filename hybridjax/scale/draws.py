@@ -119,8 +119,7 @@ class Draws:
         lost = dict.fromkeys(self.variables) | {"failed": np.array(1)}
         drawn = map(self._draw, range(rows.start, rows.stop))
         drawn = [lost if isinstance(values, ComputationError) else values for values in drawn]
-        other = {name for values in drawn for name in values.keys() ^ lost.keys()}
-        if other:
+        if other := {name for values in drawn for name in values.keys() ^ lost.keys()}:
             raise DefinitionError(
                 f"`function` must always give the same names: `{min(other)}` is in some draws only."
             )

@@ -38,8 +38,7 @@ def flow_along(
     moves = Moves(*(np.concatenate([x] * 3, axis=-1) for x in moves))
     later = period * np.repeat([0, 1, 2], M)
     moves = moves._replace(t=moves.t + later, code=np.where(moves.code < 0, MOVE, moves.code))
-    places = _places_on(map, moves, before, begin, targets)
-    if places is None:
+    if (places := _places_on(map, moves, before, begin, targets)) is None:
         return None
     # Moves start at the beginning, where recorded moves do, and at targets, which take the place of
     # a recorded start at the same time.

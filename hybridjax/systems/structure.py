@@ -274,8 +274,7 @@ class Structure:
         """g_a(û): the inputs that chart a uses."""
         if isinstance(self.system, Driven):
             u = u + jnp.broadcast_to(jnp.asarray(self.system.drive(t), float), u.shape)
-        names = self.charts[a].inputs
-        if names is None:
+        if (names := self.charts[a].inputs) is None:
             return u
         return u[np.array([self.system.inputs.index(n) for n in names], int)]
 

@@ -48,5 +48,4 @@ def test_failed_experiments_are_named():
     assert data.ok.sum() == 79 and not data.ok[17]
     assert "79/80 ok" in repr(data)
     result[:8] = hj.Result.BLOW_UP
-    data = hj.ExperimentData(np.ones_like(y), y, **usual)
-    assert data.summary().endswith("and 4 more")
+    assert hj.ExperimentData(np.ones_like(y), y, **usual).summary().endswith("and 4 more")

@@ -52,11 +52,18 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
     cycles = [hj.find_limit_cycle(hj.models.VanDerPol(mu=mu)) for mu in (1.1, 1.101)]
     (gap,), (other,) = (np.diff(hj.place_sections(x, where).lanes.t) for x in cycles)
     error = np.sqrt(2) * 0.1 / abs(other - gap) * 1e-3  # of a difference of two times
+    rough = []
     for begin in (0.0, 9.0):
         data = hj.ObservedCycle(where, times=[begin, begin + gap], times_std=0.1)
         fit = hj.fit_model(hj.models.VanDerPol(), data, "mu")
         assert fit.freedom == 0 and fit.values == pytest.approx(1.1, rel=1e-9)
         assert fit.standard_errors == pytest.approx(error, rel=0.01)
+        data = hj.ObservedCycle(where, "x", [[0.1], [-2.0]], times=[begin, begin + gap])
+        rough.append(hj.fit_model(hj.models.VanDerPol(mu=2.5), data, {"mu": (0.0, np.inf)}))
+    assert rough[0].values == pytest.approx(rough[1].values, rel=1e-6)
+    assert rough[0].result == 0 and "mu reaches its bound 0 within its error" in repr(rough[0])
+    with pytest.raises(hj.DefinitionError, match="another 'mass', which was not fitted"):
+        rough[0].chi_square({"mu": 1.1, "mass": 1.0})
 
 
 @pytest.mark.slow

@@ -42,5 +42,4 @@ def test_the_basis_spans_what_is_not_seen(rows):
     found = diagnose(tuple("abcde"), S)
     assert found.unseen.shape == rows.shape
     assert np.abs(S @ found.unseen.T).max() < 1e-2 * np.abs(S).max()
-    both = np.concatenate([rows, found.unseen])
-    assert np.linalg.matrix_rank(both, tol=1e-2) == len(rows)
+    assert np.linalg.matrix_rank(np.concatenate([rows, found.unseen]), tol=1e-2) == len(rows)

@@ -7,8 +7,7 @@ from .campaign import check, shares
 
 def agree(jobs):
     reports = [check(name, numbers) for name, numbers in jobs.items()]
-    failures = {f"{r.name}:{k}": what for r in reports for k, what in r.failures.items()}
-    assert not failures
+    assert not {f"{r.name}:{k}": what for r in reports for k, what in r.failures.items()}
     systems, compared = (sum(getattr(r, key) for r in reports) for key in ("systems", "compared"))
     print(f"{systems} systems, {compared} compared, {1 - compared / systems:.1%} excluded")
     assert compared >= 0.95 * systems

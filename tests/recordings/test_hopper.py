@@ -62,5 +62,4 @@ def test_responses_to_pushes(hopper_cycle, angle):
         value = push @ model.impulse_response(4 * N)[(m + r) % N, r - k, :, 0] / area
         np.testing.assert_allclose(theory[m, r, :, 0], value, rtol=1e-12)
         size = np.abs(theory).max(axis=(0, 1))
-        miss = np.sqrt(np.mean((found.values - theory) ** 2, axis=(0, 1)))
-        assert (miss < most * size).all()
+        assert (np.sqrt(np.mean((found.values - theory) ** 2, axis=(0, 1))) < most * size).all()

@@ -171,8 +171,7 @@ class ZarrStore:
             kept = self._group[_START]
             start = [kept[f"{i}"] for i in range(about["start"])]
             whole = [*start, *(self._group[name] for name in about["constants"])]
-            lost = {_key(x) for x in whole if x.size} - self._present()
-            if lost:
+            if lost := ({_key(x) for x in whole if x.size} - self._present()):
                 raise FileNotFoundError(f"{min(lost)} is missing")
             self.start = [np.asarray(x[...]) for x in start]
         except Exception as error:  # (of many kinds)
@@ -273,8 +272,7 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
             return None
         text = f"'{address}' is no store of results, or only begun ({error!r})"
         raise DefinitionError(f"{text}: choose another name, or delete it.") from error
-    change = difference(json.loads(json.dumps(job.description)), theirs)
-    if change is not None:
+    if (change := difference(json.loads(json.dumps(job.description)), theirs)) is not None:
         raise DefinitionError(f"'{address}' holds other results: {change}. Choose another store.")
     store = ZarrStore(address)
     if store.layout.blocks != job.blocks:
@@ -314,8 +312,7 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
         kept = group.require_group(_START)
         for i, x in enumerate(start):
             constant(kept, f"{i}", [f"axis_{j}" for j in range(np.ndim(x))], x)
-        beside = [x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])]
-        if beside:
+        if beside := ([x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])]):
             group.attrs["coordinates"] = " ".join(beside)
         about = {
             "description": layout.description,

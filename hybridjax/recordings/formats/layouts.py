@@ -33,8 +33,7 @@ def read_text(path: Path, wanted: Wanted) -> list[Columns]:
 def _opensim(path: Path, lines: list[str], end: int) -> Columns:
     """Read a motion or storage file: `key=value` up to `endheader`, then names, then numbers."""
     facts = dict(x.replace(" ", "").lower().split("=", 1) for x in lines[:end] if "=" in x)
-    start = next((k for k in range(end + 1, len(lines)) if lines[k].strip()), None)
-    if start is None:
+    if (start := next((k for k in range(end + 1, len(lines)) if lines[k].strip()), None)) is None:
         raise FileFormatError(f"'{path}' has no line with the names of its columns.")
     separator = "\t" if "\t" in lines[start] else ""
     names = split_names(lines[start], separator)

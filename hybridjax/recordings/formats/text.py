@@ -135,8 +135,7 @@ def read_table(
     lines = ["" if x.lstrip().startswith(_COMMENTS) else x for x in lines[start:]]
     if sep != "," and any("," in x for x in lines):
         notes.append("decimal commas were read as such")
-        mixed = next((k for k, x in enumerate(lines) if "." in x), None)
-        if mixed is not None:
+        if (mixed := next((k for k, x in enumerate(lines) if "." in x), None)) is not None:
             text = f"'{path}', line {start + mixed + 1}: there are points beside decimal commas; "
             raise FileFormatError(f"{text}export one of the two, and no separators of thousands.")
         lines = [x.replace(",", ".") for x in lines]
