@@ -51,8 +51,7 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
     where = [hj.Crossing("x", "rising"), hj.Crossing("v", "rising")]
     cycles = [hj.find_limit_cycle(hj.models.VanDerPol(mu=mu)) for mu in (1.1, 1.101)]
     (gap,), (other,) = (np.diff(hj.place_sections(x, where).lanes.t) for x in cycles)
-    error = np.sqrt(2) * 0.1 / abs(other - gap) * 1e-3  # of a difference of two times
-    rough = []
+    error, rough = np.sqrt(2) * 0.1 / abs(other - gap) * 1e-3, []  # of a difference of two times
     for begin in (0.0, 9.0):
         data = hj.ObservedCycle(where, times=[begin, begin + gap], times_std=0.1)
         fit = hj.fit_model(hj.models.VanDerPol(), data, "mu")
