@@ -171,4 +171,5 @@ def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
 
     fit = least_squares(residual, start, x_scale="jac")
     parameters = len(start) * (series + 1)
-    return count * np.log(max(2 * fit.cost, 1e-300) / count) + parameters * np.log(count), fit.x
+    mean = max(2 * fit.cost, 1e-300) / count
+    return count * np.log(mean) + parameters * np.log(count), fit.x

@@ -212,7 +212,8 @@ def _errors(
         error = xp.maximum(error, xp.where(xp.isfinite(change), change, 0.0))
         gain = flow.method.gain
         error = error**gain * settings.rtol ** (gain - 1) if gain != 1 else error
-    return allowed, xp.where(xp.isfinite(step.q).all(axis=0) & ~xp.isnan(error), error, xp.inf)
+    finite = xp.isfinite(step.q).all(axis=0) & ~xp.isnan(error)
+    return allowed, xp.where(finite, error, xp.inf)
 
 
 def _bent(flow: ChartFlow, before: Watch, after: Watch, start, end, t, moved, span) -> Mask:

@@ -340,7 +340,8 @@ def missing_cycles(problem: OutputErrorProblem, solution: Linearization, least: 
     """Return how many more cycles would leave this number of degrees of freedom, about."""
     n, i = np.unravel_index(np.argmin(solution.freedom), solution.freedom.shape)
     # (More lags than samples would use up more of them.)
-    return max(least - (int(solution.freedom[n, i]) or problem.freedom_left(int(n), int(i))), 0)
+    left = int(solution.freedom[n, i]) or problem.freedom_left(int(n), int(i))
+    return max(least - left, 0)
 
 
 def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:

@@ -220,4 +220,5 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float,
         score[k], left_out[k] = x.T @ error, error @ error
     meat = score.T @ score + fit.smoothness.noise * smooth
     covariance = sandwich(curvature, meat, shares + smooth / count)
-    return covariance, float(left_out.sum()), float(np.trace(np.linalg.lstsq(curvature, data)[0]))
+    detail = float(np.trace(np.linalg.lstsq(curvature, data)[0]))
+    return covariance, float(left_out.sum()), detail
