@@ -233,8 +233,7 @@ class _Walk:
         self.note(str(module), _version(str(module).partition(".")[0]), *words)
 
     def _function(self, x: types.FunctionType) -> None:
-        is_installed = is_of_package(x.__code__.co_filename)
-        if is_installed:
+        if is_installed := is_of_package(x.__code__.co_filename):
             self._origin(x.__module__, x.__qualname__)
         else:
             self.visit(x.__code__)

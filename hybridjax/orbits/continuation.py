@@ -259,8 +259,7 @@ class _Trace(NamedTuple):
             if length >= _SHORTEST * self.step:
                 continue
             if point in (Result.EVENT_ORDER, Result.GRAZING) and last is not moved:
-                moved = self.curve.elsewhere(last)
-                if moved is not None:
+                if (moved := self.curve.elsewhere(last)) is not None:
                     points[-1], length = moved, self.step
                     continue
             return points, BranchEnd(last.value, point, point.message)

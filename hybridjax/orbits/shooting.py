@@ -152,8 +152,7 @@ def follow_moves(map: ReturnMap, begin: Lanes, ends: Target, expected: Moves) ->
     for _ in range(2):
         moved, tape = move(s, lanes, u, target, settings, setout, None, options)
         end, in_chart = moved.lanes, belongs(s, lanes.chart)[:-1, 1:]
-        same = (end.armed[:, :-1] == lanes.armed[:, 1:])[in_chart].all()
-        if same:
+        if same := (end.armed[:, :-1] == lanes.armed[:, 1:])[in_chart].all():
             break
         lanes.armed[:, 1:] = end.armed[:, :-1]
     pairs = (end.chart, lanes.chart), (end.events, lanes.events)

@@ -31,7 +31,7 @@ from ..orbits.linear_flow import beginning, last_turn, of_flow
 from ..orbits.return_map import PATIENCE, ReturnMap
 from ..orbits.scale import has_implicit
 from ..systems.structure import Structure
-from ..systems.transition import TOGETHER
+from ..systems.transition import TOGETHER, Scheduled
 from . import families
 from .along import flow_along, levels_at
 from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
@@ -69,8 +69,7 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
         if placed.cycle is cycle and eqx.tree_equal(*jax.device_get((placed.family, family))):
             return placed
     family.check(cycle.structure)
-    traced = is_traced((cycle, family))
-    if traced:
+    if traced := is_traced((cycle, family)):
         require_program()
     # (Programs of `_place` are for one number of moves: none are given where they do not help.)
     turn = None if traced or has_implicit(cycle.structure) else last_turn(cycle)
@@ -324,8 +323,13 @@ def _check(placed: PlacedSections, first: int) -> None:
             f"the sections are out of order: {name((late + 1) % N)} comes before section {late} on "
             f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
         )
+    s, t = placed.cycle.structure, np.asarray(placed.lanes.t)
+    guards = [g for g, x in enumerate(s.transitions) if not isinstance(x.guard, Scheduled)]
+    events = np.asarray(placed.tape.t)[np.isin(placed.tape.code, guards)]
+    near = np.abs((t[:, None] - events + period / 2) % period - period / 2) <= TOGETHER * period
+    near = near[np.isfinite(placed.bound.time)].any()  # (rounding decides which comes first)
     # (By rounding, a round may hold the event at which it begins and ends twice, or not at all.)
-    if np.sum(np.asarray(placed.tape.code) >= 0) != len(placed.cycle.event_sequence):
+    if near or np.sum(np.asarray(placed.tape.code) >= 0) != len(placed.cycle.event_sequence):
         raise ComputationError(
             "a section coincides with an event (move it, or use `AtEvent`), or there were too few "
             "steps (find the cycle with `settings=Settings(max_steps=...)`)."

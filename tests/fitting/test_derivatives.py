@@ -42,8 +42,7 @@ def test_htfs(hopper_htf, seen_in_htf):
     size = np.abs(S).max()
     np.testing.assert_allclose(S[:, FORCES].sum(axis=1), -scaled, atol=1e-9 * size)
     np.testing.assert_allclose(S[:, HOPPER.index("l0")], 0, atol=1e-9 * size)
-    both = S[:, HOPPER.index("a")] + S[:, HOPPER.index("g")]
-    np.testing.assert_allclose(both, 0, atol=1e-9 * size)
+    assert np.abs(S[:, HOPPER.index("a")] + S[:, HOPPER.index("g")]).max() < 1e-9 * size
 
 
 def test_states_on_sections_and_times_of_events(hopper_cycle, hopper_observed, seen_in_cycle):
@@ -55,7 +54,8 @@ def test_states_on_sections_and_times_of_events(hopper_cycle, hopper_observed, s
         parts = []
         for one in hopper_observed:
             now = hj.ObservedCycle.of(cycle, one.sections, one.outputs)
-            parts += [np.ravel(x / s) for x, s in zip(now.measured, one.scales, strict=True)]
+            scales = one.prepare(hopper_cycle).scales
+            parts += [np.ravel(x / s) for x, s in zip(now.measured, scales, strict=True)]
         return np.concatenate(parts)
 
     np.testing.assert_allclose(S, by_differences(hopper_cycle, look), atol=1e-6 * size)

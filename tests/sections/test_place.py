@@ -143,9 +143,8 @@ def test_outputs_of_any_kind_and_feedthrough(hopper_cycle, placed_isochrons, iso
 def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
     monkeypatch.setattr("hybridjax.sections.place.PATIENCE", 3)
     settings = hj.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
-    cycle = dataclasses.replace(hopper_cycle, settings=settings)
     with pytest.raises(hj.ComputationError, match="max_steps.* Give them to the search for the cy"):
-        hj.place_sections(cycle, hj.ClockPhase(2))
+        hj.place_sections(dataclasses.replace(hopper_cycle, settings=settings), hj.ClockPhase(2))
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("VerticalHopper",)))
@@ -204,9 +203,11 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
 
 def test_a_section_at_the_time_of_an_event_is_refused():
     wheel = hj.find_limit_cycle(hj.models.RimlessWheel())
-    path = wheel.trajectory()
-    impact = float(path.t[path.event >= 0][0] / wheel.period)
-    with pytest.raises(hj.ComputationError, match="coincides with an event"):
-        hj.place_sections(wheel, hj.ClockPhase(2, anchor=impact))
+    impact = float(wheel.trajectory().events[0].time / wheel.period)
+    juggling = hj.find_limit_cycle(hj.models.PaddleJuggler(A=0.16))  # (half a flight apart)
+    apex = hj.ClockPhase(4, anchor=hj.Crossing("v", "falling"))
+    for cycle, family in ((wheel, hj.ClockPhase(2, anchor=impact)), (juggling, apex)):
+        with pytest.raises(hj.ComputationError, match="coincides with an event"):
+            hj.place_sections(cycle, family)
     with pytest.raises(hj.ComputationError, match="does not reach section 0"):
         hj.place_sections(wheel, hj.Crossing("th", "rising", 1.0))

@@ -75,8 +75,7 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
         (active & ~arrived & (after.t >= target.limit), target.missed),
     ):
         result = update_result(result, failed, code)
-    along = new.along
-    if along is not None:
+    if (along := new.along) is not None:
         fresh = cond(
             (fired >= 0).any(), lambda: deviation(task.s, after, task.settings), lambda: along
         )
