@@ -404,7 +404,7 @@ class LDTP(eqx.Module):
             if abs(multipliers[index] - 1) < _RESONANCE:
                 why = (
                     "Conserved quantities, and autonomous systems at clock sections, have the "
-                    "multiplier 1: use state-based sections, or leave whole f out."
+                    "multiplier 1: use sections that depend on the state, or leave whole f out."
                 )
             raise DefinitionError(
                 f"The response at f = {f[line]:g} cycles per period is unbounded: the multiplier "

@@ -89,7 +89,7 @@ class Split(NamedTuple):
             return HeldOut(fit, validate(fit, self.late, reference=reference))
         except DefinitionError as error:
             hint = "A quarter is held out: `fit_series` fits all, without a test."
-            raise DefinitionError(f"{error} ({hint})") from error
+            raise DefinitionError(f"{error} {hint}") from error
 
 
 @checked
