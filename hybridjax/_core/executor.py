@@ -175,7 +175,8 @@ def is_traced(*trees: Any) -> bool:
     return any(map(is_tracer, jax.tree_util.tree_leaves(trees)))
 
 
-# The state outside of all transformations, in which nothing else needs to be asked.
+# The state outside of all transformations, where no program is traced. In others an operation
+# tells, as the state differs under `vmap` and `jvp`, too, which compute values.
 with core.eval_context():
     _OUTSIDE = get_opaque_trace_state()
 

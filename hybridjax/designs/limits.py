@@ -197,7 +197,7 @@ def power_limits(
     for level in levels:
         level |= {f"rate of {n}": float(x) for n, x in limits.rate.items()}
         level |= {f"peak of {n}": float(x) for n, x in limits.peak.items()}
-    if silent := ([n for level in levels for n, rms in level.items() if rms == 0]):
+    if silent := [n for level in levels for n, rms in level.items() if rms == 0]:
         raise DefinitionError(f"the `design` does not move {silent[0]}: leave it out of `limit`.")
     names = [n for level in levels for n in level]
     rows = [

@@ -124,7 +124,7 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
             "`data` holds no input: name one, or use `hj.recordings.natural_multipliers`."
         )
     about = [(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records]
-    if other := ([x for x in about if x != about[0]]):
+    if other := [x for x in about if x != about[0]]:
         text = "the same sections, inputs, outputs, lead and drift"
         raise DefinitionError(f"records of `data` must have {text}, not {about[0]} and {other[0]}.")
     usable = [part for record in records for part in _with_known_inputs(record)]

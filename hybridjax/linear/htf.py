@@ -337,7 +337,8 @@ class HTF(eqx.Module):
         parts = xp.einsum("mkij,kj->mki", H[:, distance.argmin(axis=1)], U[lines])
         Y = xp.zeros((n, len(self.outputs)), complex)
         for m, part in zip(self.harmonics, parts, strict=True):
-            Y = put(Y, at := (lines + periods * m) % n, Y[at] + part)
+            at = (lines + periods * m) % n
+            Y = put(Y, at, Y[at] + part)
         return from_host(xp.fft.ifft(Y, axis=0).real)
 
     def harmonic_errors(self, other: "HTF") -> Float[Array, "M ny"]:

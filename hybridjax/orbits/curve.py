@@ -101,6 +101,7 @@ class Curve:
         self.value = float(parameter_of(cycle.system, parameter))
 
     def system_at(self, value: float) -> HybridSystem:
+        # (JAX compiles a conversion for a number of NumPy, and none for an array.)
         return with_parameters(self.cycle.system, {self.parameter: np.asarray(value)})
 
     def first(self) -> Point | Result:

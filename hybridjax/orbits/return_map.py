@@ -168,6 +168,7 @@ class ReturnMap(eqx.Module):
         if self.base is not None:
             return dataclasses.replace(self, system=system)
         period = jnp.asarray(system.period(), float)
+        # (With arrays of the host JAX would compile a program for each operation.)
         expected = self.multiplicity * (to_host(period) if on_host(self.expected) else period)
         anchor = self.anchor._replace(t=self.anchor.t * (expected / self.expected))
         return dataclasses.replace(self, system=system, anchor=anchor, expected=expected)

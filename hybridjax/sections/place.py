@@ -153,6 +153,12 @@ def _locate(map: ReturnMap, family: AbstractSections, turn: Any, flows: list) ->
     drop = xp.where(flat, -1, xp.argmax(share, axis=0))
     dims = xp.asarray(s.dims)[lanes.chart] + (xp.isinf(bound.time) & (map.base is None)) - ~flat
     duration, result = moved.lanes.t - lanes.t, moved.result
+    # Rounding would decide on which side of an event a clock section lies. (Not of the clock's.)
+    by_clock = xp.asarray([*(isinstance(x.guard, Scheduled) for x in s.transitions), True])
+    when = xp.where(by_clock[xp.maximum(tape.code, -1)], xp.nan, tape.t)
+    near = [(abs(when - x.t) <= TOGETHER * period).any(axis=0) for x in (lanes, moved.lanes)]
+    near = xp.isfinite(bound.time) & (near[0] | xp.roll(near[1], 1))
+    result = update_result(result, near, Result.COINCIDENCE)
     if not on_host(period):  # (on the host `_check` says more)
         turns = xp.abs(xp.sum(duration) / period - 1) > SAME
         result = update_result(result, turns, Result.SECTION_MISSED)
@@ -286,7 +292,7 @@ def _normals(s: Structure, bound: BoundSections, lanes: Lanes, index, u) -> Arra
 
 def _check(placed: PlacedSections, first: int) -> None:
     """**Raises:** `ComputationError` for the first section that is missed, tangent, out of order,
-    or crossed twice."""
+    crossed twice, or by the clock at the time of an event."""
     N, name, anchor = placed.n_sections, placed.family.describe, placed.family.anchor
     again = "is crossed more than once in one period"
     results = [first, *np.asarray(placed.result).tolist()]
@@ -294,6 +300,10 @@ def _check(placed: PlacedSections, first: int) -> None:
         _check_center(placed.family, placed.cycle)
     place = f" at its anchor, {anchor}" if isinstance(anchor, Crossing) else ""
     for i, code in enumerate(results):
+        if code == Result.COINCIDENCE:
+            raise ComputationError(
+                f"{name(i - 1)} coincides with an event: move the sections, or use `AtEvent`."
+            )
         if code != Result.OK:
             text = f"{name(i % N)} is not reached from section {i - 1} on the cycle"
             text = text if i else f"the cycle does not reach {name(0)}{place}"
@@ -323,13 +333,8 @@ def _check(placed: PlacedSections, first: int) -> None:
             f"the sections are out of order: {name((late + 1) % N)} comes before section {late} on "
             f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
         )
-    s, t = placed.cycle.structure, np.asarray(placed.lanes.t)
-    guards = [g for g, x in enumerate(s.transitions) if not isinstance(x.guard, Scheduled)]
-    events = np.asarray(placed.tape.t)[np.isin(placed.tape.code, guards)]
-    near = np.abs((t[:, None] - events + period / 2) % period - period / 2) <= TOGETHER * period
-    near = near[np.isfinite(placed.bound.time)].any()  # (rounding decides which comes first)
     # (By rounding, a round may hold the event at which it begins and ends twice, or not at all.)
-    if near or np.sum(np.asarray(placed.tape.code) >= 0) != len(placed.cycle.event_sequence):
+    if np.sum(np.asarray(placed.tape.code) >= 0) != len(placed.cycle.event_sequence):
         raise ComputationError(
             "a section coincides with an event (move it, or use `AtEvent`), or there were too few "
             "steps (find the cycle with `settings=Settings(max_steps=...)`)."

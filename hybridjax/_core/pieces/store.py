@@ -171,7 +171,7 @@ class ZarrStore:
             kept = self._group[_START]
             start = [kept[f"{i}"] for i in range(about["start"])]
             whole = [*start, *(self._group[name] for name in about["constants"])]
-            if lost := ({_key(x) for x in whole if x.size} - self._present()):
+            if lost := {_key(x) for x in whole if x.size} - self._present():
                 raise FileNotFoundError(f"{min(lost)} is missing")
             self.start = [np.asarray(x[...]) for x in start]
         except Exception as error:  # (of many kinds)
@@ -312,7 +312,7 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
         kept = group.require_group(_START)
         for i, x in enumerate(start):
             constant(kept, f"{i}", [f"axis_{j}" for j in range(np.ndim(x))], x)
-        if beside := ([x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])]):
+        if beside := [x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])]:
             group.attrs["coordinates"] = " ".join(beside)
         about = {
             "description": layout.description,

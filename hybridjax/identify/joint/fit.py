@@ -263,7 +263,10 @@ def fit_ldtp(
         if innovations and not isinstance(guess, LDTP):
             direct = answers_at_once(records, outside)
         how = (innovations, start == "free", check)
-        fit = (_likelier if direct is None else _fit_to_series)(records, guess, *how, bool(direct))
+        if direct is None:
+            fit = _likelier(records, guess, how)
+        else:
+            fit = _fit_to_series(records, guess, *how, direct)
         direct = fit._coordinates.direct
         grid = records.whole()
         errors = lambda: cast(Predictor, fit.predictor).errors(grid, start == "free")  # noqa: E731
@@ -319,14 +322,14 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
     return dataclasses.replace(fit, doubt=_surplus(fit, point, smaller) if check else "")
 
 
-def _likelier(records: PreparedRecords, guess: Guess, *how: bool) -> LDTPFit:
+def _likelier(records: PreparedRecords, guess: Guess, how: tuple[bool, bool, bool]) -> LDTPFit:
     """Return a fit with D = 0 if data that determine D do not contradict it; else one with D."""
-    fit = _fit_to_series(records, guess, how[0], how[1], how[2], True)
+    fit = _fit_to_series(records, guess, *how, True)
     model = fit._coordinates.model
     if not fit.determines_direct:
         return fit
     for start in (guess, model._replace(D=[0.0 * D for D in model.D])):  # (may differ in minima)
-        zero = _fit_to_series(records, start, how[0], how[1], how[2], False)
+        zero = _fit_to_series(records, start, *how, False)
         sizes = [np.linalg.slogdet(cast(Predictor, x.predictor).S)[1] for x in (zero, fit)]
         ratio = max(float(records.sampled.mean(axis=1) @ (sizes[0] - sizes[1])), 0.0)
         # (At 5 %: a D that is fitted in vain enlarges errors a little, a missing one is a bias.)

@@ -169,6 +169,6 @@ def _by_line(
         if None in row:
             k = row.index(None)
             text = f"column '{headers[k]}' holds '{fields[k][:40]}', which is not a number."
-            raise FileFormatError(f"'{path}', line {number}: {text} (Tables of subjects: --table)")
+            raise FileFormatError(f"'{path}', line {number}: {text}")
         rows.append(row)
     return np.array(rows, float).reshape(-1, count)
