@@ -34,6 +34,15 @@ def test_a_fit_that_stops_where_cycles_end_has_not_converged(monkeypatch):
     assert steps < problem.MAX_STEPS and not converged
 
 
+def test_the_unit_of_residuals_does_not_count(monkeypatch):
+    def evaluate(scale, x, guess):  # two residuals that no x removes
+        return scale * np.append(np.exp(x) - 3, x), scale * np.stack([np.exp(x), [1.0]]), guess
+
+    monkeypatch.setattr(problem, "evaluate", evaluate)
+    ends = [problem.descend(scale, np.array([4.0]), None) for scale in (1.0, 1e-3)]
+    assert ends[0][0] == pytest.approx(ends[1][0], rel=1e-3) and ends[1][4] <= ends[0][4]
+
+
 def test_errors_that_no_residual_shows_are_unknown():
     juggler, impact = hj.models.PaddleJuggler(), [hj.AtEvent("impact")]
     fit = hj.fit_model(juggler, hj.ObservedCycle(impact, times=[0.15]), "A")
@@ -58,7 +67,7 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
         assert fit.freedom == 0 and fit.values == pytest.approx(1.1, rel=1e-9)
         assert fit.standard_errors == pytest.approx(error, rel=0.01)
         data = hj.ObservedCycle(where, "x", [[0.1], [-2.0]], times=[begin, begin + gap])
-        rough.append(hj.fit_model(hj.models.VanDerPol(mu=2.5), data, {"mu": (0.0, np.inf)}))
+        rough.append(hj.fit_model(hj.models.VanDerPol(), data, {"mu": (0.0, np.inf)}))
     assert rough[0].values == pytest.approx(rough[1].values, rel=1e-6)
     assert rough[0].result == 0 and "mu reaches its bound 0 within its error" in repr(rough[0])
     with pytest.raises(hj.DefinitionError, match="another 'mass', which was not fitted"):

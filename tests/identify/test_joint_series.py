@@ -13,6 +13,7 @@ from hybridjax.identify.series.prediction import SeriesPart, SeriesProblem, nois
 from hybridjax.identify.series.records import CycleGrid
 from hybridjax.identify.series.residuals import about_misfit, answering
 
+from .conftest import scaled
 from .test_series import record
 from .test_uncertainty import covered
 
@@ -115,6 +116,18 @@ def test_too_few_dimensions_are_named(small):
         for dims, doubt in ((small.dims, ""), (2, "depend on the inputs"), (small.dims + 1, spare)):
             fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
             assert doubt in fit.doubt and bool(doubt) == bool(fit.doubt)
+
+
+@pytest.mark.parametrize("through", (0.0, 1.0))
+def test_inputs_that_their_past_determines(through):
+    """Only fits with D and without it tell whether outputs answer two lines at once."""
+    model = scaled(5, (2, 2, 2), 1, 1)
+    model = eqx.tree_at(lambda m: m.D, model, through * model.D)
+    u = np.cos(2 * np.pi / 3 * np.outer(np.arange(1200), (0.3, 1.1))).sum(axis=1, keepdims=True)
+    noise = 0.03 * np.random.default_rng(0).normal(size=u.shape)
+    data = hj.Record(u, np.asarray(model.simulate(u)) + noise, n_sections=3)
+    fit = hj.fit_ldtp(data, 2, noise="innovations", check=False)
+    assert bool(np.asarray(fit.model.D).any()) == bool(through)
 
 
 def test_residuals_of_exact_data_tell_nothing(small):

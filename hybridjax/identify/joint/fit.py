@@ -263,10 +263,7 @@ def fit_ldtp(
         if innovations and not isinstance(guess, LDTP):
             direct = answers_at_once(records, outside)
         how = (innovations, start == "free", check)
-        if direct is None:
-            fit = _likelier(records, guess, how)
-        else:
-            fit = _fit_to_series(records, guess, *how, direct)
+        fit = _fit_to_series(records, guess, *how, direct)
         direct = fit._coordinates.direct
         grid = records.whole()
         errors = lambda: cast(Predictor, fit.predictor).errors(grid, start == "free")  # noqa: E731
@@ -345,8 +342,11 @@ def _fit_to_series(
     innovations: bool,
     free_start: bool,
     check: bool,
-    direct: bool,
+    direct: bool | None,
 ) -> LDTPFit:
+    """Return a fit with D, with D = 0, or (None) with D = 0 if the data do not contradict it."""
+    if direct is None:
+        return _likelier(records, guess, (innovations, free_start, check))
     if records.lead:
         raise DefinitionError(
             f"the outputs of the records depend on inputs up to {records.lead} samples later "
