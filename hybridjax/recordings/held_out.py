@@ -63,7 +63,7 @@ class Split(NamedTuple):
                 # (A quarter of the cycles is for unknowns whose number does not grow with N.)
                 fewer = f", or take {max(0.75 * N * have / (have + missing), 1):.0f} sections"
                 obstacle = f"{have} cycles (a quarter is held out) are too few for order {d} with "
-                obstacle += f"{N} sections: record {-(-4 * missing // 3):.0f} more{fewer * (N > 1)}."
+                obstacle += f"{N} sections: record {-(-4 * missing // 3)} more{fewer * (N > 1)}."
                 break
             fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
