@@ -11,21 +11,65 @@ import sys
 
 # By name: script and options, CPU minutes, and what its numbers show.
 CASES = {
-    "speed": ("run.py", 20, "speed beside C, heyoka and scipy; errors; docs/benchmarks.md"),
-    "speed-quick": ("run.py --quick", 4, "the same with small sizes: does all of it work?"),
-    "gallery": ("gallery.py --out out", 15, "every model: cycle, multipliers, HTFs, a picture"),
+    "speed": (
+        "run.py",
+        20,
+        "speed beside C, heyoka and scipy; errors; docs/benchmarks.md",
+    ),
+    "speed-quick": (
+        "run.py --quick",
+        4,
+        "the same with small sizes: does all of it work?",
+    ),
+    "gallery": (
+        "gallery.py --out out",
+        15,
+        "every model: cycle, multipliers, HTFs, a picture",
+    ),
     "estimation": ("estimation.py --runs 200", 20, "errors and regions of HTFs"),
-    "multipliers": ("identification.py --seeds 40 --runs 200", 20, "errors and regions of fits"),
+    "multipliers": (
+        "identification.py --seeds 40 --runs 200",
+        20,
+        "errors and regions of fits",
+    ),
     "colored": ("colored.py --draws 40", 10, "regions under colored noise"),
-    "process-noise": ("process_noise.py --draws 40", 10, "fits with innovations, validation"),
+    "process-noise": (
+        "process_noise.py --draws 40",
+        10,
+        "fits with innovations, validation",
+    ),
     "in-loop": ("in_loop.py --draws 60", 3, "plant and controller apart, in a loop"),
-    "state-space": ("joint.py --draws 12", 5, "fits of whole models beside their bound"),
-    "recordings": ("recordings.py", 30, "multipliers from recordings, clean and corrupted"),
-    "population": ("population.py", 25, "means, maps and power over simulated subjects"),
+    "state-space": (
+        "joint.py --draws 12",
+        5,
+        "fits of whole models beside their bound",
+    ),
+    "recordings": (
+        "recordings.py",
+        30,
+        "multipliers from recordings, clean and corrupted",
+    ),
+    "population": (
+        "population.py",
+        25,
+        "means, maps and power over simulated subjects",
+    ),
     "designs": ("designs.py --draws 40", 25, "strides that optimal designs save"),
-    "parameters": ("fitting.py --seeds 10 --draws 40", 10, "physical parameters from data"),
-    "second-order": ("second_order.py", 2, "second-order products on lines, and draws without"),
-    "jumps": ("jumps.py --draws 200", 6, "random systems with jumps and pulses, right or refused"),
+    "parameters": (
+        "fitting.py --seeds 10 --draws 40",
+        10,
+        "physical parameters from data",
+    ),
+    "second-order": (
+        "second_order.py",
+        2,
+        "second-order products on lines, and draws without",
+    ),
+    "jumps": (
+        "jumps.py --draws 200",
+        6,
+        "random systems with jumps and pulses, right or refused",
+    ),
     "scale": ("scale.py", 30, "sweeps and experiments on several processes"),
     "motion": ("motion.py", 1, "moves of sliders, first pictures of animations"),
     "boundary": ("boundary.py", 1, "the cost of checking arguments"),
@@ -36,7 +80,15 @@ CASES = {
     "truth-trot": ("trot_truth.py", 1, "ground truth"),
     "truth-walkers": ("walkers_truth.py", 2, "ground truth"),
 }
-RELEASE = ("speed", "gallery", "estimation", "multipliers", "colored", "process-noise", "designs")
+RELEASE = (
+    "speed",
+    "gallery",
+    "estimation",
+    "multipliers",
+    "colored",
+    "process-noise",
+    "designs",
+)
 HERE = pathlib.Path(__file__).parent
 
 

@@ -13,14 +13,23 @@ from beartype import beartype
 
 import hybridjax as hj
 from hybridjax._core.boundary.checked import checked
-from hybridjax._core.boundary.kinds import Count, Index, Numbers, Order, Positive, SignalNames
+from hybridjax._core.boundary.kinds import (
+    Count,
+    Index,
+    Numbers,
+    Order,
+    Positive,
+    SignalNames,
+)
 from hybridjax._core.boundary.values import Reals
 
 
 def count(n: Count): ...
 
 
-def words(start: Literal["free", "cycle"], names: SignalNames, scale: Mapping[str, Positive]): ...
+def words(
+    start: Literal["free", "cycle"], names: SignalNames, scale: Mapping[str, Positive]
+): ...
 
 
 def records(
@@ -70,13 +79,19 @@ def calls() -> dict[str, tuple[Callable, tuple, dict]]:
     """Public functions, and arguments with which they compute."""
     model, rng = hj.testing.synthetic_ldtp(), np.random.default_rng(0)
     u = rng.normal(size=(200 * model.n_sections, len(model.inputs)))
-    y = np.asarray(model.simulate(u)) + 1e-3 * rng.normal(size=(len(u), len(model.outputs)))
+    y = np.asarray(model.simulate(u)) + 1e-3 * rng.normal(
+        size=(len(u), len(model.outputs))
+    )
     record = hj.Record(u, y, n_sections=model.n_sections)
     hopper = hj.models.VerticalHopper()
     cycle = hj.find_limit_cycle(hopper)
     return {
         "LDTP.simulate, 1200 samples": (hj.LDTP.simulate, (model, u), {}),
-        "LDTP.htf, 10 frequencies": (hj.LDTP.htf, (model, np.linspace(0.1, 0.9, 10)), {}),
+        "LDTP.htf, 10 frequencies": (
+            hj.LDTP.htf,
+            (model, np.linspace(0.1, 0.9, 10)),
+            {},
+        ),
         "fit_series, 200 cycles": (hj.fit_series, (record, 2), {}),
         "validate, 200 cycles": (hj.validate, (model, record), {}),
         "find_limit_cycle, hopper": (hj.find_limit_cycle, (hopper, cycle), {}),
@@ -89,7 +104,9 @@ def main() -> None:
     print(f"{'microseconds':<28}{'checked':>9}{'beartype':>10}")
     for name, (function, args, kwargs) in cases().items():
         bare = cost(function, args, kwargs)
-        own, other = (cost(f(function), args, kwargs) - bare for f in (checked, beartype))
+        own, other = (
+            cost(f(function), args, kwargs) - bare for f in (checked, beartype)
+        )
         print(f"{name:<28}{own:9.1f}{other:10.1f}")
     print(f"\n{'microseconds':<28}{'checks':>9}{'call':>10}{'share':>9}")
     for name, (function, args, kwargs) in calls().items():

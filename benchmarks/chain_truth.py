@@ -24,7 +24,9 @@ class Row:
         self.n = n
         joints = np.diff(np.eye(n), axis=0)
         laplace = -joints.T @ joints / M
-        self.matrix = np.block([[np.zeros((n, n)), np.eye(n)], [K * laplace, C * laplace]])
+        self.matrix = np.block(
+            [[np.zeros((n, n)), np.eye(n)], [K * laplace, C * laplace]]
+        )
         self.weight = np.concatenate([np.zeros(n), np.full(n, -G)])
 
     def field(self, t, x):
@@ -35,7 +37,9 @@ class Row:
         return A * np.sin(phase), A * W * np.cos(phase), -A * W**2 * np.sin(phase)
 
     def fly(self, t, x, end, **options):
-        return solve_ivp(self.field, (t, end), x, "DOP853", rtol=1e-13, atol=1e-14, **options)
+        return solve_ivp(
+            self.field, (t, end), x, "DOP853", rtol=1e-13, atol=1e-14, **options
+        )
 
     def next_impact(self, t, x, end, last):
         """Time, mass and state before the next impact; none before `end`."""

@@ -46,8 +46,14 @@ def turn(pieces, z, period):
         end, jump = flow * z, piece.reset
         z = piece.reset * end
         if piece.row is not None:
-            after = mp.zeros(len(z), 1) if last and period is None else pieces[k + 1].field * z
-            jump = jump + (after - jump * A * end) * piece.row / (piece.row * A * end)[0]
+            after = (
+                mp.zeros(len(z), 1)
+                if last and period is None
+                else pieces[k + 1].field * z
+            )
+            jump = (
+                jump + (after - jump * A * end) * piece.row / (piece.row * A * end)[0]
+            )
         P, times = jump * flow * P, [*times, t]
     return z, P, times
 
@@ -78,8 +84,20 @@ def cuk():
     """From the closing of the switch on."""
     E, L, C, R, Iref, T = (mp.mpf(x) for x in (15, "2e-3", "20e-6", 10, 2, "1e-4"))
     load = [0, 0, 1 / C, -1 / (R * C), 0]
-    closed = [[0, 0, 0, 0, E / L], [0, 0, -1 / C, 0, 0], [0, 1 / L, 0, -1 / L, 0], load, [0] * 5]
-    opened = [[0, -1 / L, 0, 0, E / L], [1 / C, 0, 0, 0, 0], [0, 0, 0, -1 / L, 0], load, [0] * 5]
+    closed = [
+        [0, 0, 0, 0, E / L],
+        [0, 0, -1 / C, 0, 0],
+        [0, 1 / L, 0, -1 / L, 0],
+        load,
+        [0] * 5,
+    ]
+    opened = [
+        [0, -1 / L, 0, 0, E / L],
+        [1 / C, 0, 0, 0, 0],
+        [0, 0, 0, -1 / L, 0],
+        load,
+        [0] * 5,
+    ]
     pieces = [
         Piece(matrix(closed), matrix([[-1, 0, -1, 0, Iref]]), mp.eye(5), 4e-5),
         Piece(matrix(opened), None, mp.eye(5), 0.0),
@@ -89,11 +107,21 @@ def cuk():
 
 def chua():
     """From the entry into the middle on."""
-    alpha, beta, inner, outer = mp.mpf(8), mp.mpf(100) / 7, mp.mpf(-1) / 7, mp.mpf(2) / 7
+    alpha, beta, inner, outer = (
+        mp.mpf(8),
+        mp.mpf(100) / 7,
+        mp.mpf(-1) / 7,
+        mp.mpf(2) / 7,
+    )
 
     def slab(slope, offset):
         return matrix(
-            [[-alpha * slope, alpha, 0, -alpha * offset], [1, -1, 1, 0], [0, -beta, 0, 0], [0] * 4]
+            [
+                [-alpha * slope, alpha, 0, -alpha * offset],
+                [1, -1, 1, 0],
+                [0, -beta, 0, 0],
+                [0] * 4,
+            ]
         )
 
     row, one = matrix([[1, 0, 0, -1]]), mp.eye(4)
@@ -117,9 +145,14 @@ def hoppers():
         """The force of a leg, as a row."""
         turned = W * LAG * i  # sin(w (t - lag)) = sin wt cos - cos wt sin
         return row(
-            {f"yM{i + 1}": -K, f"ym{i + 1}": K, "one": K * L0, "sin": A * mp.cos(turned),
-             "cos": -A * mp.sin(turned)}
-        )  # fmt: skip
+            {
+                f"yM{i + 1}": -K,
+                f"ym{i + 1}": K,
+                "one": K * L0,
+                "sin": A * mp.cos(turned),
+                "cos": -A * mp.sin(turned),
+            }
+        )
 
     def row(entries):
         return matrix([[entries.get(name, 0) for name in PAIR]])

@@ -51,7 +51,12 @@ def with_noise(case: str, clean: hj.ExperimentData, run, rng) -> hj.ExperimentDa
 
 def told_of_drift(record: hj.Record) -> hj.Record:
     return hj.Record(
-        record.u, record.y, n_sections=N, inputs=record.inputs, outputs=record.outputs, drift=20
+        record.u,
+        record.y,
+        n_sections=N,
+        inputs=record.inputs,
+        outputs=record.outputs,
+        drift=20,
     )
 
 
@@ -86,7 +91,9 @@ def one_case(case: str, draws: int) -> None:
     design = hj.multisine(N, PERIODS, lines="odd").scaled(RMS).realizations(4)
 
     def run(process_noise=None):
-        return hj.run_experiments(cycle, placed, design, OUTPUTS, process_noise=process_noise)
+        return hj.run_experiments(
+            cycle, placed, design, OUTPUTS, process_noise=process_noise
+        )
 
     clean = run()
 
@@ -102,17 +109,23 @@ def one_case(case: str, draws: int) -> None:
             "htf_plain": hj.fit_multipliers(plain, 2, check=False),
         }
         fits |= {
-            name: hj.fit_series(x, 2, start="cycle", check=False) for name, x in series.items()
+            name: hj.fit_series(x, 2, start="cycle", check=False)
+            for name, x in series.items()
         }
         return {
-            f"{name}.{k}": x for name, fit in fits.items() for k, x in found(fit, truth).items()
+            f"{name}.{k}": x
+            for name, fit in fits.items()
+            for k, x in found(fit, truth).items()
         }
 
     values = hj.monte_carlo(one, draws, seed=1)
     for name in ("htf", "htf_plain", "series", "series_told"):
         if name != "series_told" or case == "drift":
             kinds = ("error", "said", "held", "doubted")
-            show(f"{case}.{name}", {k: np.asarray(values[f"{name}.{k}"].values) for k in kinds})
+            show(
+                f"{case}.{name}",
+                {k: np.asarray(values[f"{name}.{k}"].values) for k in kinds},
+            )
 
 
 def main() -> None:

@@ -35,16 +35,23 @@ def experiments(cycle: hj.LimitCycle, settling: int = 20) -> hj.ExperimentData:
     u = design.inputs(design.periods + settling)
     late, early = (round(x * N * FINE) for x in DELAY)
     held = np.repeat(u, FINE, axis=1)
-    held = np.concatenate([np.zeros((len(u), late, 1)), held], axis=1)[:, : held.shape[1]]
+    held = np.concatenate([np.zeros((len(u), late, 1)), held], axis=1)[
+        :, : held.shape[1]
+    ]
     fine = hj.run_experiments(
         cycle, hj.ClockPhase(N * FINE), held, OUTPUTS, discard=settling, accuracy=1e-10
     )
     first = settling * N
     rows = FINE * np.arange(first, u.shape[1]) - early
     return hj.ExperimentData(
-        u[:, first:], fine.y[:, rows], n_sections=N, periods=design.periods,
-        inputs=fine.inputs, outputs=fine.outputs, result=fine.result,
-    )  # fmt: skip
+        u[:, first:],
+        fine.y[:, rows],
+        n_sections=N,
+        periods=design.periods,
+        inputs=fine.inputs,
+        outputs=fine.outputs,
+        result=fine.result,
+    )
 
 
 def main() -> None:
@@ -65,7 +72,9 @@ def main() -> None:
         fit = hj.fit_model(start, observed, tuple(TRUE), guess=cycle)
         seconds = time.process_time() - began
         series = hj.fit_series(noisy, 2, check=False).contains(cycle.multipliers).all()
-        rows.append((fit.values, fit.standard_errors, fit.contains(TRUE), series, seconds))
+        rows.append(
+            (fit.values, fit.standard_errors, fit.contains(TRUE), series, seconds)
+        )
     values, said, joint, series, seconds = map(np.array, zip(*rows, strict=True))
     show = lambda name, value: print(f"delays.{name} {value:.4g}", flush=True)  # noqa: E731
     error = values - np.array(list(TRUE.values()))

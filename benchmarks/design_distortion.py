@@ -28,7 +28,9 @@ def distortion(family, draws: int) -> None:
         for signal in ("u", *OUTPUTS):
             family.show(f"{row}.rms.{signal}", plan.rms[signal])
             family.show(f"{row}.rms.{signal}.usual", plan.usual_rms[signal])
-        for output, found, odd in zip(OUTPUTS, *not_linear(family, plan.design), strict=True):
+        for output, found, odd in zip(
+            OUTPUTS, *not_linear(family, plan.design), strict=True
+        ):
             said = plan.rms[f"distortion of {output}"]
             family.show(f"{row}.predicted.{output}", said)
             family.show(f"{row}.simulated_to_predicted.{output}", found / said)
@@ -36,7 +38,9 @@ def distortion(family, draws: int) -> None:
         # The design for a limited input, as strong as its distortion allows.
         other = hj.optimal_design(family.model, usual, noise=NOISE).design
         scaled = hj.optimal_design(family.model, other, limit=kept, noise=NOISE)
-        family.show(f"{row}.saved_beside_input", scaled.usual_criterion / plan.criterion)
+        family.show(
+            f"{row}.saved_beside_input", scaled.usual_criterion / plan.criterion
+        )
 
 
 def not_linear(family, design: hj.Design) -> tuple[np.ndarray, np.ndarray]:
@@ -44,7 +48,9 @@ def not_linear(family, design: hj.Design) -> tuple[np.ndarray, np.ndarray]:
     is odd in it."""
     u, model = design.inputs(), family.model
     starts = model.periodic_states(u, design.periods)
-    linear = np.stack([model.simulate(one, x0) for one, x0 in zip(u, starts, strict=True)])
+    linear = np.stack(
+        [model.simulate(one, x0) for one, x0 in zip(u, starts, strict=True)]
+    )
     up, down = (
         hj.run_experiments(
             family.cycle, family.placed, one, OUTPUTS, start="steady", accuracy=1e-11
@@ -52,5 +58,6 @@ def not_linear(family, design: hj.Design) -> tuple[np.ndarray, np.ndarray]:
         for one in (u, -u)
     )
     return tuple(
-        np.sqrt(np.mean(x**2, axis=(0, 1))) for x in (up - linear, (up - down) / 2 - linear)
+        np.sqrt(np.mean(x**2, axis=(0, 1)))
+        for x in (up - linear, (up - down) / 2 - linear)
     )

@@ -21,16 +21,23 @@ EVERYTHING = ("M", "m", "k", "b", "l0", "g")
 _ASIDE = 1e-4
 
 
-def measured(data, design: hj.Design, noise: dict[str, float], harmonics, rng) -> hj.HTF:
+def measured(
+    data, design: hj.Design, noise: dict[str, float], harmonics, rng
+) -> hj.HTF:
     """HTFs from data with noise, whose variance is known."""
     std = np.array(list(noise.values()))
     noisy = hj.experiments.add_noise(data, std=std, seed=int(rng.integers(2**31)))
     htf = hj.estimate_htf(noisy, harmonics, variance="auto")
     each = design.expected_variance()[:, None, :] * std[:, None] ** 2
     return hj.HTF(
-        htf.f, htf.H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
+        htf.f,
+        htf.H,
+        htf.harmonics,
+        htf.n_sections,
+        htf.inputs,
+        htf.outputs,
         variance=np.broadcast_to(each, htf.H.shape),
-    )  # fmt: skip
+    )
 
 
 def rms(values) -> float:
@@ -80,7 +87,9 @@ def parameters(family, draws: int) -> None:
         def error(rng, data=data, design=design, scale=1.0):
             std = {k: scale * x for k, x in noise.items()}
             htf = measured(data[rng.integers(len(data))], design, std, HARMONICS, rng)
-            fit = hj.fit_model(system, hj.ObservedHTF(htf, sections), SPRING, guess=family.cycle)
+            fit = hj.fit_model(
+                system, hj.ObservedHTF(htf, sections), SPRING, guess=family.cycle
+            )
             return np.asarray(fit.values) / truth - 1
 
         errors = hj.monte_carlo(error, draws, seed=3).value.values
@@ -105,7 +114,9 @@ def deviation(family, draws: int) -> None:
     plan = hj.optimal_design(family.model, usual, goal=goal, **about)
     N, truth = family.model.n_sections, family.model.multipliers
     minimal = hj.identify.realize(np.asarray(family.model.impulse_response(4 * N + 1)))
-    start = hj.identify.realize(family.model.htf(usual.frequencies), np.asarray(minimal.dims))
+    start = hj.identify.realize(
+        family.model.htf(usual.frequencies), np.asarray(minimal.dims)
+    )
     start = eqx.tree_at(lambda model: model.D, start, 0 * start.D)  # (and stays so)
     after = family.recorded(plan.design)
 
@@ -113,7 +124,10 @@ def deviation(family, draws: int) -> None:
         k = rng.integers(len(before))
         htf = measured(before[k], usual, noise, HARMONICS, rng)
         error = {"numerators": hj.fit_multipliers(htf, 2).compare(truth).error[0]}
-        for name, design, data in (("ldtp", usual, before), ("together", plan.design, after)):
+        for name, design, data in (
+            ("ldtp", usual, before),
+            ("together", plan.design, after),
+        ):
             htf = measured(data[k], design, noise, range(-N // 2, N // 2), rng)
             begin = time.process_time()
             fit = hj.fit_ldtp(htf, start)
@@ -132,27 +146,41 @@ def deviation(family, draws: int) -> None:
         family.show(f"deviation.{name}.rms_error", value)
         family.show(f"deviation.{name}.bound", bound[name])
         family.show(f"deviation.{name}.saved", (error["numerators"] / value) ** 2)
-    family.show("deviation.ldtp.seconds", float(np.median(found["ldtp.seconds"].values)))
+    family.show(
+        "deviation.ldtp.seconds", float(np.median(found["ldtp.seconds"].values))
+    )
     for label, unknown in (("spring", SPRING), ("everything", EVERYTHING)):
         value = physical(family, usual, noise, unknown)
         family.show(f"deviation.{label}.bound", value)
         family.show(f"deviation.{label}.saved", (bound["numerators"] / value) ** 2)
 
 
-def physical(family, design: hj.Design, noise: dict[str, float], free: tuple[str, ...]) -> float:
+def physical(
+    family, design: hj.Design, noise: dict[str, float], free: tuple[str, ...]
+) -> float:
     """Bound of the multiplier for whoever knows the equations, but not these parameters."""
     htf = family.model.htf(design.frequencies, HARMONICS)
-    each = design.expected_variance()[:, None, :] * np.array(list(noise.values()))[:, None] ** 2
+    each = (
+        design.expected_variance()[:, None, :]
+        * np.array(list(noise.values()))[:, None] ** 2
+    )
     htf = hj.HTF(
-        htf.f, htf.H, HARMONICS, htf.n_sections, htf.inputs, OUTPUTS,
+        htf.f,
+        htf.H,
+        HARMONICS,
+        htf.n_sections,
+        htf.inputs,
+        OUTPUTS,
         variance=np.broadcast_to(each, htf.H.shape),
-    )  # fmt: skip
+    )
     system, observed = family.cycle.system, hj.ObservedHTF(htf, family.placed.family)
     seen = hj.identifiability(system, observed, free, guess=family.cycle)
     slopes = []
     for name in free:
         values = [float(getattr(system, name)) * (1 + x) for x in (-_ASIDE, _ASIDE)]
-        ends = [hj.find_limit_cycle(type(system)(**{name: x}), family.cycle) for x in values]
+        ends = [
+            hj.find_limit_cycle(type(system)(**{name: x}), family.cycle) for x in values
+        ]
         slopes.append((ends[1].multipliers[0] - ends[0].multipliers[0]) / (2 * _ASIDE))
     parts = np.stack([np.real(slopes), np.imag(slopes)])
     # (What the data do not see has no effect on the multipliers that they see.)

@@ -40,20 +40,33 @@ class Walker(NamedTuple):
 
 WALKERS = {
     "compass": Walker(
-        hj.models.CompassGait(), "heelstrike", "s", "falling", ("n", "vn", "vs"), 2, 0.002
+        hj.models.CompassGait(),
+        "heelstrike",
+        "s",
+        "falling",
+        ("n", "vn", "vs"),
+        2,
+        0.002,
     ),
-    "wheel": Walker(hj.models.RimlessWheel(), "impact", "th", "rising", ("w",), 1, 0.0002),
+    "wheel": Walker(
+        hj.models.RimlessWheel(), "impact", "th", "rising", ("w",), 1, 0.0002
+    ),
 }
 
 
-def crossings(walker: Walker, cycle: hj.LimitCycle) -> tuple[list[hj.Crossing], np.ndarray]:
+def crossings(
+    walker: Walker, cycle: hj.LimitCycle
+) -> tuple[list[hj.Crossing], np.ndarray]:
     """The sections, and by how much each output changes per change of the angle there (N, ny)."""
     t, angle, *outputs = cycle.trajectory(3)(walker.angle, *walker.outputs, per_step=64)
     sign = 1 if walker.direction == "rising" else -1
     first = np.flatnonzero((sign * angle[:-1] < 0) & (sign * angle[1:] >= 0))[0]
     at = t[first] + np.arange(N) * float(cycle.period) / N
     aside = _ASIDE * float(cycle.period)
-    change = [np.interp(at + aside, t, x) - np.interp(at - aside, t, x) for x in (angle, *outputs)]
+    change = [
+        np.interp(at + aside, t, x) - np.interp(at - aside, t, x)
+        for x in (angle, *outputs)
+    ]
     levels = np.interp(at, t, angle)
     family = [hj.Crossing(walker.angle, walker.direction, x) for x in levels.tolist()]
     return family, np.stack(change[1:], axis=1) / change[0][:, None]
@@ -64,7 +77,9 @@ class Laboratory:
 
     def __init__(self, walker: Walker):
         self.walker = walker
-        self.cycle = hj.find_limit_cycle(walker.system, section=hj.AtEvent(walker.event))
+        self.cycle = hj.find_limit_cycle(
+            walker.system, section=hj.AtEvent(walker.event)
+        )
         family, self.slope = crossings(walker, self.cycle)
         self.placed = hj.place_sections(self.cycle, family)
         self.model = hj.linearize(self.cycle, self.placed, walker.outputs)
@@ -74,7 +89,9 @@ class Laboratory:
         """Without noise, for some draws of the phases."""
         drawn = [design.realizations(1, seed=k) for k in range(PHASES)]
         return [
-            hj.run_experiments(self.cycle, self.placed, x, self.walker.outputs, start="steady")
+            hj.run_experiments(
+                self.cycle, self.placed, x, self.walker.outputs, start="steady"
+            )
             for x in drawn
         ]
 
@@ -82,21 +99,32 @@ class Laboratory:
         """Of each output, on the average over the sections."""
         return std**2 * (1 + (self.slope**2).mean(axis=0))
 
-    def estimate(self, data: hj.ExperimentData, design: hj.Design, std: float, rng) -> hj.HTF:
+    def estimate(
+        self, data: hj.ExperimentData, design: hj.Design, std: float, rng
+    ) -> hj.HTF:
         """From noisy samples of everything."""
         S, n, ny = data.y.shape
         late = np.resize(self.slope, (n, ny)) * rng.normal(size=(S, n, 1))
         noisy = data.y + std * (rng.normal(size=(S, n, ny)) - late)
         data = hj.ExperimentData(
-            data.u, noisy, n_sections=N, periods=data.periods, inputs=data.inputs,
+            data.u,
+            noisy,
+            n_sections=N,
+            periods=data.periods,
+            inputs=data.inputs,
             outputs=data.outputs,
-        )  # fmt: skip
+        )
         htf = hj.estimate_htf(data, (-2, -1, 0, 1, 2), variance="auto")
         each = design.expected_variance()[:, None, :] * self.variance(std)[:, None]
         return hj.HTF(
-            htf.f, htf.H, htf.harmonics, N, htf.inputs, htf.outputs,
+            htf.f,
+            htf.H,
+            htf.harmonics,
+            N,
+            htf.inputs,
+            htf.outputs,
             variance=np.broadcast_to(each, htf.H.shape),
-        )  # fmt: skip
+        )
 
     def rms_error(self, design: hj.Design, std: float, draws: int) -> float:
         """Of the leading multipliers, over draws of noise."""
@@ -107,7 +135,9 @@ class Laboratory:
             fit = hj.fit_multipliers(htf, len(self.truth), check=False)
             return fit.compare(self.truth).error[:leading].max()
 
-        return float(np.sqrt(np.mean(hj.monte_carlo(error, draws, 3).value.values ** 2)))
+        return float(
+            np.sqrt(np.mean(hj.monte_carlo(error, draws, 3).value.values ** 2))
+        )
 
 
 def walkers(draws: int) -> None:
@@ -116,7 +146,9 @@ def walkers(draws: int) -> None:
         usual = hj.multisine(N, periods=128, lines="odd").scaled(walker.rms)
         rms = np.sqrt(np.mean(lab.recorded(usual)[0].y ** 2, axis=(0, 1)))
         std = float(0.1 * rms.min())
-        noise = dict(zip(walker.outputs, np.sqrt(lab.variance(std)).tolist(), strict=True))
+        noise = dict(
+            zip(walker.outputs, np.sqrt(lab.variance(std)).tolist(), strict=True)
+        )
         goal = hj.designs.Multipliers(which=0)
         plan = hj.optimal_design(lab.model, usual, goal=goal, noise=noise)
         everything = hj.optimal_design(lab.model, usual, noise=noise)

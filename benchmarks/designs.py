@@ -100,7 +100,9 @@ def bounds(family: Family, draws: int) -> None:
         family.show(f"bound.{limit}.saved", plan.saved)
         family.show(f"bound.{limit}.certificate", plan.certificate)
         for name in OUTPUTS:
-            family.show(f"bound.{limit}.deviation.{name}", plan.rms[name] / plan.usual_rms[name])
+            family.show(
+                f"bound.{limit}.deviation.{name}", plan.rms[name] / plan.usual_rms[name]
+            )
         family.show(f"bound.{limit}.cpu_seconds", seconds)
     noise = {"yM": 6e-6, "vM": 1.2e-5}
     usual = (hj.multisine().scaled(RMS), hj.multisine(band=(0, 2)).scaled(RMS))
@@ -136,7 +138,9 @@ def known(family: Family, draws: int, rms: float = RMS, row: str = "known") -> N
     family.show(f"{row}.saved", (found[0] / found[1]) ** 2)
 
 
-def study(family: Family, rng, first, begun, noise: dict[str, float]) -> hj.designs.Study:
+def study(
+    family: Family, rng, first, begun, noise: dict[str, float]
+) -> hj.designs.Study:
     """One, from nothing to its end; `begun`: responses to the first blocks, without noise."""
     k = int(rng.integers(PHASES))
     found = hj.designs.Study(
@@ -161,10 +165,14 @@ def studies(family: Family, draws: int) -> np.ndarray:
     begun = family.recorded(equal)
     truth, rows = family.model.multipliers, []
     for seed in range(draws):
-        done = study(family, np.random.default_rng(seed), first, begun, family.noise(begun[0]))
+        done = study(
+            family, np.random.default_rng(seed), first, begun, family.noise(begun[0])
+        )
         error = done.fit.compare(truth).error[0]
         held = bool(done.fit.contains(truth)[0])
-        rows.append((done.strides[-1], done.blocks, error, held, done.standard_errors[-1, 0]))
+        rows.append(
+            (done.strides[-1], done.blocks, error, held, done.standard_errors[-1, 0])
+        )
     return np.array(rows)
 
 

@@ -42,11 +42,18 @@ for count in (1, 200):
     run = ft.partial(hj.run_experiments, cycle, phase, large, outputs=("yM", "vM"))
     data = timed(f"experiments.{80 * count}", run)
     print("standard deviation of the outputs", np.asarray(data.y).std())
-k, b = (x.ravel() for x in jnp.meshgrid(jnp.linspace(8, 13, 100), jnp.linspace(3, 7, 100)))
+k, b = (
+    x.ravel() for x in jnp.meshgrid(jnp.linspace(8, 13, 100), jnp.linspace(3, 7, 100))
+)
 hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
 cycles = timed("cycles.10000", lambda: hj.find_limit_cycles(hoppers, guess=cycle))
 print("mean modulus", np.abs(np.asarray(cycles.multipliers)).mean())
 response = hj.response_function(cycle, phase, ("yM", "vM"))
 u = design.inputs(cycles=84)[:1]
-gradient = eqx.filter_jit(eqx.filter_grad(lambda s: jnp.mean(response(u, system=s).y ** 2)))
-print("gradient by k", timed("gradient", lambda: jax.block_until_ready(gradient(hopper)).k))
+gradient = eqx.filter_jit(
+    eqx.filter_grad(lambda s: jnp.mean(response(u, system=s).y ** 2))
+)
+print(
+    "gradient by k",
+    timed("gradient", lambda: jax.block_until_ready(gradient(hopper)).k),
+)

@@ -17,8 +17,12 @@ from mishaps import SECOND, clock, kept, misjudged, overflow, signals, trials  #
 
 def hum(frequency, size, which="uy"):
     """A tone, its frequency in cycles per period."""
-    return signals(which, lambda x, s: x + size * x.std() * np.sin(
-        2 * np.pi * frequency * s.trial.time / s.period))  # fmt: skip
+    return signals(
+        which,
+        lambda x, s: (
+            x + size * x.std() * np.sin(2 * np.pi * frequency * s.trial.time / s.period)
+        ),
+    )
 
 
 def filtered(which, order, edge, kind="low", zero_phase=True):
@@ -34,7 +38,9 @@ def filtered(which, order, edge, kind="low", zero_phase=True):
 
 
 def steps(which, levels):
-    return signals(which, lambda x, s: np.round(x / np.ptp(x) * levels) * np.ptp(x) / levels)
+    return signals(
+        which, lambda x, s: np.round(x / np.ptp(x) * levels) * np.ptp(x) / levels
+    )
 
 
 def held(which, samples):
@@ -43,8 +49,11 @@ def held(which, samples):
 
 def moved(change):
     """Times of events become `change(times, scene)`."""
-    return trials(lambda trial, s: replace(
-        trial, events={s.event: np.sort(change(trial.events[s.event], s))}))  # fmt: skip
+    return trials(
+        lambda trial, s: replace(
+            trial, events={s.event: np.sort(change(trial.events[s.event], s))}
+        )
+    )
 
 
 def reverse(trial, s):
@@ -95,13 +104,25 @@ MORE = {
     "hum of the outputs": hum(1.02, 0.02, "y"),
     "hum of the push": hum(1.02, 0.1, "u"),
     "hum at the rhythm": hum(1.0, 0.1),
-    "mains with harmonics": signals("uy", lambda x, s: x + 0.02 * x.std() * sum(
-        np.sin(2 * np.pi * k * 13.3 * s.trial.time / s.period) / k for k in (1, 2, 3))),
+    "mains with harmonics": signals(
+        "uy",
+        lambda x, s: (
+            x
+            + 0.02
+            * x.std()
+            * sum(
+                np.sin(2 * np.pi * k * 13.3 * s.trial.time / s.period) / k
+                for k in (1, 2, 3)
+            )
+        ),
+    ),
     "16 bits of a position overflow": signals("y0", overflow(16)),
     "16 bits of the push overflow": signals("u", overflow(16)),
     "rounded to 8 bits": steps("uy", 256),
     "an output rounded to 5 bits": steps("y0", 32),
-    "velocity saturates": signals("y-1", lambda x, s: x.std() * np.tanh(0.5 * x / x.std()) / 0.5),
+    "velocity saturates": signals(
+        "y-1", lambda x, s: x.std() * np.tanh(0.5 * x / x.std()) / 0.5
+    ),
     "an output late": signals("y0", lambda x, s: np.roll(x, 4)),
     "an output late by a third of a cycle": signals("y0", lambda x, s: np.roll(x, 42)),
     "outputs smoothed": filtered("y", 2, 6.0),
@@ -116,7 +137,9 @@ MORE = {
     "push turns its sign": signals("u", lambda x, s: x * np.sign(ramp(s))),
     "push doubled in one trial": signals("u", lambda x, s: 2 * x, SECOND),
     "push rectified": signals("u", lambda x, s: np.abs(x)),
-    "dead zone of the push": signals("u", lambda x, s: np.where(np.abs(x) < x.std() / 2, 0, x)),
+    "dead zone of the push": signals(
+        "u", lambda x, s: np.where(np.abs(x) < x.std() / 2, 0, x)
+    ),
     "push constant": signals("u", lambda x, s: 0 * x + 1.0),
     "push constant in one trial": signals("u", lambda x, s: 0 * x + x.std(), SECOND),
     "push as large as its noise": signals("u", lambda x, s: x + strange(x, s)),
@@ -128,23 +151,37 @@ MORE = {
     "gaps bridged by lines": signals("y", bridged),
     "rate said 10 % wrong": clock(lambda t, s: 1.1 * t),
     "times rounded to 10 ms": trials(rounded_times),
-    "late packets": clock(lambda t, s: t + 0.1 * s.period * np.floor(
-        (t - s.trial.time[0]) / s.period / 20)),
-    "push read with inertia": signals("u", lambda x, s: x + 0.02 * np.gradient(
-        s.values(s.outputs[-1]), s.trial.time)),
+    "late packets": clock(
+        lambda t, s: (
+            t + 0.1 * s.period * np.floor((t - s.trial.time[0]) / s.period / 20)
+        )
+    ),
+    "push read with inertia": signals(
+        "u", lambda x, s: x + 0.02 * np.gradient(s.values(s.outputs[-1]), s.trial.time)
+    ),
     "an output is noise": signals("y0", strange),
-    "noise grows": signals("y", lambda x, s: x + 0.02 * (ramp(s) + 0.5) * strange(x, s)),
-    "noise as large as the signal": signals("y", lambda x, s: x * (1 + 0.02 * s.normal())),
-    "subject stops": signals("y", lambda x, s: np.where(ramp(s) > 0.3, x[int(0.8 * len(x))], x)),
-    "every other cycle higher": signals("y0", lambda x, s: x + 0.02 * x.std() * (
-        np.floor(s.cycles) % 2)),
-}  # fmt: skip
+    "noise grows": signals(
+        "y", lambda x, s: x + 0.02 * (ramp(s) + 0.5) * strange(x, s)
+    ),
+    "noise as large as the signal": signals(
+        "y", lambda x, s: x * (1 + 0.02 * s.normal())
+    ),
+    "subject stops": signals(
+        "y", lambda x, s: np.where(ramp(s) > 0.3, x[int(0.8 * len(x))], x)
+    ),
+    "every other cycle higher": signals(
+        "y0", lambda x, s: x + 0.02 * x.std() * (np.floor(s.cycles) % 2)
+    ),
+}
 MORE_EVENTS = {
     "a tenth of the events lost": misjudged(lost=0.1),
     "a tenth of the events doubled": misjudged(doubled=0.1),
     "all events late": moved(lambda at, s: at + 0.02 * s.period),
-    "events drift": moved(lambda at, s: at + 0.05 * s.period * np.linspace(0, 1, len(at))),
+    "events drift": moved(
+        lambda at, s: at + 0.05 * s.period * np.linspace(0, 1, len(at))
+    ),
     "events rounded to 10 ms": moved(lambda at, s: np.round(at, 2)),
-    "events defined anew halfway": moved(lambda at, s: at + 0.02 * s.period * (
-        np.arange(len(at)) > len(at) // 2)),
-}  # fmt: skip
+    "events defined anew halfway": moved(
+        lambda at, s: at + 0.02 * s.period * (np.arange(len(at)) > len(at) // 2)
+    ),
+}

@@ -97,7 +97,9 @@ def unknown(family: Family) -> None:
         family.show(f"unknown.{name}.removed.{rms}.multiplier", error)
     data = family.run(hj.multisine(periods=84, lines="odd").scaled(rms), discard=0)
     for degree in (2, 4):
-        family.report(f"unknown.odd.local_polynomial_{degree}.{rms}", interpolated(data, degree))
+        family.report(
+            f"unknown.odd.local_polynomial_{degree}.{rms}", interpolated(data, degree)
+        )
 
 
 def interpolated(data, degree: int):
@@ -106,9 +108,13 @@ def interpolated(data, degree: int):
     offsets = np.arange(-degree - 1, degree + 2, 2)
     powers = offsets[:, None] ** np.arange(degree + 1)
     weights = np.linalg.pinv(powers)[0]
-    transient = sum(w * np.roll(Y, -k, axis=1) for w, k in zip(weights, offsets, strict=True))
+    transient = sum(
+        w * np.roll(Y, -k, axis=1) for w, k in zip(weights, offsets, strict=True)
+    )
     y = np.fft.ifft(Y - transient, axis=1).real
-    return hj.ExperimentData(data.u, y, n_sections=N, periods=data.periods, outputs=OUTPUTS)
+    return hj.ExperimentData(
+        data.u, y, n_sections=N, periods=data.periods, outputs=OUTPUTS
+    )
 
 
 def crest() -> None:
@@ -121,12 +127,22 @@ def crest() -> None:
 
 def discs(draws: int = 200_000) -> None:
     rng = np.random.default_rng(0)
-    kinds = {"normal": (0, 1), "constant": (1, 0), "0.3": (1, 0.3), "0.6": (1, 0.6), "1": (1, 1)}
+    kinds = {
+        "normal": (0, 1),
+        "constant": (1, 0),
+        "0.3": (1, 0.3),
+        "0.6": (1, 0.6),
+        "1": (1, 1),
+    }
     for count in (2, 3, 4, 6, 8, 16):
         freedom = np.full(draws, count - 1.0)
         for kind, (constant, noise) in kinds.items():
             error = constant * np.exp(2j * np.pi * rng.random((count, draws)))
-            error += noise * rng.normal(size=(count, draws, 2)) @ (np.array([1, 1j]) / np.sqrt(2))
+            error += (
+                noise
+                * rng.normal(size=(count, draws, 2))
+                @ (np.array([1, 1j]) / np.sqrt(2))
+            )
             mean = error.mean(axis=0)
             rest = error - mean
             power = np.sum(np.abs(rest) ** 2, axis=0)
@@ -135,12 +151,17 @@ def discs(draws: int = 200_000) -> None:
                 line = np.abs(np.sum(rest**2, axis=0)) / power
                 roundness = (1 - np.minimum(line, 1) ** 2) * count / (count - 2)
             radii = []
-            for name, shape in (("size", None), ("shape", roundness[None, :, None, None])):
+            for name, shape in (
+                ("size", None),
+                ("shape", roundness[None, :, None, None]),
+            ):
                 quantile = np.asarray(hj.Scatter(freedom, shape).quantile(0.95))
                 radii.append(np.sqrt(np.ravel(quantile) * power / count / (count - 1)))
                 inside = np.mean(np.abs(mean) <= radii[-1])
                 print(f"estimation.discs.{count}.{kind}.{name} {inside:.4f}")
-            print(f"estimation.discs.{count}.{kind}.wider {radii[1].mean() / radii[0].mean():.3f}")
+            print(
+                f"estimation.discs.{count}.{kind}.wider {radii[1].mean() / radii[0].mean():.3f}"
+            )
 
 
 def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> None:
@@ -149,7 +170,9 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
     chosen = [f[np.argmin(np.abs(f - x))] for x in np.geomspace(0.06, 9.9, 10)]
 
     def run(count, seed):
-        return family.run(design.realizations(count, seed), start="periodic", discard=32)
+        return family.run(
+            design.realizations(count, seed), start="periodic", discard=32
+        )
 
     truth = hj.estimate_htf((run(100, seed + k) for k in range(20)), (-1, 0, 1))
     rows = [int(np.argmin(np.abs(truth.f - x))) for x in chosen]
@@ -161,7 +184,9 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
         error = np.abs(np.asarray(estimate.H) - np.asarray(truth.H))
         return {
             "disc": (error <= np.asarray(estimate.confidence_radius()))[:, rows],
-            "variance": np.stack([estimate.variance, estimate.noise_variance])[:, :, rows],
+            "variance": np.stack([estimate.variance, estimate.noise_variance])[
+                :, :, rows
+            ],
         }
 
     found = hj.monte_carlo(draw, runs, seed)
@@ -178,7 +203,10 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
     family.show(f"{name}.distortion.mean", np.mean(1 - noise / total))
     family.show(f"{name}.distortion.most", np.max(1 - noise / total))
     family.show(f"{name}.distortion.least_covered", (1 - noise / total)[worst])
-    exact, mean = np.asarray(family.model.htf(chosen, (-1, 0, 1)).H), np.asarray(truth.H)[:, rows]
+    exact, mean = (
+        np.asarray(family.model.htf(chosen, (-1, 0, 1)).H),
+        np.asarray(truth.H)[:, rows],
+    )
     for k, output in enumerate(OUTPUTS):
         bias = np.abs(mean - exact)[1, :, k].max() / np.abs(exact)[1, :, k].max()
         family.show(f"{name}.bias.H0.{output}", bias)
@@ -203,7 +231,9 @@ def main() -> None:
                 step(family)
         if "coverage" not in options.skip:
             for k, (rms, realizations) in enumerate(COVERAGE[name]):
-                coverage(family, rms, realizations, options.runs, SEED[name] + 10**6 * k)
+                coverage(
+                    family, rms, realizations, options.runs, SEED[name] + 10**6 * k
+                )
 
 
 if __name__ == "__main__":

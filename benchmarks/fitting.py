@@ -49,9 +49,14 @@ class HTFs:
         real, imag = np.random.default_rng(seed).normal(size=(2, *self.std.shape))
         H = np.asarray(self.exact.H) + self.std * (real + 1j * imag) / np.sqrt(2)
         noisy = hj.HTF(
-            self.exact.f, H, self.exact.harmonics, SECTIONS.n_sections, self.exact.inputs, OUTPUTS,
+            self.exact.f,
+            H,
+            self.exact.harmonics,
+            SECTIONS.n_sections,
+            self.exact.inputs,
+            OUTPUTS,
             variance=self.std**2,
-        )  # fmt: skip
+        )
         return hj.ObservedHTF(noisy, SECTIONS)
 
 
@@ -60,7 +65,9 @@ class Series:
 
     def __init__(self, cycle):
         u = 0.05 * np.random.default_rng(0).normal(size=(2, 8 * SECTIONS.n_sections, 1))
-        self.data = hj.run_experiments(cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0)
+        self.data = hj.run_experiments(
+            cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0
+        )
         self.std = np.sqrt(np.mean(self.data.y**2, axis=(0, 1))) * 10 ** (-SNR / 20)
 
     def clean(self):
@@ -73,7 +80,10 @@ class Series:
 
 
 def show(name: str, value) -> None:
-    print(f"fitting.{name} {value:.4g}" if not isinstance(value, str) else value, flush=True)
+    print(
+        f"fitting.{name} {value:.4g}" if not isinstance(value, str) else value,
+        flush=True,
+    )
 
 
 def exact(kind: str, data, cycle, seeds: int) -> None:
@@ -81,9 +91,13 @@ def exact(kind: str, data, cycle, seeds: int) -> None:
     errors, guesses, steps, seconds = [], [], [], []
     for seed in range(seeds):
         factors = 1 + 0.2 * np.random.default_rng(seed).uniform(-1, 1, len(NAMES))
-        wrong = hj.models.VerticalHopper(**dict(zip(NAMES, true * factors, strict=True)))
+        wrong = hj.models.VerticalHopper(
+            **dict(zip(NAMES, true * factors, strict=True))
+        )
         begin = time.process_time()
-        fit = hj.fit_model(wrong, data.clean(), NAMES, guess=cycle, guesses=4, seed=seed)
+        fit = hj.fit_model(
+            wrong, data.clean(), NAMES, guess=cycle, guesses=4, seed=seed
+        )
         seconds.append(time.process_time() - begin)
         if seed == 0:
             show(f"{kind}.first", seconds.pop())
@@ -110,7 +124,8 @@ def seen_errors(fit, true) -> np.ndarray:
 
 def noise(kind: str, data, cycle, draws: int) -> None:
     fits = [
-        hj.fit_model(cycle.system, data.noisy(seed), NAMES, guess=cycle) for seed in range(draws)
+        hj.fit_model(cycle.system, data.noisy(seed), NAMES, guess=cycle)
+        for seed in range(draws)
     ]
     inside = sum(fit.contains(cycle.system) for fit in fits)
     show(f"{kind}.noise.converged", sum(fit.result == hj.Result.OK for fit in fits))
@@ -128,7 +143,9 @@ def main() -> None:
     )
     kinds = {"htf": HTFs, "series": Series}
     parser.add_argument("--only", default="htf,series", help="of htf,series")
-    parser.add_argument("--seeds", type=int, default=50, help="wrong systems without noise")
+    parser.add_argument(
+        "--seeds", type=int, default=50, help="wrong systems without noise"
+    )
     parser.add_argument("--draws", type=int, default=200, help="draws of noise")
     options = parser.parse_args()
     hj.enable_x64()

@@ -46,22 +46,36 @@ def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
     model = hj.linearize(cycle, placed, case.output)
     N = placed.n_sections
     design = hj.multisine(
-        N, PERIODS, band=(0, min(4.0, N / 2)), amplitude=case.amplitude or 1.0, lines="odd",
+        N,
+        PERIODS,
+        band=(0, min(4.0, N / 2)),
+        amplitude=case.amplitude or 1.0,
+        lines="odd",
         inputs=case.system.inputs,
-    )  # fmt: skip
+    )
     estimate = None
     if case.amplitude:
         data = hj.run_experiments(
-            cycle, placed, design, case.output, start=case.start, discard=PERIODS, accuracy=1e-11
+            cycle,
+            placed,
+            design,
+            case.output,
+            start=case.start,
+            discard=PERIODS,
+            accuracy=1e-11,
         )
         assert data.ok.all(), data.summary()
-        estimate = hj.estimate_htf(data, harmonics=[h for h in HARMONICS if -N / 2 <= h < N / 2])
+        estimate = hj.estimate_htf(
+            data, harmonics=[h for h in HARMONICS if -N / 2 <= h < N / 2]
+        )
     f = np.unique(design.f) if estimate is None else estimate.f
     harmonics = HARMONICS if estimate is None else estimate.harmonics
     return cycle, model.htf(f, harmonics=harmonics), estimate
 
 
-def numbers(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None) -> dict:
+def numbers(
+    case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None
+) -> dict:
     """What the table says."""
     multipliers = cycle.multipliers
     truth = np.asarray(case.truth, complex)
@@ -72,7 +86,9 @@ def numbers(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | 
         "events": [e.name for e in cycle.trajectory().events],
         "sections": exact.n_sections,
         "multipliers": [[z.real, z.imag] for z in multipliers],
-        "multiplier error": float(np.max(np.abs(multipliers - truth), initial=0.0) / size),
+        "multiplier error": float(
+            np.max(np.abs(multipliers - truth), initial=0.0) / size
+        ),
         "source": case.source,
         "channel": f"{case.push} to {case.output}",
         "largest H_0": float(np.max(np.abs(exact[0]))),
@@ -80,13 +96,19 @@ def numbers(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | 
     }
 
 
-def draw(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None, path: Path):
+def draw(
+    case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None, path: Path
+):
     """The cycle (of one that is rest: its multipliers), and |H_m| beside it; of a walker, a turn
     before."""
     with hj.plot.style():
         widths = (1.2,) * bool(case.sticks) + (1, 1.5)
         figure, (*before, left, right) = pyplot.subplots(
-            1, len(widths), figsize=(hj.plot.PAGE, 2.7), layout="constrained", width_ratios=widths
+            1,
+            len(widths),
+            figsize=(hj.plot.PAGE, 2.7),
+            layout="constrained",
+            width_ratios=widths,
         )
         for ax in before:
             sticks(case, cycle, ax)
@@ -96,13 +118,18 @@ def draw(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | Non
             hj.plot.cycle(cycle, *case.plane, ax=left)
         htfs = [exact] if estimate is None else [estimate, exact]
         hj.plot.magnitude(*htfs, harmonics=(0, 1, -1)[: len(exact.harmonics)], ax=right)
-        lowest = min(np.min(line.get_ydata(), initial=np.inf) for line in right.get_lines())
+        lowest = min(
+            np.min(line.get_ydata(), initial=np.inf) for line in right.get_lines()
+        )
         right.set_ylim(bottom=max(lowest / 2, right.get_ylim()[0]))
         legend = right.get_legend()
         right.legend(
-            legend.legend_handles, [x.get_text() for x in legend.get_texts()],
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4,
-        )  # fmt: skip
+            legend.legend_handles,
+            [x.get_text() for x in legend.get_texts()],
+            loc="lower center",
+            bbox_to_anchor=(0.5, 1.0),
+            ncols=4,
+        )
         figure.suptitle(f"{case.title}: {case.push} to {case.output}", fontsize=8)
         save(path, figure)
 
@@ -136,10 +163,15 @@ def branches(path: Path) -> None:
     ]
     panels = [
         ("x", [hj.continuation(hj.find_limit_cycle(m.Duffing()), "rate", (0.5, 2.0))]),
-        ("v", [hj.continuation(hj.find_limit_cycle(buck), "Vin", (20.0, 26.0)),
-               hj.continuation(doubled, "Vin", (24.0, 25.5))]),
+        (
+            "v",
+            [
+                hj.continuation(hj.find_limit_cycle(buck), "Vin", (20.0, 26.0)),
+                hj.continuation(doubled, "Vin", (24.0, 25.5)),
+            ],
+        ),
         ("th", [hj.continuation(gait, "slope", (0.002, 0.018)) for gait in gaits]),
-    ]  # fmt: skip
+    ]
     with hj.plot.style():
         figure, axes = pyplot.subplots(
             1, 3, figsize=(1.4 * hj.plot.PAGE, 3.0), layout="constrained"
@@ -195,9 +227,14 @@ def main():
         case = CASES[name]()
         found = compute(case)
         rows[name] = numbers(case, *found)
-        picture = "".join(c if c.isalnum() else "-" for c in name.lower()).replace("--", "-")
+        picture = "".join(c if c.isalnum() else "-" for c in name.lower()).replace(
+            "--", "-"
+        )
         draw(case, *found, options.out / f"{picture}.png")
-        print(table({name: rows[name]}).splitlines()[-1], f"({time.process_time() - begin:.0f} s)")
+        print(
+            table({name: rows[name]}).splitlines()[-1],
+            f"({time.process_time() - begin:.0f} s)",
+        )
         rows = {x: rows[x] for x in CASES if x in rows}
         numbers_file.write_text(json.dumps(rows, indent=1))
         (options.out / "gallery.md").write_text(table(rows))

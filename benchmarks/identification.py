@@ -40,7 +40,17 @@ import hybridjax as hj
 RMS = {"isochron": (0.005, 1.0), "kinematic": (0.005, 0.2)}
 STEPS = ("paper", "noise", "white", "coverage")
 SEED = {"isochron": 501, "kinematic": 502}  # of the series
-BAND = (-4, -3, -2, -1, 0, 1, 2, 3, 4)  # further harmonics tell nothing more about multipliers
+BAND = (
+    -4,
+    -3,
+    -2,
+    -1,
+    0,
+    1,
+    2,
+    3,
+    4,
+)  # further harmonics tell nothing more about multipliers
 
 
 class Identification(Family):
@@ -67,9 +77,16 @@ def paper(family: Identification) -> None:
     for k, output in enumerate(OUTPUTS):
         aaa = AAA(z, H[:, k], rtol=1e-4, clean_up=False).poles() ** N
         for name, multipliers in (("rational", rational.multipliers[k]), ("aaa", aaa)):
-            family.show(f"paper.{name}.{output}", np.nanmin(abs(multipliers - family.true)))
+            family.show(
+                f"paper.{name}.{output}", np.nanmin(abs(multipliers - family.true))
+            )
     some = hj.ExperimentData(
-        data.u[:20], data.y[:20], n_sections=N, periods=64, inputs=data.inputs, outputs=OUTPUTS
+        data.u[:20],
+        data.y[:20],
+        n_sections=N,
+        periods=64,
+        inputs=data.inputs,
+        outputs=OUTPUTS,
     )
     family.show("paper.series", family.error(hj.fit_series(some, 2, start="cycle")))
     for lines in ("all", "odd"):
@@ -99,10 +116,15 @@ def noise(family: Identification, seeds: int) -> None:
         bound = hj.identify.multiplier_bound(
             family.model,
             hj.HTF(
-                exact.f, exact.H, BAND, N, exact.inputs, OUTPUTS,
+                exact.f,
+                exact.H,
+                BAND,
+                N,
+                exact.inputs,
+                OUTPUTS,
                 variance=np.broadcast_to(variance, exact.H.shape),
             ),
-        ).standard_errors[0]  # fmt: skip
+        ).standard_errors[0]
         report(family, f"noise.{snr}", found, bound)
 
 
@@ -113,7 +135,9 @@ def report(family: Identification, name: str, fits, bound=None) -> None:
         family.show(f"{name}.bound", bound)
         family.show(f"{name}.ratio", rms / bound)
     family.show(f"{name}.rms", rms)
-    family.show(f"{name}.said", np.sqrt(np.mean([f.standard_errors[0] ** 2 for f in fits])))
+    family.show(
+        f"{name}.said", np.sqrt(np.mean([f.standard_errors[0] ** 2 for f in fits]))
+    )
     hits = sum(int(f.contains(family.true).all()) for f in fits)
     family.show(f"{name}.covered", hits / len(fits))
     family.show(f"{name}.covered.p", stats.binomtest(hits, len(fits), 0.95).pvalue)
@@ -125,7 +149,9 @@ def white(family: Identification, draws: int) -> None:
     data = family.run(u, start="cycle", discard=0)
 
     def one(s, y):
-        return hj.Record(data.u[s], y[s], n_sections=N, inputs=data.inputs, outputs=OUTPUTS)
+        return hj.Record(
+            data.u[s], y[s], n_sections=N, inputs=data.inputs, outputs=OUTPUTS
+        )
 
     family.show("white.clean", family.error(hj.fit_series(one(0, data.y), 2)))
     noisy = hj.experiments.add_noise(data, snr=20, seed=SEED[family.name] + 1)
@@ -145,7 +171,9 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
     chosen = (-1, 0, 1)
 
     def run(count, seed):
-        return family.run(design.realizations(count, seed), start="periodic", discard=32)
+        return family.run(
+            design.realizations(count, seed), start="periodic", discard=32
+        )
 
     mean = hj.estimate_htf((run(100, 10**6 + k) for k in range(20)), chosen)
 
@@ -158,9 +186,15 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
 
     def fitted(H, variance, freedom):
         htf = hj.HTF(
-            mean.f, H, chosen, N, mean.inputs, mean.outputs,
-            variance=variance, scatter=hj.Scatter(freedom),
-        )  # fmt: skip
+            mean.f,
+            H,
+            chosen,
+            N,
+            mean.inputs,
+            mean.outputs,
+            variance=variance,
+            scatter=hj.Scatter(freedom),
+        )
         return hj.fit_multipliers(htf, 2)
 
     found = hj.monte_carlo(draw, runs)
@@ -176,9 +210,14 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
     hits = sum(int(fit.contains(truth).all()) for fit in fits)
     errors = np.array([family.error(fit, truth) for fit in fits])
     family.show(f"coverage.{rms}.multiplier", hits / runs)
-    family.show(f"coverage.{rms}.p", min(4 * stats.binomtest(hits, runs, 0.95).pvalue, 1.0))
+    family.show(
+        f"coverage.{rms}.p", min(4 * stats.binomtest(hits, runs, 0.95).pvalue, 1.0)
+    )
     family.show(f"coverage.{rms}.rms", np.sqrt(np.mean(errors**2)))
-    family.show(f"coverage.{rms}.said", np.sqrt(np.mean([f.standard_errors[0] ** 2 for f in fits])))
+    family.show(
+        f"coverage.{rms}.said",
+        np.sqrt(np.mean([f.standard_errors[0] ** 2 for f in fits])),
+    )
     family.show(f"coverage.{rms}.bias", abs(truth - family.true)[0])
 
 

@@ -81,26 +81,39 @@ def respond(model: hj.LDTP, r, d, w, e) -> tuple[np.ndarray, np.ndarray]:
 
 def sizes(model: hj.LDTP) -> np.ndarray:
     """Return the rms of the outputs without noise."""
-    r, zero = np.random.default_rng(1).normal(size=(1, N * STRIDES, 1)), np.zeros((N * STRIDES, 2))
+    r, zero = (
+        np.random.default_rng(1).normal(size=(1, N * STRIDES, 1)),
+        np.zeros((N * STRIDES, 2)),
+    )
     return respond(model, r, zero[None], 0 * r, zero[None])[1].std(axis=(0, 1))
 
 
-def draw(model: hj.LDTP, size: float, sensor: np.ndarray, rng: np.random.Generator) -> hj.Record:
+def draw(
+    model: hj.LDTP, size: float, sensor: np.ndarray, rng: np.random.Generator
+) -> hj.Record:
     n, left = N * (STRIDES + BEFORE), slice(N * BEFORE, None)
     r, w = rng.normal(size=(2, 1, n, 1))
     e = sensor * rng.normal(size=(1, n, 2))
     u, y = respond(model, r, 0 * e, size * w, e)
     z = np.concatenate([u, r], axis=2)[0, left]
-    return hj.Record(z, y[0, left], n_sections=N, inputs=("u", "r"), outputs=model.outputs)
+    return hj.Record(
+        z, y[0, left], n_sections=N, inputs=("u", "r"), outputs=model.outputs
+    )
 
 
-def bound(model: hj.LDTP, size: float, sensor: np.ndarray, records: list[hj.Record]) -> float:
+def bound(
+    model: hj.LDTP, size: float, sensor: np.ndarray, records: list[hj.Record]
+) -> float:
     """Of the first multiplier, from the information of the predictions in some records."""
-    B = np.concatenate([size * np.asarray(model.B), np.zeros((N, model.A.shape[1], 2))], axis=2)
+    B = np.concatenate(
+        [size * np.asarray(model.B), np.zeros((N, model.A.shape[1], 2))], axis=2
+    )
     D = np.tile(np.concatenate([np.zeros((2, 1)), np.diag(sensor)], axis=1), (N, 1, 1))
     noise = hj.LDTP(model.A, B, model.C, D, model.dims, outputs=model.outputs)
     K, S = innovations(PeriodicModel.of(noise, np.ones(2)))
-    coordinates = local_coordinates(PeriodicModel.of(model, np.ones(2))._replace(K=K), False)
+    coordinates = local_coordinates(
+        PeriodicModel.of(model, np.ones(2))._replace(K=K), False
+    )
     plant = [record for r in records for record in in_loop(r, ("r",))[0]]
     parts = [SeriesPart.of(CycleGrid.from_records([r]), np.ones(2)) for r in plant]
     problem = SeriesProblem(parts, S, True, True, 0)
@@ -124,7 +137,9 @@ def parametric(model, size, sensor, rng) -> dict[str, float]:
     dims = np.asarray(model.dims)
     record("series", lambda: hj.fit_series(data, 2, check=False, reference="r"))
     record("ldtp", lambda: hj.fit_ldtp(data, dims, reference="r"))
-    alone = hj.Record(data.u[:, :1], data.y, n_sections=N, inputs="u", outputs=data.outputs)
+    alone = hj.Record(
+        data.u[:, :1], data.y, n_sections=N, inputs="u", outputs=data.outputs
+    )
     record("without", lambda: hj.fit_ldtp(alone, dims, noise="innovations"))
     return results
 
@@ -133,15 +148,22 @@ def discs(model, size, sensor, design, truths, rng) -> dict[str, float]:
     """Return the shares of discs of HTFs that hold the truth."""
     both = design.realizations(6, seed=int(rng.integers(1 << 31)))
     z = both.inputs(both.periods + BEFORE)
-    w, e = rng.normal(size=(*z.shape[:2], 1)), sensor * rng.normal(size=(*z.shape[:2], 2))
+    w, e = (
+        rng.normal(size=(*z.shape[:2], 1)),
+        sensor * rng.normal(size=(*z.shape[:2], 2)),
+    )
     d = sizes(model) * z[..., 1:]
     c = MOTOR * rng.normal(size=w.shape)
     u, y = respond(model, z[..., :1] + c, d, size * w, e)
     inputs = np.concatenate([u, z[..., :1], d], axis=2)
     data = hj.ExperimentData(
-        inputs, y, n_sections=N, periods=both.periods, outputs=model.outputs,
+        inputs,
+        y,
+        n_sections=N,
+        periods=both.periods,
+        outputs=model.outputs,
         inputs=("u", "r", "d0", "d1"),
-    )  # fmt: skip
+    )
     loop = hj.identify.loop(data, at_input="r", at_output=("d0", "d1"))
     return {
         name: float((np.abs(htf.H - truths[name]) <= htf.confidence_radius()).mean())
@@ -155,7 +177,11 @@ def unlike(k: int) -> hj.LDTP:
     Every tenth is unstable. All moduli are above 0.3, and the outputs tell all states.
     """
     rng = np.random.default_rng((5, k))
-    d, nu, n = int(rng.integers(2, 6)), int(rng.integers(1, 3)), int(rng.integers(8, 25))
+    d, nu, n = (
+        int(rng.integers(2, 6)),
+        int(rng.integers(1, 3)),
+        int(rng.integers(8, 25)),
+    )
     size = np.sort(rng.uniform(0.3, 0.9, d))[::-1]
     size[0] = 1.5 if k % 10 == 9 else size[0]
     T = rng.normal(size=(n, d, d)) / 2 + 1.5 * np.eye(d)
@@ -171,7 +197,9 @@ def regulator(model: hj.LDTP, weight: float) -> np.ndarray:
     A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
     P, K = np.eye(A.shape[1]), np.zeros((len(A), B.shape[2], A.shape[1]))
     for n in 40 * list(range(len(A)))[::-1]:
-        K[n] = np.linalg.solve(weight * np.eye(B.shape[2]) + B[n].T @ P @ B[n], B[n].T @ P @ A[n])
+        K[n] = np.linalg.solve(
+            weight * np.eye(B.shape[2]) + B[n].T @ P @ B[n], B[n].T @ P @ A[n]
+        )
         P = np.eye(len(P)) + A[n].T @ P @ (A[n] - B[n] @ K[n])
     return np.stack([k @ np.linalg.pinv(c) for k, c in zip(K, C, strict=True)])
 
@@ -190,7 +218,9 @@ def in_a_loop(
         y[i] = C[k] @ x + sensor * rng.normal(size=y.shape[1])
         u[i] = r[i] - gain[k] @ y[i]
         x = A[k] @ x + B[k] @ (u[i] + noise * w[i])
-    names = tuple(f"u{j}" for j in range(r.shape[1])) + tuple(f"r{j}" for j in range(r.shape[1]))
+    names = tuple(f"u{j}" for j in range(r.shape[1])) + tuple(
+        f"r{j}" for j in range(r.shape[1])
+    )
     return hj.Record(np.concatenate([u, r], axis=1), y, n_sections=len(A), inputs=names)
 
 
@@ -202,16 +232,21 @@ def random_loops(first: int, count: int) -> dict[str, int]:
         gain = regulator(model, 10 ** rng.uniform(-1, 2))
         data = in_a_loop(model, gain, rng, 0.5, 400)
         try:
-            fit = hj.fit_ldtp(data, len(model.multipliers), reference=data.inputs[gain.shape[1] :])
+            fit = hj.fit_ldtp(
+                data, len(model.multipliers), reference=data.inputs[gain.shape[1] :]
+            )
         except hj.DefinitionError:
             counts["reported"] += 1
             continue
         right = fit.contains(model.multipliers, 0.9999).all()
-        name = "reported" if fit.result != hj.Result.OK else "right" if right else "wrong"
+        name = (
+            "reported" if fit.result != hj.Result.OK else "right" if right else "wrong"
+        )
         counts[name] += 1
         counts["covered"] += int(fit.contains(model.multipliers).all())
         print(
-            f"in_loop.random.{k} {name}: {fit.compare(model.multipliers).max_error:.2g}", flush=True
+            f"in_loop.random.{k} {name}: {fit.compare(model.multipliers).max_error:.2g}",
+            flush=True,
         )
     return counts
 
@@ -219,7 +254,10 @@ def random_loops(first: int, count: int) -> dict[str, int]:
 def few_outputs(k: int) -> hj.LDTP:
     """Return the k-th of random plants: 2 to 4 multipliers, some complex, and 1 to 3 outputs."""
     rng = np.random.default_rng((7, k))
-    d, nu, n, ny = 2 + k % 3, *(int(rng.integers(*x)) for x in ((1, 3), (4, 13), (1, 4)))
+    d, nu, n, ny = (
+        2 + k % 3,
+        *(int(rng.integers(*x)) for x in ((1, 3), (4, 13), (1, 4))),
+    )
     root, i = np.zeros((d, d)), 0
     while i < d:
         pair, size = i + 1 < d and rng.random() < 0.5, rng.uniform(0.3, 0.9) ** (1 / n)
@@ -246,7 +284,9 @@ def noisy(model: hj.LDTP, kind: str, rng) -> tuple[hj.Record, tuple[str, ...] | 
     x = data.y / size
     bent = 10 ** rng.uniform(-2, -0.5) * (0.7 * x**2 + 0.3 * x**3) * (kind == "bent")
     drift = np.inf if kind == "bent" else None  # (even powers have a mean)
-    return hj.Record(data.u[:, :nu], data.y + size * bent, n_sections=N, drift=drift), None
+    return hj.Record(
+        data.u[:, :nu], data.y + size * bent, n_sections=N, drift=drift
+    ), None
 
 
 def bent_hopper(count: int, seed: int) -> list[hj.Record]:
@@ -254,18 +294,29 @@ def bent_hopper(count: int, seed: int) -> list[hj.Record]:
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     phase = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
     rng = np.random.default_rng((9, seed))
-    u = rng.normal(size=(count, STRIDES * N, 1)) * 10 ** rng.uniform(-3, -1.5, (count, 1, 1))
+    u = rng.normal(size=(count, STRIDES * N, 1)) * 10 ** rng.uniform(
+        -3, -1.5, (count, 1, 1)
+    )
     data = hj.run_experiments(cycle, phase, u, ("yM", "vM"), start="cycle", discard=0)
-    y = data.y + 0.01 * data.y.std(axis=1, keepdims=True) * rng.normal(size=data.y.shape)
+    y = data.y + 0.01 * data.y.std(axis=1, keepdims=True) * rng.normal(
+        size=data.y.shape
+    )
     return [hj.Record(u[k], y[k], n_sections=N) for k in np.flatnonzero(data.ok)]
 
 
 def too_low(first: int, count: int) -> None:
     """Print how often orders that are too low are noticed, and right ones doubted."""
-    cases = [(kind, few_outputs(k), k) for kind in ("open", "bent", "loop") for k in
-             range(first, first + count)]  # fmt: skip
+    cases = [
+        (kind, few_outputs(k), k)
+        for kind in ("open", "bent", "loop")
+        for k in range(first, first + count)
+    ]
     draws = [
-        (kind, np.asarray(model.multipliers), *noisy(model, kind, np.random.default_rng((10, k))))
+        (
+            kind,
+            np.asarray(model.multipliers),
+            *noisy(model, kind, np.random.default_rng((10, k))),
+        )
         for kind, model, k in cases
     ]
     true = np.asarray(hopper().multipliers)
@@ -279,7 +330,9 @@ def too_low(first: int, count: int) -> None:
                 fit = hj.fit_series(data, order, reference=reference)
                 whole = time.process_time() - began
                 with (
-                    mock.patch.object(series_fit.SeriesFit, "contradiction", lambda *_: ""),
+                    mock.patch.object(
+                        series_fit.SeriesFit, "contradiction", lambda *_: ""
+                    ),
                     mock.patch.object(series_fit, "_about_drift", lambda *_: ""),
                 ):
                     began = time.process_time()
@@ -287,13 +340,24 @@ def too_low(first: int, count: int) -> None:
                     seconds[kind] += [whole, time.process_time() - began]
             except hj.DefinitionError:
                 continue
-            error = np.abs(fit.multipliers[:, None] - true).min(axis=1) / fit.standard_errors
-            name = "right" if order == len(true) else "wrong" if error.max() > 5 else "near"
+            error = (
+                np.abs(fit.multipliers[:, None] - true).min(axis=1)
+                / fit.standard_errors
+            )
+            name = (
+                "right"
+                if order == len(true)
+                else "wrong"
+                if error.max() > 5
+                else "near"
+            )
             counts[kind].update({name: 1, f"{name}.doubted": int(bool(fit.doubt))})
     for kind, values in counts.items():
         for name, value in values.items():
             print(f"in_loop.orders.{kind}.{name} {value}", flush=True)
-        print(f"in_loop.orders.{kind}.seconds {seconds[kind][0] / seconds[kind][1]:.3g}")
+        print(
+            f"in_loop.orders.{kind}.seconds {seconds[kind][0] / seconds[kind][1]:.3g}"
+        )
 
 
 def recording_seconds(rate: int = 100, strides: int = 300) -> dict[str, float]:
@@ -314,7 +378,9 @@ def recording_seconds(rate: int = 100, strides: int = 300) -> dict[str, float]:
     for name, way in 3 * list(ways.items()):
         began = time.process_time()
         with warnings.catch_warnings(action="ignore"):
-            hj.identify_recording(recording, section, outputs=("x", "v"), n_sections=16, **way)
+            hj.identify_recording(
+                recording, section, outputs=("x", "v"), n_sections=16, **way
+            )
         seconds[name].append(time.process_time() - began)
     least = {name: min(values) for name, values in seconds.items()}
     return least | {"ratio": least["with"] / least["without"]}
@@ -345,19 +411,31 @@ def short_gait() -> dict[str, float]:
         "ldtp": hj.fit_ldtp(data, model.dims, reference="r"),
         "ldtp.noisy": hj.fit_ldtp(noisy, model.dims, reference="r"),
     }
-    return {x: float(fit.compare(cycle.multipliers).max_error) for x, fit in fits.items()}
+    return {
+        x: float(fit.compare(cycle.multipliers).max_error) for x, fit in fits.items()
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=400)
-    parser.add_argument("--size", type=float, default=1.0, help="of process noise, relative to r")
     parser.add_argument(
-        "--random", type=int, default=0, help="only the short gait, and so many random loops"
+        "--size", type=float, default=1.0, help="of process noise, relative to r"
     )
-    parser.add_argument("--first", type=int, default=0, help="seed of the first draw or loop")
     parser.add_argument(
-        "--orders", type=int, default=0, help="only orders that are too low, of so many plants"
+        "--random",
+        type=int,
+        default=0,
+        help="only the short gait, and so many random loops",
+    )
+    parser.add_argument(
+        "--first", type=int, default=0, help="seed of the first draw or loop"
+    )
+    parser.add_argument(
+        "--orders",
+        type=int,
+        default=0,
+        help="only orders that are too low, of so many plants",
     )
     options = parser.parse_args()
     hj.enable_x64()
@@ -390,18 +468,25 @@ def main() -> None:
         show(f"{name}.ratio", rms / least)
         show(f"{name}.draws", len(covered))
         show(f"{name}.covered", covered.mean())
-        show(f"{name}.p", stats.binomtest(int(covered.sum()), len(covered), 0.95).pvalue)
+        show(
+            f"{name}.p", stats.binomtest(int(covered.sum()), len(covered), 0.95).pvalue
+        )
         show(f"{name}.seconds", np.median(found[f"{name}.seconds"]))
     design = hj.multisine(
         N, 8, band=(0, N / 2), inputs=3, division="orthogonal", amplitude=1.0, seed=1
     )
     gain = hj.LDTP(
-        np.zeros((N, 1, 1)), np.zeros((N, 1, 2)), np.zeros((N, 1, 1)), np.tile(GAIN, (N, 1, 1))
+        np.zeros((N, 1, 1)),
+        np.zeros((N, 1, 2)),
+        np.zeros((N, 1, 1)),
+        np.tile(GAIN, (N, 1, 1)),
     )
     f = np.unique(design.line) / design.periods
     truths = {"plant": model.htf(f).H, "controller": gain.htf(f).H}
     shares = [
-        discs(model, options.size, sensor, design, truths, np.random.default_rng((2, k)))
+        discs(
+            model, options.size, sensor, design, truths, np.random.default_rng((2, k))
+        )
         for k in range(options.first, options.first + draws)
     ]
     for name in truths:

@@ -76,7 +76,9 @@ def make_job(cycle, sections, u) -> Job:
     charts = tuple(names[a] for a in np.asarray(sections.lanes.chart))
     planes = np.zeros((sections.n_sections, 3))
     if family.label == "kinematic":
-        planes = _planes(states[:, :2], np.asarray(family.center), np.asarray(family.scale))
+        planes = _planes(
+            states[:, :2], np.asarray(family.center), np.asarray(family.scale)
+        )
     return Job(
         model=MODELS[type(system).__name__],
         parameters=parameters,

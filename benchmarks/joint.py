@@ -37,9 +37,14 @@ def with_variances(model: hj.LDTP, snr: float) -> hj.HTF:
     exact = model.htf(design.frequencies)
     each = 4 * sigma[:, None] ** 2 / (N * design.periods * design.amplitude[0] ** 2)
     return hj.HTF(
-        exact.f, exact.H, exact.harmonics, N, model.inputs, model.outputs,
+        exact.f,
+        exact.H,
+        exact.harmonics,
+        N,
+        model.inputs,
+        model.outputs,
         variance=np.broadcast_to(each, exact.H.shape),
-    )  # fmt: skip
+    )
 
 
 def minimal_dims(model: hj.LDTP) -> np.ndarray:
@@ -75,13 +80,18 @@ def family(name: str, model: hj.LDTP, snr: float, draws: int) -> None:
 
     htf, true = with_variances(model, snr), np.asarray(model.multipliers)[:1]
     dims = minimal_dims(model)
-    free = hj.identify.multiplier_bound(model, htf.select(range(-4, 5))).standard_errors[0]
+    free = hj.identify.multiplier_bound(
+        model, htf.select(range(-4, 5))
+    ).standard_errors[0]
     joint = hj.identify.ldtp_bound(model, htf).standard_errors[0]
     show("bound.numerators", free)
     show("bound.ldtp", joint)
     show("strides", (free / joint) ** 2)
     found = hj.monte_carlo(lambda rng: one(htf, dims, true, rng), draws)
-    rms = {k: float(np.sqrt((found[k] ** 2).mean())) for k in ("numerators", "ldtp", "said")}
+    rms = {
+        k: float(np.sqrt((found[k] ** 2).mean()))
+        for k in ("numerators", "ldtp", "said")
+    }
     show("numerators.rms", rms["numerators"])
     show("numerators.ratio", rms["numerators"] / free)
     show("ldtp.rms", rms["ldtp"])

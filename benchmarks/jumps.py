@@ -109,23 +109,31 @@ OTHERS = {
         lambda h, m: np.cos(h) if m >= 0 else -0.3 * h,
         True,
     ),
-    "comparison of two": Kind(lambda h: 1.0 * ((h > 0) & (h < 1)), lambda h, m: float(m == 0)),
+    "comparison of two": Kind(
+        lambda h: 1.0 * ((h > 0) & (h < 1)), lambda h, m: float(m == 0)
+    ),
     "mod": Kind(lambda h: jnp.mod(h, 1.0), lambda h, m: h - m),
     "fmod": Kind(lambda h: jnp.fmod(h, 1.0), lambda h, m: h - m - (m < 0)),
     "integer": Kind(lambda h: h.astype(int) * 1.0, lambda h, m: m + (m < 0)),
     "table": Kind(lambda h: entries[jnp.searchsorted(grid, h)], entry),
     "digitize": Kind(lambda h: entries[jnp.digitize(h, grid)], entry),
     "switch": Kind(
-        lambda h: jax.lax.switch(branch(h), [lambda k=k: entries[k] for k in range(5)]), entry
+        lambda h: jax.lax.switch(branch(h), [lambda k=k: entries[k] for k in range(5)]),
+        entry,
     ),
     "select": Kind(
-        lambda h: jnp.select([h < 0, h < 1], [0.0, 1.0], 0.0), lambda h, m: float(m == 0)
+        lambda h: jnp.select([h < 0, h < 1], [0.0, 1.0], 0.0),
+        lambda h, m: float(m == 0),
     ),
     "argmax": Kind(
-        lambda h: entries[jnp.argmax(pair(h)[::-1])], lambda h, m: TABLE[int(m >= 0)], True
+        lambda h: entries[jnp.argmax(pair(h)[::-1])],
+        lambda h, m: TABLE[int(m >= 0)],
+        True,
     ),
     "argsort": Kind(
-        lambda h: entries[jnp.argsort(pair(h))[0]], lambda h, m: TABLE[int(m >= 0)], True
+        lambda h: entries[jnp.argsort(pair(h))[0]],
+        lambda h, m: TABLE[int(m >= 0)],
+        True,
     ),
     "while": Kind(counted, lambda h, m: np.maximum(m + 1.0, -3.0)),
     "scan": Kind(scanned, lambda h, m: np.clip(m + 2.0, 0, 3)),
@@ -139,15 +147,23 @@ OTHERS = {
     "complex logarithm": Kind(lambda h: jnp.log(-1 + 1j * h).imag, turned, True),
     "relu": Kind(jax.nn.relu, lambda h, m: h * (m >= 0), True),
     "abs": Kind(jnp.abs, lambda h, m: h * (1 if m >= 0 else -1), True),
-    "clip": Kind(lambda h: jnp.clip(h, 0.0, 1.0), lambda h, m: h if m == 0 else float(m > 0)),
+    "clip": Kind(
+        lambda h: jnp.clip(h, 0.0, 1.0), lambda h, m: h if m == 0 else float(m > 0)
+    ),
     "triangle": Kind(
-        lambda h: jnp.abs(jnp.mod(h, 2.0) - 1.0), lambda h, m: h - m if m % 2 else 1 - h + m
+        lambda h: jnp.abs(jnp.mod(h, 2.0) - 1.0),
+        lambda h, m: h - m if m % 2 else 1 - h + m,
     ),
     "smooth": Kind(jnp.tanh, lambda h, m: np.tanh(h), True),
-    "rather steep": Kind(lambda h: jnp.tanh(50 * h), lambda h, m: np.tanh(50 * h), True),
+    "rather steep": Kind(
+        lambda h: jnp.tanh(50 * h), lambda h, m: np.tanh(50 * h), True
+    ),
 }
 KINDS = {
-    **{name: Kind(f, lambda h, m: 2.0 * (m >= 0) - 1.0, True) for name, f in SIGN.items()},
+    **{
+        name: Kind(f, lambda h, m: 2.0 * (m >= 0) - 1.0, True)
+        for name, f in SIGN.items()
+    },
     **{name: Kind(f, lambda h, m: float(m >= 0), True) for name, f in SIDE.items()},
     **{name: Kind(f, lambda h, m: m) for name, f in FLOOR.items()},
     **OTHERS,
@@ -214,7 +230,9 @@ def argument(form, x, t, q, whole, lib):
 
 def field_of(form, x, t, q, u, value, lib):
     a, b, c, d = x.shape
-    force = d * lib.cos(2 * lib.pi * t / CLOCK) if form.base.startswith("driven") else 0.0
+    force = (
+        d * lib.cos(2 * lib.pi * t / CLOCK) if form.base.startswith("driven") else 0.0
+    )
     push = (value if form.place == "field" else 0.0) + u * (
         1 + (value if form.place == "gain" else 0.0)
     )
@@ -222,7 +240,9 @@ def field_of(form, x, t, q, u, value, lib):
         rate = -(3 + a) * q[0] - (0.7 + 0.3 * b) * q[1] - 0.3 * c * q[0] ** 3
         return q[1], rate + force + push
     if form.base == "free":
-        return q[1], (1 + 0.3 * b) * (1 - q[0] ** 2) * q[1] - (1 + 0.3 * a) * q[0] + push
+        return q[1], (1 + 0.3 * b) * (1 - q[0] ** 2) * q[1] - (1 + 0.3 * a) * q[
+            0
+        ] + push
     rate = 1.6 + 0.2 * a - q[0] - 0.3 * q[1] + 0.3 * force + push
     return rate, -(0.5 + 0.2 * b) * q[1] + 0.1 * c * q[0]
 
@@ -241,7 +261,9 @@ class On(hj.Chart):
     x: Numbers
 
     def field(self, t, q, u):
-        return field_of(self.form, self.x, t, q, u[0], term(self, t, q, "field gain"), jnp)
+        return field_of(
+            self.form, self.x, t, q, u[0], term(self, t, q, "field gain"), jnp
+        )
 
 
 class Jumping(hj.HybridSystem):
@@ -259,7 +281,9 @@ class Jumping(hj.HybridSystem):
         guard = lambda t, q, u: guard_of(f, q, term(self, t, q, "guard"))  # noqa: E731
         reset = lambda t, q, u: reset_of(f, q, term(self, t, q, "reset"))  # noqa: E731
         enabled = (
-            (lambda t, q, u: term(self, t, q, "enabled") <= 0) if f.place == "enabled" else None
+            (lambda t, q, u: term(self, t, q, "enabled") <= 0)
+            if f.place == "enabled"
+            else None
         )
         events = [hj.Transition("fire", "on", "on", guard, "falling", reset, enabled)]
         return events if "fires" in f.base else []
@@ -297,7 +321,10 @@ class Truth:
 
     def __init__(self, form: Form, x: Numbers):
         self.form, self.x, self.kind = form, x, KINDS[form.kind]
-        self.fires, self.narrow = "fires" in form.base, form.argument in ("pulse", "bump", "box")
+        self.fires, self.narrow = (
+            "fires" in form.base,
+            form.argument in ("pulse", "bump", "box"),
+        )
         self.longest = 0.04
 
     def number(self, t, q, held):
@@ -306,7 +333,9 @@ class Truth:
     def middle(self, t, q, held):
         """The distance from the middle of a narrow term, in its widths."""
         h = self.number(t, q, held)
-        return (1 - h) * (2 * (held.turns % 2) - 1) if self.form.argument == "box" else h
+        return (
+            (1 - h) * (2 * (held.turns % 2) - 1) if self.form.argument == "box" else h
+        )
 
     def value(self, t, q, held):
         """The term; far from its middle, as it would be if that were not near."""
@@ -325,10 +354,14 @@ class Truth:
         return held._replace(floor=floor, zone=zone)
 
     def field(self, t, q, u, held):
-        return np.array(field_of(self.form, self.x, t, q, u, self.value(t, q, held), np))
+        return np.array(
+            field_of(self.form, self.x, t, q, u, self.value(t, q, held), np)
+        )
 
     def output(self, t, held, q):
-        return q[0] * (1 + (self.value(t, q, held) if self.form.place == "output" else 0.0))
+        return q[0] * (
+            1 + (self.value(t, q, held) if self.form.place == "output" else 0.0)
+        )
 
     def edges(self, held):
         """Functions that fall through zero where a decision ends; the last is the guard."""
@@ -343,7 +376,12 @@ class Truth:
                 if np.isfinite(x)
             ]
         if self.narrow:
-            levels = {-2: (None, -NARROW), -1: (-NARROW, 0), 0: (0, NARROW), 1: (NARROW, None)}
+            levels = {
+                -2: (None, -NARROW),
+                -1: (-NARROW, 0),
+                0: (0, NARROW),
+                1: (NARROW, None),
+            }
             ends += [
                 lambda t, q, side=side, x=x: side * (self.middle(t, q, held) - x)
                 for side, x in zip((1, -1), levels[held.zone], strict=True)
@@ -351,7 +389,9 @@ class Truth:
             ]
         if self.fires:
             sign = 1 if held.armed else -1
-            ends.append(lambda t, q: sign * guard_of(self.form, q, self.value(t, q, held)))
+            ends.append(
+                lambda t, q: sign * guard_of(self.form, q, self.value(t, q, held))
+            )
         for end in ends:
             end.terminal, end.direction = True, -1.0
         return ends
@@ -364,7 +404,11 @@ class Truth:
         for _ in range(400):
             if end - t < 1e-13:
                 return q
-            rate = abs(self.field(t, q, u, held)[0]) if self.form.argument == "bump" else 1.0
+            rate = (
+                abs(self.field(t, q, u, held)[0])
+                if self.form.argument == "bump"
+                else 1.0
+            )
             within = self.narrow and held.zone in (-1, 0)
             longest = 0.5 * self.x.width / (rate + 1e-3) if within else self.longest
             options: Any = dict(method="DOP853", rtol=1e-11, atol=1e-13)
@@ -394,8 +438,13 @@ class Truth:
 
     def jacobian(self, t, q, end, by_input=False):
         if by_input:
-            return (self.flow(t, q, end, STEP) - self.flow(t, q, end, -STEP)) / (2 * STEP)
-        ends = [[self.flow(t, q + sign * d, end) for sign in (1, -1)] for d in STEP * np.eye(2)]
+            return (self.flow(t, q, end, STEP) - self.flow(t, q, end, -STEP)) / (
+                2 * STEP
+            )
+        ends = [
+            [self.flow(t, q + sign * d, end) for sign in (1, -1)]
+            for d in STEP * np.eye(2)
+        ]
         return np.stack([(a - b) / (2 * STEP) for a, b in ends], axis=1)
 
 
@@ -403,7 +452,11 @@ def draw(seed: int, k: int, per_form: int) -> tuple[Form, Numbers]:
     rng = np.random.default_rng([seed, k // per_form])
     base = str(rng.choice(list(PLACES)))
     name = str(rng.choice(ARGUMENTS, p=np.array([4, 2, 2, 2, 2, 2, 3, 2, 2]) / 21))
-    kinds = {"ramp": ["mod", "triangle", "floor", "round"], "pulse": ["smooth"], "bump": ["smooth"]}
+    kinds = {
+        "ramp": ["mod", "triangle", "floor", "round"],
+        "pulse": ["smooth"],
+        "bump": ["smooth"],
+    }
     form = Form(
         base,
         str(rng.choice(PLACES[base].split())),
@@ -416,7 +469,11 @@ def draw(seed: int, k: int, per_form: int) -> tuple[Form, Numbers]:
         float(rng.choice([-1, 1]) * 10 ** rng.uniform(-0.3, 0.7)),
         float(rng.uniform(-0.7, 0.9)),
         float(10 ** rng.uniform(-4, -1)),
-        float(1.0 if rng.random() < 0.7 else rng.choice([2.0, 3.0, 1.5, 0.5, np.sqrt(2), 0.7])),
+        float(
+            1.0
+            if rng.random() < 0.7
+            else rng.choice([2.0, 3.0, 1.5, 0.5, np.sqrt(2), 0.7])
+        ),
         rng.uniform(-1, 1, 4) + np.array([0, 0, 1, 1.5]),
     )
     return form, numbers
@@ -424,7 +481,11 @@ def draw(seed: int, k: int, per_form: int) -> tuple[Form, Numbers]:
 
 def far(a, b) -> float:
     a, b = np.asarray(a), np.asarray(b)
-    return float(np.max(np.abs(a - b) / (1 + np.abs(b)))) if np.all(np.isfinite(a)) else np.inf
+    return (
+        float(np.max(np.abs(a - b) / (1 + np.abs(b))))
+        if np.all(np.isfinite(a))
+        else np.inf
+    )
 
 
 def verdicts(form: Form, x: Numbers) -> dict[str, Any]:
@@ -453,7 +514,10 @@ def verdicts(form: Form, x: Numbers) -> dict[str, Any]:
             return {name: f"excluded: {reason}"}
 
     def of_cycle(cycle):
-        if form.argument in ("clock", "phase", "ramp", "pulse", "box") and not has_clock:
+        if (
+            form.argument in ("clock", "phase", "ramp", "pulse", "box")
+            and not has_clock
+        ):
             return np.inf  # it needs a clock
         t, q, period = (
             float(cycle.anchor.t[0]),
@@ -470,13 +534,18 @@ def verdicts(form: Form, x: Numbers) -> dict[str, Any]:
             values = np.delete(values, np.argmin(np.abs(values - 1)))
         mine = np.asarray(cycle.multipliers)
         mine = np.concatenate([mine, np.zeros(len(values) - len(mine))])
-        return max(min(far(mine, values), far(mine, values[::-1])), far(states[1:], [q] * 3))
+        return max(
+            min(far(mine, values), far(mine, values[::-1])), far(states[1:], [q] * 3)
+        )
 
     def of_model(model):
         lanes, errors = hj.place_sections(said["cycle"], hj.ClockPhase(3)).lanes, []
         t, period = np.asarray(lanes.t), float(said["cycle"].period)
         for n, q in enumerate(np.asarray(lanes.q).T):
-            held, end = truth.decide(t[n], q, True), t[n + 1] if n < 2 else t[0] + period
+            held, end = (
+                truth.decide(t[n], q, True),
+                t[n + 1] if n < 2 else t[0] + period,
+            )
             at = ft.partial(truth.output, t[n], held)
             C = [(at(q + d) - at(q - d)) / 2e-6 for d in 1e-6 * np.eye(2)]
             errors.append(far(np.asarray(model.C[n])[1], C))
@@ -491,7 +560,10 @@ def verdicts(form: Form, x: Numbers) -> dict[str, Any]:
     find = lambda: hj.find_limit_cycle(system, begin, settle=10.0, **options)  # noqa: E731
     result = check("cycle", find, of_cycle)
     if "cycle" in said:
-        model = lambda: hj.linearize(said["cycle"], hj.ClockPhase(3), outputs=("x", "z"))  # noqa: E731
+
+        def model():
+            return hj.linearize(said["cycle"], hj.ClockPhase(3), outputs=("x", "z"))
+
         result |= check("model", model, of_model)
     start = tuple(1.1 * np.asarray(begin.state))
     run = lambda: hj.simulate(system, "on", start, 2.2 * CLOCK, time=0.05, input=0.1)  # noqa: E731
@@ -509,14 +581,29 @@ def main() -> int:
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
     hj.enable_x64()
-    counts: dict[str, collections.Counter] = collections.defaultdict(collections.Counter)
+    counts: dict[str, collections.Counter] = collections.defaultdict(
+        collections.Counter
+    )
     for k in range(options.first, options.first + options.draws):
         form, numbers = draw(options.seed, k, options.per_form)
         for name, x in verdicts(form, numbers).items():
-            word = x.partition(":")[0] if isinstance(x, str) else "right" if x <= WRONG else "WRONG"
+            word = (
+                x.partition(":")[0]
+                if isinstance(x, str)
+                else "right"
+                if x <= WRONG
+                else "WRONG"
+            )
             counts[name][word] += 1
             if options.verbose or word == "WRONG":
-                print(k, *form, name, str(x)[:150].replace("\n", " "), sep=" | ", flush=True)
+                print(
+                    k,
+                    *form,
+                    name,
+                    str(x)[:150].replace("\n", " "),
+                    sep=" | ",
+                    flush=True,
+                )
     for name, x in counts.items():
         print(f"{name}: " + ", ".join(f"{n} {word}" for word, n in sorted(x.items())))
     silent = sum(x["WRONG"] for x in counts.values())

@@ -25,7 +25,9 @@ def moves(name: str) -> None:
     parameter, low, high = MOVES[name]
     explorer = hj.explore(getattr(hj.models, name)(), parameter)
     rows = []
-    for number, value in enumerate([*np.linspace(low, high, 51), *np.linspace(high, low, 51)]):
+    for number, value in enumerate(
+        [*np.linspace(low, high, 51), *np.linspace(high, low, 51)]
+    ):
         marks = [time.process_time()]
         for gain in (False, True):
             explorer._answer({parameter: value}, gain, number)
@@ -33,7 +35,9 @@ def moves(name: str) -> None:
         rows.append(np.diff(marks))
     move, gain = np.median(rows[51:], axis=0)
     last = np.quantile(np.array(rows[51:])[:, 0], 0.9)
-    print(f"{name}.move {move:.3f} s (nine of ten below {last:.3f} s), gain {gain:.3f} s")
+    print(
+        f"{name}.move {move:.3f} s (nine of ten below {last:.3f} s), gain {gain:.3f} s"
+    )
 
 
 def first(name: str) -> None:
@@ -46,7 +50,9 @@ def first(name: str) -> None:
         with tempfile.TemporaryDirectory() as folder:
             slow = hj.plot.animate(cycle, speed=0.2)
             size = slow.save(Path(folder, "hopper.gif")).stat().st_size
-        print(f"{name}.gif {size / 1000:.0f} kB, {slow.interval * len(slow.times):.1f} s")
+        print(
+            f"{name}.gif {size / 1000:.0f} kB, {slow.interval * len(slow.times):.1f} s"
+        )
 
 
 if __name__ == "__main__":

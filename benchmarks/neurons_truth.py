@@ -16,7 +16,10 @@ import numpy as np
 
 def izhikevich(v, w):
     current = 10.0 + 4.0 * hy.cos(2 * math.pi / 40.0 * hy.time)
-    fields = [(v, 0.04 * v**2 + 5.0 * v + 140.0 - w + current), (w, 0.02 * (0.2 * v - w))]
+    fields = [
+        (v, 0.04 * v**2 + 5.0 * v + 140.0 - w + current),
+        (w, 0.02 * (0.2 * v - w)),
+    ]
     return fields, 30.0, -65.0, 8.0, 40.0, (-65.0, -5.0)
 
 
@@ -39,7 +42,10 @@ class Neuron:
             after = np.array([rest, before[1] + step])
             speeds = [rate(x, time=t)[0] for x in (before[:2], after)]
             self.spikes.append(t)
-            integrator.state[:] = *after, before[2] + math.log(abs(speeds[1] / speeds[0]))
+            integrator.state[:] = (
+                *after,
+                before[2] + math.log(abs(speeds[1] / speeds[0])),
+            )
             self.sign = math.copysign(1.0, speeds[1] / speeds[0])
             return True
 

@@ -34,19 +34,27 @@ def case_of(name: str) -> Case:
 
 
 def results(case: Case) -> dict[str, np.ndarray]:
-    options = {x: getattr(case, x) for x in ("section", "multiplicity", "conserved", "max_period")}
+    options = {
+        x: getattr(case, x)
+        for x in ("section", "multiplicity", "conserved", "max_period")
+    }
     cycle = hj.find_limit_cycle(case.system, case.guess, **options)
     placed = hj.place_sections(cycle, case.sections)
     model = hj.linearize(cycle, placed, case.output)
     design = hj.multisine(
-        placed.n_sections, 4, amplitude=case.amplitude or 1e-5, inputs=case.system.inputs
+        placed.n_sections,
+        4,
+        amplitude=case.amplitude or 1e-5,
+        inputs=case.system.inputs,
     )
     u = design.inputs(cycles=4)[:2]
     data = hj.run_experiments(cycle, placed, u, case.output, start="cycle", discard=0)
     q, y = np.asarray(placed.lanes.q), np.nan_to_num(data.y)
     return {
         "cycle": q / (np.abs(q).max(axis=1, keepdims=True) + 1e-300),
-        "linearization": np.concatenate([np.ravel(x) for x in (*model.A, *model.B, *model.C)]),
+        "linearization": np.concatenate(
+            [np.ravel(x) for x in (*model.A, *model.B, *model.C)]
+        ),
         "experiments": y / (np.abs(y).max() + np.abs(data.cycle_outputs).max()),
         "stated": np.asarray(data.error),
     }
@@ -63,19 +71,27 @@ def one_run(names: list[str], path: str) -> None:
 
 def compare(runs: int) -> None:
     orders = [NAMES, NAMES[::-1]]
-    orders += [list(np.random.default_rng(k).permutation(NAMES)) for k in range(runs - 2)]
+    orders += [
+        list(np.random.default_rng(k).permutation(NAMES)) for k in range(runs - 2)
+    ]
     with tempfile.TemporaryDirectory() as folder:
         paths = [os.path.join(folder, f"{k}.npz") for k in range(len(orders))]
         for order, path in zip(orders, paths, strict=True):
-            subprocess.run([sys.executable, __file__, "--order", path, *order], check=True)
+            subprocess.run(
+                [sys.executable, __file__, "--order", path, *order], check=True
+            )
         parts = [dict(np.load(path)) for path in paths]
-    print("\n| system | cycle | linearization | experiments | stated |\n|---|---|---|---|---|")
+    print(
+        "\n| system | cycle | linearization | experiments | stated |\n|---|---|---|---|---|"
+    )
     for name in NAMES:
         row = []
         for what in ("cycle", "linearization", "experiments"):
             each = [x[f"{name}|{what}"] for x in parts]
             size = np.abs(each[0]).max() if what == "linearization" else 1.0
-            differences = [np.abs(a - b).max() / size for a, b in itertools.combinations(each, 2)]
+            differences = [
+                np.abs(a - b).max() / size for a, b in itertools.combinations(each, 2)
+            ]
             row.append(max(differences))
         stated = max(x[f"{name}|stated"].max() for x in parts)
         print(f"| {name} | {' | '.join(f'{x:.1e}' for x in (*row, stated))} |")

@@ -72,11 +72,16 @@ def overhead(cycles=84, experiments=80):
                 min(cpu(*work) for _ in range(5))
                 for work in ((loop, Hopper(dt=1 / 32), plain, few), (experiments,))
             )
-            print(f"  {total / alone:.3f} times a loop of its steps from section to section")
+            print(
+                f"  {total / alone:.3f} times a loop of its steps from section to section"
+            )
     cycle = hj.plants.settle(Hopper(dt=1 / 32), FAMILIES[0], OUTPUTS)
     walls: dict[int, list[float]] = {1: [], 2: []}
     for processes in (1, 2) * 3:
-        began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+        began, before = (
+            time.perf_counter(),
+            resource.getrusage(resource.RUSAGE_CHILDREN),
+        )
         data = cycle.run_experiments(u, discard=20, processes=processes)
         walls[processes].append(time.perf_counter() - began)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -107,18 +112,30 @@ def accuracy():
         # Experiments with few lines are no test of discs: products of few cosines are not Gaussian,
         # hit few lines, and are smaller than the bias of third order.
         for seed in range(4):
-            design = hj.multisine(32, periods=32, band=(0, 4), amplitude=0.002, seed=seed)
+            design = hj.multisine(
+                32, periods=32, band=(0, 4), amplitude=0.002, seed=seed
+            )
             data = cycle.run_experiments(design.realizations(4, seed), discard=48)
             estimate = hj.estimate_htf(data)
             exact = model.htf(estimate.f, harmonics=estimate.harmonics)
-            inside += [np.mean(np.abs(estimate.H - exact.H) <= estimate.confidence_radius(0.95))]
-            print(f"  {data.summary()}; {100 * inside[-1]:.1f} % of HTFs within their discs")
+            inside += [
+                np.mean(
+                    np.abs(estimate.H - exact.H) <= estimate.confidence_radius(0.95)
+                )
+            ]
+            print(
+                f"  {data.summary()}; {100 * inside[-1]:.1f} % of HTFs within their discs"
+            )
         error = np.std(inside, ddof=1) / 2
-        print(f"  mean {100 * np.mean(inside):.1f} % (standard error {100 * error:.1f} %)")
+        print(
+            f"  mean {100 * np.mean(inside):.1f} % (standard error {100 * error:.1f} %)"
+        )
         design = hj.multisine(32, periods=16, band=(0, 8), amplitude=0.002)
         estimate = hj.estimate_htf(cycle.run_experiments(design, discard=40))
         fit = hj.fit_multipliers(estimate, order=2)
-        print(f"  {fit}\n  true ones within the region: {fit.contains(hopper.multipliers)}")
+        print(
+            f"  {fit}\n  true ones within the region: {fit.contains(hopper.multipliers)}"
+        )
 
 
 def drive(model, data):
@@ -130,16 +147,24 @@ def mujoco():
     file = pathlib.Path(__file__).parents[1] / "tests" / "plants" / "hopper.xml"
     for solref in ("0.02 1", "0.1 1"):
         model = mj.MjModel.from_xml_string(file.read_text().replace("0.02 1", solref))
-        plant = hj.plants.MuJoCoPlant(model, {"push": "N"}, control=drive, period=1.0, substeps=20)
-        cycle = hj.plants.settle(plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"))
+        plant = hj.plants.MuJoCoPlant(
+            model, {"push": "N"}, control=drive, period=1.0, substeps=20
+        )
+        cycle = hj.plants.settle(
+            plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate")
+        )
         returns = cycle.perturbed_returns()
         print(f"solref {solref}: {returns}")
         design = hj.multisine(n_sections=10, periods=16, amplitude=0.02)
         estimate = hj.estimate_htf(cycle.run_experiments(design))
         fit = hj.fit_multipliers(estimate, order=2)
         print(f"  {fit}")
-        print(f"  returns within the region of HTFs: {fit.contains(returns.multipliers)}")
-        print(f"  HTFs within the region of returns: {returns.contains(fit.multipliers)}")
+        print(
+            f"  returns within the region of HTFs: {fit.contains(returns.multipliers)}"
+        )
+        print(
+            f"  HTFs within the region of returns: {returns.contains(fit.multipliers)}"
+        )
 
 
 def walker():
@@ -156,37 +181,62 @@ def walker():
         print(f"{cycle}\n  {returns}")
         N = cycle.sections.n_sections
         for amplitude in (0.1, 1.0):
-            design = hj.multisine(n_sections=N, periods=16, amplitude=amplitude, lines="odd")
+            design = hj.multisine(
+                n_sections=N, periods=16, amplitude=amplitude, lines="odd"
+            )
             data = cycle.run_experiments(design, discard=24)
             fit = hj.fit_multipliers(hj.estimate_htf(data), order=2)
             print(f"  {amplitude} N: {data.summary()}; {fit}")
-            print(f"  returns within its region: {fit.contains(returns.multipliers[:2])}")
-            print(f"  experiments within that of returns: {returns.contains(fit.multipliers)}")
+            print(
+                f"  returns within its region: {fit.contains(returns.multipliers[:2])}"
+            )
+            print(
+                f"  experiments within that of returns: {returns.contains(fit.multipliers)}"
+            )
 
 
 def stairs():
     """Fixed time steps: returns and experiments by time step, integrator and amplitude."""
-    text = (pathlib.Path(__file__).parents[1] / "tests" / "plants" / "hopper.xml").read_text()
-    for step, integrator in ((2e-3, "Euler"), (5e-4, "Euler"), (5e-4, "implicit"), (1e-4, "Euler")):
+    text = (
+        pathlib.Path(__file__).parents[1] / "tests" / "plants" / "hopper.xml"
+    ).read_text()
+    for step, integrator in (
+        (2e-3, "Euler"),
+        (5e-4, "Euler"),
+        (5e-4, "implicit"),
+        (1e-4, "Euler"),
+    ):
         change = f'timestep="{step}" integrator="{integrator}"'
         model = mj.MjModel.from_xml_string(text.replace('timestep="0.0005"', change))
         plant = hj.plants.MuJoCoPlant(
             model, {"push": "N"}, control=drive, period=1.0, substeps=round(0.01 / step)
         )
-        cycle = hj.plants.settle(plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"), cycles=40)
+        cycle = hj.plants.settle(
+            plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"), cycles=40
+        )
         returns = cycle.perturbed_returns()
-        print(f"{step} {integrator}: returns {returns.multipliers[0]:.6f}, noise {returns.noise}")
+        print(
+            f"{step} {integrator}: returns {returns.multipliers[0]:.6f}, noise {returns.noise}"
+        )
         for amplitude in (1e-4, 2e-2):
             design = hj.multisine(n_sections=10, periods=8, amplitude=amplitude)
-            fit = hj.fit_multipliers(hj.estimate_htf(cycle.run_experiments(design)), order=2)
+            fit = hj.fit_multipliers(
+                hj.estimate_htf(cycle.run_experiments(design)), order=2
+            )
             inside = fit.contains(returns.multipliers[:2])[0]
-            print(f"  {amplitude} N: {fit.multipliers[0]:.6f}, returns within the region: {inside}")
+            print(
+                f"  {amplitude} N: {fit.multipliers[0]:.6f}, returns within the region: {inside}"
+            )
 
 
 if __name__ == "__main__":
     hj.enable_x64()
     subjects = dict(
-        overhead=overhead, accuracy=accuracy, mujoco=mujoco, walker=walker, stairs=stairs
+        overhead=overhead,
+        accuracy=accuracy,
+        mujoco=mujoco,
+        walker=walker,
+        stairs=stairs,
     )
     for name in sys.argv[1:] or subjects:
         subjects[name]()

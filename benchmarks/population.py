@@ -40,36 +40,50 @@ def make_pool(path: pathlib.Path, subjects: int, chunk: int = 100) -> None:
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     sections = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
     response = hj.response_function(cycle, sections, OUTPUTS)
-    run = eqx.filter_jit(eqx.filter_vmap(lambda hopper, u: response(u[None], system=hopper).y))
+    run = eqx.filter_jit(
+        eqx.filter_vmap(lambda hopper, u: response(u[None], system=hopper).y)
+    )
     rows = []
     for first in range(0, subjects, chunk):
         k, b = (value * (1 + 0.04 * rng.normal(size=chunk)) for value in (10.0, 5.0))
         hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
         true = np.asarray(hj.find_limit_cycles(hoppers, guess=cycle).multipliers)[:, 0]
         u = 0.03 * rng.normal(size=(chunk, LONGEST * N, 1))
-        y = np.asarray(jax.block_until_ready(run(hoppers, u) - run(hoppers, 0 * u)))[:, 0]
+        y = np.asarray(jax.block_until_ready(run(hoppers, u) - run(hoppers, 0 * u)))[
+            :, 0
+        ]
         y = y + rng.normal(size=y.shape) * NOISE
         for s in range(chunk):
             strides = int(rng.integers(60, LONGEST + 1))
             fit = fitted(u[s], y[s], strides)
             short = fitted(u[s], y[s], SHORT) if s % 3 == 0 else None
-            rows.append({
-                "true": true[s], "strides": strides, "fit": fit.multipliers[0],
-                "covariance": fit.multiplier_covariances[0], "freedom": fit.covariance_freedom,
-                "short": short.multipliers[0] if short else np.nan,
-                "short_covariance": short.multiplier_covariances[0] if short else np.eye(2),
-                "short_freedom": short.covariance_freedom if short else np.nan,
-                "map": fit.impulse_response(LAGS)[:, :, 0, 0],
-            })  # fmt: skip
+            rows.append(
+                {
+                    "true": true[s],
+                    "strides": strides,
+                    "fit": fit.multipliers[0],
+                    "covariance": fit.multiplier_covariances[0],
+                    "freedom": fit.covariance_freedom,
+                    "short": short.multipliers[0] if short else np.nan,
+                    "short_covariance": short.multiplier_covariances[0]
+                    if short
+                    else np.eye(2),
+                    "short_freedom": short.covariance_freedom if short else np.nan,
+                    "map": fit.impulse_response(LAGS)[:, :, 0, 0],
+                }
+            )
         print(f"{first + chunk} of {subjects} subjects", flush=True)
     np.savez(path, **{name: np.array([row[name] for row in rows]) for name in rows[0]})
 
 
 def fitted(u, y, strides):
     record = hj.Record(
-        u[: strides * N], y[: strides * N], n_sections=N, inputs={"u": "N"},
+        u[: strides * N],
+        y[: strides * N],
+        n_sections=N,
+        inputs={"u": "N"},
         outputs={"yM": "m", "vM": "m/s"},
-    )  # fmt: skip
+    )
     return hj.fit_series(record, 2, overhang=0, start="cycle", check=False)
 
 
@@ -106,11 +120,14 @@ def means(pool, populations: int = 400) -> None:
         held, spread, plain = [], [], []
         for _ in range(populations):
             i = rng.choice(len(y), n, replace=False)
-            row = population(y[i], error[i], freedom[i], pool["strides"][i]).mean("modulus")
+            row = population(y[i], error[i], freedom[i], pool["strides"][i]).mean(
+                "modulus"
+            )
             held.append(row["low"][0] <= true.mean() <= row["high"][0])
             spread.append(row["spread_low"][0] <= true.std() <= row["spread_high"][0])
             plain.append(
-                abs(y[i].mean() - true.mean()) < stats.t.isf(0.025, n - 1) * stats.sem(y[i])
+                abs(y[i].mean() - true.mean())
+                < stats.t.isf(0.025, n - 1) * stats.sem(y[i])
             )
         show_held(f"mean.{n}", held)
         show_held(f"mean_of_single_estimates.{n}", plain)
@@ -119,7 +136,9 @@ def means(pool, populations: int = 400) -> None:
 
 def population(y, error, freedom, strides):
     table = {"subject": np.arange(len(y)), "strides": strides}
-    return hj.recordings.Population(table, {"modulus": y}, {"modulus": error}, freedom=freedom)
+    return hj.recordings.Population(
+        table, {"modulus": y}, {"modulus": error}, freedom=freedom
+    )
 
 
 def differences(pool, populations: int = 1000, n: int = 12) -> None:
@@ -136,25 +155,36 @@ def differences(pool, populations: int = 1000, n: int = 12) -> None:
     for lengths in ("60_to_300", "40_and_200"):
         for design in ("groups", "paired"):
             factor = "group" if design == "groups" else "condition"
-            subject = np.arange(2 * n) if design == "groups" else np.tile(np.arange(n), 2)
+            subject = (
+                np.arange(2 * n) if design == "groups" else np.tile(np.arange(n), 2)
+            )
             for shift in (0.0, 1.0, 1.5):
                 rng, rejected = np.random.default_rng(7), []
                 for _ in range(populations):
                     i = rng.choice(len(y), 2 * n, replace=False)
                     data = [y[i], error[i], pool["freedom"][i], pool["strides"][i]]
                     if lengths == "40_and_200":
-                        i, j = (rng.choice(x, 2 * n, replace=False) for x in (has, long))
+                        i, j = (
+                            rng.choice(x, 2 * n, replace=False) for x in (has, long)
+                        )
                         few = short[i], short_error[i], pool["short_freedom"][i], SHORT
                         many = y[j], error[j], pool["freedom"][j], pool["strides"][j]
-                        data = [np.where(is_short, *x) for x in zip(few, many, strict=True)]
+                        data = [
+                            np.where(is_short, *x) for x in zip(few, many, strict=True)
+                        ]
                     values = data[0] + shift * spread * (labels == "a")
                     table = {"subject": subject, factor: labels, "strides": data[3]}
                     study = hj.recordings.Population(
-                        table, {"modulus": values}, {"modulus": data[1]}, freedom=data[2]
+                        table,
+                        {"modulus": values},
+                        {"modulus": data[1]},
+                        freedom=data[2],
                     )
                     p = study.difference("modulus", "a", "b")["p"][0]
                     two = values[:n], values[n:]
-                    plain = (stats.ttest_ind if design == "groups" else stats.ttest_rel)(*two)
+                    plain = (
+                        stats.ttest_ind if design == "groups" else stats.ttest_rel
+                    )(*two)
                     rejected.append((p < 0.05, plain.pvalue < 0.05))
                 name = f"difference.{lengths}.{design}.{shift:g}_spreads"
                 ours, plain = 100 * np.mean(rejected, axis=0)
@@ -167,24 +197,38 @@ def predictions(pool, populations: int = 400) -> None:
     of 12 subjects with 40 strides each."""
     y, error = moduli(pool)
     short, short_error = moduli(pool, "short")
-    true, has = np.abs(pool["true"]), np.flatnonzero(np.isfinite(short) & np.isfinite(short_error))
+    true, has = (
+        np.abs(pool["true"]),
+        np.flatnonzero(np.isfinite(short) & np.isfinite(short_error)),
+    )
     show("prediction.spread", true.std())
-    show("prediction.rms_standard_error_of_40_strides", np.sqrt(np.mean(short_error[has] ** 2)))
+    show(
+        "prediction.rms_standard_error_of_40_strides",
+        np.sqrt(np.mean(short_error[has] ** 2)),
+    )
     show("prediction.median_standard_error_of_40_strides", np.median(short_error[has]))
     for name, count in (("one_of_12", 1), ("all_12", 12)):
         rng, errors, held = np.random.default_rng(3), [], []
         for _ in range(populations):
             few = rng.choice(has, count, replace=False)
-            others = rng.choice(np.setdiff1d(np.arange(len(y)), few), 12 - count, replace=False)
+            others = rng.choice(
+                np.setdiff1d(np.arange(len(y)), few), 12 - count, replace=False
+            )
             study = population(
-                np.r_[short[few], y[others]], np.r_[short_error[few], error[others]],
+                np.r_[short[few], y[others]],
+                np.r_[short_error[few], error[others]],
                 np.r_[pool["short_freedom"][few], pool["freedom"][others]],
                 np.r_[np.full(count, SHORT), pool["strides"][others]],
-            )  # fmt: skip
+            )
             table = study.predictions("modulus")
             value = table["prediction"][:count]
             errors += [*zip(value - true[few], short[few] - true[few], strict=True)]
-            held += [*((table["low"][:count] <= true[few]) & (true[few] <= table["high"][:count]))]
+            held += [
+                *(
+                    (table["low"][:count] <= true[few])
+                    & (true[few] <= table["high"][:count])
+                )
+            ]
         predicted, single = np.sqrt(np.mean(np.square(errors), axis=0))
         show(f"prediction.{name}.rms_error", predicted)
         show(f"prediction.{name}.rms_error_of_fit", single)
@@ -201,8 +245,13 @@ def maps(pool, populations: int = 1000, n: int = 12) -> None:
     results = {"paired": [], "groups": [], "band": []}
     for _ in range(populations):
         i = rng.choice(len(values), 2 * n, replace=False)
-        table = {"subject": np.tile(np.arange(n), 2), "condition": np.repeat(["a", "b"], n)}
-        paired = hj.recordings.PopulationMaps(table, values[i], axes).difference("a", "b")
+        table = {
+            "subject": np.tile(np.arange(n), 2),
+            "condition": np.repeat(["a", "b"], n),
+        }
+        paired = hj.recordings.PopulationMaps(table, values[i], axes).difference(
+            "a", "b"
+        )
         table = {"subject": np.arange(n), "group": np.repeat(["a", "b"], n // 2)}
         one = hj.recordings.PopulationMaps(table, values[i[:n]], axes)
         for name, test in (("paired", paired), ("groups", one.difference("a", "b"))):
@@ -215,7 +264,9 @@ def maps(pool, populations: int = 1000, n: int = 12) -> None:
     show_held("maps.band", results["band"])
 
 
-def command(subjects: int = 20, trials: int = 3, strides: int = 300, rate: int = 100) -> None:
+def command(
+    subjects: int = 20, trials: int = 3, strides: int = 300, rate: int = 100
+) -> None:
     """Time and memory of `hybridjax identify --table`, with two processes."""
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as name:
@@ -224,20 +275,39 @@ def command(subjects: int = 20, trials: int = 3, strides: int = 300, rate: int =
             hopper = hj.models.VerticalHopper(k=10 * (1 + 0.04 * rng.normal()))
             cycle = hj.find_limit_cycle(hopper)
             force = [
-                hj.testing.random_force(strides, rate, bandwidth=8, rms=0.02, seed=100 * s + k)
+                hj.testing.random_force(
+                    strides, rate, bandwidth=8, rms=0.02, seed=100 * s + k
+                )
                 for k in range(trials)
             ]
             made = np.stack(force)
-            made = hj.testing.simulate_recording(cycle, made, OUTPUTS, rate=rate, steps=1)
+            made = hj.testing.simulate_recording(
+                cycle, made, OUTPUTS, rate=rate, steps=1
+            )
             made = hj.testing.spoil(made, OUTPUTS, noise=3e-4, seed=s)
             for k, trial in enumerate(made.trials):
                 header = ",".join(("time", *made.signals))
-                np.savetxt(folder / f"{s}_{k}.csv", np.column_stack([trial.time, trial.values]),
-                           "%.7g", delimiter=",", header=header, comments="")  # fmt: skip
+                np.savetxt(
+                    folder / f"{s}_{k}.csv",
+                    np.column_stack([trial.time, trial.values]),
+                    "%.7g",
+                    delimiter=",",
+                    header=header,
+                    comments="",
+                )
                 rows.append(f"{s}_{k}.csv,S{s},{'young' if s % 2 else 'old'}")
         (folder / "subjects.csv").write_text("\n".join(rows) + "\n")
-        options = "--input u --outputs yM,vM --crossing vM:falling --sections 16 --workers 2"
-        line = [sys.executable, "-m", "hybridjax", "identify", "--table", "subjects.csv"]
+        options = (
+            "--input u --outputs yM,vM --crossing vM:falling --sections 16 --workers 2"
+        )
+        line = [
+            sys.executable,
+            "-m",
+            "hybridjax",
+            "identify",
+            "--table",
+            "subjects.csv",
+        ]
         start = time.perf_counter()
         process = largest_memory(
             subprocess.Popen([*line, *options.split(), "--out", "out"], cwd=folder)

@@ -69,13 +69,19 @@ def truth(size: float, color: float) -> tuple[hj.LDTP, hj.LDTP, hj.LDTP]:
     B = [np.concatenate([b, np.zeros((len(b), ny))], axis=1) for b in B]
     D = [np.concatenate([d, SENSOR * np.eye(ny)], axis=1) for d in direct]
     noise = hj.LDTP.from_blocks(A, B, C, D, outputs=plant.outputs)
-    return plant, hj.LDTP.from_blocks(A, inputs, C, own.D, plant.inputs, plant.outputs), noise
+    return (
+        plant,
+        hj.LDTP.from_blocks(A, inputs, C, own.D, plant.inputs, plant.outputs),
+        noise,
+    )
 
 
 def draw(plant: hj.LDTP, noise: hj.LDTP, rng: np.random.Generator) -> hj.Record:
     n, before = 6 * CYCLES, 6 * 20
     u = rng.normal(size=(n + before, 2))
-    y = np.asarray(plant.simulate(u)) + np.asarray(noise.simulate(rng.normal(size=(len(u), 3))))
+    y = np.asarray(plant.simulate(u)) + np.asarray(
+        noise.simulate(rng.normal(size=(len(u), 3)))
+    )
     return hj.Record(u[before:], y[before:], n_sections=6, outputs=plant.outputs)
 
 
@@ -90,11 +96,16 @@ def innovations(noise: PeriodicModel) -> tuple[list[np.ndarray], np.ndarray]:
     for _ in range(noise.dims[0]):
         for A, B in zip(noise.A, noise.B, strict=True):
             P = A @ P @ A.T + B @ B.T
-    unit, S = np.sqrt(np.diag(P)), np.zeros((noise.n_sections, *noise.D[0].shape[:1] * 2))
+    unit, S = (
+        np.sqrt(np.diag(P)),
+        np.zeros((noise.n_sections, *noise.D[0].shape[:1] * 2)),
+    )
     for _ in range(10_000):
         before, K = (P, S), []
         S = np.zeros_like(S)
-        for n, (A, B, C, D) in enumerate(zip(noise.A, noise.B, noise.C, noise.D, strict=True)):
+        for n, (A, B, C, D) in enumerate(
+            zip(noise.A, noise.B, noise.C, noise.D, strict=True)
+        ):
             S[n] = C @ P @ C.T + D @ D.T
             K.append(np.linalg.solve(S[n], (A @ P @ C.T + B @ D.T).T).T)
             left, entering = A - K[-1] @ C, B - K[-1] @ D
@@ -159,7 +170,9 @@ def color(name: str, size: float, draws: int) -> None:
     least = bound(joint, noise, [draw(plant, noise, rng) for _ in range(10)])
     show("bound", least)
     found = hj.monte_carlo(lambda rng: one(plant, joint, noise, rng), draws)
-    rms = {k: float(np.sqrt((found[k] ** 2).mean())) for k in ("ldtp", "said", "series")}
+    rms = {
+        k: float(np.sqrt((found[k] ** 2).mean())) for k in ("ldtp", "said", "series")
+    }
     show("ldtp.rms", rms["ldtp"])
     show("ldtp.ratio", rms["ldtp"] / least)
     show("ldtp.said", rms["said"])
@@ -176,7 +189,9 @@ def color(name: str, size: float, draws: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--size", type=float, default=0.1, help="of the noise that drives")
+    parser.add_argument(
+        "--size", type=float, default=0.1, help="of the noise that drives"
+    )
     parser.add_argument("--colors", nargs="*", default=("white", "colored"))
     options = parser.parse_args()
     hj.enable_x64()

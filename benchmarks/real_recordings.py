@@ -28,10 +28,14 @@ def neuron(cell, every=1):
         spikes, f = np.cumsum(steps, dtype=int) / 1e4, k + 1
         current = 20 * np.sin(2 * np.pi * f * t)
         if k % every == 0:
-            about = dict(events={"spike": spikes}, units={"current": "pA"}, name=f"{f} Hz")
+            about = dict(
+                events={"spike": spikes}, units={"current": "pA"}, name=f"{f} Hz"
+            )
             trials.append(hj.Recording(t, {"current": current}, **about))
     places = np.arange(200) / 200
-    curve = np.interp(places, a["published_phase"], a[f"cell{cell}_published"], period=1)
+    curve = np.interp(
+        places, a["published_phase"], a[f"cell{cell}_published"], period=1
+    )
     return hj.Recording.join(trials), curve
 
 
@@ -43,10 +47,14 @@ def robot():
         t, outer = a["time"][rows], a["outer"][rows].astype(int)
         begins = t[np.flatnonzero(np.diff(outer, prepend=1 - outer[0]) > 0)]
         steps = t[np.flatnonzero(np.diff(outer, prepend=1 - outer[0]))]
-        signals = {name: a[name][rows].astype(float) for name in ("voltage", "hip", "stance")}
+        signals = {
+            name: a[name][rows].astype(float) for name in ("voltage", "hip", "stance")
+        }
         units = {"voltage": "V", "hip": "rad", "stance": "rad"}
         events = {"stride": np.append(begins, t[-1]), "step": np.append(steps, t[-1])}
-        runs.append(hj.Recording(t, signals, events=events, units=units, name=f"run {run}"))
+        runs.append(
+            hj.Recording(t, signals, events=events, units=units, name=f"run {run}")
+        )
     return hj.Recording.join(runs)
 
 
@@ -56,12 +64,16 @@ def walking():
     for s, (first, last) in enumerate([(6, 61), (1, 54)]):
         t, left = a[f"time{s}"].astype(float), a[f"left{s}"]
         rows = (t >= first) & (t <= last)
-        angles = np.where(a[f"gap{s}"][:, None], np.nan, a[f"angles{s}"])[rows].astype(float)
+        angles = np.where(a[f"gap{s}"][:, None], np.nan, a[f"angles{s}"])[rows].astype(
+            float
+        )
         signals = dict(zip(map(str, a["names"]), angles.T, strict=True))
         events = {"strike": left[(left >= first) & (left <= last)]}
         units = dict.fromkeys(signals, "rad")
         trials.append(
-            hj.Recording(t[rows], signals, events=events, units=units, name=f"segment {s}")
+            hj.Recording(
+                t[rows], signals, events=events, units=units, name=f"segment {s}"
+            )
         )
     return hj.Recording.join(trials)
 
@@ -86,7 +98,9 @@ def plain_curve(recording, phase, name):
     mean = np.stack([intervals.sums(x) for x in both.T], axis=1) / count[:, None]
     both -= mean[intervals.trial] * fit.used[:, None]
     across, deviation = both[:, :-1], both[:, -1]
-    a = np.linalg.lstsq(across.T @ across + np.diag(fit.penalty), across.T @ deviation)[0]
+    a = np.linalg.lstsq(across.T @ across + np.diag(fit.penalty), across.T @ deviation)[
+        0
+    ]
     return basis(np.arange(200) / 200, WAVES) @ a
 
 
@@ -101,7 +115,9 @@ def neurons(every=2):
         at = np.array([0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95])
         low, high = found.interval(at)
         place, linear = (at * 200).astype(int), plain_curve(recording, phase, "current")
-        rows = zip(at, found(at), low, high, published[place], linear[place], strict=True)
+        rows = zip(
+            at, found(at), low, high, published[place], linear[place], strict=True
+        )
         for x, z, a, b, other, plain in rows:
             print(
                 f"  Z({x:.2f}) = {z:.2f} [{a:.2f}, {b:.2f}], published {other:.2f}, "
@@ -116,14 +132,22 @@ def neurons(every=2):
             f"the published curve is in the band at {100 * held.mean():.0f} % of the phases; rms "
             f"difference {own:.2f}, of plain regression {plain:.2f}"
         )
-        print(f"R2 of intervals left out: {found.left_out:.3f}; flat: {found.left_out_flat:.3f}")
+        print(
+            f"R2 of intervals left out: {found.left_out:.3f}; flat: {found.left_out_flat:.3f}"
+        )
         both, _ = neuron(cell)
-        print(f"R2 of the trials that were not fitted: {explained(found, both, every):.3f}")
+        print(
+            f"R2 of the trials that were not fitted: {explained(found, both, every):.3f}"
+        )
         for first, last in ((0, 5), (10, 20), (40, 70)):
             some = eqx.tree_at(lambda r: r.trials, both, both.trials[first:last])
-            part = hj.recordings.phase_response(some, hj.AtEvent("spike"), input="current")
+            part = hj.recordings.phase_response(
+                some, hj.AtEvent("spike"), input="current"
+            )
             error = np.sqrt(part.covariance[0, 0])
-            print(f"mean of Z, {first + 1} to {last} Hz: {part.coefficients[0]:.3f} ± {error:.3f}")
+            print(
+                f"mean of Z, {first + 1} to {last} Hz: {part.coefficients[0]:.3f} ± {error:.3f}"
+            )
 
 
 def explained(curve, recording, every):
@@ -135,10 +159,14 @@ def explained(curve, recording, every):
     count = intervals.sums(np.ones(len(intervals.start)))
     rates = count / intervals.sums(intervals.duration)
     for _ in range(12):
-        ahead = forecast(intervals, tabulated(WAVES, curve.jitter), curve.coefficients, rates)
+        ahead = forecast(
+            intervals, tabulated(WAVES, curve.jitter), curve.coefficients, rates
+        )
         left, slope = intervals.duration - ahead.duration, ahead.slopes[:, -1]
         used = np.abs(left * ahead.rate) < 0.5
-        rates = rates + intervals.sums(left * slope * used) / intervals.sums(slope**2 * used)
+        rates = rates + intervals.sums(left * slope * used) / intervals.sums(
+            slope**2 * used
+        )
     mean = intervals.sums(intervals.duration * used) / intervals.sums(1.0 * used)
     whole = (intervals.duration - mean[intervals.trial])[used]
     return 1 - (left[used] ** 2).sum() / (whole**2).sum()
@@ -157,8 +185,13 @@ def robots():
         within += float(left[0])
         freedom += len(k) - 3
     spread = np.sqrt(within / freedom)
-    ratio = np.mean([len(d) * (x / 2) ** 2 for d, x in zip(steps, sizes, strict=True)]) / spread**2
-    rms, low, high = 1000 * np.array([np.sqrt(np.mean(np.square(sizes))), min(sizes), max(sizes)])
+    ratio = (
+        np.mean([len(d) * (x / 2) ** 2 for d, x in zip(steps, sizes, strict=True)])
+        / spread**2
+    )
+    rms, low, high = 1000 * np.array(
+        [np.sqrt(np.mean(np.square(sizes))), min(sizes), max(sizes)]
+    )
     print(
         f"alternate steps differ by {rms:.0f} ms (rms over runs; from {low:.0f} to {high:.0f}), "
         f"steps of a leg scatter by {1000 * spread:.0f} ms: F = {ratio:.0f} of {len(steps)} and "
@@ -186,9 +219,17 @@ def robots():
     except hj.DefinitionError as error:
         print("to fit all of it:", error)
     data = hj.recordings.section_data(
-        recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=7, bandwidth=np.inf
+        recording,
+        phase,
+        inputs=(),
+        outputs=("hip", "stance"),
+        n_sections=7,
+        bandwidth=np.inf,
     )
-    print("The closed loop, its input a part of it:", hj.recordings.natural_multipliers(data, 1))
+    print(
+        "The closed loop, its input a part of it:",
+        hj.recordings.natural_multipliers(data, 1),
+    )
 
 
 def robot_layout(seeds=40, multiplier=0.6):
@@ -245,11 +286,17 @@ def variability():
     phase = hj.recordings.estimate_phase(recording, hj.AtEvent("strike"))
     print(f"\nWalking: {phase}")
     for trial, periods in zip(recording.trials, phase.periods, strict=True):
-        print(f"  {trial.name}: {len(periods)} strides of {periods.mean():.3f} s, "
-              f"standard deviation {periods.std(ddof=1):.3f} s")  # fmt: skip
+        print(
+            f"  {trial.name}: {len(periods)} strides of {periods.mean():.3f} s, "
+            f"standard deviation {periods.std(ddof=1):.3f} s"
+        )
     for n_sections in (8, 16, 32):
         data = hj.recordings.section_data(
-            recording, phase, inputs=(), outputs=recording.signals, n_sections=n_sections
+            recording,
+            phase,
+            inputs=(),
+            outputs=recording.signals,
+            n_sections=n_sections,
         )
         for order in (1, 2, 3):
             found = hj.recordings.natural_multipliers(data, order)
@@ -258,7 +305,9 @@ def variability():
 
 def walking_layout(seeds=200, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
     """Records as long as the segments, of a system whose multipliers are known."""
-    print(f"\nThe layout of walking, simulated: multipliers {multipliers}, {seeds} draws")
+    print(
+        f"\nThe layout of walking, simulated: multipliers {multipliers}, {seeds} draws"
+    )
     model = linear_rhythm(multipliers, n_sections, outputs)
     for noise in (0.0, 0.3, 0.5):
 
@@ -267,7 +316,9 @@ def walking_layout(seeds=200, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
                 variable(model, STRIDES, noise, rng), len(multipliers)
             )
             modulus = np.stack([np.abs(found.multipliers), np.abs(found.plain)])
-            low, high = np.moveaxis([found.interval(), found.interval(plain=True)], 2, 0)
+            low, high = np.moveaxis(
+                [found.interval(), found.interval(plain=True)], 2, 0
+            )
             held = (low <= np.array(multipliers)) & (np.array(multipliers) <= high)
             return {"modulus": modulus, "held": held.astype(float)}
 
@@ -295,12 +346,18 @@ def variable(model, strides, noise, rng):
         t = np.arange(len(y)) / N
         names = {f"y{i}": column for i, column in enumerate(y.T)}
         events = {"strike": np.arange(count) * 1.0}
-        trials.append(hj.Recording(t, names, events=events, name=f"trial {len(trials)}"))
+        trials.append(
+            hj.Recording(t, names, events=events, name=f"trial {len(trials)}")
+        )
     recording = hj.Recording.join(trials)
     return hj.recordings.section_data(
-        recording, hj.AtEvent("strike"), inputs=(), outputs=recording.signals, n_sections=N,
+        recording,
+        hj.AtEvent("strike"),
+        inputs=(),
+        outputs=recording.signals,
+        n_sections=N,
         bandwidth=np.inf,
-    )  # fmt: skip
+    )
 
 
 def phase_model(seeds=10, seconds=3, trials=20):
@@ -323,9 +380,13 @@ def phase_model(seeds=10, seconds=3, trials=20):
             force = 20 * np.sin(2 * np.pi * np.linspace(3, 97, trials)[:, None] * t)
             if "noise" in label:
                 force = np.stack(
-                    [hj.testing.random_force(seconds, 2000, 100, rms=15, seed=seed + k)[:, 0]
-                     for k in range(trials)]
-                )  # fmt: skip
+                    [
+                        hj.testing.random_force(
+                            seconds, 2000, 100, rms=15, seed=seed + k
+                        )[:, 0]
+                        for k in range(trials)
+                    ]
+                )
                 force = np.pad(force, ((0, 0), (0, 1)), mode="edge")
             rhythm = (45 + 10 * rng.uniform(size=trials)).tolist()
             made = hj.testing.simulate_beats(
@@ -345,7 +406,10 @@ def phase_model(seeds=10, seconds=3, trials=20):
 
         found = hj.monte_carlo(one, seeds)
         off = found.off.values
-        rms, bias = np.sqrt(np.mean(off**2, axis=(0, 2))), np.abs(off.mean(axis=0)).max(axis=1)
+        rms, bias = (
+            np.sqrt(np.mean(off**2, axis=(0, 2))),
+            np.abs(off.mean(axis=0)).max(axis=1),
+        )
         print(
             f"{label}, jitter {jitter:g}: held {100 * found.held.values.mean():.1f} % of the time; "
             f"bias up to {bias[0]:.3f}, rms error {rms[0]:.3f} (plain regression {bias[1]:.3f}, "
@@ -356,5 +420,12 @@ def phase_model(seeds=10, seconds=3, trials=20):
 
 
 def real():
-    for part in (neurons, robots, robot_layout, variability, walking_layout, phase_model):
+    for part in (
+        neurons,
+        robots,
+        robot_layout,
+        variability,
+        walking_layout,
+        phase_model,
+    ):
         part()

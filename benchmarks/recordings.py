@@ -49,9 +49,16 @@ HINTS = {"band", "outputs", "left over"}
 def hopper(strides, seeds):
     """Recordings of the paper's hopper, one for each seed, and its multipliers."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    u = [hj.testing.random_force(strides, RATE, BANDWIDTH, rms=RMS, seed=seed) for seed in seeds]
-    both = hj.testing.simulate_recording(cycle, np.stack(u), ("yM", "vM"), rate=RATE, steps=1)
-    return [eqx.tree_at(lambda r: r.trials, both, (t,)) for t in both.trials], cycle.multipliers
+    u = [
+        hj.testing.random_force(strides, RATE, BANDWIDTH, rms=RMS, seed=seed)
+        for seed in seeds
+    ]
+    both = hj.testing.simulate_recording(
+        cycle, np.stack(u), ("yM", "vM"), rate=RATE, steps=1
+    )
+    return [
+        eqx.tree_at(lambda r: r.trials, both, (t,)) for t in both.trials
+    ], cycle.multipliers
 
 
 def noisy(recording, noise, seed):
@@ -89,7 +96,9 @@ def distance(multipliers, true):
 
 
 def errors(seeds=10):
-    print(f"\nHopper, {RATE} Hz, force of {BANDWIDTH:g} Hz and rms {RMS} N; {seeds} seeds")
+    print(
+        f"\nHopper, {RATE} Hz, force of {BANDWIDTH:g} Hz and rms {RMS} N; {seeds} seeds"
+    )
     recordings, true = hopper(1000, range(seeds))
     print("phase  strides  noise    rms error  (median)   said     plain ARX, rms")
     for name, strides, noise in itertools.product(PHASES, (1000, 300), NOISES):
@@ -110,7 +119,9 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-def coverage(draws=400, strides=300, noise=1e-4, chunk=50, n_sections=16, phases=PHASES):
+def coverage(
+    draws=400, strides=300, noise=1e-4, chunk=50, n_sections=16, phases=PHASES
+):
     print(
         f"\nCoverage of 95 % regions: {draws} draws, {strides} strides, {n_sections} sections, "
         f"noise {noise:g}"
@@ -120,15 +131,22 @@ def coverage(draws=400, strides=300, noise=1e-4, chunk=50, n_sections=16, phases
         """So many recordings, simulated side by side."""
         recordings, true = hopper(strides, rng.integers(2**31, size=chunk).tolist())
         seeds = rng.integers(2**31, size=chunk).tolist()
-        dirty = [noisy(r, noise, seed) for r, seed in zip(recordings, seeds, strict=True)]
+        dirty = [
+            noisy(r, noise, seed) for r, seed in zip(recordings, seeds, strict=True)
+        ]
         return {
-            name: [found_in(at_sections(d, name, n_sections).records, true) for d in dirty]
+            name: [
+                found_in(at_sections(d, name, n_sections).records, true) for d in dirty
+            ]
             for name in phases
         }
 
     found = hj.monte_carlo(some, draws // chunk)
     for name in phases:
-        print(f"{name}: {tally(found[name].values.reshape(draws, 3, -1)[..., 0])}", flush=True)
+        print(
+            f"{name}: {tally(found[name].values.reshape(draws, 3, -1)[..., 0])}",
+            flush=True,
+        )
 
 
 def quiet(draws=200):
@@ -160,7 +178,8 @@ def dirt(seeds=5, strides=500, noise=1e-4):
     gap = (strides / 2, strides / 2 + 20)
     poor, third = {"missing": 0.01, "gap": gap}, "a third of the samples not there"
     sine = change_signals(
-        "y", lambda x, s: x + 5e-3 * np.sin(2 * np.pi * s.trial.time / np.ptp(s.trial.time))
+        "y",
+        lambda x, s: x + 5e-3 * np.sin(2 * np.pi * s.trial.time / np.ptp(s.trial.time)),
     )
     cases = {  # phase, how it is spoiled, mishap, drift
         "clean": ("angle", {}, None, None),
@@ -171,9 +190,12 @@ def dirt(seeds=5, strides=500, noise=1e-4):
         "period that grows by 5 %": ("angle", {}, "clock slows down", None),
         "cycles from apex to apex, clean": ("apex", {}, None, None),
         "1 % lost, gap, 5 events lost, 5 doubled": (
-            "apex", poor, misjudged(lost=0.01, doubled=0.01), None,
+            "apex",
+            poor,
+            misjudged(lost=0.01, doubled=0.01),
+            None,
         ),
-    }  # fmt: skip
+    }
     for label, (name, spoiled, mishap, drift) in cases.items():
         found, said, hits = [], [], 0
         for seed, recording in enumerate(recordings):
@@ -181,7 +203,9 @@ def dirt(seeds=5, strides=500, noise=1e-4):
                 dirty = noisy(recording, noise, seed)
                 dirty = spoil(dirty, ("yM", "vM"), seed=seed, **spoiled)
             else:
-                dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed, **spoiled)
+                dirty = spoil(
+                    recording, ("yM", "vM"), noise=noise, seed=seed, **spoiled
+                )
             if mishap is not None:
                 names = {"input": "u", "outputs": ("yM", "vM"), "event": "apex"}
                 dirty = mishandle(dirty, mishap, seed=seed, **names)
@@ -212,10 +236,14 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
         hj.testing.random_force(strides, rate, BANDWIDTH, rms=RMS, seed=k)
         for k in range(seeds * trials)
     ]
-    made = hj.testing.simulate_recording(cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1)
+    made = hj.testing.simulate_recording(
+        cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1
+    )
     names = {"input": "u", "outputs": ("yM", "vM"), "event": "apex"}
     verdicts = []
-    print("| mishap | rms error | said | verdict | what is said |\n|---|---|---|---|---|")
+    print(
+        "| mishap | rms error | said | verdict | what is said |\n|---|---|---|---|---|"
+    )
     of_events = EVENT_MISHAPS | MORE_EVENTS
     every = MISHAPS | MORE | of_events
     for kind in ["none", *every]:
@@ -228,7 +256,12 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
                     one = mishandle(one, every[kind], seed=seed, **names)
                 phase = APEX if kind in of_events else hj.Crossing("vM", "falling")
                 result = hj.identify_recording(
-                    one, phase, inputs="u", outputs=("yM", "vM"), n_sections=n_sections, order=2
+                    one,
+                    phase,
+                    inputs="u",
+                    outputs=("yM", "vM"),
+                    n_sections=n_sections,
+                    order=2,
                 )
             except hj.DefinitionError as error:
                 verdict.append("refused")
@@ -237,7 +270,9 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
             right = result.fit.contains(cycle.multipliers, 0.999).all()
             doubts = {f.cause for f in result.advice.warnings} - HINTS
             causes |= dict.fromkeys(sorted(doubts))
-            verdict.append("right" if right else "named" if doubts else "SILENTLY WRONG")
+            verdict.append(
+                "right" if right else "named" if doubts else "SILENTLY WRONG"
+            )
             found.append(distance(result.fit.multipliers, cycle.multipliers))
             said.append(result.fit.standard_errors[0])
         verdicts += verdict
@@ -252,7 +287,9 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
 
 
 def spikes(seeds=50, strides=300, noise=1e-4, n_sections=16):
-    print(f"\nSpikes of 20 standard deviations: {seeds} seeds, {strides} strides, noise {noise:g}")
+    print(
+        f"\nSpikes of 20 standard deviations: {seeds} seeds, {strides} strides, noise {noise:g}"
+    )
     recordings, true = hopper(strides, range(seeds))
     crossing = hj.Crossing("vM", "falling")
     for name, phase in (("apex", crossing), ("angle", phase_of("angle", n_sections))):
@@ -264,7 +301,11 @@ def spikes(seeds=50, strides=300, noise=1e-4, n_sections=16):
                     dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
                     dirty = spoil(dirty, signals, spikes=share, seed=seed)
                     data = hj.recordings.section_data(
-                        dirty, phase, inputs="u", outputs=("yM", "vM"), n_sections=n_sections
+                        dirty,
+                        phase,
+                        inputs="u",
+                        outputs=("yM", "vM"),
+                        n_sections=n_sections,
                     )
                     fit = hj.fit_series(data.records, 2, check=False)
                     found.append(distance(fit.multipliers, true))
@@ -286,12 +327,28 @@ def walker(draws=30, strides=100, trials=5, noise=1e-4):
     # Section of the cycle, outputs, phase, event to mark, rms of the force, order, overhang
     # in cycles (what smaller multipliers leave after it is neglected).
     systems = {
-        "rimless wheel": (wheel, "impact", ("th", "w"), middle, ("th", "rising"), 0.0015, 1, 1),
+        "rimless wheel": (
+            wheel,
+            "impact",
+            ("th", "w"),
+            middle,
+            ("th", "rising"),
+            0.0015,
+            1,
+            1,
+        ),
         "compass gait": (
-            gait, "heelstrike", ("n", "s", "vn", "vs"), middle, ("s", "falling"), 0.05, 2, 2,
+            gait,
+            "heelstrike",
+            ("n", "s", "vn", "vs"),
+            middle,
+            ("s", "falling"),
+            0.05,
+            2,
+            2,
         ),
         "van der Pol": oscillator(),
-    }  # fmt: skip
+    }
     for label, about in systems.items():
         walks(label, *about, draws, strides, trials, noise)
 
@@ -303,7 +360,19 @@ def oscillator():
 
 
 def walks(
-    label, system, event, outputs, phase, mark, size, order, overhang, draws, strides, trials, noise
+    label,
+    system,
+    event,
+    outputs,
+    phase,
+    mark,
+    size,
+    order,
+    overhang,
+    draws,
+    strides,
+    trials,
+    noise,
 ):
     where = {} if event is None else {"section": hj.AtEvent(event)}
     cycle = hj.find_limit_cycle(system, **where)
@@ -312,10 +381,14 @@ def walks(
 
     def one(rng):
         force = [
-            hj.testing.random_force(strides * period, rate, 8 / period, rms=size, seed=seed)
+            hj.testing.random_force(
+                strides * period, rate, 8 / period, rms=size, seed=seed
+            )
             for seed in rng.integers(2**31, size=trials).tolist()
         ]
-        made = hj.testing.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
+        made = hj.testing.simulate_recording(
+            cycle, np.stack(force), outputs, rate=rate, steps=1
+        )
         made = spoil(made, outputs, noise=noise, seed=int(rng.integers(2**31)))
         if mark:
             made = made.mark("middle", hj.Crossing(*mark), bandwidth=20 / period)
@@ -323,7 +396,9 @@ def walks(
             made, phase, inputs="u", outputs=outputs, n_sections=16, timing="duration"
         )
         fit = hj.fit_series(data, order, overhang=16 * overhang, check=False)
-        reach = [np.abs(fit.ellipse(i) - z).max() for i, z in enumerate(fit.multipliers)]
+        reach = [
+            np.abs(fit.ellipse(i) - z).max() for i, z in enumerate(fit.multipliers)
+        ]
         return {
             "held": int(fit.contains(true).all()),
             "error": float(fit.compare(true).max_error),
@@ -339,7 +414,9 @@ def walks(
 
 
 def size(trials=10, minutes=10, rate=1000):
-    print(f"\n{trials} trials of {minutes} minutes at {rate} Hz, CSV to report by the command")
+    print(
+        f"\n{trials} trials of {minutes} minutes at {rate} Hz, CSV to report by the command"
+    )
     with tempfile.TemporaryDirectory() as folder:
         files = [str(Path(folder) / f"trial{k}.csv") for k in range(trials)]
         # In a process of its own: a child's largest memory counts from what its parent holds.
@@ -348,8 +425,23 @@ def size(trials=10, minutes=10, rate=1000):
         )
         making.start()
         making.join()
-        command = [sys.executable, "-m", "hybridjax", "identify", *files, "--input", "force"]
-        command += ["--outputs", "yM,vM", "--phase", "yM,vM", "--out", str(Path(folder) / "out")]
+        command = [
+            sys.executable,
+            "-m",
+            "hybridjax",
+            "identify",
+            *files,
+            "--input",
+            "force",
+        ]
+        command += [
+            "--outputs",
+            "yM,vM",
+            "--phase",
+            "yM,vM",
+            "--out",
+            str(Path(folder) / "out"),
+        ]
         start = time.perf_counter()
         running = subprocess.Popen(command, stdout=subprocess.DEVNULL)
         _, status, used = os.wait4(running.pid, 0)
@@ -357,11 +449,15 @@ def size(trials=10, minutes=10, rate=1000):
         if status:
             raise RuntimeError("the command failed.")
         cpu = used.ru_utime + used.ru_stime
-        print(f"{wall:.0f} s, {cpu:.0f} CPU s, largest memory {used.ru_maxrss / 2**20:.2f} GiB")
+        print(
+            f"{wall:.0f} s, {cpu:.0f} CPU s, largest memory {used.ru_maxrss / 2**20:.2f} GiB"
+        )
 
 
 def bag(sizes=(0.25, 2.0), minutes=10, rate=100):
-    print(f"\nMCAP files of images: {minutes} minutes of forces at {rate} Hz are read out of each")
+    print(
+        f"\nMCAP files of images: {minutes} minutes of forces at {rate} Hz are read out of each"
+    )
     for gigabytes in sizes:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "bag"
@@ -424,7 +520,9 @@ def write_trials(files, minutes, rate):
         hj.testing.random_force(minutes * 60, rate, BANDWIDTH, rms=RMS, seed=k)
         for k in range(len(files))
     ]
-    made = hj.testing.simulate_recording(cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1)
+    made = hj.testing.simulate_recording(
+        cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1
+    )
     made = spoil(made, ("yM", "vM"), noise=1e-4)
     for file, trial in zip(files, made.trials, strict=True):
         table = np.column_stack([trial.time, trial.values])
@@ -433,8 +531,17 @@ def write_trials(files, minutes, rate):
 
 
 ALL = (
-    "errors", "dirt", "mishaps", "spikes", "walker", "size", "bag", "coverage", "quiet", "real",
-)  # fmt: skip
+    "errors",
+    "dirt",
+    "mishaps",
+    "spikes",
+    "walker",
+    "size",
+    "bag",
+    "coverage",
+    "quiet",
+    "real",
+)
 
 if __name__ == "__main__":
     hj.enable_x64()

@@ -11,7 +11,16 @@ from typing import Any
 
 
 Show = Callable[[str, Any], None]
-PACKAGES = ("hybridjax", "jax", "jaxlib", "equinox", "diffrax", "numpy", "scipy", "heyoka")
+PACKAGES = (
+    "hybridjax",
+    "jax",
+    "jaxlib",
+    "equinox",
+    "diffrax",
+    "numpy",
+    "scipy",
+    "heyoka",
+)
 
 
 class Report:
@@ -33,7 +42,11 @@ class Report:
 
 
 def hardware() -> dict[str, Any]:
-    return {"cpu": _processor(), "cores": _cores(), "system": platform.platform(terse=True)}
+    return {
+        "cpu": _processor(),
+        "cores": _cores(),
+        "system": platform.platform(terse=True),
+    }
 
 
 def software() -> dict[str, str]:
@@ -45,7 +58,9 @@ def software() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             pass
     if shutil.which("gcc"):
-        out = subprocess.run(("gcc", "-dumpfullversion"), capture_output=True, text=True)
+        out = subprocess.run(
+            ("gcc", "-dumpfullversion"), capture_output=True, text=True
+        )
         found["gcc"] = out.stdout.strip()
     return found
 
@@ -57,7 +72,9 @@ def today() -> str:
 def _processor() -> str:
     try:
         with open("/proc/cpuinfo") as file:
-            return next(x.split(":")[1].strip() for x in file if x.startswith("model name"))
+            return next(
+                x.split(":")[1].strip() for x in file if x.startswith("model name")
+            )
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
 

@@ -60,7 +60,11 @@ def main() -> int:
             continue
         show("seconds", time.perf_counter() - begin)
         values = {x: v for x, v in report.values.items() if x.startswith(f"{name}.")}
-        found[name] = about | {"repeat": options.repeat, "quick": options.quick, "values": values}
+        found[name] = about | {
+            "repeat": options.repeat,
+            "quick": options.quick,
+            "values": values,
+        }
         if options.json:
             options.json.write_text(json.dumps(found, indent=1) + "\n")
         if options.baseline:
@@ -79,15 +83,23 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--only", type=names, default=NAMES, help=f"of {','.join(NAMES)}")
-    parser.add_argument("--with", dest="peer", metavar="jaxonomy=PYTHON", help="add jaxonomy")
+    parser.add_argument(
+        "--only", type=names, default=NAMES, help=f"of {','.join(NAMES)}"
+    )
+    parser.add_argument(
+        "--with", dest="peer", metavar="jaxonomy=PYTHON", help="add jaxonomy"
+    )
     parser.add_argument(
         "--repeat", type=int, default=5, help="calls, the least time of which counts"
     )
     parser.add_argument("--quick", action="store_true", help="less of everything")
     parser.add_argument("--json", type=pathlib.Path, help="a file for all numbers")
-    parser.add_argument("--baseline", action="store_true", help="keep them in baseline.json")
-    parser.add_argument("--table", action="store_true", help="only update docs/benchmarks.md")
+    parser.add_argument(
+        "--baseline", action="store_true", help="keep them in baseline.json"
+    )
+    parser.add_argument(
+        "--table", action="store_true", help="only update docs/benchmarks.md"
+    )
     options = parser.parse_args()
     if options.table and not BASELINE.exists():
         parser.error("there is no baseline.json yet: measure it by --baseline")
@@ -107,7 +119,9 @@ def names(text: str) -> list[str]:
     chosen = text.split(",")
     for name in chosen:
         if name not in NAMES:
-            raise argparse.ArgumentTypeError(f"there is no case {name}: {', '.join(NAMES)}")
+            raise argparse.ArgumentTypeError(
+                f"there is no case {name}: {', '.join(NAMES)}"
+            )
     return [name for name in NAMES if name in chosen]
 
 

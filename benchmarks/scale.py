@@ -56,7 +56,11 @@ def show(name: str, value: float) -> None:
 
 def axes(points: int) -> dict[str, np.ndarray]:
     n = round(points ** (1 / 3))
-    return {"k": np.linspace(8, 13, n), "b": np.linspace(3, 7, n), "M": np.linspace(1.5, 2.5, n)}
+    return {
+        "k": np.linspace(8, 13, n),
+        "b": np.linspace(3, 7, n),
+        "M": np.linspace(1.5, 2.5, n),
+    }
 
 
 def total(over) -> int:
@@ -95,13 +99,23 @@ def alone(points: int, store: pathlib.Path | None) -> None:
     begin = time.process_time()
     work(over)
     name = "alone" if store is None else "stored"
-    show(f"sweep.{name}.cpu_us_per_point", (time.process_time() - begin) / total(over) * 1e6)
+    show(
+        f"sweep.{name}.cpu_us_per_point",
+        (time.process_time() - begin) / total(over) * 1e6,
+    )
     show(f"sweep.{name}.memory", megabytes())
 
 
 def by_itself(points: int, store: pathlib.Path | None) -> float:
     """`alone` in a process of its own; its microseconds per point."""
-    command = [sys.executable, __file__, "--points", str(points), "--alone", str(store or "")]
+    command = [
+        sys.executable,
+        __file__,
+        "--points",
+        str(points),
+        "--alone",
+        str(store or ""),
+    ]
     out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     print(out, end="", flush=True)
     return float(out.split()[1])
@@ -117,7 +131,10 @@ def sweep(points: int, folder: pathlib.Path) -> None:
     show("sweep.overhead", one / in_memory - 1)
     show("sweep.bytes_per_point", size(folder / "alone.zarr") / count)
     for workers in (1, 2, 4):
-        with LocalCluster(n_workers=workers, **QUIET) as cluster, Client(cluster) as client:
+        with (
+            LocalCluster(n_workers=workers, **QUIET) as cluster,
+            Client(cluster) as client,
+        ):
             call = {"guess": cycle, "client": client}
             hj.sweep(hj.models.VerticalHopper(), few(over), **call)  # compiled
             before, begin = client.run(cpu_seconds), time.perf_counter()
@@ -146,7 +163,9 @@ def open_values(store: pathlib.Path) -> np.ndarray:
     import xarray
 
     found = xarray.open_zarr(store, consolidated=False, chunks=None)
-    return np.stack([found[name].values for name in ("period", "spectral_radius", "result")])
+    return np.stack(
+        [found[name].values for name in ("period", "spectral_radius", "result")]
+    )
 
 
 def draw(rng) -> np.ndarray:
@@ -184,14 +203,18 @@ def kills(count: int, folder: pathlib.Path) -> None:
         restarts += 1
         while client.poll() is None:
             time.sleep(0.02)
-            for path in store.glob("failed/c/*"):  # (its last chunk: the piece is whole)
+            for path in store.glob(
+                "failed/c/*"
+            ):  # (its last chunk: the piece is whole)
                 stamp = path.stat().st_mtime_ns
                 times.setdefault(path.name, set()).add(stamp)
             done = len(times)
             if moments and done >= moments[0]:
                 victim = events.get(moments.pop(0), "worker")
                 worker = rng.randrange(2)
-                process = {"scheduler": scheduler, "client": client}.get(victim, workers[worker])
+                process = {"scheduler": scheduler, "client": client}.get(
+                    victim, workers[worker]
+                )
                 process.send_signal(signal.SIGKILL)
                 killed += 1
                 if victim == "worker":
@@ -212,18 +235,33 @@ def start(folder: pathlib.Path, store: pathlib.Path):
     file = folder / "scheduler.json"
     file.unlink(missing_ok=True)
     command = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
-    scheduler = quiet([*command, "--scheduler-file", file, "--port", "0", "--no-dashboard"])
+    scheduler = quiet(
+        [*command, "--scheduler-file", file, "--port", "0", "--no-dashboard"]
+    )
     while not file.exists():
         time.sleep(0.1)
     workers = [worker_process(folder) for _ in range(2)]
     address = json.loads(file.read_text())["address"]
     here = str(pathlib.Path(__file__).parent)
-    return scheduler, quiet([sys.executable, "-c", CLIENT, address, store, here]), workers
+    return (
+        scheduler,
+        quiet([sys.executable, "-c", CLIENT, address, store, here]),
+        workers,
+    )
 
 
 def worker_process(folder: pathlib.Path) -> subprocess.Popen:
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--no-nanny", "--nthreads", "1"]
-    return quiet([*command, "--no-dashboard", "--scheduler-file", folder / "scheduler.json"])
+    command = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_worker",
+        "--no-nanny",
+        "--nthreads",
+        "1",
+    ]
+    return quiet(
+        [*command, "--no-dashboard", "--scheduler-file", folder / "scheduler.json"]
+    )
 
 
 def quiet(command) -> subprocess.Popen:
@@ -273,12 +311,19 @@ def experiments(count: int, fitted: int, folder: pathlib.Path) -> None:
         show(f"experiments.fit.{S}.memory", megabytes())
     show("experiments.fit.linear", seconds[1] / seconds[0] / 2)
     whole = hj.fit_series(list(records), 2, check=False)
-    show("experiments.fit.difference", np.abs(found.coefficients - whole.coefficients).max())
+    show(
+        "experiments.fit.difference",
+        np.abs(found.coefficients - whole.coefficients).max(),
+    )
 
 
 def workers(count: int) -> None:
     """One scheduler; the workers are threads' worth of processes that only sleep."""
-    options = {"n_workers": 4, "threads_per_worker": count // 4, "dashboard_address": ":0"}
+    options = {
+        "n_workers": 4,
+        "threads_per_worker": count // 4,
+        "dashboard_address": ":0",
+    }
     rates = []
     with LocalCluster(**options) as cluster, Client(cluster) as client:
         for seconds in (0.0, 1.0, 2.0, 4.0, 8.0):
@@ -326,7 +371,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
         if options.alone is not None:
-            alone(options.points, pathlib.Path(options.alone) if options.alone else None)
+            alone(
+                options.points, pathlib.Path(options.alone) if options.alone else None
+            )
             return
         if "sweep" not in options.skip:
             sweep(options.points, folder)

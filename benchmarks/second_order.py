@@ -26,7 +26,12 @@ def sections():
     return {
         "isochron": hj.ClockPhase(32, anchor=apex),
         "kinematic": hj.KinematicPhase(
-            32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=apex
+            32,
+            position="yM",
+            velocity="vM",
+            center=(1.9, 0.0),
+            scale=(0.3, 1.9),
+            anchor=apex,
         ),
     }
 
@@ -40,16 +45,22 @@ def errors(cycle, placed, exact, seed: int, division: str) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=24, help="number of draws, from seed 0 on")
+    parser.add_argument(
+        "--seeds", type=int, default=24, help="number of draws, from seed 0 on"
+    )
     seeds = range(parser.parse_args().seeds)
     hj.enable_x64()
     hj.enable_compilation_cache()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for family, definition in sections().items():
         placed = hj.place_sections(cycle, definition)
-        exact = hj.linearize(cycle, placed, OUTPUTS).htf(hj.paper_design().frequencies, 0)
+        exact = hj.linearize(cycle, placed, OUTPUTS).htf(
+            hj.paper_design().frequencies, 0
+        )
         for choice, label in (("random", "random"), ("sum-free", "avoiding")):
-            found = np.array([errors(cycle, placed, exact, seed, choice) for seed in seeds])
+            found = np.array(
+                [errors(cycle, placed, exact, seed, choice) for seed in seeds]
+            )
             for k, output in enumerate(OUTPUTS):
                 name = f"second_order.{family}.{label}.{output}"
                 print(f"{name}.min {found[:, k].min():.2e}")

@@ -52,7 +52,9 @@ class PushedWheel(hj.models.RimlessWheel):
 
     def transitions(self):
         (x,) = super().transitions()
-        return [dataclasses.replace(x, reset=lambda t, q, u: (*x.reset(t, q, u), *q[2:]))]
+        return [
+            dataclasses.replace(x, reset=lambda t, q, u: (*x.reset(t, q, u), *q[2:]))
+        ]
 
 
 class Circuit(hj.Chart):
@@ -71,7 +73,9 @@ class Boost(hj.HybridSystem):
         return {"closed": Circuit(0.0), "open": Circuit(1.0)}
 
     def transitions(self):
-        yield hj.Transition("opens", "closed", "open", lambda t, q, u: 0.4 + u[0] - q[2])
+        yield hj.Transition(
+            "opens", "closed", "open", lambda t, q, u: 0.4 + u[0] - q[2]
+        )
         anew = lambda t, q, u: (q[0], q[1], 0.0)  # noqa: E731
         yield hj.Transition("closes", "open", "closed", hj.Scheduled(1e-5), reset=anew)
 
@@ -86,7 +90,9 @@ def slope(mean, size):
     """The response to a complex wave, by differences of responses to real ones of some sizes."""
 
     def by(angle):
-        coarse, fine = ((mean(h, angle) - mean(-h, angle)) / (2 * h) for h in (size, size / 2))
+        coarse, fine = (
+            (mean(h, angle) - mean(-h, angle)) / (2 * h) for h in (size, size / 2)
+        )
         return (4 * fine - coarse) / 3
 
     return by(0.0) + 1j * by(np.pi / 2)
@@ -104,7 +110,9 @@ def clocked(system, outputs, size):
         flow = linear_flow(hj.find_limit_cycle(Pushed(system, push), begin), 1 / 64)
         y = np.take_along_axis(flow.q, columns[flow.chart][:, None], axis=2)
         weight = flow.length[:, None] * rule().weights / (4 * period)
-        return np.einsum("pk,pky->y", weight * np.exp(-2.5j * np.pi * flow.t / period), y)
+        return np.einsum(
+            "pk,pky->y", weight * np.exp(-2.5j * np.pi * flow.t / period), y
+        )
 
     return cycle.htf(0.25, 1, outputs).H[0, 0, :, 0], slope(mean, size)
 
@@ -121,7 +129,10 @@ def wheel():
             [*np.asarray(cycle.anchor.q[:2, 0]), 0.0, 0.0],
             PushedWheel(push=push, wave=wave),
         )
-        ends = [hj.simulate(system, "swing", begin, n * period, settings=tight) for n in (28, 32)]
+        ends = [
+            hj.simulate(system, "swing", begin, n * period, settings=tight)
+            for n in (28, 32)
+        ]
         return (ends[1].after[-1][2:] - ends[0].after[-1][2:]) @ [1, 1j] / (4 * period)
 
     return cycle.htf(0.25, 1, "w").H[0, 0, :, 0], slope(mean, 1e-4)
@@ -138,6 +149,9 @@ if __name__ == "__main__":
     ]
     for system, outputs, size in cases:
         H, response = clocked(system, outputs, size)
-        print(f"{type(system).__name__:15} {np.max(np.abs(H / response - 1)):.1e}", flush=True)
+        print(
+            f"{type(system).__name__:15} {np.max(np.abs(H / response - 1)):.1e}",
+            flush=True,
+        )
     H, response = wheel()
     print(f"{'RimlessWheel':15} {np.max(np.abs(H / response - 1)):.1e}")

@@ -23,15 +23,22 @@ def main() -> None:
     with (
         tempfile.TemporaryDirectory() as folder,
         SLURMCluster(
-            cores=1, processes=1, memory="2GB", walltime="00:20:00", job_script_prologue=kept,
-            log_directory=folder, scheduler_options={"dashboard_address": ":0"},
+            cores=1,
+            processes=1,
+            memory="2GB",
+            walltime="00:20:00",
+            job_script_prologue=kept,
+            log_directory=folder,
+            scheduler_options={"dashboard_address": ":0"},
         ) as cluster,
-    ):  # fmt: skip
+    ):
         cluster.scale(jobs=2)
         with Client(cluster) as client:
             client.wait_for_workers(2, timeout=300)
             wheels = hj.models.RimlessWheel()
-            found = hj.sweep(wheels, over, chunk=10, store=f"{folder}/map.zarr", client=client)
+            found = hj.sweep(
+                wheels, over, chunk=10, store=f"{folder}/map.zarr", client=client
+            )
             found.load()
     error = np.abs(found.spectral_radius - np.cos(2 * np.pi / found.spokes) ** 2).max()
     print(f"slurm.points {found.result.size}")

@@ -68,7 +68,13 @@ def cycle(field, jacobian, start, rtol, atol=1e-16):
         return t, z
 
     solver = Radau(
-        whole, 0.0, np.array([*start, 0.0]), np.inf, rtol=rtol, atol=atol, jac=derivative
+        whole,
+        0.0,
+        np.array([*start, 0.0]),
+        np.inf,
+        rtol=rtol,
+        atol=atol,
+        jac=derivative,
     )
     rises, top, steps, begin = [], -np.inf, [], time.process_time()
     clock = []
@@ -86,7 +92,13 @@ def cycle(field, jacobian, start, rtol, atol=1e-16):
             _, z = crossing(t0, before, solver.t, speed, turn)
             top = max(top, z[0])
     (t1, z1), (t2, z2) = rises[-2:]
-    return t2 - t1, top, z2[2] - z1[2], clock[-1][1] - clock[-2][1], clock[-1][0] - clock[-2][0]
+    return (
+        t2 - t1,
+        top,
+        z2[2] - z1[2],
+        clock[-1][1] - clock[-2][1],
+        clock[-1][0] - clock[-2][0],
+    )
 
 
 def compliant_hopper():
@@ -130,7 +142,10 @@ def compliant_hopper():
         t2, z2, P2 = until(flight, z1, touch, mp.mpf("0.8347"))
         P3 = mp.expm(contact * (1 - t1 - t2))
         jumps = []
-        for before, after, row, x in ((contact, flight, lift, z1), (flight, contact, touch, z2)):
+        for before, after, row, x in (
+            (contact, flight, lift, z1),
+            (flight, contact, touch, z2),
+        ):
             slow = (row * before * x)[0]
             jumps.append(mp.eye(7) + (after * x - before * x) * row / slow)
         return P3 * z2, P3 * jumps[1] * P2 * jumps[0] * P1, (t1, t2)
@@ -153,4 +168,6 @@ if __name__ == "__main__":
         print("compliant hopper", *compliant_hopper(), flush=True)
     for name, case in CASES.items():
         if options.only in name:
-            print(name, *(repr(float(x)) for x in cycle(*case, options.rtol)), flush=True)
+            print(
+                name, *(repr(float(x)) for x in cycle(*case, options.rtol)), flush=True
+            )

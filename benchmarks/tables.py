@@ -35,23 +35,33 @@ def machines(values: dict, baseline: dict) -> str:
     found = {}
     for line, name in lines:
         found.setdefault(line, []).append(name)
-    return "\n".join(f"- {', '.join(names)}: {line}." for line, names in found.items()) or NONE
+    return (
+        "\n".join(f"- {', '.join(names)}: {line}." for line, names in found.items())
+        or NONE
+    )
 
 
 def experiments(values: dict, baseline: dict) -> str:
     """Seconds and errors of each at its fastest setting with errors below 1e-9."""
     who = {
-        "run": "`run_experiments`", "program": "its compiled program",
-        "loops": "`run_experiments`, loop kernels", "c": "C loop",
-        "heyoka.scalar": "heyoka, one by one", "heyoka.simd": "heyoka, batches of 8",
-        "heyoka.batch": "heyoka, batches of 80", "scipy": "scipy DOP853", "jaxonomy": "jaxonomy",
-    }  # fmt: skip
+        "run": "`run_experiments`",
+        "program": "its compiled program",
+        "loops": "`run_experiments`, loop kernels",
+        "c": "C loop",
+        "heyoka.scalar": "heyoka, one by one",
+        "heyoka.simd": "heyoka, batches of 8",
+        "heyoka.batch": "heyoka, batches of 80",
+        "scipy": "scipy DOP853",
+        "jaxonomy": "jaxonomy",
+    }
     rows = []
     for key, name in who.items():
         row = [name]
         for job in JOBS:
             seconds = values.get(f"experiments.{job}.at_1e-09.{key}.cpu")
-            ratio = values.get(f"experiments.{job}.at_1e-09.ratio_{key.replace('.', '_')}.run")
+            ratio = values.get(
+                f"experiments.{job}.at_1e-09.ratio_{key.replace('.', '_')}.run"
+            )
             error = values.get(f"experiments.{job}.at_1e-09.{key}.error")
             text = number(seconds)
             if error is not None:
@@ -84,9 +94,14 @@ def honesty(values: dict, baseline: dict) -> str:
         measured = [number(values.get(f"{name}.{x}")) for x in columns]
         rows.append((f"{model}, {family}", accuracy, *measured))
     head = (
-        "job", "accuracy", "ran well", "largest error", "error <= estimate",
-        "error <= accuracy", "estimate / error",
-    )  # fmt: skip
+        "job",
+        "accuracy",
+        "ran well",
+        "largest error",
+        "error <= estimate",
+        "error <= accuracy",
+        "estimate / error",
+    )
     return markdown(head, rows)
 
 
@@ -104,15 +119,20 @@ def derivatives(values: dict, baseline: dict) -> str:
         }
         for who, key in found.items():
             key = key.replace(f"{job}.{job}", job)
-            measured = [number(values.get(f"{key}.{x}")) for x in ("cpu", "error", "compile")]
+            measured = [
+                number(values.get(f"{key}.{x}")) for x in ("cpu", "error", "compile")
+            ]
             rows.append((job.replace(".", ", "), who, *measured))
     return markdown(("job", "", "seconds", "error", "compile"), rows)
 
 
 TABLES: dict[str, Callable[[dict, dict], str]] = {
-    "machines": machines, "experiments": experiments, "loops": loops,
-    "honesty": honesty, "derivatives": derivatives,
-}  # fmt: skip
+    "machines": machines,
+    "experiments": experiments,
+    "loops": loops,
+    "honesty": honesty,
+    "derivatives": derivatives,
+}
 
 
 def number(value: Any, unit: str = "") -> str:

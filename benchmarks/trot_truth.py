@@ -13,7 +13,17 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 
-M, J, HIP, K, B, L0, G, A, T = 1.0, 0.2, np.array([-0.5, 0.5]), 15.0, 1.0, 1.0, 10.0, 0.2, 1.0
+M, J, HIP, K, B, L0, G, A, T = (
+    1.0,
+    0.2,
+    np.array([-0.5, 0.5]),
+    15.0,
+    1.0,
+    1.0,
+    10.0,
+    0.2,
+    1.0,
+)
 RATE = 2 * np.pi / T
 
 
@@ -39,7 +49,13 @@ def flow(t, end, x, down, thrust, events=True):
         for i, guard in enumerate(guards):
             guard.direction, guard.terminal = (1 if down[i] else -1), True
         way = solve_ivp(
-            moving, (t, end), x, "DOP853", rtol=1e-13, atol=1e-14, events=guards if events else None
+            moving,
+            (t, end),
+            x,
+            "DOP853",
+            rtol=1e-13,
+            atol=1e-14,
+            events=guards if events else None,
         )
         t, x = way.t[-1], way.y[:, -1]
         if way.status == 0:
@@ -62,7 +78,9 @@ def cycle(thrust, x=(0.4, -1.0)):
 
 
 def central(function, x, h=1e-4):
-    return np.array([(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(4)]).T
+    return np.array(
+        [(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(4)]
+    ).T
 
 
 def one_sided(function, x, direction, h=1e-4):
@@ -86,7 +104,9 @@ def across(x, time, down, thrust, first, tau=0.02):
         1.0 if (first == 0) != down else -1.0
     )  # a lower foot lands first, a higher lets go first
     D = one_sided(whole, start, np.array([0.0, 0.0, lower, 0.0]))
-    return np.linalg.solve(central(on, to(start)), D) @ np.linalg.inv(central(to, start))
+    return np.linalg.solve(central(on, to(start)), D) @ np.linalg.inv(
+        central(to, start)
+    )
 
 
 def times(x, thrust):
@@ -97,8 +117,13 @@ def times(x, thrust):
         guard.direction, guard.terminal = (1 if down else -1), True
         way = solve_ivp(
             lambda t, x, down=down: field(t, x, np.array([down, down]), thrust),
-            (t, T), x, "DOP853", rtol=1e-13, atol=1e-14, events=guard,
-        )  # fmt: skip
+            (t, T),
+            x,
+            "DOP853",
+            rtol=1e-13,
+            atol=1e-14,
+            events=guard,
+        )
         t, x, down = way.t[-1], way.y[:, -1], not down
         found.append(float(t))
     return found

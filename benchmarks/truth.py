@@ -71,7 +71,9 @@ def bar(m, J, hind, front, k, b, l0, g, rho, A, T) -> Piecewise:
         reset.append([])
         for j, s in enumerate(hips):
             impulse = -(1 - on[j]) * (1 - rho) * speed[j] / (1 / m + s**2 / J)
-            reset[-1].append([y, v + impulse / m, q, p + s * impulse / J, one, sin, cos, u])
+            reset[-1].append(
+                [y, v + impulse / m, q, p + s * impulse / J, one, sin, cos, u]
+            )
     charts = ("air", "hind", "front", "both")
     return Piecewise(charts, rate, *(np.array(x) for x in (G, guard, to, reset)))
 
@@ -125,7 +127,11 @@ def _start(job, system, sections, derivatives) -> Lanes:
     t = job.times[sections]
     z = np.zeros((8, 1 + derivatives, len(sections)))
     z[:4, 0] = job.states[sections].T
-    z[4, 0], z[SIN, 0], z[COS, 0] = 1.0, np.sin(system.rate * t), np.cos(system.rate * t)
+    z[4, 0], z[SIN, 0], z[COS, 0] = (
+        1.0,
+        np.sin(system.rate * t),
+        np.cos(system.rate * t),
+    )
     return Lanes(t, chart, z, np.zeros((derivatives, len(sections))))
 
 
@@ -204,5 +210,7 @@ def _first_zeros(P, window):
     tau = at[0] * width + np.where(found, before / slope, 0.0) * width
     D = P[1:] * np.arange(1, TERMS)[:, None, None]
     for _ in range(5):
-        tau = tau - np.where(found, _value(P, tau) / np.where(found, _value(D, tau), 1.0), 0.0)
+        tau = tau - np.where(
+            found, _value(P, tau) / np.where(found, _value(D, tau), 1.0), 0.0
+        )
     return np.where(found, tau, np.inf)

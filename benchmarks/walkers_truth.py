@@ -26,7 +26,9 @@ class Chain:
     """A walker that stands on one point."""
 
     def __init__(self, lengths, masses, inertias, foot, swapped):
-        self.R, self.m, self.I = (np.array(x, float) for x in (lengths, masses, inertias))
+        self.R, self.m, self.I = (
+            np.array(x, float) for x in (lengths, masses, inertias)
+        )
         self.foot, self.swapped, self.n = np.array(foot, float), swapped, len(inertias)
         self.A = self.R.T @ np.diag(self.m) @ self.R
 
@@ -34,7 +36,9 @@ class Chain:
         return self.A * np.cos(q[:, None] - q) + np.diag(self.I)
 
     def bias(self, q, v):
-        return (self.A * np.sin(q[:, None] - q)) @ v**2 - G * np.sin(q) * (self.m @ self.R)
+        return (self.A * np.sin(q[:, None] - q)) @ v**2 - G * np.sin(q) * (
+            self.m @ self.R
+        )
 
     def field(self, t, x, u=0.0):
         q, v = x[: self.n], x[self.n :]
@@ -50,11 +54,15 @@ class Chain:
         s, c = np.sin(q), np.cos(q)
         way = np.stack([c, -s])  # of a point at (sin q, cos q), per angle
         coupling = way * (self.m @ self.R)
-        M = np.block([[self.mass(q), coupling.T], [coupling, np.sum(self.m) * np.eye(2)]])
+        M = np.block(
+            [[self.mass(q), coupling.T], [coupling, np.sum(self.m) * np.eye(2)]]
+        )
         J = np.concatenate([way * self.foot, np.eye(2)], axis=1)
         system = np.block([[M, -J.T], [J, np.zeros((2, 2))]])
         rest = np.concatenate([v, np.zeros(2)])
-        after = np.linalg.solve(system, np.concatenate([M @ rest, np.zeros(2)]))[: self.n]
+        after = np.linalg.solve(system, np.concatenate([M @ rest, np.zeros(2)]))[
+            : self.n
+        ]
         return np.concatenate([q[self.swapped], after[self.swapped]])
 
     def until(self, x, level, direction, u=0.0, wait=0.0):
@@ -83,7 +91,9 @@ class Chain:
     def ways(self):
         """From a touchdown to each of the angles `levels` of the stance leg, and to the next."""
         for angle in self.levels:
-            yield lambda x, u, angle=angle: self.until(x, lambda q: self.leg @ q - angle, 1, u)[0]
+            yield lambda x, u, angle=angle: self.until(
+                x, lambda q: self.leg @ q - angle, 1, u
+            )[0]
         yield lambda x, u: self.land(self.until(x, self.guard, self.direction, u)[0])
 
     def derivatives(self, x):
@@ -122,9 +132,12 @@ class TorsoWalker(Chain):
 
     def __init__(self, r=1.0, l=0.5):  # noqa: E741
         super().__init__(
-            [[r / 2, 0, 0], [r, -r / 2, 0], [r, 0, 0], [r, 0, l]], [5, 5, 15, 10], [0, 0, 0],
-            [r, -r, 0], [1, 0, 2],
-        )  # fmt: skip
+            [[r / 2, 0, 0], [r, -r / 2, 0], [r, 0, 0], [r, 0, l]],
+            [5, 5, 15, 10],
+            [0, 0, 0],
+            [r, -r, 0],
+            [1, 0, 2],
+        )
 
     def guard(self, q):
         return q[0] - np.pi / 8
@@ -144,11 +157,16 @@ class FiveLinkBiped(Chain):
         center, l, order = np.array([0.24, 0.11, 0.24]), 0.4, [0, 1, 2, 1, 0]  # noqa: E741
         shin, thigh, torso = center
         lengths = [
-            [l - shin, 0, 0, 0, 0], [l, l - thigh, 0, 0, 0], [l, l, torso, 0, 0],
-            [l, l, 0, -thigh, 0], [l, l, 0, -l, -shin],
-        ]  # fmt: skip
+            [l - shin, 0, 0, 0, 0],
+            [l, l - thigh, 0, 0, 0],
+            [l, l, torso, 0, 0],
+            [l, l, 0, -thigh, 0],
+            [l, l, 0, -l, -shin],
+        ]
         inertias = (about_joint - m * center**2)[order]
-        super().__init__(lengths, m[order], inertias, [l, l, 0, -l, -l], [4, 3, 2, 1, 0])
+        super().__init__(
+            lengths, m[order], inertias, [l, l, 0, -l, -l], [4, 3, 2, 1, 0]
+        )
 
     def guard(self, q):
         return self.foot @ np.cos(q) + 1e3 * (self.foot @ np.sin(q) < 0)
@@ -174,12 +192,24 @@ if __name__ == "__main__":
     guesses = {
         TorsoWalker: [-0.3927, 0.3927, 0.5236, 0.9395, -0.2763, 2.0386],
         FiveLinkBiped: [
-            -0.0755, -0.2988, 0.2004, 0.0874, 0.2955, 4.0145, -1.0352, 0.2622, 1.6457, 1.1118,
+            -0.0755,
+            -0.2988,
+            0.2004,
+            0.0874,
+            0.2955,
+            4.0145,
+            -1.0352,
+            0.2622,
+            1.6457,
+            1.1118,
         ],
-    }  # fmt: skip
+    }
     for walker, guess in guesses.items():
         x, period, multipliers = walker().cycle(np.array(guess))
-        print(walker.__name__, f"period {period:.14g}\n state {x}\n multipliers {multipliers}")
+        print(
+            walker.__name__,
+            f"period {period:.14g}\n state {x}\n multipliers {multipliers}",
+        )
         by_state, by_input = walker().derivatives(x)
         values = {"state": x, "by_state": by_state, "by_input": by_input}
         found |= {f"{walker.__name__}.{name}": value for name, value in values.items()}

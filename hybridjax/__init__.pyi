@@ -28,7 +28,10 @@ from .errors import (
 )
 from .experiments.data import ExperimentData as ExperimentData
 from .experiments.design.design import Design as Design
-from .experiments.design.multisine import multisine as multisine, paper_design as paper_design
+from .experiments.design.multisine import (
+    multisine as multisine,
+    paper_design as paper_design,
+)
 from .experiments.record import Record as Record
 from .experiments.response import response_function as response_function
 from .experiments.run import run_experiments as run_experiments
@@ -42,7 +45,10 @@ from .fitting.observations import (
 from .fitting.stability import spectral_radius as spectral_radius
 from .identify.htf_estimate import estimate_htf as estimate_htf
 from .identify.joint.fit import fit_ldtp as fit_ldtp
-from .identify.multipliers import fit_multipliers as fit_multipliers, select_order as select_order
+from .identify.multipliers import (
+    fit_multipliers as fit_multipliers,
+    select_order as select_order,
+)
 from .identify.rational import fit_rational as fit_rational
 from .identify.series.fit import fit_series as fit_series
 from .identify.validate import validate as validate

@@ -24,7 +24,16 @@ from .linear.htf import HTF
 from .linear.ldtp import LDTP
 
 
-Saved = Design | ExperimentData | HTF | LDTP | RationalFit | Record | SeriesFit | StructuredFit
+Saved = (
+    Design
+    | ExperimentData
+    | HTF
+    | LDTP
+    | RationalFit
+    | Record
+    | SeriesFit
+    | StructuredFit
+)
 
 KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)}
 
@@ -48,9 +57,13 @@ def save(path: FilePath, thing: Saved) -> None:
     """
     path, kind = Path(path), type(thing).__name__
     if type(thing) is not KINDS.get(kind):
-        raise DefinitionError(f"save takes {', '.join(KINDS)}; it cannot write a {kind}.")
+        raise DefinitionError(
+            f"save takes {', '.join(KINDS)}; it cannot write a {kind}."
+        )
     if path.suffix not in (".npz", ".mat"):
-        raise DefinitionError(f"let the name '{path.name}' end in '.npz', or in '.mat' for MATLAB.")
+        raise DefinitionError(
+            f"let the name '{path.name}' end in '.npz', or in '.mat' for MATLAB."
+        )
     require_x64(thing)
     write_module(path, thing)
 

@@ -46,7 +46,9 @@ truth = hj.models.VerticalHopper()
 cycle = hj.find_limit_cycle(truth)
 apex = hj.Crossing("vM", "falling")
 sections = hj.ClockPhase(SECTIONS, anchor=apex)
-design = hj.multisine(SECTIONS, periods=16, band=(0, 3.0), amplitude=0.02, seed=0).realizations(4)
+design = hj.multisine(
+    SECTIONS, periods=16, band=(0, 3.0), amplitude=0.02, seed=0
+).realizations(4)
 data = hj.run_experiments(cycle, sections, design, OUTPUTS, start="periodic")
 data = hj.experiments.add_noise(data, snr=20, seed=0)
 estimate = hj.estimate_htf(data, (-1, 0, 1))
@@ -59,7 +61,9 @@ estimate
 # %%
 names = ("m", "M", "k", "b", "l0", "a", "g")
 wrong = hj.models.VerticalHopper(m=1.15, M=1.8, k=11.0, b=4.3, l0=2.2, a=18.0, g=2.1)
-fit = hj.fit_model(wrong, hj.ObservedHTF(estimate, sections), names, guess=cycle, guesses=4)
+fit = hj.fit_model(
+    wrong, hj.ObservedHTF(estimate, sections), names, guess=cycle, guesses=4
+)
 fit
 
 # %%
@@ -73,15 +77,23 @@ print(fit.identifiability)
 
 # %%
 for name in ("m", "M", "k", "b"):
-    print(f"{name}: {float(getattr(fit.system, name)):.4f}, true {float(getattr(truth, name)):g}")
-print(f"a/g: {float(fit.system.a / fit.system.g):.4f}, true {float(truth.a / truth.g):g}")
-print(f"chi square {fit.chi_square(truth):.2f} for 5 combinations;", fit.contains(truth))
+    print(
+        f"{name}: {float(getattr(fit.system, name)):.4f}, true {float(getattr(truth, name)):g}"
+    )
+print(
+    f"a/g: {float(fit.system.a / fit.system.g):.4f}, true {float(truth.a / truth.g):g}"
+)
+print(
+    f"chi square {fit.chi_square(truth):.2f} for 5 combinations;", fit.contains(truth)
+)
 
 # %%
 f = np.linspace(0.02, 3, 300)
 exact = {
     "fitted": hj.linearize(fit.cycle, sections, OUTPUTS).htf(f, (-1, 0, 1)),
-    "start": hj.linearize(hj.find_limit_cycle(wrong), sections, OUTPUTS).htf(f, (-1, 0, 1)),
+    "start": hj.linearize(hj.find_limit_cycle(wrong), sections, OUTPUTS).htf(
+        f, (-1, 0, 1)
+    ),
 }
 with hj.plot.style():
     figure, panels = pyplot.subplots(
@@ -91,9 +103,13 @@ with hj.plot.style():
     for row, output in enumerate(OUTPUTS):
         for axes, m in zip(panels[row], (-1, 0, 1), strict=True):
             axes.plot(
-                estimate.f[order], np.abs(estimate[m][order, row, 0]), ".", ms=3, label="estimate",
+                estimate.f[order],
+                np.abs(estimate[m][order, row, 0]),
+                ".",
+                ms=3,
+                label="estimate",
                 color=hj.plot.COLORS["gray"],
-            )  # fmt: skip
+            )
             axes.plot(f, np.abs(exact["start"][m][:, row, 0]), "--", label="start")
             axes.plot(f, np.abs(exact["fitted"][m][:, row, 0]), label="fit")
             axes.set_title(f"$|H_{{{m}}}|$ of {output}")
@@ -160,7 +176,9 @@ print(records.summary())
 
 measured = jnp.asarray(records.y + np.tile(records.cycle_outputs, (PERIODS, 1)))
 scale = jnp.asarray(records.y.std(axis=(0, 1)))
-start = jnp.zeros((5, 8)).at[:3].set(jnp.array([[0.5], *records.cycle_outputs[0][:, None]]))
+start = (
+    jnp.zeros((5, 8)).at[:3].set(jnp.array([[0.5], *records.cycle_outputs[0][:, None]]))
+)
 
 # %% [markdown]
 # `response_function` computes the same outputs as `run_experiments`, as a differentiable function.
@@ -171,17 +189,25 @@ start = jnp.zeros((5, 8)).at[:3].set(jnp.array([[0.5], *records.cycle_outputs[0]
 # weak regularization towards zero determines the weights that the data do not identify.
 
 # %%
-network = eqx.nn.MLP(1, 1, 6, 1, activation=jnp.tanh, key=jax.random.key(0), dtype=float)
-small = eqx.tree_at(lambda n: n.layers[-1].weight, network, 0.01 * network.layers[-1].weight)
+network = eqx.nn.MLP(
+    1, 1, 6, 1, activation=jnp.tanh, key=jax.random.key(0), dtype=float
+)
+small = eqx.tree_at(
+    lambda n: n.layers[-1].weight, network, 0.01 * network.layers[-1].weight
+)
 law = Law(jnp.asarray(5.0), small)
-guess = hj.find_limit_cycle(Hopper(damping=law), hj.Guess("stance", (1.965, 1.876), 0.5))
+guess = hj.find_limit_cycle(
+    Hopper(damping=law), hj.Guess("stance", (1.965, 1.876), 0.5)
+)
 response = hj.response_function(guess, phases, OUTPUTS)
 numbers, rest = eqx.partition(law, eqx.is_inexact_array)
 begin, back = jax.flatten_util.ravel_pytree(numbers)
 
 
 def misfit(weights):
-    system = eqx.tree_at(lambda s: s.damping, guess.system, eqx.combine(back(weights), rest))
+    system = eqx.tree_at(
+        lambda s: s.damping, guess.system, eqx.combine(back(weights), rest)
+    )
     return ((response(force, start, system).y - measured) / scale).ravel()
 
 
@@ -205,7 +231,9 @@ print("noise: 0.0001")
 # the leg on the body.
 
 # %%
-found = hj.find_limit_cycle(eqx.tree_at(lambda s: s.damping, guess.system, learned), guess)
+found = hj.find_limit_cycle(
+    eqx.tree_at(lambda s: s.damping, guess.system, learned), guess
+)
 print("true         ", real.multipliers)
 print("linear guess ", guess.multipliers)
 print("learned      ", found.multipliers)
@@ -218,14 +246,25 @@ t, chart, q = moments.dense()
 speeds = np.asarray(q)[np.asarray(chart) == 0, 3]
 v = jnp.linspace(speeds.min(), speeds.max(), 200)
 with hj.plot.style():
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(hj.plot.PAGE, 2.8), layout="constrained")
-    left.plot(v, jax.vmap(true_law)(v), color=hj.plot.COLORS["gray"], lw=4, alpha=0.5, label="true")
+    figure, (left, right) = pyplot.subplots(
+        1, 2, figsize=(hj.plot.PAGE, 2.8), layout="constrained"
+    )
+    left.plot(
+        v,
+        jax.vmap(true_law)(v),
+        color=hj.plot.COLORS["gray"],
+        lw=4,
+        alpha=0.5,
+        label="true",
+    )
     left.plot(v, 5 * v, "--", color="C1", label="guess")
     left.plot(v, jax.vmap(learned)(v), color="C2", label="learned")
     left.set(xlabel="speed of the foot (m/s)", ylabel="damping force (N)")
     left.legend()
     right.plot(v, 5 * v - jax.vmap(true_law)(v), "--", color="C1", label="guess")
-    right.plot(v, jax.vmap(learned)(v) - jax.vmap(true_law)(v), color="C2", label="learned")
+    right.plot(
+        v, jax.vmap(learned)(v) - jax.vmap(true_law)(v), color="C2", label="learned"
+    )
     right.axhline(0, color=hj.plot.COLORS["gray"], lw=0.8)
     right.set(xlabel="speed of the foot (m/s)", ylabel="error of the damping force (N)")
     right.legend()

@@ -34,14 +34,18 @@ hj.enable_x64()
 budget, asked, force = 4000, 5e-5, 0.001
 outputs = ("yM", "vM")
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-sections = hj.ClockPhase(32, anchor=hj.Crossing("vM", "falling"))  # 32 instants per stride
+sections = hj.ClockPhase(
+    32, anchor=hj.Crossing("vM", "falling")
+)  # 32 instants per stride
 rng = np.random.default_rng(1)
 
 
 def laboratory(design):
     """What comes back: the responses, and noise that nobody told us the size of."""
     data = hj.run_experiments(cycle, sections, design, outputs, start="periodic")
-    return hj.experiments.add_noise(data, std=(6e-6, 1.2e-5), seed=int(rng.integers(1000)))
+    return hj.experiments.add_noise(
+        data, std=(6e-6, 1.2e-5), seed=int(rng.integers(1000))
+    )
 
 
 # %% [markdown]
@@ -113,10 +117,14 @@ study.fit.compare(cycle.multipliers)
 # %%
 block = study.design
 u = block.inputs()
-print(f"{len(u)} experiments of {block.periods} strides, rms {np.sqrt(np.mean(u**2)):.2g} N,")
+print(
+    f"{len(u)} experiments of {block.periods} strides, rms {np.sqrt(np.mean(u**2)):.2g} N,"
+)
 print(f"peak {np.abs(u).max():.2g} N")
 folder = pathlib.Path(tempfile.mkdtemp())
-hj.recordings.write_design(folder / "time.csv", block, period=float(cycle.period), rate=1000)
+hj.recordings.write_design(
+    folder / "time.csv", block, period=float(cycle.period), rate=1000
+)
 hj.recordings.write_design(folder / "phase.csv", block)
 for name in ("time.csv", "phase.csv"):
     with open(folder / name) as file:

@@ -30,7 +30,12 @@ phase = hj.ClockPhase(8, anchor=hj.Crossing("vM", "falling"))
 plant = hj.linearize(cycle, phase, ("yM", "vM"))
 ones = np.ones((8, 1, 1))
 controller = hj.LDTP(
-    0.6 * ones, ones * [[0.3, 0.8]], ones, ones * [[0.0, 0.0]], inputs=("yM", "vM"), outputs="u"
+    0.6 * ones,
+    ones * [[0.3, 0.8]],
+    ones,
+    ones * [[0.0, 0.0]],
+    inputs=("yM", "vM"),
+    outputs="u",
 )
 closed = plant.feedback(controller)
 print(np.abs(plant.multipliers), np.abs(closed.multipliers))
@@ -79,7 +84,9 @@ panels = {
     "plant with its controller": (loop.closed, closed.htf(f), 1, 0),
     "controller": (loop.controller, controller.htf(f), 0, 1),
 }
-for ax, (title, (estimate, exact, output, source)) in zip(axes, panels.items(), strict=True):
+for ax, (title, (estimate, exact, output, source)) in zip(
+    axes, panels.items(), strict=True
+):
     hj.plot.magnitude(
         estimate, exact, output=output, input=source, harmonics=(0,), decades=2, ax=ax
     )

@@ -29,7 +29,9 @@ import hybridjax as hj
 
 hj.enable_x64()
 # (Run this in the repository, or in its folder notebooks.)
-folder = Path("data" if Path("data/pacemaker_neurons.npz").exists() else "notebooks/data")
+folder = Path(
+    "data" if Path("data/pacemaker_neurons.npz").exists() else "notebooks/data"
+)
 data = dict(np.load(folder / "pacemaker_neurons.npz"))
 
 # %% [markdown]
@@ -39,16 +41,21 @@ data = dict(np.load(folder / "pacemaker_neurons.npz"))
 
 # %%
 time = np.arange(0, 10.0002, 2e-4)
-spikes = np.split(data["cell8_steps"].astype(int), np.cumsum(data["cell8_counts"], dtype=int)[:-1])
+spikes = np.split(
+    data["cell8_steps"].astype(int), np.cumsum(data["cell8_counts"], dtype=int)[:-1]
+)
 trials = []
 for f in range(5, 101, 10):
     current = 20 * np.sin(2 * np.pi * f * time)
     trials.append(
         hj.Recording(
-            time, {"current": current}, events={"spike": np.cumsum(spikes[f - 1]) / 1e4},
-            units={"current": "pA"}, name=f"{f} Hz",
+            time,
+            {"current": current},
+            events={"spike": np.cumsum(spikes[f - 1]) / 1e4},
+            units={"current": "pA"},
+            name=f"{f} Hz",
         )
-    )  # fmt: skip
+    )
 recording = hj.Recording.join(trials)
 phase = hj.recordings.estimate_phase(recording, hj.AtEvent("spike"))
 print(phase)
@@ -73,11 +80,23 @@ found
 # %%
 figure = hj.plot.phase_response(found)
 panel = figure.ax
-panel.plot(data["published_phase"], data["cell8_published"], color="black", lw=1, label="published")
+panel.plot(
+    data["published_phase"],
+    data["cell8_published"],
+    color="black",
+    lw=1,
+    label="published",
+)
 panel.errorbar(
-    data["measured_phase"], data["cell8_measured"], data["cell8_measured_error"],
-    fmt=".", ms=3, lw=0.5, color="gray", label="with noise currents",
-)  # fmt: skip
+    data["measured_phase"],
+    data["cell8_measured"],
+    data["cell8_measured_error"],
+    fmt=".",
+    ms=3,
+    lw=0.5,
+    color="gray",
+    label="with noise currents",
+)
 legend = panel.legend(fontsize="x-small")
 
 # %% [markdown]
@@ -93,7 +112,9 @@ legend = panel.legend(fontsize="x-small")
 # curve.
 
 # %%
-print(f"R2 of intervals left out: {found.left_out:.3f}; of a flat curve: {found.left_out_flat:.3f}")
+print(
+    f"R2 of intervals left out: {found.left_out:.3f}; of a flat curve: {found.left_out_flat:.3f}"
+)
 
 # %% [markdown]
 # ## A simulated check
@@ -105,11 +126,15 @@ print(f"R2 of intervals left out: {found.left_out:.3f}; of a flat curve: {found.
 x = np.arange(400) / 400
 true = 1 - 0.5 * np.cos(2 * np.pi * x) - 0.2 * np.cos(4 * np.pi * x)
 force = np.stack([trial.values[::5, 0] for trial in recording.trials])
-made = hj.testing.simulate_beats(true, force, rate=1000, rhythm=52.0, jitter=found.jitter, seed=1)
+made = hj.testing.simulate_beats(
+    true, force, rate=1000, rhythm=52.0, jitter=found.jitter, seed=1
+)
 again = hj.recordings.phase_response(made, hj.AtEvent("beat"), input="u")
 low, high = again.interval(x)
 again
 
 # %%
-print(f"the band holds the true curve at {100 * np.mean((low <= true) & (true <= high)):.0f} %"
-      " of the phases")  # fmt: skip
+print(
+    f"the band holds the true curve at {100 * np.mean((low <= true) & (true <= high)):.0f} %"
+    " of the phases"
+)

@@ -96,8 +96,12 @@ class Robot(hj.HybridSystem):
 
         return [
             hj.Transition("touchdown", "flight", "compression", guard=height),
-            hj.Transition("bottom", "compression", "extension", guard=lambda t, q, u: -q[1]),
-            hj.Transition("liftoff", "extension", "flight", guard=lambda t, q, u: -height(t, q, u)),
+            hj.Transition(
+                "bottom", "compression", "extension", guard=lambda t, q, u: -q[1]
+            ),
+            hj.Transition(
+                "liftoff", "extension", "flight", guard=lambda t, q, u: -height(t, q, u)
+            ),
         ]
 
 
@@ -162,9 +166,13 @@ print(f"by hand {slope:.8f}, exactly {cycle.multipliers[0].real:.8f}")
 _, *orbit = cycle.trajectory()("y", "v")
 center = [(np.min(x) + np.max(x)) / 2 + 0.1 * np.ptp(x) for x in orbit]
 scale = [(np.max(x) - np.min(x)) / 2 for x in orbit]
-phase = hj.KinematicPhase(16, position="y", velocity="v", center=center, scale=scale, anchor=apex)
+phase = hj.KinematicPhase(
+    16, position="y", velocity="v", center=center, scale=scale, anchor=apex
+)
 model = hj.linearize(cycle, phase, outputs=("y", "v"))
-design = hj.multisine(n_sections=16, periods=32, lines="odd", seed=0).scaled(rms=0.05)  # N
+design = hj.multisine(n_sections=16, periods=32, lines="odd", seed=0).scaled(
+    rms=0.05
+)  # N
 data = hj.run_experiments(cycle, phase, design, outputs=("y", "v"))
 print(data.summary())
 estimate = hj.estimate_htf(data, harmonics=(-1, 0, 1))
@@ -190,7 +198,9 @@ def multiplier(robot):
 slopes = jax.grad(multiplier)(robot)  # without `jit`: that would compile for a minute
 for name in ("m", "g", "l0", "k", "b", "thrust"):
     value = getattr(robot, name)
-    change = round(float(0.01 * value * getattr(slopes, name)), 12) or 0.0  # less is rounding
+    change = (
+        round(float(0.01 * value * getattr(slopes, name)), 12) or 0.0
+    )  # less is rounding
     print(f"1 % more {name:6s} changes it by {change:+.1e}")
 
 # %% [markdown]
@@ -203,7 +213,11 @@ for name in ("m", "g", "l0", "k", "b", "thrust"):
 # %%
 class Forgetful(Robot):
     def transitions(self):
-        return [hj.Transition("touchdown", "flight", "squat", guard=lambda t, q, u: q[0] - self.l0)]
+        return [
+            hj.Transition(
+                "touchdown", "flight", "squat", guard=lambda t, q, u: q[0] - self.l0
+            )
+        ]
 
 
 def attempt(action):

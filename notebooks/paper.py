@@ -85,16 +85,20 @@ class Hopper(hj.HybridSystem):
     def transitions(self):
         return (
             hj.Transition(
-                "touchdown", "flight", "stance",
+                "touchdown",
+                "flight",
+                "stance",
                 guard=lambda t, q, u: q[2],
                 reset=lambda t, q, u: q[:2],
             ),
             hj.Transition(
-                "liftoff", "stance", "flight",
+                "liftoff",
+                "stance",
+                "flight",
                 guard=lambda t, q, u: self.leg(t, q[0], 0.0) + self.m * self.g,
                 reset=lambda t, q, u: (q[0], q[1], 0.0, 0.0),
             ),
-        )  # fmt: skip
+        )
 
     def period(self):
         return 1.0
@@ -132,11 +136,18 @@ apex = hj.Crossing("vM", "falling")
 families = {
     "isochron": hj.ClockPhase(SECTIONS, anchor=apex),
     "kinematic": hj.KinematicPhase(
-        SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=apex
+        SECTIONS,
+        position="yM",
+        velocity="vM",
+        center=(1.9, 0.0),
+        scale=(0.3, 1.9),
+        anchor=apex,
     ),
 }
 placed = {name: hj.place_sections(cycle, family) for name, family in families.items()}
-axes = hj.plot.cycle(cycle, "yM", "vM", sections=placed["kinematic"], perturbed=trajectory)
+axes = hj.plot.cycle(
+    cycle, "yM", "vM", sections=placed["kinematic"], perturbed=trajectory
+)
 
 # %% [markdown]
 # ## The linear periodic system (eqs. 5 to 7)
@@ -151,7 +162,12 @@ models = {name: hj.linearize(cycle, where, outputs) for name, where in placed.it
 for name, model in models.items():
     print(name, model)
     print("   dimensions", *np.asarray(model.dims))
-    print("   on section 0:", model.coordinates[0], "rank of the return map:", model.rank())
+    print(
+        "   on section 0:",
+        model.coordinates[0],
+        "rank of the return map:",
+        model.rank(),
+    )
     print("   multipliers", model.multipliers)
 
 # %% [markdown]
@@ -194,7 +210,9 @@ for name in families:
     errors = estimates[name].harmonic_errors(exact[name])
     print(f"{name}: error of H_0 (of max|H_0|) {np.asarray(errors[SECTIONS // 2])}")
     size = np.abs(exact[name].select((-2, 0, 2)).H[..., 0]).max(axis=1)
-    print(f"   max|H_-2|, max|H_2| over max|H_0|: {size[0] / size[1]}, {size[2] / size[1]}")
+    print(
+        f"   max|H_-2|, max|H_2| over max|H_0|: {size[0] / size[1]}, {size[2] / size[1]}"
+    )
 
 pairs = {name: (estimates[name], exact[name]) for name in families}
 figure = hj.plot.harmonics(pairs)
@@ -212,7 +230,9 @@ for name, fit in rational.items():
     for output in outputs:
         error = fit.compare(cycle.multipliers, output).max_error
         bias = biased.compare(cycle.multipliers, output).max_error
-        print(f"{name}, {output}: error {error:.1e}; of the same fit to the exact H_0 {bias:.1e}")
+        print(
+            f"{name}, {output}: error {error:.1e}; of the same fit to the exact H_0 {bias:.1e}"
+        )
 figure = hj.plot.bodes(pairs, fits=rational)
 
 # %% [markdown]
@@ -220,7 +240,9 @@ figure = hj.plot.bodes(pairs, fits=rational)
 # multipliers. This structure is exact:
 
 # %%
-structured = {name: hj.fit_multipliers(e, order=models[name]) for name, e in estimates.items()}
+structured = {
+    name: hj.fit_multipliers(e, order=models[name]) for name, e in estimates.items()
+}
 for name, fit in structured.items():
     print(name)
     print(fit.compare(cycle.multipliers))
@@ -260,4 +282,7 @@ u = 0.01 * sum(np.cos(2 * np.pi * f * n / SECTIONS + f) for f in lines)[:, None]
 predicted = estimate.predict(u)
 linear = model.simulate(u, model.periodic_state(u, PERIODS))
 size = np.abs(linear).max(axis=0)
-print("largest error, of the largest response:", abs(predicted - linear).max(axis=0) / size)
+print(
+    "largest error, of the largest response:",
+    abs(predicted - linear).max(axis=0) / size,
+)

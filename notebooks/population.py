@@ -43,13 +43,17 @@ for k in range(12):
     cycle = hj.find_limit_cycle(hopper)
     strides = int(rng.integers(80, 200))
     force = hj.testing.random_force(strides, 64, bandwidth=6, rms=0.02, seed=k)
-    clean = hj.testing.simulate_recording(cycle, force[None], ("yM", "vM"), rate=64, steps=1)
+    clean = hj.testing.simulate_recording(
+        cycle, force[None], ("yM", "vM"), rate=64, steps=1
+    )
     recording = hj.testing.spoil(clean, ("yM", "vM"), noise=5e-4, seed=k)
     data = hj.recordings.section_data(
         recording, apex, inputs="u", outputs=("yM", "vM"), n_sections=12
     )
     fits.append(hj.fit_series(data, order=2))
-    responses.append(hj.recordings.impulse_responses(fits[-1], data, cycles=2, width=0.1))
+    responses.append(
+        hj.recordings.impulse_responses(fits[-1], data, cycles=2, width=0.1)
+    )
     true.append(abs(cycle.multipliers[0]))
     table["strides"].append(strides)
 

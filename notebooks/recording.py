@@ -138,9 +138,13 @@ axes = hj.plot.multipliers(fit, {"plain regression": advice.plain})
 
 # %%
 sections = hj.KinematicPhase(
-    32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
+    32,
+    position="yM",
+    velocity="vM",
+    center=(1.9, 0.0),
+    scale=(0.3, 1.9),
     anchor=apex,
-)  # fmt: skip
+)
 exact = hj.linearize(cycle, sections, outputs=("yM", "vM"))
 f = np.arange(1, 161) / 20
 figure = hj.plot.bode(fit.htf(f), exact.htf(f))
@@ -169,7 +173,13 @@ with tempfile.TemporaryDirectory() as folder:
 # does the same and writes a report of one page. From Python:
 
 # %%
-found = hj.identify_recording(recording, angle, inputs="u", outputs=("yM", "vM"), order=2)
+found = hj.identify_recording(
+    recording, angle, inputs="u", outputs=("yM", "vM"), order=2
+)
 with tempfile.TemporaryDirectory() as folder:
     page = hj.write_report(Path(folder) / "results", found)
-    print(sorted(path.name for path in page.parent.iterdir()), page.stat().st_size // 1000, "kB")
+    print(
+        sorted(path.name for path in page.parent.iterdir()),
+        page.stat().st_size // 1000,
+        "kB",
+    )

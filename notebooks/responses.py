@@ -87,6 +87,11 @@ legend = figure.legend(loc="outside upper right", ncols=3)
 
 # %%
 noisy = buck.fluctuations(
-    guards={"ramp ends (open)": 1e-6, "ramp ends": 1e-6, "switch on": 1e-3, "switch off": 1e-3}
+    guards={
+        "ramp ends (open)": 1e-6,
+        "ramp ends": 1e-6,
+        "switch on": 1e-3,
+        "switch off": 1e-3,
+    }
 )
 print(np.sqrt(noisy.covariance([0.0])[0, 0, 0]))

@@ -27,7 +27,9 @@ import hybridjax as hj
 
 hj.enable_x64()
 # (Run this in the repository, or in its folder notebooks.)
-folder = Path("data" if Path("data/compass_gait_robot.npz").exists() else "notebooks/data")
+folder = Path(
+    "data" if Path("data/compass_gait_robot.npz").exists() else "notebooks/data"
+)
 data = dict(np.load(folder / "compass_gait_robot.npz"))
 
 # %%
@@ -37,8 +39,13 @@ for run in np.unique(data["run"]):
     time, outer = data["time"][rows], data["outer"][rows].astype(int)
     before = np.append(1 - outer[0], outer[:-1])
     strides, steps = time[outer > before], time[outer != before]
-    signals = {name: data[name][rows].astype(float) for name in ("voltage", "hip", "stance")}
-    events = {"stride": np.append(strides, time[-1]), "step": np.append(steps, time[-1])}
+    signals = {
+        name: data[name][rows].astype(float) for name in ("voltage", "hip", "stance")
+    }
+    events = {
+        "stride": np.append(strides, time[-1]),
+        "step": np.append(steps, time[-1]),
+    }
     runs.append(hj.Recording(time, signals, events=events, name=f"run {run}"))
 recording = hj.Recording.join(runs)
 phase = hj.recordings.estimate_phase(recording, hj.AtEvent("stride"))
@@ -96,7 +103,12 @@ except hj.DefinitionError as error:
 
 # %%
 angles = hj.recordings.section_data(
-    recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=7, bandwidth=np.inf
+    recording,
+    phase,
+    inputs=(),
+    outputs=("hip", "stance"),
+    n_sections=7,
+    bandwidth=np.inf,
 )
 natural = hj.recordings.natural_multipliers(angles)
 natural

@@ -80,7 +80,9 @@ def control(model, data):
 
 
 model = mujoco.MjModel.from_xml_string(XML)
-plant = hj.plants.MuJoCoPlant(model, {"push": "N"}, control=control, period=PERIOD, substeps=40)
+plant = hj.plants.MuJoCoPlant(
+    model, {"push": "N"}, control=control, period=PERIOD, substeps=40
+)
 
 # %% [markdown]
 # ## Its cycle
@@ -101,7 +103,9 @@ def draw(z):
         return hip + length * jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
 
     left, right = (
-        hj.Drawing.spring(hip, along(z["pitch"] + z[side], 0.95 + z[f"{side}_leg"]), 0.03)
+        hj.Drawing.spring(
+            hip, along(z["pitch"] + z[side], 0.95 + z[f"{side}_leg"]), 0.03
+        )
         for side in ("left", "right")
     )
     return hj.Drawing(
@@ -143,15 +147,25 @@ data = cycle.run_experiments(design, discard=24)
 print(data.summary())
 fit = hj.fit_multipliers(hj.estimate_htf(data), order=2)
 print(fit)
-print("returns lie in the region of the experiments:", fit.contains(returns.multipliers[:2]))
-print("experiments lie in the region of the returns:", returns.contains(fit.multipliers))
+print(
+    "returns lie in the region of the experiments:",
+    fit.contains(returns.multipliers[:2]),
+)
+print(
+    "experiments lie in the region of the returns:", returns.contains(fit.multipliers)
+)
 
 # %%
 figure, ax = plt.subplots(figsize=(4.5, 4))
-for estimate, color, name in ((returns, "C0", "perturbed returns"), (fit, "C1", "experiments")):
+for estimate, color, name in (
+    (returns, "C0", "perturbed returns"),
+    (fit, "C1", "experiments"),
+):
     border = estimate.ellipse(0)
     ax.fill(border.real, border.imag, color=color, alpha=0.3, label=f"{name}, 95 %")
-    ax.plot(estimate.multipliers[0].real, estimate.multipliers[0].imag, "+", color=color)
+    ax.plot(
+        estimate.multipliers[0].real, estimate.multipliers[0].imag, "+", color=color
+    )
 ax.set(xlabel="Re λ", ylabel="Im λ")
 ax.locator_params(nbins=5)
 ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.2))
@@ -193,7 +207,9 @@ print(f"{stood.mean():.0%} of pushes between -200 and 200 N are stood")
 # %%
 figure, ax = plt.subplots(figsize=(6, 3.2))
 ax.plot(begin[stood], force[stood], "o", mfc="none", mec="0.5", label="stood")
-points = ax.scatter(begin[~stood], force[~stood], c=fell[~stood], cmap="viridis", label="fell")
+points = ax.scatter(
+    begin[~stood], force[~stood], c=fell[~stood], cmap="viridis", label="fell"
+)
 figure.colorbar(points, label="time until the fall (s)")
 ax.set(xlabel="time of the push in the cycle (s)", ylabel="force (N)")
 ax.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)

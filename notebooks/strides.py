@@ -46,7 +46,9 @@ print(design)
 
 # %%
 outputs = ("yM", "vM")
-clean = hj.run_experiments(cycle, phase, design, outputs)  # the first 20 strides are discarded
+clean = hj.run_experiments(
+    cycle, phase, design, outputs
+)  # the first 20 strides are discarded
 data = hj.experiments.add_noise(clean, snr=20)  # one part in ten of noise
 hj.plot.experiment(data)
 print(data.summary())
@@ -94,11 +96,17 @@ hj.plot.multipliers(truth, {"20 dB": fit})
 
 # %%
 for count in (1, 2, 4):
-    some = hj.multisine(lines="odd", periods=64, seed=1).realizations(count).scaled(rms=0.005)
+    some = (
+        hj.multisine(lines="odd", periods=64, seed=1)
+        .realizations(count)
+        .scaled(rms=0.005)
+    )
     record = hj.run_experiments(cycle, phase, some, outputs)
     errors = []
     for seed in range(10):
-        noisy = hj.estimate_htf(hj.experiments.add_noise(record, snr=20, seed=seed), (-1, 0, 1))
+        noisy = hj.estimate_htf(
+            hj.experiments.add_noise(record, snr=20, seed=seed), (-1, 0, 1)
+        )
         errors.append(hj.fit_multipliers(noisy, order=2).multipliers[0] - truth[0])
     rms = np.sqrt(np.mean(np.abs(errors) ** 2))
     print(f"{len(record.y) * 84:5d} strides: error of the multipliers {rms:.1e}")
@@ -116,7 +124,9 @@ walk = hj.run_experiments(cycle, phase, pushes, outputs, discard=0)
 noisy = hj.experiments.add_noise(walk, snr=20)
 y = noisy.y[0].copy()
 y[1000:1100] = np.nan  # a hundred samples were lost
-series = hj.fit_series(hj.Record(noisy.u[0], y, n_sections=32, outputs=outputs), order=2)
+series = hj.fit_series(
+    hj.Record(noisy.u[0], y, n_sections=32, outputs=outputs), order=2
+)
 series
 
 # %%

@@ -68,8 +68,12 @@ with hj.plot.style():
     figure, (left, right) = pyplot.subplots(
         1, 2, figsize=(hj.plot.PAGE, 3.0), layout="constrained", sharey=True
     )
-    image = left.pcolormesh(k_axis, b_axis, modulus, cmap="viridis", vmin=0, rasterized=True)
-    lines = left.contour(k_axis, b_axis, modulus, [0.5, 0.7, 0.9], colors="white", linewidths=0.7)
+    image = left.pcolormesh(
+        k_axis, b_axis, modulus, cmap="viridis", vmin=0, rasterized=True
+    )
+    lines = left.contour(
+        k_axis, b_axis, modulus, [0.5, 0.7, 0.9], colors="white", linewidths=0.7
+    )
     left.clabel(lines, fontsize=6)
     figure.colorbar(image, ax=left, label="largest modulus of a multiplier")
     label(left, "contraction in one period")
@@ -127,7 +131,9 @@ found = minimize(
     options={"ftol": 1e-12},
 )
 best = hj.find_limit_cycle(hj.models.VerticalHopper(k=found.x[0], b=found.x[1]), cycle)
-print(f"{found.message} after {found.nit} steps: k = {found.x[0]:.5f}, b = {found.x[1]:.5f}")
+print(
+    f"{found.message} after {found.nit} steps: k = {found.x[0]:.5f}, b = {found.x[1]:.5f}"
+)
 print("multipliers at the start:  ", cycle.multipliers)
 print("multipliers at the optimum:", best.multipliers)
 
@@ -141,7 +147,11 @@ print("multipliers at the optimum:", best.multipliers)
 
 # %%
 y, v = np.moveaxis(np.asarray(cycles.legs.q)[:, :2], 1, 0)
-y1, v1, h = np.roll(y, -1, axis=1), np.roll(v, -1, axis=1), float(cycle.period) / y.shape[1]
+y1, v1, h = (
+    np.roll(y, -1, axis=1),
+    np.roll(v, -1, axis=1),
+    float(cycle.period) / y.shape[1],
+)
 s = v / (v - v1)
 top = (1 + 2 * s) * (1 - s) ** 2 * y + s * (1 - s) ** 2 * h * v
 top = top + s**2 * (3 - 2 * s) * y1 - s**2 * (1 - s) * h * v1
@@ -150,31 +160,52 @@ heights = np.where(cycles.ok, top[rows], np.nan).reshape(POINTS, POINTS)
 
 line = []
 for column in range(POINTS):
-    good = np.flatnonzero(~np.isnan(heights[:, column]))[::-1]  # height falls with damping
+    good = np.flatnonzero(~np.isnan(heights[:, column]))[
+        ::-1
+    ]  # height falls with damping
     if len(good) and heights[good, column].min() < WANTED < heights[good, column].max():
         b_here = np.interp(WANTED, heights[good, column], b_axis[good])
         radius = np.interp(b_here, b_axis[good[::-1]], modulus[good[::-1], column])
         line.append((k_axis[column], b_here, radius))
 line = np.array(line)
 winner = line[np.argmin(line[:, 2])]
-print("best of the sweep at this height: k = {:.3f}, b = {:.3f}, radius {:.5f}".format(*winner))
+print(
+    "best of the sweep at this height: k = {:.3f}, b = {:.3f}, radius {:.5f}".format(
+        *winner
+    )
+)
 print(f"by gradient:                      radius {np.abs(best.multipliers).max():.5f}")
 
 # %%
 path = np.array(path)
 red = hj.plot.COLORS["red"]
 with hj.plot.style():
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(hj.plot.PAGE, 3.0), layout="constrained")
-    image = left.pcolormesh(k_axis, b_axis, modulus, cmap="viridis", vmin=0, rasterized=True)
+    figure, (left, right) = pyplot.subplots(
+        1, 2, figsize=(hj.plot.PAGE, 3.0), layout="constrained"
+    )
+    image = left.pcolormesh(
+        k_axis, b_axis, modulus, cmap="viridis", vmin=0, rasterized=True
+    )
     figure.colorbar(image, ax=left, label="largest modulus of a multiplier")
     left.plot(*line[:, :2].T, color="white", lw=1.2, label=f"apex at {WANTED} m")
     left.plot(*path.T, ".-", color=red, label="steps of the optimizer")
     left.plot(*path[-1], "*", ms=11, color=red, mec="white", label="optimum")
     label(left, "where the apex has the wanted height")
-    legend = left.legend(loc="upper left", frameon=True, framealpha=0.6, facecolor="black")
+    legend = left.legend(
+        loc="upper left", frameon=True, framealpha=0.6, facecolor="black"
+    )
     for text in legend.get_texts():
         text.set_color("white")
     right.plot(line[:, 0], line[:, 2], ".", ms=3, label="sweep, along the white line")
-    right.plot(found.x[0], np.abs(best.multipliers).max(), "*", ms=11, color=red, label="optimum")
-    right.set(xlabel="stiffness k (N/m)", ylabel="largest modulus", title="along that line")
+    right.plot(
+        found.x[0],
+        np.abs(best.multipliers).max(),
+        "*",
+        ms=11,
+        color=red,
+        label="optimum",
+    )
+    right.set(
+        xlabel="stiffness k (N/m)", ylabel="largest modulus", title="along that line"
+    )
     right.legend()

@@ -38,12 +38,16 @@ trials = []
 for segment, (first, last) in enumerate([(6, 61), (1, 54)]):
     time, strikes = data[f"time{segment}"].astype(float), data[f"left{segment}"]
     rows = (time >= first) & (time <= last)
-    angles = np.where(data[f"gap{segment}"][:, None], np.nan, data[f"angles{segment}"])[rows]
+    angles = np.where(data[f"gap{segment}"][:, None], np.nan, data[f"angles{segment}"])[
+        rows
+    ]
     signals = dict(zip(map(str, data["names"]), angles.T.astype(float), strict=True))
     events = {"strike": strikes[(strikes >= first) & (strikes <= last)]}
     units = dict.fromkeys(signals, "rad")
     trials.append(
-        hj.Recording(time[rows], signals, events=events, units=units, name=f"segment {segment}")
+        hj.Recording(
+            time[rows], signals, events=events, units=units, name=f"segment {segment}"
+        )
     )
 recording = hj.Recording.join(trials)
 phase = hj.recordings.estimate_phase(recording, hj.AtEvent("strike"))
@@ -92,11 +96,18 @@ def variable(noise, strides=300, sections=8, seed=0):
         time, {f"y{i}": v for i, v in enumerate(y.T)}, events={"e": np.arange(strides)}
     )
     return hj.recordings.section_data(
-        made, hj.AtEvent("e"), inputs=(), outputs=made.signals, n_sections=sections,
+        made,
+        hj.AtEvent("e"),
+        inputs=(),
+        outputs=made.signals,
+        n_sections=sections,
         bandwidth=np.inf,
-    )  # fmt: skip
+    )
 
 
 for noise in (0.0, 0.5):
     known = hj.recordings.natural_multipliers(variable(noise))
-    print(f"noise of {noise}:", np.round(np.abs([known.multipliers[0], known.plain[0]]), 3))
+    print(
+        f"noise of {noise}:",
+        np.round(np.abs([known.multipliers[0], known.plain[0]]), 3),
+    )

@@ -20,7 +20,10 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     _answer = _programs.with_name(f"accepted-{importlib.metadata.version('jaxlib')}")
     if not _answer.exists():
         _try = [sys.executable, "-c", "import jax; jax.devices()"]
-        _quick = "--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false"
+        _quick = (
+            "--xla_backend_optimization_level=0",
+            "--xla_cpu_use_fusion_emitters=false",
+        )
         _accepted = [
             option
             for option in _quick
@@ -45,13 +48,27 @@ from hybridjax._core.execution import libraries
 
 # Files whose fast tests cover each capability once, for `-m core`.
 CORE = (
-    "test_layers", "test_budget", "test_words", "test_release", "linear/test_ldtp",
-    "linear/test_htf", "engine/test_chain", "systems/test_system", "orbits/test_cycle",
-    "sections/test_linearize", "experiments/test_design", "experiments/test_steady",
-    "identify/test_nonparametric", "identify/test_structured", "identify/test_rational",
-    "recordings/test_recording", "designs/test_limits", "fitting/test_parameters",
-    "_core/test_boundary", "plot/test_plots", "test_io",
-)  # fmt: skip
+    "test_layers",
+    "test_words",
+    "test_release",
+    "linear/test_ldtp",
+    "linear/test_htf",
+    "engine/test_chain",
+    "systems/test_system",
+    "orbits/test_cycle",
+    "sections/test_linearize",
+    "experiments/test_design",
+    "experiments/test_steady",
+    "identify/test_nonparametric",
+    "identify/test_structured",
+    "identify/test_rational",
+    "recordings/test_recording",
+    "designs/test_limits",
+    "fitting/test_parameters",
+    "_core/test_boundary",
+    "plot/test_plots",
+    "test_io",
+)
 
 
 def pytest_collection_modifyitems(items):
@@ -84,7 +101,9 @@ for library in libraries():
     library.set(1)
 hj.enable_x64()
 hj.enable_compilation_cache()  # of this run: what one worker has compiled the others need not
-hypothesis.settings.register_profile("untimed", hypothesis.settings.default, deadline=None)
+hypothesis.settings.register_profile(
+    "untimed", hypothesis.settings.default, deadline=None
+)
 hypothesis.settings.load_profile("untimed")
 
 DATA = pathlib.Path(__file__).parent / "data"
@@ -217,4 +236,6 @@ def kinematic_ldtp(hopper_cycle, placed_kinematic):
 
 @pytest.fixture(scope="session")
 def vanderpol_cycle():
-    return hj.find_limit_cycle(hj.models.VanDerPol(mu=1.0), section=hj.Crossing("v", "falling"))
+    return hj.find_limit_cycle(
+        hj.models.VanDerPol(mu=1.0), section=hj.Crossing("v", "falling")
+    )

@@ -44,23 +44,33 @@ def test_reproduce_writes_its_results(results):
     assert summary["limit_cycle"]["period"] == pytest.approx(1.0)
     multipliers = np.array(summary["limit_cycle"]["multipliers"]) @ [1, 1j]
     assert multipliers == pytest.approx(
-        [-0.248983334735609 + 0.699333251798004j, -0.248983334735609 - 0.699333251798004j], abs=1e-9
+        [
+            -0.248983334735609 + 0.699333251798004j,
+            -0.248983334735609 - 0.699333251798004j,
+        ],
+        abs=1e-9,
     )
     for family in ("isochron", "kinematic"):
         result = summary["families"][family]
         assert result["experiments"] == "20/20 ok"
         assert result["multipliers_fit_structured_error"] < 5e-3
     for family in ("isochron", "kinematic"):
-        exact, estimate = (hj.load(results / f"{x}_{family}.npz") for x in ("exact", "estimate"))
+        exact, estimate = (
+            hj.load(results / f"{x}_{family}.npz") for x in ("exact", "estimate")
+        )
         assert exact.harmonics == estimate.harmonics == tuple(range(-16, 16))
-        model, fit = (hj.load(results / f"{x}_{family}.npz") for x in ("ldtp", "structured"))
+        model, fit = (
+            hj.load(results / f"{x}_{family}.npz") for x in ("ldtp", "structured")
+        )
         np.testing.assert_allclose(model.htf(exact.f).H, exact.H, atol=1e-12)
         assert fit.compare(model.multipliers).max_error < 5e-3
         assert hj.load(results / f"rational_{family}.npz").multipliers.shape == (2, 2)
 
 
 def test_bad_input_is_one_sentence():
-    with pytest.raises(SystemExit, match="^hybridjax: cannot write to '/dev/null/x'.*") as error:
+    with pytest.raises(
+        SystemExit, match="^hybridjax: cannot write to '/dev/null/x'.*"
+    ) as error:
         main(["reproduce", "--out", "/dev/null/x"])
     assert "\n" not in str(error.value)
 
@@ -89,7 +99,9 @@ WRONG = {
         "--crossing y:up": "'y:up' is not a signal, a direction and a value",
         "--crossing y:rising:nan": "'y:rising:nan' is not a signal, a direction and a value",
     },
-    "identify x.csv --out x --input u": {"--phase y,v": "name --outputs, or choose --timing"},
+    "identify x.csv --out x --input u": {
+        "--phase y,v": "name --outputs, or choose --timing"
+    },
     "": {"": "required: COMMAND", "fly": "invalid choice: 'fly'"},
 }
 
@@ -139,12 +151,22 @@ def test_an_interruption_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("hybridjax.apps.reproduce._reproduce", interrupted)
     with pytest.raises(SystemExit) as error:
         main(["reproduce", "--out", str(tmp_path / "new")])
-    assert error.value.code == 130 and capsys.readouterr().err == "hybridjax: interrupted.\n"
+    assert (
+        error.value.code == 130
+        and capsys.readouterr().err == "hybridjax: interrupted.\n"
+    )
     assert not list(tmp_path.iterdir())
 
 
 def test_the_main_job_imports_what_it_needs():
     """And nothing else that takes long."""
-    heavy = "diffrax", "optimistix", "lineax", "scipy.linalg", "scipy.special", "matplotlib"
+    heavy = (
+        "diffrax",
+        "optimistix",
+        "lineax",
+        "scipy.linalg",
+        "scipy.special",
+        "matplotlib",
+    )
     code = f"import sys, hybridjax.apps.reproduce\nprint([m for m in {heavy} if m in sys.modules])"
     assert run_python("-c", code) == "[]\n"

@@ -45,7 +45,9 @@ def test_python_control(model):
     assert system.dt == 2.0 and system.input_labels[2] == "u[1]"
     expected = convert.to_lti(model).htf(f).H[0]
     response = system(np.exp(2j * np.pi * f))
-    np.testing.assert_allclose(np.moveaxis(response, 2, 0), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.moveaxis(response, 2, 0), expected, rtol=0, atol=1e-12
+    )
     H = model.htf(f)
     data = convert.to_control(H, period=2.0)
     assert data.output_labels == ["y[-2]", "y[-1]", "y[0]", "y[1]", "y[2]"]
@@ -67,7 +69,9 @@ def recording():
     t = np.arange(5) / 10
     one = {"a": t, "b": np.where(t == 0.2, np.nan, t**2)}
     parts = [
-        hj.Recording(t, one, events={"e": [0.1, 0.3], "never": []}, units={"a": "N"}, name=name)
+        hj.Recording(
+            t, one, events={"e": [0.1, 0.3], "never": []}, units={"a": "N"}, name=name
+        )
         for name in ("first", "second")
     ]
     return hj.Recording.join(parts)
@@ -80,7 +84,9 @@ def test_datasets_know_names_and_units(model):
     one = dataset.H.sel(harmonic=-1, input="w", output="y").sel(f=0.4)
     assert one.item() == complex(H[-1][-1, 0, 1])
     assert dataset.input_unit.sel(input="u").item() == "N"
-    fewer = convert.from_xarray(dataset.isel(harmonic=[1, 2], input=[0]).sel(f=slice(0, 0.2)))
+    fewer = convert.from_xarray(
+        dataset.isel(harmonic=[1, 2], input=[0]).sel(f=slice(0, 0.2))
+    )
     assert fewer.harmonics == (-1, 0) and fewer.inputs == ("u",) and len(fewer.f) == 2
     made = convert.to_xarray(recording())
     assert made.a.attrs["units"] == "N" and "units" not in made.b.attrs
@@ -97,7 +103,9 @@ def test_datasets_know_names_and_units(model):
     np.testing.assert_array_equal(later.y, data.y[:, N:])
     backwards, late = slice(None, None, -1), slice(1, None)
     for part in (dataset.isel(sample=x) for x in (backwards, late)):
-        with pytest.raises(hj.DefinitionError, match="`sample` must be in order, from section 0"):
+        with pytest.raises(
+            hj.DefinitionError, match="`sample` must be in order, from section 0"
+        ):
             convert.from_xarray(part)
     for part in (whole.isel(section=slice(2)), whole.roll(section=1, roll_coords=True)):
         with pytest.raises(hj.DefinitionError, match="`section` must be in order"):
@@ -112,7 +120,9 @@ def test_section_data(wave):
     dataset, frame = convert.to_xarray(data), convert.to_pandas(data)
     np.testing.assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
     np.testing.assert_array_equal(frame["time"], data.times[0])
-    np.testing.assert_array_equal(frame["section"][:8], (frame["section"][0] + np.arange(8)) % 8)
+    np.testing.assert_array_equal(
+        frame["section"][:8], (frame["section"][0] + np.arange(8)) % 8
+    )
     with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray(dataset)
     average = dataset.average_cycle.sel(signal="x").values
@@ -134,7 +144,9 @@ def test_pandas(model):
     u = np.random.default_rng(3).normal(size=(60 * N, 2))
     fit = hj.fit_series(hj.Record(u, model.simulate(u), n_sections=N), order=1)
     table = convert.to_pandas(fit)
-    np.testing.assert_array_equal(table["real"] + 1j * table["imaginary"], fit.multipliers)
+    np.testing.assert_array_equal(
+        table["real"] + 1j * table["imaginary"], fit.multipliers
+    )
     errors = np.hypot(table["real_error"], table["imaginary_error"])
     np.testing.assert_array_equal(errors, fit.standard_errors)
     np.testing.assert_array_equal(table["standard_error"], fit.standard_errors)
@@ -149,9 +161,13 @@ def test_what_is_refused(model, monkeypatch):
     with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray({"a": 1})
     clash = hj.Recording([0.0, 1.0], {"trial": [0.0, 1.0]})
-    with pytest.raises(hj.DefinitionError, match="'trial' is also the name of a coordinate"):
+    with pytest.raises(
+        hj.DefinitionError, match="'trial' is also the name of a coordinate"
+    ):
         convert.to_xarray(clash)
     for call, name in ((convert.to_control, "control"), (convert.to_xarray, "xarray")):
         monkeypatch.setitem(__import__("sys").modules, name, None)
-        with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{name}\]'"):
+        with pytest.raises(
+            hj.DefinitionError, match=rf"pip install 'hybridjax\[{name}\]'"
+        ):
             call(model)

@@ -24,7 +24,9 @@ def same(a, b):
         assert isinstance(x, jax.Array) == isinstance(y, jax.Array)
         if hasattr(x, "dtype"):
             x, y = np.asarray(x), np.asarray(y)
-            assert x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes()
+            assert (
+                x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes()
+            )
         else:
             assert x == y and str(x) == str(y)  # also units
     return True
@@ -45,10 +47,18 @@ def folder(tmp_path_factory):
 def ldtp():
     rng = np.random.default_rng(0)
     A = [rng.normal(size=s) / 4 for s in ((3, 2), (2, 3))]
-    B, C = [rng.normal(size=(3, 2)), rng.normal(size=(2, 2))], [np.ones((1, 2)), np.ones((1, 3))]
+    B, C = (
+        [rng.normal(size=(3, 2)), rng.normal(size=(2, 2))],
+        [np.ones((1, 2)), np.ones((1, 3))],
+    )
     names = (("x", "v"), ("x", "v", "z"))
     return hj.LDTP.from_blocks(
-        A, B, C, inputs={"force": "N", "torque é": ""}, outputs={"y": "m"}, coordinates=names
+        A,
+        B,
+        C,
+        inputs={"force": "N", "torque é": ""},
+        outputs={"y": "m"},
+        coordinates=names,
     )
 
 
@@ -64,11 +74,17 @@ def things(ldtp, htf):
     y = np.ones((2, 6, 1))
     y[1, 3:] = np.nan
     failed = hj.ExperimentData(
-        np.zeros((2, 6, 1)), y, n_sections=3, periods=1, result=[0, hj.Result.GRAZING],
+        np.zeros((2, 6, 1)),
+        y,
+        n_sections=3,
+        periods=1,
+        result=[0, hj.Result.GRAZING],
         simulated=Simulated(np.array([-1, 3]), np.array([1e-9, 2e-9]), "by hand"),
         cycle_outputs=np.arange(3.0)[:, None],
-    )  # fmt: skip
-    object.__setattr__(failed, "periods", np.int64(1))  # as where nobody checks annotations
+    )
+    object.__setattr__(
+        failed, "periods", np.int64(1)
+    )  # as where nobody checks annotations
     return [design, data, estimate, ldtp, plain, *fits, record, series, htf, failed]
 
 
@@ -80,8 +96,12 @@ def test_every_kind_comes_back_bit_by_bit(folder, things, htf):
     xarray = pytest.importorskip("xarray")
     for thing in things:
         dataset = hj.convert.to_xarray(thing)
-        assert isinstance(dataset, xarray.Dataset) and same(hj.convert.from_xarray(dataset), thing)
-        assert same(hj.convert.from_xarray(xarray.Dataset.from_dict(dataset.to_dict())), thing)
+        assert isinstance(dataset, xarray.Dataset) and same(
+            hj.convert.from_xarray(dataset), thing
+        )
+        assert same(
+            hj.convert.from_xarray(xarray.Dataset.from_dict(dataset.to_dict())), thing
+        )
     dataset = hj.convert.to_xarray(htf)
     assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
 
@@ -91,10 +111,14 @@ def test_every_kind_comes_back_bit_by_bit(folder, things, htf):
 def test_round_trip_of_any_htf(folder, data):
     F, ny, nu = data.draw(array_shapes(min_dims=3, max_dims=3, max_side=3))
     harmonics = data.draw(st.sets(st.integers(-3, 3), min_size=1).map(sorted))
-    finite = st.complex_numbers(allow_nan=False, allow_infinity=False, max_magnitude=1e300)
+    finite = st.complex_numbers(
+        allow_nan=False, allow_infinity=False, max_magnitude=1e300
+    )
     H = data.draw(arrays(complex, (len(harmonics), F, ny, nu), elements=finite))
     numbers = st.floats(-1e300, 1e300)
-    f = data.draw(st.lists(numbers, min_size=F, max_size=F, unique_by=lambda x: round(x, 6)))
+    f = data.draw(
+        st.lists(numbers, min_size=F, max_size=F, unique_by=lambda x: round(x, 6))
+    )
     words = st.text().map("y".__add__)  # (no input's name)
     names = data.draw(st.lists(words, min_size=ny, max_size=ny, unique=True))
     htf = hj.HTF(f, H, harmonics, 7, None, names, data.draw(st.text()))
@@ -113,7 +137,9 @@ def test_damaged_files_are_refused_or_harmless(folder, things, data):
     else:
         # Half of the flips in the archive's directory at the end, where checksums do not reach.
         low = data.draw(st.sampled_from([0, max(0, len(content) - 700)]))
-        for k in data.draw(st.lists(st.integers(low, len(content) - 1), min_size=1, max_size=3)):
+        for k in data.draw(
+            st.lists(st.integers(low, len(content) - 1), min_size=1, max_size=3)
+        ):
             content[k] ^= data.draw(st.integers(1, 255))
     path.write_bytes(content)
     try:
@@ -140,7 +166,10 @@ def rewrite(path, header=None, arrays=None):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"header": {"format_version": 9, "package_version": "9.0"}}, "version 9.* hybridjax 9.0"),
+        (
+            {"header": {"format_version": 9, "package_version": "9.0"}},
+            "version 9.* hybridjax 9.0",
+        ),
         ({"header": {"format": "other"}}, "not written by `hj.save`"),
         ({"header": {"kind": "os.system"}}, "holds a 'os.system'; `load` reads Design"),
         ({"header": {"kind": "LDTP"}}, "not those of LDTP"),
@@ -186,7 +215,10 @@ def test_where_nothing_can_be_written_or_read(folder, things):
     with pytest.raises(hj.DefinitionError, match="cannot write .*Is a directory"):
         hj.save(folder / "taken.npz", things[0])
     os.mkfifo(folder / "pipe.npz")
-    for name, problem in (("absent", "cannot read .*No such file"), ("pipe", "is empty")):
+    for name, problem in (
+        ("absent", "cannot read .*No such file"),
+        ("pipe", "is empty"),
+    ):
         with pytest.raises(hj.errors.HybridJaxError, match=problem):
             hj.load(folder / f"{name}.npz")
     assert not [p for p in folder.iterdir() if p.name.startswith(".")]

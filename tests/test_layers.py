@@ -37,7 +37,9 @@ def imported(file):
             found += [(*module, alias.name) for alias in node.names]
         elif isinstance(node, ast.Import):
             names = [tuple(alias.name.split(".")) for alias in node.names]
-            found += [name[1:] for name in names if name[0] == "hybridjax" and len(name) > 1]
+            found += [
+                name[1:] for name in names if name[0] == "hybridjax" and len(name) > 1
+            ]
     return found
 
 
@@ -51,7 +53,9 @@ def test_imports_flow_one_way():
         assert own in LAYERS, f"{own} has no place in the layers yet"
         for other, *_ in imported(file):
             if other in LAYERS:
-                assert LAYERS.index(other) <= LAYERS.index(own), f"{file} imports from {other}"
+                assert LAYERS.index(other) <= LAYERS.index(own), (
+                    f"{file} imports from {other}"
+                )
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda f: str(f.relative_to(ROOT)))
@@ -62,13 +66,19 @@ def test_folders(folder):
     depth, needs = len(where), {}
     for file in folder.rglob("*.py"):
         own = file.relative_to(folder).with_suffix("").parts[0]
-        others = {path[depth] for path in imported(file) if path[:depth] == where and path[depth:]}
+        others = {
+            path[depth]
+            for path in imported(file)
+            if path[:depth] == where and path[depth:]
+        }
         needs.setdefault(own, set()).update(others - {own})
     tuple(graphlib.TopologicalSorter(needs).static_order())
     modules = {f.stem for f in folder.iterdir() if f.suffix == ".py" or f.is_dir()}
     stub = folder / "__init__.pyi"
     if stub.exists():
-        imports = [n for n in ast.parse(stub.read_text()).body if isinstance(n, ast.ImportFrom)]
+        imports = [
+            n for n in ast.parse(stub.read_text()).body if isinstance(n, ast.ImportFrom)
+        ]
         names = {x.asname for n in imports if n.module is not None for x in n.names}
         assert not names & modules
 
@@ -83,7 +93,9 @@ def test_importing_hybridjax_does_not_import_jax():
 
 
 def test_public_names_resolve_and_have_docstrings():
-    stubs = (".".join(f.parent.relative_to(ROOT.parent).parts) for f in ROOT.rglob("*.pyi"))
+    stubs = (
+        ".".join(f.parent.relative_to(ROOT.parent).parts) for f in ROOT.rglob("*.pyi")
+    )
     for namespace in map(importlib.import_module, stubs):
         for name in namespace.__all__:
             assert getattr(namespace, name).__doc__, name

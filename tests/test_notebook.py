@@ -17,21 +17,34 @@ NAMES = sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb"))
 def cells(source):
     """The code cells of a percent-format source, without comments at their ends."""
     parts = re.split(r"^# %%(.*)$", source, flags=re.MULTILINE)[1:]
-    return [code.strip() for kind, code in zip(parts[::2], parts[1::2], strict=True)
-            if "markdown" not in kind]  # fmt: skip
+    return [
+        code.strip()
+        for kind, code in zip(parts[::2], parts[1::2], strict=True)
+        if "markdown" not in kind
+    ]
 
 
 def test_every_source_was_executed():
-    assert NAMES == sorted(path.stem for path in NOTEBOOKS.glob("*.py") if path.stem != "build")
+    assert NAMES == sorted(
+        path.stem for path in NOTEBOOKS.glob("*.py") if path.stem != "build"
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_executed_notebook_has_the_code_of_its_source(name):
     notebook = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text())
-    code = ["".join(c["source"]).strip() for c in notebook["cells"] if c["cell_type"] == "code"]
+    code = [
+        "".join(c["source"]).strip()
+        for c in notebook["cells"]
+        if c["cell_type"] == "code"
+    ]
     assert code == cells((NOTEBOOKS / f"{name}.py").read_text())
     printed = json.dumps([c.get("outputs") for c in notebook["cells"]])
-    assert "Traceback" not in printed and "Warning" not in printed and "stderr" not in printed
+    assert (
+        "Traceback" not in printed
+        and "Warning" not in printed
+        and "stderr" not in printed
+    )
 
 
 def how_to_push(found):
@@ -55,9 +68,13 @@ def own_system(found):
 
 
 def fit(found):
-    assert found.fit.identifiability.rank == 5 and found.fit.contains(found.truth, 0.999)
-    error, before = (np.abs(c.multipliers - found.real.multipliers).max()
-                     for c in (found.found, found.guess))  # fmt: skip
+    assert found.fit.identifiability.rank == 5 and found.fit.contains(
+        found.truth, 0.999
+    )
+    error, before = (
+        np.abs(c.multipliers - found.real.multipliers).max()
+        for c in (found.found, found.guess)
+    )
     assert error < 2e-3 < before
 
 
@@ -102,7 +119,10 @@ def in_the_loop(found):
     for fit in (found.fit, found.series):
         assert fit.contains(found.cycle.multipliers, 0.999).all()
     truth = found.controller.htf(found.f).H
-    held = np.abs(found.loop.controller.H - truth) <= found.loop.controller.confidence_radius()
+    held = (
+        np.abs(found.loop.controller.H - truth)
+        <= found.loop.controller.confidence_radius()
+    )
     assert held.mean() > 0.9
 
 

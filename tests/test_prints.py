@@ -31,7 +31,9 @@ def shown(thing):
     assert len(page) < BYTES and "nan" not in page.replace("nanm", "")
     root = ElementTree.fromstring(f"<page>{page}</page>")
     tags = [x.tag.rpartition("}")[2] for x in root.iter()]
-    return types.SimpleNamespace(texts=list(root.itertext()), pictures=tags.count("svg"))
+    return types.SimpleNamespace(
+        texts=list(root.itertext()), pictures=tags.count("svg")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +49,17 @@ def test_systems_print_values_with_units(name):
     assert head == name and len(lines) <= 16
     for field, line in zip(own_fields(system), lines, strict=True):
         number = f"{float(getattr(system, field.name)):.6g} {field.metadata['unit']}".rstrip()
-        assert line.split() == [field.name, *number.split(), *field.metadata["doc"].split()]
+        assert line.split() == [
+            field.name,
+            *number.split(),
+            *field.metadata["doc"].split(),
+        ]
 
 
 def test_many_systems_print_their_number_and_range():
-    hoppers = eqx.filter_vmap(lambda k: hj.models.VerticalHopper(k=k))(jnp.linspace(8.0, 13.0, 100))
+    hoppers = eqx.filter_vmap(lambda k: hj.models.VerticalHopper(k=k))(
+        jnp.linspace(8.0, 13.0, 100)
+    )
     text = " ".join(repr(hoppers).split())
     assert "k 100 numbers, 8 to 13 N/m" in text and "M 100 numbers, all 2 kg" in text
 
@@ -61,9 +69,18 @@ def test_under_transformations(hopper_cycle, placed_kinematic, kinematic_ldtp):
 
     @jax.jit
     def look(k):
-        written = hj.models.VerticalHopper(k=k), hj.Settings(rtol=k), hj.ClockPhase(8, anchor=k)
+        written = (
+            hj.models.VerticalHopper(k=k),
+            hj.Settings(rtol=k),
+            hj.ClockPhase(8, anchor=k),
+        )
         printed.extend(map(repr, (*written, hj.Guess("stance", (k, 0.0), k))))
-        for thing in (hopper_cycle, placed_kinematic, kinematic_ldtp, kinematic_ldtp.htf([0.1])):
+        for thing in (
+            hopper_cycle,
+            placed_kinematic,
+            kinematic_ldtp,
+            kinematic_ldtp.htf([0.1]),
+        ):
             traced = jax.tree_util.tree_map(
                 lambda x: x * k.astype(x.dtype) if eqx.is_array(x) else x, thing
             )
@@ -90,23 +107,44 @@ def test_definitions_print_as_they_are_written():
     class Learned(hj.models.VerticalHopper):
         term: eqx.nn.MLP = None
 
-    assert repr(Learned(term=network)).splitlines()[-1].split() == ["term", "MLP(33", "numbers)"]
+    assert repr(Learned(term=network)).splitlines()[-1].split() == [
+        "term",
+        "MLP(33",
+        "numbers)",
+    ]
 
 
-def test_results_print_briefly(hopper_cycle, placed_kinematic, kinematic_ldtp, hopper_data):
+def test_results_print_briefly(
+    hopper_cycle, placed_kinematic, kinematic_ldtp, hopper_data
+):
     response = hj.response_function(hopper_cycle, placed_kinematic, OUTPUTS)
     htf = kinematic_ldtp.htf([0.1, 0.2])
     things = [
-        hopper_cycle, hopper_cycle.trajectory(), placed_kinematic, kinematic_ldtp, htf,
-        hopper_data, KINEMATIC, response, hj.section_map(hopper_cycle, placed_kinematic, 0, 5),
-        hj.ObservedHTF(htf, KINEMATIC), hj.ObservedSeries(hopper_data, KINEMATIC),
-        hj.ObservedCycle(KINEMATIC, period=1.0), Simulated(np.zeros(3, int)),
-    ]  # fmt: skip
+        hopper_cycle,
+        hopper_cycle.trajectory(),
+        placed_kinematic,
+        kinematic_ldtp,
+        htf,
+        hopper_data,
+        KINEMATIC,
+        response,
+        hj.section_map(hopper_cycle, placed_kinematic, 0, 5),
+        hj.ObservedHTF(htf, KINEMATIC),
+        hj.ObservedSeries(hopper_data, KINEMATIC),
+        hj.ObservedCycle(KINEMATIC, period=1.0),
+        Simulated(np.zeros(3, int)),
+    ]
     for thing in things:
         text, widths = repr(thing), [len(line) for line in repr(thing).splitlines()]
-        assert len(widths) <= 12 and max(widths) <= 100 and text.startswith(type(thing).__name__)
+        assert (
+            len(widths) <= 12
+            and max(widths) <= 100
+            and text.startswith(type(thing).__name__)
+        )
         assert "f64[" not in text and "array(" not in text
-    assert "period       1 s" in repr(hopper_cycle) and "yM = 1.96504037 m, " in repr(hopper_cycle)
+    assert "period       1 s" in repr(hopper_cycle) and "yM = 1.96504037 m, " in repr(
+        hopper_cycle
+    )
     assert "u (N) -> yM (m), vM (m/s)" in repr(hopper_data)
 
 
@@ -114,7 +152,9 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     m, end = kinematic_ldtp, BranchEnd(1.0, hj.Result.OK, "the <values> end")
     model = hj.LDTP(m.A, m.B, m.C, m.D, m.dims, inputs="<u>", outputs=("yM & co", "vM"))
     point = BranchPoint("flip", 1, 2.0, np.array([-1.0 + 0j, 0.5]))
-    branch = Branch("k", np.array([1.0, 2.0]), many(hopper_cycle, 2), (point,), (end, end))
+    branch = Branch(
+        "k", np.array([1.0, 2.0]), many(hopper_cycle, 2), (point,), (end, end)
+    )
     t = np.linspace(0.0, 20.0, 2001)
     tt, *values = hopper_cycle.trajectory()("yM", "vM")
     y, v = (np.interp(t, tt, x, period=1.0) * (1 + 1e-6 * np.sin(t)) for x in values)
@@ -125,7 +165,11 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     )
     f = np.linspace(0.05, 5, 300)
     for thing, texts, pictures in (
-        (hopper_cycle, ["-0.248983 + 0.699333i", "1 s", "liftoff, touchdown", "yM (m)"], 2),
+        (
+            hopper_cycle,
+            ["-0.248983 + 0.699333i", "1 s", "liftoff, touchdown", "yM (m)"],
+            2,
+        ),
         (placed_kinematic, ["27 in flight, 5 in stance", "2 to 4"], 1),
         (branch, ["flip", "2", "-1", "the <values> end"], 1),
         (model, ["<u>", "yM & co, vM"], 1),
@@ -140,7 +184,11 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
 
 
 def test_fits_show_standard_errors():
-    A, B, C = [[[0.6, 0.5], [-0.5, 0.6]]] * 4, [[[1.0], [0.3]]] * 4, [[[1.0, 0.0], [0.2, 1.0]]] * 4
+    A, B, C = (
+        [[[0.6, 0.5], [-0.5, 0.6]]] * 4,
+        [[[1.0], [0.3]]] * 4,
+        [[[1.0, 0.0], [0.2, 1.0]]] * 4,
+    )
     model = hj.LDTP(A, B, C, inputs="<u>", outputs=("yM & co", "vM"))
     rng = np.random.default_rng(0)
     u = rng.normal(size=(600, 1))
@@ -149,7 +197,9 @@ def test_fits_show_standard_errors():
     fit = hj.fit_series(record, order=2)
     page = shown(fit)
     errors = [x for x in page.texts if re.fullmatch(r"\d\.\de-\d\d", x)]
-    np.testing.assert_allclose([float(x) for x in errors], fit.standard_errors, rtol=0.05)
+    np.testing.assert_allclose(
+        [float(x) for x in errors], fit.standard_errors, rtol=0.05
+    )
     assert re.findall(r"± (\S+?)[,;]", repr(fit)) == errors  # one meaning in both
     assert any(x.startswith("noise yM & co ") for x in page.texts)
     assert shown(hj.validate(fit, record)).pictures == 1
@@ -176,5 +226,10 @@ def test_pictures_are_xml_whatever_is_drawn():
 
 
 def test_p_values_have_few_digits():
-    given = {4e-11: "p < 0.001", 0.001: "p = 0.001", 0.0314: "p = 0.031", 0.997: "p > 0.99"}
+    given = {
+        4e-11: "p < 0.001",
+        0.001: "p = 0.001",
+        0.0314: "p = 0.031",
+        0.997: "p > 0.99",
+    }
     assert {p: p_value(p) for p in given} == given

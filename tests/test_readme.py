@@ -104,14 +104,20 @@ def test_files_that_documents_name_are_there():
 
 
 def test_there_is_one_test_command_for_ci_to_find():
-    found = [block for block in blocks_of("bash") if re.match("python3 -m venv .* pytest$", block)]
+    found = [
+        block
+        for block in blocks_of("bash")
+        if re.match("python3 -m venv .* pytest$", block)
+    ]
     assert len(found) == 1
     script = ROOT / ".ci/run"
     assert script.stat().st_mode & 0o100 and "README.md" in script.read_text()
 
 
 def test_claims_name_tests_that_exist():
-    for path, name in re.findall(r"`(?:[^`]* )?(tests/\S+?\.py)(?:::(\w+))?`", CLAIMS.read_text()):
+    for path, name in re.findall(
+        r"`(?:[^`]* )?(tests/\S+?\.py)(?:::(\w+))?`", CLAIMS.read_text()
+    ):
         assert f"def {name}" in (ROOT / path).read_text(), f"there is no {path}::{name}"
 
 
@@ -122,7 +128,9 @@ LONG = "experiments figures fit-parameters identify-from-recordings models scale
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [pytest.param(x, marks=long_or_not(x)) for x in sorted(PAGES)])
+@pytest.mark.parametrize(
+    "page", [pytest.param(x, marks=long_or_not(x)) for x in sorted(PAGES)]
+)
 def test_the_page_runs_and_prints_what_it_shows(page, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     session, printed = Session(page, monkeypatch), ""
@@ -131,15 +139,21 @@ def test_the_page_runs_and_prints_what_it_shows(page, capsys, tmp_path, monkeypa
             session.run(text)
             printed = capsys.readouterr().out
         elif language == "text":
-            assert same_output(text, printed), f"{page} shows\n{text}\nbut prints\n{printed}"
+            assert same_output(text, printed), (
+                f"{page} shows\n{text}\nbut prints\n{printed}"
+            )
 
 
 @pytest.mark.slow
 def test_the_example_runs_in_processes_of_its_own(tmp_path):
-    *_, script = (text for kind, text in blocks("docs/how-to/scale.md") if kind == "python")
+    *_, script = (
+        text for kind, text in blocks("docs/how-to/scale.md") if kind == "python"
+    )
     (tmp_path / "script.py").write_text(script)
     parts = run_python("script.py", cwd=tmp_path, timeout=300).split("around")
-    scatter, mean = ([complex(z) for z in part.strip(" []\n").split()] for part in parts)
+    scatter, mean = (
+        [complex(z) for z in part.strip(" []\n").split()] for part in parts
+    )
     true = (0.6 + 0.5j) ** 4
     np.testing.assert_allclose(mean, [true, true.conjugate()], atol=1e-3)
     assert 0 < abs(scatter[0]) < 2e-3

@@ -22,22 +22,35 @@ def public_names() -> list[str]:
     for table in (ROOT / "hybridjax").rglob("__init__.pyi"):
         package = ".".join(table.parent.relative_to(ROOT).parts)
         for line in ast.parse(table.read_text()).body:
-            if isinstance(line, ast.ImportFrom) and line.module:  # (others import namespaces)
+            if (
+                isinstance(line, ast.ImportFrom) and line.module
+            ):  # (others import namespaces)
                 names += [f"{package}.{alias.asname}" for alias in line.names]
-    errors = [name for name, thing in vars(hj.errors).items() if isinstance(thing, type)]
+    errors = [
+        name for name, thing in vars(hj.errors).items() if isinstance(thing, type)
+    ]
     return names + [f"hybridjax.errors.{x}" for x in errors if not hasattr(hj, x)]
 
 
 def test_every_public_name_is_in_the_reference_once():
     pages = "".join(page.read_text() for page in (ROOT / "docs/reference").glob("*.md"))
-    assert Counter(re.findall(r"^::: (\S+)$", pages, re.MULTILINE)) == Counter(public_names())
+    assert Counter(re.findall(r"^::: (\S+)$", pages, re.MULTILINE)) == Counter(
+        public_names()
+    )
 
 
 # Results of functions, and classes of errors.
 GIVEN = UNCHECKED["made by this package"] | {
-    "ComputationError", "Design", "FileFormatError", "FindingWarning", "LDTP", "PrecisionError",
-    "SettledCycle", "StoredExperiments", "FMUPlant",  # (an example would need an FMU)
-}  # fmt: skip
+    "ComputationError",
+    "Design",
+    "FileFormatError",
+    "FindingWarning",
+    "LDTP",
+    "PrecisionError",
+    "SettledCycle",
+    "StoredExperiments",
+    "FMUPlant",  # (an example would need an FMU)
+}
 
 
 def test_every_public_name_that_a_user_writes_is_in_an_example():
@@ -52,7 +65,9 @@ def test_every_public_name_that_a_user_writes_is_in_an_example():
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    pytest.importorskip("mkdocs", reason="pip install '.[docs]' installs what builds the site")
+    pytest.importorskip(
+        "mkdocs", reason="pip install '.[docs]' installs what builds the site"
+    )
     folder = tmp_path_factory.mktemp("site")
     run_python("-m", "mkdocs", "build", "--strict", "--site-dir", folder, cwd=ROOT)
     return folder
@@ -64,8 +79,13 @@ def test_the_pictures_of_the_home_page_are_those_that_are_drawn_now(monkeypatch)
     pictures = importlib.import_module("pictures")
     for name, plot in pictures.draw().items():
         for now, file in zip(pictures.numbers(plot), pictures.drawn(name), strict=True):
-            off, size = np.subtract(now["points"], file["points"]), np.abs(file["points"])
-            assert np.all(np.abs(off) <= file["within"] * size.max(axis=0, initial=1e-9))
+            off, size = (
+                np.subtract(now["points"], file["points"]),
+                np.abs(file["points"]),
+            )
+            assert np.all(
+                np.abs(off) <= file["within"] * size.max(axis=0, initial=1e-9)
+            )
 
 
 @pytest.mark.slow
@@ -75,7 +95,9 @@ def test_thumbnails_are_those_of_the_code_on_their_pages(monkeypatch):
     values = lambda text: np.array(re.findall(r"-?\d+(?:\.\d+)?", text), float)  # noqa: E731
     for name in ("compass-gait", "slip", "van-der-pol"):
         file = values((pictures.IMAGES / f"gallery/{name}.svg").read_text())
-        np.testing.assert_allclose(values(pictures.thumbnail(*pictures.run(name))), file, atol=1.01)
+        np.testing.assert_allclose(
+            values(pictures.thumbnail(*pictures.run(name))), file, atol=1.01
+        )
 
 
 @pytest.mark.slow
@@ -93,17 +115,23 @@ def test_nothing_is_fetched_from_another_host(site):
     for page in site.rglob("*.html"):
         assert not fetched.findall(page.read_text()), page
     for style in site.rglob("*.css"):
-        assert not re.findall(r"url\([\"']?(?:https?:)?//|@import", style.read_text()), style
+        assert not re.findall(
+            r"url\([\"']?(?:https?:)?//|@import", style.read_text()
+        ), style
 
 
 @pytest.mark.slow
 def test_links_lead_somewhere(site):
     """Also those that MkDocs does not look at: in HTML, and in the theme's."""
     pages = {page: page.read_text() for page in site.rglob("*.html")}
-    known = {page: set(re.findall(r'\sid="([^"]+)"', text)) for page, text in pages.items()}
+    known = {
+        page: set(re.findall(r'\sid="([^"]+)"', text)) for page, text in pages.items()
+    }
     for page, text in pages.items():
         # (The page of errors has links from the root of the host.)
-        for link in re.findall(r'\s(?:href|src)="([^":]*)"', text) if page.stem != "404" else ():
+        for link in (
+            re.findall(r'\s(?:href|src)="([^":]*)"', text) if page.stem != "404" else ()
+        ):
             path, _, anchor = unquote(html.unescape(link)).partition("#")
             target = (page.parent / path).resolve() if path else page
             target = target / "index.html" if target.is_dir() else target
@@ -124,5 +152,7 @@ def test_notebooks_come_with_their_pictures(site):
         page = (site / "notebooks" / f"{notebook.stem}.html").read_text()
         pictures = re.findall(r'src="([\w-]+\.png)"', page)
         text = notebook.read_text()
-        assert len(pictures) == text.count('"image/png"') and "image/" in text  # or animations
+        assert (
+            len(pictures) == text.count('"image/png"') and "image/" in text
+        )  # or animations
         assert all((site / "notebooks" / name).exists() for name in pictures)

@@ -57,21 +57,32 @@ def script():
 @pytest.mark.slow
 def test_a_users_script_has_no_errors_in_mypy(tmp_path, script):
     (tmp_path / "session.py").write_text(script)
-    options, paths = ["--follow-imports=silent", "--cache-dir=cache"], {"MYPYPATH": str(ROOT)}
-    run_python("-m", "mypy", *options, "session.py", cwd=tmp_path, env={**os.environ, **paths})
+    options, paths = (
+        ["--follow-imports=silent", "--cache-dir=cache"],
+        {"MYPYPATH": str(ROOT)},
+    )
+    run_python(
+        "-m", "mypy", *options, "session.py", cwd=tmp_path, env={**os.environ, **paths}
+    )
 
 
 def test_a_users_script_has_no_errors_in_pyright(tmp_path, script):
     """In its basic mode."""
     (tmp_path / "session.py").write_text(script)
-    about = {"typeCheckingMode": "basic", "include": ["session.py"], "extraPaths": [str(ROOT)]}
+    about = {
+        "typeCheckingMode": "basic",
+        "include": ["session.py"],
+        "extraPaths": [str(ROOT)],
+    }
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(about))
     run_python("-m", "basedpyright", "-p", tmp_path, "--pythonpath", sys.executable)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "checker", [("mypy",), ("basedpyright", "--pythonpath", sys.executable)], ids=lambda c: c[0]
+    "checker",
+    [("mypy",), ("basedpyright", "--pythonpath", sys.executable)],
+    ids=lambda c: c[0],
 )
 def test_the_package_has_no_type_errors(checker):
     """With the settings in pyproject.toml."""
@@ -81,15 +92,25 @@ def test_the_package_has_no_type_errors(checker):
 # Arguments that may be anything: what a subclass declares, what users' functions return, objects of
 # a library that is an extra, and what the function looks at by itself.
 ALLOWED = {
-    "Chart.field", "HybridSystem.period", "sweep.maps", "save.thing", "Recording.__init__.time",
-    "Recording.from_frame.frame", "from_xarray.dataset", "MuJoCoPlant.__init__.model",
-    "MuJoCoPlant.set_state", "SettledCycle.__init__.state",
-}  # fmt: skip
+    "Chart.field",
+    "HybridSystem.period",
+    "sweep.maps",
+    "save.thing",
+    "Recording.__init__.time",
+    "Recording.from_frame.frame",
+    "from_xarray.dataset",
+    "MuJoCoPlant.__init__.model",
+    "MuJoCoPlant.set_state",
+    "SettledCycle.__init__.state",
+}
 
 
 def public():
     """Public functions, and the methods of public classes and their constructors, by name."""
-    folders = [ROOT / "hybridjax", *(f.parent for f in (ROOT / "hybridjax").glob("*/__init__.pyi"))]
+    folders = [
+        ROOT / "hybridjax",
+        *(f.parent for f in (ROOT / "hybridjax").glob("*/__init__.pyi")),
+    ]
     for folder in folders:
         module = importlib.import_module(".".join(folder.relative_to(ROOT).parts))
         for name in module.__all__:
@@ -99,7 +120,10 @@ def public():
             elif inspect.isclass(thing) and thing.__module__.startswith("hybridjax"):
                 for part, method in vars(thing).items():
                     method = getattr(method, "__func__", method)
-                    own = inspect.isfunction(method) and method.__qualname__ == f"{name}.{part}"
+                    own = (
+                        inspect.isfunction(method)
+                        and method.__qualname__ == f"{name}.{part}"
+                    )
                     # (`HybridSystem.__new__` checks models; their methods are functions of states.)
                     own = own and not thing.__module__.startswith("hybridjax.models")
                     if own and (part[0] != "_" or part in SPECIAL):
@@ -122,21 +146,53 @@ def test_public_signatures_say_what_they_take():
 # checked: this package makes them, and JAX does, with leaves of any kind.)
 UNCHECKED = {
     "written by users, called by the engine": {
-        "Chart.field", "HybridSystem.draw", "AbstractSections.bind", "AbstractSections.check",
-        "AbstractSections.describe", "AbstractLevels.level", "AbstractLevels.present",
-        "AbstractObservation.prepare", "AbstractObservation.residuals",
-        "Plant.reset", "Plant.step", "Plant",
+        "Chart.field",
+        "HybridSystem.draw",
+        "AbstractSections.bind",
+        "AbstractSections.check",
+        "AbstractSections.describe",
+        "AbstractLevels.level",
+        "AbstractLevels.present",
+        "AbstractObservation.prepare",
+        "AbstractObservation.residuals",
+        "Plant.reset",
+        "Plant.step",
+        "Plant",
     },
     "checked with the system, by what takes it": {"HybridSystem"},
     "checked by its own constructor, inside of `draw`": {"Drawing", "Drawing.spring"},
     "made by this package": {
-        "Advice", "Branch", "Constrained", "Finding", "Identification", "Impact",
-        "ImpulseResponses", "Inspection", "IntervalForecast", "LDTPFit", "Lanes", "LimitCycle",
-        "LimitCycles", "Motion", "NaturalMultipliers", "Phase", "PhaseResponse", "PlacedSections",
-        "Plan", "Plan.stride", "Plot", "ResponseFunction", "SectionData", "SectionMap", "SeriesFit",
-        "SettledCycle", "Stepping", "Trajectory", "Trial",
+        "Advice",
+        "Branch",
+        "Constrained",
+        "Finding",
+        "Identification",
+        "Impact",
+        "ImpulseResponses",
+        "Inspection",
+        "IntervalForecast",
+        "LDTPFit",
+        "Lanes",
+        "LimitCycle",
+        "LimitCycles",
+        "Motion",
+        "NaturalMultipliers",
+        "Phase",
+        "PhaseResponse",
+        "PlacedSections",
+        "Plan",
+        "Plan.stride",
+        "Plot",
+        "ResponseFunction",
+        "SectionData",
+        "SectionMap",
+        "SeriesFit",
+        "SettledCycle",
+        "Stepping",
+        "Trajectory",
+        "Trial",
     },
-}  # fmt: skip
+}
 
 
 def test_public_functions_check_what_they_are_given():
@@ -145,6 +201,8 @@ def test_public_functions_check_what_they_are_given():
         if not any(p != "self" for p in inspect.signature(function).parameters):
             continue
         if name.removesuffix(".__init__") in unchecked:
-            assert not hasattr(function, "kinds"), f"{name} is checked: take it off the list"
+            assert not hasattr(function, "kinds"), (
+                f"{name} is checked: take it off the list"
+            )
         else:
             assert function.kinds.by_name, f"{name} is not checked"

@@ -42,4 +42,6 @@ def test_private_words_have_standard_terms():
     pages = {str(path.relative_to(ROOT)): texts(path) for path in FILES}
     for phrase, term in EXCLUDED.items():
         pattern = re.compile(rf"\b(?:{phrase})\b".replace(" ", r"\s+"))
-        assert not [name for name, text in pages.items() if pattern.search(text)], f"write {term!r}"
+        assert not [name for name, text in pages.items() if pattern.search(text)], (
+            f"write {term!r}"
+        )

@@ -20,7 +20,12 @@ def Field(states, function):
 
 def toy(charts, transitions=(), period=None, outputs=(), **names):
     """Return a system without parameters, whose methods return these."""
-    parts = {"charts": charts, "transitions": transitions, "period": period, "outputs": outputs}
+    parts = {
+        "charts": charts,
+        "transitions": transitions,
+        "period": period,
+        "outputs": outputs,
+    }
     methods = {name: lambda self, x=x: x for name, x in parts.items()}
     return type("Toy", (hj.HybridSystem,), methods | names)()
 
@@ -38,9 +43,13 @@ def hopper_in(length, time):
     """Return the hopper with lengths and times multiplied."""
     h, force = hj.models.VerticalHopper(), length / time**2
     return hj.models.VerticalHopper(
-        l0=h.l0 * length, a=h.a * force, g=h.g * force,
-        k=h.k / time**2, b=h.b / time, omega=h.omega / time,
-    )  # fmt: skip
+        l0=h.l0 * length,
+        a=h.a * force,
+        g=h.g * force,
+        k=h.k / time**2,
+        b=h.b / time,
+        omega=h.omega / time,
+    )
 
 
 class Toys(hj.HybridSystem):
@@ -94,6 +103,18 @@ def many(cycle, n):
     arrays = jax.tree_util.tree_map(lambda x: np.broadcast_to(x, (n, *x.shape)), arrays)
     c, codes = eqx.combine(arrays, rest), np.tile(cycle.event_sequence, (n, 1))
     return LimitCycles(
-        c.system, cycle.base, c.period, c.anchor, c.legs, c.factors, c.residual, c.iterations,
-        c.result, codes, cycle.settings, c.conserved, c.multiplicity, c.numbers,
-    )  # fmt: skip
+        c.system,
+        cycle.base,
+        c.period,
+        c.anchor,
+        c.legs,
+        c.factors,
+        c.residual,
+        c.iterations,
+        c.result,
+        codes,
+        cycle.settings,
+        c.conserved,
+        c.multiplicity,
+        c.numbers,
+    )

@@ -5,9 +5,19 @@ from typing import NamedTuple
 
 # In the order in which they run.
 NAMES = (
-    "experiments", "honesty", "sizes", "size", "jacobians", "gradients", "grid",
-    "steps", "solvers", "walkers", "cores", "compile",
-)  # fmt: skip
+    "experiments",
+    "honesty",
+    "sizes",
+    "size",
+    "jacobians",
+    "gradients",
+    "grid",
+    "steps",
+    "solvers",
+    "walkers",
+    "cores",
+    "compile",
+)
 
 
 class Options(NamedTuple):

@@ -16,7 +16,9 @@ def call(module: str, *arguments: str, **environment: str) -> Any:
     done = subprocess.run(
         (sys.executable, "-m", f"cases.{module}", *arguments),
         # Programs from the cache make XLA print pages about features of the processor.
-        env=os.environ | environment | {"PYTHONPATH": path, "TF_CPP_MIN_LOG_LEVEL": "3"},
+        env=os.environ
+        | environment
+        | {"PYTHONPATH": path, "TF_CPP_MIN_LOG_LEVEL": "3"},
         stdout=subprocess.PIPE,
         text=True,
         check=True,

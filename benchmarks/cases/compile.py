@@ -38,7 +38,15 @@ import one_thread
 
 
 CORES = 2
-JOBS = "derivatives", "responses", "cycles", "sweep", "second_process", "branch", "walkers"
+JOBS = (
+    "derivatives",
+    "responses",
+    "cycles",
+    "sweep",
+    "second_process",
+    "branch",
+    "walkers",
+)
 # A plane of 50 x 50 hoppers.
 AXES = {"k": np.linspace(9, 11, 50), "b": np.linspace(4.5, 5.5, 50)}
 
@@ -71,13 +79,18 @@ def run(show, options) -> None:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "cached", "later"):
                 if state == "later":
-                    call("compile", "hopper", family, "thoroughly", HYBRIDJAX_CACHE=cache)
+                    call(
+                        "compile", "hopper", family, "thoroughly", HYBRIDJAX_CACHE=cache
+                    )
                 calls(family, state, "hopper", family, cache=cache)
             folder = str(pathlib.Path(cache, "modules"))
             found = call("compile", "hopper", family, folder, HYBRIDJAX_CACHE=cache)
         for name, value in found.items():
             show(f"{family}.{name}", value)
-    others = [("own", "own", "kinematic"), *((f"bar.{x}", "bar", x) for m, x in ALL if m == "bar")]
+    others = [
+        ("own", "own", "kinematic"),
+        *((f"bar.{x}", "bar", x) for m, x in ALL if m == "bar"),
+    ]
     for label, *job in [] if options.quick else others:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "cached"):
@@ -107,7 +120,9 @@ def first_calls(model: str, family: str, repetition: int = 0):
 
     cycle = timed("find_limit_cycle", lambda: hj.find_limit_cycle(system))
     timed("linearize", lambda: hj.linearize(cycle, own, outputs))
-    data = timed("run_experiments", lambda: hj.run_experiments(cycle, own, design, outputs))
+    data = timed(
+        "run_experiments", lambda: hj.run_experiments(cycle, own, design, outputs)
+    )
     assert data.ok.all()
     timed("find_limit_cycle_again", lambda: hj.find_limit_cycle(system))
     return seconds
@@ -133,13 +148,18 @@ def derivatives() -> dict[str, float]:
     hj.enable_x64()
     hopper, outputs = hj.models.VerticalHopper(), OUTPUTS["hopper"]
     family, cycle = sections("hopper", "kinematic"), hj.find_limit_cycle(hopper)
-    htf = hj.linearize(cycle, family, outputs).htf(np.linspace(0.01, 0.49, 40), (-1, 0, 1))
+    htf = hj.linearize(cycle, family, outputs).htf(
+        np.linspace(0.01, 0.49, 40), (-1, 0, 1)
+    )
 
     def coefficient(system):
         neighbor = hj.find_limit_cycle(system, cycle)
         return hj.linearize(neighbor, family, outputs).characteristic_polynomial()[2]
 
-    near, observed = hj.models.VerticalHopper(k=10.8, b=4.75), hj.ObservedHTF(htf, family)
+    near, observed = (
+        hj.models.VerticalHopper(k=10.8, b=4.75),
+        hj.ObservedHTF(htf, family),
+    )
     return twice(
         gradient=lambda: eqx.filter_grad(coefficient)(hopper).k.item(),
         fit=lambda: hj.fit_model(near, observed, ("k", "b"), guesses=4),
@@ -220,7 +240,10 @@ def responses() -> dict[str, float]:
 
     hj.enable_x64()
     hopper, seconds = hj.find_limit_cycle(hj.models.VerticalHopper()), {}
-    neuron, f = hj.find_limit_cycle(hj.models.FitzHughNagumo()), np.linspace(0.013, 9.987, 620)
+    neuron, f = (
+        hj.find_limit_cycle(hj.models.FitzHughNagumo()),
+        np.linspace(0.013, 9.987, 620),
+    )
     htf = lambda: hopper.htf(f, range(-2, 3), ("yM", "vM"))  # noqa: E731
     jobs = {"hopper": hopper.responses, "neuron": neuron.responses, "htf_first": htf}
     for name, job in (jobs | {f"htf_again_{k}": htf for k in range(30)}).items():
@@ -249,10 +272,16 @@ def diffeqsolve() -> float:
     start = jnp.array([2.0, 1.9, 0.0, 0.5])
     begin = time.process_time()
     found = diffrax.diffeqsolve(
-        term, diffrax.Dopri8(), 0.0, 1.0, 0.01, start,
+        term,
+        diffrax.Dopri8(),
+        0.0,
+        1.0,
+        0.01,
+        start,
         stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
-        saveat=diffrax.SaveAt(t1=True), event=touchdown,
-    )  # fmt: skip
+        saveat=diffrax.SaveAt(t1=True),
+        event=touchdown,
+    )
     jax.block_until_ready(found.ys)
     return time.process_time() - begin
 
@@ -298,7 +327,8 @@ def main(model: str, family: str, folder: str | None) -> None:
         "same_value.compilations": same["backend_compile"],
         "another_value.traces": len(seen["jaxpr_trace"]) - same["jaxpr_trace"],
         "another_value.traced": " ".join(seen["jaxpr_trace"][same["jaxpr_trace"] :]),
-        "another_value.compilations": len(seen["backend_compile"]) - same["backend_compile"],
+        "another_value.compilations": len(seen["backend_compile"])
+        - same["backend_compile"],
         "programs": len(texts),
         "programs_with_callbacks": len(callbacks),
     }

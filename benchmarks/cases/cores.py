@@ -15,7 +15,9 @@ CORES = 2
 def run(show, options) -> None:
     from .children import call
 
-    for name, value in call("cores", str(options.repeat), str(int(options.quick))).items():
+    for name, value in call(
+        "cores", str(options.repeat), str(int(options.quick))
+    ).items():
         show(name, value)
 
 
@@ -34,7 +36,9 @@ def main(repeat: int, quick: bool) -> None:
             for workers in (1, 2):
                 task.run(workers=workers)
             for workers in (1, 2):
-                data, seconds = measure(lambda t=task, w=workers: t.run(workers=w), repeat)
+                data, seconds = measure(
+                    lambda t=task, w=workers: t.run(workers=w), repeat
+                )
                 name = f"{task.label}.size_{count}.workers_{workers}"
                 found[f"{name}.wall"] = walls[workers] = seconds.wall
                 found[f"{name}.cpu"] = seconds.cpu

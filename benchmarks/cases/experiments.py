@@ -19,8 +19,13 @@ ACCURACIES = (1e-7, 1e-8, 1e-9)
 LIMITS = (1e-7, 1e-9)
 OURS = ("run", "program", "loops")
 PEERS = (
-    "c", "heyoka.scalar", "heyoka.simd", "heyoka.batch", "scipy", "jaxonomy",
-)  # fmt: skip
+    "c",
+    "heyoka.scalar",
+    "heyoka.simd",
+    "heyoka.batch",
+    "scipy",
+    "jaxonomy",
+)
 
 
 def run(show, options) -> None:
@@ -46,7 +51,9 @@ def run(show, options) -> None:
 def _runs(task: Problem, who: str, note, repeat: int) -> None:
     for accuracy in ACCURACIES:
         name = f"{task.label}.{who}.accuracy_{accuracy:.0e}"
-        data, compiling, seconds = first_and_later(ft.partial(task.run, accuracy), repeat)
+        data, compiling, seconds = first_and_later(
+            ft.partial(task.run, accuracy), repeat
+        )
         if accuracy == ACCURACIES[0]:
             note(f"{task.label}.{who}.compile", compiling)
         _result(note, name, seconds, task.error(data))
@@ -57,7 +64,9 @@ def _ours(task: Problem, note, repeat: int) -> None:
     _runs(task, "run", note, repeat)
     for accuracy in ACCURACIES:
         name = f"{task.label}.program.accuracy_{accuracy:.0e}"
-        y, _, seconds = first_and_later(ft.partial(program, *task.response(accuracy)), repeat)
+        y, _, seconds = first_and_later(
+            ft.partial(program, *task.response(accuracy)), repeat
+        )
         _result(note, name, seconds, task.distance(y))
 
 
@@ -88,7 +97,10 @@ def _compare(label: str, limit: float, seen: dict, show) -> None:
         for ours in OURS:
             if who in best and ours in best:
                 ratio = best[who] / best[ours]
-                show(f"{label}.at_{limit:.0e}.ratio_{who.replace('.', '_')}.{ours}", ratio)
+                show(
+                    f"{label}.at_{limit:.0e}.ratio_{who.replace('.', '_')}.{ours}",
+                    ratio,
+                )
 
 
 def main(model: str, family: str, repeat: str, quick: str) -> None:
@@ -97,7 +109,12 @@ def main(model: str, family: str, repeat: str, quick: str) -> None:
     hj.enable_loop_kernels()
     hj.enable_x64()
     found = {}
-    _runs(problem(model, family, bool(int(quick))), "loops", found.__setitem__, int(repeat))
+    _runs(
+        problem(model, family, bool(int(quick))),
+        "loops",
+        found.__setitem__,
+        int(repeat),
+    )
     print(json.dumps(found))
 
 

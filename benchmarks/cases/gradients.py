@@ -46,7 +46,9 @@ def run(show, options) -> None:
                 show(f"{name}.error", abs(float(value) - true) / true)
             else:
                 show(f"{name}.times_plain", seconds.cpu / plain)
-                error = np.max(np.abs(np.asarray(value) - exact)) / np.max(np.abs(exact))
+                error = np.max(np.abs(np.asarray(value) - exact)) / np.max(
+                    np.abs(exact)
+                )
                 show(f"{name}.error", float(error))
 
 

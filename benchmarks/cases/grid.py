@@ -32,14 +32,19 @@ def run(show, options) -> None:
         return cycles, cycles.multipliers
 
     _, first = measure(work)
-    (cycles, multipliers), later = measure(work, 1 if options.quick else min(options.repeat, 3))
+    (cycles, multipliers), later = measure(
+        work, 1 if options.quick else min(options.repeat, 3)
+    )
     show("hoppers", len(cycles))
     show("compile", first.wall - later.wall)
     show("cpu", later.cpu)
     show("wall", later.wall)
     show("found", float(cycles.ok.mean()))
     for code in np.unique(cycles.result[~cycles.ok]):
-        show(f"failed.{Result(int(code)).name.lower()}", int((cycles.result == code).sum()))
+        show(
+            f"failed.{Result(int(code)).name.lower()}",
+            int((cycles.result == code).sum()),
+        )
     show("residual", float(cycles.residual[cycles.ok].max()))
     show("good", float((cycles.ok & (cycles.residual <= 1e-10)).mean()))
     show("in_flight", int((cycles.anchor.chart.ravel() == 0).sum()))
@@ -63,7 +68,10 @@ def _check(cycles: LimitCycles, multipliers, show, count: int) -> None:
         off = ours + 1e-3 * rng.standard_normal(ours.shape)
         theirs = fsolve(lambda q, turn=turn: turn(q) - q, off, xtol=1e-13)
         h = 1e-5
-        J = [(turn(theirs + h * e) - turn(theirs - h * e)) / (2 * h) for e in np.eye(len(ours))]
+        J = [
+            (turn(theirs + h * e) - turn(theirs - h * e)) / (2 * h)
+            for e in np.eye(len(ours))
+        ]
         values = np.linalg.eigvals(np.array(J).T)
         distance = np.abs(values[:, None] - multipliers[i][None, :2]).min(axis=0).max()
         errors.append((np.abs(theirs - ours).max(), distance))
@@ -84,9 +92,15 @@ def _flow(charts, name: str, q, t: float, end: float):
         for guard in chart.guards:
             guard.terminal, guard.direction = True, -1
         out = solve_ivp(
-            chart.field, (t, end), q, method="DOP853", events=chart.guards, args=(0.0,),
-            rtol=1e-12, atol=1e-13,
-        )  # fmt: skip
+            chart.field,
+            (t, end),
+            q,
+            method="DOP853",
+            events=chart.guards,
+            args=(0.0,),
+            rtol=1e-12,
+            atol=1e-13,
+        )
         t, q = out.t[-1], out.y[:, -1]
         if out.status == 0:
             if name != home:

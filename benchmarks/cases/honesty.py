@@ -22,7 +22,9 @@ def run(show, options) -> None:
         for factor in FACTORS:
             task = problem(model, family, options.quick).scaled(factor)
             for accuracy in ACCURACIES:
-                name = f"{task.label}.amplitude_{0.01 * factor:g}.accuracy_{accuracy:.0e}"
+                name = (
+                    f"{task.label}.amplitude_{0.01 * factor:g}.accuracy_{accuracy:.0e}"
+                )
                 _honest(task, accuracy, name, show)
 
 
@@ -32,7 +34,9 @@ def _honest(task: Problem, accuracy: float, name: str, show) -> None:
 
 def show_honesty(task: Problem, data, accuracy: float, name: str, show) -> None:
     """The share of experiments that ran well, and the errors of these."""
-    campaign = prepare(task.cycle, task.placed, task.u, task.outputs, Options(discard=0))
+    campaign = prepare(
+        task.cycle, task.placed, task.u, task.outputs, Options(discard=0)
+    )
     scale = campaign.stepping.scales[:, 1:3]
     scale = np.resize(scale, task.exact.shape[1:])
     assert scale.shape[0] % N == 0

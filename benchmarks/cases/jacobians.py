@@ -48,7 +48,10 @@ def run(show, options) -> None:
             show(f"{name}.cpu", seconds.cpu)
             show(f"{name}.error", _error((A, B), exact))
             work = ft.partial(_placing, cycle, task.placed.family)
-            show(f"{task.label}.placing.rtol_{rtol:.0e}.cpu", first_and_later(work, repeat)[2].cpu)
+            show(
+                f"{task.label}.placing.rtol_{rtol:.0e}.cpu",
+                first_and_later(work, repeat)[2].cpu,
+            )
         name = f"{task.label}.linearize"
         work = ft.partial(hj.linearize, task.cycle, task.placed, task.outputs)
         ldtp, compiling, seconds = first_and_later(work, repeat)

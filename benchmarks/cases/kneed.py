@@ -18,17 +18,36 @@ class KneedWalker(hj.HybridSystem):
     slope: float = 0.0504
 
     def mechanism(self):
-        arms = [(0.375, 0, 0), (0.675, 0, 0), (1, 0, 0), (1, -0.325, 0), (1, -0.5, -0.125)]
-        return chain(np.array(arms), np.array([0.05, 0.5, 0.5, 0.5, 0.05]), 0.0, 9.81, {})
+        arms = [
+            (0.375, 0, 0),
+            (0.675, 0, 0),
+            (1, 0, 0),
+            (1, -0.325, 0),
+            (1, -0.5, -0.125),
+        ]
+        return chain(
+            np.array(arms), np.array([0.05, 0.5, 0.5, 0.5, 0.05]), 0.0, 9.81, {}
+        )
 
     def charts(self):
         torque = jnp.array([1.0, -1.0, 0.0])
-        free, locked = self.mechanism(), self.mechanism().along(lambda p: p[jnp.array([0, 1, 1])])
+        free, locked = (
+            self.mechanism(),
+            self.mechanism().along(lambda p: p[jnp.array([0, 1, 1])]),
+        )
         bent = lambda t, q, u: (*q[3:], *free.acceleration(q[:3], q[3:], u[0] * torque))  # noqa: E731
-        straight = lambda t, q, u: (*q[2:], *locked.acceleration(q[:2], q[2:], u[0] * torque[:2]))  # noqa: E731
+
+        def straight(t, q, u):
+            return (
+                *q[2:],
+                *locked.acceleration(q[:2], q[2:], u[0] * torque[:2]),
+            )
+
         angles, rates = ("stance", "thigh", "shank"), ("v_stance", "v_thigh", "v_shank")
-        return {"free": FieldChart(bent, angles + rates),
-                "locked": FieldChart(straight, angles[:2] + rates[:2])}  # fmt: skip
+        return {
+            "free": FieldChart(bent, angles + rates),
+            "locked": FieldChart(straight, angles[:2] + rates[:2]),
+        }
 
     def transitions(self):
         bend = lambda q: q[1:2] - q[2:3]  # noqa: E731
@@ -47,7 +66,12 @@ class KneedWalker(hj.HybridSystem):
         landing = lambda t, q, u: 2 * self.slope - q[0] - q[1]  # noqa: E731
         return (
             hj.Transition(
-                "kneestrike", "free", "locked", lambda t, q, u: bend(q)[0], "rising", kneestrike
+                "kneestrike",
+                "free",
+                "locked",
+                lambda t, q, u: bend(q)[0],
+                "rising",
+                kneestrike,
             ),
             hj.Transition(
                 "heelstrike",

@@ -66,10 +66,14 @@ class Problem:
         """All experiments, as a user runs them, by the program that jobs find after a while."""
         batched._LARGE = 0
         return hj.run_experiments(
-            self.cycle, self.placed, self.u, self.outputs,
-            discard=0, accuracy=accuracy,
+            self.cycle,
+            self.placed,
+            self.u,
+            self.outputs,
+            discard=0,
+            accuracy=accuracy,
             execution=hj.Execution(workers=workers),
-        )  # fmt: skip
+        )
 
     def error(self, data: hj.ExperimentData) -> float:
         """Largest error of the outputs, in their own units."""
@@ -87,7 +91,14 @@ class Problem:
         start = jnp.repeat(start, len(self.u), axis=1)
         z = tuple(prepared.outputs)
         stepping = prepared.stepping
-        return self.placed, stepping.plan, start, jnp.asarray(self.u), z, stepping.settings
+        return (
+            self.placed,
+            stepping.plan,
+            start,
+            jnp.asarray(self.u),
+            z,
+            stepping.settings,
+        )
 
 
 def responding(placed, plan, start, u, outputs, settings):
@@ -117,7 +128,12 @@ def sections(model: str, family: str) -> hj.ClockPhase | hj.KinematicPhase:
         return hj.ClockPhase(N, anchor=anchor)
     center, scale = CENTERS[model]
     return hj.KinematicPhase(
-        N, position=position, velocity=velocity, center=center, scale=scale, anchor=anchor
+        N,
+        position=position,
+        velocity=velocity,
+        center=center,
+        scale=scale,
+        anchor=anchor,
     )
 
 

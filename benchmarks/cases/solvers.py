@@ -28,9 +28,14 @@ RTOL = 1e-11
 
 def run(show, options) -> None:
     for mu in (100.0,) if options.quick else PERIODS:
-        _relaxation(lambda name, x, mu=mu: show(f"vanderpol_{mu:g}.{name}", x), mu, options)
+        _relaxation(
+            lambda name, x, mu=mu: show(f"vanderpol_{mu:g}.{name}", x), mu, options
+        )
     for model in (hj.models.VerticalHopper(), hj.models.CompliantHopper()):
-        name, work = type(model).__name__, lambda model=model: hj.find_limit_cycle(model)
+        name, work = (
+            type(model).__name__,
+            lambda model=model: hj.find_limit_cycle(model),
+        )
         _, _, seconds = first_and_later(work, options.repeat)
         show(f"{name}.find_limit_cycle.cpu", seconds.cpu)
 
@@ -46,7 +51,9 @@ def _relaxation(show, mu: float, options) -> None:
         s = Structure(system)
         t = jax.numpy.zeros(q.shape[1])
         lanes = start_lanes(s, t, jax.numpy.zeros(q.shape[1], int), q)
-        return move(s, lanes, jax.numpy.zeros((1, q.shape[1])), until(t + period), settings).moved
+        return move(
+            s, lanes, jax.numpy.zeros((1, q.shape[1])), until(t + period), settings
+        ).moved
 
     def seconds_of(q):
         moved, compiling, seconds = first_and_later(
@@ -55,7 +62,9 @@ def _relaxation(show, mu: float, options) -> None:
         assert not np.any(moved.result)
         return np.asarray(moved.lanes.q), compiling, seconds
 
-    points = np.asarray(turn(points).lanes.q)  # they were on the cycle up to interpolation
+    points = np.asarray(
+        turn(points).lanes.q
+    )  # they were on the cycle up to interpolation
     one, compiling, alone = seconds_of(points[:, :1])
     show("compile", compiling)
     error = _distance(one, points[:, :1], sizes)
@@ -81,9 +90,15 @@ def _points(mu: float, period: float, count: int) -> np.ndarray:
     start = [2.0, -2 / (3 * mu)]
     times = 2 * period + period * np.arange(count) / count
     found = solve_ivp(
-        *_flow(mu), (0, 3 * period), start, "Radau", t_eval=times, rtol=1e-12, atol=1e-15,
+        *_flow(mu),
+        (0, 3 * period),
+        start,
+        "Radau",
+        t_eval=times,
+        rtol=1e-12,
+        atol=1e-15,
         jac=_jacobian(mu),
-    )  # fmt: skip
+    )
     return found.y
 
 
@@ -98,7 +113,13 @@ def _jacobian(mu):
 def _scipy(mu, start, period, rtol):
     begin = time.process_time()
     found = solve_ivp(
-        *_flow(mu), (0, period), start, "Radau", rtol=rtol, atol=rtol * 1e-3, jac=_jacobian(mu)
+        *_flow(mu),
+        (0, period),
+        start,
+        "Radau",
+        rtol=rtol,
+        atol=rtol * 1e-3,
+        jac=_jacobian(mu),
     )
     return found.y[:, -1], time.process_time() - begin, len(found.t)
 

@@ -15,10 +15,15 @@ TIGHT = hj.Settings(rtol=1e-14, atol=1e-14)
 def run(show, options) -> None:
     tight = hj.find_limit_cycle(hj.models.VerticalHopper(), settings=TIGHT)
     hopper = hj.models.VerticalHopper()
-    found, _, seconds = first_and_later(lambda: hj.find_limit_cycle(hopper), options.repeat)
+    found, _, seconds = first_and_later(
+        lambda: hj.find_limit_cycle(hopper), options.repeat
+    )
     show("find_limit_cycle.wall", seconds.wall)
     show("find_limit_cycle.error", _distance(found.anchor.q, tight.anchor.q))
-    show("find_limit_cycle.multiplier_error", _distance(found.multipliers, tight.multipliers))
+    show(
+        "find_limit_cycle.multiplier_error",
+        _distance(found.multipliers, tight.multipliers),
+    )
     f = hj.paper_design().frequencies[:: 50 if options.quick else 10]
     found = cycle("hopper")
     for model, family in HOPPER:

@@ -22,27 +22,42 @@ def run(show, options) -> None:
     angles = np.linspace(-0.16, 0.16, SECTIONS - 1)
     at_angles = [hj.Crossing("leg", "rising", angle) for angle in angles]
     phase = hj.KinematicPhase(
-        SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
+        SECTIONS,
+        position="yM",
+        velocity="vM",
+        center=(1.9, 0.0),
+        scale=(0.3, 1.9),
         anchor=hj.Crossing("vM", "falling"),
-    )  # fmt: skip
+    )
     cases = {
         "hopper": (hj.models.VerticalHopper(), phase, "yM", 5e-4),
-        "biped": (hj.models.FiveLinkBiped(), [hj.AtEvent("touchdown"), *at_angles], "leg", 1e-2),
+        "biped": (
+            hj.models.FiveLinkBiped(),
+            [hj.AtEvent("touchdown"), *at_angles],
+            "leg",
+            1e-2,
+        ),
     }
     found = {}
     for name, case in cases.items():
-        found[name] = _costs(lambda key, x, name=name: show(f"{name}.{key}", x), case, options)
+        found[name] = _costs(
+            lambda key, x, name=name: show(f"{name}.{key}", x), case, options
+        )
     for key, value in found["biped"].items():
         show(f"ratio.{key}", value / found["hopper"][key])
 
 
 def _costs(show, case, options) -> dict[str, float]:
     model, sections, output, amplitude = case
-    cycle, compiling, seconds = first_and_later(lambda: hj.find_limit_cycle(model), options.repeat)
+    cycle, compiling, seconds = first_and_later(
+        lambda: hj.find_limit_cycle(model), options.repeat
+    )
     costs = {"cycle.first": compiling + seconds.wall, "cycle.cpu": seconds.cpu}
     placed = hj.place_sections(cycle, sections)
     count, cycles = (16, 4) if options.quick else (EXPERIMENTS, CYCLES)
-    u = amplitude * np.random.default_rng(0).standard_normal((count, cycles * SECTIONS, 1))
+    u = amplitude * np.random.default_rng(0).standard_normal(
+        (count, cycles * SECTIONS, 1)
+    )
     batched._LARGE = 0
     how = {"discard": 0, "accuracy": ACCURACY, "execution": hj.Execution(workers=1)}
     _, _, seconds = first_and_later(
@@ -53,7 +68,10 @@ def _costs(show, case, options) -> dict[str, float]:
     steps = np.ceil(np.asarray(placed.duration) / np.asarray(prepared.stepping.plan.h))
     stages = [len(s.method(a).c) for a in chart]
     work = u.size / SECTIONS * np.sum(steps * stages * np.array(s.dims)[chart])
-    costs |= {"experiments.cpu": seconds.cpu, "experiments.nanoseconds": 1e9 * seconds.cpu / work}
+    costs |= {
+        "experiments.cpu": seconds.cpu,
+        "experiments.nanoseconds": 1e9 * seconds.cpu / work,
+    }
     for key, value in costs.items():
         show(key, value)
     return costs

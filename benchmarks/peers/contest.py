@@ -67,7 +67,9 @@ class Contest(NamedTuple):
         loop, compiling = measure(lambda: c_peer.setup(self.job))
         self.show(f"{self._label('c')}.compile", compiling.wall)
         for steps in c_peer.SETTINGS:
-            result = measure(lambda steps=steps: c_peer.run(self.job, loop, steps), self.repeat)
+            result = measure(
+                lambda steps=steps: c_peer.run(self.job, loop, steps), self.repeat
+            )
             self._result(f"{self._label('c')}.steps_{steps}", *result)
 
     def _heyoka(self):
@@ -77,10 +79,14 @@ class Contest(NamedTuple):
         for tol in heyoka_peer.SETTINGS:
             for kind, batch in {"scalar": 1, "simd": 8, "batch": min(S, 80)}.items():
                 name = f"{self._label('heyoka')}.{kind}.tol_{tol:.0e}"
-                ready, compiling = measure(lambda t=tol, b=batch: heyoka_peer.setup(self.job, t, b))
+                ready, compiling = measure(
+                    lambda t=tol, b=batch: heyoka_peer.setup(self.job, t, b)
+                )
                 self.show(f"{name}.compile", compiling.cpu)
                 job, scale = self._part(8) if batch == 1 else (self.job, 1.0)
-                result = measure(lambda j=job, r=ready: heyoka_peer.run(j, r), self.repeat)
+                result = measure(
+                    lambda j=job, r=ready: heyoka_peer.run(j, r), self.repeat
+                )
                 self._result(name, *result, scale)
 
     def _scipy(self):
@@ -116,7 +122,9 @@ def jacobians(job: Job, exact: np.ndarray, show, repeat: int = 20) -> None:
     try:
         for tol in (1e-6, 1e-9):
             ready, compiling = measure(lambda tol=tol: heyoka_jacobians.setup(job, tol))
-            found, seconds = measure(lambda ready=ready: heyoka_jacobians.run(job, ready), repeat)
+            found, seconds = measure(
+                lambda ready=ready: heyoka_jacobians.run(job, ready), repeat
+            )
             show(f"{label}.tol_{tol:.0e}.compile", compiling.cpu)
             show(f"{label}.tol_{tol:.0e}.cpu", seconds.cpu)
             show(f"{label}.tol_{tol:.0e}.error", float(np.max(np.abs(found - exact))))
@@ -141,7 +149,9 @@ def sizes(job: Job, exact, show, counts, cycles: int) -> None:
         ):
             try:
                 ready = peer.setup(part, *options)
-                y, seconds = measure(lambda p=part, r=ready, x=peer: x.run(p, r), repeat)
+                y, seconds = measure(
+                    lambda p=part, r=ready, x=peer: x.run(p, r), repeat
+                )
                 show(f"{label}.{name}.microseconds", 1e6 * seconds.cpu / part.u.size)
                 error = np.abs(y - exact[np.arange(count) % len(exact)])
                 show(f"{label}.{name}.error", float(np.max(error)))

@@ -28,7 +28,9 @@ def setup(job: Job, tol: float = 1e-12) -> Ready:
     model = models.make(job)
     variables = [x for x, _ in model.fields]
     # Derivatives by (t, four states, u) at the start.
-    system = hy.var_ode_sys(model.fields, [hy.time, *variables, hy.par[models.INPUT]], order=1)
+    system = hy.var_ode_sys(
+        model.fields, [hy.time, *variables, hy.par[models.INPUT]], order=1
+    )
     fields = hy.cfunc([f for _, f in model.fields], variables)
     switches = (hy.par[1], hy.par[2])
 
@@ -40,7 +42,8 @@ def setup(job: Job, tol: float = 1e-12) -> Ready:
             t, state = ta.time[lane], ta.state[:4, lane].copy()
             pars, D = ta.pars[:, lane].copy(), ta.state[4:, lane].reshape(4, 6)
             dt, through = (
-                x[..., 0] for x in saltation(state[:, None], D[..., None], pars[:, None], t)
+                x[..., 0]
+                for x in saltation(state[:, None], D[..., None], pars[:, None], t)
             )
             state = np.array(model.jump(j, t, state, pars[models.SWITCH], np.cos))
             pars[1 + j] = ta.pars[1 + j, lane] = 1 - pars[1 + j]
@@ -53,7 +56,8 @@ def setup(job: Job, tol: float = 1e-12) -> Ready:
 
     falls = {"direction": hy.event_direction.negative}
     events = [
-        hy.t_event_batch(g, callback=callback(j, g), **falls) for j, g in enumerate(model.guards)
+        hy.t_event_batch(g, callback=callback(j, g), **falls)
+        for j, g in enumerate(model.guards)
     ]
     section = None
     if not job.clocked:
@@ -71,7 +75,9 @@ def setup(job: Job, tol: float = 1e-12) -> Ready:
     for i, t in enumerate(job.times):
         own = pars[: fields.nparams, i].copy()
         D[:, 0, i] = -fields(state[:, i].copy(), pars=own, time=t)
-    return Ready(ta, section, np.concatenate([state, D.reshape(24, -1)]), pars[: len(ta.pars)])
+    return Ready(
+        ta, section, np.concatenate([state, D.reshape(24, -1)]), pars[: len(ta.pars)]
+    )
 
 
 def _saltation(guard, after, model, variables):
@@ -89,7 +95,9 @@ def _saltation(guard, after, model, variables):
         out = f(np.vstack([state, t]), pars=np.ascontiguousarray(pars[: f.nparams]))
         (g, *after), field = out[:25].reshape(5, 5, -1), out[25:]
         after = np.array(after)
-        dt = -np.einsum("il,icl->cl", g[:4], D) / (np.einsum("il,il->l", g[:4], field) + g[4])
+        dt = -np.einsum("il,icl->cl", g[:4], D) / (
+            np.einsum("il,il->l", g[:4], field) + g[4]
+        )
         D = D + field[:, None] * dt
         return dt, np.einsum("jil,icl->jcl", after[:, :4], D) + after[:, 4:] * dt
 
@@ -103,7 +111,9 @@ def run(job: Job, ready: Ready) -> np.ndarray:
     ta.state[:], ta.pars[:] = ready.state, ready.pars
     ta.set_time(job.times)
     ta.reset_cooldowns()
-    longest = job.durations.copy() if job.clocked else np.full(N, 2 * job.durations.max())
+    longest = (
+        job.durations.copy() if job.clocked else np.full(N, 2 * job.durations.max())
+    )
     for _ in range(20):
         ta.step(longest)
         if job.clocked:

@@ -70,7 +70,9 @@ def setup(job: Job, tol: float = 1e-7, batch: int = 1) -> Ready:
 
         return change
 
-    events = [event(g, callback=callback(j), **falls) for j, g in enumerate(model.guards)]
+    events = [
+        event(g, callback=callback(j), **falls) for j, g in enumerate(model.guards)
+    ]
     if not job.clocked:
         events.append(event(models.section(model), **falls))
     make = hy.taylor_adaptive if scalar else hy.taylor_adaptive_batch
@@ -126,7 +128,9 @@ def _scalar_clocked(job, ready, u):
     _begin(job, ta)
     record = np.empty((len(u), 2))
     state, pars, go = ta.state, ta.pars, ta.propagate_until
-    for k, (force, time) in enumerate(zip(u.tolist(), _arrivals(job, len(u)), strict=True)):
+    for k, (force, time) in enumerate(
+        zip(u.tolist(), _arrivals(job, len(u)), strict=True)
+    ):
         record[k] = state[:2]
         pars[0] = force
         go(time)
@@ -155,7 +159,9 @@ def _batch_clocked(job, ready, u):
     _begin(job, ta)
     record = np.empty((u.shape[1], 2, u.shape[0]))
     state, pars, go = ta.state, ta.pars, ta.propagate_until
-    for k, (force, time) in enumerate(zip(u.T.copy(), _arrivals(job, u.shape[1]), strict=True)):
+    for k, (force, time) in enumerate(
+        zip(u.T.copy(), _arrivals(job, u.shape[1]), strict=True)
+    ):
         record[k] = state[:2]
         pars[0] = force
         go(time)
@@ -188,5 +194,7 @@ def _batch_kinematic(job, ready, u):
             return record.reshape(L, end, 2)[:, :n]
         step(longest)
         # Faster to see than the outcomes of the lanes, a list of tuples: which lie on a section.
-        here = np.flatnonzero(np.abs(pars[3] * state[0] + pars[4] * state[1] + pars[5]) < 1e-10)
+        here = np.flatnonzero(
+            np.abs(pars[3] * state[0] + pars[4] * state[1] + pars[5]) < 1e-10
+        )
     raise RuntimeError("a section is not reached")

@@ -92,10 +92,14 @@ def simulator(job, durations, rtol):
             self.declare_discrete_state(default_value=first, as_array=False)
             falls = {"direction": "positive_then_non_positive"}
             self.declare_zero_crossing(self.event, self.jump, name="event", **falls)
-            self.declare_zero_crossing(self.section, self.arrive, name="section", **falls)
+            self.declare_zero_crossing(
+                self.section, self.arrive, name="section", **falls
+            )
 
         def leg(self, t, y, ym):
-            return p["k"] * (p["l0"] - (y - ym)) + p["a"] * jnp.sin(p["omega"] * t + phase)
+            return p["k"] * (p["l0"] - (y - ym)) + p["a"] * jnp.sin(
+                p["omega"] * t + phase
+            )
 
         def ode(self, t, state, **parameters):
             y, v, ym, vm = state.continuous_state
@@ -167,7 +171,8 @@ def main(given: str, made: str) -> None:
     record = np.stack([np.asarray(compiled(u)) for u in job["u"]])
     seconds.append((time.process_time(), time.perf_counter()))
     compiling, running = (
-        tuple(b - a for a, b in zip(*pair, strict=True)) for pair in itertools.pairwise(seconds)
+        tuple(b - a for a, b in zip(*pair, strict=True))
+        for pair in itertools.pairwise(seconds)
     )
     pathlib.Path(made).write_bytes(pickle.dumps((record, *compiling, *running)))
 

@@ -43,10 +43,14 @@ def hopper(m, M, k, b, l0, a, g, omega, retention) -> dict[str, Chart]:
 
     return {
         "flight": Chart(
-            flight, (touchdown,), (lambda t, q: ("stance", np.array([q[0], retention * q[1]])),)
+            flight,
+            (touchdown,),
+            (lambda t, q: ("stance", np.array([q[0], retention * q[1]])),),
         ),
         "stance": Chart(
-            stance, (liftoff,), (lambda t, q: ("flight", np.array([q[0], q[1], 0.0, 0.0])),)
+            stance,
+            (liftoff,),
+            (lambda t, q: ("flight", np.array([q[0], q[1], 0.0, 0.0])),),
         ),
     }
 
@@ -101,7 +105,9 @@ def _to_section(job, charts, k, t, chart, q, u, rtol):
             return t, chart, q
         if out.status != 1:
             raise RuntimeError(f"section {k} is not reached: {out.message}")
-        event = next(j for j, times in enumerate(out.t_events) if len(times)) - len(functions)
+        event = next(j for j, times in enumerate(out.t_events) if len(times)) - len(
+            functions
+        )
         if event < 0:
             return t, chart, q
         chart, q = here.jumps[event](t, q)

@@ -7,7 +7,8 @@ from math_core import LatexToMathML
 
 
 _WRITTEN = re.compile(
-    r'<(?P<tag>span|div) class="arithmatex">\\[(\[](?P<tex>.*?)\\[)\]]</(?P=tag)>', re.DOTALL
+    r'<(?P<tag>span|div) class="arithmatex">\\[(\[](?P<tex>.*?)\\[)\]]</(?P=tag)>',
+    re.DOTALL,
 )
 _CONVERTER = LatexToMathML()
 

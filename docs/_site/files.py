@@ -9,7 +9,11 @@ from mkdocs.structure.files import File
 
 
 ROOT = Path(__file__).parents[2]
-LISTS = {"CHANGELOG.md": "changelog.md", "CLAIMS.md": "claims.md", "KNOWN_GAPS.md": "known-gaps.md"}
+LISTS = {
+    "CHANGELOG.md": "changelog.md",
+    "CLAIMS.md": "claims.md",
+    "KNOWN_GAPS.md": "known-gaps.md",
+}
 
 
 def on_files(files, config):
@@ -26,7 +30,9 @@ def on_page_markdown(markdown: str, page, **_) -> str:
     if page.is_homepage:
         page.meta["hide"] = ["navigation", "toc"]
     up = "../" * page.file.src_uri.count("/")
-    markdown = re.sub(r"\]\((?:\.\./)+(notebooks/\w+)\.ipynb", rf"]({up}\1.md", markdown)
+    markdown = re.sub(
+        r"\]\((?:\.\./)+(notebooks/\w+)\.ipynb", rf"]({up}\1.md", markdown
+    )
     for name, target in LISTS.items():
         markdown = re.sub(rf"\]\((?:\.\./)+{name}", f"]({up}{target}", markdown)
     if page.file.src_uri in LISTS.values():
@@ -52,9 +58,15 @@ def _pages(path: Path) -> dict[str, str | bytes]:
                 name = f"{path.stem}-{len(pictures) + 1}.png"
                 pictures[name] = base64.b64decode(data["image/png"])
                 code = re.sub(r"[\[\]`\n]", " ", source.strip().rsplit("\n", 1)[-1])
-                is_wide = int.from_bytes(pictures[name][16:20]) > 800  # (where PNGs have it)
+                is_wide = (
+                    int.from_bytes(pictures[name][16:20]) > 800
+                )  # (where PNGs have it)
                 kind = "{ .wide }" if is_wide else ""
-                parts.append(f"![Figure that the code above draws: {code}]({name}){kind}")
-            elif "text/plain" in data:  # (what a long call said of itself is empty in the end)
+                parts.append(
+                    f"![Figure that the code above draws: {code}]({name}){kind}"
+                )
+            elif (
+                "text/plain" in data
+            ):  # (what a long call said of itself is empty in the end)
                 parts.append(f"```text\n{''.join(data['text/plain'])}\n```")
     return {f"{path.stem}.md": "\n\n".join(parts)} | pictures

@@ -23,8 +23,11 @@ def slug(name: str) -> str:
 def codes() -> dict[str, tuple[str, str]]:
     """Title and code of each case, by the name of its picture."""
     tree = ast.parse((ROOT / "benchmarks/gallery_cases.py").read_text())
-    values = {x.targets[0].id: x.value for x in tree.body if isinstance(x, ast.Assign)
-              and isinstance(x.targets[0], ast.Name)}  # fmt: skip
+    values = {
+        x.targets[0].id: x.value
+        for x in tree.body
+        if isinstance(x, ast.Assign) and isinstance(x.targets[0], ast.Name)
+    }
     cases = next(x for x in tree.body if isinstance(x, ast.AnnAssign)).value
     return {
         slug(key.value): _code(slug(key.value), case.body, values)
@@ -56,11 +59,13 @@ def on_files(files, config):
         about = "\n".join(f"| {x} | {y} |" for x, y in numbers)
         words = _words(text, name)
         parts = [
-            f"# {title[0].upper()}{title[1:]}\n\n{words}", _moving(name, title, "0s"),
-            f"```python\n{code}```", f"![{_alt(title)}](../images/gallery/{name}.png){{ .wide }}",
+            f"# {title[0].upper()}{title[1:]}\n\n{words}",
+            _moving(name, title, "0s"),
+            f"```python\n{code}```",
+            f"![{_alt(title)}](../images/gallery/{name}.png){{ .wide }}",
             f"| number | value |\n|---|---|\n{about}",
             "[All models, and the meaning of the numbers](../gallery.md)",
-        ]  # fmt: skip
+        ]
         content = "\n\n".join(parts)
         files.append(File.generated(config, f"gallery/{name}.md", content=content))
     return files
@@ -103,4 +108,6 @@ def _alt(title: str) -> str:
 def _moving(name: str, title: str, begin: str) -> str:
     svg = (ROOT / f"docs/images/gallery/{name}.svg").read_text().strip()
     end = f'begin="{begin}"' + (f' end="{name}.mouseout"' if begin != "0s" else "")
-    return svg.replace('begin="0s"', end).replace("<svg", f'<svg role="img" aria-label="{title}"')
+    return svg.replace('begin="0s"', end).replace(
+        "<svg", f'<svg role="img" aria-label="{title}"'
+    )

@@ -10,7 +10,9 @@ import griffe
 # Functions that are named as the makers of a result. Doubled: longer lists.
 _MAKERS = 4
 # A list of arguments, and the names and the text of an item.
-_ARGUMENTS = re.compile(r"(?<=\*\*Arguments:\*\*\n\n)(?:- .*\n?(?:(?: +\S.*| *)(?:\n|$))*)+")
+_ARGUMENTS = re.compile(
+    r"(?<=\*\*Arguments:\*\*\n\n)(?:- .*\n?(?:(?: +\S.*| *)(?:\n|$))*)+"
+)
 _ITEM = re.compile(r"((?:`[^`]+`(?:, (?:and )?)?)+)[:,]?\s*(.*)", re.DOTALL)
 
 
@@ -33,16 +35,27 @@ class Members(griffe.Extension):
             obj.docstring.value = _ARGUMENTS.sub(_table, obj.docstring.value)
 
     def on_function(self, *, func: griffe.Function, **_) -> None:
-        if any(decorator.callable_path.endswith("remembered") for decorator in func.decorators):
+        if any(
+            decorator.callable_path.endswith("remembered")
+            for decorator in func.decorators
+        ):
             value = griffe.Attribute(
-                func.name, annotation=func.returns, docstring=func.docstring,
-                lineno=func.lineno, endlineno=func.endlineno, parent=func.parent,
-            )  # fmt: skip
+                func.name,
+                annotation=func.returns,
+                docstring=func.docstring,
+                lineno=func.lineno,
+                endlineno=func.endlineno,
+                parent=func.parent,
+            )
             value.labels |= {"property"}
             func.parent.set_member(func.name, value)
 
     def on_class_members(self, *, cls: griffe.Class, **_) -> None:
-        lines = [_parameter(x) for x in cls.attributes.values() if str(x.annotation) == "Parameter"]
+        lines = [
+            _parameter(x)
+            for x in cls.attributes.values()
+            if str(x.annotation) == "Parameter"
+        ]
         if lines and cls.docstring:
             cls.docstring.value += "\n\n**Parameters:**\n\n" + "\n".join(lines)
 

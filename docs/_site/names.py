@@ -15,7 +15,9 @@ def _entries() -> dict[str, str]:
     names = re.findall(r"^::: (\S+)", pages, re.MULTILINE)
     count = Counter(name.split(".")[-1] for name in names)
     last = {name.split(".")[-1]: name for name in names}
-    return {word: name for word, name in last.items() if count[word] == 1 and _special(word)}
+    return {
+        word: name for word, name in last.items() if count[word] == 1 and _special(word)
+    }
 
 
 def _special(word: str) -> bool:
@@ -24,16 +26,23 @@ def _special(word: str) -> bool:
 
 # Terms of the glossary, by their anchors.
 _TERMS = {
-    "chart": "charts?", "isochron": "isochrons?",
+    "chart": "charts?",
+    "isochron": "isochrons?",
     "excited-line": "excited (?:lines?|frequenc(?:y|ies))",
-    "htf": r"harmonic transfer functions?(?: \(HTFs?\))?|HTFs?", "ldtp": "LDTPs?(?: systems?)?",
-    "limit-cycle": "limit cycles?", "multiplier": "(?:Floquet )?multipliers?",
-    "section": "(?:Poincaré )?sections?", "return-map": "return maps?",
+    "htf": r"harmonic transfer functions?(?: \(HTFs?\))?|HTFs?",
+    "ldtp": "LDTPs?(?: systems?)?",
+    "limit-cycle": "limit cycles?",
+    "multiplier": "(?:Floquet )?multipliers?",
+    "section": "(?:Poincaré )?sections?",
+    "return-map": "return maps?",
     "saltation": "saltation matri(?:x|ces)",
-    "autonomous": "autonomous systems?", "coverage": "coverage", "cramer-rao": "Cramér-Rao bounds?",
-    "distortion": "(?:nonlinear )?distortion", "realization": "realizations?",
+    "autonomous": "autonomous systems?",
+    "coverage": "coverage",
+    "cramer-rao": "Cramér-Rao bounds?",
+    "distortion": "(?:nonlinear )?distortion",
+    "realization": "realizations?",
     "phase-response": "phase responses?(?: curves?)?",
-}  # fmt: skip
+}
 # Where no link may begin: in code, equations, headings, tables, HTML and other links.
 _OTHER = r"```.*?^```|`[^`]*`|\$[^$]*\$|^[#|<!].*?$|\[[^\]]*\](?:\([^)]*\))?|^ {4}.*?$"
 
@@ -45,7 +54,9 @@ def on_page_markdown(markdown: str, page, **_) -> str:
         return markdown
     glossary = "../" * source.count("/") + "glossary.md"
     for anchor, term in _TERMS.items():
-        pattern = re.compile(rf"{_OTHER}|\b(?P<term>{term})\b", re.MULTILINE | re.DOTALL)
+        pattern = re.compile(
+            rf"{_OTHER}|\b(?P<term>{term})\b", re.MULTILINE | re.DOTALL
+        )
         first = next((x for x in pattern.finditer(markdown) if x["term"]), None)
         if first:
             link = f"[{first['term']}]({glossary}#{anchor})"
@@ -60,7 +71,9 @@ def on_page_content(content: str, page, **_) -> str:
 
     def linked(code: re.Match) -> str:
         whole, name, rest = code.groups()
-        identifier = f"hybridjax.{name}" if whole.startswith("hj.") else entries.get(name)
+        identifier = (
+            f"hybridjax.{name}" if whole.startswith("hj.") else entries.get(name)
+        )
         if identifier is None:
             return code[0]
         return f'<autoref {optional}identifier="{identifier}"><code>{whole}{rest}</code></autoref>'

@@ -38,7 +38,9 @@ def draw() -> dict[str, Plot]:
     model = hj.linearize(cycle, sections, outputs=("yM", "vM"))
     first = hj.multisine(32, periods=32, lines="odd").scaled(rms=0.001)
     force = hj.testing.random_force(100, 500, 8.0, rms=0.0205, seed=0)
-    recording = hj.testing.simulate_recording(cycle, force[None], ("yM", "vM"), rate=500)
+    recording = hj.testing.simulate_recording(
+        cycle, force[None], ("yM", "vM"), rate=500
+    )
     data = hj.recordings.section_data(
         recording, APEX, inputs="u", outputs=("yM", "vM"), n_sections=16
     )
@@ -52,7 +54,9 @@ def draw() -> dict[str, Plot]:
 
 def walk() -> Motion:
     """The animation below the first sentence."""
-    gait = hj.find_limit_cycle(hj.models.CompassGait(), section=hj.AtEvent("heelstrike"))
+    gait = hj.find_limit_cycle(
+        hj.models.CompassGait(), section=hj.AtEvent("heelstrike")
+    )
     return hj.plot.animate(gait)
 
 
@@ -77,7 +81,10 @@ def thumbnail(cycle: hj.LimitCycle, plane: list[str]) -> str:
         return _svg(shapes)
     pictures = Pictures(path, period)
     scenes, extent = pictures.at(times), np.maximum(pictures.high - pictures.low, 1e-9)
-    center, scale = (pictures.low + pictures.high) / 2, min(140 / extent[0], 100 / extent[1])
+    center, scale = (
+        (pictures.low + pictures.high) / 2,
+        min(140 / extent[0], 100 / extent[1]),
+    )
     to = lambda x: (80, 60) + (x - center) * scale  # noqa: E731
     colors = itertools.cycle(CYCLE[:3])
     shapes = []
@@ -110,7 +117,9 @@ def _svg(shapes: list[str]) -> str:
 
 def _line(name: str, frames: list, color: str, about: str = "") -> str:
     digits = 0 if len(frames) > 1 else 1  # (many frames make large files)
-    paths = ["M" + " ".join(f"{x:.{digits}f},{y:.{digits}f}" for x, y in z) for z in frames]
+    paths = [
+        "M" + " ".join(f"{x:.{digits}f},{y:.{digits}f}" for x, y in z) for z in frames
+    ]
     moves = _animated("d", paths, about)
     return f'<path d="{paths[0]}" fill="none" stroke="{color}" stroke-width="2">{moves}</path>'
 
@@ -143,12 +152,20 @@ def numbers(plot: Plot) -> list[dict]:
     to the largest."""
     curves = []
     for line in (line for panel in plot.axes.flat for line in panel.get_lines()):
-        points, within = line.get_xydata()[np.isfinite(line.get_xydata()).all(axis=1)], 1e-6
+        points, within = (
+            line.get_xydata()[np.isfinite(line.get_xydata()).all(axis=1)],
+            1e-6,
+        )
         if line.get_label() == "optimal":
             # Rounding shifts power between neighbors: its part up to each frequency is compared.
             f, power = np.linspace(0, 10, 21), np.cumsum(points[:, 1] ** 2)
-            points, within = np.stack([f, np.interp(f, points[:, 0], power / power[-1])]).T, 0.03
-        elif line.get_linestyle() != "None" and line.get_linewidth() and len(points) > 1:
+            points, within = (
+                np.stack([f, np.interp(f, points[:, 0], power / power[-1])]).T,
+                0.03,
+            )
+        elif (
+            line.get_linestyle() != "None" and line.get_linewidth() and len(points) > 1
+        ):
             points = spaced(points, 20)[0]
         rounded = [tuple(float(f"{x:.9g}") for x in point) for point in points]
         curves.append({"points": rounded, "within": within})
@@ -164,16 +181,21 @@ def drawn(name: str) -> list[dict]:
 def of_pages() -> None:
     """Draw what how-to pages save, with a palette, which takes a third of the size."""
     pages = {
-        "find-a-cycle": "cycle", "design-experiments": "bode", "optimal-designs": "spectrum",
-        "identify-from-recordings": "multipliers", "populations": "paired",
-    }  # fmt: skip
+        "find-a-cycle": "cycle",
+        "design-experiments": "bode",
+        "optimal-designs": "spectrum",
+        "identify-from-recordings": "multipliers",
+        "populations": "paired",
+    }
     for page, name in pages.items():
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
             text = (IMAGES.parent / f"how-to/{page}.md").read_text()
             exec("".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})
             with Image.open(f"{name}.png") as picture:
                 small = picture.convert("RGB").quantize(64)
-                small.save(IMAGES / f"{name}.png", optimize=True, dpi=picture.info["dpi"])
+                small.save(
+                    IMAGES / f"{name}.png", optimize=True, dpi=picture.info["dpi"]
+                )
 
 
 def of_page() -> pyplot.Figure:

@@ -46,7 +46,9 @@ def write_module(path: Path, thing: eqx.Module) -> None:
     """
     kind = type(thing).__name__
     if (wrong := _wrong_field(thing)) is not None:
-        raise DefinitionError(f"this {kind} cannot be saved: its {wrong}, a wrong type or shape.")
+        raise DefinitionError(
+            f"this {kind} cannot be saved: its {wrong}, a wrong type or shape."
+        )
     static, arrays = taken_apart(thing)
     header = {
         "format": _FORMAT,
@@ -55,7 +57,9 @@ def write_module(path: Path, thing: eqx.Module) -> None:
         "kind": kind,
         "static": static,
         "units": {str(name): name.unit for name in signals_in(static)},
-        "arrays": {name: f"{array.dtype}{list(array.shape)}" for name, array in arrays.items()},
+        "arrays": {
+            name: f"{array.dtype}{list(array.shape)}" for name, array in arrays.items()
+        },
         "conventions": inspect.cleandoc(type(thing).__doc__ or ""),
     }
     text = json.dumps(header, indent=1, default=lambda x: x.item())
@@ -153,7 +157,9 @@ def _module_in(hint: Any) -> type | None:
     return next((x for x in classes if issubclass(x, eqx.Module)), None)
 
 
-def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]) -> dict[str, Any]:
+def _read_header(
+    path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
+) -> dict[str, Any]:
     try:
         if array is None or array.nbytes > limits.TEXT:
             raise ValueError
@@ -162,15 +168,21 @@ def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
     except (AttributeError, ValueError, TypeError, KeyError, RecursionError):
         name = None
     if name != _FORMAT:
-        raise FileFormatError(f"'{path}' was not written by `hj.save`, whose files alone are read.")
+        raise FileFormatError(
+            f"'{path}' was not written by `hj.save`, whose files alone are read."
+        )
     if version != _VERSION:
         text = f"format version {version}, not {_VERSION}: use hybridjax"
         raise FileFormatError(f"'{path}' has {text} {header.get('package_version')}.")
     kind = header.get("kind")
     if not isinstance(kind, str) or kind not in kinds:
-        raise FileFormatError(f"'{path}' holds a {kind!r}; `load` reads {', '.join(kinds)} only.")
+        raise FileFormatError(
+            f"'{path}' holds a {kind!r}; `load` reads {', '.join(kinds)} only."
+        )
     header.setdefault("units", {})  # (files written before units were kept)
-    if not all(isinstance(header.get(part), dict) for part in ("static", "arrays", "units")):
+    if not all(
+        isinstance(header.get(part), dict) for part in ("static", "arrays", "units")
+    ):
         raise damaged(path, "its header is incomplete")
     return header
 
@@ -190,7 +202,11 @@ def restored(value: Any, units: Mapping[str, str]) -> Any:
         return {key: restored(part, units) for key, part in value.items()}
     if isinstance(value, list):
         return tuple(restored(part, units) for part in value)
-    return Signal(value, str(units[value])) if isinstance(value, str) and value in units else value
+    return (
+        Signal(value, str(units[value]))
+        if isinstance(value, str) and value in units
+        else value
+    )
 
 
 def _wrong_field(thing: eqx.Module) -> str | None:
@@ -199,9 +215,16 @@ def _wrong_field(thing: eqx.Module) -> str | None:
         for field in dataclasses.fields(thing):
             value = getattr(thing, field.name)
             if not _matches(value, field.type):
-                what = f"{value.dtype}{value.shape}" if hasattr(value, "dtype") else repr(value)
+                what = (
+                    f"{value.dtype}{value.shape}"
+                    if hasattr(value, "dtype")
+                    else repr(value)
+                )
                 return f"{field.name} is {what}"
-            if isinstance(value, eqx.Module) and (wrong := _wrong_field(value)) is not None:
+            if (
+                isinstance(value, eqx.Module)
+                and (wrong := _wrong_field(value)) is not None
+            ):
                 return f"{field.name}.{wrong}"
     return None
 
@@ -213,7 +236,9 @@ def _matches(value: Any, hint: Any) -> bool:
     if origin is types.UnionType or origin is typing.Union:
         return any(_matches(value, option) for option in arguments)
     if origin is tuple:  # tuple[X, ...], the only form in use
-        return isinstance(value, tuple) and all(_matches(x, arguments[0]) for x in value)
+        return isinstance(value, tuple) and all(
+            _matches(x, arguments[0]) for x in value
+        )
     if hint is int:  # none that is larger than a header may declare
         whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
         return whole and bool(abs(value) <= limits.PERIODS)
@@ -233,23 +258,34 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             with zipfile.ZipFile(file) as archive:
                 members = archive.infolist()
                 _check_sizes(members, path.stat().st_size)
-                return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
-        except Exception as error:  # whatever broken bytes make zipfile and numpy stumble over
+                return {
+                    m.filename.removesuffix(".npy"): _array(archive, m) for m in members
+                }
+        except (
+            Exception
+        ) as error:  # whatever broken bytes make zipfile and numpy stumble over
             # (A place outside of the file is EINVAL; what else the system reports is no damage. The
             # text is for the user, and nothing reads it.)
-            if isinstance(error, MemoryError) or getattr(error, "errno", EINVAL) != EINVAL:
+            if (
+                isinstance(error, MemoryError)
+                or getattr(error, "errno", EINVAL) != EINVAL
+            ):
                 raise
             raise damaged(path, str(error) or type(error).__name__) from error
 
 
 def damaged(path: Path, reason: str) -> FileFormatError:
-    return FileFormatError(f"'{path}' is damaged, or no npz file: {reason.rstrip('.')}.")
+    return FileFormatError(
+        f"'{path}' is damaged, or no npz file: {reason.rstrip('.')}."
+    )
 
 
 def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:
     size, most = sum(m.file_size for m in members), limits.unpacked(packed)
     if size > most:
-        raise ValueError(f"it declares arrays of {size} bytes, but packs them into {packed}")
+        raise ValueError(
+            f"it declares arrays of {size} bytes, but packs them into {packed}"
+        )
     if len({m.filename for m in members}) < len(members):
         raise ValueError("two of its arrays have one name")
 
@@ -263,5 +299,9 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     if dtype.hasobject:
         raise ValueError(f"'{member.filename}' holds Python objects")
     if declared != member.file_size or math.prod(shape) > member.file_size:
-        raise ValueError(f"'{member.filename}' declares the shape {shape}, and is not that large")
-    return np.lib.format.read_array(io.BytesIO(archive.read(member)), allow_pickle=False)
+        raise ValueError(
+            f"'{member.filename}' declares the shape {shape}, and is not that large"
+        )
+    return np.lib.format.read_array(
+        io.BytesIO(archive.read(member)), allow_pickle=False
+    )

@@ -30,7 +30,9 @@ def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ..
         letter = {"inputs": "u", "outputs": "y", "references": "r"}[kind]
         return (letter,) if count == 1 else tuple(f"{letter}{i}" for i in range(count))
     if len(given) != count:
-        raise DefinitionError(f"{count} {kind} need {count} names, but `{kind}` is {given}.")
+        raise DefinitionError(
+            f"{count} {kind} need {count} names, but `{kind}` is {given}."
+        )
     return tuple(given)
 
 
@@ -49,11 +51,16 @@ def input_and_output_names(
 def require_apart(inputs: Collection[str], outputs: Collection[str]) -> None:
     """**Raises:** `DefinitionError` for an output that is an input."""
     if shared := [name for name in outputs if name in inputs]:
-        raise DefinitionError(f"'{shared[0]}' is in `inputs` and in `outputs`: name it in one.")
+        raise DefinitionError(
+            f"'{shared[0]}' is in `inputs` and in `outputs`: name it in one."
+        )
 
 
 def require_same(
-    what: str, a: Any, b: Any, fields: Iterable[str] = ("n_sections", "inputs", "outputs")
+    what: str,
+    a: Any,
+    b: Any,
+    fields: Iterable[str] = ("n_sections", "inputs", "outputs"),
 ) -> None:
     """**Raises:** `DefinitionError` if two things ("model and data") differ in a field."""
     for name in fields:
@@ -63,13 +70,17 @@ def require_same(
 def require_equal(what: str, name: str, x: Any, y: Any) -> None:
     """**Raises:** `DefinitionError` if numbers or names of two things ("model and data") differ."""
     if x != y:
-        raise DefinitionError(f"{what} have different {name}: {x} and {y}; they must be the same.")
+        raise DefinitionError(
+            f"{what} have different {name}: {x} and {y}; they must be the same."
+        )
 
 
 def require_index(kind: str, index: int, count: int) -> None:
     """**Raises:** `DefinitionError` for an index of a kind of which there are only `count`."""
     if not -count <= index < count:
-        raise DefinitionError(f"there is no {kind} {index}: there are {count}, counted from 0.")
+        raise DefinitionError(
+            f"there is no {kind} {index}: there are {count}, counted from 0."
+        )
 
 
 def require_axes(what: str, array: Any, *axes: Mapping[str, int]) -> None:
@@ -81,10 +92,14 @@ def require_axes(what: str, array: Any, *axes: Mapping[str, int]) -> None:
     if np.shape(array) not in [tuple(x.values()) for x in axes]:
         written = (", ".join(f"{n} {axis}" for axis, n in x.items()) for x in axes)
         allowed = " or ".join(f"of shape ({x})" if x else "one number" for x in written)
-        raise DefinitionError(f"{what} must be {allowed}, not of shape {np.shape(array)}.")
+        raise DefinitionError(
+            f"{what} must be {allowed}, not of shape {np.shape(array)}."
+        )
 
 
-def require_among(kind: str, names: Iterable[str], among: Collection[str], where: str = "") -> None:
+def require_among(
+    kind: str, names: Iterable[str], among: Collection[str], where: str = ""
+) -> None:
     """**Raises:** `DefinitionError` for the first name that is not among those of a kind (a noun).
 
     **Arguments:** `where`: how the sentence begins. Default: nothing.
@@ -92,7 +107,9 @@ def require_among(kind: str, names: Iterable[str], among: Collection[str], where
     for name in names:
         if name not in among:
             known = ", ".join(among) or "none"
-            raise DefinitionError(f"{where}there is no {kind} '{name}'; {kind}s are {known}.")
+            raise DefinitionError(
+                f"{where}there is no {kind} '{name}'; {kind}s are {known}."
+            )
 
 
 def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
@@ -104,7 +121,9 @@ def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
         return names.index(wanted)
     if not isinstance(wanted, str) and 0 <= wanted < len(names):
         return int(wanted)
-    raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")
+    raise DefinitionError(
+        f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}."
+    )
 
 
 @contextmanager
@@ -128,10 +147,18 @@ def package(name: str) -> ModuleType:
     except ImportError as error:
         name = name.split(".")[0]
         extra = _EXTRAS.get(name, name)
-        raise DefinitionError(f"this needs {name}: `pip install 'hybridjax[{extra}]'`.") from error
+        raise DefinitionError(
+            f"this needs {name}: `pip install 'hybridjax[{extra}]'`."
+        ) from error
 
 
 # The extra of a library that is not called like it.
-_EXTRAS = {"distributed": "scale", "zarr": "scale", "ezc3d": "c3d", "h5py": "mat", "rosbags": "ros"}
+_EXTRAS = {
+    "distributed": "scale",
+    "zarr": "scale",
+    "ezc3d": "c3d",
+    "h5py": "mat",
+    "rosbags": "ros",
+}
 _EXTRAS |= {"fmpy": "fmu", "gymnasium": "gym", "anywidget": "explore"}
 _EXTRAS |= dict.fromkeys(("pandas", "pyarrow", "openpyxl"), "tables")

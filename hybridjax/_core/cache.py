@@ -95,7 +95,9 @@ def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
         raise PermissionError(f"'{programs}' was not made in this place: move it away")
     for path in programs.glob("*-[ac]*e"):  # the only files that JAX reads or writes
         about = path.lstat()
-        is_ours = about.st_uid == here.st_uid and about.st_nlink == 1  # and no link to others'
+        is_ours = (
+            about.st_uid == here.st_uid and about.st_nlink == 1
+        )  # and no link to others'
         if not (stat.S_ISREG(about.st_mode) and about.st_size <= _LARGEST and is_ours):
             raise PermissionError(f"'{path}' is no compiled program: move it away")
     return programs

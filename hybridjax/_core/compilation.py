@@ -34,7 +34,10 @@ from .progress import say_compiling
 
 # No optimization passes of LLVM, and the older of XLA's two code generators: compiles in a third of
 # the time.
-_QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+_QUICK: dict[str, Any] = {
+    "xla_backend_optimization_level": 0,
+    "xla_cpu_use_fusion_emitters": False,
+}
 # XLA divides a program among its threads: dividing a small one takes a fifth longer.
 _UNDIVIDED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
@@ -46,9 +49,15 @@ WORTH_COMPILING = 6.0
 _WORTH_OPTIMIZING = 8.0
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
 # is 1024.
-_LOOP_KERNELS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
+_LOOP_KERNELS = (
+    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
+)
 # JAX's settings by which the same function becomes another program.
-_SETTINGS = "jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion"
+_SETTINGS = (
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_numpy_dtype_promotion",
+)
 # Programs of either kind that are kept. Fewer: taking turns with many systems compiles again.
 _KEPT = 1024
 
@@ -85,7 +94,9 @@ def _loops_are_kernels() -> bool:
     def loop(x, count):
         return jax.lax.fori_loop(0, count, lambda _, x: x * x[0], x)
 
-    return "xla_cpu_small_call" in str(jax.jit(loop).lower(jnp.ones(1000), 9).compile().as_text())
+    return "xla_cpu_small_call" in str(
+        jax.jit(loop).lower(jnp.ones(1000), 9).compile().as_text()
+    )
 
 
 @ft.cache
@@ -138,7 +149,9 @@ def quick_jit(function: Callable) -> Callable:
 
     @ft.cache
     def quick() -> Any:
-        options: Any = {"compiler_options": compiler_options()}  # handed on to `jax.jit`
+        options: Any = {
+            "compiler_options": compiler_options()
+        }  # handed on to `jax.jit`
         return eqx.filter_jit(traced, **options)
 
     @ft.wraps(function)
@@ -164,7 +177,9 @@ def one_program(function: Callable) -> Callable:
     return ft.wraps(function)(lambda *x: (program if is_hidden(x) else function)(*x))
 
 
-def host_first(function: Callable, derived: Callable = lambda compiled: compiled) -> Callable:
+def host_first(
+    function: Callable, derived: Callable = lambda compiled: compiled
+) -> Callable:
     """A function of few lanes, run on the host (see `executor.py`) while that is faster in total;
     compiled by `quick_jit` once the host has spent as much on arguments of the same kind as
     compiling takes: in a thread, or at once if a single call has taken so long. Both give the same
@@ -194,7 +209,12 @@ def host_first(function: Callable, derived: Callable = lambda compiled: compiled
         if key in programs:
             return programs[key](*arguments)
         try:
-            with eval_context(), uncollected(), at_ease(), executor.at_most(WORTH_COMPILING):
+            with (
+                eval_context(),
+                uncollected(),
+                at_ease(),
+                executor.at_most(WORTH_COMPILING),
+            ):
                 return from_host(function(*to_host(arguments)))
         except executor.OutOfTimeError:
             programs[key] = compiled
@@ -272,7 +292,9 @@ def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
         lowered = jax.jit(run).lower(leaves)
         text = lowered.as_text()
         digest = key[0], hashlib.sha256(text.encode()).digest()
-        _by_kind[key] = _by_text.setdefault(digest, _Program(lowered, "@lapack_" in text))
+        _by_kind[key] = _by_text.setdefault(
+            digest, _Program(lowered, "@lapack_" in text)
+        )
     return _by_kind[key]
 
 
@@ -341,7 +363,11 @@ def in_turn(alone: bool) -> Iterator[None]:
 
 
 def kernel(
-    function: Callable, form: Callable, static: tuple[Hashable, ...], trees: Any, lanes: int
+    function: Callable,
+    form: Callable,
+    static: tuple[Hashable, ...],
+    trees: Any,
+    lanes: int,
 ) -> Callable:
     """`function(*static, *trees, *point)` of single points, brought to lanes by a `form` and
     compiled, as a function of NumPy's arrays.
@@ -361,7 +387,9 @@ def kernel(
     return ft.partial(_run_lanes, *_bound(function, form, static, trees, lanes), lanes)
 
 
-def _run_lanes(program: Callable, arrays: list, lanes: int, *arguments, some=None) -> np.ndarray:
+def _run_lanes(
+    program: Callable, arrays: list, lanes: int, *arguments, some=None
+) -> np.ndarray:
     if some is not None:
         arguments = [x[..., some] if x.shape[-1] == len(some) else x for x in arguments]
         values = _run_lanes(program, arrays, lanes, *arguments)
@@ -395,10 +423,16 @@ def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:
     leaves, structure = jax.tree_util.tree_flatten(trees)
     # (Arrays of an accelerator are copied once, by way of NumPy, and not in each call.)
     is_near = lambda x: getattr(getattr(x, "device", None), "platform", "") == "cpu"  # noqa: E731
-    arrays = [x if is_near(x) else jax.device_put(np.asarray(x)) for x in leaves if _is_array(x)]
+    arrays = [
+        x if is_near(x) else jax.device_put(np.asarray(x))
+        for x in leaves
+        if _is_array(x)
+    ]
     # (1, 1.0 and True are equal, and not the same.)
     static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
-    return _kernel_program(function, form, static, structure, static_leaves, lanes), arrays
+    return _kernel_program(
+        function, form, static, structure, static_leaves, lanes
+    ), arrays
 
 
 @ft.lru_cache(_KEPT)

@@ -44,7 +44,9 @@ class Execution:
         return self.workers or (core_count() if on_cpu() else 1)
 
 
-def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -> Iterator[Any]:
+def in_threads(
+    work: Callable[[Any], Any], items: Iterable[Any], workers: int
+) -> Iterator[Any]:
     """`work` of each item, in order, under the caller's configuration of JAX. A single worker is
     the caller's own thread: in a new one the allocator of memory starts empty."""
     if workers == 1:
@@ -86,7 +88,9 @@ def core_count() -> int:
 # MKL, those of distributions) are left alone. Their functions have 64-bit or 32-bit integers, and a
 # prefix or none.
 _NAMES = [
-    f"{prefix}openblas_{{}}_num_threads{bits}" for prefix in ("scipy_", "") for bits in ("64_", "")
+    f"{prefix}openblas_{{}}_num_threads{bits}"
+    for prefix in ("scipy_", "")
+    for bits in ("64_", "")
 ]
 _lock = threading.Lock()
 _before: list[int] = []
@@ -111,7 +115,9 @@ def libraries() -> list[Library]:
                 with contextlib.suppress(OSError, StopIteration):
                     loaded = ctypes.CDLL(str(file))
                     name = next(x for x in _NAMES if hasattr(loaded, x.format("set")))
-                    functions = (getattr(loaded, name.format(what)) for what in ("get", "set"))
+                    functions = (
+                        getattr(loaded, name.format(what)) for what in ("get", "set")
+                    )
                     libraries.append(Library(*functions))
     return libraries
 

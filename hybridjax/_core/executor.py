@@ -107,7 +107,9 @@ def while_loop(going: Callable, body: Callable, carry: Any) -> Any:
     return carry
 
 
-def scan(body: Callable, carry: Any, xs: Any, stack: Callable = np.stack) -> tuple[Any, Any]:
+def scan(
+    body: Callable, carry: Any, xs: Any, stack: Callable = np.stack
+) -> tuple[Any, Any]:
     """`jax.lax.scan`; on the host results are joined by `stack`."""
     first = jax.tree_util.tree_leaves(xs)[0]
     if not on_host(first):
@@ -121,7 +123,11 @@ def scan(body: Callable, carry: Any, xs: Any, stack: Callable = np.stack) -> tup
 
 def for_each_row(function: Callable, rows: Any) -> Any:
     """`jax.vmap` of a function of one row."""
-    return np.stack([function(x) for x in rows]) if on_host(rows) else jax.vmap(function)(rows)
+    return (
+        np.stack([function(x) for x in rows])
+        if on_host(rows)
+        else jax.vmap(function)(rows)
+    )
 
 
 def put(x: Array, index: Any, value: Any) -> Array:
@@ -135,7 +141,11 @@ def put(x: Array, index: Any, value: Any) -> Array:
 
 def lane(x: Array, i: Array) -> Array:
     """Lane i of x, as the only one."""
-    return x[..., i : i + 1] if on_host(x) else jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
+    return (
+        x[..., i : i + 1]
+        if on_host(x)
+        else jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
+    )
 
 
 def solve(matrices: Array, right: Array) -> Array:

@@ -82,7 +82,9 @@ def by_columns(
         except NotOnHostError:
             require_program()
             return eqx.filter_jvp(compiled, arguments, tangents)
-        return from_host(result), _combined(from_host(columns), jax.tree_util.tree_leaves(moved))
+        return from_host(result), _combined(
+            from_host(columns), jax.tree_util.tree_leaves(moved)
+        )
 
     return derived
 
@@ -91,5 +93,7 @@ def by_columns(
 def _combined(columns, tangents):
     """Tangents by the columns of derivatives. (One product: one for each array compiles longer.)"""
     _, parts = ravel_pytree(jax.tree_util.tree_map(lambda x: x[0], columns))
-    matrix = jnp.concatenate([x.reshape(len(x), -1) for x in jax.tree_util.tree_leaves(columns)], 1)
+    matrix = jnp.concatenate(
+        [x.reshape(len(x), -1) for x in jax.tree_util.tree_leaves(columns)], 1
+    )
     return parts(jnp.concatenate([jnp.ravel(x) for x in tangents]) @ matrix)

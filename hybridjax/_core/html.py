@@ -51,7 +51,10 @@ def card(kind: str, of: str, *parts: str) -> str:
 
 def facts(pairs: Mapping[str, str]) -> str:
     """A table of values by name."""
-    rows = (f"<tr><th>{escape(x)}</th><td>{escape(text)}</td></tr>" for x, text in pairs.items())
+    rows = (
+        f"<tr><th>{escape(x)}</th><td>{escape(text)}</td></tr>"
+        for x, text in pairs.items()
+    )
     return f'<table class="plain">{"".join(rows)}</table>'
 
 
@@ -84,9 +87,13 @@ def multiplier_table(
     values: Complex[np.ndarray, " d"], errors: Float[np.ndarray, " d"] | None = None
 ) -> str:
     """The multipliers, their standard errors if they are given, and their moduli."""
-    columns = {"multiplier": [complex_number(z, 6 if errors is None else 8) for z in values]}
+    columns = {
+        "multiplier": [complex_number(z, 6 if errors is None else 8) for z in values]
+    }
     if errors is not None:
-        columns["± standard error"] = [f"{x:.1e}" if np.isfinite(x) else "unknown" for x in errors]
+        columns["± standard error"] = [
+            f"{x:.1e}" if np.isfinite(x) else "unknown" for x in errors
+        ]
     columns["modulus"] = [f"{abs(z):.6g}" for z in values]
     return table(tuple(columns), list(zip(*columns.values(), strict=True)))
 
@@ -110,14 +117,22 @@ def unit_circle(
     circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
     curves = [
         Curve(np.real(circle), np.imag(circle), color=COLORS[-1]),
-        *(Curve(np.real(z).clip(-3, 3), np.imag(z).clip(-3, 3), color=COLORS[0]) for z in regions),
+        *(
+            Curve(np.real(z).clip(-3, 3), np.imag(z).clip(-3, 3), color=COLORS[0])
+            for z in regions
+        ),
         Curve(np.real(values), np.imag(values), color=COLORS[1], points=True),
     ]
     return picture(curves, "real part", "imaginary part", square=True)
 
 
 def picture(
-    curves: Sequence[Curve], x: str = "", y: str = "", *, log: bool = False, square: bool = False
+    curves: Sequence[Curve],
+    x: str = "",
+    y: str = "",
+    *,
+    log: bool = False,
+    square: bool = False,
 ) -> str:
     """An SVG of curves on axes called `x` and `y`, or "" where nothing finite can be drawn.
 
@@ -132,15 +147,23 @@ def picture(
     import matplotlib  # heavy, and needed by notebooks only
     from matplotlib.figure import Figure
 
-    colors = ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color")
+    colors = (
+        "axes.edgecolor",
+        "axes.labelcolor",
+        "text.color",
+        "xtick.color",
+        "ytick.color",
+    )
     look: dict[Any, Any] = {"text.parse_math": False, **dict.fromkeys(colors, _INK)}
     look |= {"svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans"], "font.size": 7}
     with matplotlib.rc_context(look):
         figure = Figure(figsize=(3.2, 2.2), layout="constrained")
         axes = figure.add_subplot(
-            xlabel=x, title=y, aspect="equal" if square else "auto",
+            xlabel=x,
+            title=y,
+            aspect="equal" if square else "auto",
             yscale="log" if log else "linear",
-        )  # fmt: skip
+        )
         axes.title.set(ha="left", x=0, size=7)
         axes.spines[["top", "right"]].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
@@ -151,14 +174,20 @@ def picture(
             n = len(visible)
             k = np.linspace(0, n - 1, min(n, _POINTS)).round().astype(int)
             values = np.where(visible, c.y, np.nan)[k]
-            line: dict[str, Any] = {"ls": "", "marker": "o", "ms": 3} if c.points else {"lw": 1}
+            line: dict[str, Any] = (
+                {"ls": "", "marker": "o", "ms": 3} if c.points else {"lw": 1}
+            )
             color = _INK if c.color == "currentColor" else c.color
-            axes.plot(np.asarray(c.x)[k], values, color=color, label=c.name or None, **line)
+            axes.plot(
+                np.asarray(c.x)[k], values, color=color, label=c.name or None, **line
+            )
         if any(c.name for c in curves):
             axes.legend(frameon=False, handlelength=1, labelcolor="linecolor")
         file = io.StringIO()
         bare = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         figure.savefig(file, format="svg", transparent=True, metadata=bare)
     svg = file.getvalue()
-    svg = re.sub(r"<style.*?</style>|<!--.*?-->|\n\s*", " ", svg[svg.index("<svg") :], flags=re.S)
+    svg = re.sub(
+        r"<style.*?</style>|<!--.*?-->|\n\s*", " ", svg[svg.index("<svg") :], flags=re.S
+    )
     return svg.replace(_INK, "currentColor")

@@ -35,7 +35,9 @@ class PerLane(eqx.Module):
     def axes(self) -> Any:
         """Return the axes of lanes in the form that `jax.vmap` takes: -1 or None for each array."""
         structure = jax.tree_util.tree_structure(eqx.filter(self.tree, eqx.is_array))
-        return jax.tree_util.tree_unflatten(structure, [-1 if x else None for x in self.split])
+        return jax.tree_util.tree_unflatten(
+            structure, [-1 if x else None for x in self.split]
+        )
 
 
 def shared(tree: Any) -> Any:
@@ -78,7 +80,9 @@ def by_lane(function: Callable, *trees: Any, quick: bool = False) -> Callable:
     def call(*arguments):
         lanes = max(x.shape[-1] for x in arguments)
         common = tuple(x.shape[-1] < lanes for x in arguments)
-        arguments = [x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)]
+        arguments = [
+            x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)
+        ]
         return program(common, lanes >= _VECTOR_LANES and not quick)(arrays, *arguments)
 
     return call
@@ -125,7 +129,9 @@ def _join(x, mapped: bool, by_lane: bool, size: int, L: int):
     elif by_lane:
         x = x[..., None, :]
     x = x if by_lane else x[..., None]
-    return jnp.broadcast_to(x, (*x.shape[:-2], size, L)).reshape(*x.shape[:-2], size * L)
+    return jnp.broadcast_to(x, (*x.shape[:-2], size, L)).reshape(
+        *x.shape[:-2], size * L
+    )
 
 
 def _join_common(tree, mapped, size: int, L: int):
@@ -138,7 +144,9 @@ def _join_common(tree, mapped, size: int, L: int):
     flags = zip(leaves, mapped, split, strict=True)
     joined = [_join(x, m, s, size, L) if m or s else x for x, m, s in flags]
     either = tuple(m or s for m, s in zip(mapped, split, strict=True))
-    return PerLane(eqx.combine(jax.tree_util.tree_unflatten(structure, joined), static), either)
+    return PerLane(
+        eqx.combine(jax.tree_util.tree_unflatten(structure, joined), static), either
+    )
 
 
 # Up to this many numbers that a lane's result depends on, its Jacobian is computed. Twice as many:
@@ -146,7 +154,9 @@ def _join_common(tree, mapped, size: int, L: int):
 JACOBIAN_COLUMNS = 32
 
 
-def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any]) -> tuple[Any, Any]:
+def lane_jvp(
+    function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any]
+) -> tuple[Any, Any]:
     """`function(lane, shared)` and its tangent; `lane` and `shared` are pairs (primal, tangent).
 
     Arrays of `lane`, and of the result, have the lanes on their last axis; all lanes share those of
@@ -164,18 +174,26 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
     ]
     moving, fixed_lane = eqx.partition(lane[0], has[0])
     common, fixed_shared = eqx.partition(shared[0], has[1])
-    t_moving, t_common = (eqx.filter(t, h) for t, h in ((lane[1], has[0]), (shared[1], has[1])))
+    t_moving, t_common = (
+        eqx.filter(t, h) for t, h in ((lane[1], has[0]), (shared[1], has[1]))
+    )
 
     def of(moving, common):
-        return function(eqx.combine(moving, fixed_lane), eqx.combine(common, fixed_shared))
+        return function(
+            eqx.combine(moving, fixed_lane), eqx.combine(common, fixed_shared)
+        )
 
     leaves = jax.tree_util.tree_leaves
-    sizes = [math.prod(x.shape[:-1]) for x in leaves(moving)] + [x.size for x in leaves(common)]
+    sizes = [math.prod(x.shape[:-1]) for x in leaves(moving)] + [
+        x.size for x in leaves(common)
+    ]
     if not sizes or sum(sizes) > JACOBIAN_COLUMNS:
         return jax.jvp(of, (moving, common), (t_moving, t_common))
 
     total = sum(sizes)
-    _, parts = ravel_pytree((jax.tree_util.tree_map(lambda x: x[..., 0], moving), common))
+    _, parts = ravel_pytree(
+        (jax.tree_util.tree_map(lambda x: x[..., 0], moving), common)
+    )
 
     def push(direction):
         of_lane, of_all = parts(direction)
@@ -192,7 +210,9 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
     weights = jnp.concatenate([jnp.broadcast_to(r, (r.shape[0], lanes)) for r in rows])
 
     def contract(column):
-        return jnp.sum(column * weights.reshape(total, *[1] * (column.ndim - 2), lanes), axis=0)
+        return jnp.sum(
+            column * weights.reshape(total, *[1] * (column.ndim - 2), lanes), axis=0
+        )
 
     return end, jax.tree_util.tree_map(contract, columns)
 
@@ -211,7 +231,9 @@ def take_rows(x: Array, rows: Sequence[int]) -> Array:
     return namespace(x).stack([x[row] for row in rows])
 
 
-def put_rows(x: Array, rows: Sequence[int], here: Bool[Array, " L"], new: Array) -> Array:
+def put_rows(
+    x: Array, rows: Sequence[int], here: Bool[Array, " L"], new: Array
+) -> Array:
     """x (W, L) with these rows replaced by those of `new` for the lanes `here`."""
     xp = namespace(x)
     if list(rows) == list(range(len(x))):
@@ -220,7 +242,9 @@ def put_rows(x: Array, rows: Sequence[int], here: Bool[Array, " L"], new: Array)
     place[np.array(rows, int)] = np.arange(len(rows))
     if on_host(x) or len(x) > _FEW:
         return xp.where(here & (place >= 0)[:, None], new[place], x)
-    return xp.stack([x[r] if k < 0 else xp.where(here, new[k], x[r]) for r, k in enumerate(place)])
+    return xp.stack(
+        [x[r] if k < 0 else xp.where(here, new[k], x[r]) for r, k in enumerate(place)]
+    )
 
 
 def pick(x: Array, rows: Sequence[int], which: Int[Array, " L"]) -> Array:

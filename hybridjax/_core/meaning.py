@@ -34,15 +34,21 @@ from .memo import Memory
 
 
 # Functions by which code reads values that are not named in it, and functions that read files.
-_HIDDEN = re.compile("eval|exec|globals|__import__|import_module|getenv|check_output|urlopen")
-_READING = re.compile("open|(read|open|load)_.+|load|loadtxt|loadmat|genfromtxt|fromfile|memmap")
+_HIDDEN = re.compile(
+    "eval|exec|globals|__import__|import_module|getenv|check_output|urlopen"
+)
+_READING = re.compile(
+    "open|(read|open|load)_.+|load|loadtxt|loadmat|genfromtxt|fromfile|memmap"
+)
 _FRAMES = {"__globals__", "f_globals", "f_locals"}
 _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range
 _PACKAGE = os.path.join(pathlib.Path(__file__).parents[1], "")
 _MODELS = os.path.join(_PACKAGE, "models")
 _FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib"))
 # Packages of a user and of a distribution lie elsewhere than those of Python.
-_INSTALLED = re.compile("|".join([*map(re.escape, _FOLDERS), r".*[\\/](site|dist)-packages[\\/]"]))
+_INSTALLED = re.compile(
+    "|".join([*map(re.escape, _FOLDERS), r".*[\\/](site|dist)-packages[\\/]"])
+)
 
 
 Thing = TypeVar("Thing")
@@ -58,7 +64,11 @@ def current(x: Thing) -> Thing:
     if not isinstance(x, Definition):
         return x
     digest, thing = code_digest(x), cast(Any, x)
-    return thing if x.code_digest == digest else _marked.recall(x, digest, lambda: _mark(x, digest))
+    return (
+        thing
+        if x.code_digest == digest
+        else _marked.recall(x, digest, lambda: _mark(x, digest))
+    )
 
 
 def _mark(x: Any, digest: str) -> Any:
@@ -68,7 +78,9 @@ def _mark(x: Any, digest: str) -> Any:
     return marked
 
 
-_marked = Memory()  # an object that is given again has the same copy, which others may remember
+_marked = (
+    Memory()
+)  # an object that is given again has the same copy, which others may remember
 
 
 def code_digest(x: Definition) -> str:
@@ -120,7 +132,9 @@ def _clear_old_traces(things: Iterable[Any], definition: str) -> None:
         if not seen and isinstance(x, _JITTED):
             x.clear_cache()  # which a call by the user may have filled
         if definition not in seen:
-            seen[definition] = _Walk(x, classes=1).result  # (hidden reads have been refused before)
+            seen[definition] = _Walk(
+                x, classes=1
+            ).result  # (hidden reads have been refused before)
         now[x] = {definition: seen[definition]}
     if any(len({*_meanings[x].values()}) > 1 for x in now):
         _meanings.clear()
@@ -130,8 +144,12 @@ def _clear_old_traces(things: Iterable[Any], definition: str) -> None:
 
 def _is_traced_by_identity(x: Any) -> bool:
     # (A function of `exec` without a `__name__` has no module.)
-    module = getattr(x, "__module__", None) or "exec" * isinstance(x, types.FunctionType)
-    by_identity = type(x).__hash__ is object.__hash__ and bool(type(x).__weakrefoffset__)
+    module = getattr(x, "__module__", None) or "exec" * isinstance(
+        x, types.FunctionType
+    )
+    by_identity = type(x).__hash__ is object.__hash__ and bool(
+        type(x).__weakrefoffset__
+    )
     return by_identity and (isinstance(x, _JITTED) or not is_packaged(module))
 
 
@@ -201,7 +219,9 @@ class _Walk:
                 self._origin(x.__name__)
                 self.visit(type(x))
                 if not is_packaged(x.__name__):
-                    self.visit({k: v for k, v in vars(x).items() if not _is_description(k, v)})
+                    self.visit(
+                        {k: v for k, v in vars(x).items() if not _is_description(k, v)}
+                    )
             case types.BuiltinFunctionType():
                 self.note(x.__name__)
                 if not isinstance(x.__self__, types.ModuleType):
@@ -219,7 +239,9 @@ class _Walk:
     def _array(self, x: Any) -> None:
         if is_tracer(x):
             return self.note(str(x.aval))
-        is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        is_key = isinstance(x, jax.Array) and jnp.issubdtype(
+            x.dtype, jax.dtypes.prng_key
+        )
         values = np.asarray(jax.random.key_data(x) if is_key else x)
         self.note(values.dtype.str, values.shape)
         if values.dtype.hasobject:
@@ -240,8 +262,12 @@ class _Walk:
             self._globals(x)
         wrapped = getattr(x, "__wrapped__", None)
         # A wrapper of a package may remember what it has been called with.
-        registered = vars(x).get("registry")  # the functions of one that dispatches by type
-        self.visit_all((wrapped, registered) if is_installed and wrapped else x.__closure__ or ())
+        registered = vars(x).get(
+            "registry"
+        )  # the functions of one that dispatches by type
+        self.visit_all(
+            (wrapped, registered) if is_installed and wrapped else x.__closure__ or ()
+        )
         self.visit_all((x.__defaults__, x.__kwdefaults__))
         if not is_installed:
             self.visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})
@@ -250,13 +276,17 @@ class _Walk:
         """Visit what a function, and the functions written in it, read of their module."""
         paths, imported, names = _names(x.__code__)
         package = x.__globals__.get("__package__")
-        modules = {x: sys.modules.get(x, sys.modules.get(f"{package}.{x}")) for x in imported}
+        modules = {
+            x: sys.modules.get(x, sys.modules.get(f"{package}.{x}")) for x in imported
+        }
         if _FRAMES & {*names}:
             self._refuse_hidden(x, (), globals)
         if not self.classes and {"read_text", "read_bytes"} & {*names}:
             self._refuse_hidden(x, (), pathlib.Path.read_text)
         for path in (*paths, *((name, "") for name in imported)):
-            value = modules[path[0]] if path[0] in modules else x.__globals__.get(path[0])
+            value = (
+                modules[path[0]] if path[0] in modules else x.__globals__.get(path[0])
+            )
             builtin = getattr(builtins, path[0], None)
             self._refuse_hidden(x, path, builtin if value is None else value)
             if value is None:
@@ -264,7 +294,11 @@ class _Walk:
             self.note(path[0])
             if isinstance(value, types.ModuleType):
                 self._attributes(value, names)
-            if not isinstance(value, types.ModuleType) or path[1:] == () or path[1][:2] == "__":
+            if (
+                not isinstance(value, types.ModuleType)
+                or path[1:] == ()
+                or path[1][:2] == "__"
+            ):
                 self.visit(value)
 
     def _refuse_hidden(self, x: types.FunctionType, path: Names, value: Any) -> None:
@@ -272,11 +306,15 @@ class _Walk:
             if isinstance(value, types.ModuleType):
                 value = getattr(value, name, None)
         name = str(getattr(value, "__name__", "")) if callable(value) else ""
-        is_hidden = _HIDDEN.fullmatch(name) or (not self.classes and _READING.fullmatch(name))
+        is_hidden = _HIDDEN.fullmatch(name) or (
+            not self.classes and _READING.fullmatch(name)
+        )
         is_hidden = is_hidden and is_packaged(getattr(value, "__module__", None))
         if is_hidden or value is sys.modules:
             text = f"uses `{name or 'sys.modules'}`, whose changes cannot be noticed"
-            raise DefinitionError(f"`{x.__qualname__}` {text}: read values before, by their names.")
+            raise DefinitionError(
+                f"`{x.__qualname__}` {text}: read values before, by their names."
+            )
 
     def _attributes(self, module: types.ModuleType, names: Names) -> None:
         """Visit the attributes of a module that a function names."""
@@ -306,8 +344,12 @@ class _Walk:
             module = str(base.__module__)  # (of a metaclass it may be a descriptor)
             self._origin(module, base.__qualname__)
             # (A class of `exec` without a `__name__` has the module of Python's own.)
-            if not is_packaged(module) or (module == "builtins" and "__module__" in vars(base)):
-                self.visit({k: v for k, v in vars(base).items() if not _is_description(k, v)})
+            if not is_packaged(module) or (
+                module == "builtins" and "__module__" in vars(base)
+            ):
+                self.visit(
+                    {k: v for k, v in vars(base).items() if not _is_description(k, v)}
+                )
         self.visit(type(x))
         self.classes -= 1
 
@@ -318,8 +360,13 @@ class _Walk:
         is_wrapped = isinstance(x, eqx.Module) or hasattr(x, "__wrapped__")
         if is_packaged(type(x).__module__) and not is_wrapped:
             parts = None
-            with contextlib.suppress(Exception):  # whatever an object raises that cannot be pickled
-                parts = [list(y) if isinstance(y, Iterator) else y for y in x.__reduce_ex__(4)[1:]]
+            with contextlib.suppress(
+                Exception
+            ):  # whatever an object raises that cannot be pickled
+                parts = [
+                    list(y) if isinstance(y, Iterator) else y
+                    for y in x.__reduce_ex__(4)[1:]
+                ]
             if parts is not None:
                 return self.visit_all(parts)
         items = sorted(getattr(x, "__dict__", {}).items())
@@ -329,7 +376,9 @@ class _Walk:
         self.visit_all((state, getattr(x, "__wrapped__", None)))
         slots = [vars(base).get("__slots__", ()) for base in type(x).__mro__]
         names = [y for z in slots for y in ((z,) if isinstance(z, str) else z)]
-        self.visit_all(getattr(x, y, None) for y in names if y not in ("__dict__", "__weakref__"))
+        self.visit_all(
+            getattr(x, y, None) for y in names if y not in ("__dict__", "__weakref__")
+        )
 
 
 @ft.lru_cache(4096)
@@ -353,7 +402,9 @@ def _names(code: types.CodeType) -> tuple[tuple[Names, ...], Names, Names]:
             is_open = False
             continue
         is_open = True
-    imported = [x.argval for x in dis.get_instructions(code) if x.opname == "IMPORT_NAME"]
+    imported = [
+        x.argval for x in dis.get_instructions(code) if x.opname == "IMPORT_NAME"
+    ]
     words = [x for x in code.co_consts if isinstance(x, str) and x.isidentifier()]
     inner = [_names(x) for x in code.co_consts if isinstance(x, types.CodeType)]
     every: Any = zip((paths, imported, [*code.co_names, *words]), *inner, strict=True)
@@ -365,7 +416,11 @@ def _names(code: types.CodeType) -> tuple[tuple[Names, ...], Names, Names]:
 def _version(package: str) -> str:
     """Return the version of an installed package, "" for others and Python's own."""
     try:
-        return "" if package in sys.stdlib_module_names else importlib.metadata.version(package)
+        return (
+            ""
+            if package in sys.stdlib_module_names
+            else importlib.metadata.version(package)
+        )
     except (importlib.metadata.PackageNotFoundError, ValueError):  # or no name
         return str(getattr(sys.modules.get(package), "__version__", ""))
 
@@ -396,11 +451,18 @@ def is_of_package(path: str) -> bool:
     """Test whether a file belongs to Python or to a package, `hybridjax.models` excepted."""
     file = pathlib.Path(path)
     recorded = (file.parts[-k] in _recorded(x) for k, x in enumerate(file.parents, 1))
-    return not path.startswith(_MODELS) and (_INSTALLED.match(path) is not None or any(recorded))
+    return not path.startswith(_MODELS) and (
+        _INSTALLED.match(path) is not None or any(recorded)
+    )
 
 
 @ft.cache
 def _recorded(folder: pathlib.Path) -> frozenset[str]:
     """Names of what pip has put into a folder (with `--target`)."""
-    records = [x.read_text("RECORD") for x in importlib.metadata.distributions(path=[str(folder)])]
-    return frozenset(re.split("[/,]", y)[0] for x in records for y in (x or "").splitlines())
+    records = [
+        x.read_text("RECORD")
+        for x in importlib.metadata.distributions(path=[str(folder)])
+    ]
+    return frozenset(
+        re.split("[/,]", y)[0] for x in records for y in (x or "").splitlines()
+    )

@@ -27,7 +27,9 @@ def require_x64(*trees: Any) -> None:
     of `trees` is of less than 64 bits (an array of JAX that was made before `enable_x64()`).
     """
     if not jax.config.read("jax_enable_x64"):
-        raise PrecisionError("JAX is in 32-bit mode: call `hybridjax.enable_x64()` first.")
+        raise PrecisionError(
+            "JAX is in 32-bit mode: call `hybridjax.enable_x64()` first."
+        )
     for path, leaf in jax.tree_util.tree_leaves_with_path(trees):
         dtype = getattr(leaf, "dtype", None)
         if dtype is None or not jnp.issubdtype(dtype, jnp.inexact):
@@ -44,8 +46,12 @@ def real(x: Any) -> jax.Array:
     Numbers of Python and NumPy keep their digits also where JAX is switched to 64 bits later, so
     that a definition may be built before. Arrays of JAX remain what they are.
     """
-    made_by_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree_util.tree_leaves(x))
+    made_by_jax = any(
+        isinstance(leaf, jax.Array) for leaf in jax.tree_util.tree_leaves(x)
+    )
     if made_by_jax or is_inside_program():
         return jnp.asarray(x, float)
-    with jax.enable_x64(True):  # (No program is compiled for numbers of Python and NumPy.)
+    with jax.enable_x64(
+        True
+    ):  # (No program is compiled for numbers of Python and NumPy.)
         return jax.device_put(np.asarray(x, float))

@@ -42,7 +42,11 @@ class Call:
 
     def __str__(self) -> str:
         """The current step."""
-        step = self.step if self.total is None else f"{self.done} of {self.total} {self.name}"
+        step = (
+            self.step
+            if self.total is None
+            else f"{self.done} of {self.total} {self.name}"
+        )
         return " ".join(filter(None, (step, "(compiling)" if self.compiling else "")))
 
 
@@ -103,14 +107,22 @@ def say_compiling(compiling: bool) -> None:
 
 
 def _is_watched() -> bool:
-    return (_display() is not None or sys.stderr.isatty()) if _enabled is None else _enabled
+    return (
+        (_display() is not None or sys.stderr.isatty())
+        if _enabled is None
+        else _enabled
+    )
 
 
 def _display() -> Callable[..., Any] | None:
     """IPython's `display`; `None` outside of Jupyter."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
-    return None if ipython is None or not hasattr(shell, "kernel") else ipython.display.display
+    return (
+        None
+        if ipython is None or not hasattr(shell, "kernel")
+        else ipython.display.display
+    )
 
 
 @contextlib.contextmanager

@@ -18,6 +18,8 @@ def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
             close = difflib.get_close_matches(name, names, n=1)
             suggestion = f"; did you mean {close[0]!r}?" if close else ""
             text = f"module {package!r} has no attribute {name!r}{suggestion}"
-            raise AttributeError(text, name="") from error  # (else Python suggests it again)
+            raise AttributeError(
+                text, name=""
+            ) from error  # (else Python suggests it again)
 
     return __getattr__, listed, names

@@ -24,17 +24,38 @@ class Result(enum.IntEnum):
     GRAZING = 4, "a guard or section was touched tangentially (grazing)"
     ZENO = 5, "events accumulate in finite time (Zeno)"
     BLOW_UP = 6, "the state left all bounds"
-    STEP_LIMIT = 7, "the limit on steps was reached; `Settings(max_steps=...)` raises it"
+    STEP_LIMIT = (
+        7,
+        "the limit on steps was reached; `Settings(max_steps=...)` raises it",
+    )
     NOT_CONVERGED = 8, "the iteration did not converge"
     SINGULAR = 9, "J - I is singular: the cycle is not isolated"
     BAD_INPUT = 10, "the start or the input is NaN or infinite"
     EQUILIBRIUM = 11, "the iteration ended in an equilibrium instead of a cycle"
-    EXTRA_TURNS = 12, "the cycle closes sooner, or meets its section more often, than asked"
-    COINCIDENCE = 13, "two events coincide on the cycle: their order is not fixed beside it"
-    STEP_COLLAPSE = 14, "steps shrank to nothing: a field may jump only where a transition does"
-    FIELD_NOT_FINITE = 15, "NaN or infinity in a field, guard or reset: 1/0 or a singular matrix"
-    GUARD_PASSED = 16, "a reset put the state on a guard: what comes to rest there needs a chart"
-    PULSE_PASSED = 17, "steps pass over a pulse: begin and end it by transitions (`hj.Scheduled`)"
+    EXTRA_TURNS = (
+        12,
+        "the cycle closes sooner, or meets its section more often, than asked",
+    )
+    COINCIDENCE = (
+        13,
+        "two events coincide on the cycle: their order is not fixed beside it",
+    )
+    STEP_COLLAPSE = (
+        14,
+        "steps shrank to nothing: a field may jump only where a transition does",
+    )
+    FIELD_NOT_FINITE = (
+        15,
+        "NaN or infinity in a field, guard or reset: 1/0 or a singular matrix",
+    )
+    GUARD_PASSED = (
+        16,
+        "a reset put the state on a guard: what comes to rest there needs a chart",
+    )
+    PULSE_PASSED = (
+        17,
+        "steps pass over a pulse: begin and end it by transitions (`hj.Scheduled`)",
+    )
     PLANT_STOPPED = 18, "the plant ended the experiment: see `data.simulated.causes`"
 
 

@@ -5,10 +5,19 @@ from typing import Any
 
 
 SECONDS = {
-    "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0,
-    "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9,
-    "min": 60.0, "h": 3600.0,
-}  # fmt: skip
+    "s": 1.0,
+    "sec": 1.0,
+    "second": 1.0,
+    "seconds": 1.0,
+    "ms": 1e-3,
+    "msec": 1e-3,
+    "us": 1e-6,
+    "µs": 1e-6,
+    "μs": 1e-6,
+    "ns": 1e-9,
+    "min": 60.0,
+    "h": 3600.0,
+}
 """Units of time."""
 
 
@@ -39,7 +48,9 @@ class Signal(str):
     __hash__ = str.__hash__
 
     def __repr__(self) -> str:
-        return f"{super().__repr__()} ({self.unit})" if self.unit else super().__repr__()
+        return (
+            f"{super().__repr__()} ({self.unit})" if self.unit else super().__repr__()
+        )
 
     def __getnewargs__(self) -> Any:
         return str(self), self.unit

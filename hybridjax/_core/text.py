@@ -47,7 +47,10 @@ def folded(text: str, indent: str = "") -> str:
     if len(text) <= _WIDTH:
         return text
     parts = re.split(r";\s+", text.replace(" ± ", "\0±\0"))  # (never apart)
-    lines = (textwrap.fill(x, _WIDTH - 2 - len(indent), subsequent_indent="  ") for x in parts)
+    lines = (
+        textwrap.fill(x, _WIDTH - 2 - len(indent), subsequent_indent="  ")
+        for x in parts
+    )
     return ";\n".join(lines).replace("\0", " ").replace("\n", f"\n  {indent}")
 
 
@@ -64,7 +67,9 @@ def value(x: Any) -> str:
         inside = ", ".join(map(value, x))
         return f"({inside},)" if len(x) == 1 else f"({inside})"
     text = getattr(x, "__name__", None) or repr(x)
-    if isinstance(x, eqx.Module) and ("\n" in text or type(x).__repr__ is eqx.Module.__repr__):
+    if isinstance(x, eqx.Module) and (
+        "\n" in text or type(x).__repr__ is eqx.Module.__repr__
+    ):
         leaves = jax.tree_util.tree_leaves(eqx.filter(x, eqx.is_array))
         return f"{type(x).__name__}({sum(leaf.size for leaf in leaves)} numbers)"
     return text
@@ -106,4 +111,8 @@ def _array(x: np.ndarray) -> str:
     if x.dtype.kind not in "iuf" or not np.isfinite(x).any():
         return f"{shape} ({x.dtype})"
     low, high = np.nanmin(x), np.nanmax(x)
-    return f"{shape}, all {low:.6g}" if low == high else f"{shape}, {low:.6g} to {high:.6g}"
+    return (
+        f"{shape}, all {low:.6g}"
+        if low == high
+        else f"{shape}, {low:.6g} to {high:.6g}"
+    )

@@ -29,7 +29,9 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        raise DefinitionError(f"cannot write '{path}': {error.strerror or error}.") from error
+        raise DefinitionError(
+            f"cannot write '{path}': {error.strerror or error}."
+        ) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
@@ -71,16 +73,22 @@ def results_folder(folder: Path, kind: str, names: Iterable[str]) -> Iterator[Pa
         yield new
         _put(new, folder, kind)
     except OSError as error:
-        raise DefinitionError(f"cannot write to '{folder}': {error.strerror or error}.") from error
+        raise DefinitionError(
+            f"cannot write to '{folder}': {error.strerror or error}."
+        ) from error
     finally:
         shutil.rmtree(new, ignore_errors=True)
-        with contextlib.suppress(OSError):  # those that were made in vain: they are empty
+        with contextlib.suppress(
+            OSError
+        ):  # those that were made in vain: they are empty
             for path in made:
                 path.rmdir()
 
 
 def _put(new: Path, folder: Path, kind: str) -> None:
-    names = {path.relative_to(new).as_posix() for path in new.rglob("*") if path.is_file()}
+    names = {
+        path.relative_to(new).as_posix() for path in new.rglob("*") if path.is_file()
+    }
     before = _listed(folder, kind)
     _refuse_others(folder, names, before)
     # First a list of both, so that all of them are on it after an interruption.

@@ -33,7 +33,9 @@ def _different(text: str) -> tuple[str, ...]:
     return names
 
 
-def _option(kind: str, pattern: str, *convert: Callable[[str], Any]) -> Callable[[str], Any]:
+def _option(
+    kind: str, pattern: str, *convert: Callable[[str], Any]
+) -> Callable[[str], Any]:
     """A function that converts the groups of a regular expression in the text of an option, and
     refuses a text that is no `kind`. The result of a single group is no tuple."""
 
@@ -60,19 +62,26 @@ _cycles = _option("a number of cycles, four or more", "(.*)", _between(float, 4)
 _names = _option("a list of different names", "(.*)", _different)
 _two_names = _option("two names with a comma in between", "([^,]*,[^,]*)", _different)
 _two_numbers = _option("two numbers as in 1.5,0", "([^,]*),([^,]*)", _FINITE, _FINITE)
-_two_positive = _option("two positive numbers as in 1.5,2", "([^,]*),([^,]*)", _POSITIVE, _POSITIVE)
+_two_positive = _option(
+    "two positive numbers as in 1.5,2", "([^,]*),([^,]*)", _POSITIVE, _POSITIVE
+)
 _model = _option("FILE.py:NAME", r"(.*\.py):([^\W\d]\w*)", str, str)
-_axis = _option("NAME=LOW:HIGH:COUNT", "([^=]+)=(.*):(.*):(.*)", str, _FINITE, _FINITE, _COUNT)
+_axis = _option(
+    "NAME=LOW:HIGH:COUNT", "([^=]+)=(.*):(.*):(.*)", str, _FINITE, _FINITE, _COUNT
+)
 _crossing = _option(
     "a signal, a direction and a value, as in x:falling:0.2",
     r"\s*([^:]*[^:\s])\s*(?::\s*(rising|falling)\s*(?::(.*))?)?",
-    str, lambda direction: direction or "rising", lambda value: _FINITE(value or "0"),
-)  # fmt: skip
+    str,
+    lambda direction: direction or "rising",
+    lambda value: _FINITE(value or "0"),
+)
 _format = "|".join(get_args(Format))
 _formats = _option(
-    f"one or more of {', '.join(get_args(Format))}", f"((?:{_format})(?:, *(?:{_format}))*)",
+    f"one or more of {', '.join(get_args(Format))}",
+    f"((?:{_format})(?:, *(?:{_format}))*)",
     _different,
-)  # fmt: skip
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,16 +92,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options that are wrong or contradict each other, 130 where it was interrupted.
     """
     parser = argparse.ArgumentParser(
-        prog="hybridjax", description="Identify the dynamics of rhythmic hybrid systems."
+        prog="hybridjax",
+        description="Identify the dynamics of rhythmic hybrid systems.",
     )
-    parser.add_argument("--version", action="version", version=f"hybridjax {__version__}")
+    parser.add_argument(
+        "--version", action="version", version=f"hybridjax {__version__}"
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_reproduce(commands)
     _add_identify(commands)
     _add_sweep(commands)
     options, more = parser.parse_known_args(arguments)
     if more:
-        options.parser.error(f"unrecognized arguments: {' '.join(more)} (names need commas)")
+        options.parser.error(
+            f"unrecognized arguments: {' '.join(more)} (names need commas)"
+        )
     # XLA reports, as errors, that cached programs name CPU features of its own; and for small
     # matrices more BLAS threads than one only wait for each other.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -117,18 +131,37 @@ def _add_reproduce(commands) -> None:
         "hopper: figures, numbers, and models for hj.load, laid over the exact answer.",
     )
     add = reproduce.add_argument
-    add("--seed", type=_seed, default=0, help="of random subsets and phases (default: %(default)s)")
-    add("--quick", action="store_true", help="a short form: 20 experiments of 36 cycles, of which "
-        "16 are used, in place of 80 experiments of 84, of which 64 are used")  # fmt: skip
+    add(
+        "--seed",
+        type=_seed,
+        default=0,
+        help="of random subsets and phases (default: %(default)s)",
+    )
+    add(
+        "--quick",
+        action="store_true",
+        help="a short form: 20 experiments of 36 cycles, of which "
+        "16 are used, in place of 80 experiments of 84, of which 64 are used",
+    )
     _add_results(reproduce)
     reproduce.set_defaults(run=_reproduce, parser=reproduce)
 
 
 def _add_results(command) -> None:
-    command.add_argument("--out", required=True, type=_place, metavar="DIR",
-        help="folder for the results; made if needed")  # fmt: skip
-    command.add_argument("--formats", type=_formats, default=("png",), metavar="NAMES",
-        help="of the figures: png, pdf, svg, or several with commas (default: png)")  # fmt: skip
+    command.add_argument(
+        "--out",
+        required=True,
+        type=_place,
+        metavar="DIR",
+        help="folder for the results; made if needed",
+    )
+    command.add_argument(
+        "--formats",
+        type=_formats,
+        default=("png",),
+        metavar="NAMES",
+        help="of the figures: png, pdf, svg, or several with commas (default: png)",
+    )
 
 
 def _add_identify(commands) -> None:
@@ -139,36 +172,108 @@ def _add_identify(commands) -> None:
         "multipliers, harmonic transfer functions and impulse responses, with a report.",
     )
     add = identify.add_argument
-    add("files", nargs="*", metavar="FILE", help="one trial in each: CSV, Excel, Parquet, MATLAB, "
-        "HDF5, C3D, OpenSim, ROS and more")  # fmt: skip
-    add("--table", type=_place, metavar="TABLE.csv", help="in place of files: a table of a study, "
+    add(
+        "files",
+        nargs="*",
+        metavar="FILE",
+        help="one trial in each: CSV, Excel, Parquet, MATLAB, "
+        "HDF5, C3D, OpenSim, ROS and more",
+    )
+    add(
+        "--table",
+        type=_place,
+        metavar="TABLE.csv",
+        help="in place of files: a table of a study, "
         "with the columns file and subject, and condition, group, age, ...; a report for each "
-        "subject and one for all; a later call goes on")  # fmt: skip
-    add("--workers", type=_count, default=1, metavar="N",
-        help="processes for the subjects of --table (default: %(default)s)")  # fmt: skip
-    add("--input", required=True, type=_names, metavar="NAMES", help="measured perturbations")
-    add("--reference", type=_names, default=(), metavar="NAMES", help="signals that act from "
-        "outside on a loop, if a controller makes the inputs")  # fmt: skip
-    add("--outputs", default=(), type=_names, metavar="NAMES", help="measured outputs; by default "
-        "the durations between the events of --event")  # fmt: skip
+        "subject and one for all; a later call goes on",
+    )
+    add(
+        "--workers",
+        type=_count,
+        default=1,
+        metavar="N",
+        help="processes for the subjects of --table (default: %(default)s)",
+    )
+    add(
+        "--input",
+        required=True,
+        type=_names,
+        metavar="NAMES",
+        help="measured perturbations",
+    )
+    add(
+        "--reference",
+        type=_names,
+        default=(),
+        metavar="NAMES",
+        help="signals that act from "
+        "outside on a loop, if a controller makes the inputs",
+    )
+    add(
+        "--outputs",
+        default=(),
+        type=_names,
+        metavar="NAMES",
+        help="measured outputs; by default the durations between the events of --event",
+    )
     phase = identify.add_mutually_exclusive_group(required=True)
-    phase.add_argument("--phase", type=_two_names, metavar="X,V",
-        help="two signals whose angle about the center is the phase")  # fmt: skip
-    phase.add_argument("--crossing", type=_crossing, metavar="X:DIRECTION[:VALUE]",
-        help="a cycle begins where signal X crosses a value, rising or falling")  # fmt: skip
+    phase.add_argument(
+        "--phase",
+        type=_two_names,
+        metavar="X,V",
+        help="two signals whose angle about the center is the phase",
+    )
+    phase.add_argument(
+        "--crossing",
+        type=_crossing,
+        metavar="X:DIRECTION[:VALUE]",
+        help="a cycle begins where signal X crosses a value, rising or falling",
+    )
     phase.add_argument("--event", metavar="NAME", help="event at which a cycle begins")
     for name, kind in {"--center": _two_numbers, "--scale": _two_positive}.items():
-        add(name, type=kind, metavar="X,V", help="of the angle of --phase; estimated by default")
-    add("--sections", type=_count, default=32, metavar="N",
-        help="sections in each cycle (default: %(default)s)")  # fmt: skip
-    add("--order", type=_count, metavar="D", help="number of multipliers; found by default")
-    add("--bandwidth", type=_positive, metavar="HZ", help="of the splines through the outputs; by "
-        "default N per period")  # fmt: skip
-    add("--time", default="time", metavar="NAME", help="column of times (default: %(default)s)")
-    add("--timing", choices=("clock", "duration"), help="an extra output, from when "
-        "sections are crossed: for systems with a clock, or without")  # fmt: skip
-    add("--drift", type=_cycles, metavar="CYCLES", help="remove changes of the cycle that take "
-        "longer than this")  # fmt: skip
+        add(
+            name,
+            type=kind,
+            metavar="X,V",
+            help="of the angle of --phase; estimated by default",
+        )
+    add(
+        "--sections",
+        type=_count,
+        default=32,
+        metavar="N",
+        help="sections in each cycle (default: %(default)s)",
+    )
+    add(
+        "--order",
+        type=_count,
+        metavar="D",
+        help="number of multipliers; found by default",
+    )
+    add(
+        "--bandwidth",
+        type=_positive,
+        metavar="HZ",
+        help="of the splines through the outputs; by default N per period",
+    )
+    add(
+        "--time",
+        default="time",
+        metavar="NAME",
+        help="column of times (default: %(default)s)",
+    )
+    add(
+        "--timing",
+        choices=("clock", "duration"),
+        help="an extra output, from when "
+        "sections are crossed: for systems with a clock, or without",
+    )
+    add(
+        "--drift",
+        type=_cycles,
+        metavar="CYCLES",
+        help="remove changes of the cycle that take longer than this",
+    )
     _add_results(identify)
     identify.set_defaults(run=_identify, parser=identify)
 
@@ -181,14 +286,35 @@ def _add_sweep(commands) -> None:
         "store, which a later call goes on with, and pictures beside it.",
     )
     add = sweep.add_argument
-    add("model", type=_model, metavar="FILE.py:NAME",
-        help="a system, its class, or a function of parameters that gives one")  # fmt: skip
-    add("--over", required=True, action="append", type=_axis, metavar="NAME=LOW:HIGH:COUNT",
-        help="values of a parameter, evenly spaced; may be repeated")  # fmt: skip
-    add("--want", type=_names, default=("spectral_radius", "period"), metavar="NAMES",
+    add(
+        "model",
+        type=_model,
+        metavar="FILE.py:NAME",
+        help="a system, its class, or a function of parameters that gives one",
+    )
+    add(
+        "--over",
+        required=True,
+        action="append",
+        type=_axis,
+        metavar="NAME=LOW:HIGH:COUNT",
+        help="values of a parameter, evenly spaced; may be repeated",
+    )
+    add(
+        "--want",
+        type=_names,
+        default=("spectral_radius", "period"),
+        metavar="NAMES",
         help="period, state, multipliers, spectral_radius, residual; with commas "
-        "(default: spectral_radius,period)")  # fmt: skip
-    add("--out", required=True, type=_place, metavar="STORE", help="the Zarr store, e.g. map.zarr")
+        "(default: spectral_radius,period)",
+    )
+    add(
+        "--out",
+        required=True,
+        type=_place,
+        metavar="STORE",
+        help="the Zarr store, e.g. map.zarr",
+    )
     sweep.set_defaults(run=_sweep, parser=sweep)
 
 
@@ -214,16 +340,24 @@ def _sweep(options) -> int:
 
 def _identify(options) -> int:
     if options.phase is None and (options.center or options.scale):
-        options.parser.error("--center and --scale are of the angle of --phase, which is not given")
+        options.parser.error(
+            "--center and --scale are of the angle of --phase, which is not given"
+        )
     named = [*options.input, *options.reference, *options.outputs]
     if twice := ", ".join(x for x in dict.fromkeys(named) if named.count(x) > 1):
-        options.parser.error(f"{twice}: name it once (omit --reference without a controller)")
+        options.parser.error(
+            f"{twice}: name it once (omit --reference without a controller)"
+        )
     if beside := {*options.input} & {*(options.phase or (options.crossing or ())[:1])}:
-        options.parser.error(f"{', '.join(beside)} is an input: define the phase by another signal")
+        options.parser.error(
+            f"{', '.join(beside)} is an input: define the phase by another signal"
+        )
     if bool(options.files) == bool(options.table):
         options.parser.error("give either files of one subject or --table TABLE.csv")
     if not (options.outputs or options.event or options.timing):
-        options.parser.error("name --outputs, or choose --timing, which makes times an output")
+        options.parser.error(
+            "name --outputs, or choose --timing, which makes times an output"
+        )
     _begin(cache=False)
     if options.table:
         from .subjects import run as run_table

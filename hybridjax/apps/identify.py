@@ -72,7 +72,9 @@ def run(options: Any) -> bool:
     return result.fit.result == Result.OK
 
 
-def steps_of(options: Any) -> tuple[tuple[str, ...], Callable[[Recording], Identification]]:
+def steps_of(
+    options: Any,
+) -> tuple[tuple[str, ...], Callable[[Recording], Identification]]:
     """Return the names of the signals to be read, and the function that identifies a recording."""
     named = (*options.input, *options.reference, *options.outputs)
     named += options.phase or (options.crossing or ())[:1]
@@ -86,10 +88,17 @@ def steps_of(options: Any) -> tuple[tuple[str, ...], Callable[[Recording], Ident
     else:
         sections = AtEvent(options.event)
     identify = functools.partial(
-        identify_recording, phase=sections, inputs=options.input, outputs=options.outputs,
-        n_sections=options.sections, order=options.order, bandwidth=options.bandwidth,
-        timing=options.timing, drift=options.drift, reference=options.reference or None,
-    )  # fmt: skip
+        identify_recording,
+        phase=sections,
+        inputs=options.input,
+        outputs=options.outputs,
+        n_sections=options.sections,
+        order=options.order,
+        bandwidth=options.bandwidth,
+        timing=options.timing,
+        drift=options.drift,
+        reference=options.reference or None,
+    )
     return tuple(dict.fromkeys(named)), identify
 
 
@@ -124,10 +133,19 @@ def report_folder(
     """Return a context with a new folder for the results, which at the end replace those in
     `folder`."""
     files = (PAGE, "sections.csv", "cycle.csv", "htf.npz", "fit.npz", "summary.json")
-    figures = ["phase", "sections", "multipliers", "impulse_responses", "validation", "curve"]
+    figures = [
+        "phase",
+        "sections",
+        "multipliers",
+        "impulse_responses",
+        "validation",
+        "curve",
+    ]
     for suffix in _suffixes(inputs):
         figures += [f"bode{suffix}", f"harmonics{suffix}"]
-    images = [f"figures/{name}.{format}" for name in figures for format in with_png(formats)]
+    images = [
+        f"figures/{name}.{format}" for name in figures for format in with_png(formats)
+    ]
     return results_folder(Path(folder), "report", [*files, *images])
 
 
@@ -141,7 +159,9 @@ def _suffixes(inputs: Sequence[str]) -> list[str]:
     return [f"_{x.replace('/', '-')}" for x in inputs] if len(inputs) > 1 else [""]
 
 
-def write_results(folder: Path, result: Identification, formats: Sequence[Format]) -> None:
+def write_results(
+    folder: Path, result: Identification, formats: Sequence[Format]
+) -> None:
     """Write all results into a folder that is new."""
     (folder / "figures").mkdir()
     data, recording = result.data, result.recording
@@ -150,14 +170,23 @@ def write_results(folder: Path, result: Identification, formats: Sequence[Format
     htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
     images = {}
     for name, drawn in _figures(result, htf):
-        image, *_ = look.save_and_close(folder / "figures" / name, drawn, with_png(formats))
+        image, *_ = look.save_and_close(
+            folder / "figures" / name, drawn, with_png(formats)
+        )
         images[name] = base64.b64encode(image.read_bytes()).decode()
     save(folder / "htf.npz", htf)
     save(folder / "fit.npz", result.fit)
-    header = [f"{n} ({u})" if u else n for n, u in zip(data.signals, data.units, strict=True)]
+    header = [
+        f"{n} ({u})" if u else n for n, u in zip(data.signals, data.units, strict=True)
+    ]
     records = zip(data.records, data.times, data.trials, strict=True)
     rows = (
-        (recording.trials[trial].name, k, *divmod(record.first_section + i, data.n_sections), *row)
+        (
+            recording.trials[trial].name,
+            k,
+            *divmod(record.first_section + i, data.n_sections),
+            *row,
+        )
         for k, (record, times, trial) in enumerate(records)
         for i, row in enumerate(_written(times[:, None], record.u, record.y))
     )
@@ -177,8 +206,9 @@ def page_of(title: str, parts: Iterable[str]) -> str:
         f"<title>{escape(title)}</title>"
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<style>{_STYLE}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
-        + "\n".join(parts) + "\n</body></html>\n"
-    )  # fmt: skip
+        + "\n".join(parts)
+        + "\n</body></html>\n"
+    )
 
 
 def _written(*arrays: np.ndarray) -> Iterable[list[str]]:
@@ -197,7 +227,9 @@ def summarize(result: Identification) -> dict[str, Any]:
     return {
         "version": __version__,
         "trials": [t.name for t in result.recording.trials],
-        "sampling_rates": [float(1 / np.median(np.diff(t.time))) for t in result.recording.trials],
+        "sampling_rates": [
+            float(1 / np.median(np.diff(t.time))) for t in result.recording.trials
+        ],
         "left_out": _left_out(result),
         "notes": list(result.recording.notes),
         "units": {"time": "s"} | dict(zip(data.signals, data.units, strict=True)),
@@ -210,7 +242,9 @@ def summarize(result: Identification) -> dict[str, Any]:
         "period": data.period,
         "period_jitter": result.phase.jitter,
         "period_mean": float(periods.mean()),
-        "period_standard_error": float(periods.std() / np.sqrt(max(len(periods) - 1, 1))),
+        "period_standard_error": float(
+            periods.std() / np.sqrt(max(len(periods) - 1, 1))
+        ),
         "period_drift_per_cycle": result.phase.drift,
         "multipliers": complex_pairs(fit.multipliers),
         "standard_errors": fit.standard_errors.tolist(),
@@ -226,7 +260,10 @@ def summarize(result: Identification) -> dict[str, Any]:
 def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]]:
     """Yield names and figures, each drawn when the one before was saved."""
     shown = [m for m in (0, 1, -1) if m in htf.harmonics]
-    yield "multipliers", plot.multipliers(result.fit, {"plain regression": result.advice.plain})
+    yield (
+        "multipliers",
+        plot.multipliers(result.fit, {"plain regression": result.advice.plain}),
+    )
     yield "validation", plot.validation(result.held_out.validation)
     yield "impulse_responses", plot.impulse_responses(result.responses)
     for i, suffix in enumerate(_suffixes(htf.inputs)):
@@ -243,7 +280,11 @@ def _page(result: Identification, images: dict[str, str]) -> str:
     data, recording, warnings = result.data, result.recording, result.advice.warnings
     trials = escape(", ".join(t.name for t in recording.trials))
     loop = result.fit.reference
-    method = f"instrumental variables of {escape(listed(loop))}" if loop else "output-error fit"
+    method = (
+        f"instrumental variables of {escape(listed(loop))}"
+        if loop
+        else "output-error fit"
+    )
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
     expected = zip(result.advice.strides, result.advice.expected, strict=True)
@@ -260,9 +301,15 @@ def _page(result: Identification, images: dict[str, str]) -> str:
         html.card("Phase", "", html.text(repr(result.phase))),
         data._repr_html_(),
         html.card(
-            "Standard errors to be expected from more strides", "", html.table(
+            "Standard errors to be expected from more strides",
+            "",
+            html.table(
                 ("strides", *map(html.complex_number, result.fit.multipliers)),
-                [(str(n), *(f"{e:.1e}" for e in x)) for n, x in expected if np.isfinite(x).all()],
+                [
+                    (str(n), *(f"{e:.1e}" for e in x))
+                    for n, x in expected
+                    if np.isfinite(x).all()
+                ],
             ),
         ),
         *(f"<p>{text}</p>" for text in MEANING),
@@ -277,7 +324,7 @@ def _page(result: Identification, images: dict[str, str]) -> str:
         f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
         f"{data.bandwidth:.3g} Hz; {method} with {result.fit.numerators.shape[1]} lags; "
         "regions from the residuals, cycle by cycle.</p>",
-    ]  # fmt: skip
+    ]
     return page_of("Floquet multipliers from a recording", parts)
 
 

@@ -28,7 +28,9 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
         "families": {},
     }
     for name, family in families.items():
-        biases = [family.rational_exact.compare(true, name).max_error for name in OUTPUTS]
+        biases = [
+            family.rational_exact.compare(true, name).max_error for name in OUTPUTS
+        ]
         errors = family.estimate.harmonic_errors(family.ldtp.htf(family.estimate.f))
         at = {m: k for k, m in enumerate(family.estimate.harmonics)}
         results = family.structured.result, *np.ravel(family.rational.result)
@@ -37,7 +39,9 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
             "converged": all(x == Result.OK for x in results),
             "multipliers_from_linearization": complex_pairs(family.ldtp.multipliers),
             "multipliers_fit_structured": complex_pairs(family.structured.multipliers),
-            "multipliers_fit_structured_error": family.structured.compare(true).max_error,
+            "multipliers_fit_structured_error": family.structured.compare(
+                true
+            ).max_error,
             "multipliers_fit_2p1z": {
                 output: {
                     "multipliers": complex_pairs(family.rational.multipliers[k]),
@@ -49,7 +53,11 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
                 for k, output in enumerate(OUTPUTS)
             },
             "htf_error_of_max_H_0": {
-                output: {f"H_{m}": float(errors[at[m], k]) for m in (-2, -1, 0, 1, 2) if m in at}
+                output: {
+                    f"H_{m}": float(errors[at[m], k])
+                    for m in (-2, -1, 0, 1, 2)
+                    if m in at
+                }
                 for k, output in enumerate(OUTPUTS)
             },
         }
@@ -64,7 +72,9 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
     observations = []
 
     def note(claim, holds, measured):
-        observations.append({"claim": claim, "holds": bool(holds), "measured": measured})
+        observations.append(
+            {"claim": claim, "holds": bool(holds), "measured": measured}
+        )
 
     def top(family, m):
         return np.abs(np.asarray(family.estimate[m])[:, :, 0]).max(axis=0)
@@ -72,38 +82,59 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
     iso, kin = families["isochron"], families["kinematic"]
     ratio = top(iso, 0) / top(kin, 0)
     text = f"max|H_0| isochron / kinematic: {_pairs(ratio)}"
-    note("the gain of H_0 is doubled with isochrons", np.all((ratio > 1.6) & (ratio < 2.5)), text)
+    note(
+        "the gain of H_0 is doubled with isochrons",
+        np.all((ratio > 1.6) & (ratio < 2.5)),
+        text,
+    )
     a, b = iso.rational, kin.rational
     moved = np.max(np.abs(np.sort_complex(a.poles) - np.sort_complex(b.poles)), axis=1)
     text = f"distance of the fitted poles in z: {_pairs(moved)}"
-    note("the choice of phase leaves the poles where they are", np.all(moved < 1e-3), text)
+    note(
+        "the choice of phase leaves the poles where they are",
+        np.all(moved < 1e-3),
+        text,
+    )
     moved = np.max(np.abs(a.zeros - b.zeros), axis=1)
     text = f"distance of the fitted zeros in z: {_pairs(moved)}"
     note("the choice of phase moves the zeros", np.any(moved > 1e-2), text)
     for name, family in families.items():
         f = np.asarray(family.exact.f)
         size = np.log(np.abs(np.asarray(family.exact[0])[:, :, 0]))
-        peaks = [f[find_peaks(size[:, k], prominence=0.01)[0]] for k in range(len(OUTPUTS))]
+        peaks = [
+            f[find_peaks(size[:, k], prominence=0.01)[0]] for k in range(len(OUTPUTS))
+        ]
         peaks = [p[(p > 1.5) & (p < 2.5)] for p in peaks]
         places = [", ".join(f"{x:.3g}" for x in p) or "none" for p in peaks]
-        places = [f"{place} ({output})" for output, place in zip(OUTPUTS, places, strict=True)]
+        places = [
+            f"{place} ({output})" for output, place in zip(OUTPUTS, places, strict=True)
+        ]
         text = f"local maxima of |H_0| for f in (1.5, 2.5): {'; '.join(places)}"
         note(f"{name}: bumps of H_0 around f = 2", any(map(len, peaks)), text)
         power = np.sum(np.abs(np.asarray(family.estimate.H)[..., 0]) ** 2, axis=1)
         order = np.abs(np.array(family.estimate.harmonics))
         within = [power[order <= m].sum(axis=0) / power.sum(axis=0) for m in (1, 2)]
         second = np.maximum(top(family, 2), top(family, -2)) / top(family, 0)
-        text = f"max|H_+-2| / max|H_0|: {_pairs(second)}; part of the sum of |H_m|^2 with "
+        text = (
+            f"max|H_+-2| / max|H_0|: {_pairs(second)}; part of the sum of |H_m|^2 with "
+        )
         text += f"|m| <= 1: {_pairs(within[0])}, with |m| <= 2: {_pairs(within[1])}"
         note(f"{name}: |H_m| is negligible for |m| >= 2", np.all(second < 0.1), text)
-        close = [family.rational.compare(family.ldtp.multipliers, k).max_error for k in OUTPUTS]
+        close = [
+            family.rational.compare(family.ldtp.multipliers, k).max_error
+            for k in OUTPUTS
+        ]
         text = f"{name}: eigenvalues from the fits are right up to the third significant digit"
         note(text, max(close) < 5e-3, f"|error|: {_pairs(close)}")
     exact = next(iter(families.values())).ldtp.multipliers
     text = ", ".join(f"{z:.6f}" for z in exact)
     text += ": with the paper's parameters the real part is negative, the printed sign was lost"
     printed = 0.25 + np.array([0.7j, -0.7j])
-    note("the multipliers are 0.25 +- 0.70i", np.all(np.abs(exact - printed) < 1e-2), text)
+    note(
+        "the multipliers are 0.25 +- 0.70i",
+        np.all(np.abs(exact - printed) < 1e-2),
+        text,
+    )
     return observations
 
 
@@ -123,10 +154,15 @@ def table(summary: dict) -> str:
         for output, fit in family["multipliers_fit_2p1z"].items():
             row(f"2 poles 1 zero, {name}, {output}", fit["multipliers"], fit["error"])
             bias = fit["error_of_the_same_fit_to_the_exact_htf"]
-            rows.append(f"  {'    the same fit to the exact H_0':38}{'':28}  {bias:.1e}")
+            rows.append(
+                f"  {'    the same fit to the exact H_0':38}{'':28}  {bias:.1e}"
+            )
         error = family["multipliers_fit_structured_error"]
         row(f"structured, {name}", family["multipliers_fit_structured"], error)
-    rows += ["", "Largest error of the estimated HTF, relative to max|H_0| of the output"]
+    rows += [
+        "",
+        "Largest error of the estimated HTF, relative to max|H_0| of the output",
+    ]
     for name, family in summary["families"].items():
         for output, errors in family["htf_error_of_max_H_0"].items():
             sizes = "  ".join(f"{m}: {e:.1e}" for m, e in errors.items())
@@ -144,4 +180,6 @@ def complex_pairs(values) -> list[list[float]]:
 
 
 def _pairs(values) -> str:
-    return ", ".join(f"{v:.3g} ({name})" for name, v in zip(OUTPUTS, values, strict=True))
+    return ", ".join(
+        f"{v:.3g} ({name})" for name, v in zip(OUTPUTS, values, strict=True)
+    )

@@ -70,7 +70,9 @@ def _log(begin: float, text: str) -> None:
     print(f"[{time.time() - begin:6.1f} s] {text}", flush=True)
 
 
-def reproduce(out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format]) -> dict:
+def reproduce(
+    out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format]
+) -> dict:
     """Run the protocol and write figures, `summary.json` and files for `hj.load` into a folder.
 
     They appear when all of them are ready, and replace those of an earlier run. Other files in the
@@ -87,25 +89,38 @@ def reproduce(out: str | os.PathLike, protocol: Protocol, formats: Sequence[Form
     figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
     files = [f"{figure}.{format}" for figure in figures for format in formats]
     saved = [f"{result}_{family}.npz" for family in _FAMILIES for result in _SAVED]
-    with results_folder(Path(out), "reproduce", ["summary.json", *saved, *files]) as folder:
+    with results_folder(
+        Path(out), "reproduce", ["summary.json", *saved, *files]
+    ) as folder:
         return _reproduce(folder, protocol, formats)
 
 
 def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict:
     begin = time.time()
     # Lines without second-order products on them need many experiments.
-    division: Literal["random", "sum-free"] = "sum-free" if protocol.experiments >= 80 else "random"
+    division: Literal["random", "sum-free"] = (
+        "sum-free" if protocol.experiments >= 80 else "random"
+    )
     design = paper_design(
-        periods=protocol.keep, seed=protocol.seed, division=division,
+        periods=protocol.keep,
+        seed=protocol.seed,
+        division=division,
         experiments=protocol.experiments,
-    )  # fmt: skip
-    _log(begin, f"design: {design.experiments} experiments, {len(design.f)} frequencies")
+    )
+    _log(
+        begin, f"design: {design.experiments} experiments, {len(design.f)} frequencies"
+    )
     cycle = find_limit_cycle(VerticalHopper())
     multipliers = ", ".join(f"{z:.9f}" for z in cycle.multipliers)
-    _log(begin, f"limit cycle: period {float(cycle.period):.6g}, multipliers {multipliers}")
+    _log(
+        begin,
+        f"limit cycle: period {float(cycle.period):.6g}, multipliers {multipliers}",
+    )
 
     discard = protocol.cycles - protocol.keep
-    families = {name: _identify(name, cycle, design, discard, begin) for name in _FAMILIES}
+    families = {
+        name: _identify(name, cycle, design, discard, begin) for name in _FAMILIES
+    }
     _draw(cycle, families, out, formats, begin)
     summary = summarize(protocol, cycle, families)
     for name, family in families.items():
@@ -117,12 +132,19 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict
     return summary
 
 
-def _identify(name: str, cycle: LimitCycle, design: Design, discard: int, begin: float) -> Family:
+def _identify(
+    name: str, cycle: LimitCycle, design: Design, discard: int, begin: float
+) -> Family:
     """Return all results with one family of sections."""
     apex, N = Crossing("vM", "falling"), design.n_sections
     sections: Any = ClockPhase(N, anchor=apex)
     if name == "kinematic":
-        plane: Any = {"position": "yM", "velocity": "vM", "center": (1.9, 0.0), "scale": (0.3, 1.9)}
+        plane: Any = {
+            "position": "yM",
+            "velocity": "vM",
+            "center": (1.9, 0.0),
+            "scale": (0.3, 1.9),
+        }
         sections = KinematicPhase(N, **plane, anchor=apex)
     placed = place_sections(cycle, sections)
     ldtp = linearize(cycle, placed, OUTPUTS)
@@ -136,10 +158,14 @@ def _identify(name: str, cycle: LimitCycle, design: Design, discard: int, begin:
     rational, rational_exact = fit_rational(estimate), fit_rational(exact)
     structured = fit_multipliers(estimate, ldtp)
     _log(begin, f"{name}: HTF estimate, 2-pole 1-zero fits, structured fit")
-    return Family(placed, ldtp, exact, experiments, estimate, rational, rational_exact, structured)
+    return Family(
+        placed, ldtp, exact, experiments, estimate, rational, rational_exact, structured
+    )
 
 
-def _draw(cycle: LimitCycle, families: Mapping[str, Family], out: Path, formats, begin) -> None:
+def _draw(
+    cycle: LimitCycle, families: Mapping[str, Family], out: Path, formats, begin
+) -> None:
     """Write the figures."""
     from .. import plot  # here, since it is heavy
     from ..plot.look import save_and_close
@@ -155,7 +181,10 @@ def _figures(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -> It
     for name, family in families.items():
         drawn = plot.cycle(cycle, *OUTPUTS, sections=family.placed, perturbed=perturbed)
         yield f"fig1_cycle_{name}", drawn
-        estimates |= {f"2p1z, {name}": family.rational, f"structured, {name}": family.structured}
+        estimates |= {
+            f"2p1z, {name}": family.rational,
+            f"structured, {name}": family.structured,
+        }
     pairs = {name: (family.estimate, family.exact) for name, family in families.items()}
     rational = {name: family.rational for name, family in families.items()}
     yield "fig3_harmonics", plot.harmonics(pairs, (0, 1, -1, 2, -2))
@@ -170,7 +199,11 @@ def _perturbed(cycle: LimitCycle) -> Trajectory:
     state["yM"] += 0.05
     chart = list(cycle.system.charts())[int(cycle.anchor.chart[0])]
     return simulate(
-        cycle.system, chart, list(state.values()), 12 * float(cycle.period),
-        time=float(cycle.anchor.t[0]), throw=False,
+        cycle.system,
+        chart,
+        list(state.values()),
+        12 * float(cycle.period),
+        time=float(cycle.anchor.t[0]),
+        throw=False,
         settings=Settings(rtol=1e-6, atol=1e-6),  # a figure shows no more
-    )  # fmt: skip
+    )

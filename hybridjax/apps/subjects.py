@@ -36,7 +36,11 @@ from .identify import PAGE, page_of, report_folder, steps_of, with_png, write_re
 
 
 # Columns of the table of a study, and their names in the summaries.
-_COLUMNS = {"strides": "cycles", "period": "period", "period_error": "period_standard_error"}
+_COLUMNS = {
+    "strides": "cycles",
+    "period": "period",
+    "period_error": "period_standard_error",
+}
 _FILES = ("subjects.csv", "population.csv", "population.html")
 
 
@@ -60,14 +64,22 @@ class Study:
     def remarks(self) -> list[str]:
         """Failures, and the fits to doubt, in sentences."""
         fits = zip(self.population.table["report"], self.fits, strict=True)
-        doubts = [f"{name} is doubtful: {fit.doubt}." for name, fit in fits if fit.doubt]
-        return [f"{name} failed: {text}" for name, text in self.failures.items()] + doubts
+        doubts = [
+            f"{name} is doubtful: {fit.doubt}." for name, fit in fits if fit.doubt
+        ]
+        return [
+            f"{name} failed: {text}" for name, text in self.failures.items()
+        ] + doubts
 
     def __repr__(self) -> str:
-        lines = [f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"]
+        lines = [
+            f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"
+        ]
         lines += [folded(f"  {text}", "  ") for text in self.remarks]
         if len(self.results):
-            lines.append(self.results.T.to_string(header=False, float_format="{:.4g}".format))
+            lines.append(
+                self.results.T.to_string(header=False, float_format="{:.4g}".format)
+            )
         return "\n".join(lines)
 
 
@@ -80,14 +92,20 @@ def _cause(write: Callable[..., str], *arguments: Any) -> str:
         return f"{kind}{error}"
 
 
-def _report(files: list[Path], folder: Path, identify: Callable, reading: dict, formats) -> str:
+def _report(
+    files: list[Path], folder: Path, identify: Callable, reading: dict, formats
+) -> str:
     """Identify the trials of one subject in one condition, and write the report.
 
     **Returns:** the cause of a failure, or "". Results of the same files and options are kept.
     """
-    stats = [(str(x), x.stat().st_size, x.stat().st_mtime_ns) for x in files if x.exists()]
+    stats = [
+        (str(x), x.stat().st_size, x.stat().st_mtime_ns) for x in files if x.exists()
+    ]
     key = json.dumps([__version__, stats, digest_of(identify), reading, formats])
-    mark, *needed = (folder / name for name in ("job.json", PAGE, "fit.npz", "summary.json"))
+    mark, *needed = (
+        folder / name for name in ("job.json", PAGE, "fit.npz", "summary.json")
+    )
     if mark.is_file() and mark.read_text() == key and all(x.is_file() for x in needed):
         return ""
     enable_x64()
@@ -105,7 +123,11 @@ def run(options: Any) -> int:
     **Returns:** the exit status: 1 if a subject failed.
     """
     signals, identify = steps_of(options)
-    reading: Any = {"time": options.time, "signals": signals, "formats": options.formats}
+    reading: Any = {
+        "time": options.time,
+        "signals": signals,
+        "formats": options.formats,
+    }
     spawn = multiprocessing.get_context("spawn")
     pool = concurrent.futures.ProcessPoolExecutor(options.workers, mp_context=spawn)
     try:
@@ -162,20 +184,33 @@ def identify_subjects(
     reading: dict[str, Any] = {"time": time, "signals": tuple(signals) or None}
     for name, trials in rows.groupby("report", sort=False):
         if (trials[["subject", *factors_of(rows)]].nunique() > 1).any():
-            raise DefinitionError(f"two subjects would have the report '{name}': rename one.")
+            raise DefinitionError(
+                f"two subjects would have the report '{name}': rename one."
+            )
         files = [Path(table).parent / file for file in trials["file"]]
-        job = functools.partial(_cause, _report, files, root / name, identify, reading, formats)
+        job = functools.partial(
+            _cause, _report, files, root / name, identify, reading, formats
+        )
         calls[name] = client.submit(job).result if client else job
-    causes = {name: _cause(calls[name]) for name in counted(list(calls), "subjects", len(calls))}
+    causes = {
+        name: _cause(calls[name])
+        for name in counted(list(calls), "subjects", len(calls))
+    }
     failures = {name: text for name, text in causes.items() if text}
-    frame = rows[~rows["report"].isin(failures)].drop_duplicates("report", ignore_index=True)
+    frame = rows[~rows["report"].isin(failures)].drop_duplicates(
+        "report", ignore_index=True
+    )
     if not len(frame):
-        raise ComputationError("all subjects fail: " + "; ".join(map(": ".join, failures.items())))
+        raise ComputationError(
+            "all subjects fail: " + "; ".join(map(": ".join, failures.items()))
+        )
     fits: Any = tuple(load(root / name / "fit.npz") for name in frame["report"])
     texts = [(root / name / "summary.json").read_text() for name in frame["report"]]
     for name, key in _COLUMNS.items():
         frame[name] = [float(json.loads(text)[key]) for text in texts]
-    population = Population.from_fits(fits, frame.drop(columns=["file", "trial"], errors="ignore"))
+    population = Population.from_fits(
+        fits, frame.drop(columns=["file", "trial"], errors="ignore")
+    )
     parts = [package("pandas").DataFrame()]
     try:
         parts.append(population.mean("modulus"))
@@ -193,12 +228,21 @@ def identify_subjects(
 def _rows(path: Path) -> Any:
     """Return the table with the names of reports; columns with numbers in all rows as numbers."""
     text = dict.fromkeys(("file", "subject", "group", "condition"), str)
-    how = {"dtype": text, "keep_default_na": False, "skipinitialspace": True, "index_col": False}
+    how = {
+        "dtype": text,
+        "keep_default_na": False,
+        "skipinitialspace": True,
+        "index_col": False,
+    }
     try:
         rows = package("pandas").read_csv(path, encoding="utf-8-sig", **how)
     except (OSError, ValueError) as why:
-        raise DefinitionError(f"cannot read '{path}': {getattr(why, 'strerror', why)}.") from None
-    if not all(name in rows and len(rows) and rows[name].all() for name in ("file", "subject")):
+        raise DefinitionError(
+            f"cannot read '{path}': {getattr(why, 'strerror', why)}."
+        ) from None
+    if not all(
+        name in rows and len(rows) and rows[name].all() for name in ("file", "subject")
+    ):
         text = "'file' and 'subject' in each row, separated by commas."
         raise DefinitionError(f"the table '{path}' needs {text}")
     rows = table_of(rows, len(rows))
@@ -210,7 +254,10 @@ def _rows(path: Path) -> Any:
 def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) -> None:
     """Write the tables, and the report for all."""
     population, results = study.population, study.results
-    links = (f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>' for n in population.table["report"])
+    links = (
+        f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>'
+        for n in population.table["report"]
+    )
     errors = {f"{name}_error": error for name, error in population.errors.items()}
     parts = [
         *(f'<p class="warn">{escape(x)}</p>' for x in study.remarks),
@@ -220,8 +267,16 @@ def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) ->
     ]
     with results_folder(study.folder, "population", _FILES) as new:
         with contextlib.suppress(DefinitionError):  # for too few subjects
-            save_and_close(new / "forest", plot.forest(population, "modulus"), with_png(formats))
-            parts.append('<img alt="Modulus of the leading multiplier" src="forest.png">')
-        population.table.assign(**population.values, **errors).to_csv(new / _FILES[0], index=False)
+            save_and_close(
+                new / "forest", plot.forest(population, "modulus"), with_png(formats)
+            )
+            parts.append(
+                '<img alt="Modulus of the leading multiplier" src="forest.png">'
+            )
+        population.table.assign(**population.values, **errors).to_csv(
+            new / _FILES[0], index=False
+        )
         results.to_csv(new / _FILES[1], index=False)
-        (new / _FILES[2]).write_text(page_of(f"{len(study.fits)} reports", parts), encoding="utf-8")
+        (new / _FILES[2]).write_text(
+            page_of(f"{len(study.fits)} reports", parts), encoding="utf-8"
+        )

@@ -18,12 +18,18 @@ def run(options: Any) -> int:
 
     **Raises:** `DefinitionError` for a file without such a model, and as `sweep`.
     """
-    over = {name: np.linspace(low, high, count) for name, low, high, count in options.over}
+    over = {
+        name: np.linspace(low, high, count) for name, low, high, count in options.over
+    }
     if len(over) < len(options.over):
-        raise DefinitionError("a parameter has two axes: give each `--over` another name.")
+        raise DefinitionError(
+            "a parameter has two axes: give each `--over` another name."
+        )
     maps = sweep(_load(*options.model), over, options.want, store=options.out)
     print(maps)
-    print(f"{int((maps.result == 0).sum())} of {maps.result.size} points have a limit cycle")
+    print(
+        f"{int((maps.result == 0).sum())} of {maps.result.size} points have a limit cycle"
+    )
     for name in options.want:
         if maps[name].dims == tuple(over) and len(over) <= 2:
             path = f"{Path(options.out).with_suffix('')}-{name}"
@@ -35,11 +41,15 @@ def _load(file: str, name: str) -> Any:
     """The system, class or function of this name in a Python file."""
     path = Path(file)
     if not path.is_file():
-        raise DefinitionError(f"there is no file '{file}': give the model as FILE.py:NAME.")
+        raise DefinitionError(
+            f"there is no file '{file}': give the model as FILE.py:NAME."
+        )
     sys.path.insert(0, str(path.parent.resolve()))  # for its own imports
     module = importlib.import_module(path.stem)
     if Path(module.__file__ or "").resolve() != path.resolve():
-        raise DefinitionError(f"another module is called '{path.stem}': rename '{file}'.")
+        raise DefinitionError(
+            f"another module is called '{path.stem}': rename '{file}'."
+        )
     if not hasattr(module, name):
         raise DefinitionError(f"'{file}' has no '{name}'.")
     system = getattr(module, name)

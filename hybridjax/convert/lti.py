@@ -47,7 +47,14 @@ def to_lti(model: LDTP) -> LDTP:
     **Raises:** `PrecisionError` in single precision.
     """
     require_x64(model)
-    A, B, C, D, d, ny = model.A, model.B, model.C, model.D, model.A.shape[-1], len(model.outputs)
+    A, B, C, D, d, ny = (
+        model.A,
+        model.B,
+        model.C,
+        model.D,
+        model.A.shape[-1],
+        len(model.outputs),
+    )
     N, _, nu = B.shape
 
     def advance(carry, section):
@@ -55,7 +62,10 @@ def to_lti(model: LDTP) -> LDTP:
         from_state, from_inputs = carry
         n, A, B, C, D = section
         rows = C @ from_state, jnp.einsum("ij,jkl->ikl", C, from_inputs).at[:, n].set(D)
-        return (A @ from_state, jnp.einsum("ij,jkl->ikl", A, from_inputs).at[:, n].set(B)), rows
+        return (
+            A @ from_state,
+            jnp.einsum("ij,jkl->ikl", A, from_inputs).at[:, n].set(B),
+        ), rows
 
     carry = jnp.eye(d), jnp.zeros((d, N, nu))
     (A, B), (C, D) = jax.lax.scan(advance, carry, (jnp.arange(N), A, B, C, D))
@@ -72,7 +82,9 @@ def to_lti(model: LDTP) -> LDTP:
 
 
 def _at_sections(names: tuple[str, ...], n_sections: int) -> tuple[str, ...]:
-    return tuple(Signal(f"{x}[{n}]", unit_of(x)) for n in range(n_sections) for x in names)
+    return tuple(
+        Signal(f"{x}[{n}]", unit_of(x)) for n in range(n_sections) for x in names
+    )
 
 
 @checked
@@ -90,7 +102,10 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     """
     if isinstance(thing, LDTP):
         lti = to_lti(thing)
-        names = {"inputs": list(map(str, lti.inputs)), "outputs": list(map(str, lti.outputs))}
+        names = {
+            "inputs": list(map(str, lti.inputs)),
+            "outputs": list(map(str, lti.outputs)),
+        }
         return package("control").StateSpace(*_matrices(lti), period, **names)
     inputs = list(map(str, thing.inputs))
     outputs = [f"{y}[{m}]" for m in thing.harmonics for y in thing.outputs]
@@ -112,7 +127,9 @@ class HarmonicStateSpace(NamedTuple):
     error: float
     """The largest error of H_-1, H_0 and H_1, relative to the largest of them."""
 
-    def transfer(self, f: Frequencies, period: float) -> Complex[np.ndarray, "f M ny nu"]:
+    def transfer(
+        self, f: Frequencies, period: float
+    ) -> Complex[np.ndarray, "f M ny nu"]:
         """Responses of all harmonics to inputs of frequencies in cycles per period."""
         M = 2 * self.order + 1
         B, D = (x.reshape(len(x), M, -1)[:, self.order] for x in (self.B, self.D))
@@ -159,14 +176,23 @@ def to_harmonic_state_space(
     jumps = (flow.jumps.by_state - np.eye(s.d)) * sizes
     if np.abs(jumps).max() > 1e-9 or flow.jumps.by_input.any():
         text = "events at which deviations jump, which no finite number of harmonics represents"
-        raise DefinitionError(f"{type(s.system).__name__} has {text}: use `cycle.htf` (exact).")
+        raise DefinitionError(
+            f"{type(s.system).__name__} has {text}: use `cycle.htf` (exact)."
+        )
     _, by_state, by_input = linear_outputs(s, flow, z)
-    series = flow.by_state, flow.by_input[..., columns], by_state, by_input[..., columns]
+    series = (
+        flow.by_state,
+        flow.by_input[..., columns],
+        by_state,
+        by_input[..., columns],
+    )
     for n in [order] if order else _ORDERS:
         m, k = np.arange(-n, n + 1), np.arange(-2 * n, 2 * n + 1)
         waves = np.exp(-2j * np.pi * k[:, None, None] * flow.after(map) / period)
         waves = waves * flow.length[:, None] * rule().weights / period
-        parts = [np.einsum("mpk,pkij->mij", waves, x)[m[:, None] - m + 2 * n] for x in series]
+        parts = [
+            np.einsum("mpk,pkij->mij", waves, x)[m[:, None] - m + 2 * n] for x in series
+        ]
         A, B, C, D = (x.swapaxes(1, 2).reshape(len(m) * x.shape[2], -1) for x in parts)
         A = A - np.diag(np.repeat(2j * np.pi * m / period, s.d))
         space = HarmonicStateSpace(A, B, C, D, n, 0.0)

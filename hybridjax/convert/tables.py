@@ -16,7 +16,15 @@ from ..recordings.recording import Recording
 from .xarray_datasets import to_xarray
 
 
-Tabular = Recording | SectionData | HTF | LimitCycles | Branch | MultiplierEstimate | RationalFit
+Tabular = (
+    Recording
+    | SectionData
+    | HTF
+    | LimitCycles
+    | Branch
+    | MultiplierEstimate
+    | RationalFit
+)
 
 
 @checked
@@ -37,14 +45,18 @@ def to_pandas(thing: Tabular) -> Any:
     """
     frame = package("pandas").DataFrame
     if isinstance(thing, MultiplierEstimate):
-        real, imaginary = np.sqrt(np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)).T
+        real, imaginary = np.sqrt(
+            np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)
+        ).T
         errors = {"real_error": real, "imaginary_error": imaginary}
         errors["standard_error"] = thing.standard_errors
         return frame({**_parts("", thing.multipliers), **errors})
     if isinstance(thing, RationalFit):
         outputs = np.repeat(list(map(str, thing.outputs)), thing.poles.shape[1])
         poles = _parts("pole_", thing.poles.ravel())
-        return frame({"output": outputs, **poles, **_parts("", thing.multipliers.ravel())})
+        return frame(
+            {"output": outputs, **poles, **_parts("", thing.multipliers.ravel())}
+        )
     dataset = to_xarray(thing)
     if isinstance(thing, HTF):
         rows = dataset[[x for x in ("H", "variance") if x in dataset]].to_dataframe()
@@ -61,7 +73,9 @@ def to_pandas(thing: Tabular) -> Any:
         if x.ndim > 1:
             numbers = {f"{name}.{k}": values for k, values in enumerate(x.values.T)}
         for key, values in numbers.items():
-            table |= _parts(f"{key}.", values) if np.iscomplexobj(values) else {key: values}
+            table |= (
+                _parts(f"{key}.", values) if np.iscomplexobj(values) else {key: values}
+            )
     return frame(table)
 
 

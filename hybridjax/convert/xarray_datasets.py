@@ -31,9 +31,15 @@ _HEADER = "hybridjax"
 _RESERVED = {"time", "trial", "event", "event_time", "event_trial"}
 # Dimensions, by the names of axes in annotations.
 _AXES = {
-    "S": "experiment", "n": "sample", "N": "section", "M": "harmonic", "F": "f",
-    "ny": "output", "nu": "input", "d": "multiplier",
-}  # fmt: skip
+    "S": "experiment",
+    "n": "sample",
+    "N": "section",
+    "M": "harmonic",
+    "F": "f",
+    "ny": "output",
+    "nu": "input",
+    "d": "multiplier",
+}
 _STATES = {
     "A": ("section", "next_state", "state"),
     "B": ("section", "next_state", "input"),
@@ -93,7 +99,9 @@ def from_xarray(dataset: Any) -> Saved:
             order, whole = dataset[dimension].values, dimension == "section"
             late = order[0] % (size if whole else static["n_sections"])
             if late or (np.diff(order) != 1).any() or (whole and len(order) < size):
-                raise DefinitionError(f"`{dimension}` must be in order, from section 0 on.")
+                raise DefinitionError(
+                    f"`{dimension}` must be in order, from section 0 on."
+                )
         for dimension, field in _COORDINATES.items():
             if dimension in dataset.coords:
                 static[field] = tuple(x.item() for x in dataset[dimension].values)
@@ -101,11 +109,20 @@ def from_xarray(dataset: Any) -> Saved:
                 units = dataset[f"{dimension}_unit"].values
                 static[field] = tuple(map(Signal, static[field], map(str, units)))
         arrays = {
-            str(name): np.asarray(dataset[name].transpose(*_axes(kind, str(name))).values)
+            str(name): np.asarray(
+                dataset[name].transpose(*_axes(kind, str(name))).values
+            )
             for name in {*dataset.data_vars, *({"f"} & set(dataset.coords))}
         }
         return put_together(kind, static, arrays)
-    except (HybridJaxError, IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (
+        HybridJaxError,
+        IndexError,
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+    ) as error:
         text = f"was changed since `to_xarray` made it of a {header['kind']}: {error}"
         raise DefinitionError(f"`dataset` {text}") from error
 
@@ -115,15 +132,24 @@ def _from_module(module: eqx.Module) -> Any:
     coordinates: dict[str, Any] = {}
     for dimension, field in _COORDINATES.items():
         if (values := static.pop(field, None)) is not None:
-            coordinates[dimension] = [str(x) if isinstance(x, str) else int(x) for x in values]
+            coordinates[dimension] = [
+                str(x) if isinstance(x, str) else int(x) for x in values
+            ]
             if isinstance(values[0], str):
                 coordinates[f"{dimension}_unit"] = dimension, list(map(unit_of, values))
-    variables = {name: (_axes(type(module), name), array) for name, array in arrays.items()}
+    variables = {
+        name: (_axes(type(module), name), array) for name, array in arrays.items()
+    }
     coordinates |= {name: variables.pop(name) for name in {"f"} & set(variables)}
     units = {str(name): name.unit for name in signals_in(static)}
     dataset = package("xarray").Dataset(variables, coordinates)
     sizes = {x: n for x, n in dataset.sizes.items() if x in _ORDERED}
-    header = {"kind": type(module).__name__, "static": static, "units": units, "sizes": sizes}
+    header = {
+        "kind": type(module).__name__,
+        "static": static,
+        "units": units,
+        "sizes": sizes,
+    }
     text = json.dumps(header, default=lambda x: x.item())
     order = {x: np.arange(n) for x, n in sizes.items()}
     return dataset.assign_coords(order).assign_attrs({_HEADER: text})
@@ -135,7 +161,9 @@ def _axes(kind: type, name: str) -> tuple[str, ...]:
         return _STATES[name]
     hint: Any = kind
     for part in name.split("."):
-        module = next(x for x in options_of(hint) if isinstance(x, type) and hasattr(x, "__mro__"))
+        module = next(
+            x for x in options_of(hint) if isinstance(x, type) and hasattr(x, "__mro__")
+        )
         hint = module.__dataclass_fields__[part].type  # type: ignore[attr-defined]
     shaped = next(x for x in options_of(hint) if hasattr(x, "dim_str"))
     axes: list[str] = []
@@ -157,8 +185,15 @@ def _from_recording(recording: Recording) -> Any:
     variables["event"] = "occurrence", np.array([name for _, name, _ in events], str)
     coordinates = {
         "time": ("sample", np.concatenate([t.time for t in trials]), {"units": "s"}),
-        "trial": ("sample", np.repeat(np.arange(len(trials)), [len(t.time) for t in trials])),
-        "event_time": ("occurrence", np.array([x for *_, x in events], float), {"units": "s"}),
+        "trial": (
+            "sample",
+            np.repeat(np.arange(len(trials)), [len(t.time) for t in trials]),
+        ),
+        "event_time": (
+            "occurrence",
+            np.array([x for *_, x in events], float),
+            {"units": "s"},
+        ),
         "event_trial": ("occurrence", np.array([s for s, *_ in events], int)),
     }
     return package("xarray").Dataset(variables, coordinates)
@@ -171,7 +206,10 @@ def _from_section_data(data: SectionData) -> Any:
     variables = _signals(data, np.concatenate(values))
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
     variables["average_cycle"] = ("phase", "signal"), cycle
-    sections = [(r.first_section + np.arange(n)) % N for r, n in zip(records, lengths, strict=True)]
+    sections = [
+        (r.first_section + np.arange(n)) % N
+        for r, n in zip(records, lengths, strict=True)
+    ]
     coordinates = {
         "time": ("sample", np.concatenate(data.times), {"units": "s"}),
         "trial": ("sample", np.repeat(data.trials, lengths)),
@@ -219,7 +257,9 @@ def _signals(data: Recording | SectionData, values: np.ndarray) -> dict[str, Any
     **Raises:** `DefinitionError` for signals that are called like a coordinate.
     """
     if reserved := _RESERVED & set(data.signals):
-        raise DefinitionError(f"'{min(reserved)}' is also the name of a coordinate: rename it.")
+        raise DefinitionError(
+            f"'{min(reserved)}' is also the name of a coordinate: rename it."
+        )
     triples = zip(data.signals, data.units, values.T, strict=True)
     return {str(name): _variable("sample", x, unit) for name, unit, x in triples}
 

@@ -61,7 +61,10 @@ class Certificate(NamedTuple):
 
 
 def certify(
-    bound: Bound, power: Powers, limits: PowerLimits, level: Float[np.ndarray, " O"] | float = 1.0
+    bound: Bound,
+    power: Powers,
+    limits: PowerLimits,
+    level: Float[np.ndarray, " O"] | float = 1.0,
 ) -> Certificate:
     """Return the certificate of powers with this bound.
 
@@ -73,7 +76,9 @@ def certify(
     alone = 1 / np.abs(limits.cost).max(axis=0)
     gain = alone * bound.sensitivity / (power @ bound.sensitivity)
     best = linprog(-gain / gain.max(), limits.cost * alone, np.ones(len(limits.cost)))
-    if best.x is None:  # the tangent of a quadratic limit may leave some powers unbounded
+    if (
+        best.x is None
+    ):  # the tangent of a quadratic limit may leave some powers unbounded
         return Certificate(np.inf, np.full(len(power), np.nan))
     price = -best.ineqlin.marginals @ (limits.cost * alone)
     relative = gain / gain.max() / np.where(price > 0, price, np.nan)
@@ -106,7 +111,9 @@ def allocate(criterion: Criterion, limits: PowerLimits, start: Powers) -> Alloca
             certificate = certify(now, power, limits)
             if certificate.excess <= 1 + ENOUGH:
                 break
-        target, prices = _cheapest(power * np.sqrt(now.sensitivity), limits.tangent(power), prices)
+        target, prices = _cheapest(
+            power * np.sqrt(now.sensitivity), limits.tangent(power), prices
+        )
         trial = floored(limits.scaled(power * (floored(target) / power) ** length))
         bound = criterion.bound(trial)
         if bound.criterion <= now.criterion:
@@ -140,12 +147,19 @@ def worthwhile(cosines: Candidates, gain: Powers, experiments: int) -> Kept:
     classes = line_class(cosines.line, cosines.periods)
     for number in np.unique(classes):
         members = np.flatnonzero(kept & (classes == number))
-        kept[members[np.argsort(gain[members])][: max(len(members) - experiments, 0)]] = False
+        kept[
+            members[np.argsort(gain[members])][: max(len(members) - experiments, 0)]
+        ] = False
     return np.flatnonzero(kept)
 
 
 def to_design(
-    cosines: Candidates, power: Powers, use: Powers, experiments: int, usual: Design, seed: int
+    cosines: Candidates,
+    power: Powers,
+    use: Powers,
+    experiments: int,
+    usual: Design,
+    seed: int,
 ) -> Design:
     """Return experiments in which each cosine has this power on the average, and which all take the
     same share of the limits. Strong cosines occur in several experiments, weak ones in one.

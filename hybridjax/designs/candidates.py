@@ -62,7 +62,9 @@ class Candidates(NamedTuple):
         shared = np.stack([design.experiment, design.line])
         if len(np.unique(shared, axis=1).T) < len(design.line):
             text = "use division='random' or 'disjoint'"
-            raise DefinitionError(f"the `design` excites several inputs with one line: {text}.")
+            raise DefinitionError(
+                f"the `design` excites several inputs with one line: {text}."
+            )
         line, channel = np.unique(np.stack([design.line, design.channel]), axis=1)
         return cls(line, channel, design.periods, design.n_sections, design.cycles(0))
 
@@ -86,7 +88,9 @@ class Candidates(NamedTuple):
         inputs = self.channel.max() + 1
         key = self.line * inputs + self.channel
         order = np.argsort(key)
-        return order[np.searchsorted(key, design.line * inputs + design.channel, sorter=order)]
+        return order[
+            np.searchsorted(key, design.line * inputs + design.channel, sorter=order)
+        ]
 
     def powers_in(self, design: Design) -> Float[np.ndarray, "E K"]:
         """Return the mean square of each cosine in each experiment of a design."""
@@ -106,7 +110,9 @@ def mean_squares(model: Model, cosines: Candidates) -> Squares:
     The rate is the change from one section to the next: a cosine of f changes by
     $2 \\sin(\\pi f / N)$ times its amplitude.
     """
-    inputs = {n: (cosines.channel == i).astype(float) for i, n in enumerate(model.inputs)}
+    inputs = {
+        n: (cosines.channel == i).astype(float) for i, n in enumerate(model.inputs)
+    }
     change = 4 * np.sin(np.pi * cosines.f / cosines.n_sections) ** 2
     rates = {f"rate of {name}": square * change for name, square in inputs.items()}
     H = cosines.responses(model)
@@ -116,7 +122,9 @@ def mean_squares(model: Model, cosines: Candidates) -> Squares:
 
 def rms_of(squares: list[Squares], names: list[str], power: Powers) -> dict[str, float]:
     """Return rms values of signals; of several models the root of the mean square."""
-    return {n: float(np.sqrt(np.mean([each[n] @ power for each in squares]))) for n in names}
+    return {
+        n: float(np.sqrt(np.mean([each[n] @ power for each in squares]))) for n in names
+    }
 
 
 class Noise(NamedTuple):
@@ -124,7 +132,9 @@ class Noise(NamedTuple):
 
     outputs: Int[np.ndarray, " ny"]
     """Indices of these outputs."""
-    spectrum: Callable[[Float[np.ndarray, " F"], tuple[int, ...]], Float[np.ndarray, "M F ny"]]
+    spectrum: Callable[
+        [Float[np.ndarray, " F"], tuple[int, ...]], Float[np.ndarray, "M F ny"]
+    ]
     """The variance of white noise with the same spectral density as at the harmonics m of f."""
 
 
@@ -140,7 +150,9 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
         noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}
     require_among("output", noise, outputs, "`noise`: ")
     if not noise:
-        raise DefinitionError(f"`noise` names no output; outputs are {', '.join(outputs)}.")
+        raise DefinitionError(
+            f"`noise` names no output; outputs are {', '.join(outputs)}."
+        )
     measured = {name: noise[name] for name in outputs if name in noise}
 
     def spectrum(f: np.ndarray, harmonics: tuple[int, ...]) -> np.ndarray:
@@ -188,7 +200,11 @@ def measured_htfs(
         outputs = tuple(htf.outputs[k] for k in noise.outputs)
         larger = np.mean(np.abs(H) ** 2) / np.mean(variance) or 1.0
         htf = dataclasses.replace(
-            htf, H=H, variance=larger * variance, inputs=htf.inputs[i : i + 1], outputs=outputs
+            htf,
+            H=H,
+            variance=larger * variance,
+            inputs=htf.inputs[i : i + 1],
+            outputs=outputs,
         )
         yield Measured(htf, members, int(i), float(np.sqrt(larger)))
 
@@ -213,4 +229,6 @@ def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
         if len(models) == count:
             return models
     text = f"only {len(models)} of {_TRIES * count} models in its confidence region are stable"
-    raise DefinitionError(f"`fit` is uncertain, {text}: measure more before a design is made.")
+    raise DefinitionError(
+        f"`fit` is uncertain, {text}: measure more before a design is made."
+    )

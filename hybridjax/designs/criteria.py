@@ -46,7 +46,9 @@ def criterion_of(
     that do not exist, and combinations that the data do not identify, which are named.
     """
     if isinstance(goal, Parameters) and (len(models) > 1 or not goal.cycle.stable):
-        raise DefinitionError("a `goal` of parameters needs a single `model` and a stable `cycle`.")
+        raise DefinitionError(
+            "a `goal` of parameters needs a single `model` and a stable `cycle`."
+        )
     each = []
     for model in models:
         if isinstance(goal, Multipliers):
@@ -70,7 +72,9 @@ def _multipliers(
             apart = np.abs(minimal - multipliers[goal.which])
             if not apart.min() < _SAME * np.abs(multipliers).max():
                 text = f"multiplier {multipliers[goal.which]:.4g}: add an input or an output"
-                raise DefinitionError(f"no input excites, or no output has, the {text}.")
+                raise DefinitionError(
+                    f"no input excites, or no output has, the {text}."
+                )
             goal = dataclasses.replace(goal, which=int(np.argmin(apart)))
         wanted, names, part = wanted_parts(goal, minimal, c)
         return matrices.criterion(wanted @ slopes, names, part)
@@ -83,13 +87,17 @@ def _multipliers(
 
 
 def wanted_parts(
-    goal: Multipliers, multipliers: Complex[np.ndarray, " d"], c: Float[np.ndarray, " d"]
+    goal: Multipliers,
+    multipliers: Complex[np.ndarray, " d"],
+    c: Float[np.ndarray, " d"],
 ) -> tuple[Float[np.ndarray, "rows d"], tuple[str, ...], Int[np.ndarray, " rows"]]:
     """Return derivatives of real and imaginary parts, or moduli, by c; the names of the multipliers
     and moduli, and for each row the index of its name."""
     d = len(c)
     if d == 0:
-        raise DefinitionError("all multipliers of the model are zero: choose another `goal`.")
+        raise DefinitionError(
+            "all multipliers of the model are zero: choose another `goal`."
+        )
     require_index("multiplier", goal.which or 0, d)
     slope = np.polyval(np.polyder(np.array([1.0, *c])), multipliers)
     wanted, names, part = list[np.ndarray](), list[str](), list[int]()
@@ -98,7 +106,9 @@ def wanted_parts(
         if goal.which is None and z.imag < 0:
             continue
         if abs(slope[k]) < _SAME:
-            raise DefinitionError(f"the multiplier {z:.4g} is double: choose another `goal`.")
+            raise DefinitionError(
+                f"the multiplier {z:.4g} is double: choose another `goal`."
+            )
         gradient = -(z ** np.arange(d - 1, -1, -1)) / slope[k]
         name = f"{z.real:.4g}" if z.imag == 0 else f"{z.real:.4g}{z.imag:+.4g}i"
         rows = [gradient.real, gradient.imag][: 1 + (z.imag != 0)]
@@ -110,7 +120,9 @@ def wanted_parts(
     return np.array(wanted), tuple(names), np.array(part)
 
 
-def _parameters(goal: Parameters, model: Model, lines: Candidates, noise: Noise) -> LinearCriterion:
+def _parameters(
+    goal: Parameters, model: Model, lines: Candidates, noise: Noise
+) -> LinearCriterion:
     free = tuple(goal.free)
     wanted = free if goal.wanted is None else tuple(goal.wanted)
     require_among("free parameter", wanted, free, "`wanted` of `goal`: ")
@@ -120,7 +132,9 @@ def _parameters(goal: Parameters, model: Model, lines: Candidates, noise: Noise)
         data = identifiability(goal.cycle.system, observed, free, guess=goal.cycle)
         if not data.complete:
             lost = "; ".join(data.descriptions())
-            raise DefinitionError(f"the data do not identify {lost}: leave it out of `free`.")
+            raise DefinitionError(
+                f"the data do not identify {lost}: leave it out of `free`."
+            )
         shape = 2, len(htf.harmonics), len(members), htf.H[0, 0].size
         cosine = np.broadcast_to(members[:, None], shape).ravel()
         channels.append(Channel(cosine, weight * data.sensitivity))
@@ -128,7 +142,9 @@ def _parameters(goal: Parameters, model: Model, lines: Candidates, noise: Noise)
     return LinearCriterion(wanted, free, tuple(channels), rows, np.arange(len(wanted)))
 
 
-def _channels(x: Measured, c: Float[np.ndarray, " d"], overhang: int | None) -> Iterator[Channel]:
+def _channels(
+    x: Measured, c: Float[np.ndarray, " d"], overhang: int | None
+) -> Iterator[Channel]:
     r"""Yield H delayed by 1 to d periods, and the part of it that numerators can explain, from
     $dH = dB/\chi - H\, d\chi/\chi$.
 
@@ -136,7 +152,10 @@ def _channels(x: Measured, c: Float[np.ndarray, " d"], overhang: int | None) -> 
     """
     for group in grouped(x.htf, len(c), overhang):
         delays = range(1, len(c) + 1)
-        slopes = [group.weighted(c, group.period_delay[:, None] ** j * group.data) for j in delays]
+        slopes = [
+            group.weighted(c, group.period_delay[:, None] ** j * group.data)
+            for j in delays
+        ]
         size = np.tile(group.weight / np.abs(chi(group.period_delay, c)), 2)
         cosines = np.tile(x.cosines[group.line], 2)
         slope = x.weight * np.concatenate(slopes, axis=1)

@@ -52,7 +52,9 @@ class Channel(NamedTuple):
         rows = np.flatnonzero(np.isin(self.cosine, kept))
         basis = None if self.basis is None else self.basis[rows]
         basis = powers_basis(basis)[0] if basis is not None and basis.size else basis
-        return Channel(np.searchsorted(kept, self.cosine[rows]), self.slopes[rows], basis)
+        return Channel(
+            np.searchsorted(kept, self.cosine[rows]), self.slopes[rows], basis
+        )
 
     def rows(self, power: Powers, unknowns: int) -> Float[np.ndarray, "d rows"]:
         """Return derivatives with these powers, less the part that numerators explain."""
@@ -61,7 +63,11 @@ class Channel(NamedTuple):
         if self.basis is not None:
             q, _ = np.linalg.qr(weight * self.basis)
             slopes -= q @ (q.T @ slopes)
-        return slopes.reshape(len(slopes), unknowns, -1).swapaxes(0, 1).reshape(unknowns, -1)
+        return (
+            slopes.reshape(len(slopes), unknowns, -1)
+            .swapaxes(0, 1)
+            .reshape(unknowns, -1)
+        )
 
 
 class LinearCriterion(eqx.Module):
@@ -78,17 +84,25 @@ class LinearCriterion(eqx.Module):
 
     def only(self, kept: Kept) -> "LinearCriterion":
         channels = (channel.only(kept) for channel in self.channels)
-        return dataclasses.replace(self, channels=tuple(x for x in channels if len(x.cosine)))
+        return dataclasses.replace(
+            self, channels=tuple(x for x in channels if len(x.cosine))
+        )
 
     def bound(self, power: Powers) -> Bound:
         d = len(self.unknowns)
-        rows = np.concatenate([channel.rows(power, d) for channel in self.channels], axis=1)
+        rows = np.concatenate(
+            [channel.rows(power, d) for channel in self.channels], axis=1
+        )
         cosine = [np.repeat(x.cosine, x.slopes.shape[1] // d) for x in self.channels]
         half = _root(rows @ rows.T, self.unknowns)
         spread = self.wanted @ half
         influence, variances = spread @ half.T @ rows, (spread**2).sum(axis=1)
-        squares = np.bincount(np.concatenate(cosine), (influence**2).sum(axis=0), len(power))
-        return Bound(np.bincount(self.part, variances), squares / power, float(variances.sum()))
+        squares = np.bincount(
+            np.concatenate(cosine), (influence**2).sum(axis=0), len(power)
+        )
+        return Bound(
+            np.bincount(self.part, variances), squares / power, float(variances.sum())
+        )
 
 
 class Criterion(eqx.Module):
@@ -114,25 +128,39 @@ class Criterion(eqx.Module):
         top = criteria.max()
         mean = top * np.mean((criteria / top) ** self.exponent) ** (1 / self.exponent)
         share = (criteria / mean) ** (self.exponent - 1) / len(criteria)
-        variances = share @ np.array([bound.variances for bound in bounds]) / share.sum()
-        return Bound(variances, share @ np.array([x.sensitivity for x in bounds]), float(mean))
+        variances = (
+            share @ np.array([bound.variances for bound in bounds]) / share.sum()
+        )
+        return Bound(
+            variances, share @ np.array([x.sensitivity for x in bounds]), float(mean)
+        )
 
     def only(self, kept: Kept) -> "Criterion":
         """Return the criterion where only these cosines are applied."""
         return Criterion(tuple(x.only(kept) for x in self.each), self.exponent)
 
 
-def _root(matrix: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]) -> Float[np.ndarray, "d d"]:
+def _root(
+    matrix: Float[np.ndarray, "d d"], unknowns: tuple[str, ...]
+) -> Float[np.ndarray, "d d"]:
     """Return R with R R^T the inverse of the information."""
     size = np.sqrt(np.diag(matrix))
     lost = np.flatnonzero(~(size > 0))
     if len(lost):
-        raise DefinitionError(f"{unknowns[lost[0]]} changes no response: drop it or add an output.")
+        raise DefinitionError(
+            f"{unknowns[lost[0]]} changes no response: drop it or add an output."
+        )
     values, vectors = np.linalg.eigh(matrix / size / size[:, None])
-    if not values[0] > ROUNDING:  # relative to the largest, for combinations of matrices
+    if (
+        not values[0] > ROUNDING
+    ):  # relative to the largest, for combinations of matrices
         direction = vectors[:, 0] / size
         largest = np.abs(direction).max()
         named = zip(direction, unknowns, strict=True)
-        along = " ".join(f"{x:+.2g} {name}" for x, name in named if abs(x) > 1e-3 * largest)
-        raise DefinitionError(f"no response changes along {along}: fix one, or add an output.")
+        along = " ".join(
+            f"{x:+.2g} {name}" for x, name in named if abs(x) > 1e-3 * largest
+        )
+        raise DefinitionError(
+            f"no response changes along {along}: fix one, or add an output."
+        )
     return vectors / np.sqrt(values) / size[:, None]

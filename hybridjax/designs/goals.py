@@ -84,7 +84,9 @@ class FrequencyResponse(eqx.Module):
 
     def __check_init__(self):
         if not self.band[0] < self.band[1]:
-            raise DefinitionError(f"`band` must be two ascending frequencies, not {self.band}.")
+            raise DefinitionError(
+                f"`band` must be two ascending frequencies, not {self.band}."
+            )
 
 
 Goal = Multipliers | Parameters | FrequencyResponse

@@ -37,7 +37,9 @@ _DIFFERENT = 0.3
 
 Words = Literal["input", "output"]
 # Squares of larger and smaller levels are infinite or zero.
-Level = Annotated[float, Number("a number from 1e-100 to 1e100", low=1e-100, high=1e100)]
+Level = Annotated[
+    float, Number("a number from 1e-100 to 1e100", low=1e-100, high=1e100)
+]
 
 
 @checked
@@ -65,7 +67,9 @@ class Distortion(eqx.Module):
     def __check_init__(self):
         as_family(self.sections)
         if not self.rms:
-            raise DefinitionError("`rms` is empty: name an output, such as {'y': 1e-3}.")
+            raise DefinitionError(
+                "`rms` is empty: name an output, such as {'y': 1e-3}."
+            )
         self.cycle.structure.resolve_outputs(tuple(map(str, self.rms)))
 
 
@@ -107,7 +111,9 @@ class Limits(eqx.Module):
         periods = design.periods
         count = design.experiments if self.strides is None else self.strides // periods
         if count == 0:
-            text = f"`limit` allows {self.strides} strides, fewer than one experiment has"
+            text = (
+                f"`limit` allows {self.strides} strides, fewer than one experiment has"
+            )
             raise DefinitionError(f"{text}, {periods}: allow more.")
         if count > cosines:
             text = f"take a `design` with more lines, or fewer experiments than {count}"
@@ -139,7 +145,9 @@ class PowerLimits(NamedTuple):
     def use_of_curved(self, power: Powers) -> Float[np.ndarray, " O"]:
         return np.sqrt(np.maximum(self.curved @ power @ power, 0))
 
-    def tangent(self, power: Powers, level: Float[np.ndarray, " O"] | float = 1.0) -> "PowerLimits":
+    def tangent(
+        self, power: Powers, level: Float[np.ndarray, " O"] | float = 1.0
+    ) -> "PowerLimits":
         r"""Return linear limits, $p^T Q q \le \sqrt{p^T Q p}$, that all q within the quadratic ones
         obey (Cauchy-Schwarz inequality): p itself uses both alike.
 
@@ -147,7 +155,9 @@ class PowerLimits(NamedTuple):
         """
         slope, use = self.curved @ power, self.use_of_curved(power)
         slope = slope / np.where(use > 0, use * level, 1.0)[:, None]
-        return PowerLimits(self.names, np.concatenate([self.cost, slope]), self.curved[:0])
+        return PowerLimits(
+            self.names, np.concatenate([self.cost, slope]), self.curved[:0]
+        )
 
     def scaled(self, power: Powers) -> Powers:
         """Return the same proportions, as large as the limits allow."""
@@ -164,7 +174,9 @@ class PowerLimits(NamedTuple):
         return flat.price(np.full(len(flat.cost), 1 / len(flat.cost)))
 
     def only(self, kept: Kept) -> "PowerLimits":
-        return self._replace(cost=self.cost[:, kept], curved=self.curved[:, kept][:, :, kept])
+        return self._replace(
+            cost=self.cost[:, kept], curved=self.curved[:, kept][:, :, kept]
+        )
 
     def require_limits(self) -> None:
         """**Raises:** `DefinitionError` if some cosine is not limited."""
@@ -187,18 +199,24 @@ def power_limits(
     inputs, outputs = models[0].inputs, models[0].outputs
     if isinstance(limits.rms, str):
         names = inputs if limits.rms == "input" else outputs
-        levels = [{n: float(np.sqrt(square[n] @ usual)) for n in names} for square in squares]
+        levels = [
+            {n: float(np.sqrt(square[n] @ usual)) for n in names} for square in squares
+        ]
     else:
         require_among("signal", limits.rms, (*inputs, *outputs), "`limit`: ")
         if not (limits.rms or limits.rate or limits.peak or limits.distortion):
-            raise DefinitionError("`limit` is empty: name a signal, such as rms={'u': 0.1}.")
+            raise DefinitionError(
+                "`limit` is empty: name a signal, such as rms={'u': 0.1}."
+            )
         levels = [{str(n): float(x) for n, x in limits.rms.items()} for _ in squares]
     limits.require_inputs(inputs)
     for level in levels:
         level |= {f"rate of {n}": float(x) for n, x in limits.rate.items()}
         level |= {f"peak of {n}": float(x) for n, x in limits.peak.items()}
     if silent := [n for level in levels for n, rms in level.items() if rms == 0]:
-        raise DefinitionError(f"the `design` does not move {silent[0]}: leave it out of `limit`.")
+        raise DefinitionError(
+            f"the `design` does not move {silent[0]}: leave it out of `limit`."
+        )
     names = [n for level in levels for n in level]
     rows = [
         square[n.removeprefix("peak of ")] / rms**2
@@ -208,7 +226,9 @@ def power_limits(
     K = len(usual)
     cost = np.reshape(rows, (-1, K))
     distinct = np.sort(np.unique(cost, axis=0, return_index=True)[1])
-    return PowerLimits(tuple(names[i] for i in distinct), cost[distinct], np.zeros((0, K, K)))
+    return PowerLimits(
+        tuple(names[i] for i in distinct), cost[distinct], np.zeros((0, K, K))
+    )
 
 
 def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
@@ -217,9 +237,14 @@ def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
     phase = np.array(design.phase)
     for e in range(design.experiments):
         lines = np.flatnonzero(design.experiment == e)
-        parts = {n: getattr(design, n)[lines] for n in ("line", "channel", "amplitude", "phase")}
+        parts = {
+            n: getattr(design, n)[lines]
+            for n in ("line", "channel", "amplitude", "phase")
+        }
         # (Alone, so that a line that occurs in several experiments may have any phase.)
-        single = dataclasses.replace(design, experiment=0 * lines, experiments=1, **parts)
+        single = dataclasses.replace(
+            design, experiment=0 * lines, experiments=1, **parts
+        )
         phase[lines] = optimize_phases(single, seed).phase
     design = dataclasses.replace(design, phase=phase)
     highest = np.abs(design.inputs()).max(axis=1)
@@ -260,18 +285,26 @@ class Products(NamedTuple):
             difference, size = np.linalg.norm(H - expected), np.linalg.norm(expected)
             if difference > _DIFFERENT * size:
                 share = difference / max(size, np.finfo(float).tiny)
-                text = f"differ in H_0 (to {name}, by {share:.0%}): use the same sections"
-                raise DefinitionError(f"the model and the distortion of `limit` {text}.")
+                text = (
+                    f"differ in H_0 (to {name}, by {share:.0%}): use the same sections"
+                )
+                raise DefinitionError(
+                    f"the model and the distortion of `limit` {text}."
+                )
 
     def rms(self, design: Design, phases: bool = False) -> Float[np.ndarray, " O"]:
         """Return the distortion in a design: expected with random phases, or with its `phases`."""
         if phases:
-            return np.sqrt(np.mean(self.quadratic.second_order(design.inputs()) ** 2, axis=(0, 1)))
+            return np.sqrt(
+                np.mean(self.quadratic.second_order(design.inputs()) ** 2, axis=(0, 1))
+            )
         power = self.cosines.powers_in(design)
         squares = np.einsum("ek,okl,el->o", power, self.expected, power, optimize=True)
         return np.sqrt(np.maximum(squares, 0) / design.experiments)
 
-    def divided(self, kept: Kept, share: Float[np.ndarray, "E k"]) -> Float[np.ndarray, "O k k"]:
+    def divided(
+        self, kept: Kept, share: Float[np.ndarray, "E k"]
+    ) -> Float[np.ndarray, "O k k"]:
         """Return the expected mean square, in units of the limit, as a form of the mean powers of
         cosines whose power in each experiment is a `share` of it."""
         expected = self.expected[:, kept][:, :, kept] / (self.level**2)[:, None, None]
@@ -289,7 +322,9 @@ def products(
     sections; `ComputationError` as `place_sections`.
     """
     sections = as_family(limit.sections)
-    require_same("the distortion of `limit` and the model", sections, cosines, ("n_sections",))
+    require_same(
+        "the distortion of `limit` and the model", sections, cosines, ("n_sections",)
+    )
     outputs = tuple(str(n) for n in limit.rms)
     quadratic = second_order(limit.cycle, sections, outputs, inputs)
     pairs = quadratic.products(cosines.f, cosines.channel)

@@ -53,16 +53,26 @@ class Matrices(NamedTuple):
 
         **Raises:** `DefinitionError` if the usual design does not determine them.
         """
-        shown, hidden = (np.bincount(part, ((wanted @ r) ** 2).sum(axis=1)) for r in self.spread)
+        shown, hidden = (
+            np.bincount(part, ((wanted @ r) ** 2).sum(axis=1)) for r in self.spread
+        )
         if (hidden > _MISSED * (shown + hidden)).any():
-            raise DefinitionError("`design` does not determine the `goal`: add harmonics or lines.")
+            raise DefinitionError(
+                "`design` does not determine the `goal`: add harmonics or lines."
+            )
         wanted = wanted @ self.spread.root
-        unknowns = tuple(f"combination {k} of the matrices" for k in range(wanted.shape[1]))
+        unknowns = tuple(
+            f"combination {k} of the matrices" for k in range(wanted.shape[1])
+        )
         return LinearCriterion(names, unknowns, (self.channel,), wanted, part)
 
 
 def ldtp_matrices(
-    model: Model, cosines: Candidates, harmonics: Harmonics | None, noise: Noise, power: Powers
+    model: Model,
+    cosines: Candidates,
+    harmonics: Harmonics | None,
+    noise: Noise,
+    power: Powers,
 ) -> Matrices:
     """Return the unknown matrices of a minimal model.
 
@@ -76,7 +86,9 @@ def ldtp_matrices(
     lags = 2 * default_horizon(model.n_sections) + 1
     response = np.asarray(model.impulse_response(lags))[:, :, noise.outputs]
     htfs = list(measured_htfs(model, cosines, harmonics, noise))
-    scale = np.sqrt(np.mean([check_values(measured.htf) ** 2 for measured in htfs], axis=0))
+    scale = np.sqrt(
+        np.mean([check_values(measured.htf) ** 2 for measured in htfs], axis=0)
+    )
     direct = bool(response[:, 0].any())
     coordinates = local_coordinates(PeriodicModel.of(realize(response), scale), direct)
     gram = np.zeros((coordinates.size, coordinates.size))
@@ -99,7 +111,9 @@ def _rows(
     at power 1."""
     for htf, cosines, channel, unit in htfs:
         weight = unit * error_weights(htf, scale)[..., 0] * scale
-        for chunk, slopes in transfer_slopes(coordinates, np.asarray(htf.f), htf.harmonics):
+        for chunk, slopes in transfer_slopes(
+            coordinates, np.asarray(htf.f), htf.harmonics
+        ):
             rows = slopes[..., channel] * weight[:, chunk]
             rows = np.ascontiguousarray(rows.transpose(2, 0, 1, 3))
             yield cosines[chunk], rows.reshape(*rows.shape[:2], -1).view(float)
@@ -110,7 +124,11 @@ def _flat(rows: Float[np.ndarray, "lines P rows"]) -> Float[np.ndarray, "P lines
 
 
 def response_criterion(
-    goal: FrequencyResponse, model: Model, cosines: Candidates, noise: Noise, power: Powers
+    goal: FrequencyResponse,
+    model: Model,
+    cosines: Candidates,
+    noise: Noise,
+    power: Powers,
 ) -> LinearCriterion:
     """Return the criterion of transfer functions in a band.
 
@@ -118,7 +136,9 @@ def response_criterion(
     """
     N, (low, high) = cosines.n_sections, goal.band
     if high > N / 2:
-        raise DefinitionError(f"`band` must lie within 0 and {N / 2:g}, not {goal.band}.")
+        raise DefinitionError(
+            f"`band` must lie within 0 and {N / 2:g}, not {goal.band}."
+        )
     harmonics = check_harmonics(goal.wanted, N)
     matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
     f = low + (high - low) * (np.arange(_POINTS) + 0.5) / _POINTS
@@ -126,14 +146,18 @@ def response_criterion(
     parts = [part for _, part in transfer_slopes(matrices.coordinates, f, harmonics)]
     slopes = np.concatenate(parts, axis=2)
     size = np.sqrt((np.abs(H) ** 2).mean(axis=1).sum(axis=0))  # (ny, nu)
-    slopes = np.stack([np.real(slopes), np.imag(slopes)], axis=3) / size / np.sqrt(_POINTS)
+    slopes = (
+        np.stack([np.real(slopes), np.imag(slopes)], axis=3) / size / np.sqrt(_POINTS)
+    )
     names = [
         f"H_{m} of {model.outputs[i]}{f' from {u}' * (len(model.inputs) > 1)}"
         for m in harmonics
         for i in noise.outputs
         for u in model.inputs
     ]
-    each = slopes.transpose(1, 4, 5, 2, 3, 0).reshape(len(names), -1, matrices.coordinates.size)
+    each = slopes.transpose(1, 4, 5, 2, 3, 0).reshape(
+        len(names), -1, matrices.coordinates.size
+    )
     # As few rows of each quantity as have the same sum of squares, up to rounding.
     _, values, vectors = np.linalg.svd(each, full_matrices=False)
     kept = values**2 > np.finfo(float).eps * values[:, :1] ** 2

@@ -18,11 +18,27 @@ from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
 from .allocation import ENOUGH, allocate, certify, to_design, worthwhile
-from .candidates import Candidates, Model, NoiseLike, Powers, make_noise, mean_squares, rms_of
+from .candidates import (
+    Candidates,
+    Model,
+    NoiseLike,
+    Powers,
+    make_noise,
+    mean_squares,
+    rms_of,
+)
 from .criteria import criterion_of
 from .criterion import Criterion
 from .goals import Goal, Multipliers
-from .limits import Limit, PowerLimits, Products, as_limits, below_peaks, power_limits, products
+from .limits import (
+    Limit,
+    PowerLimits,
+    Products,
+    as_limits,
+    below_peaks,
+    power_limits,
+    products,
+)
 
 
 # Ratio of strides from which on `advice` recommends the design. Larger: designs that save a third
@@ -103,12 +119,18 @@ class OptimalDesign(eqx.Module):
     @property
     def saved(self) -> float:
         """Number of strides of `usual` that one stride of `design` replaces."""
-        return self.usual_criterion * self.usual.cycles(0) / (self.criterion * self.strides)
+        return (
+            self.usual_criterion
+            * self.usual.cycles(0)
+            / (self.criterion * self.strides)
+        )
 
     def strides_for(self, standard_error: Positive) -> int:
         """Return the strides, with repeats of `design`, after which no quantity has a larger
         standard error."""
-        return int(np.ceil(self.strides * (self.standard_errors.max() / standard_error) ** 2))
+        return int(
+            np.ceil(self.strides * (self.standard_errors.max() / standard_error) ** 2)
+        )
 
     @property
     def advice(self) -> str:
@@ -119,14 +141,21 @@ class OptimalDesign(eqx.Module):
         limits = " and ".join([f"rms of {rms}"] * bool(rms) + special)
         saved = float(f"{self.saved:.2g}")  # (a third digit differs between machines)
         text = f"one stride of this design replaces {saved:g} with {self.usual_name}."
-        text = text if self.saved > _WORTH_IT else f"{self.usual_name} are nearly optimal."
+        text = (
+            text if self.saved > _WORTH_IT else f"{self.usual_name} are nearly optimal."
+        )
         return f"With the {limits} limited, {text}"
 
     def __repr__(self) -> str:
         rows = [("", self.usual_name, "optimal")]
         rows.append(("strides", str(self.usual.cycles(0)), str(self.strides)))
-        errors = zip(self.names, self.usual_standard_errors, self.standard_errors, strict=True)
-        rows += [(f"standard error of {name}", f"{a:.2e}", f"{b:.2e}") for name, a, b in errors]
+        errors = zip(
+            self.names, self.usual_standard_errors, self.standard_errors, strict=True
+        )
+        rows += [
+            (f"standard error of {name}", f"{a:.2e}", f"{b:.2e}")
+            for name, a, b in errors
+        ]
         rms = ((n, x) for n, x in self.usual_rms.items() if x > 0)
         rows += [(f"rms of {n}", f"{x:.3g}", f"{self.rms[n]:.3g}") for n, x in rms]
         bounded = any(n.startswith("distortion of ") for n in self.rms)
@@ -135,7 +164,9 @@ class OptimalDesign(eqx.Module):
             f"no design within the limits {'(of distortion: an upper bound) ' * bounded}"
             f"needs less than {1 / self.certificate:.1%} of these strides"
         )
-        below = "\n".join(["", self.advice, certificate, repr(self.design)]).replace("\n", "\n  ")
+        below = "\n".join(["", self.advice, certificate, repr(self.design)]).replace(
+            "\n", "\n  "
+        )
         return f"OptimalDesign({', '.join(self.names)}){columns(rows)}{below}"
 
 
@@ -153,7 +184,9 @@ class Rules(NamedTuple):
         use = self.linear.cost @ self.cosines.power_of(design)
         if self.distortion is not None:
             use = np.append(use, self.distortion.rms(design) / self.distortion.level)
-        return dataclasses.replace(design, amplitude=design.amplitude / np.sqrt(use.max()))
+        return dataclasses.replace(
+            design, amplitude=design.amplitude / np.sqrt(use.max())
+        )
 
     def below_peaks(self, design: Design) -> Design:
         """Return the design within the peaks, and with these phases also within a distortion."""
@@ -163,7 +196,9 @@ class Rules(NamedTuple):
         if self.distortion is None:
             return design
         use = (self.distortion.rms(design, phases=True) / self.distortion.level).max()
-        return dataclasses.replace(design, amplitude=design.amplitude / np.sqrt(max(use, 1.0)))
+        return dataclasses.replace(
+            design, amplitude=design.amplitude / np.sqrt(max(use, 1.0))
+        )
 
     def distorted(self, design: Design) -> dict[str, float]:
         """Return the rms of distortions in a design, by name."""
@@ -182,9 +217,13 @@ class Rules(NamedTuple):
         power = each.mean(axis=0)
         kept = np.flatnonzero(power)
         power, share = power[kept], each[:, kept] / power[kept]
-        limits = self.linear.only(kept)._replace(curved=self.distortion.divided(kept, share))
+        limits = self.linear.only(kept)._replace(
+            curved=self.distortion.divided(kept, share)
+        )
         factor = np.ones(len(self.cosines.line))
-        factor[kept] = np.sqrt(allocate(criterion.only(kept), limits, power).power / power)
+        factor[kept] = np.sqrt(
+            allocate(criterion.only(kept), limits, power).power / power
+        )
         amplitude = design.amplitude * factor[self.cosines.places(design)]
         return self.scaled(dataclasses.replace(design, amplitude=amplitude))
 
@@ -193,9 +232,13 @@ class Rules(NamedTuple):
         use: dict[str, float] = {}
         shares = self.linear.cost @ self.cosines.power_of(design)
         for name, share in zip(self.linear.names, shares, strict=True):
-            use[name] = max(use.get(name, 0.0), np.inf if name.startswith("peak of ") else share)
+            use[name] = max(
+                use.get(name, 0.0), np.inf if name.startswith("peak of ") else share
+            )
         if self.distortion is not None:
-            levels = zip(self.distorted(design).items(), self.distortion.level, strict=True)
+            levels = zip(
+                self.distorted(design).items(), self.distortion.level, strict=True
+            )
             use |= {name: rms / level for (name, rms), level in levels}
         return tuple(name for name, share in use.items() if share > 1 / (1 + ENOUGH))
 
@@ -255,7 +298,11 @@ def optimal_design(
     models = [model] if isinstance(model, Model) else list(model)
     if not models:
         raise DefinitionError("`model` must be one model or more, not an empty list.")
-    usual = multisine(models[0].n_sections, inputs=models[0].inputs) if design is None else design
+    usual = (
+        multisine(models[0].n_sections, inputs=models[0].inputs)
+        if design is None
+        else design
+    )
     _check_alike(models, usual)
     given, cosines = as_limits(limit), Candidates.of(usual)
     squares = [mean_squares(each, cosines) for each in models]

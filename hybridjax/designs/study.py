@@ -106,17 +106,25 @@ class Study(eqx.Module):
     def __check_init__(self):
         first, goal = self.first, self.goal
         if len(first.input_names) > 1:
-            raise DefinitionError("`first` must have a single input: study one at a time.")
+            raise DefinitionError(
+                "`first` must have a single input: study one at a time."
+            )
         if goal.estimator == "fit_ldtp":
-            raise DefinitionError("`goal` of a study needs estimator='fit_multipliers'.")
+            raise DefinitionError(
+                "`goal` of a study needs estimator='fit_multipliers'."
+            )
         require_index("multiplier", goal.which or 0, self.order)
         limits = as_limits(self.limit)
         if limits.strides is not None:
-            raise DefinitionError("a study ends at `standard_error`: leave strides out of `limit`.")
+            raise DefinitionError(
+                "a study ends at `standard_error`: leave strides out of `limit`."
+            )
         limits.require_inputs(first.input_names)
         named, signals = limits.rms, (*first.input_names, *self.outputs)
         if not isinstance(named, str):
-            require_among("signal", named, signals, "`limit` (`outputs` names those to come): ")
+            require_among(
+                "signal", named, signals, "`limit` (`outputs` names those to come): "
+            )
         if not is_traced(first):
             Candidates.of(first)
 
@@ -139,7 +147,9 @@ class Study(eqx.Module):
     @property
     def strides(self) -> Float[np.ndarray, " B"]:
         """Cycles of all records up to each block, with those that were discarded."""
-        return np.cumsum([block.strides for block in self._history.blocks]).astype(float)
+        return np.cumsum([block.strides for block in self._history.blocks]).astype(
+            float
+        )
 
     @property
     def standard_errors(self) -> Float[np.ndarray, "B g"]:
@@ -158,7 +168,9 @@ class Study(eqx.Module):
         """True if the requested precision is reached."""
         if self.fit is None or not np.isfinite(self.standard_errors[-1]).all():
             return False
-        return bool(self.standard_errors[-1].max() * _student(self.fit) <= self.standard_error)
+        return bool(
+            self.standard_errors[-1].max() * _student(self.fit) <= self.standard_error
+        )
 
     @property
     def design(self) -> Design:
@@ -184,51 +196,77 @@ class Study(eqx.Module):
         exceeds `standard_error` (tested if there are cycles before the window); as `estimate_htf`,
         `fit_multipliers` and `optimal_design`.
         """
-        require_equal("data and study", "n_sections", data.n_sections, self.first.n_sections)
+        require_equal(
+            "data and study", "n_sections", data.n_sections, self.first.n_sections
+        )
         require_equal("data and study", "numbers of inputs", len(data.inputs), 1)
         block = block_of(data, self.goal, repeats)
         for earlier in self._history.blocks[:1]:
-            require_same("blocks of one study", earlier.htf, block.htf, ("inputs", "outputs"))
+            require_same(
+                "blocks of one study", earlier.htf, block.htf, ("inputs", "outputs")
+            )
         blocks = (*self._history.blocks, block)
         best = estimate(blocks, self.order, self.goal)
         if are_alike(best.fit.correlation, best.fit.freedom):
             text = f"the data show more than {self.order} multipliers"
-            raise DefinitionError(f"{text}: add the blocks to a study with a larger `order`.")
+            raise DefinitionError(
+                f"{text}: add the blocks to a study with a larger `order`."
+            )
         errors = _standard_errors(best.fit, self.goal)
         if best.objection:
             errors = np.full_like(errors, np.nan)
         else:
             noise = best.noise[-1]
-            refuse_transient(data, repeats, best.fit.multipliers, noise, self.standard_error)
+            refuse_transient(
+                data, repeats, best.fit.multipliers, noise, self.standard_error
+            )
         errors_so_far = [*self.standard_errors, errors]
         width = max(map(len, errors_so_far))
         padded = [np.append(x, np.full(width - len(x), np.nan)) for x in errors_so_far]
         strides = sum(block.strides for block in blocks)
-        plan = None if best.objection else self._next(best, errors, strides, len(blocks))
+        plan = (
+            None if best.objection else self._next(best, errors, strides, len(blocks))
+        )
         history = History(blocks, np.array(padded), best, plan)
-        return eqx.tree_at(lambda s: s._history, self, history, is_leaf=lambda x: x is None)
+        return eqx.tree_at(
+            lambda s: s._history, self, history, is_leaf=lambda x: x is None
+        )
 
     def _next(
-        self, best: Estimate, errors: Float[np.ndarray, " g"], strides: float, blocks: int
+        self,
+        best: Estimate,
+        errors: Float[np.ndarray, " g"],
+        strides: float,
+        blocks: int,
     ) -> OptimalDesign:
         """Return the design for the missing strides."""
 
         def planned(limit: Limit) -> OptimalDesign:
             return optimal_design(
-                best.fit, self.first, goal=self.goal, limit=limit, noise=best.last_noise,
+                best.fit,
+                self.first,
+                goal=self.goal,
+                limit=limit,
+                noise=best.last_noise,
                 seed=self.seed + blocks,
-            )  # fmt: skip
+            )
 
         plan, periods = planned(self.limit), self.first.periods
         # Precisions of independent blocks add.
         now = (errors**2).sum()
         wanted = now * (self.standard_error / errors.max() / _student(best.fit)) ** 2
-        missing = plan.strides * (plan.standard_errors**2).sum() * (1 / wanted - 1 / now)
+        missing = (
+            plan.strides * (plan.standard_errors**2).sum() * (1 / wanted - 1 / now)
+        )
         count = int(np.ceil(min(missing * (1 + _SPARE), _GROWTH * strides) / periods))
-        count = min(max(count, self.first.experiments), len(Candidates.of(self.first).f))
+        count = min(
+            max(count, self.first.experiments), len(Candidates.of(self.first).f)
+        )
         if count == self.first.experiments:
             return plan
-        return planned(dataclasses.replace(as_limits(self.limit), strides=count * periods))
+        return planned(
+            dataclasses.replace(as_limits(self.limit), strides=count * periods)
+        )
 
     def __repr__(self) -> str:
         if self.fit is None:
@@ -257,13 +295,20 @@ class Study(eqx.Module):
         rows = []
         for n, errors in zip(self.strides, self.standard_errors, strict=True):
             numbers = ", ".join(f"{x:.2e}" for x in errors)
-            rows.append((f"{n:.0f}", numbers if np.isfinite(errors).all() else "estimate rejected"))
+            rows.append(
+                (
+                    f"{n:.0f}",
+                    numbers if np.isfinite(errors).all() else "estimate rejected",
+                )
+            )
         return rows
 
     def _outlook(self) -> str:
         best, plan = self._history.estimate, self.plan
         if plan is None or best is None:
-            return f"next: the first design again, since {best.objection if best else ''}"
+            return (
+                f"next: the first design again, since {best.objection if best else ''}"
+            )
         usual = (plan.usual_standard_errors**2).sum() * plan.usual.cycles(0)
         equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
         comparison = f"{plan.usual_name} would take about {equal:.3g} strides for the last errors"
@@ -276,11 +321,17 @@ class Study(eqx.Module):
 def _standard_errors(fit: StructuredFit, goal: Multipliers) -> Float[np.ndarray, " g"]:
     """Return standard errors of the multipliers of a goal, those of a conjugate pair once."""
     z = np.asarray(fit.multipliers)
-    wanted = np.flatnonzero(np.imag(z) >= 0) if goal.which is None else np.array([goal.which])
+    wanted = (
+        np.flatnonzero(np.imag(z) >= 0)
+        if goal.which is None
+        else np.array([goal.which])
+    )
     covariance = fit.multiplier_covariances[wanted]
     if goal.part == "position":
         return np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    direction = np.stack([np.real(z[wanted]), np.imag(z[wanted])], axis=1) / np.abs(z[wanted, None])
+    direction = np.stack([np.real(z[wanted]), np.imag(z[wanted])], axis=1) / np.abs(
+        z[wanted, None]
+    )
     return np.sqrt(np.einsum("gi,gij,gj->g", direction, covariance, direction))
 
 

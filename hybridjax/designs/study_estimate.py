@@ -11,9 +11,19 @@ from .._core.executor import from_host, to_host
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import require_deviations
-from ..identify.multipliers import StructuredFit, fit_multipliers, noise_ratios, unsupported
+from ..identify.multipliers import (
+    StructuredFit,
+    fit_multipliers,
+    noise_ratios,
+    unsupported,
+)
 from ..identify.spectral_sums import spectral_sums
-from ..identify.variable_projection import HTFGroup, grouped, maximum_likelihood, misfit_of
+from ..identify.variable_projection import (
+    HTFGroup,
+    grouped,
+    maximum_likelihood,
+    misfit_of,
+)
 from ..linear.htf import HTF
 from .allocation import ENOUGH
 from .goals import Multipliers
@@ -44,14 +54,25 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     each = []
     for s in np.flatnonzero(data.ok):
         u, y = data.u[s : s + 1], data.y[s : s + 1]
-        single = dataclasses.replace(data, u=u, y=y, result=data.result[s : s + 1], simulated=None)
+        single = dataclasses.replace(
+            data, u=u, y=y, result=data.result[s : s + 1], simulated=None
+        )
         each.append(spectral_sums(single, goal.fitted_harmonics, repeats=repeats))
-    N, P, f = data.n_sections, data.periods, np.concatenate([sums.line for sums in each])
+    N, P, f = (
+        data.n_sections,
+        data.periods,
+        np.concatenate([sums.line for sums in each]),
+    )
     power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])[:, None]
-    H = np.concatenate([sums.along[:, 0] for sums in each], axis=0).swapaxes(0, 1) / power
+    H = (
+        np.concatenate([sums.along[:, 0] for sums in each], axis=0).swapaxes(0, 1)
+        / power
+    )
     variance = np.broadcast_to((N * P / repeats / power)[..., None], (*H.shape, 1))
     names = data.inputs, data.outputs
-    htf = HTF(np.arange(len(f)), H[..., None], each[0].harmonics, N, *names, variance=variance)
+    htf = HTF(
+        np.arange(len(f)), H[..., None], each[0].harmonics, N, *names, variance=variance
+    )
     # Frequencies may occur several times, measured each time on their own.
     htf = eqx.tree_at(lambda htf: htf.f, htf, from_host(f / P))
     return Block(htf, data.u.shape[0] * data.u.shape[1] // N)
@@ -89,15 +110,23 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     where these are few; and from the levels of the noise, as if it were white.
     """
     htfs = to_host([block.htf for block in blocks])
-    f, H = np.concatenate([x.f for x in htfs]), np.concatenate([x.H for x in htfs], axis=1)
+    f, H = (
+        np.concatenate([x.f for x in htfs]),
+        np.concatenate([x.H for x in htfs], axis=1),
+    )
     member = np.repeat(np.arange(len(blocks)), [len(htf.f) for htf in htfs])
     # To begin with, all of it may be noise.
-    square = [np.mean(np.abs(htf.H) ** 2 / htf.variance, axis=(0, 1, 3)) for htf in htfs]
+    square = [
+        np.mean(np.abs(htf.H) ** 2 / htf.variance, axis=(0, 1, 3)) for htf in htfs
+    ]
     noise, c = np.sqrt(square), None
 
     def weighted() -> tuple[HTF, list[HTFGroup]]:
         """Return all lines of all blocks, one after the other, with their variances."""
-        each = [htf.variance * std[:, None] ** 2 for htf, std in zip(htfs, noise, strict=True)]
+        each = [
+            htf.variance * std[:, None] ** 2
+            for htf, std in zip(htfs, noise, strict=True)
+        ]
         values = f, H, np.concatenate(each, axis=1)
         htf = from_host(eqx.tree_at(lambda x: (x.f, x.H, x.variance), htfs[0], values))
         return htf, grouped(htf, order, goal.overhang)
@@ -110,7 +139,9 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
         for group in groups:
             misfit, block = misfit_of(group, c), member[group.line]
             for k, output in enumerate(group.channel[:, 0]):
-                np.add.at(left[:, output], block, (misfit.residual[:, :, k] ** 2).sum(axis=0))
+                np.add.at(
+                    left[:, output], block, (misfit.residual[:, :, k] ** 2).sum(axis=0)
+                )
                 np.add.at(freedom[:, output], block, (1 - misfit.leverage).sum(axis=0))
         change = np.sqrt(left / freedom)
         noise = noise * change
@@ -118,14 +149,18 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
             break
     htf, groups = weighted()
     by_scatter = fit_multipliers(htf, order, overhang=goal.overhang, check=False)
-    by_level = fit_multipliers(htf, order, overhang=goal.overhang, check=False, errors="variance")
+    by_level = fit_multipliers(
+        htf, order, overhang=goal.overhang, check=False, errors="variance"
+    )
     fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
     objection = ""
     if unsupported(lambda _: noise_ratios(groups, htf, fit.coefficients), order):
         # (The sentence advises on a single fit.)
         objection = f"the data do not support {order} multipliers (lower `order` in a new study)"
     if not objection and (np.abs(fit.multipliers) >= 1).any():
-        objection = "the estimate is unstable, and an unstable system has no periodic response"
+        objection = (
+            "the estimate is unstable, and an unstable system has no periodic response"
+        )
     return Estimate(fit, by_level, noise, objection)
 
 
@@ -155,8 +190,12 @@ def refuse_transient(
     excess = np.mean((early - late) ** 2, axis=(0, 1)) - 2 * noise**2
     threshold = _BEYOND_NOISE * 2 * noise**2 * np.sqrt(2 / early[..., 0].size)
     size = np.sqrt(np.maximum(excess, 0) / np.mean(y**2, axis=(0, 1)))
-    left = np.where(excess > threshold, size, 0).max() * np.abs(multipliers).max() ** (before - k)
+    left = np.where(excess > threshold, size, 0).max() * np.abs(multipliers).max() ** (
+        before - k
+    )
     if left > allowed:
         text = f"{left:.1g} of the start's transient is left (allowed: {allowed:.1g})"
         remedy = "use `hj.identify.remove_transient(data).data`, or start='steady'"
-        raise DefinitionError(f"after {before} discarded cycles a part of {text}: {remedy}.")
+        raise DefinitionError(
+            f"after {before} discarded cycles a part of {text}: {remedy}."
+        )

@@ -35,7 +35,9 @@ Values = Float[Array, "*shape"]
 Flags = Bool[Array, "*shape"]
 
 
-def first_crossing(v0: Values, v1: Values, d0: Values, d1: Values, armed: Flags) -> CubicCrossing:
+def first_crossing(
+    v0: Values, v1: Values, d0: Values, d1: Values, armed: Flags
+) -> CubicCrossing:
     """First falling zero of the cubic with values v0, v1 and slopes d0, d1 (per step).
 
     A guard that is not armed at the start counts only after it has become positive.

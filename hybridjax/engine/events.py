@@ -36,7 +36,9 @@ _ZENO_STREAK, _ZENO_REST = 10, 1e-3
 _ZENO_SLOW = 3
 
 
-def width(t: Float[Array, " #L"], span: Times, rate: Float[Array, "W L"]) -> Float[Array, "W L"]:
+def width(
+    t: Float[Array, " #L"], span: Times, rate: Float[Array, "W L"]
+) -> Float[Array, "W L"]:
     """Values of watched functions that count as zero: their change in a time of rounding errors."""
     xp = namespace(rate)
     return (INSTANT * span + ROUNDING * xp.abs(t)) * xp.abs(rate)
@@ -55,7 +57,9 @@ def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
 
 def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
     """Test whether rows of a `Watch` belong to the chart of each lane (the target's row does)."""
-    source = np.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
+    source = np.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[
+        :, None
+    ]
     return (source == chart) | (source == -1)
 
 
@@ -95,7 +99,9 @@ def _noise(s: Structure, lanes: Lanes, u: Inputs, mask: Mask) -> Float[Array, "G
 
         t, q = only(here, lanes.t), only(here, lanes.q[: s.dims[a]])
         first = xp.asarray(np.zeros(1, np.int32))
-        slopes = kernels.watched(s, a, None, t, q, only(here, u), first)[:, 1 : 2 + len(q)]
+        slopes = kernels.watched(s, a, None, t, q, only(here, u), first)[
+            :, 1 : 2 + len(q)
+        ]
         by_size = xp.sum(xp.abs(slopes * xp.concatenate([t[None], q])), axis=1)
         return put_rows(out, rows, here, ROUNDING * by_size)
 
@@ -151,7 +157,9 @@ def _within(kind: Kind, g: Index) -> tuple[Mask, Int[Array, " #L"]]:
     return place >= 0, xp.maximum(place, 0)
 
 
-def next_schedule(s: Structure, t: Times, chart: Index, end: Times) -> tuple[Times, Index]:
+def next_schedule(
+    s: Structure, t: Times, chart: Index, end: Times
+) -> tuple[Times, Index]:
     """Time of the next scheduled event after t (infinity if there is none), and its transition.
 
     Times that differ by rounding are one: an event that was due at t is past, and one that is due
@@ -191,10 +199,14 @@ def keep_pace(
     xp, (since, gap, streak, total) = namespace(pace), pace
     since = since + moved
     ratio = since / xp.where(gap > 0, gap, 1.0)
-    shrinks = (since < gap) | (since == 0)  # (not the first interval after events at one time)
+    shrinks = (since < gap) | (
+        since == 0
+    )  # (not the first interval after events at one time)
     streak = xp.where(event, xp.where(shrinks, streak + 1, 0.0), streak)
     total = xp.where(event, xp.where(shrinks, total + since, 0.0), total)
-    to_come = xp.where(shrinks, since * ratio / xp.where(shrinks, 1 - ratio, 1.0), xp.inf)
+    to_come = xp.where(
+        shrinks, since * ratio / xp.where(shrinks, 1 - ratio, 1.0), xp.inf
+    )
     zeno = (streak >= _ZENO_STREAK) & (to_come <= _ZENO_REST * total)
     zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
     gap, since = xp.where(event, since, gap), xp.where(event, 0.0, since)

@@ -42,29 +42,52 @@ WIDE = 256
 
 
 def field(
-    s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = None, lanes: int = POINTS
+    s: Structure,
+    a: int,
+    t: Times,
+    q: States,
+    u: Inputs,
+    some: Some = None,
+    lanes: int = POINTS,
 ) -> Expanded:
     """The field of chart a, and its derivatives (on the host)."""
     return s.kernel(_field, _expanded, a, lanes=lanes)(t, q, u, some=some)
 
 
-def step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: Some = None) -> Step:
+def step(
+    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: Some = None
+) -> Step:
     """A step in chart a, without derivatives."""
-    return Step(*s.kernel(_field, _ByMethod(_step, s.method(a)), a)(t, q, u, h, some=some))
+    return Step(
+        *s.kernel(_field, _ByMethod(_step, s.method(a)), a)(t, q, u, h, some=some)
+    )
 
 
 def step_along(
-    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, along: States, some: Some
+    s: Structure,
+    a: int,
+    t: Times,
+    q: States,
+    u: Inputs,
+    h: Times,
+    along: States,
+    some: Some,
 ) -> tuple[Step, States, States]:
     """A step in chart a, and the derivatives of its end and of its estimate along a direction."""
-    rows = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)(t, q, u, h, along, some=some)
+    rows = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)(
+        t, q, u, h, along, some=some
+    )
     return Step(*rows[:5]), rows[5], rows[6]
 
 
-def linear_step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Expanded:
+def linear_step(
+    s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times
+) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
     states, inputs and length of the step."""
-    return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=POINTS)(t, q, u, h)
+    return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=POINTS)(
+        t, q, u, h
+    )
 
 
 def watched(
@@ -81,14 +104,18 @@ def watched(
     """The guards of chart a, and the level if it has one, with their derivatives."""
     static = a, s.guard_kinds(a)
     if not on_host(q):
-        return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(t, q, u, index)
+        return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(
+            t, q, u, index
+        )
     # (A program for many points is worth its compilation from so many calls on.)
     lanes = lanes or (1 if q.shape[-1] < 4 * POINTS else POINTS)
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
 
-def reset(s: Structure, g: Member, t: Times, q: States, u: Inputs, some: Some = None) -> Expanded:
+def reset(
+    s: Structure, g: Member, t: Times, q: States, u: Inputs, some: Some = None
+) -> Expanded:
     """The state after transitions of one kind, and (on the host) its derivatives."""
     if on_host(q):
         return s.kernel(_reset, _expanded, g.kind)(t, q, u, g.place, some=some)
@@ -113,20 +140,32 @@ def by_parameter_of_period(s: Structure) -> Any:
     """The derivative of the period of a clock by the only input, which is added to a parameter."""
     if is_traced(s):
         return jax.jacfwd(lambda u: _period(s, 0.0, 0.0, u))(jnp.zeros(1))[0, 0]
-    return s.kernel(_period, _expanded)(*(np.zeros(x) for x in [1, (0, 1), (1, 1)]))[0, -1, 0]
+    return s.kernel(_period, _expanded)(*(np.zeros(x) for x in [1, (0, 1), (1, 1)]))[
+        0, -1, 0
+    ]
 
 
-def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) -> Expanded:
+def outputs(
+    s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs
+) -> Expanded:
     """Outputs in chart a, and their derivatives."""
     return linear(s, _outputs, a, t, q, u, items)
 
 
 def linear(
-    s: Structure, function: Callable, a: int, t: Times, q: States, u: Inputs, *trees: Any
+    s: Structure,
+    function: Callable,
+    a: int,
+    t: Times,
+    q: States,
+    u: Inputs,
+    *trees: Any,
 ) -> Expanded:
     """A vector function (chart, structure, *trees, t, q, u) of chart a, and its derivatives."""
     if not on_host(q):
-        return s.by_lane(_columns(ft.partial(function, a), 1 + len(trees)), *trees)(t, q, u)
+        return s.by_lane(_columns(ft.partial(function, a), 1 + len(trees)), *trees)(
+            t, q, u
+        )
     lanes = POINTS if q.shape[-1] < 16 * POINTS else 4 * POINTS
     return s.kernel(function, _expanded, a, trees=trees, lanes=lanes)(t, q, u)
 
@@ -135,7 +174,9 @@ def levels(
     s: Structure, a: int, levels: AbstractLevels, n_sections: int, t: Times, q: States
 ) -> Float[Array, "N 2 L"]:
     """The levels of all sections in chart a, and their rates along the flow."""
-    return s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=POINTS)(t, q)
+    return s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=POINTS)(
+        t, q
+    )
 
 
 # Functions of a point, by what is static, the structure, and other trees. (They belong to the
@@ -147,7 +188,14 @@ def _field(a: int, s: Structure, t, q, u, *_):
 
 
 def watched_at(
-    a: int, kinds: tuple[Kind, ...], s: Structure, levels: AbstractLevels | None, t, q, u, i
+    a: int,
+    kinds: tuple[Kind, ...],
+    s: Structure,
+    levels: AbstractLevels | None,
+    t,
+    q,
+    u,
+    i,
 ):
     """The guards of chart a, of these kinds, and the level of section i if the chart has one."""
     guards = s.guard_values(kinds, t, q, u)
@@ -170,7 +218,9 @@ def _period(s: Structure, t, q, u):
 
 def _outputs(a: int, s: Structure, items: Items, t, q, u):
     under = s.under(u)
-    return under.resolve_outputs(items)(a, t, q, u if under is s else jnp.zeros(under.nu))
+    return under.resolve_outputs(items)(
+        a, t, q, u if under is s else jnp.zeros(under.nu)
+    )
 
 
 def _due(g: int, s: Structure, t, q, u):
@@ -183,7 +233,9 @@ def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q)
     f = s.field(a, t, q, jnp.zeros(s.nu))
 
     def along(i):
-        return jax.jvp(lambda t, q: levels.level(s, a, i, t, q), (t, q), (jnp.ones_like(t), f))
+        return jax.jvp(
+            lambda t, q: levels.level(s, a, i, t, q), (t, q), (jnp.ones_like(t), f)
+        )
 
     return jnp.stack(jax.vmap(along)(jnp.arange(n_sections, dtype=np.int32)), axis=1)
 
@@ -219,7 +271,9 @@ class Tangents(Structure):
     for what does not move.
     """
 
-    def __init__(self, s: Structure, along: Structure, levels, by_levels, directions: int):
+    def __init__(
+        self, s: Structure, along: Structure, levels, by_levels, directions: int
+    ):
         super().__init__(s.source)
         self.directions, self._levels, self._plain = directions, levels, s
         self._along, self.nu = from_host((along, by_levels)), s.nu
@@ -238,7 +292,9 @@ class Tangents(Structure):
             still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
             along = [self._along[1] if x is self._levels else still(x) for x in trees]
             every, along = (self._plain, *trees), (self._along[0], *along)
-            return kernel(function, _Tangent(form, moving), static, (every, along), WIDE)
+            return kernel(
+                function, _Tangent(form, moving), static, (every, along), WIDE
+            )
 
         of_lanes = self.once((function, form, static), trees, make)
 
@@ -259,7 +315,9 @@ class Systems(Structure):
     def __init__(self, source: PerLane):
         super().__init__(source)
         first = lambda x: np.asarray(x)[..., 0] if eqx.is_array(x) else x  # noqa: E731
-        arrays = map(np.asarray, jax.tree_util.tree_leaves(eqx.filter(source.tree, eqx.is_array)))
+        arrays = map(
+            np.asarray, jax.tree_util.tree_leaves(eqx.filter(source.tree, eqx.is_array))
+        )
         self._numbers = np.concatenate([x.reshape(-1, x.shape[-1]) for x in arrays])
         self._single = Structure(from_host(jax.tree_util.tree_map(first, source.tree)))
 
@@ -271,7 +329,9 @@ class Systems(Structure):
     def kernel(self, function, form, *static, trees=(), lanes=1):
         every = self._single, *trees
         make = lambda: kernel(function, _BySystem(form), static, every, WIDE)  # noqa: E731
-        return ft.partial(self.once((function, form, static), trees, make), self._numbers)
+        return ft.partial(
+            self.once((function, form, static), trees, make), self._numbers
+        )
 
 
 class _BySystem(NamedTuple):
@@ -287,8 +347,12 @@ class _BySystem(NamedTuple):
         def lanes(numbers, *point):
             parts = zip(leaves, jnp.split(numbers, ends), strict=True)
             arrays = [y.reshape(*x.shape, -1).astype(x.dtype) for x, y in parts]
-            systems = eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static)
-            return self.form(function, PerLane(systems, (True,) * len(arrays)), *trees)(*point)
+            systems = eqx.combine(
+                jax.tree_util.tree_unflatten(structure, arrays), static
+            )
+            return self.form(function, PerLane(systems, (True,) * len(arrays)), *trees)(
+                *point
+            )
 
         return lanes
 
@@ -308,7 +372,9 @@ def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
 def parted(tree: Any) -> tuple[Any, Any]:
     """Complex arrays (N, P, ...) as values (N, ...) and derivatives (P, N, ...)."""
     by = lambda x: np.swapaxes(x.imag, 0, 1) / TINY  # noqa: E731
-    return jax.tree_util.tree_map(lambda x: x.real[:, 0], tree), jax.tree_util.tree_map(by, tree)
+    return jax.tree_util.tree_map(lambda x: x.real[:, 0], tree), jax.tree_util.tree_map(
+        by, tree
+    )
 
 
 class _Tangent(NamedTuple):
@@ -347,7 +413,9 @@ class _ByMethod(NamedTuple):
 
     def __call__(self, function: Callable, *trees: Any) -> Callable:
         field = by_lane(function, *trees, quick=True)
-        return lambda t, q, u, h, *others: self.compute(self.method, field, t, q, u, h, *others)
+        return lambda t, q, u, h, *others: self.compute(
+            self.method, field, t, q, u, h, *others
+        )
 
 
 def _step(method: Method, field: Callable, t, q, u, h, *x):
@@ -357,7 +425,9 @@ def _step(method: Method, field: Callable, t, q, u, h, *x):
 
 
 def _step_along(method: Method, field: Callable, t, q, u, h, along):
-    step, *tangent = _along(method, lambda t, q: field(t, q, u, h, along), t, q, h, along)
+    step, *tangent = _along(
+        method, lambda t, q: field(t, q, u, h, along), t, q, h, along
+    )
     return jnp.stack([*step, *tangent])
 
 
@@ -368,7 +438,9 @@ def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
     def end(t, q, u, h):
         fixed = jax.lax.stop_gradient((u, h))
         still = lambda t, q: field(t, q, *fixed, *x)  # noqa: E731
-        step = take_step(method, lambda t, q: field(t, q, u, h, *x), t, q, h, still=still)
+        step = take_step(
+            method, lambda t, q: field(t, q, u, h, *x), t, q, h, still=still
+        )
         return step.q, step.f1
 
     n, L = q.shape
@@ -377,7 +449,9 @@ def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
 
     def push(direction):
         parts = zip(jnp.split(direction, split), shapes, strict=True)
-        tangents = [jnp.broadcast_to(x.reshape(*shape, 1), (*shape, L)) for x, shape in parts]
+        tangents = [
+            jnp.broadcast_to(x.reshape(*shape, 1), (*shape, L)) for x, shape in parts
+        ]
         (value, f), (tangent, _) = jax.jvp(end, (t, q, u, h), tuple(tangents))
         return value, f, tangent
 

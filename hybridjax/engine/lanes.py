@@ -100,7 +100,11 @@ def needed(mask: Mask, tree):
     present = mask.any()
 
     def cut(x):
-        return jnp.where(present, x, jax.lax.stop_gradient(x)) if eqx.is_inexact_array(x) else x
+        return (
+            jnp.where(present, x, jax.lax.stop_gradient(x))
+            if eqx.is_inexact_array(x)
+            else x
+        )
 
     return jax.tree_util.tree_map(cut, tree)
 

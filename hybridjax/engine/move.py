@@ -80,11 +80,20 @@ def through(
 
     **Returns:** the same at the end; by target (rows) the lanes before, their ends, and the tape.
     """
-    ends, levels = (targets.time, targets.index, targets.event, targets.limit), targets.levels
+    ends, levels = (
+        (targets.time, targets.index, targets.event, targets.limit),
+        targets.levels,
+    )
     by = targets.missed, targets.event_sequence
     if not options.at_once:
-        return _pieces((move, options, *by), s, levels, settings, ends, begin, u, patience)
-    static = search, options._replace(tangents=bool(options.tangents), at_once=False), *by
+        return _pieces(
+            (move, options, *by), s, levels, settings, ends, begin, u, patience
+        )
+    static = (
+        search,
+        options._replace(tangents=bool(options.tangents), at_once=False),
+        *by,
+    )
     make = lambda: whole(_pieces, (static,), (s, levels, settings))  # noqa: E731
     arguments = ends, begin, u, np.float64(patience)
     return s.once(("through", static), (levels, settings), make)(*arguments)
@@ -106,7 +115,9 @@ def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
 
 
 @eqx.filter_jit
-def _search(s, lanes, u, target, setout, result, settings, options: Options) -> Recorded:
+def _search(
+    s, lanes, u, target, setout, result, settings, options: Options
+) -> Recorded:
     def run(s, target, common, by_lane):
         (settings, options), (lanes, u, setout, result) = common, by_lane
         return search(s, lanes, u, target, shared(settings), setout, result, options)
@@ -114,7 +125,9 @@ def _search(s, lanes, u, target, setout, result, settings, options: Options) -> 
     return _over_lanes(run, s, target, (settings, options), (lanes, u, setout, result))
 
 
-def _over_lanes(run: Callable, s: Structure, target: Target, common: tuple, by_lane: tuple) -> Any:
+def _over_lanes(
+    run: Callable, s: Structure, target: Target, common: tuple, by_lane: tuple
+) -> Any:
     """`run(s, target, common, by_lane)`, with the axes that `jax.vmap` maps as more lanes."""
 
     def whole(common, by_lane):
@@ -159,8 +172,13 @@ def _follow_jvp(primals, tangents):
         return replay(s, begin, u, end, recorded.tape, unroll)
 
     t_s, t_lanes, t_u, t_target, *_ = tangents
-    by_lane = (lanes.t, lanes.q, u, target.time), (t_lanes.t, t_lanes.q, t_u, t_target.time)
-    (t, q), (t_t, t_q) = lane_jvp(repeat, by_lane, ((s, levels), (t_s, t_target.levels)))
+    by_lane = (
+        (lanes.t, lanes.q, u, target.time),
+        (t_lanes.t, t_lanes.q, t_u, t_target.time),
+    )
+    (t, q), (t_t, t_q) = lane_jvp(
+        repeat, by_lane, ((s, levels), (t_s, t_target.levels))
+    )
     ends = lambda x: (x.moved.lanes.t, x.moved.lanes.q)  # noqa: E731
     out = eqx.tree_at(ends, recorded, (t, q))
     none = jax.tree_util.tree_map(lambda _: None, out)
@@ -189,13 +207,22 @@ def flow_jacobian(
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
     still, start, goal = fixed((s, lanes, target))
-    u, options = jnp.zeros((s.nu, 1)), Options(tape=True, new_input=False, tangents=wanted)
+    u, options = (
+        jnp.zeros((s.nu, 1)),
+        Options(tape=True, new_input=False, tangents=wanted),
+    )
     moved, tape = move(still, start, u, goal, settings, h, result, options)
     assert tape is not None
     jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True, wanted=wanted)
     if wanted is not True:
-        end = jnp.where(wanted, end, jnp.concatenate([moved.lanes.t[None], moved.lanes.q]))
-    return jacobian, moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:])), tape
+        end = jnp.where(
+            wanted, end, jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
+        )
+    return (
+        jacobian,
+        moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:])),
+        tape,
+    )
 
 
 def tape_jacobian(

@@ -27,7 +27,17 @@ from ..systems.varied import Varied
 from . import kernels
 from .arrays import Array, Index, Inputs, Mask, Padded, Times
 from .events import apply_resets, scheduled_time
-from .lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Lanes, Tape, fixed, for_each_chart, needed, only
+from .lanes import (
+    ARRIVE_LEVEL,
+    ARRIVE_TIME,
+    IDLE,
+    Lanes,
+    Tape,
+    fixed,
+    for_each_chart,
+    needed,
+    only,
+)
 from .runge_kutta import Step, take_step
 from .target import Target
 from .watch import ChartFlow, slopes
@@ -39,11 +49,18 @@ _BLOCK = 16
 
 
 def replay(
-    s: Structure, lanes: Lanes, u: Inputs, target: Target, tape: Tape, unroll: bool = False
+    s: Structure,
+    lanes: Lanes,
+    u: Inputs,
+    target: Target,
+    tape: Tape,
+    unroll: bool = False,
 ) -> tuple[Times, Padded]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
     h, code = tape.h, tape.code
-    scheduled = jnp.array([isinstance(tr.guard, Scheduled) for tr in s.transitions] + [False])
+    scheduled = jnp.array(
+        [isinstance(tr.guard, Scheduled) for tr in s.transitions] + [False]
+    )
 
     def row(carry, row):
         h, code = row
@@ -52,7 +69,9 @@ def replay(
             t, q, chart = carry
             by_clock = (code >= 0) & scheduled[code]
             due = scheduled_time(s, code, t + h)
-            h1 = jnp.where(code == ARRIVE_TIME, target.time - t, jnp.where(by_clock, due - t, h))
+            h1 = jnp.where(
+                code == ARRIVE_TIME, target.time - t, jnp.where(by_clock, due - t, h)
+            )
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
@@ -60,12 +79,16 @@ def replay(
             q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
             return t, q, chart
 
-        return jax.lax.cond((code != IDLE).any(), move, lambda carry: carry, carry), None
+        return jax.lax.cond(
+            (code != IDLE).any(), move, lambda carry: carry, carry
+        ), None
 
     @ft.partial(jax.checkpoint, prevent_cse=False)
     def block(carry, rows):
         follow = lambda carry: jax.lax.scan(row, carry, rows)[0]  # noqa: E731
-        return jax.lax.cond((rows[1] != IDLE).any(), follow, lambda carry: carry, carry), None
+        return jax.lax.cond(
+            (rows[1] != IDLE).any(), follow, lambda carry: carry, carry
+        ), None
 
     # Most tapes are empty but for their beginning: empty blocks of rows are skipped, and reverse
     # mode keeps no more of a block than where it starts.
@@ -115,7 +138,9 @@ def _advance(
 
         if flow.rows:
             t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
-        return jnp.where(here, t1, t_out), q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
+        return jnp.where(here, t1, t_out), q_out.at[:n].set(
+            jnp.where(here, q1, q_out[:n])
+        )
 
     return for_each_chart(s, chart, moving, work, (t, q))
 
@@ -153,7 +178,10 @@ def chain(
     if across is not None:
         f = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
         by[:, :, 1:n] = by[:, :, 1:n] @ projections(f, np.asarray(across)[moves.chart])
-    columns, ends = _products(moves, by, len(lanes.t)), np.concatenate([lanes.t[None], lanes.q])
+    columns, ends = (
+        _products(moves, by, len(lanes.t)),
+        np.concatenate([lanes.t[None], lanes.q]),
+    )
     ends[:, moves.lane] = end.T  # (the last move of a lane comes last)
     return columns[:, :, 1:n] if of_states else columns, ends
 
@@ -175,7 +203,15 @@ class Variation:
     derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets. If not
     `twice`, their Jacobians have no derivatives."""
 
-    def __init__(self, s: kernels.Tangents, lanes: Lanes, target: Target, tape: Tape, times, twice):
+    def __init__(
+        self,
+        s: kernels.Tangents,
+        lanes: Lanes,
+        target: Target,
+        tape: Tape,
+        times,
+        twice,
+    ):
         moves, n, P = recorded_moves(lanes, tape), 1 + s.d, s.directions
         self._s, self._moves, self.first = s, moves, np.flatnonzero(moves.order == 0)
         if len(self.first) < len(lanes.t):
@@ -199,35 +235,49 @@ class Variation:
         along = Moves(*(x[..., np.tile(needed, len(moves.t))] for x in along))
         later = np.concatenate([np.zeros((n, len(lanes.t))), times]).T.ravel()
         target = dataclasses.replace(
-            target, time=many(target.time) + 1j * kernels.TINY * later,
+            target,
+            time=many(target.time) + 1j * kernels.TINY * later,
             index=many(np.broadcast_to(target.index, target.time.shape)),
-        )  # fmt: skip
+        )
         end, by = linear_moves(s, along, target)
-        by, end = by.reshape(len(moves.t), -1, *by.shape[1:]), end.reshape(len(moves.t), -1, n)
+        by, end = (
+            by.reshape(len(moves.t), -1, *by.shape[1:]),
+            end.reshape(len(moves.t), -1, n),
+        )
         self._by, self._change = np.real(by[:, 0]), np.imag(by) / kernels.TINY
         kick = np.imag(end[:, -len(self._unit) :]) / kernels.TINY
         self._kick = np.moveaxis(kick, 1, 2) @ self._unit
 
-    def tangents(self, begin: Float[np.ndarray, "n P"]) -> Float[np.ndarray, "moves n P"]:
+    def tangents(
+        self, begin: Float[np.ndarray, "n P"]
+    ) -> Float[np.ndarray, "moves n P"]:
         """Tangents of (t, q) where moves start, and at the last end."""
         starts = [begin]
         for by, kick in zip(self._by[:, :, : len(begin)], self._kick, strict=True):
             starts.append(by @ starts[-1] + kick)
         return np.stack(starts)
 
-    def jacobians(self, tangents: Float[np.ndarray, "moves n P"], sizes: Any = None) -> Any:
+    def jacobians(
+        self, tangents: Float[np.ndarray, "moves n P"], sizes: Any = None
+    ) -> Any:
         """Derivatives (L, P, n, m) of (t, q) at the ends of lanes by (t, q, u) at their starts, and
         their own in each direction, as complex numbers. `sizes`: as `across` of `chain`."""
         moves, (M, n, m), P = self._moves, self._by.shape, tangents.shape[2]
         along = np.concatenate([tangents[:-1], np.tile(self._unit, (M, 1, 1))], axis=1)
-        change = np.moveaxis(along, 1, 2) @ self._change.reshape(*along.shape[:2], n * m)
+        change = np.moveaxis(along, 1, 2) @ self._change.reshape(
+            *along.shape[:2], n * m
+        )
         by = self._by[:, None] + 1j * kernels.TINY * change.reshape(M, P, n, m)
         if sizes is not None:
-            f = slopes(self._s, *self.points(tangents, np.arange(M))).T.reshape(M, P, n - 1)
+            f = slopes(self._s, *self.points(tangents, np.arange(M))).T.reshape(
+                M, P, n - 1
+            )
             by[..., 1:n] = by[..., 1:n] @ projections(f, sizes[moves.chart][:, None])
         lane, order = (np.repeat(x, P) for x in (moves.lane, moves.order))
         moves = moves._replace(lane=lane * P + np.arange(M * P) % P, order=order)
-        return _products(moves, by.reshape(-1, n, m), len(self.first) * P).reshape(-1, P, n, m)
+        return _products(moves, by.reshape(-1, n, m), len(self.first) * P).reshape(
+            -1, P, n, m
+        )
 
     def points(self, tangents: Float[np.ndarray, "moves n P"], move: Any) -> tuple:
         """Times, charts, states and inputs where some moves start, in each direction."""
@@ -237,18 +287,24 @@ class Variation:
         return t + aside[0], chart, q + aside[1:], self._s.pushed(np.arange(len(t)) % P)
 
 
-def linear_moves(s: Structure, moves: Moves, target: Target) -> tuple[np.ndarray, np.ndarray]:
+def linear_moves(
+    s: Structure, moves: Moves, target: Target
+) -> tuple[np.ndarray, np.ndarray]:
     """(t, q) after some moves (M, n), and its derivatives by (t, q, u) before them (M, n, m)."""
     n, M = 1 + s.d, len(moves.t)
     end, by = (np.zeros((M, *x), target.time.dtype) for x in ((n,), (n, n + s.nu)))
     for a in np.unique(moves.chart):
         in_chart = np.flatnonzero(moves.chart == a)
         of_chart = Moves(*(x[..., in_chart] for x in moves))
-        end[in_chart], by[in_chart] = _linear(s.at(of_chart.lane), int(a), of_chart, target)
+        end[in_chart], by[in_chart] = _linear(
+            s.at(of_chart.lane), int(a), of_chart, target
+        )
     return end, by
 
 
-def projections(f: Float[Array, "*K d"], sizes: Float[Array, "*K d"]) -> Float[Array, "*K d d"]:
+def projections(
+    f: Float[Array, "*K d"], sizes: Float[Array, "*K d"]
+) -> Float[Array, "*K d d"]:
     """Projections of states along the flow f, orthogonal in sizes."""
     xp, f = namespace(f), f / sizes
     f = f / xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
@@ -267,11 +323,16 @@ def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
         np.where(first, lanes.t[lane], tape.t[last, lane]),
         np.where(first, lanes.chart[lane], tape.chart[last, lane]),
         np.where(first, lanes.q[:, lane], tape.after[last, :, lane].T),
-        np.asarray(tape.h)[row, lane], np.asarray(tape.code)[row, lane], lane, order,
-    )  # fmt: skip
+        np.asarray(tape.h)[row, lane],
+        np.asarray(tape.code)[row, lane],
+        lane,
+        order,
+    )
 
 
-def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndarray, np.ndarray]:
+def _linear(
+    s: Structure, a: int, moves: Moves, target: Target
+) -> tuple[np.ndarray, np.ndarray]:
     """Moves that start in chart a."""
     n, M, code = s.dims[a], len(moves.t), moves.code
     u = kernels.unpushed(s, moves.lane)
@@ -279,19 +340,27 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndar
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
     goal = target.time[moves.lane]
     h = np.where(on_time, goal - moves.t, moves.h)
-    expanded = np.array(np.moveaxis(_linear_step(s, a, moves.t, moves.q[:n], u, h), -1, 0))
+    expanded = np.array(
+        np.moveaxis(_linear_step(s, a, moves.t, moves.q[:n], u, h), -1, 0)
+    )
     q, dq, f = expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     t = np.where(on_time, goal, moves.t + h)
     # By (t, q, u). A step to a known time shrinks with t, and lasts until a schedule has come.
     dt = np.zeros((M, 1, dq.shape[2] - 1), dq.dtype)
     dt[:, 0, 0] = -1.0 * (by_clock | on_time)
-    for g in map(int, np.intersect1d(code, s.schedules(a) if isinstance(s, Varied) else [])):
+    for g in map(
+        int, np.intersect1d(code, s.schedules(a) if isinstance(s, Varied) else [])
+    ):
         now = np.flatnonzero(code == g)
-        dt[now, 0, 1 + n :] = kernels.due(s, g, t[now], q[:, now], u[:, now])[0, 2 + n :].T
+        dt[now, 0, 1 + n :] = kernels.due(s, g, t[now], q[:, now], u[:, now])[
+            0, 2 + n :
+        ].T
     dq = dq[:, :, :-1] + dq[:, :, -1:] * dt
     dt[:, 0, 0] += 1.0
 
-    which = np.where(code == ARRIVE_LEVEL, len(s.transitions), np.where(by_clock, -1, code))
+    which = np.where(
+        code == ARRIVE_LEVEL, len(s.transitions), np.where(by_clock, -1, code)
+    )
     lands = np.flatnonzero(which >= 0)
     if len(lands):
         point, landing = (t[lands], q[:, lands], f[:, lands]), s.at(lands)
@@ -315,7 +384,10 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndar
         dt[lands] += delay
         dq[lands] = moved + f @ delay
 
-    end, by = np.zeros((M, 1 + s.d), dq.dtype), np.zeros((M, 1 + s.d, 1 + s.d + s.nu), dq.dtype)
+    end, by = (
+        np.zeros((M, 1 + s.d), dq.dtype),
+        np.zeros((M, 1 + s.d, 1 + s.d + s.nu), dq.dtype),
+    )
     columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
     for kind in [(-1,), *s.kinds]:
         now = np.flatnonzero(np.isin(np.maximum(code, -1), kind))
@@ -323,8 +395,12 @@ def _linear(s: Structure, a: int, moves: Moves, target: Target) -> tuple[np.ndar
         if len(now) == 0:
             continue
         if kind != (-1,):
-            place = np.argmax(np.array(kind)[:, None] == code[now], axis=0).astype(np.int32)
-            by_reset = kernels.reset(s.at(now), Member(kind, place), t[now], new, u[:, now])
+            place = np.argmax(np.array(kind)[:, None] == code[now], axis=0).astype(
+                np.int32
+            )
+            by_reset = kernels.reset(
+                s.at(now), Member(kind, place), t[now], new, u[:, now]
+            )
             new = by_reset[:, 0]
             by_t, by_q, by_u = _split(np.moveaxis(by_reset, -1, 0), n)
             dnew = by_t @ dt[now] + by_q @ dnew

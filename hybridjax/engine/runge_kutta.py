@@ -60,7 +60,9 @@ def take_step(
     unroll = unroll or q.shape[1] >= _UNROLLED_LANES
     K: Any = (_unrolled_stages if unroll else _looped_stages)(method, field, t, q, h)
     weights = np.array(method.b), np.array(method.error)
-    change, error = (_combine(w, K) if unroll else jnp.tensordot(w, K, 1) for w in weights)
+    change, error = (
+        _combine(w, K) if unroll else jnp.tensordot(w, K, 1) for w in weights
+    )
     end = q + h * change
     return Step(end, K[0], field(t + h, end), h * error, h * error)
 
@@ -72,7 +74,11 @@ def _looped_stages(method, field, t, q, h) -> Float[Array, "stages n L"]:
 
     stages = len(method.c)
     begin = jnp.zeros((stages, *q.shape), q.dtype)
-    tableau = jnp.asarray(method.a, q.dtype), jnp.asarray(method.c, q.dtype), jnp.arange(stages)
+    tableau = (
+        jnp.asarray(method.a, q.dtype),
+        jnp.asarray(method.c, q.dtype),
+        jnp.arange(stages),
+    )
     return jax.lax.scan(stage, begin, tableau)[0]
 
 
@@ -85,7 +91,9 @@ def _unrolled_stages(method, field, t, q, h) -> list[States]:
 
 def _combine(weights, K):
     """Sum of weights times stages. Unrolled, it is compiled into one loop with the stage."""
-    return sum((float(w) * k for w, k in zip(weights, K, strict=False) if w != 0), start=0.0)
+    return sum(
+        (float(w) * k for w, k in zip(weights, K, strict=False) if w != 0), start=0.0
+    )
 
 
 def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> States:
@@ -93,7 +101,9 @@ def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> State
     field at (t, q); zero where it is not finite."""
     # Shifts of both signs, odd and even; not all states by the same part, since a common factor may
     # cancel.
-    shifts = np.stack([np.roll([-3.1, 1.9, -0.8, 4.4], k) for k in range(len(q) + 1)], axis=1)
+    shifts = np.stack(
+        [np.roll([-3.1, 1.9, -0.8, 4.4], k) for k in range(len(q) + 1)], axis=1
+    )
     xp = namespace(q)
     shifts = xp.asarray(shifts * xp.finfo(q.dtype).eps, dtype=q.dtype)
 
@@ -104,7 +114,9 @@ def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> State
     return xp.max(xp.where(xp.isfinite(changes), changes, 0.0), axis=0)
 
 
-def short_step(field: LaneField, t: Times, q: States, f: States, h: Times) -> tuple[States, States]:
+def short_step(
+    field: LaneField, t: Times, q: States, f: States, h: Times
+) -> tuple[States, States]:
     """A short step of the classical method of order 4, given the field f at its start.
 
     Its derivatives at h = 0 are right to order 4.
@@ -146,10 +158,14 @@ def _decoupled(method: Method) -> _Decoupled:
     values, T = np.linalg.eig(A)
     kept = np.imag(values) >= 0  # one of each conjugate pair, twice
     values, left, right = values[kept], T[:, kept], np.linalg.inv(T)[kept]
-    return _Decoupled(left * np.where(np.imag(values) > 0, 2, 1), np.diag(values), right)
+    return _Decoupled(
+        left * np.where(np.imag(values) > 0, 2, 1), np.diag(values), right
+    )
 
 
-def _implicit_step(method: Method, field: LaneField, t, q, h, still: LaneField | None) -> Step:
+def _implicit_step(
+    method: Method, field: LaneField, t, q, h, still: LaneField | None
+) -> Step:
     """One step of an implicit method. The last change of Newton's iterations counts as an error.
 
     With `still`, the stages are corrected twice by Newton's method with the true Jacobian at their
@@ -196,11 +212,15 @@ def _increments(method, field, t, q, h):
     small = 4.0 * jnp.finfo(q.dtype).eps  # a few rounding errors
 
     def correction(w):
-        residual = h * evaluate(t + c * h, q + jnp.tensordot(np.array(method.a), w, 1)) - w
+        residual = (
+            h * evaluate(t + c * h, q + jnp.tensordot(np.array(method.a), w, 1)) - w
+        )
         residual = jnp.tensordot(right, residual, 1)
         solved = []
         for row, r in zip(R, residual, strict=True):
-            before = sum((g * x for g, x in zip(row, solved, strict=False) if g != 0), start=0.0)
+            before = sum(
+                (g * x for g, x in zip(row, solved, strict=False) if g != 0), start=0.0
+            )
             r = r if isinstance(before, float) else r + h * _apply(J, before)
             g = row[len(solved)]
             solved.append(_apply(solve[g], r) if g != 0 else r)
@@ -252,7 +272,9 @@ def _shifted(J, g):
     return jnp.eye(len(J))[..., None] - g * J
 
 
-def _apply(matrix: Inexact[Array, "n m #L"], x: Inexact[Array, "m L"]) -> Inexact[Array, "n L"]:
+def _apply(
+    matrix: Inexact[Array, "n m #L"], x: Inexact[Array, "m L"]
+) -> Inexact[Array, "n L"]:
     return jnp.sum(matrix * x, axis=1)
 
 

@@ -76,7 +76,8 @@ class Settings(eqx.Module):
         rtol: PositiveScalar | None = None,
         atol: PositiveScalar | None = None,
         max_steps: StepCount = 256,
-        scale: Annotated[Numbers, Reals("charts states", sign="nonnegative")] | None = None,
+        scale: Annotated[Numbers, Reals("charts states", sign="nonnegative")]
+        | None = None,
         solver: Solver | Mapping[str, Solver] | Literal["auto"] | None = None,
     ):
         self.rtol, self.atol, self.scale = _kept(rtol), _kept(atol), _kept(scale)
@@ -102,14 +103,20 @@ class Settings(eqx.Module):
 
 def _kept(x: Any) -> Any:
     """Arrays of the host unchanged, other numbers as arrays of JAX."""
-    return x if x is None or (isinstance(x, np.ndarray) and x.dtype == np.float64) else real(x)
+    return (
+        x
+        if x is None or (isinstance(x, np.ndarray) and x.dtype == np.float64)
+        else real(x)
+    )
 
 
 def size(settings: Settings, a: int, *q: States) -> States:
     """Sizes of states of chart a against which errors are judged: those of `q` or, where `q` is
     small, the usual ones, which must be known."""
     if settings.scale is None or settings.rtol is None:
-        raise DefinitionError("derivatives of the flow need the sizes of states: give `scale`.")
+        raise DefinitionError(
+            "derivatives of the flow need the sizes of states: give `scale`."
+        )
     xp = namespace(q[0])
     largest = ft.reduce(xp.maximum, map(xp.abs, q))
     usual = settings.scale[a, : len(largest)].reshape(len(largest), -1)
@@ -129,8 +136,14 @@ def tolerance(
         return settings.rtol * size(settings, a, q, step.q)
     xp = namespace(q)
     largest = xp.maximum(xp.abs(q), xp.abs(step.q))
-    change = xp.abs(tau) * xp.abs(step.f0)  # (a step that is far too long may end anywhere)
+    change = xp.abs(tau) * xp.abs(
+        step.f0
+    )  # (a step that is far too long may end anywhere)
     # Rounding errors of the rate may be ten times as large at the stages as at the start.
     rounding = ROUNDING * largest + 10.0 * xp.abs(tau) * rounding
-    allowed = settings.rtol * largest + settings.atol * xp.maximum(largest, change) + rounding
-    return xp.maximum(allowed, xp.finfo(largest.dtype).tiny)  # where all is at rest at zero
+    allowed = (
+        settings.rtol * largest + settings.atol * xp.maximum(largest, change) + rounding
+    )
+    return xp.maximum(
+        allowed, xp.finfo(largest.dtype).tiny
+    )  # where all is at rest at zero

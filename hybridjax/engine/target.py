@@ -22,7 +22,12 @@ class AbstractLevels(Definition):
 
     @abc.abstractmethod
     def level(
-        self, s: Structure, a: int, i: Int[Array, ""], t: Float[Array, ""], q: Float[Array, " n"]
+        self,
+        s: Structure,
+        a: int,
+        i: Int[Array, ""],
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
     ) -> Float[Array, ""]:
         """Level of section i at a single state of chart a; it falls through zero at the section.
 

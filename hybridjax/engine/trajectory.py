@@ -50,7 +50,9 @@ class Event(NamedTuple):
     """State after the reset, by name."""
 
     def __repr__(self) -> str:
-        before, after = (signal_values(x, x.values()) for x in (self.before, self.after))
+        before, after = (
+            signal_values(x, x.values()) for x in (self.before, self.after)
+        )
         event = f"Event({self.name} at t = {number(self.time)}: {self.source} to {self.target}; "
         return folded(f"{event}before {before}; after {after})")
 
@@ -83,9 +85,16 @@ class Trajectory(eqx.Module):
         """The trajectory up to row k, where it ends for this reason."""
         to = slice(k + 1)
         return Trajectory(
-            self.structure, self.t[to], self.chart[to], self.before[to], self.after[to],
-            self.slope_before[to], self.slope_after[to], self.event[to], result,
-        )  # fmt: skip
+            self.structure,
+            self.t[to],
+            self.chart[to],
+            self.before[to],
+            self.after[to],
+            self.slope_before[to],
+            self.slope_after[to],
+            self.event[to],
+            result,
+        )
 
     @property
     def events(self) -> list[Event]:
@@ -97,7 +106,9 @@ class Trajectory(eqx.Module):
                 s.by_name(s.chart_index(name), q[k])
                 for name, q in ((tr.source, self.before), (tr.target, self.after))
             )
-            events.append(Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after))
+            events.append(
+                Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after)
+            )
         return events
 
     def dense(self, per_step: Count = 32) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -114,9 +125,14 @@ class Trajectory(eqx.Module):
         t = self.t[:-1, None] + h * x
         chart = np.broadcast_to(self.chart[:-1, None], t.shape)
         keep = np.ones(t.shape, bool)
-        keep[1:, 0] = self.event[1:-1] >= 0  # a step's start repeats the last end, but for resets
+        keep[1:, 0] = (
+            self.event[1:-1] >= 0
+        )  # a step's start repeats the last end, but for resets
         last = np.flatnonzero(self.event[-1:] >= 0) - 1
-        t, chart = np.append(t[keep], self.t[last]), np.append(chart[keep], self.chart[last])
+        t, chart = (
+            np.append(t[keep], self.t[last]),
+            np.append(chart[keep], self.chart[last]),
+        )
         return t, chart, np.vstack([q[keep], self.after[last]])
 
     def at(
@@ -129,11 +145,15 @@ class Trajectory(eqx.Module):
         """
         t = np.asarray(t)
         if len(t) and not self.t[0] <= t.min() <= t.max() <= self.t[-1]:
-            raise DefinitionError(f"times must lie between {self.t[0]:.9g} and {self.t[-1]:.9g}.")
+            raise DefinitionError(
+                f"times must lie between {self.t[0]:.9g} and {self.t[-1]:.9g}."
+            )
         k = np.searchsorted(self.t, t, side="right") - 1
         j = np.minimum(k + 1, len(self.t) - 1)
         h = (self.t[j] - self.t[k])[:, None]
-        x = np.divide(t[:, None] - self.t[k, None], h, out=np.zeros_like(h), where=h > 0)
+        x = np.divide(
+            t[:, None] - self.t[k, None], h, out=np.zeros_like(h), where=h > 0
+        )
         ends = self.after[k], self.before[j], self.slope_after[k], self.slope_before[j]
         return self.chart[k], interpolate(x, h, *ends)
 
@@ -148,8 +168,13 @@ class Trajectory(eqx.Module):
 
     def __repr__(self):
         s, system = self.structure, self.system
-        counts = ((np.sum(self.event == g), tr.name) for g, tr in enumerate(s.transitions))
-        events = ", ".join(f"{count} {name}" for count, name in counts if count) or "no events"
+        counts = (
+            (np.sum(self.event == g), tr.name) for g, tr in enumerate(s.transitions)
+        )
+        events = (
+            ", ".join(f"{count} {name}" for count, name in counts if count)
+            or "no events"
+        )
         span = f"t = {number(self.t[0])} to {number(self.t[-1], unit=system.time_unit)}"
         return folded(
             f"Trajectory({type(system).__name__}: {span}, {len(self.t) - 1} steps; {events}; "
@@ -217,7 +242,11 @@ def simulate(
     s = Structure(current(Driven(system, input)) if callable(input) else system)
     start = Guess(chart, state, time)
     lanes = begin = lane_at(s, chart, start.state, start.time, "`state`")
-    settings, u, end = settings.filled(SIMULATION), constant[:, None], lanes.t + float(duration)
+    settings, u, end = (
+        settings.filled(SIMULATION),
+        constant[:, None],
+        lanes.t + float(duration),
+    )
     tapes, steps, h, result = [], 0, None, Result.STEP_LIMIT
     while result == Result.STEP_LIMIT and steps < max_steps:
         moved, tape = _piece(s, lanes, u, end, settings, h)
@@ -248,13 +277,18 @@ def recorded(
         tape = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
         columns = tape.t, tape.before, tape.after, tape.chart, tape.code
         rows.append(tuple(x[tape.code != IDLE] for x in columns))
-    t, before, after, chart, event = (np.concatenate(x) for x in zip(*rows, strict=True))
+    t, before, after, chart, event = (
+        np.concatenate(x) for x in zip(*rows, strict=True)
+    )
     source, until = np.append(chart[:1], chart[:-1]), u
     if u.shape[1] > 1:
         u = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
         until, u = np.hstack([u[:, :1], u]), np.hstack([u, u[:, -1:]])
     with at_ease():
-        left, right = slopes(s, t, source, before.T, until).T, slopes(s, t, chart, after.T, u).T
+        left, right = (
+            slopes(s, t, source, before.T, until).T,
+            slopes(s, t, chart, after.T, u).T,
+        )
     return Trajectory(s, t, chart, before, after, left, right, event, result)
 
 
@@ -286,12 +320,25 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
         def guards(k, q, a=int(a), n=n):
             return kernels.watched(s, a, None, t[k], q[k, :n].T, u, first)
 
-        now, was, later = guards(k, after), guards(k, before)[:, 0], guards(k + 1, before)[:, 0]
-        slope, f = now[:, 2 : 2 + n], kernels.field(s, int(a), t[k], after[k, :n].T, u)[:, 0]
-        zero = _SAME * np.einsum("gnk,n->gk", np.abs(slope), np.abs(after[:, :n]).max(axis=0))
+        now, was, later = (
+            guards(k, after),
+            guards(k, before)[:, 0],
+            guards(k + 1, before)[:, 0],
+        )
+        slope, f = (
+            now[:, 2 : 2 + n],
+            kernels.field(s, int(a), t[k], after[k, :n].T, u)[:, 0],
+        )
+        zero = _SAME * np.einsum(
+            "gnk,n->gk", np.abs(slope), np.abs(after[:, :n]).max(axis=0)
+        )
         rate = now[:, 1] + np.einsum("gnk,nk->gk", slope, f)
-        still = np.abs(rate) <= _SAME * np.einsum("gnk,nk->gk", np.abs(slope), np.abs(f))
-        crossed = (np.abs(was) <= zero) & (np.array(s.dims)[charts[k - 1]] == n) & ~still
+        still = np.abs(rate) <= _SAME * np.einsum(
+            "gnk,nk->gk", np.abs(slope), np.abs(f)
+        )
+        crossed = (
+            (np.abs(was) <= zero) & (np.array(s.dims)[charts[k - 1]] == n) & ~still
+        )
         on = (np.abs(now[:, 0]) <= zero) & (later < 0) & ~crossed
         passed += k[on.any(axis=0)].tolist()
     return min(passed, default=None)

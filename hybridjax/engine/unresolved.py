@@ -44,7 +44,9 @@ _NEAR = 1e-5
 # take longer, and many more memory.
 _POINTS = 1024
 # Operations with jumps, and with kinks.
-_DECISIONS = frozenset("sign floor ceil round rem atan2 gt lt ge le eq ne is_finite".split())
+_DECISIONS = frozenset(
+    "sign floor ceil round rem atan2 gt lt ge le eq ne is_finite".split()
+)
 _KINKS = _DECISIONS | frozenset("max min abs clamp select_n cond".split())
 # A field jumps if it changes by this part of itself between points that are so many times closer,
 # in parts of the period and sizes of the states. Smaller changes: rounding is refused. Larger:
@@ -89,7 +91,9 @@ def may_be_sudden(s: Structure, a: int, function: Callable) -> frozenset[str]:
     """Names of the `sudden` operations of a function (structure, chart, *point) of a module."""
     key = function, a, kind(s)
     if key not in _sudden:
-        names = (name for name, _ in sudden(program_of(s, a, ft.partial(function, s, a))))
+        names = (
+            name for name, _ in sudden(program_of(s, a, ft.partial(function, s, a)))
+        )
         _sudden[key] = frozenset(names)
         if _sudden[key] == {"power"}:
             _sudden[key] = frozenset()
@@ -112,7 +116,9 @@ def _is_smooth(equation: Any, moves: list[bool]) -> bool:
             return not moves[1]
         case name:
             # (JAX 0.11 leaves calls without results in a program.)
-            real = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars)
+            real = all(
+                jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars
+            )
             return name in _CALLS or (name in _SMOOTH and real)
 
 
@@ -128,12 +134,16 @@ def passed_over(
     for a in np.unique(path.chart[:-1]).tolist():
         rows = np.flatnonzero((path.chart[:-1] == a) & (np.diff(path.t) > 0))
         if len(rows) and may_have_pulses(s, a):
-            wrong = np.argwhere(_passing(path, a, rows, u, settings, linear))[:1].tolist()
+            wrong = np.argwhere(_passing(path, a, rows, u, settings, linear))[
+                :1
+            ].tolist()
             passed += [(int(rows[k]), column_name(s, a, j)) for k, j in wrong]
     return min(passed, default=None)
 
 
-def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np.ndarray:
+def _passing(
+    path: Any, a: int, rows, u, settings: Settings, linear: bool
+) -> np.ndarray:
     """Test which of the steps that begin at some rows, in chart a, pass over a pulse of each rate,
     gain and guard: over what a polynomial through eight of its values in the step lacks."""
     s, n, legendre = path.structure, path.structure.dims[a], np.polynomial.legendre
@@ -142,30 +152,58 @@ def _passing(path: Any, a: int, rows, u, settings: Settings, linear: bool) -> np
     (x, _), (y, w) = legendre.leggauss(8), legendre.leggauss(4)
     fine = 2 * (np.arange(pieces)[:, None] + (y + 1) / 2).ravel() / pieces - 1
     polynomial = legendre.legvander(fine, 7) @ np.linalg.inv(legendre.legvander(x, 7))
-    weights, nodes = np.tile(w / 2 / pieces, pieces), (np.append(x, fine)[:, None] + 1) / 2
+    weights, nodes = (
+        np.tile(w / 2 / pieces, pieces),
+        (np.append(x, fine)[:, None] + 1) / 2,
+    )
     probes = _probes(s.method(a), (fine + 1) / 2, weights)
-    ends = path.after[:-1], path.before[1:], path.slope_after[:-1], path.slope_before[1:]
+    ends = (
+        path.after[:-1],
+        path.before[1:],
+        path.slope_after[:-1],
+        path.slope_before[1:],
+    )
     parts = []
     for k in np.split(rows, range(_POINTS, len(rows), _POINTS)):
         h = np.diff(path.t)[k, None, None]
         q = interpolate(nodes, h, *(x[k, None, :n] for x in ends))
         points = np.concatenate([path.t[k, None, None] + h * nodes, q], axis=2)
-        values = values_at(s, a, points.reshape(-1, 1 + n), u, bool(may_be_sudden(s, a, _guards)))
+        values = values_at(
+            s, a, points.reshape(-1, 1 + n), u, bool(may_be_sudden(s, a, _guards))
+        )
         values = values.reshape(*points.shape[:2], -1)
-        rates, (guards, enabled) = values[:, 8:, :m], np.split(values[:, 8:, m:], 2, axis=2)
+        rates, (guards, enabled) = (
+            values[:, 8:, :m],
+            np.split(values[:, 8:, m:], 2, axis=2),
+        )
         beside = rates - polynomial @ values[:, :8, :m]
         low = guards < -_NEAR * np.abs(guards).max(axis=(0, 1))
-        falls = (low & (np.maximum.accumulate(guards, 1) > 0) & (enabled > 0)).any(axis=1)
-        moved, passed = h[:, 0] * (weights @ np.abs(rates)), h[:, 0] * np.abs(weights @ beside)
+        falls = (low & (np.maximum.accumulate(guards, 1) > 0) & (enabled > 0)).any(
+            axis=1
+        )
+        moved, passed = (
+            h[:, 0] * (weights @ np.abs(rates)),
+            h[:, 0] * np.abs(weights @ beside),
+        )
         if linear and len(k) > 1 and not only_poles:
             pairs = np.concatenate([rates[:-1, :, n:], rates[1:, :, n:]], axis=1)
-            off = np.abs(np.einsum("pf,kfj->kpj", probes, pairs)).max(axis=1, initial=0.0)
+            off = np.abs(np.einsum("pf,kfj->kpj", probes, pairs)).max(
+                axis=1, initial=0.0
+            )
             off = np.where(np.diff(k)[:, None] == 1, h[:-1, 0] * off, 0.0)
             passed[:-1, n:] = np.maximum(passed[:-1, n:], off)
-        parts.append((moved, passed, *(np.abs(x).max(axis=1) for x in (beside, rates)), falls))
-    moved, passed, missed, largest, falls = map(np.concatenate, zip(*parts, strict=True))
+        parts.append(
+            (moved, passed, *(np.abs(x).max(axis=1) for x in (beside, rates)), falls)
+        )
+    moved, passed, missed, largest, falls = map(
+        np.concatenate, zip(*parts, strict=True)
+    )
     size, accuracy = moved.sum(axis=0), np.max(np.asarray(settings.rtol))
-    usual = np.abs(path.after[rows]).max(axis=0) if settings.scale is None else settings.scale[a]
+    usual = (
+        np.abs(path.after[rows]).max(axis=0)
+        if settings.scale is None
+        else settings.scale[a]
+    )
     size[:n] = np.maximum(size[:n], usual[:n])
     same = np.repeat([_SAME * accuracy, _SAME_GAIN], [n, m - n])
     wrong = passed > same * size + ROUNDING * size.max()
@@ -182,9 +220,14 @@ def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarr
     experiments and linearizations have other steps than the cycle, up to half as long again."""
     t, rows = np.concatenate([within, 1 + within]), []
     for begin, length in product(np.arange(5) / 4, (1.0, 1.5)):
-        stages, inside = begin + length * np.array(method.c), (t > begin) & (t < begin + length)
+        stages, inside = (
+            begin + length * np.array(method.c),
+            (t > begin) & (t < begin + length),
+        )
         left = np.clip(np.searchsorted(t, stages) - 1, 0, len(t) - 2)
-        part = length * np.array(method.b) * (stages - t[left]) / (t[left + 1] - t[left])
+        part = (
+            length * np.array(method.b) * (stages - t[left]) / (t[left + 1] - t[left])
+        )
         row = -np.tile(weights, 2) * inside
         np.add.at(row, left, length * np.array(method.b) - part)
         np.add.at(row, left + 1, part)
@@ -203,7 +246,9 @@ def column_name(s: Structure, a: int, j: int) -> str:
     return f"guard of '{s.transitions[s.guards(a)[j - n * (1 + s.nu)]].name}'"
 
 
-def values_at(s: Structure, a: int, points: Points, u: Float[np.ndarray, " nu"], guards=False):
+def values_at(
+    s: Structure, a: int, points: Points, u: Float[np.ndarray, " nu"], guards=False
+):
     """The field of chart a at points and its derivatives by the inputs; if so asked, the `guards`
     and whether their predicates hold, too."""
 
@@ -219,7 +264,9 @@ def values_at(s: Structure, a: int, points: Points, u: Float[np.ndarray, " nu"],
             rows += [kernels.enabled(s, x, *point, lanes=lanes)[None] for x in members]
         return np.concatenate(rows).T
 
-    return np.concatenate([at(x) for x in np.split(points, range(_POINTS, len(points), _POINTS))])
+    return np.concatenate(
+        [at(x) for x in np.split(points, range(_POINTS, len(points), _POINTS))]
+    )
 
 
 def may_have_pulses(s: Structure, a: int) -> frozenset[str]:
@@ -236,14 +283,18 @@ def _guards(s: Structure, a: int, *point: Any) -> Any:
     return s.guard_values(s.guard_kinds(a), *point)
 
 
-def jumps(s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarray, " 1+n"]):
+def jumps(
+    s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarray, " 1+n"]
+):
     """Yield times at which the field or a gain jumps within intervals of an orbit, the column of
     `values_at` that jumps, and the jump."""
     n, m, parts = s.dims[a], s.dims[a] * (1 + s.nu), np.arange(1, 4)[:, None, None] / 4
     at = lambda points: values_at(s, a, points, np.zeros(s.nu))[:, :m]  # noqa: E731
     first, last = at(low), at(high)
     shifted = low * (1 + 2e-15 * (-1.0) ** np.arange(1 + n))
-    rounding = np.nanquantile(np.abs(at(shifted) - first), 0.9, axis=0)  # (not at a jump)
+    rounding = np.nanquantile(
+        np.abs(at(shifted) - first), 0.9, axis=0
+    )  # (not at a jump)
     limit = np.maximum(np.nanmax(np.abs(first), axis=0), rounding / _JUMP)
     limit[:n] = np.maximum(limit[:n], sizes[1:] / sizes[0])
     limit[n:] = np.maximum(limit[n:], _SAME_GAIN * limit[n:].max(initial=0.0))
@@ -254,11 +305,16 @@ def jumps(s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarr
         values = np.nan_to_num(np.stack([first, *inside, last]))
         change = np.abs(np.diff(values, axis=0)) / limit
         near = np.abs(np.diff(points, axis=0) / sizes).max(axis=2, keepdims=True)
-        uneven = np.abs(np.diff(values, axis=0) - np.diff(values, axis=0).mean(axis=0)) / limit
+        uneven = (
+            np.abs(np.diff(values, axis=0) - np.diff(values, axis=0).mean(axis=0))
+            / limit
+        )
         worst, here = uneven.max(axis=2).argmax(axis=0), np.arange(len(low))
         low, high = points[worst, here], points[worst + 1, here]
         first, last = values[worst, here], values[worst + 1, here]
-        for i, j in np.argwhere(((change > _JUMP) & (change > _STEEP * near))[worst, here]):
+        for i, j in np.argwhere(
+            ((change > _JUMP) & (change > _STEEP * near))[worst, here]
+        ):
             yield low[i, 0], j, change[worst[i], i, j] * limit[j]
         keep = uneven.max(axis=(0, 2)) > _JUMP
         low, high, first, last = (x[keep] for x in (low, high, first, last))
@@ -268,15 +324,21 @@ def jumps(s: Structure, a: int, low: Points, high: Points, sizes: Float[np.ndarr
 
 def has_kinks(s: Structure) -> bool:
     """Test whether a field has operations with kinks or jumps, where many steps are rejected."""
-    return any(may_be_sudden(s, a, Structure.field) & _KINKS for a in range(len(s.charts)))
+    return any(
+        may_be_sudden(s, a, Structure.field) & _KINKS for a in range(len(s.charts))
+    )
 
 
 def lines_of_jumps(s: Structure, a: int) -> list[str]:
     """The lines of code by which the field of a chart may jump: those that decide, if there are
     any."""
-    lines = [(name, _line_of(x)) for name, x in sudden(program_of(s, a)) if name != "power"]
+    lines = [
+        (name, _line_of(x)) for name, x in sudden(program_of(s, a)) if name != "power"
+    ]
     decisions = [x for x in lines if x[0] in _DECISIONS]
-    return [line for line in dict.fromkeys(line for _, line in decisions or lines) if line]
+    return [
+        line for line in dict.fromkeys(line for _, line in decisions or lines) if line
+    ]
 
 
 def _line_of(equation: Any) -> str:

@@ -12,7 +12,17 @@ from .._core.lanes import PerLane, pick, put_rows, shared
 from ..systems.solver import Method
 from ..systems.structure import Structure
 from . import kernels
-from .arrays import AnyInputs, AnyTimes, Array, Index, Inputs, Mask, Padded, States, Times
+from .arrays import (
+    AnyInputs,
+    AnyTimes,
+    Array,
+    Index,
+    Inputs,
+    Mask,
+    Padded,
+    States,
+    Times,
+)
 from .lanes import for_each_chart, only
 from .runge_kutta import LaneField, Step, short_step, step_along, take_step
 from .target import AbstractLevels, Target
@@ -27,7 +37,9 @@ class Watch(NamedTuple):
     rate: Float[Array, "W L"]
 
 
-def chart_field(s: Structure, a: int, u: AnyInputs, some: Mask | None = None) -> LaneField:
+def chart_field(
+    s: Structure, a: int, u: AnyInputs, some: Mask | None = None
+) -> LaneField:
     """Field of chart a over lanes; on the host for `some` lanes only, if not all are needed."""
     if on_host(u):
         return lambda t, q: kernels.field(s, a, t, q, u, some)[:, 0]
@@ -96,7 +108,9 @@ class ChartFlow(NamedTuple):
     ) -> tuple[Step, States, States]:
         """A step, and the derivatives of its end and of its estimate along a direction."""
         if on_host(q):
-            return kernels.step_along(self.s, self.a, t, q, self.u, h, along, self.subset)
+            return kernels.step_along(
+                self.s, self.a, t, q, self.u, h, along, self.subset
+            )
         return step_along(self.method, self.field, t, q, h, along)
 
     def watch(self, t: AnyTimes, q: States, f: States) -> Watch:
@@ -104,17 +118,26 @@ class ChartFlow(NamedTuple):
         a, levels, index = self.a, self.levels, self.index
         if on_host(q):
             rows = kernels.watched(self.s, a, levels, t, q, self.u, index, self.subset)
-            return Watch(rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1))
+            return Watch(
+                rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1)
+            )
         kinds = self.s.guard_kinds(a)
 
         def watch(s, levels, t, q, u, i, f):
             functions = lambda t, q: kernels.watched_at(a, kinds, s, levels, t, q, u, i)  # noqa: E731
             return jax.jvp(functions, (t, q), (jnp.ones_like(t), f))
 
-        return Watch(*self.s.by_lane(watch, levels, name=("watch", a))(t, q, self.u, index, f))
+        return Watch(
+            *self.s.by_lane(watch, levels, name=("watch", a))(t, q, self.u, index, f)
+        )
 
     def locate(
-        self, t: AnyTimes, q: States, f: States, which: Index, first: Times | None = None
+        self,
+        t: AnyTimes,
+        q: States,
+        f: States,
+        which: Index,
+        first: Times | None = None,
     ) -> Located:
         """The zero of watched function `which` (-1: none) near (t, q), where the field is f.
 
@@ -135,9 +158,13 @@ class ChartFlow(NamedTuple):
         return Located(step + last, q + last * f, f, last, error)
 
 
-def chart_flow(s: Structure, a: int, here: Mask, u: Inputs, target: Target) -> ChartFlow:
+def chart_flow(
+    s: Structure, a: int, here: Mask, u: Inputs, target: Target
+) -> ChartFlow:
     """The `ChartFlow` of the lanes `here`; the others are taken along as copies of one of them."""
-    return ChartFlow(s, a, only(here, u), target.levels, only(here, target.index)).only(here)
+    return ChartFlow(s, a, only(here, u), target.levels, only(here, target.index)).only(
+        here
+    )
 
 
 def slopes(s: Structure, t: Times, chart: Index, q: Padded, u: AnyInputs) -> Padded:
@@ -153,7 +180,13 @@ def slopes(s: Structure, t: Times, chart: Index, q: Padded, u: AnyInputs) -> Pad
 
 
 def watch(
-    s: Structure, t: Times, chart: Index, q: Padded, u: Inputs, target: Target, mask: Mask
+    s: Structure,
+    t: Times,
+    chart: Index,
+    q: Padded,
+    u: Inputs,
+    target: Target,
+    mask: Mask,
 ) -> Watch:
     """All watched functions at the lanes of `mask`."""
 

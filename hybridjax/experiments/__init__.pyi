@@ -6,4 +6,7 @@ from .noise import (
     simulate_experiments as simulate_experiments,
 )
 from .run import Options as Options
-from .stored import StoredExperiments as StoredExperiments, stream_experiments as stream_experiments
+from .stored import (
+    StoredExperiments as StoredExperiments,
+    stream_experiments as stream_experiments,
+)

@@ -75,8 +75,12 @@ class ExperimentData(eqx.Module):
 
     def __init__(
         self,
-        u: Annotated[Numbers, Reals("experiments samples inputs", missing=True, infinite=True)],
-        y: Annotated[Numbers, Reals("experiments samples outputs", missing=True, infinite=True)],
+        u: Annotated[
+            Numbers, Reals("experiments samples inputs", missing=True, infinite=True)
+        ],
+        y: Annotated[
+            Numbers, Reals("experiments samples outputs", missing=True, infinite=True)
+        ],
         *,
         n_sections: SectionCount,
         periods: PeriodCount,
@@ -97,10 +101,16 @@ class ExperimentData(eqx.Module):
         shapes = self.u.shape, self.y.shape
         if any(0 in s for s in shapes) or shapes[0][:2] != shapes[1][:2]:
             text = "the same experiments and samples (their first two axes)"
-            raise DefinitionError(f"`u` {shapes[0]} and `y` {shapes[1]} must have {text}.")
-        self.result = np.zeros(len(self.u), int) if result is None else np.asarray(result, int)
+            raise DefinitionError(
+                f"`u` {shapes[0]} and `y` {shapes[1]} must have {text}."
+            )
+        self.result = (
+            np.zeros(len(self.u), int) if result is None else np.asarray(result, int)
+        )
         if not np.isin(self.result, list(Result)).all():
-            raise DefinitionError("`result` must hold codes of `Result`, such as 0 for OK.")
+            raise DefinitionError(
+                "`result` must hold codes of `Result`, such as 0 for OK."
+            )
         self.simulated = simulated
         self.cycle_outputs = None if cycle_outputs is None else np.array(cycle_outputs)
         self.n_sections, self.periods = n_sections, periods
@@ -108,12 +118,16 @@ class ExperimentData(eqx.Module):
         self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
         (S, n, ny), N = self.y.shape, self.n_sections
         if n % N:
-            raise DefinitionError(f"records must hold whole periods of N = {N} samples, not {n}.")
+            raise DefinitionError(
+                f"records must hold whole periods of N = {N} samples, not {n}."
+            )
         self.windows()
         for name in ("result", "failed_at", "error"):
             require_axes(f"`{name}`", getattr(self, name), {"experiments": S})
         if self.cycle_outputs is not None:
-            require_axes("`cycle_outputs`", self.cycle_outputs, {"sections": N, "outputs": ny})
+            require_axes(
+                "`cycle_outputs`", self.cycle_outputs, {"sections": N, "outputs": ny}
+            )
         for name, values in (("u", self.u), ("y", self.y)):
             finite = np.isfinite(values)
             if finite.all():  # (along the last, short axis it takes ten times as long)
@@ -135,19 +149,31 @@ class ExperimentData(eqx.Module):
         """**Raises:** `DefinitionError` if no experiment ran to its end."""
         if not self.ok.any():
             causes = self.summary()
-            raise DefinitionError(f"no experiment ran to its end ({causes}): lower the inputs.")
+            raise DefinitionError(
+                f"no experiment ran to its end ({causes}): lower the inputs."
+            )
 
     @property
     def records(self) -> tuple[Record, ...]:
         """The experiments that ran to their end, each with all of its cycles."""
-        about: Any = {"n_sections": self.n_sections, "inputs": self.inputs, "outputs": self.outputs}
-        return tuple(Record(self.u[s], self.y[s], **about) for s in np.flatnonzero(self.ok))
+        about: Any = {
+            "n_sections": self.n_sections,
+            "inputs": self.inputs,
+            "outputs": self.outputs,
+        }
+        return tuple(
+            Record(self.u[s], self.y[s], **about) for s in np.flatnonzero(self.ok)
+        )
 
     @property
     def failed_at(self) -> Int[np.ndarray, " S"]:
         """The sample at which an experiment failed; -1 if it did not fail, or if the sample is not
         known."""
-        return np.full(len(self.u), -1) if self.simulated is None else self.simulated.failed_at
+        return (
+            np.full(len(self.u), -1)
+            if self.simulated is None
+            else self.simulated.failed_at
+        )
 
     @property
     def error(self) -> Float[np.ndarray, " S"]:
@@ -174,9 +200,13 @@ class ExperimentData(eqx.Module):
         n, length = self.u.shape[1], self.n_sections * self.periods
         if repeats * length > n:
             text = f"{n // self.n_sections} cycles are too few for {repeats} x P = {self.periods}"
-            raise DefinitionError(f"{text} periods: record more, or lower `periods` or repeats.")
+            raise DefinitionError(
+                f"{text} periods: record more, or lower `periods` or repeats."
+            )
         first = n - repeats * length
-        return [slice(first + r * length, first + (r + 1) * length) for r in range(repeats)]
+        return [
+            slice(first + r * length, first + (r + 1) * length) for r in range(repeats)
+        ]
 
     def summary(self, limit: Index = 5) -> str:
         """Return `80/80 ok`, or the number of OK experiments with the causes of the first `limit`
@@ -204,8 +234,12 @@ class ExperimentData(eqx.Module):
         """
         plus, minus = self.u[::2], self.u[1::2]
         if len(self.u) % 2:
-            raise DefinitionError(f"{len(self.u)} experiments are not pairs: leave one out.")
-        unit = np.maximum(np.abs(self.u[self.ok]).max(axis=(0, 1), initial=0), np.finfo(float).tiny)
+            raise DefinitionError(
+                f"{len(self.u)} experiments are not pairs: leave one out."
+            )
+        unit = np.maximum(
+            np.abs(self.u[self.ok]).max(axis=(0, 1), initial=0), np.finfo(float).tiny
+        )
         total, size = (np.abs(x / unit).max(axis=(1, 2)) for x in (plus + minus, plus))
         apart = ~(total <= _OPPOSITE * size)
         if apart.any():
@@ -226,16 +260,21 @@ class ExperimentData(eqx.Module):
 
 
 def summary(
-    result: Int[np.ndarray, " S"], failed_at: Int[np.ndarray, " S"], n_sections: int, limit: int,
+    result: Int[np.ndarray, " S"],
+    failed_at: Int[np.ndarray, " S"],
+    n_sections: int,
+    limit: int,
     causes: tuple[str, ...] = (),
-) -> str:  # fmt: skip
+) -> str:
     """Return the number of OK experiments, with place and cause of the first `limit` failures."""
     failed = np.flatnonzero(result != Result.OK)
     text = [f"{len(result) - len(failed)}/{len(result)} ok"]
     for s in failed[:limit]:
         cycle, section = divmod(int(failed_at[s]), n_sections)
         where = f"section {section}, cycle {cycle}: " if failed_at[s] >= 0 else ""
-        text.append(f"#{s}: {where}{causes[s] if causes else Result(int(result[s])).message}")
+        text.append(
+            f"#{s}: {where}{causes[s] if causes else Result(int(result[s])).message}"
+        )
     if len(failed) > limit:
         text.append(f"and {len(failed) - limit} more")
     return folded("; ".join(text))

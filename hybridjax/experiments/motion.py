@@ -47,10 +47,14 @@ def perturbed_trajectory(
         j, turns = (k + 1) % N, int((k + 1) % N == 0)
         target = placed.target(np.array([j]), lanes.t, np.array([turns]))
         with at_ease():
-            moved, tape = move(s, lanes, u, target, settings, options=Options(tape=True))
+            moved, tape = move(
+                s, lanes, u, target, settings, options=Options(tape=True)
+            )
         assert tape is not None
         if (code := Result(int(moved.result[0]))) != Result.OK:
-            raise ComputationError(f"the motion stops after sample {k}: {code.message}.")
+            raise ComputationError(
+                f"the motion stops after sample {k}: {code.message}."
+            )
         tapes.append(tape._replace(t=tape.t + shift))
         shift += turns * period
         lanes = moved.lanes._replace(

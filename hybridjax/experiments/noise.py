@@ -43,7 +43,9 @@ class ProcessNoise:
     def __post_init__(self):
         # (Numbers and tuples of them can be compared and written down, arrays cannot.)
         plain = np.asarray(self.std).tolist()
-        object.__setattr__(self, "std", tuple(plain) if isinstance(plain, list) else plain)
+        object.__setattr__(
+            self, "std", tuple(plain) if isinstance(plain, list) else plain
+        )
 
     def draw(
         self, shape: tuple[int, ...], n_sections: SectionCount, first: Index = 0
@@ -59,7 +61,9 @@ class ProcessNoise:
         self.require(n_sections)
         each = (np.random.default_rng((self.seed, first + s)) for s in range(shape[0]))
         white = np.reshape([rng.normal(size=shape[1:]) for rng in each], shape)
-        return np.resize(self.std, shape[1])[:, None] * with_memory(white, self.memory, n_sections)
+        return np.resize(self.std, shape[1])[:, None] * with_memory(
+            white, self.memory, n_sections
+        )
 
     def require(self, n_sections: SectionCount) -> None:
         """**Raises:** `DefinitionError` if `std` has entries for another number of sections."""
@@ -76,7 +80,9 @@ def with_memory(
 
     step = np.exp(-1 / (n_sections * memory))
     fresh = np.sqrt(-np.expm1(-2 / (n_sections * memory)))
-    later, _ = lfilter([fresh], [1, -step], white[:, 1:], axis=1, zi=step * white[:, :1])
+    later, _ = lfilter(
+        [fresh], [1, -step], white[:, 1:], axis=1, zi=step * white[:, :1]
+    )
     return np.concatenate([white[:, :1], later], axis=1)
 
 
@@ -113,7 +119,11 @@ def simulate_experiments(
             'the model is unstable: use start="periodic", or discard=0 for the transient itself.'
         )
     u = applied = design.inputs(design.periods + discard)
-    x0 = ldtp.periodic_states(design.inputs(), design.periods) if start == "periodic" else None
+    x0 = (
+        ldtp.periodic_states(design.inputs(), design.periods)
+        if start == "periodic"
+        else None
+    )
     if process_noise is not None:
         applied = u + process_noise.draw(u.shape, design.n_sections)
     return ExperimentData(
@@ -160,4 +170,6 @@ def add_noise(
     require_axes("`std`", std, {}, {"outputs": ny}, {"sections": N, "outputs": ny})
     white = np.random.default_rng(seed).normal(size=data.y.shape)
     each = np.resize(np.broadcast_to(std, (N, ny)), data.y.shape[1:])
-    return eqx.tree_at(lambda d: d.y, data, data.y + each * with_memory(white, memory, N))
+    return eqx.tree_at(
+        lambda d: d.y, data, data.y + each * with_memory(white, memory, N)
+    )

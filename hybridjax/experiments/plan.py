@@ -16,7 +16,14 @@ from jaxtyping import Float, Int
 
 from .._core.boundary.values import Number
 from .._core.compilation import at_ease, host_first
-from .._core.executor import Array, from_host, is_inside_program, is_traced, namespace, to_host
+from .._core.executor import (
+    Array,
+    from_host,
+    is_inside_program,
+    is_traced,
+    namespace,
+    to_host,
+)
 from .._core.memo import Memory
 from .._core.results import Result
 from ..engine.lanes import IDLE
@@ -66,7 +73,9 @@ _LEAST_SHARE = 1e-6
 # bad guesses set the length of the last step. Smaller: good ones are not used.
 _WORST_GUESS = 3.0
 
-Accuracy = Annotated[float, Number("a number from 1e-13 to 0.01", low=ROUNDING, high=1e-2)]
+Accuracy = Annotated[
+    float, Number("a number from 1e-13 to 0.01", low=ROUNDING, high=1e-2)
+]
 """Relative to the states' scales. Below the least, rounding is larger; above the largest, errors on
 the cycle differ from those of experiments beside it."""
 
@@ -97,7 +106,10 @@ class Plan(eqx.Module):
 
 
 def make_plan(
-    placed: PlacedSections, settings: Settings, accuracy: float, scale: Float[np.ndarray, "N n"]
+    placed: PlacedSections,
+    settings: Settings,
+    accuracy: float,
+    scale: Float[np.ndarray, "N n"],
 ) -> Plan:
     """Return the cheapest schedule that keeps the accuracy.
 
@@ -117,7 +129,9 @@ def make_plan(
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
     impact = np.maximum(_impact(J, error, scale), np.finfo(float).eps)
-    missed = np.isnan(ways.ends[0, -1]) & (np.arange(len(ways.ends[0, -1])) > 0)[:, None]
+    missed = (
+        np.isnan(ways.ends[0, -1]) & (np.arange(len(ways.ends[0, -1])) > 0)[:, None]
+    )
     impacts = np.where(missed, 0.0, np.where(np.isnan(impact), np.inf, impact))
     impact = impacts.max(axis=1)
     lost = ~np.isfinite(impact).any(axis=0)
@@ -132,7 +146,9 @@ def make_plan(
     for share in accuracy * 0.5 ** np.arange(0, 4 + N.bit_length()):
         # The first candidate of each section with so small an impact, or the best.
         enough = impact <= share
-        best = np.where(enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0))
+        best = np.where(
+            enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0)
+        )
         total = impact[best, section].sum()
         if total <= accuracy:
             break
@@ -147,8 +163,12 @@ def make_plan(
     large = slice(1 + placed.structure().nu)
     impact, estimate = impacts[best, large, section].T, estimate[best, large, section].T
     # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
-    together = _CAUTION * _accumulated(J, error[best, 0, section], scale) / impact[0].sum()
-    weight = (impact / estimate).max(axis=0) * np.maximum(together, 1 / _MOST_CANCELLATION)
+    together = (
+        _CAUTION * _accumulated(J, error[best, 0, section], scale) / impact[0].sum()
+    )
+    weight = (impact / estimate).max(axis=0) * np.maximum(
+        together, 1 / _MOST_CANCELLATION
+    )
     impact, estimate = impact[0], estimate[0]
     # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
     share = np.minimum(accuracy * estimate / impact, 1.0) / N
@@ -177,13 +197,17 @@ def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]
     if not has_implicit(s):
         return np.zeros((1, nu))
     time = 0 if placed.cycle.clocked else 1
-    largest = np.abs(by_input / np.roll(scale, -1, axis=0)[:, :, None])[:, time:].max(axis=(0, 1))
+    largest = np.abs(by_input / np.roll(scale, -1, axis=0)[:, :, None])[:, time:].max(
+        axis=(0, 1)
+    )
     one = np.diag(np.divide(1.0, largest, where=largest > 0, out=np.zeros(nu)))
     return np.concatenate([np.zeros((1, nu)), *(size * one for size in _KICKS)])
 
 
 @host_first
-def _try_ways(placed: PlacedSections, settings: Settings, kicks: Float[Array, "M nu"]) -> _Ways:
+def _try_ways(
+    placed: PlacedSections, settings: Settings, kicks: Float[Array, "M nu"]
+) -> _Ways:
     s, xp, N = placed.structure(), namespace(placed.lanes.t), placed.n_sections
     M, implicit = len(kicks), has_implicit(s)
     equal = () if implicit else _EQUAL_STEPS
@@ -191,7 +215,9 @@ def _try_ways(placed: PlacedSections, settings: Settings, kicks: Float[Array, "M
     patience = max(settings.max_steps, PATIENCE)
     following, _, target = placed.onwards()
     lead = _lead(placed, target)
-    by_level = xp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
+    by_level = xp.isinf(placed.bound.time[following]) & (
+        placed.bound.event[following] < 0
+    )
     longest = placed.duration * xp.where(by_level, _ROOM, 1 + 1e-9)
 
     # A lane for every section in each of K candidates and the reference.
@@ -205,19 +231,25 @@ def _try_ways(placed: PlacedSections, settings: Settings, kicks: Float[Array, "M
     each = lambda x: xp.repeat(xp.asarray(x), M * N)  # noqa: E731
     lanes = all_ways(placed.lanes)
     per_lane = ("time", "index", "event", "limit")
-    target = dataclasses.replace(target, **{x: all_ways(getattr(target, x)) for x in per_lane})
+    target = dataclasses.replace(
+        target, **{x: all_ways(getattr(target, x)) for x in per_lane}
+    )
     start = Stride(all_ways(longest) / each(divide), all_ways(lead), each(slack))
     accuracy = each(rtol), each(settings.atol * rtol / settings.rtol)
     tolerance = Settings(1.0, 1.0, patience, settings.scale)
     tolerance = eqx.tree_at(lambda x: (x.rtol, x.atol), tolerance, accuracy)
     u = xp.tile(xp.repeat(kicks.T, N, axis=1), W)
-    moved, tape = move(s, lanes, u, target, tolerance, start, options=Options(tape=implicit))
+    moved, tape = move(
+        s, lanes, u, target, tolerance, start, options=Options(tape=implicit)
+    )
     ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
     ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, M, N)
     estimate = moved.error.reshape(W, M, N)[:K] * (rtol[:K, None, None] / settings.rtol)
     first = longest / divide[:K, None]
     if tape is not None:  # the first step that is accepted, or all the way
-        taken = xp.take_along_axis(tape.h, xp.argmax(tape.code != IDLE, axis=0)[None], axis=0)
+        taken = xp.take_along_axis(
+            tape.h, xp.argmax(tape.code != IDLE, axis=0)[None], axis=0
+        )
         shortest = taken.reshape(W, M, N)[:K].min(axis=1)
         first = xp.where(shortest < 0.9 * first, shortest, longest)
     return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
@@ -227,7 +259,9 @@ def _lead(placed: PlacedSections, target):
     """Return the time to the next level as a multiple of Newton's guess; 1 if the guess is bad."""
     s, lanes = placed.structure(), placed.lanes
     N, xp = placed.n_sections, namespace(lanes.t)
-    watched = watch(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, xp.ones(N, bool))
+    watched = watch(
+        s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, xp.ones(N, bool)
+    )
     value, rate = watched.value[-1], watched.rate[-1]
     falls = (value > 0) & (rate < 0)
     lead = placed.duration * xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
@@ -246,7 +280,9 @@ def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
         np.maximum(worst[m // N], np.abs(x).max(axis=1), out=worst[m // N])
         x = J[(section + 1 + m) % N] @ x
     ratio = np.clip(worst[-1] / np.where(worst[-2] > 0, worst[-2], 1.0), 0.0, 0.999)
-    return (worst.sum(axis=0) + worst[-1] * ratio / (1 - ratio)).T.reshape(error.shape[:-1])
+    return (worst.sum(axis=0) + worst[-1] * ratio / (1 - ratio)).T.reshape(
+        error.shape[:-1]
+    )
 
 
 def _accumulated(J, error, scale) -> float:
@@ -288,7 +324,9 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
         time = np.full((placed.n_sections, 1), float(cycle.period))
         sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
         scales = np.concatenate([time, sizes], axis=1)
-        return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
+        return Stepping(
+            make_plan(placed, settings, accuracy, scales), settings, scales, accuracy
+        )
 
     # A plan is no part of the program that JAX traces.
     inside = is_inside_program() and not is_traced(placed)

@@ -64,7 +64,9 @@ class Record(eqx.Module):
         """**Raises:** `DefinitionError` for shapes that do not fit together."""
         self.u, self.y = np.array(u), np.array(y)
         if len(self.u) != len(self.y) or 0 in (len(self.u), *self.y.shape):
-            text = f"`u` {self.u.shape} and `y` {self.y.shape} must have the same samples"
+            text = (
+                f"`u` {self.u.shape} and `y` {self.y.shape} must have the same samples"
+            )
             raise DefinitionError(f"{text} (their first axes), one or more.")
         require_index("section", first_section, n_sections)
         self.n_sections, self.first_section, self.lead = n_sections, first_section, lead
@@ -118,7 +120,9 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     parts = [data] if isinstance(data, HasRecords) else data
     records = [record for part in parts for record in part.records]
     if not records:
-        raise DefinitionError("`data` holds no experiment that ran well: see `data.summary()`.")
+        raise DefinitionError(
+            "`data` holds no experiment that ran well: see `data.summary()`."
+        )
     if not all(record.inputs for record in records):
         raise DefinitionError(
             "`data` holds no input: name one, or use `hj.recordings.natural_multipliers`."
@@ -126,10 +130,14 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     about = [(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records]
     if other := [x for x in about if x != about[0]]:
         text = "the same sections, inputs, outputs, lead and drift"
-        raise DefinitionError(f"records of `data` must have {text}, not {about[0]} and {other[0]}.")
+        raise DefinitionError(
+            f"records of `data` must have {text}, not {about[0]} and {other[0]}."
+        )
     usable = [part for record in records for part in _with_known_inputs(record)]
     if not usable:
-        raise DefinitionError("an input is NaN at every sample: give the input that acted.")
+        raise DefinitionError(
+            "an input is NaN at every sample: give the input that acted."
+        )
     return usable
 
 
@@ -149,7 +157,9 @@ def require_deviations(records: Sequence[Record]) -> None:
     was declared and inputs change: it holds the limit cycle itself."""
     N, nu = records[0].n_sections, len(records[0].inputs)
     x = np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in records])
-    section = np.concatenate([r.first_section + np.arange(len(r.u)) for r in records]) % N
+    section = (
+        np.concatenate([r.first_section + np.arange(len(r.u)) for r in records]) % N
+    )
     left = x - average_cycle(section, x, N)[section]
     with np.errstate(invalid="ignore"):
         changes = np.nansum(left**2, axis=0) / np.nansum(x**2, axis=0)

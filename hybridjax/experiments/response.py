@@ -80,7 +80,12 @@ def course(placed: PlacedSections, outputs: Sequence[str | Output]) -> Course:
     """Return the course of experiments around a limit cycle."""
     cycle = placed.cycle
     return Course(
-        cycle.system, tuple(outputs), placed.bound, placed.lanes, cycle.period, cycle.event_sequence
+        cycle.system,
+        tuple(outputs),
+        placed.bound,
+        placed.lanes,
+        cycle.period,
+        cycle.event_sequence,
     )
 
 
@@ -111,7 +116,9 @@ def flow_batch(
     N, (S, n, _) = len(course.bound.time), u.shape
     one_turn = len(sequence)
     first = jax.tree_util.tree_map(lambda x: x[..., :1], course.lanes)
-    lanes = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first)
+    lanes = jax.tree_util.tree_map(
+        lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first
+    )
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
 
     @jax.checkpoint
@@ -131,9 +138,14 @@ def flow_batch(
         target = section_target(course.bound, course.lanes, period, *to)
         target = dataclasses.replace(target, event_sequence=sequence)
         stride = plan.stride(i, S)
-        moved = move(s, lanes, u, target, settings, stride, result, Options(glide=True)).moved
+        moved = move(
+            s, lanes, u, target, settings, stride, result, Options(glide=True)
+        ).moved
         # An event may change places with a section, but none may be left out or come in addition.
-        wrong = jnp.abs(moved.lanes.events - (course.lanes.events[j] + turns * one_turn)) > 1
+        wrong = (
+            jnp.abs(moved.lanes.events - (course.lanes.events[j] + turns * one_turn))
+            > 1
+        )
         result = update_result(moved.result, wrong, Result.EVENT_ORDER)
         # Times and events are counted within one turn, so that every turn is computed alike.
         lanes = eqx.tree_at(
@@ -152,7 +164,9 @@ def flow_batch(
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
     error = ROUNDING + plan.least + jnp.max(each_turn, axis=0)
-    end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
+    end = jnp.where(
+        result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan
+    )
     answers = None if answers is None else jnp.moveaxis(answers, -1, 0)
     return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T, answers)
 
@@ -209,7 +223,11 @@ class ResponseFunction(eqx.Module):
         if start is None:
             start = jnp.tile(placed.section_zero[:, None], len(u))
         return flow_batch(
-            course(placed, self.outputs), self.stepping.plan, start, u, self.stepping.settings
+            course(placed, self.outputs),
+            self.stepping.plan,
+            start,
+            u,
+            self.stepping.settings,
         )
 
 

@@ -142,7 +142,11 @@ class Inputs:
     periods: int
 
     def __len__(self) -> int:
-        return self.source.experiments if isinstance(self.source, Design) else len(self.source)
+        return (
+            self.source.experiments
+            if isinstance(self.source, Design)
+            else len(self.source)
+        )
 
     def part(self, rows: slice) -> Float[np.ndarray, "S n nu"]:
         """Return the inputs of consecutive experiments."""
@@ -179,7 +183,9 @@ class Campaign:
     large: bool
     feedback: Matrices | None = None
 
-    def run(self, rows: slice | None = None, workers: int | None = None) -> ExperimentData:
+    def run(
+        self, rows: slice | None = None, workers: int | None = None
+    ) -> ExperimentData:
         """Run the experiments of consecutive `rows`. Default: all of them.
 
         **Raises:** `DefinitionError` for an output that is not defined where experiments go, and if
@@ -202,7 +208,9 @@ class Campaign:
         inputs: tuple[str, ...] = z.structure.inputs
         if answer is not None:
             u = np.concatenate([u + answer, u], axis=2)
-            inputs = inputs + signals(names("references", None, len(inputs)), map(unit_of, inputs))
+            inputs = inputs + signals(
+                names("references", None, len(inputs)), map(unit_of, inputs)
+            )
         return ExperimentData(
             u,
             y,
@@ -259,7 +267,9 @@ class Campaign:
         if (change > stepping.accuracy).any():
             s = int(np.nanargmax(change))
             text = f"was found (Newton's last step: {change[s]:.1e}): lower the input, or discard"
-            raise ComputationError(f"experiment {first + s}: no periodic response {text} cycles.")
+            raise ComputationError(
+                f"experiment {first + s}: no periodic response {text} cycles."
+            )
         start = np.where(np.isnan(change), predicted, start)
         return start, parts if still and window.shape == u.shape else None
 
@@ -276,17 +286,40 @@ class Campaign:
             if answer is not None:
                 answer[rows] = part.feedback
         result, failed_at, error = map(np.concatenate, zip(*parts, strict=True))
-        return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error, answer
+        return (
+            y.reshape(S, n, -1),
+            result.astype(int),
+            failed_at.astype(int),
+            error,
+            answer,
+        )
 
-    def _flow(self, u, start, execution: Execution, name: str) -> Iterator[tuple[slice, Any]]:
+    def _flow(
+        self, u, start, execution: Execution, name: str
+    ) -> Iterator[tuple[slice, Any]]:
         """Yield rows and their `Response`, batch after batch."""
-        stepping, base, feedback = self.stepping, self.at_sections.on_cycle, self.feedback
-        loop = None if feedback is None else from_host(Feedback(feedback, jax.numpy.asarray(base)))
+        stepping, base, feedback = (
+            self.stepping,
+            self.at_sections.on_cycle,
+            self.feedback,
+        )
+        loop = (
+            None
+            if feedback is None
+            else from_host(Feedback(feedback, jax.numpy.asarray(base)))
+        )
 
         def arguments(rows):
             # (Nobody changes them before the program is done, so they may share memory.)
             x, held = jax.device_put((start[:, rows], u[rows]))
-            return self.at_sections.course, stepping.plan, x, held, stepping.settings, loop
+            return (
+                self.at_sections.course,
+                stepping.plan,
+                x,
+                held,
+                stepping.settings,
+                loop,
+            )
 
         return in_batches(self._program, arguments, len(u), execution, name)
 
@@ -320,13 +353,19 @@ def prepare(
     start, noise = options.start, options.process_noise
     feedback = None if options.feedback is None else _controller(placed, items, options)
     _require_return(cycle, placed, feedback is not None)
-    discard = (DISCARD if start == "cycle" else 0) if options.discard is None else options.discard
+    discard = (
+        (DISCARD if start == "cycle" else 0)
+        if options.discard is None
+        else options.discard
+    )
     N = placed.n_sections
     inputs = check_inputs(design, discard, N, cycle.system.inputs)
     if noise is not None:
         noise.require(N)
     if start != "cycle" and inputs.cycles % inputs.periods:
-        raise DefinitionError(f"start='{start}' needs inputs of whole windows: use `discard=0`.")
+        raise DefinitionError(
+            f"start='{start}' needs inputs of whole windows: use `discard=0`."
+        )
     together = len(inputs) if chunk is None else min(chunk, len(inputs))
     execution = divide(together, options.execution or Execution())
     return Campaign(
@@ -356,14 +395,18 @@ def _controller(
     loop = model.feedback(F)  # type: ignore[arg-type]  # (not None)
     if len(loop.multipliers) and abs(loop.multipliers[0]) >= 1:
         text = f"its largest multiplier is {abs(loop.multipliers[0]):.4g} in modulus"
-        raise ComputationError(f"with this feedback the limit cycle is not stable: {text}.")
+        raise ComputationError(
+            f"with this feedback the limit cycle is not stable: {text}."
+        )
     if isinstance(F, LDTP):
         return to_host(F.matrices)
     shape = len(model.inputs), len(model.outputs)
     return to_host(static_gain(to_host(F), model.n_sections, shape))
 
 
-def check_inputs(design: DesignLike, discard: int, n_sections: int, inputs: tuple) -> Inputs:
+def check_inputs(
+    design: DesignLike, discard: int, n_sections: int, inputs: tuple
+) -> Inputs:
     """Return the inputs for N sections and the inputs of these names, with the first `discard`
     cycles not for estimation.
 
@@ -372,7 +415,9 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, inputs: tupl
     if isinstance(design, Design):
         require_inputs(design, "system", n_sections, inputs)
         return Inputs(design, discard + design.periods, design.periods)
-    u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
+    u = np.asarray(
+        design
+    )  # may lie on disk (`numpy.memmap`), so never all of it is read at once
     require_shape(u.shape, n_sections, len(inputs))
     for k in range(0, len(u), CHUNK):
         finite = np.isfinite(np.asarray(u[k : k + CHUNK], float)).all(axis=(1, 2))
@@ -382,11 +427,15 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, inputs: tupl
             )
     cycles = u.shape[1] // n_sections
     if discard >= cycles:
-        raise DefinitionError(f"discard={discard} leaves none of {cycles} cycles of inputs.")
+        raise DefinitionError(
+            f"discard={discard} leaves none of {cycles} cycles of inputs."
+        )
     return Inputs(u, cycles, cycles - discard)
 
 
-def _require_return(cycle: LimitCycle, placed: PlacedSections, stabilized: bool) -> None:
+def _require_return(
+    cycle: LimitCycle, placed: PlacedSections, stabilized: bool
+) -> None:
     """**Raises:** an error for cycles that experiments would leave."""
     if not cycle.clocked and bool(np.isfinite(placed.bound.time).any()):
         raise DefinitionError(
@@ -395,10 +444,11 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections, stabilized: bool)
             "(KinematicPhase, or a list of Crossing and AtEvent)."
         )
     if not cycle.stable and not stabilized:
-        text = (
-            f"the limit cycle is not stable (largest multiplier {np.abs(cycle.multipliers[0]):.4g})"
+        largest = np.abs(cycle.multipliers[0])
+        raise ComputationError(
+            f"the limit cycle is not stable (largest multiplier {largest:.4g}): stabilize it, as "
+            "by `feedback`, or use `linearize` alone."
         )
-        raise ComputationError(f"{text}: stabilize it, as by `feedback`, or use `linearize` alone.")
 
 
 class _AtSections(NamedTuple):
@@ -424,7 +474,9 @@ def divide(S: int, execution: Execution) -> Execution:
         rounds = -(-S // (most * workers))
         size = max(-(-S // (rounds * workers)), min(_UNDIVIDED, S))
         size = min(-(-size // _VECTOR) * _VECTOR, max(S, 1))
-    return dataclasses.replace(execution, batch=size, workers=min(workers, -(-S // size)))
+    return dataclasses.replace(
+        execution, batch=size, workers=min(workers, -(-S // size))
+    )
 
 
 def in_batches(
@@ -446,9 +498,13 @@ def in_batches(
         rows = slice(k, k + size)
         if k + size > S:  # the last batch is filled up with repetitions
             rows = np.arange(k, k + size) % S
-        return jax.tree_util.tree_map(lambda x: np.asarray(x)[: S - k], program(*arguments(rows)))
+        return jax.tree_util.tree_map(
+            lambda x: np.asarray(x)[: S - k], program(*arguments(rows))
+        )
 
     starts = range(0, S, size)
     parts = in_threads(work, starts, execution.workers or 1)
-    for k, part in counted(zip(starts, parts, strict=True), f"batches of {name}", len(starts)):
+    for k, part in counted(
+        zip(starts, parts, strict=True), f"batches of {name}", len(starts)
+    ):
         yield slice(k, min(k + size, S)), part

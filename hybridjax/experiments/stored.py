@@ -13,7 +13,15 @@ from .._core.boundary.kinds import ExperimentCount, FilePath, Index
 from .._core.execution import Execution
 from .._core.pieces.description import digest_of, versions
 from .._core.pieces.run import DaskClient, fill
-from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, absolute, flags
+from .._core.pieces.store import (
+    Blocks,
+    Constant,
+    Layout,
+    Variable,
+    ZarrStore,
+    absolute,
+    flags,
+)
 from .._core.progress import working
 from .._core.results import Result
 from .._core.signal import Signal, unit_of
@@ -85,8 +93,12 @@ class StoredExperiments:
         """Read chunk after chunk. **Raises:** `DefinitionError` if one is missing;
         `FileFormatError` if one is damaged."""
         if missing := self.missing():
-            text = f"{len(missing)} of {len(self)} chunks in '{self.address}' are missing"
-            raise DefinitionError(f"{text}: make the call that began it again to run them.")
+            text = (
+                f"{len(missing)} of {len(self)} chunks in '{self.address}' are missing"
+            )
+            raise DefinitionError(
+                f"{text}: make the call that began it again to run them."
+            )
         for k in range(len(self)):
             yield self[k]
 
@@ -97,7 +109,9 @@ class StoredExperiments:
 
     def summary(self, limit: Index = 5) -> str:
         """Return the same as `ExperimentData.summary`, for all experiments."""
-        result, failed_at = (self._store.array(name) for name in ("result", "failed_at"))
+        result, failed_at = (
+            self._store.array(name) for name in ("result", "failed_at")
+        )
         return summary(result, failed_at, self.n_sections, limit)
 
     def __repr__(self) -> str:
@@ -158,12 +172,16 @@ def stream_experiments(
         S = len(campaign.inputs)
         return (campaign.run(slice(k, min(k + chunk, S))) for k in range(0, S, chunk))
     if options.feedback is not None:
-        raise DefinitionError("a store keeps no experiments with feedback: leave `store` out.")
+        raise DefinitionError(
+            "a store keeps no experiments with feedback: leave `store` out."
+        )
     # (Batches as for one thread: their size does not depend on the machine.)
     execution = dataclasses.replace(options.execution or Execution(), workers=1)
     options = dataclasses.replace(options, execution=execution)
     with working("stream_experiments"):
-        campaign = prepare(cycle, sections, design, outputs, options, chunk, one_program=True)
+        campaign = prepare(
+            cycle, sections, design, outputs, options, chunk, one_program=True
+        )
         S = len(campaign.inputs)
         fill(ExperimentJob(campaign, Blocks((S,), (min(chunk, S),))), store, client)
     return StoredExperiments(store)
@@ -181,9 +199,12 @@ class ExperimentJob:
         (rows,) = self.blocks.slices(k)
         data = self.campaign.run(rows, Execution(workers=workers).threads)
         return {
-            "u": data.u, "y": data.y, "result": data.result,
-            "failed_at": data.failed_at, "error": data.error,
-        }  # fmt: skip
+            "u": data.u,
+            "y": data.y,
+            "result": data.result,
+            "failed_at": data.failed_at,
+            "error": data.error,
+        }
 
     def begin(self) -> tuple["ExperimentJob", Layout]:
         """Return the job, and the form of its records."""
@@ -193,7 +214,9 @@ class ExperimentJob:
         variables = {
             "u": Variable("<f8", ("sample", "input"), (n, len(u))),
             "y": Variable("<f8", ("sample", "output"), (n, len(values.outputs.names))),
-            "result": Variable("<i8", attributes=flags([x.name.lower() for x in Result])),
+            "result": Variable(
+                "<i8", attributes=flags([x.name.lower() for x in Result])
+            ),
             "failed_at": Variable("<i8"),
             "error": Variable("<f8"),
         }
@@ -203,7 +226,9 @@ class ExperimentJob:
             "cycle_outputs": (("section", "output"), values.on_cycle, {}),
         }
         coordinates = "input", "output"
-        return self, Layout(("experiment",), self.blocks, variables, constants, coordinates, text)
+        return self, Layout(
+            ("experiment",), self.blocks, variables, constants, coordinates, text
+        )
 
     def arrays(self) -> list[np.ndarray]:
         """Return the arrays that records depend on beside inputs and parameters: those of the
@@ -216,9 +241,16 @@ class ExperimentJob:
         mine, other = eqx.partition(self._computed(), eqx.is_array)
         leaves, structure = jax.tree_util.tree_flatten(mine)
         pairs = zip(leaves, arrays, strict=True)
-        new = [jax.numpy.asarray(x) if isinstance(old, jax.Array) else x for old, x in pairs]
-        placed, stepping, model = eqx.combine(jax.tree_util.tree_unflatten(structure, new), other)
-        campaign = dataclasses.replace(self.campaign, placed=placed, stepping=stepping, model=model)
+        new = [
+            jax.numpy.asarray(x) if isinstance(old, jax.Array) else x
+            for old, x in pairs
+        ]
+        placed, stepping, model = eqx.combine(
+            jax.tree_util.tree_unflatten(structure, new), other
+        )
+        campaign = dataclasses.replace(
+            self.campaign, placed=placed, stepping=stepping, model=model
+        )
         return dataclasses.replace(self, campaign=campaign)
 
     def _computed(self) -> Any:
@@ -258,5 +290,7 @@ class ExperimentJob:
 def _design(source: Design | np.ndarray) -> str:
     if isinstance(source, Design):
         return digest_of(source)
-    parts = (source[k : k + CHUNK] for k in range(0, len(source), CHUNK))  # (may lie on disk)
+    parts = (
+        source[k : k + CHUNK] for k in range(0, len(source), CHUNK)
+    )  # (may lie on disk)
     return digest_of(*map(digest_of, parts))

@@ -22,7 +22,15 @@ from ..systems.quotient import check_symmetry
 from ..systems.system import Guess, HybridSystem
 from .model_fit import Identifiability, ModelFit, ParameterGuess, diagnose
 from .observations import AbstractObservation
-from .problem import DELAYS, FitProblem, Free, Parameters, descend, evaluate, free_parameters
+from .problem import (
+    DELAYS,
+    FitProblem,
+    Free,
+    Parameters,
+    descend,
+    evaluate,
+    free_parameters,
+)
 
 
 Data = AbstractObservation | Sequence[AbstractObservation]
@@ -89,7 +97,9 @@ def fit_model(
     problem, near = _prepare(system, data, free, guess)
     p = problem.parameters
     x0 = np.asarray(p.encode(p.read(system, problem.observations)))
-    around = _SPREAD * np.random.default_rng(seed).uniform(-1, 1, (guesses - 1, len(x0)))
+    around = _SPREAD * np.random.default_rng(seed).uniform(
+        -1, 1, (guesses - 1, len(x0))
+    )
     ends: list[End] = []
     for start in counted(np.stack([x0, *(x0 + around)]), "guesses", guesses):
         at_guess = not ends and near.system is system
@@ -99,7 +109,11 @@ def fit_model(
             break
     best = min(ends, key=lambda end: (end.cost, -len(end.residuals)))
     if best.cost == np.inf:
-        why = "its residuals are not finite" if len(best.residuals) else Result(best.result).message
+        why = (
+            "its residuals are not finite"
+            if len(best.residuals)
+            else Result(best.result).message
+        )
         raise ComputationError(
             f"none of {guesses} guesses has a limit cycle on which the data can be observed "
             f"({why}): give another system, or more `guesses`."
@@ -109,7 +123,11 @@ def fit_model(
 
 @checked
 def identifiability(
-    system: HybridSystem, data: Data, free: Free, *, guess: Guess | LimitCycle | None = None
+    system: HybridSystem,
+    data: Data,
+    free: Free,
+    *,
+    guess: Guess | LimitCycle | None = None,
 ) -> Identifiability:
     """Find the combinations of parameters that data identify, without a fit.
 
@@ -138,10 +156,14 @@ def _prepare(
     """Return the problem, and a limit cycle near which to search for others."""
     observations = [data] if isinstance(data, AbstractObservation) else data
     if not observations:
-        raise DefinitionError("`data` must be one observation or more, not an empty list.")
+        raise DefinitionError(
+            "`data` must be one observation or more, not an empty list."
+        )
     parameters = free_parameters(system, free, observations)
     with searching("as `guess`"):
-        near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
+        near = (
+            guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
+        )
     require_similar(near.return_map, system)
     moved = away_from_events(near)
     if moved is not near:
@@ -155,7 +177,9 @@ def _prepare(
 
 
 def _relative(
-    parameters: Parameters, x: Float[Array, " p"], jacobian: Float[Array | np.ndarray, "r p"]
+    parameters: Parameters,
+    x: Float[Array, " p"],
+    jacobian: Float[Array | np.ndarray, "r p"],
 ) -> Float[np.ndarray, "r p"]:
     """Return derivatives by relative changes of the values from those by coordinates."""
     values, slopes = jax.jvp(parameters.decode, (x,), (jnp.ones_like(x),))
@@ -192,14 +216,21 @@ class End(NamedTuple):
 
 
 def _cycle_at(
-    problem: FitProblem, system: HybridSystem, x: Float[np.ndarray, " p"], near: LimitCycle
+    problem: FitProblem,
+    system: HybridSystem,
+    x: Float[np.ndarray, " p"],
+    near: LimitCycle,
 ) -> LimitCycle:
     """Return the cycle with the parameters at x, converged or not."""
     p = problem.parameters
-    return find_limit_cycle(p.insert(system, p.decode(jnp.asarray(x))), near, throw=False)
+    return find_limit_cycle(
+        p.insert(system, p.decode(jnp.asarray(x))), near, throw=False
+    )
 
 
-def _descend(problem: FitProblem, start: Float[np.ndarray, " p"], cycle: LimitCycle) -> End:
+def _descend(
+    problem: FitProblem, start: Float[np.ndarray, " p"], cycle: LimitCycle
+) -> End:
     if int(cycle.result) != Result.OK:
         none = np.zeros(0), np.zeros((0, len(start)))
         return End(start, start, np.inf, *none, cycle, 0, int(cycle.result))
@@ -208,11 +239,14 @@ def _descend(problem: FitProblem, start: Float[np.ndarray, " p"], cycle: LimitCy
     return End(start, x, float(r @ r), r, J, near, steps, int(result))
 
 
-def _summary(problem: FitProblem, system: HybridSystem, ends: list[End], best: End) -> ModelFit:
+def _summary(
+    problem: FitProblem, system: HybridSystem, ends: list[End], best: End
+) -> ModelFit:
     parameters = problem.parameters
     decode = lambda x: np.asarray(parameters.decode(jnp.asarray(x)))  # noqa: E731
     guesses = tuple(
-        ParameterGuess(decode(e.start), decode(e.x), e.cost, e.steps, e.result) for e in ends
+        ParameterGuess(decode(e.start), decode(e.x), e.cost, e.steps, e.result)
+        for e in ends
     )
     cycle = _cycle_at(problem, system, best.x, best.cycle)
     values, residuals = decode(best.x), best.residuals
@@ -225,6 +259,16 @@ def _summary(problem: FitProblem, system: HybridSystem, ends: list[End], best: E
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
     root = left[:, :rank] / singular[:rank] * size[:, None]
     return ModelFit(
-        cycle.system, cycle, parameters.names, values, unit * root @ root.T,
-        residuals, best.cost, freedom, identified, guesses, best.result, problem,
-    )  # fmt: skip
+        cycle.system,
+        cycle,
+        parameters.names,
+        values,
+        unit * root @ root.T,
+        residuals,
+        best.cost,
+        freedom,
+        identified,
+        guesses,
+        best.result,
+        problem,
+    )

@@ -68,13 +68,19 @@ class Identifiability(eqx.Module):
         nonzero = ", ".join(f"{x:.2g}" for x in self.singular_values[: self.rank])
         lost = ", ".join(f"{x:.1g}" for x in self.singular_values[self.rank :])
         names, p = ", ".join(self.names), len(self.names)
-        lines = [f"Identifiability: {self.rank} of {p} combinations of ({names}) are identified"]
+        lines = [
+            f"Identifiability: {self.rank} of {p} combinations of ({names}) are identified"
+        ]
         lines += [f"  not identified: {text}" for text in self.descriptions()]
-        lines.append(f"  singular values {nonzero}" + (f"; zero: {lost}" if lost else ""))
+        lines.append(
+            f"  singular values {nonzero}" + (f"; zero: {lost}" if lost else "")
+        )
         return "\n".join(lines)
 
 
-def diagnose(names: tuple[str, ...], sensitivity: Float[np.ndarray, "r p"]) -> Identifiability:
+def diagnose(
+    names: tuple[str, ...], sensitivity: Float[np.ndarray, "r p"]
+) -> Identifiability:
     """Return the identifiability from the sensitivities S of weighted residuals to relative changes
     of the parameters."""
     _, values, rows = np.linalg.svd(np.linalg.qr(sensitivity, mode="r"))
@@ -195,33 +201,55 @@ class ModelFit(eqx.Module):
         standard errors.
         """
         if isinstance(true, HybridSystem):
-            kept = {x: y for x, y in arrays_of(self.system).items() if x not in self.names}
+            kept = {
+                x: y for x, y in arrays_of(self.system).items() if x not in self.names
+            }
             given = arrays_of(true).items()
-            true = {x: y for x, y in given if not np.array_equal(y, kept.get(x, np.nan))}
+            true = {
+                x: y for x, y in given if not np.array_equal(y, kept.get(x, np.nan))
+            }
         if more := [name for name in true if name not in self.names]:
-            raise DefinitionError(f"`true` has another '{more[0]}', which was not fitted: free it.")
+            raise DefinitionError(
+                f"`true` has another '{more[0]}', which was not fitted: free it."
+            )
         if missing := [name for name in self.names if name not in true]:
-            raise DefinitionError(f"`true` must have a value of '{missing[0]}', which was fitted.")
+            raise DefinitionError(
+                f"`true` must have a value of '{missing[0]}', which was fitted."
+            )
         values = jnp.array([float(true[name]) for name in self.names])
-        r, *_ = evaluate(self.problem, self.problem.parameters.encode(values), self.cycle)
+        r, *_ = evaluate(
+            self.problem, self.problem.parameters.encode(values), self.cycle
+        )
         unit = self.problem.unit(self.cost, self.freedom)
         if np.isnan(unit):
-            raise DefinitionError("give `std`: no residual is left to estimate standard errors.")
+            raise DefinitionError(
+                "give `std`: no residual is left to estimate standard errors."
+            )
         return (float(r @ r) - self.cost) / unit
 
     @checked
-    def contains(self, true: HybridSystem | Mapping[str, float], level: Probability = 0.95) -> bool:
+    def contains(
+        self, true: HybridSystem | Mapping[str, float], level: Probability = 0.95
+    ) -> bool:
         """Test whether other values lie in the joint confidence region."""
         rank = max(self.identifiability.rank, 1)
-        region = stats.chi2(rank) if self.weighted else stats.f(rank, self.freedom, scale=rank)
+        region = (
+            stats.chi2(rank)
+            if self.weighted
+            else stats.f(rank, self.freedom, scale=rank)
+        )
         return bool(self.chi_square(true) <= region.ppf(level))
 
     def __repr__(self) -> str:
         width = max(map(len, self.names))
-        lines = [f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"]
+        lines = [
+            f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"
+        ]
         lines += [self._cost(), "standard errors include noise, but no distortion:"]
         for name, value, error, unit in self._rows():
-            lines.append(f"{name:{width}}  {value:<14} {error} {unit * ('±' in error)}".rstrip())
+            lines.append(
+                f"{name:{width}}  {value:<14} {error} {unit * ('±' in error)}".rstrip()
+            )
         return "\n  ".join(lines + self._remarks())
 
     def _remarks(self) -> list[str]:
@@ -230,11 +258,15 @@ class ModelFit(eqx.Module):
         errors = np.where(np.isfinite(self.standard_errors), self.standard_errors, 0.0)
         for bounds in (self.problem.parameters.low, self.problem.parameters.high):
             for k in np.flatnonzero(np.abs(np.asarray(bounds) - self.values) < errors):
-                remarks.append(f"{self.names[k]} reaches its bound {bounds[k]:g} within its error")
+                remarks.append(
+                    f"{self.names[k]} reaches its bound {bounds[k]:g} within its error"
+                )
         return remarks
 
     def _cost(self) -> str:
-        misfit = f"residuals {100 * np.sqrt(np.mean(self.residuals**2)):.2g} % of the data"
+        misfit = (
+            f"residuals {100 * np.sqrt(np.mean(self.residuals**2)):.2g} % of the data"
+        )
         expected = f"expected {self.freedom}" if self.weighted else misfit
         good = sum(guess.result == Result.OK for guess in self.guesses)
         head = f"cost {self.cost:.6g}, {expected}; {good} of {len(self.guesses)} guesses converged"
@@ -242,12 +274,25 @@ class ModelFit(eqx.Module):
 
     def _rows(self) -> Iterator[tuple[str, str, str, str]]:
         """Yield each name with its value, standard error and unit."""
-        for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
+        for name, value, error in zip(
+            self.names, self.values, self.standard_errors, strict=True
+        ):
             shown = "not identified alone" if np.isinf(error) else f"± {error:.2g}"
-            unit = self.system.time_unit if name in DELAYS else unit_of_parameter(self.system, name)
+            unit = (
+                self.system.time_unit
+                if name in DELAYS
+                else unit_of_parameter(self.system, name)
+            )
             yield name, f"{value:.9g}", shown, unit
 
     def _repr_html_(self) -> str:
-        parameters = table(("parameter", "value", "standard error", "unit"), self._rows())
+        parameters = table(
+            ("parameter", "value", "standard error", "unit"), self._rows()
+        )
         of = f"of {type(self.system).__name__}: {Result(self.result).message}"
-        return card("ModelFit", of, parameters, text("\n".join([self._cost(), *self._remarks()])))
+        return card(
+            "ModelFit",
+            of,
+            parameters,
+            text("\n".join([self._cost(), *self._remarks()])),
+        )

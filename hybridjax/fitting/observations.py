@@ -118,7 +118,11 @@ class ObservedHTF(AbstractObservation):
         """
         self.delay = None if delay is None else jnp.asarray(delay, float)
         self.f, self.H, self.sections = htf.f, htf.H, as_family(sections)
-        self.harmonics, self.inputs, self.outputs = htf.harmonics, htf.inputs, htf.outputs
+        self.harmonics, self.inputs, self.outputs = (
+            htf.harmonics,
+            htf.inputs,
+            htf.outputs,
+        )
         require_same("HTFs and `sections`", htf, self.sections, ("n_sections",))
         self.weights = jnp.asarray(error_weights(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
@@ -162,7 +166,9 @@ class ObservedSeries(AbstractObservation):
     weighted: Bool[Array, ""]
     flow: tuple[Plan, Settings] | None
 
-    def __init__(self, data: ExperimentData, sections: FamilyLike, std: Deviations | None = None):
+    def __init__(
+        self, data: ExperimentData, sections: FamilyLike, std: Deviations | None = None
+    ):
         """**Arguments:** `data`: from experiments with `start="cycle"`. `sections`: their family.
         `std`: standard deviation of the measurement noise, one number or one for each output.
 
@@ -198,7 +204,9 @@ class ObservedSeries(AbstractObservation):
         plan, settings = self.flow
         y = flow_batch(course(placed, self.outputs), plan, start, self.u, settings).y
         if not self.absolute:
-            y = y - jnp.tile(placed.observe(self.outputs), (y.shape[1] // placed.n_sections, 1))
+            y = y - jnp.tile(
+                placed.observe(self.outputs), (y.shape[1] // placed.n_sections, 1)
+            )
         return ((y - self.y) / self.scale).ravel()
 
     def prepare(self, cycle: LimitCycle) -> "ObservedSeries":
@@ -261,15 +269,21 @@ class ObservedCycle(AbstractObservation):
         }
         given = {name: entry for name, entry in given.items() if entry[0] is not None}
         if not given or ("values" in given) != bool(ny):
-            raise DefinitionError("give `outputs` with their `values`, `times`, or a `period`.")
+            raise DefinitionError(
+                "give `outputs` with their `values`, `times`, or a `period`."
+            )
         self.which = tuple(given)
         for name, (x, _, axes) in given.items():
             require_axes(f"`{name}`", x, axes)
         self.measured = tuple(jnp.asarray(x, float) for x, *_ in given.values())
-        self.scales = tuple(_scale(k, std, jnp.asarray(x)) for k, (x, std, _) in given.items())
+        self.scales = tuple(
+            _scale(k, std, jnp.asarray(x)) for k, (x, std, _) in given.items()
+        )
         weights = {std is not None for _, std, _ in given.values()}
         if len(weights) > 1:
-            raise DefinitionError("give standard deviations of all measurements, or of none.")
+            raise DefinitionError(
+                "give standard deviations of all measurements, or of none."
+            )
         self.weighted = jnp.asarray(weights.pop())
 
     @classmethod
@@ -289,10 +303,14 @@ class ObservedCycle(AbstractObservation):
         t, y = observed_at(cycle, self.sections, self.outputs, last_turn(cycle))
         predicted = {"values": y, "times": t, "period": cycle.period}
         parts = []
-        for name, measured, scale in zip(self.which, self.measured, self.scales, strict=True):
+        for name, measured, scale in zip(
+            self.which, self.measured, self.scales, strict=True
+        ):
             error = predicted[name] - measured
             if name == "times":
-                turns = jnp.round((error if cycle.clocked else error - error[0]) / cycle.period)
+                turns = jnp.round(
+                    (error if cycle.clocked else error - error[0]) / cycle.period
+                )
                 error = error - jax.lax.stop_gradient(turns) * cycle.period
                 if not cycle.clocked:  # any moment may be zero: only differences count
                     error = helmert(len(error)) @ error
@@ -312,10 +330,14 @@ def _real(H: Array, measured: Array, weights: Array) -> Float[Array, " r"]:
 
 
 def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
-    if std is None and name == "times":  # (any moment may be zero: `prepare` knows the period)
+    if (
+        std is None and name == "times"
+    ):  # (any moment may be zero: `prepare` knows the period)
         return jnp.asarray(jnp.nan)
     if std is None:
-        size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))  # of the shape seen.shape[1:]
+        size = jnp.sqrt(
+            jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0)
+        )  # of the shape seen.shape[1:]
         if not jnp.all(size > 0):
             raise DefinitionError(
                 f"`{name}` are zero throughout and have no size: leave them out, or give their "

@@ -70,7 +70,9 @@ class Parameters(eqx.Module):
     high: Float[Array, " p"]
     size: Float[Array, " p"]
 
-    def read(self, system: HybridSystem, observations: Observations) -> Float[Array, " p"]:
+    def read(
+        self, system: HybridSystem, observations: Observations
+    ) -> Float[Array, " p"]:
         """Return the values of a system, and the delays of its observations."""
         return jnp.stack([_value(system, observations, name) for name in self.names])
 
@@ -78,7 +80,9 @@ class Parameters(eqx.Module):
     def insert(self, system: HybridSystem, values: Float[Array, " p"]) -> HybridSystem:
         """Return the system with other values."""
         named = zip(self.names, values, strict=True)
-        return with_parameters(system, {name: x for name, x in named if name not in DELAYS})
+        return with_parameters(
+            system, {name: x for name, x in named if name not in DELAYS}
+        )
 
     def observed(
         self, observations: Observations, values: Float[Array, " p"]
@@ -107,7 +111,9 @@ class Parameters(eqx.Module):
         """Return values at coordinates x."""
         low, high, cases = self._bounds()
         inside = low + (high - low) * jax.nn.sigmoid(x)
-        return jnp.select(cases, [inside, low + jnp.exp(x), high - jnp.exp(x)], x * self.size)
+        return jnp.select(
+            cases, [inside, low + jnp.exp(x), high - jnp.exp(x)], x * self.size
+        )
 
     def _bounds(self) -> tuple[Array, Array, list[Array]]:
         """Return bounds with zero for infinity; the cases of both, a lower one, an upper one."""
@@ -119,7 +125,11 @@ class Parameters(eqx.Module):
 def _value(system: HybridSystem, observations: Observations, name: str) -> Array:
     if name not in DELAYS:
         return parameter_of(system, name)
-    delays = [o.delay for o in observations if isinstance(o, ObservedHTF) and o.delay is not None]
+    delays = [
+        o.delay
+        for o in observations
+        if isinstance(o, ObservedHTF) and o.delay is not None
+    ]
     if not delays:
         raise DefinitionError(
             f"'{name}' is free, but no data have a delay: pass `ObservedHTF(..., delay=)`."
@@ -137,7 +147,9 @@ def free_parameters(
     """
     names = (free,) if isinstance(free, str) else tuple(free)
     if not names or len(set(names)) < len(names):
-        raise DefinitionError(f"`free` must name one parameter or more, each once, not {names}.")
+        raise DefinitionError(
+            f"`free` must name one parameter or more, each once, not {names}."
+        )
     rows = []
     for name in names:
         value = float(_value(system, observations, name))
@@ -153,7 +165,9 @@ def free_parameters(
     return Parameters(names, *map(jnp.asarray, np.transpose(rows)))
 
 
-def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> tuple[LimitCycle, Turn | None]:
+def candidate_cycle(
+    system: HybridSystem, guess: LimitCycle
+) -> tuple[LimitCycle, Turn | None]:
     """Return the cycle of a system near the `guess`, as `find_limit_cycle`, under a transformation;
     and its last turn outside of programs.
 
@@ -205,13 +219,20 @@ class FitProblem(eqx.Module):
         if not self.weighted:
             return max(misfit, np.finfo(float).tiny) if freedom else np.nan
         htfs = [x for x in self.observations if isinstance(x, ObservedHTF)]
-        return estimated_noise(max((float(x.most) for x in htfs), default=1.0), misfit)[1] ** 2
+        return (
+            estimated_noise(max((float(x.most) for x in htfs), default=1.0), misfit)[1]
+            ** 2
+        )
 
-    def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> tuple[Array, tuple]:
+    def residuals(
+        self, x: Float[Array, " p"], guess: LimitCycle
+    ) -> tuple[Array, tuple]:
         """Return the residuals (r,), infinite where there is no limit cycle, or no observation on
         it; and the anchor, the period and the last turn of the cycle."""
         values = self.parameters.decode(x)
-        cycle, turn = candidate_cycle(self.parameters.insert(guess.system, values), guess)
+        cycle, turn = candidate_cycle(
+            self.parameters.insert(guess.system, values), guess
+        )
         observations = self.parameters.observed(self.observations, values)
         parts = [observation.residuals(cycle) for observation in observations]
         return _joined(parts, cycle.result), (cycle.anchor, cycle.period, turn)
@@ -258,7 +279,9 @@ def evaluate(
 
 def descend(
     problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle
-) -> tuple[Any, Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle, int, bool]:
+) -> tuple[
+    Any, Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle, int, bool
+]:
     """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals and their
     Jacobian, a guess for their cycle, number of evaluations, and whether it has converged.
 

@@ -13,7 +13,9 @@ from ..orbits.cycle import LimitCycle
 
 
 @checked
-def spectral_radius(model: LDTP | LimitCycle, smoothing: Probability = 1e-3) -> Float[Array, ""]:
+def spectral_radius(
+    model: LDTP | LimitCycle, smoothing: Probability = 1e-3
+) -> Float[Array, ""]:
     r"""A smooth upper bound of the largest modulus of the Floquet multipliers.
 
     The number $\rho_\epsilon$ with
@@ -45,19 +47,27 @@ def spectral_radius(model: LDTP | LimitCycle, smoothing: Probability = 1e-3) -> 
 
 
 @jax.jit
-def _smooth_radius(power: Float[Array, "d d"], smoothing: Float[Array, ""]) -> Float[Array, ""]:
+def _smooth_radius(
+    power: Float[Array, "d d"], smoothing: Float[Array, ""]
+) -> Float[Array, ""]:
     d = power.shape[0]
 
     def excess(x, power):
         """Logarithm of the sum over that of d / epsilon, at rho = e^x: convex and falling."""
         identity = jnp.eye(d)
         twice = jnp.kron(power, power)  # its powers map vec(I) to vec(P P^T)
-        total = jnp.linalg.solve(jnp.eye(d * d) - jnp.exp(-2 * x) * twice, identity.ravel())
+        total = jnp.linalg.solve(
+            jnp.eye(d * d) - jnp.exp(-2 * x) * twice, identity.ravel()
+        )
         return jnp.log(identity.ravel() @ total) - jnp.log(d / smoothing)
 
     fixed = jax.lax.stop_gradient(power)
     true = jnp.max(jnp.abs(jnp.linalg.eigvals(fixed)))
-    begin = jnp.log(jnp.maximum(true / jnp.sqrt(1 - smoothing / d), 1e-6 * jnp.linalg.norm(fixed)))
+    begin = jnp.log(
+        jnp.maximum(true / jnp.sqrt(1 - smoothing / d), 1e-6 * jnp.linalg.norm(fixed))
+    )
     # Newton's method goes up from the lower bound and never beyond the root.
     solver: optx.Newton = optx.Newton(rtol=1e-12, atol=1e-12)
-    return jnp.exp(optx.root_find(excess, solver, begin, power, max_steps=64, throw=False).value)
+    return jnp.exp(
+        optx.root_find(excess, solver, begin, power, max_steps=64, throw=False).value
+    )

@@ -25,7 +25,9 @@ SLOWEST = 0.99
 _SMALLEST_REMAINDER = 0.1
 
 
-def chi(period_delay: Complex[np.ndarray, " E"], c: Coefficients) -> Complex[np.ndarray, " E"]:
+def chi(
+    period_delay: Complex[np.ndarray, " E"], c: Coefficients
+) -> Complex[np.ndarray, " E"]:
     r"""Return $1 + c_1 z^{-N} + \ldots + c_d z^{-dN}$ at values of $z^{-N}$, the period's delay."""
     return np.polyval([*c[::-1], 1.0], period_delay)
 
@@ -33,7 +35,9 @@ def chi(period_delay: Complex[np.ndarray, " E"], c: Coefficients) -> Complex[np.
 def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
     """Return the multipliers by decreasing modulus, of each pair the upper one first."""
     roots = np.roots([1.0, *coefficients]).astype(complex)
-    roots = np.pad(roots, (0, len(coefficients) - len(roots)))  # numpy drops roots at zero
+    roots = np.pad(
+        roots, (0, len(coefficients) - len(roots))
+    )  # numpy drops roots at zero
     return roots[np.lexsort((-np.imag(roots), -np.abs(roots)))]
 
 
@@ -89,7 +93,9 @@ def fading(c: Coefficients) -> Coefficients:
     return c * (SLOWEST / slowest) ** np.arange(1, len(c) + 1)
 
 
-def in_blocks(x: Float[np.ndarray, "S T *rest"], count: int) -> Float[np.ndarray, "B length *rest"]:
+def in_blocks(
+    x: Float[np.ndarray, "S T *rest"], count: int
+) -> Float[np.ndarray, "B length *rest"]:
     """Divide the T cycles of each record into blocks, the last one filled up with zeros."""
     S, T, *shape = x.shape
     length = -(-T // count)

@@ -85,7 +85,9 @@ def descend(point: P, damping: float = 0.0, max_steps: int = 50) -> tuple[P, boo
             damping, factor = max(damping, FIRST_DAMPING) * factor, 2 * factor
             step, gain = point.step(damping)
             trial = point.moved(step)
-        damping *= max(_LESS, 1 - (2 * min((point.cost - trial.cost) / gain, 1.0) - 1) ** 3)
+        damping *= max(
+            _LESS, 1 - (2 * min((point.cost - trial.cost) / gain, 1.0) - 1) ** 3
+        )
         point = trial.accepted()
     return point, False
 
@@ -142,11 +144,15 @@ class NormalEquations:
     **Arguments:** `gram` (P, P), $J^T J$. `gradient` (P,), $J^T r$.
     """
 
-    def __init__(self, gram: Float[np.ndarray, "P P"], gradient: Float[np.ndarray, " P"]):
+    def __init__(
+        self, gram: Float[np.ndarray, "P P"], gradient: Float[np.ndarray, " P"]
+    ):
         self.gradient = gradient
         size = np.sqrt(np.maximum(np.diag(gram), 0))
         self._size = np.where(size > 0, size, 1.0)
-        self._values, self._vectors = np.linalg.eigh(gram / self._size / self._size[:, None])
+        self._values, self._vectors = np.linalg.eigh(
+            gram / self._size / self._size[:, None]
+        )
         self._slope = self._vectors.T @ (gradient / self._size)
         self._shown = self._values > ROUNDING * self._values[-1]
 
@@ -163,7 +169,10 @@ class NormalEquations:
 
     def spread(self, unit: float = 1.0) -> "Spread":
         """Return the uncertainty of the solution, for errors of this variance."""
-        vectors, least = self._vectors / self._size[:, None], ROUNDING * self._values[-1]
+        vectors, least = (
+            self._vectors / self._size[:, None],
+            ROUNDING * self._values[-1],
+        )
         root = vectors * np.sqrt(unit / np.maximum(self._values, least))
         return Spread(root[:, self._shown], root[:, ~self._shown])
 
@@ -177,7 +186,9 @@ class Spread(NamedTuple):
     """The same for undetermined combinations, with the smallest eigenvalue above rounding: a lower
     bound."""
 
-    def variance(self, slopes: Inexact[np.ndarray, "P *rest"]) -> Float[np.ndarray, "*rest"]:
+    def variance(
+        self, slopes: Inexact[np.ndarray, "P *rest"]
+    ) -> Float[np.ndarray, "*rest"]:
         """Return the variance of numbers with these derivatives; infinite if undetermined."""
         shown, hidden = (
             (np.abs(np.tensordot(x.T, slopes, 1)) ** 2).sum(axis=0)

@@ -106,14 +106,25 @@ def estimate_htf(
     if variance != "noise" and np.median(lines.realizations) > 0 and not why_not:
         total, noise = lines.total, lines.noise
         shared = lines.realizations.sum()
-        freedom = np.where(lines.realizations < 1, shared, lines.realizations).astype(float)
+        freedom = np.where(lines.realizations < 1, shared, lines.realizations).astype(
+            float
+        )
         scatter = Scatter(freedom, _roundness(sums, rows, lines.H))
     elif lines.noise is not None:
         scatter = Scatter(sums.count[rows] * (repeats - 1.0))
     return HTF(
-        f, lines.H, sums.harmonics, setup.n_sections, setup.inputs, setup.outputs, "estimate",
-        variance=total, noise_variance=noise, scatter=scatter, power=lines.power,
-    )  # fmt: skip
+        f,
+        lines.H,
+        sums.harmonics,
+        setup.n_sections,
+        setup.inputs,
+        setup.outputs,
+        "estimate",
+        variance=total,
+        noise_variance=noise,
+        scatter=scatter,
+        power=lines.power,
+    )
 
 
 class _LineEstimates(NamedTuple):
@@ -159,7 +170,9 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
     realizations = count - np.where(sums.mirrored[rows], 2 * nu, nu)
     mean = residual / np.maximum(realizations, 1)[:, None, None]
     mean[realizations < 1] = residual.sum(axis=0) / max(realizations.sum(), 1)
-    noise = variance(sums.noise[rows] / count[:, None, None]) if sums.repeats > 1 else None
+    noise = (
+        variance(sums.noise[rows] / count[:, None, None]) if sums.repeats > 1 else None
+    )
     H = H.transpose(2, 0, 3, 1)
     return _LineEstimates(H, realizations, variance(mean), noise, 1 / spread)
 
@@ -179,7 +192,9 @@ def _roundness(
     if shared or sums.mirrored[rows].any() or sums.count.max() > _FEW_REALIZATIONS:
         return None
     power = np.einsum("kii->ki", gram).real[None, :, None]
-    energy, turned = (x[rows].transpose(2, 0, 3, 1) for x in (sums.energies, sums.turned))
+    energy, turned = (
+        x[rows].transpose(2, 0, 3, 1) for x in (sums.energies, sums.turned)
+    )
     square = energy - np.abs(H) ** 2 * power
     square = np.where(square > ROUNDING * energy, square, 0.0)
     return roundness(square, turned - H**2 * power, sums.present[rows][None, :, None])
@@ -207,7 +222,9 @@ def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
     """Return the reason why the scatter over experiments is not that over random phases, if any."""
     nu = len(sums.setup.inputs)
     gram = sums.gram[rows]
-    power, square = (np.einsum("kii->k", x) for x in (gram[:, :nu, :nu], gram[:, nu:, :nu]))
+    power, square = (
+        np.einsum("kii->k", x) for x in (gram[:, :nu, :nu], gram[:, nu:, :nu])
+    )
     several = sums.count[rows] > nu
     # |sum of U^2| is the sum of |U|^2 where all phases are the same.
     alike = several & (np.abs(square) > (1 - SILENT_LINE) * power.real)

@@ -54,7 +54,9 @@ class Roles(NamedTuple):
         references = [list(names).index(name) for name in reference]
         inputs = [i for i in range(len(names)) if i not in references]
         if not inputs:
-            raise DefinitionError("all inputs are references: name those of the controller, too.")
+            raise DefinitionError(
+                "all inputs are references: name those of the controller, too."
+            )
         if len(references) < (len(inputs) if fewest is None else fewest):
             raise DefinitionError(
                 f"{len(inputs)} inputs of the plant need as many references, which move each of "
@@ -63,7 +65,9 @@ class Roles(NamedTuple):
         return cls(inputs, references)
 
 
-def in_loop(data: RecordedData, reference: Sequence[str]) -> tuple[list[Record], list[Record]]:
+def in_loop(
+    data: RecordedData, reference: Sequence[str]
+) -> tuple[list[Record], list[Record]]:
     """Return records from the plant's inputs to the outputs, and from the references to these
     inputs.
 
@@ -78,11 +82,15 @@ def in_loop(data: RecordedData, reference: Sequence[str]) -> tuple[list[Record],
     for r in records:
         u, ref = r.u[:, roles.inputs], r.u[:, roles.references]
         plant.append(dataclasses.replace(r, u=u, inputs=inputs))
-        drive.append(dataclasses.replace(r, u=ref, y=u, inputs=references, outputs=inputs))
+        drive.append(
+            dataclasses.replace(r, u=ref, y=u, inputs=references, outputs=inputs)
+        )
     return plant, drive
 
 
-def require_loop(roles: Roles, signals: Sequence[np.ndarray], names: Sequence[str]) -> None:
+def require_loop(
+    roles: Roles, signals: Sequence[np.ndarray], names: Sequence[str]
+) -> None:
     """**Raises:** `DefinitionError` for an input that is its reference: there is no loop then."""
     for i in roles.inputs:
         for k in roles.references:
@@ -108,23 +116,33 @@ class Sums(NamedTuple):
         """Return the rows of signals, for all components."""
         signals = [*self.setup.outputs, *self.setup.inputs]
         columns = np.array([signals.index(x) for x in names], int)
-        return np.add.outer(np.arange(self.setup.n_sections) * len(signals), columns).ravel()
+        return np.add.outer(
+            np.arange(self.setup.n_sections) * len(signals), columns
+        ).ravel()
 
 
-def spectral_products(data: ExperimentData, repeats: int, like: Sums | None = None) -> Sums:
+def spectral_products(
+    data: ExperimentData, repeats: int, like: Sums | None = None
+) -> Sums:
     N, P = data.n_sections, data.periods
     z = np.concatenate([data.y, data.u], axis=2)[data.ok]
     size = np.linalg.norm(z, axis=(0, 1))
     unit = like.unit if like else np.where(size > 0, size, 1.0)
     z = z / unit
     bins = (np.arange(P // 2 + 1)[:, None] + P * np.arange(N)) % (N * P)
-    spectra = np.stack([np.fft.fft(z[:, w], axis=1)[:, bins] for w in data.windows(repeats)])
+    spectra = np.stack(
+        [np.fft.fft(z[:, w], axis=1)[:, bins] for w in data.windows(repeats)]
+    )
     # (windows, S, K, N, signals) to (windows, K, N * signals, S), components first
     spectra = np.moveaxis(spectra, 1, 4)
     spectra = spectra.reshape(*spectra.shape[:2], -1, spectra.shape[4])
     mean = spectra.sum(axis=0) / repeats
     apart = spectra - mean
-    between = (apart @ apart.conj().swapaxes(2, 3)).sum(axis=0) / max(repeats - 1, 1) / repeats
+    between = (
+        (apart @ apart.conj().swapaxes(2, 3)).sum(axis=0)
+        / max(repeats - 1, 1)
+        / repeats
+    )
     setup = Setup(N, P, data.inputs, data.outputs)
     return Sums(mean @ mean.conj().swapaxes(1, 2), between, len(z), setup, unit)
 
@@ -152,9 +170,13 @@ def htf_by_reference(
             sums = Sums(*both, total.experiments + sums.experiments, *sums[3:])
         total = sums
     if total is None or not total.experiments:
-        raise DefinitionError("`data` holds no experiment that ran well: see `data.summary()`.")
+        raise DefinitionError(
+            "`data` holds no experiment that ran well: see `data.summary()`."
+        )
     inputs, references = (tuple(total.setup.inputs[i] for i in part) for part in roles)
-    return solve(total, total.setup.outputs, inputs, references, (repeats, variance), threshold)
+    return solve(
+        total, total.setup.outputs, inputs, references, (repeats, variance), threshold
+    )
 
 
 def excited_classes(
@@ -212,7 +234,11 @@ def solve(
             f"{classes[weak][0] / P:g} + integers fall to "
             f"{np.sqrt(size[weak][0, -1] / size[weak][0, 0]):.1e} of the largest. Choose others."
         )
-    H = np.linalg.solve(power, to_r.conj().swapaxes(1, 2) @ block(r, y)).conj().swapaxes(1, 2)
+    H = (
+        np.linalg.solve(power, to_r.conj().swapaxes(1, 2) @ block(r, y))
+        .conj()
+        .swapaxes(1, 2)
+    )
     spread = np.linalg.inv(power)
 
     def variance(G, rows):
@@ -229,7 +255,10 @@ def solve(
         # other part adds errors of entries of P to E: of one at the edge of its disc, where they
         # count three times, and of all others, whose scatter takes degrees of freedom.
         left = spread @ block(u, u) - np.eye(len(u))
-        edge = np.einsum("kij,kji->ki", left, spread).real / np.einsum("kii->ki", spread).real
+        edge = (
+            np.einsum("kij,kji->ki", left, spread).real
+            / np.einsum("kii->ki", spread).real
+        )
         rows = freedom + np.einsum("kii->k", left).real
         total = variance(G, rows[:, None, None] + 2 * edge[:, None])
         freedom = 1 / (1 / freedom + np.einsum("kij,kji->k", left, left).real / rows**2)
@@ -255,6 +284,14 @@ def solve(
     by_line[lines.row] = freedom[:, None]
     scatter = None if total is None else Scatter(by_line, shared=True)
     return HTF(
-        f, lines.entries(H * unit), check_harmonics(None, N), N, inputs, outputs, "estimate",
-        variance=entries(total), noise_variance=entries(noise), scatter=scatter,
-    )  # fmt: skip
+        f,
+        lines.entries(H * unit),
+        check_harmonics(None, N),
+        N,
+        inputs,
+        outputs,
+        "estimate",
+        variance=entries(total),
+        noise_variance=entries(noise),
+        scatter=scatter,
+    )

@@ -34,8 +34,13 @@ class Loop(eqx.Module):
     missing: tuple[str, ...] = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        htfs = {x: getattr(self, x) for x in ("plant", "controller", "closed", "sensitivity")}
-        lines = [folded(f"  {name:11} {htf!r}", "  ") for name, htf in htfs.items() if htf]
+        htfs = {
+            x: getattr(self, x)
+            for x in ("plant", "controller", "closed", "sensitivity")
+        }
+        lines = [
+            folded(f"  {name:11} {htf!r}", "  ") for name, htf in htfs.items() if htf
+        ]
         return "\n".join(["Loop", *lines, *(f"  {text}" for text in self.missing)])
 
 
@@ -84,8 +89,12 @@ def loop(
             )
     products = spectral_products(data, repeats)
 
-    def estimate(outputs: Sequence[str], inputs: Sequence[str], reference: Sequence[str]) -> HTF:
-        sums = _without(products, products.rows([x for x in (*r, *d) if x not in reference]))
+    def estimate(
+        outputs: Sequence[str], inputs: Sequence[str], reference: Sequence[str]
+    ) -> HTF:
+        sums = _without(
+            products, products.rows([x for x in (*r, *d) if x not in reference])
+        )
         return solve(sums, tuple(outputs), tuple(inputs), reference, (repeats, "auto"))
 
     plant = estimate(y, u, r) if r else None
@@ -94,7 +103,9 @@ def loop(
         controller = estimate(u, y, d)
         controller = eqx.tree_at(lambda x: x.H, controller, -controller.H)
     text = "The {} is not estimated: this needs experiments with a reference that is added to its "
-    missing = [] if r else [f"{text.format('plant')}input (a push, an injected current)."]
+    missing = (
+        [] if r else [f"{text.format('plant')}input (a push, an injected current)."]
+    )
     end = "measured signal y (a moved scene, an offset)."
     missing += [] if d else [text.format("controller") + end]
     first = r or d

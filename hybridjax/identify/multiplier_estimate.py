@@ -59,7 +59,9 @@ class MultiplierComparison(eqx.Module):
         pairs = zip(names, self.true, self.estimated, self.error, strict=True)
         for name, true, estimated, error in pairs:
             label = f"{name:>{width - 2}}  " if width else ""
-            rows.append(f"{label}{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}")
+            rows.append(
+                f"{label}{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}"
+            )
         return "\n".join(rows)
 
 
@@ -75,12 +77,17 @@ def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComp
     """
     from scipy.optimize import linear_sum_assignment  # (a third of a second)
 
-    values, truth = np.asarray(estimated, complex).ravel(), np.asarray(true, complex).ravel()
+    values, truth = (
+        np.asarray(estimated, complex).ravel(),
+        np.asarray(true, complex).ravel(),
+    )
     if values.size == 0 or truth.size == 0:
         raise DefinitionError("`true` or the estimate holds no multiplier to compare.")
     rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
     order = np.lexsort((-np.imag(truth[columns]), -np.abs(truth[columns])))
-    return MultiplierComparison(true=truth[columns][order], estimated=values[rows][order])
+    return MultiplierComparison(
+        true=truth[columns][order], estimated=values[rows][order]
+    )
 
 
 class MultiplierEstimate(eqx.Module):
@@ -117,7 +124,9 @@ class MultiplierEstimate(eqx.Module):
         with np.errstate(all="ignore"):
             gradient = -powers / slope[:, None]
         real = np.imag(self.multipliers) == 0
-        parts = np.stack([gradient.real, np.where(real[:, None], 0.0, gradient.imag)], axis=1)
+        parts = np.stack(
+            [gradient.real, np.where(real[:, None], 0.0, gradient.imag)], axis=1
+        )
         return np.einsum("iaj,jk,ibk->iab", parts, self.covariance, parts)
 
     @property
@@ -156,16 +165,22 @@ class MultiplierEstimate(eqx.Module):
         return out
 
     @checked
-    def contains(self, true: Multipliers, level: Probability = 0.95) -> Bool[np.ndarray, " k"]:
+    def contains(
+        self, true: Multipliers, level: Probability = 0.95
+    ) -> Bool[np.ndarray, " k"]:
         """Test whether supposed multipliers lie in the confidence region of this level.
 
         A conjugate pair is one hypothesis, not two.
         """
         truth = np.atleast_1d(np.asarray(true, complex)).ravel()
-        return self.distance(truth) <= self._radius(level, np.where(np.imag(truth) == 0, 1, 2))
+        return self.distance(truth) <= self._radius(
+            level, np.where(np.imag(truth) == 0, 1, 2)
+        )
 
     @checked
-    def ellipse(self, index: int = 0, level: Probability = 0.95) -> Complex[np.ndarray, " points"]:
+    def ellipse(
+        self, index: int = 0, level: Probability = 0.95
+    ) -> Complex[np.ndarray, " points"]:
         """Return the border of a multiplier's confidence region, to first order: a closed curve.
 
         For a real multiplier it is an interval, drawn forth and back. NaN if the covariance is
@@ -177,7 +192,9 @@ class MultiplierEstimate(eqx.Module):
         degrees = 1 if self.multipliers[index].imag == 0 else 2
         values, vectors = np.linalg.eigh(self.multiplier_covariances[index])
         angle = np.linspace(0, 2 * np.pi, 100)
-        circle = np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
+        circle = np.sqrt(np.maximum(values, 0))[:, None] * np.stack(
+            [np.cos(angle), np.sin(angle)]
+        )
         x, y = np.sqrt(self._radius(level, degrees)) * (vectors @ circle)
         return self.multipliers[index] + x + 1j * y
 
@@ -186,7 +203,9 @@ class MultiplierEstimate(eqx.Module):
         """Pair the multipliers with the true ones; printing the result shows a table."""
         return compare_multipliers(self.multipliers, true)
 
-    def contradiction(self, others: Iterable[Callable[[], RoughFit]], drift: str = "") -> str:
+    def contradiction(
+        self, others: Iterable[Callable[[], RoughFit]], drift: str = ""
+    ) -> str:
         """Return a sentence if the data do not determine the multipliers, or another fit
         contradicts them; else "".
 
@@ -250,7 +269,12 @@ class MultiplierEstimate(eqx.Module):
         if np.isinf(self.covariance_freedom):
             return 2 * special.gammaincinv(degrees / 2, level)
         left = np.maximum(self.covariance_freedom - degrees + 1, 1.0)
-        return degrees * self.covariance_freedom / left * special.fdtri(degrees, left, level)
+        return (
+            degrees
+            * self.covariance_freedom
+            / left
+            * special.fdtri(degrees, left, level)
+        )
 
 
 def warned(doubt: str, check: bool) -> str:

@@ -81,14 +81,20 @@ class StructuredFit(MultiplierEstimate):
         return htf if harmonics is None else htf.select(harmonics)
 
     def _about(self) -> str:
-        misfit = ", ".join(f"{n} {x:.1e}" for n, x in zip(self.outputs, self.residual, strict=True))
+        misfit = ", ".join(
+            f"{n} {x:.1e}" for n, x in zip(self.outputs, self.residual, strict=True)
+        )
         about = f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
-        about += f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
+        about += (
+            f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
+        )
         return "; ".join(filter(None, [about, self.doubt]))
 
 
 def _evaluate(numerators, c, f, n_sections: int) -> Complex[np.ndarray, "M F ny nu"]:
-    powers = np.exp(-2j * np.pi / n_sections * f[:, None] * np.arange(numerators.shape[1]))
+    powers = np.exp(
+        -2j * np.pi / n_sections * f[:, None] * np.arange(numerators.shape[1])
+    )
     H = np.einsum("fr,mrij->mfij", powers, numerators)
     return H / chi(np.exp(-2j * np.pi * f), c)[:, None, None]
 
@@ -136,15 +142,22 @@ def fit_multipliers(
     order = order.rank() if isinstance(order, LDTP) else order
     rms = weights.check_values(htf)
     if errors == "variance" and htf.variance is None:
-        raise DefinitionError("errors='variance' needs HTFs with variances: take 'residuals'.")
+        raise DefinitionError(
+            "errors='variance' needs HTFs with variances: take 'residuals'."
+        )
     f, H = np.asarray(htf.f), np.asarray(htf.H)
 
     def weighted(order: int):
-        size, weight = varpro.numerator_size(htf, order, overhang), weights.error_weights(htf, rms)
+        size, weight = (
+            varpro.numerator_size(htf, order, overhang),
+            weights.error_weights(htf, rms),
+        )
         groups = varpro.group_htf(htf, weight, size)
         c, converged = varpro.maximum_likelihood(groups, order)
         for _ in range(_REWEIGHTINGS * (htf.variance is None)):
-            variance = varpro.error_spectrum(groups, c, f, weights.line_variances(htf), len(rms))
+            variance = varpro.error_spectrum(
+                groups, c, f, weights.line_variances(htf), len(rms)
+            )
             weight = np.broadcast_to(weights.weights_of(variance, rms), H.shape)
             groups = varpro.group_htf(htf, weight, size)
             c, converged = varpro.maximum_likelihood(groups, order, c)
@@ -158,7 +171,9 @@ def fit_multipliers(
 
     def ratios(k: int) -> NoiseRatios:
         used, *_, fitted, _ = (groups, c, True) if k == order else weighted(k)
-        return noise_ratios(used, htf, fitted, htf.variance is None and residual.max() < ROUNDING)
+        return noise_ratios(
+            used, htf, fitted, htf.variance is None and residual.max() < ROUNDING
+        )
 
     surplus = unsupported(ratios, order)
     if check and surplus:
@@ -167,9 +182,20 @@ def fit_multipliers(
     correlation = weights.neighbor_correlation(misfit / scale, H / scale, f)
     result = Result.OK if converged else Result.NOT_CONVERGED
     fit = StructuredFit(
-        multipliers_of(c), c, *covariance, residual, correlation, B, cost, freedom, result,
-        htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
-    )  # fmt: skip
+        multipliers_of(c),
+        c,
+        *covariance,
+        residual,
+        correlation,
+        B,
+        cost,
+        freedom,
+        result,
+        htf.harmonics,
+        htf.n_sections,
+        htf.inputs,
+        htf.outputs,
+    )
 
     def of_order(order: int) -> RoughFit:
         # No larger numerators, if possible: without zero multipliers they are large enough.
@@ -181,12 +207,16 @@ def fit_multipliers(
 
     # One more multiplier, or a pair.
     more = [functools.partial(of_order, order + k) for k in (1, 2) if check]
-    return dataclasses.replace(fit, doubt=warned(surplus or fit.contradiction(more), check))
+    return dataclasses.replace(
+        fit, doubt=warned(surplus or fit.contradiction(more), check)
+    )
 
 
 @checked
 @one_blas_thread()
-def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> MultiplierEstimate:
+def multiplier_bound(
+    model: LDTP, htf: HTF, overhang: Index | None = None
+) -> MultiplierEstimate:
     r"""Return the Cramer-Rao bound of the multipliers of a known model.
 
     The errors of the HTFs are independent, circular and Gaussian, and all numerators are unknown.
@@ -208,7 +238,9 @@ def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> Mu
     exact, multipliers = exact_htf(model, htf), model.multipliers
     d, c = len(multipliers), np.poly(multipliers).real[1:]
     groups = varpro.grouped(exact, d, overhang)
-    J = np.concatenate([varpro.misfit_of(x, c).jacobian.reshape(d, -1) for x in groups], axis=1)
+    J = np.concatenate(
+        [varpro.misfit_of(x, c).jacobian.reshape(d, -1) for x in groups], axis=1
+    )
     return MultiplierEstimate(multipliers, c, np.linalg.inv(J @ J.T), np.inf)
 
 
@@ -282,7 +314,9 @@ class OrderSelection(eqx.Module):
                 f"({self.threshold[k]:.1f})  {self.cost[k] / self.freedom[k]:14.4g} "
                 f"{self.mdl[k]:12.5g}"
             )
-        rows.append(f"by rank: {self.by_rank}, by MDL: {self.by_mdl}; order: {self.order}")
+        rows.append(
+            f"by rank: {self.by_rank}, by MDL: {self.by_mdl}; order: {self.order}"
+        )
         return "\n".join(rows)
 
 
@@ -329,15 +363,23 @@ def select_order(
         costs.append(cost)
         freedoms.append(freedom - d)
     cost, freedom, data = np.array(costs), np.array(freedoms), 2 * htf.H.size
-    level, _ = weights.estimated_noise(weights.largest_misfit(htf), cost[-1] / freedom[-1])
-    likelihood = data * np.log(np.maximum(cost, 1e-300)) if htf.variance is None else cost / level
+    level, _ = weights.estimated_noise(
+        weights.largest_misfit(htf), cost[-1] / freedom[-1]
+    )
+    likelihood = (
+        data * np.log(np.maximum(cost, 1e-300))
+        if htf.variance is None
+        else cost / level
+    )
     exact = bool(noise.max() < ROUNDING)
     values, spread = noise_ratios(largest, htf, c, exact)
     return OrderSelection(
         orders=np.arange(max_order + 1),
         strength=np.sqrt(values[::-1]),
         deviation=(values[::-1] - 1) / spread,
-        threshold=np.array([_largest_of_noise(max_order + 1 - d) for d in range(max_order + 1)]),
+        threshold=np.array(
+            [_largest_of_noise(max_order + 1 - d) for d in range(max_order + 1)]
+        ),
         cost=cost,
         freedom=freedom,
         mdl=likelihood + np.log(data) * (data - freedom),
@@ -387,10 +429,18 @@ def unsupported(ratios: Callable[[int], NoiseRatios], order: int) -> str:
     most, weakest = order, 0.0
     while most:
         values, spread = ratios(most)
-        sizes, limits = (values - 1) / spread, [_largest_of_noise(k + 1) for k in range(most + 1)]
+        sizes, limits = (
+            (values - 1) / spread,
+            [_largest_of_noise(k + 1) for k in range(most + 1)],
+        )
         if (sizes[1:] > limits[1:]).all():
             break
-        most, weakest = int((sizes[1:] > limits[1:]).sum()), np.sqrt(max(values[1], 0.0))
+        most, weakest = (
+            int((sizes[1:] > limits[1:]).sum()),
+            np.sqrt(max(values[1], 0.0)),
+        )
     text = f"the data support {most} multipliers, not {order}: the weakest is {weakest:.3g} times "
     remedy = f"lower `order` to {most}" if most else "excite more"
-    return f"{text}the noise, and may be noise alone; {remedy}, or measure longer" * (most < order)
+    return f"{text}the noise, and may be noise alone; {remedy}, or measure longer" * (
+        most < order
+    )

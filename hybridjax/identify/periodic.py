@@ -46,7 +46,9 @@ class PeriodicModel(NamedTuple):
     """(d[n+1], ny), or without columns: then noise does not enter the state."""
 
     @classmethod
-    def of(cls, model: LDTP, scale: Float[np.ndarray, " ny"], errors: int = 0) -> "PeriodicModel":
+    def of(
+        cls, model: LDTP, scale: Float[np.ndarray, " ny"], errors: int = 0
+    ) -> "PeriodicModel":
         """Return an `LDTP` with outputs in units of `scale`, and with K = 0 of `errors` columns."""
         dims = [int(d) for d in np.asarray(model.dims)]
         after = [*dims[1:], dims[0]]
@@ -60,7 +62,10 @@ class PeriodicModel(NamedTuple):
         )
 
     def to_ldtp(
-        self, scale: Float[np.ndarray, " ny"], inputs: tuple[str, ...], outputs: tuple[str, ...]
+        self,
+        scale: Float[np.ndarray, " ny"],
+        inputs: tuple[str, ...],
+        outputs: tuple[str, ...],
     ) -> LDTP:
         """Return the model with outputs in their own units."""
         return LDTP.from_blocks(*self.times(scale)[:4], inputs, outputs)
@@ -91,7 +96,9 @@ class PeriodicModel(NamedTuple):
 
     def monodromy(self, first: int = 0) -> Float[np.ndarray, "d d"]:
         """Return the product of A over one period from section `first` on."""
-        return reduce(lambda product, A: A @ product, [*self.A[first:], *self.A[:first]])
+        return reduce(
+            lambda product, A: A @ product, [*self.A[first:], *self.A[:first]]
+        )
 
     def refined(
         self, direct: bool, linearize: Callable[["LocalCoordinates"], NormalEquations]
@@ -101,7 +108,9 @@ class PeriodicModel(NamedTuple):
 
         **Raises:** `LinAlgError` for a model that is resonant or overflows.
         """
-        to_A, to_C = ([np.zeros((len(x), 0)) for x in blocks] for blocks in (self.A, self.C))
+        to_A, to_C = (
+            [np.zeros((len(x), 0)) for x in blocks] for blocks in (self.A, self.C)
+        )
         coordinates = LocalCoordinates(self, to_A, to_C, direct)
         return coordinates.moved(linearize(coordinates).step(0.0)[0])
 
@@ -150,7 +159,9 @@ class LocalCoordinates(NamedTuple):
         A, B, C, D, K = map(list, self.model)
         places, F, gain = self.places, self.model.F, self.model.gain
         for n in range(self.model.n_sections):
-            change = {name: step[places[n][name]].reshape(s) for name, s in self.blocks(n)}
+            change = {
+                name: step[places[n][name]].reshape(s) for name, s in self.blocks(n)
+            }
             K[n] = K[n] + change["K"]
             later = K[n] if K[n].shape[1] else gain[n]
             F[n] = F[n] + (self.to_A[n] - gain[n] @ self.to_C[n]) @ change["Y"]
@@ -170,7 +181,9 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
     N, predictor = model.n_sections, model._replace(A=model.F)
     largest = np.abs(np.linalg.eigvals(predictor.monodromy())).max()
     rho = float((_LARGEST_MODULUS / max(largest, _LARGEST_MODULUS)) ** (1 / N))
-    roots, back = zip(*[_root(n, P) for n, P in enumerate(_gramians(predictor, rho))], strict=True)
+    roots, back = zip(
+        *[_root(n, P) for n, P in enumerate(_gramians(predictor, rho))], strict=True
+    )
     after = (*roots[1:], roots[0])
     model = PeriodicModel(
         [after[n].T @ model.A[n] @ back[n] for n in range(N)],
@@ -181,7 +194,9 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
     )
     to_A, to_C = [], []
     for F, K, C in zip(model.F, model.gain, model.C, strict=True):
-        left = np.linalg.qr(np.concatenate([rho * F, C]), mode="complete")[0][:, F.shape[1] :]
+        left = np.linalg.qr(np.concatenate([rho * F, C]), mode="complete")[0][
+            :, F.shape[1] :
+        ]
         to_C.append(left[len(F) :])
         to_A.append(left[: len(F)] / rho + K @ to_C[-1])
     return LocalCoordinates(model, to_A, to_C, direct)
@@ -199,7 +214,9 @@ def _gramians(model: PeriodicModel, rho: float) -> Blocks:
 
     d = model.dims[0]
     P, phi = around(np.zeros((d, d)))[0], rho**model.n_sections * model.monodromy()
-    for _ in range(6):  # periods are doubled until the remainder, 0.5^(2^6), is rounding
+    for _ in range(
+        6
+    ):  # periods are doubled until the remainder, 0.5^(2^6), is rounding
         P, phi = P + phi.T @ P @ phi, phi @ phi
     return around(P)
 
@@ -233,7 +250,9 @@ def characteristic_slopes(
         M = phi @ M + c[-1] * np.eye(d)
     slopes = np.zeros((d, coordinates.size))
     order = [(first + k) % N for k in range(N)]
-    before = accumulate((model.A[n] for n in order[:-1]), lambda P, A: A @ P, initial=np.eye(d))
+    before = accumulate(
+        (model.A[n] for n in order[:-1]), lambda P, A: A @ P, initial=np.eye(d)
+    )
     after = np.eye(d)
     for n, entering in zip(reversed(order), reversed(list(before)), strict=True):
         by_A = after.T @ np.array(by_phi) @ entering.T

@@ -17,7 +17,13 @@ from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
 from .descent import least_squares
 from .multiplier_estimate import MultiplierComparison, Multipliers, compare_multipliers
-from .variable_projection import HTFGroup, equal_weights, late_columns, numerators_of, residuals_of
+from .variable_projection import (
+    HTFGroup,
+    equal_weights,
+    late_columns,
+    numerators_of,
+    residuals_of,
+)
 
 
 # Iterations of Sanathanan and Koerner from which descents start. Fewer: other minima are found;
@@ -71,7 +77,9 @@ class RationalFit(eqx.Module):
         return HTF(f, H, 0, N, self.input, self.outputs, "rational fit")
 
     @checked
-    def compare(self, true: Multipliers, output: str | int | None = None) -> MultiplierComparison:
+    def compare(
+        self, true: Multipliers, output: str | int | None = None
+    ) -> MultiplierComparison:
         """Pair the multipliers of each output's fit (or of one output alone) with the true ones.
 
         **Raises:** `DefinitionError` for an output that is not there.
@@ -80,7 +88,9 @@ class RationalFit(eqx.Module):
         if output is not None:
             chosen = [channel_index("output", output, self.outputs)]
         parts = [compare_multipliers(self.multipliers[k], true) for k in chosen]
-        true, estimated = np.concatenate([(part.true, part.estimated) for part in parts], axis=1)
+        true, estimated = np.concatenate(
+            [(part.true, part.estimated) for part in parts], axis=1
+        )
         names = tuple(self.outputs[k] for k in chosen for _ in parts[0].true)
         return MultiplierComparison(true, estimated, names)
 
@@ -150,7 +160,9 @@ def fit_rational(
         h = H[:, row]
         name = f"H_0 of {htf.outputs[row]}"
         if not np.isfinite(h).all():
-            raise DefinitionError(f"{name} holds NaN or infinity: leave these frequencies out.")
+            raise DefinitionError(
+                f"{name} holds NaN or infinity: leave these frequencies out."
+            )
         rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
         if rms == 0:
             raise DefinitionError(f"{name} is zero: leave this output out.")
@@ -158,11 +170,16 @@ def fit_rational(
         (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [entry])
         linearize = functools.partial(residuals_of, [group])
         with np.errstate(all="ignore"):
-            ends = [least_squares(linearize, a, 200, _ACCURACY**2) for a in _starts(group, poles)]
+            ends = [
+                least_squares(linearize, a, 200, _ACCURACY**2)
+                for a in _starts(group, poles)
+            ]
             cost = np.array([float(np.linalg.norm(linearize(a)[0])) for a, _ in ends])
         cost[~np.isfinite(cost)] = np.inf
         if not np.isfinite(cost).any():
-            raise ComputationError(f"no start led to a finite fit of {name}: try fewer poles.")
+            raise ComputationError(
+                f"no start led to a finite fit of {name}: try fewer poles."
+            )
         lowest = cost <= cost.min() * (1 + _ACCURACY)
         best = int(np.argmax(lowest * [1 + converged for _, converged in ends]))
         a, converged = ends[best]
@@ -171,18 +188,30 @@ def fit_rational(
         fits.append((b, np.append(1.0, a), cost[best], int(result)))
     numerator, denominator, residual, result = map(np.array, zip(*fits, strict=True))
     roots = np.stack([_roots(a) for a in denominator])
-    with np.errstate(over="ignore", invalid="ignore"):  # a useless pole far outside overflows
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # a useless pole far outside overflows
         multipliers = roots**htf.n_sections
-    fitted = numerator, denominator, roots, np.stack([_roots(b) for b in numerator]), multipliers
+    fitted = (
+        numerator,
+        denominator,
+        roots,
+        np.stack([_roots(b) for b in numerator]),
+        multipliers,
+    )
     names = tuple(htf.outputs[row] for row in rows)
-    return RationalFit(*fitted, residual, result, htf.n_sections, names, htf.inputs[column])
+    return RationalFit(
+        *fitted, residual, result, htf.n_sections, names, htf.inputs[column]
+    )
 
 
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     """Return the roots by decreasing modulus; NaN for each that lies at infinity."""
     finite = np.roots(coefficients).astype(complex)
     finite = finite[np.lexsort((-np.imag(finite), -np.abs(finite)))]
-    return np.concatenate([np.full(len(coefficients) - 1 - len(finite), np.nan), finite])
+    return np.concatenate(
+        [np.full(len(coefficients) - 1 - len(finite), np.nan), finite]
+    )
 
 
 def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:

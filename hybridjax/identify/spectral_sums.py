@@ -20,7 +20,9 @@ from ..linear.frequency_response import Harmonics, check_harmonics
 from .descent import ROUNDING
 
 
-Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
+Experiments = (
+    ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
+)
 """Experiments, or parts of them one after the other."""
 
 
@@ -107,7 +109,9 @@ def spectral_sums(
     total, count = None, 0
     for part in [data] if isinstance(data, ExperimentData) else data:
         new = Setup(part.n_sections, part.periods, part.inputs, part.outputs)
-        require_equal("`data`", "sections, periods or signals", total.setup if total else new, new)
+        require_equal(
+            "`data`", "sections, periods or signals", total.setup if total else new, new
+        )
         chosen = () if harmonics == () else check_harmonics(harmonics, part.n_sections)
         sums = _sums_of_part(part, new, chosen, threshold, repeats, count)
         total = sums if total is None else _add(total, sums)
@@ -115,7 +119,9 @@ def spectral_sums(
     if total is None:
         raise DefinitionError("`data` must be experiments, not an empty list.")
     if len(total.line) == 0:
-        raise DefinitionError("the inputs are zero in the window: give the inputs that acted.")
+        raise DefinitionError(
+            "the inputs are zero in the window: give the inputs that acted."
+        )
     return total
 
 
@@ -132,7 +138,9 @@ def _sums_of_part(
     experiment, line, U = _excited(data, windows, threshold, first)
     lines, index = np.unique(line, return_inverse=True)
     mirrored = needs_two_phases(lines, setup.periods, setup.n_sections)
-    if mirrored.any() and data.ok.any():  # the limit cycle has power at multiples of f = 1
+    if (
+        mirrored.any() and data.ok.any()
+    ):  # the limit cycle has power at multiples of f = 1
         require_deviations(data.records)
     good = data.ok[experiment]
 
@@ -174,7 +182,9 @@ def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmo
     """Return Y at lines k + m P for each entry k, the mean over the windows, and its variance."""
     N, P = data.n_sections, data.periods
     output = (line[:, None] + P * np.asarray(harmonics, int)) % (N * P)
-    Y = np.stack([np.fft.fft(data.y[:, w], axis=1)[experiment[:, None], output] for w in windows])
+    Y = np.stack(
+        [np.fft.fft(data.y[:, w], axis=1)[experiment[:, None], output] for w in windows]
+    )
     mean = Y.sum(axis=0) / len(Y)
     return mean, (np.abs(Y - mean) ** 2).sum(axis=0) / max(len(Y) - 1, 1) / len(Y)
 
@@ -194,7 +204,9 @@ def _excited(data: ExperimentData, windows: list[slice], threshold: float, first
             f"the input does not repeat: its last {len(windows)} windows of P = {data.periods} "
             f"differ by {worst:.2g} of the largest line. Take fewer `repeats`, or another P."
         )
-    experiment, line = np.nonzero(((size > threshold * peak) & (size > ROUNDING)).any(axis=2))
+    experiment, line = np.nonzero(
+        ((size > threshold * peak) & (size > ROUNDING)).any(axis=2)
+    )
     check_sharing(experiment + first, line, data.periods)
     return experiment, line, U[experiment, line]
 
@@ -213,7 +225,10 @@ def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
     for signal in u[chosen].transpose(0, 2, 1).reshape(-1, u.shape[1]):
         size = np.abs(np.fft.rfft(signal))
         lines = np.flatnonzero(size > SILENT_LINE * size.max())
-        if not np.isfinite(signal).all() or not _FEWEST_LINES <= len(lines) <= len(signal) // 4:
+        if (
+            not np.isfinite(signal).all()
+            or not _FEWEST_LINES <= len(lines) <= len(signal) // 4
+        ):
             continue
         spectra = np.zeros((_REDRAWS, len(size)), complex)
         angle = rng.uniform(0, 2 * np.pi, (_REDRAWS, len(lines)))

@@ -49,7 +49,9 @@ class TransientFit(eqx.Module):
     def __repr__(self) -> str:
         shown = ", ".join(f"{x:.4g}" for x in self.multipliers)
         size = ", ".join(f"{x:.2g}" for x in np.nanmax(self.removed, axis=0))
-        return folded(f"TransientFit(multipliers {shown}; removed rms up to {size}; {self.data!r})")
+        return folded(
+            f"TransientFit(multipliers {shown}; removed rms up to {size}; {self.data!r})"
+        )
 
 
 @checked
@@ -77,7 +79,9 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     S, n, ny = data.y.shape
     cycles = n // N - 1
     if order is not None and order > cycles // 2:
-        raise DefinitionError(f"`order` must be at most half of the {cycles} cycles, not {order}.")
+        raise DefinitionError(
+            f"`order` must be at most half of the {cycles} cycles, not {order}."
+        )
     if cycles < P:
         raise DefinitionError(
             f"the record has {n // N} cycles, but to remove a transient it must hold the "
@@ -85,7 +89,9 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
         )
     data.require_ok()
     # Inputs have units of their own.
-    u = data.u[data.ok] / np.maximum(np.abs(data.u[data.ok]).max(axis=(0, 1)), np.finfo(float).tiny)
+    u = data.u[data.ok] / np.maximum(
+        np.abs(data.u[data.ok]).max(axis=(0, 1)), np.finfo(float).tiny
+    )
     change = np.abs(u[:, N * P :] - u[:, : -N * P]).max(axis=(1, 2))
     worst = int(np.argmax(change))
     if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
@@ -96,14 +102,20 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
 
     size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
     good = np.flatnonzero(data.ok).tolist()
-    y = (data.y[data.ok] / np.where(size > 0, size, 1.0)).reshape(len(good), -1, N * ny)[:, 1:]
+    y = (data.y[data.ok] / np.where(size > 0, size, 1.0)).reshape(
+        len(good), -1, N * ny
+    )[:, 1:]
     everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
     if everything:
         free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(good)
     else:
         size_of = np.abs(np.fft.rfft(u[:, data.window], axis=1)).max(axis=2)
-        excited = map(np.flatnonzero, size_of > SILENT_LINE * size_of.max(axis=1, keepdims=True))
-        free = [_free(np.unique(np.append(line_class(x, P), 0)), P, cycles) for x in excited]
+        excited = map(
+            np.flatnonzero, size_of > SILENT_LINE * size_of.max(axis=1, keepdims=True)
+        )
+        free = [
+            _free(np.unique(np.append(line_class(x, P), 0)), P, cycles) for x in excited
+        ]
     left = [Q @ record for Q, record in zip(free, y, strict=True)]
     least = min(map(len, free))
     if least <= (order or 1):
@@ -115,7 +127,9 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     # Pairs (Q, z) with no more columns of z than rows, and the same residuals.
     whole = [np.concatenate(left, axis=1)] if everything else left
     fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T)[1].T for z in whole]
-    blocks = list(zip(free, fewer, strict=False))  # (with everything, all Q are the same)
+    blocks = list(
+        zip(free, fewer, strict=False)
+    )  # (with everything, all Q are the same)
     count = sum(z.size for z in left)
     fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
     c = min(fits, key=lambda fit: fit[0])[1]

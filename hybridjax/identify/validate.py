@@ -22,7 +22,13 @@ from .periodic import PeriodicModel
 from .series.fit import SeriesFit
 from .series.prediction import Predictor
 from .series.records import CycleGrid, PreparedRecords, drift_waves
-from .series.residuals import FEWEST_SAMPLES, independence_test, is_exact, whitened, whiteness_test
+from .series.residuals import (
+    FEWEST_SAMPLES,
+    independence_test,
+    is_exact,
+    whitened,
+    whiteness_test,
+)
 
 
 # Samples for each unknown of its initial condition and drift, which a record must exceed. Fewer:
@@ -30,7 +36,9 @@ from .series.residuals import FEWEST_SAMPLES, independence_test, is_exact, white
 _SAMPLES_PER_UNKNOWN = 3
 
 
-def can_be_compared(model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool) -> bool:
+def can_be_compared(
+    model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool
+) -> bool:
     """Test whether a record has samples beyond those that fit its initial condition and drift."""
     N, ny = record.n_sections, record.y.shape[1]
     unknown = N * ny * drift_waves(record).shape[1]
@@ -117,10 +125,16 @@ class Validation(eqx.Module):
         head = f"{'output':>{w}}  {'fit':>9}  {'rms left':>9}"
         rows = [f"{head}  {'white':>11}  {'independent':>11}"]
         for i, name in enumerate(names):
-            tests = f"{p_value(self.whiteness[i]):>11}  {p_value(self.independence[i]):>11}"
-            rows.append(f"{name:>{w}}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}  {tests}")
+            tests = (
+                f"{p_value(self.whiteness[i]):>11}  {p_value(self.independence[i]):>11}"
+            )
+            rows.append(
+                f"{name:>{w}}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}  {tests}"
+            )
         if self.unexplained:
-            rows.append(f"predicted no better than by the mean cycle: {listed(self.unexplained)}")
+            rows.append(
+                f"predicted no better than by the mean cycle: {listed(self.unexplained)}"
+            )
         verdict = {True: "no sign of it", False: "yes"}
         rows.append(
             f"correlated in time: {verdict[self.white]}; with the input: "
@@ -130,7 +144,11 @@ class Validation(eqx.Module):
             rows.append(f"records too short to compare, left out: {self.left_out}")
         pairs = zip(self.visible, self.outputs, strict=True)
         visible = ", ".join(f"{100 * x:.2g} % of {name}" for x, name in pairs)
-        rows.append(folded(f"misfits that would be noticed in four of five such data: {visible}"))
+        rows.append(
+            folded(
+                f"misfits that would be noticed in four of five such data: {visible}"
+            )
+        )
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
@@ -191,7 +209,9 @@ def validate(
     """
     free_start = start == "free"
     tested = (model.predictor or model.model) if isinstance(model, LDTPFit) else model
-    unstable = not isinstance(tested, Predictor) and (np.abs(model.multipliers) >= 1).any()
+    unstable = (
+        not isinstance(tested, Predictor) and (np.abs(model.multipliers) >= 1).any()
+    )
     records, drive = uninterrupted_records(data), None
     if reference is not None:
         records, drive = in_loop(data, reference)
@@ -213,7 +233,9 @@ def validate(
         return (grid.sampled & (grid.age > lags)[..., None]).sum(axis=(0, 1))
 
     if (few := int(sampled.min())) < FEWEST_SAMPLES:
-        raise DefinitionError(f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles.")
+        raise DefinitionError(
+            f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles."
+        )
     # One period, less for few cycles.
     tried = range(1, min(N, few // _SAMPLES_PER_LAG) + 1)
     lags = max((k for k in tried if count(k).min() >= FEWEST_SAMPLES), default=1)
@@ -222,8 +244,14 @@ def validate(
             f"the records are too short: each section must be sampled {FEWEST_SAMPLES} times with "
             f"{lags} samples before it. Record longer without gaps."
         )
-    roots = [] if isinstance(model, LDTP) or isinstance(tested, LDTP) else list(model.spread(grid))
-    if isinstance(tested, LDTP):  # outputs in units of their size, so that none is neglected
+    roots = (
+        []
+        if isinstance(model, LDTP) or isinstance(tested, LDTP)
+        else list(model.spread(grid))
+    )
+    if isinstance(
+        tested, LDTP
+    ):  # outputs in units of their size, so that none is neglected
         S = np.tile(np.diag(prepared.scale**2), (N, 1, 1))
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
     with np.errstate(all="ignore"):
@@ -233,7 +261,9 @@ def validate(
         n = np.maximum(np.isfinite(y).sum(axis=(0, 1)), 2)
         alone = (y - np.nanmean(y, axis=(0, 1))) * n / (n - 1)
         gain = np.nansum(alone**2 - error**2, axis=2)[grid.sampled.any(axis=(2, 3))]
-        no_better = stats.norm.sf(gain.mean(axis=0) * np.sqrt(len(gain)), scale=gain.std(axis=0))
+        no_better = stats.norm.sf(
+            gain.mean(axis=0) * np.sqrt(len(gain)), scale=gain.std(axis=0)
+        )
     if unstable and (drive or not np.isfinite(simulated[grid.inside]).all()):
         raise DefinitionError(
             "the simulation of an unstable plant grows without bound: validate `fit_ldtp(series)`."
@@ -243,17 +273,25 @@ def validate(
     auto, whiteness = whiteness_test(whitened(error, roots), lags)
     late = np.where((grid.age >= lags)[..., None], error, np.nan)
     outside = CycleGrid.from_records(list(itertools.compress(drive or records, kept))).u
-    cross, independence, visible = independence_test(outside, late, lags, level / ny, roots)
+    cross, independence, visible = independence_test(
+        outside, late, lags, level / ny, roots
+    )
     k, longest = max(enumerate(compared), key=lambda pair: len(pair[1].u))
     first = longest.first_section
-    shown = slice(first, first + len(longest.u) - longest.lead)  # later inputs are unknown
+    shown = slice(
+        first, first + len(longest.u) - longest.lead
+    )  # later inputs are unknown
     return Validation(
         fit=100 * (1 - rms / np.nanstd(y, axis=(0, 1, 2))),
         noise=rms,
         no_better=no_better,
-        whiteness=np.maximum(whiteness, is_exact(grid, error)),  # (rounding shows nothing)
+        whiteness=np.maximum(
+            whiteness, is_exact(grid, error)
+        ),  # (rounding shows nothing)
         independence=np.maximum(independence, is_exact(grid, error)),
-        visible=np.where(size > 0, visible * rms / np.where(size > 0, size, 1.0), np.inf),
+        visible=np.where(
+            size > 0, visible * rms / np.where(size > 0, size, 1.0), np.inf
+        ),
         autocorrelation=auto,
         cross_correlation=cross,
         measured=y[k].reshape(-1, ny)[shown],

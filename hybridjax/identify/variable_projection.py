@@ -19,7 +19,13 @@ from jaxtyping import Complex, Float, Inexact, Int
 from ..errors import DefinitionError
 from ..linear.htf import HTF
 from .denominator import Covariance, chi, inverse_of_remainder, sandwich
-from .descent import NO_LEADING_COEFFICIENT, ROUGH, ROUNDING, Coefficients, least_squares
+from .descent import (
+    NO_LEADING_COEFFICIENT,
+    ROUGH,
+    ROUNDING,
+    Coefficients,
+    least_squares,
+)
 from .weights import check_values, error_weights
 
 
@@ -72,7 +78,9 @@ class HTFGroup(NamedTuple):
         self, c: Coefficients, values: Complex[np.ndarray, "E n"]
     ) -> Float[np.ndarray, "2*E n"]:
         """Return the rows of chi H = B, weighted: errors of H are multiplied by chi there."""
-        return split((self.weight / np.abs(chi(self.period_delay, c)))[:, None] * values)
+        return split(
+            (self.weight / np.abs(chi(self.period_delay, c)))[:, None] * values
+        )
 
     def numerator_space(
         self, c: Coefficients
@@ -154,7 +162,9 @@ def delayed_responses(groups: Groups, c: Coefficients) -> tuple[np.ndarray, np.n
         delayed, left = late_columns(group, c)
         columns.append(delayed)
         by_delay = (left * (group.period_delay ** delays[:, None]).real).sum(axis=1)
-        noise_gram = noise_gram + by_delay[np.abs(delays[:, None] - delays)] * group.size
+        noise_gram = (
+            noise_gram + by_delay[np.abs(delays[:, None] - delays)] * group.size
+        )
     noise = np.linalg.cholesky(noise_gram)
     _, triangle = np.linalg.qr(np.concatenate(columns))
     return np.linalg.solve(noise, triangle.T), noise
@@ -174,7 +184,10 @@ def cost_of(groups: Groups, c: Coefficients) -> tuple[float, int]:
 
 
 def maximum_likelihood(
-    groups: list[HTFGroup], order: int, start: Coefficients | None = None, rough: bool = False
+    groups: list[HTFGroup],
+    order: int,
+    start: Coefficients | None = None,
+    rough: bool = False,
 ) -> tuple[Coefficients, bool]:
     """Return the coefficients with the smallest misfit, and whether they are a minimum.
 
@@ -182,7 +195,9 @@ def maximum_likelihood(
     problem. `rough`: whether to stop where noise of variance one explains the next step.
     """
     start = _linearized(groups, order) if start is None else start
-    return least_squares(lambda c: residuals_of(groups, c), start, **(ROUGH if rough else {}))
+    return least_squares(
+        lambda c: residuals_of(groups, c), start, **(ROUGH if rough else {})
+    )
 
 
 def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
@@ -228,9 +243,16 @@ def summarize(
         freedom += group.freedom * group.size
         # A residual is smaller than the error, by the share of its equation in the numerators (to
         # rounding, at most all of it).
-        error = misfit.residual / np.sqrt(1 - np.minimum(misfit.leverage, 1 - 1e-15))[..., None]
+        error = (
+            misfit.residual
+            / np.sqrt(1 - np.minimum(misfit.leverage, 1 - 1e-15))[..., None]
+        )
         np.add.at(score, group.line, np.einsum("jaek,aek->ej", misfit.jacobian, error))
-        np.add.at(shares, group.line, np.einsum("iaek,jaek->eij", misfit.jacobian, misfit.jacobian))
+        np.add.at(
+            shares,
+            group.line,
+            np.einsum("iaek,jaek->eij", misfit.jacobian, misfit.jacobian),
+        )
     square = shares.sum(axis=0)
     if errors == "variance":
         return sandwich(square - noise, square), cost, freedom
@@ -270,7 +292,9 @@ def grouped(htf: HTF, order: int, overhang: int | None) -> list[HTFGroup]:
     return group_htf(htf, error_weights(htf, check_values(htf)), size)
 
 
-def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> list[HTFGroup]:
+def group_htf(
+    htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int
+) -> list[HTFGroup]:
     r"""Group all entries of the HTFs, with numerators of `size` coefficients.
 
     The numerator of $H_m$ is real if m and -m are the same harmonic. It is the conjugate of that of
@@ -298,13 +322,20 @@ def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> li
                 single.append((row, -1, 1.0, channel, h[at], w[at]))
             elif row < other and same[i, j]:
                 real.append((row, other, half, channel, half * (h + g)[at], w[at]))
-                real.append((row, other, 1j * half, channel, half / 1j * (h - g)[at], w[at]))
+                real.append(
+                    (row, other, 1j * half, channel, half / 1j * (h - g)[at], w[at])
+                )
             elif row < other:
                 both = np.concatenate([h[at], g[at]]), np.concatenate([w[at], v[at]])
                 double.append((row, other, 1.0, channel, *both))
     kinds = zip((powers, turned, pair), entries, strict=True)
     sources = np.arange(len(f)) if htf.scatter is None else htf.scatter.sources(f)
-    return [group for kind in kinds if kind[1] for group in equal_weights(f, sources, size, *kind)]
+    return [
+        group
+        for kind in kinds
+        if kind[1]
+        for group in equal_weights(f, sources, size, *kind)
+    ]
 
 
 def equal_weights(
@@ -321,7 +352,9 @@ def equal_weights(
     position of its harmonic and of the opposite one, its share, output and input, values and
     weights.
     """
-    harmonic, mirror, share, channel, data, weights = map(np.array, zip(*entries, strict=True))
+    harmonic, mirror, share, channel, data, weights = map(
+        np.array, zip(*entries, strict=True)
+    )
     basis, to_powers = powers_basis(split(matrix))
     if len(to_powers) > size:
         to_powers = to_powers[:size] + 1j * to_powers[size:]
@@ -360,7 +393,9 @@ def powers_basis(
     (smallest) coefficients that make each element.
     """
     u, s, vh = np.linalg.svd(powers, full_matrices=False)
-    kept = s > 0.1 * ROUNDING * s[0]  # one combination less would change bounds by 0.3 %
+    kept = (
+        s > 0.1 * ROUNDING * s[0]
+    )  # one combination less would change bounds by 0.3 %
     return u[:, kept], vh[kept].conj().T / s[kept]
 
 
@@ -406,8 +441,14 @@ def error_spectrum(
     """
     square, expected = np.zeros((outputs, 2)), np.zeros((outputs, 2, 2))
     for group in groups:
-        relative = lines[:, 0, group.channel[:, 1]]  # (F, K), columns alike but for factors
-        parts = _components(group.period_delay, c) * group.weight**2 * relative[group.line, 0]
+        relative = lines[
+            :, 0, group.channel[:, 1]
+        ]  # (F, K), columns alike but for factors
+        parts = (
+            _components(group.period_delay, c)
+            * group.weight**2
+            * relative[group.line, 0]
+        )
         size = group.scale**2 / 2 * relative[0] / relative[0, 0]
         residual = (misfit_of(group, c).residual ** 2).sum(axis=0)
         # tr(G_k R G_l R), where R subtracts the best numerators: the mean of `parts[k]` times the
@@ -423,7 +464,9 @@ def error_spectrum(
     return (sizes @ _components(np.exp(-2j * np.pi * f), c)).T[..., None] * lines
 
 
-def _components(delay: Complex[np.ndarray, " E"], c: Coefficients) -> Float[np.ndarray, "2 E"]:
+def _components(
+    delay: Complex[np.ndarray, " E"], c: Coefficients
+) -> Float[np.ndarray, "2 E"]:
     """Return the spectra of white noise and of noise that passes the system."""
     return np.stack([np.ones(len(delay)), 1 / np.abs(chi(delay, c)) ** 2])
 

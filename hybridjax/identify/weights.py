@@ -26,13 +26,17 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
     htf.require_sampled("a fit")
     H = np.asarray(htf.H)
     if not np.isfinite(H).all():
-        raise DefinitionError("the HTFs hold NaN or infinity: leave these frequencies out.")
+        raise DefinitionError(
+            "the HTFs hold NaN or infinity: leave these frequencies out."
+        )
     rms = np.sqrt(np.mean(np.abs(H) ** 2, axis=(0, 1, 3)))
     if (rms == 0).any():
         name = htf.outputs[int(np.argmin(rms))]
         raise DefinitionError(f"the HTFs of {name} are zero: leave this output out.")
     if htf.variance is not None:
-        bad = np.argwhere(~(np.isfinite(htf.variance) & (np.asarray(htf.variance) >= 0)))
+        bad = np.argwhere(
+            ~(np.isfinite(htf.variance) & (np.asarray(htf.variance) >= 0))
+        )
         if len(bad):
             m, k, i, _ = (int(x) for x in bad[0])
             raise DefinitionError(
@@ -42,7 +46,9 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
     return rms
 
 
-def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, "M F ny nu"]:
+def error_weights(
+    htf: HTF, rms: Float[np.ndarray, " ny"]
+) -> Float[np.ndarray, "M F ny nu"]:
     """Return one over the standard deviation of real and imaginary part, known or supposed.
 
     Variances that were estimated with few degrees of freedom are poor weights: they are replaced
@@ -53,7 +59,9 @@ def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, 
     for the power of the inputs.
     """
     if htf.variance is None:
-        return np.broadcast_to(1 / (rms[:, None] * np.sqrt(line_variances(htf))), htf.H.shape)
+        return np.broadcast_to(
+            1 / (rms[:, None] * np.sqrt(line_variances(htf))), htf.H.shape
+        )
     variance = np.asarray(htf.variance)
     if htf.scatter is not None and variance.all():
         _, same = np.unique(np.abs(htf.harmonics), return_inverse=True)
@@ -62,7 +70,9 @@ def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, 
         for _ in range(20):  # more sweeps change nothing in 6 digits
             by_line = (variance / size[same]).mean(axis=0)
             mean = np.average(variance / by_line, axis=1, weights=freedom)
-            size = np.stack([mean[same == k].mean(axis=0) for k in range(len(size))])[:, None]
+            size = np.stack([mean[same == k].mean(axis=0) for k in range(len(size))])[
+                :, None
+            ]
         variance = size[same] * by_line
     return weights_of(variance, rms)
 

@@ -37,7 +37,9 @@ class Matrices(NamedTuple):
     dims: Int[Array, " N"]
 
 
-def static_gain(gain: Float[Array, "*N ny nu"], n_sections: int, shape: tuple[int, int]):
+def static_gain(
+    gain: Float[Array, "*N ny nu"], n_sections: int, shape: tuple[int, int]
+):
     """Return a gain, or N of them, as a system without states, for `shape` (ny, nu).
 
     **Raises:** `DefinitionError` for another shape.
@@ -70,7 +72,8 @@ def connect(
 
     A, B, C, D = (beside(x, y) for x, y in zip(a[:4], b[:4], strict=True))
     to_inputs = solve(
-        xp.eye(len(K)) - K @ D, xp.concatenate([K @ C, xp.broadcast_to(L, (len(D), *L.shape))], 2)
+        xp.eye(len(K)) - K @ D,
+        xp.concatenate([K @ C, xp.broadcast_to(L, (len(D), *L.shape))], 2),
     )
     by_state, by_input = to_inputs[..., : C.shape[2]], to_inputs[..., C.shape[2] :]
     place = [xp.arange(x.A.shape[1]) >= x.dims[:, None] for x in (a, b)]
@@ -87,8 +90,12 @@ def require_well_posed(D: Float[Array, "N ny nu"], F: Float[Array, "N nu ny"]) -
     """**Raises:** `DefinitionError` where a section answers itself without bounds by -F."""
     if is_traced(D, F):
         return
-    values = np.linalg.svd(np.eye(D.shape[1]) + np.asarray(D) @ np.asarray(F), compute_uv=False)
-    if len(bad := np.flatnonzero(values[:, -1] < _WELL_POSED * np.maximum(values[:, 0], 1))):
+    values = np.linalg.svd(
+        np.eye(D.shape[1]) + np.asarray(D) @ np.asarray(F), compute_uv=False
+    )
+    if len(
+        bad := np.flatnonzero(values[:, -1] < _WELL_POSED * np.maximum(values[:, 0], 1))
+    ):
         raise DefinitionError(
             f"direct feed-through answers itself at section {bad[0]} (I + D of plant times D of "
             "controller is singular): let the controller wait a section."
@@ -110,18 +117,25 @@ class Lines(NamedTuple):
         **Raises:** `DefinitionError` for a class that lacks a line.
         """
         start = np.minimum(f % 1, -f % 1)
-        start = np.sort(start)[np.insert(np.diff(np.sort(start)) > SAME_FREQUENCY, 0, True)]
+        start = np.sort(start)[
+            np.insert(np.diff(np.sort(start)) > SAME_FREQUENCY, 0, True)
+        ]
         wanted = start[:, None] + np.arange(N)
         size = np.abs((f - wanted[..., None] + N / 2) % N - N / 2)
         opposite = np.abs((f + wanted[..., None] + N / 2) % N - N / 2)
-        there, mirrored = size.min(axis=2) < SAME_FREQUENCY, opposite.min(axis=2) < SAME_FREQUENCY
+        there, mirrored = (
+            size.min(axis=2) < SAME_FREQUENCY,
+            opposite.min(axis=2) < SAME_FREQUENCY,
+        )
         if not (there | mirrored).all():
             lost = (wanted[~(there | mirrored)][0] + N / 2) % N - N / 2
             raise DefinitionError(
                 f"the HTFs do not hold f = {abs(lost):.10g} cycles per period: algebra takes all "
                 f"lines f + integers, up to N/2 = {N / 2:g}."
             )
-        return cls(np.where(there, size.argmin(axis=2), opposite.argmin(axis=2)), ~there)
+        return cls(
+            np.where(there, size.argmin(axis=2), opposite.argmin(axis=2)), ~there
+        )
 
     def matrices(self, x: Array) -> Complex[Array, "K Nny Nnu"]:
         """Return the harmonic matrices of values (N, F, ny, nu), in the order of all harmonics."""
@@ -129,7 +143,9 @@ class Lines(NamedTuple):
         m = np.arange(N)[:, None] - np.arange(N)
         sign = np.where(self.mirrored, -1, 1)[:, None]
         values = x[(sign * m + N // 2) % N, self.row[:, None]]  # (K, a, b, ny, nu)
-        values = xp.where(self.mirrored[:, None, :, None, None], xp.conj(values), values)
+        values = xp.where(
+            self.mirrored[:, None, :, None, None], xp.conj(values), values
+        )
         return values.swapaxes(2, 3).reshape(K, N * x.shape[2], N * x.shape[3])
 
     def entries(self, matrices: Array) -> Complex[Array, "N F ny nu"]:

@@ -40,14 +40,18 @@ def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, 
     every = all_harmonics(n_sections)
     if harmonics is None:
         return every
-    integers = tuple(sorted(harmonics)) if isinstance(harmonics, Iterable) else (harmonics,)
+    integers = (
+        tuple(sorted(harmonics)) if isinstance(harmonics, Iterable) else (harmonics,)
+    )
     if outside := ([m for m in integers if m not in every] if n_sections else []):
         raise DefinitionError(
             f"Harmonic {outside[0]} does not exist: with {n_sections} sections the harmonics are "
             f"{every[0]} to {every[-1]}."
         )
     if len(set(integers)) < len(integers) or not integers:
-        raise DefinitionError(f"`harmonics` must be one or more different integers: {integers}.")
+        raise DefinitionError(
+            f"`harmonics` must be one or more different integers: {integers}."
+        )
     return integers
 
 
@@ -59,10 +63,15 @@ def _derived(compiled: Callable) -> Callable:
     def rule(arguments, tangents):
         if not must_be_on_host():
             return eqx.filter_jvp(compiled, arguments, tangents)
-        value, pairs = harmonic_transfer(*arguments), zip(arguments, tangents[:4], strict=False)
+        value, pairs = (
+            harmonic_transfer(*arguments),
+            zip(arguments, tangents[:4], strict=False),
+        )
         along = [jnp.zeros_like(x) if t is None else t for x, t in pairs]
         shape, each = jax.ShapeDtypeStruct(value.shape, value.dtype), "broadcast_all"
-        return value, jax.pure_callback(_along, shape, *arguments, *along, vmap_method=each)
+        return value, jax.pure_callback(
+            _along, shape, *arguments, *along, vmap_method=each
+        )
 
     return derived
 
@@ -72,7 +81,9 @@ def _along(*arrays: jax.Array) -> Complex[np.ndarray, "... N F ny nu"]:
     which its arguments, which come first, do not depend."""
     lead = np.shape(arrays[0])[:-3]
     A, B, C, _, f = (np.asarray(x)[(0,) * len(lead)] for x in arrays[:5])
-    dA, dB, dC, dD = (np.asarray(x).reshape(-1, *x.shape[-3:])[:, :, None] for x in arrays[5:])
+    dA, dB, dC, dD = (
+        np.asarray(x).reshape(-1, *x.shape[-3:])[:, :, None] for x in arrays[5:]
+    )
     z, (P, N, _, d, _), nu = _unit_roots(A, f), dA.shape, B.shape[-1]
     X = _states(A, z * B[:, None], f)
     # (Directions are further columns.)

@@ -52,7 +52,8 @@ class Scatter(eqx.Module):
     def __init__(
         self,
         freedom: Annotated[Numbers, Reals("frequencies", sign="positive")],
-        roundness: Annotated[Numbers, Reals(_ENTRIES, sign="nonnegative")] | None = None,
+        roundness: Annotated[Numbers, Reals(_ENTRIES, sign="nonnegative")]
+        | None = None,
         shared: bool = False,
     ):
         require_x64()
@@ -151,7 +152,8 @@ class HTF(eqx.Module):
         variance: Variance | None = None,
         noise_variance: Variance | None = None,
         scatter: Scatter | None = None,
-        power: Annotated[Numbers, Reals("frequencies inputs", sign="positive")] | None = None,
+        power: Annotated[Numbers, Reals("frequencies inputs", sign="positive")]
+        | None = None,
     ):
         require_x64()
         self.f, self.H = from_host((f, H.astype(complex)))
@@ -184,9 +186,15 @@ class HTF(eqx.Module):
             f = np.asarray(self.f)
             span = f" {f.min():.4g} to {f.max():.4g}"
         low, high, number = self.harmonics[0], self.harmonics[-1], len(self.harmonics)
-        sections = f"{self.n_sections} sections" if self.n_sections else "continuous time"
+        sections = (
+            f"{self.n_sections} sections" if self.n_sections else "continuous time"
+        )
         dense = number == high - low + 1
-        shown = f"{low} to {high}" if dense and number > 3 else ", ".join(map(str, self.harmonics))
+        shown = (
+            f"{low} to {high}"
+            if dense and number > 3
+            else ", ".join(map(str, self.harmonics))
+        )
         return folded(
             f"HTF({self.source}; harmonics {shown}; {count} frequencies{span} cycles/period; "
             f"{sections}: {listed(self.inputs)} -> {listed(self.outputs)})"
@@ -225,9 +233,15 @@ class HTF(eqx.Module):
         """The same with fewer harmonics."""
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
-        arrays = {"H": self.H, "variance": self.variance, "noise_variance": self.noise_variance}
+        arrays = {
+            "H": self.H,
+            "variance": self.variance,
+            "noise_variance": self.noise_variance,
+        }
         roundness = None if self.scatter is None else self.scatter.roundness
-        arrays, roundness = jax.tree.map(lambda x: x[rows], to_host((arrays, roundness)))
+        arrays, roundness = jax.tree.map(
+            lambda x: x[rows], to_host((arrays, roundness))
+        )
         scatter = self.scatter and replace(self.scatter, roundness=roundness)
         return replace(self, harmonics=harmonics, scatter=scatter, **arrays)
 
@@ -258,7 +272,9 @@ class HTF(eqx.Module):
         **Raises:** `DefinitionError` as `feedback`, and for different numbers of both.
         """
         if len(self.inputs) != len(self.outputs):
-            raise DefinitionError("an inverse needs as many inputs as outputs: leave some out.")
+            raise DefinitionError(
+                "an inverse needs as many inputs as outputs: leave some out."
+            )
         return _combined(algebra.inverse, [self], self.outputs, self.inputs)
 
     def feedback(self, controller: "HTF | HasHTF") -> "HTF":
@@ -297,11 +313,15 @@ class HTF(eqx.Module):
                 "the HTFs have no variance: estimate them from several realizations of the "
                 "design or from repeated periods."
             )
-        quantile = -np.log1p(-level) if self.scatter is None else self.scatter.quantile(level)
+        quantile = (
+            -np.log1p(-level) if self.scatter is None else self.scatter.quantile(level)
+        )
         quantile, variance = to_host((quantile, self.variance))
         return from_host((quantile * variance) ** 0.5)
 
-    def predict(self, u: Annotated[Numbers, Reals("samples inputs")]) -> Float[Array, "time ny"]:
+    def predict(
+        self, u: Annotated[Numbers, Reals("samples inputs")]
+    ) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
 
         Harmonics that are not stored count as zero. Differentiable with respect to `H`.
@@ -377,7 +397,9 @@ class HTF(eqx.Module):
     def _index(self, m):
         (m,) = check_harmonics(int(self._circle(m)), self.n_sections)
         if m not in self.harmonics:
-            raise DefinitionError(f"harmonic {m} is not there; harmonics are {self.harmonics}.")
+            raise DefinitionError(
+                f"harmonic {m} is not there; harmonics are {self.harmonics}."
+            )
         return self.harmonics.index(m)
 
 
@@ -388,7 +410,9 @@ class HasHTF(Protocol):
     def htf(self, f: Vector) -> HTF: ...
 
 
-def require_chain(name: str, outputs: tuple[str, ...], inputs: tuple[str, ...], a, b) -> None:
+def require_chain(
+    name: str, outputs: tuple[str, ...], inputs: tuple[str, ...], a, b
+) -> None:
     """**Raises:** `DefinitionError` if outputs are not the inputs that they become, by name and
     unit, or two systems differ in their sections."""
     require_same("systems to be connected", a, b, ("n_sections",))
@@ -403,7 +427,9 @@ def _require_same_lines(a: HTF, b: HTF) -> None:
     if a.f.shape != b.f.shape or not (
         is_traced(a.f, b.f) or np.allclose(a.f, b.f, rtol=0, atol=SAME_FREQUENCY)
     ):
-        raise DefinitionError("two HTFs have different frequencies: compute both at one `f`.")
+        raise DefinitionError(
+            "two HTFs have different frequencies: compute both at one `f`."
+        )
 
 
 def _combined(
@@ -419,17 +445,28 @@ def _combined(
     for x in terms:
         _require_same_lines(first, x)
         if x.harmonics != every:
-            raise DefinitionError(f"algebra needs all {N} harmonics: leave `harmonics` out.")
+            raise DefinitionError(
+                f"algebra needs all {N} harmonics: leave `harmonics` out."
+            )
     lines = algebra.Lines.of(np.asarray(first.f), N)
-    result, pairs = operation(*(lines.matrices(x) for x in to_host([x.H for x in terms])))
+    result, pairs = operation(
+        *(lines.matrices(x) for x in to_host([x.H for x in terms]))
+    )
 
     def variance(name: str) -> Array | None:
         given = to_host([getattr(x, name) for x in terms])
         exact = [x.source == "exact" for x in terms]
-        if all(exact) or any(v is None and not e for v, e in zip(given, exact, strict=True)):
+        if all(exact) or any(
+            v is None and not e for v, e in zip(given, exact, strict=True)
+        ):
             return None
-        full = [np.zeros(x.H.shape) if v is None else v for x, v in zip(terms, given, strict=True)]
-        return lines.entries(algebra.variance_of(pairs, [*map(lines.matrices, full)])).real
+        full = [
+            np.zeros(x.H.shape) if v is None else v
+            for x, v in zip(terms, given, strict=True)
+        ]
+        return lines.entries(
+            algebra.variance_of(pairs, [*map(lines.matrices, full)])
+        ).real
 
     freedoms = to_host([x.scatter.freedom for x in terms if x.scatter is not None])
     scatter = None
@@ -439,16 +476,26 @@ def _combined(
         scatter = Scatter(put(xp.zeros(len(first.f)), lines.row, least), shared=True)
     source = "exact" if all(x.source == "exact" for x in terms) else "estimate"
     return HTF(
-        first.f, lines.entries(result), every, N, inputs, outputs, source,
-        variance=variance("variance"), noise_variance=variance("noise_variance"), scatter=scatter,
-    )  # fmt: skip
+        first.f,
+        lines.entries(result),
+        every,
+        N,
+        inputs,
+        outputs,
+        source,
+        variance=variance("variance"),
+        noise_variance=variance("noise_variance"),
+        scatter=scatter,
+    )
 
 
 def require_distinct(f: Float[np.ndarray, " F"]) -> None:
     """**Raises:** `DefinitionError` for a frequency that occurs twice."""
     f = np.sort(f)
     if len(again := np.flatnonzero(np.diff(f) < SAME_FREQUENCY)):
-        raise DefinitionError(f"`f` holds {f[again[0]]:.10g} cycles per period twice: keep one.")
+        raise DefinitionError(
+            f"`f` holds {f[again[0]]:.10g} cycles per period twice: keep one."
+        )
 
 
 def _optional(name: str, value: Numbers | None, shape: tuple[int, ...]) -> Array | None:
@@ -456,5 +503,7 @@ def _optional(name: str, value: Numbers | None, shape: tuple[int, ...]) -> Array
         return None
     array = jnp.asarray(value)
     if array.shape != shape:
-        raise DefinitionError(f"`{name}` must have the shape {shape}, not {array.shape}.")
+        raise DefinitionError(
+            f"`{name}` must have the shape {shape}, not {array.shape}."
+        )
     return array

@@ -19,7 +19,12 @@ from .._core.precision import require_x64
 from .._core.text import folded, listed
 from ..errors import DefinitionError
 from . import algebra, time_response
-from .frequency_response import Frequencies, Harmonics, check_harmonics, harmonic_transfer
+from .frequency_response import (
+    Frequencies,
+    Harmonics,
+    check_harmonics,
+    harmonic_transfer,
+)
 from .htf import HTF, require_chain
 from .multipliers import product_eigenvalues, product_rank
 
@@ -86,7 +91,12 @@ class LDTP(eqx.Module):
         ny, nu = C.shape[1], B.shape[2]
         through = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
         matrices = {"A": A, "B": B, "C": C, "D": through}
-        for name, sizes in {"A": (d, d), "B": (d, nu), "C": (ny, d), "D": (ny, nu)}.items():
+        for name, sizes in {
+            "A": (d, d),
+            "B": (d, nu),
+            "C": (ny, d),
+            "D": (ny, nu),
+        }.items():
             array, shape = matrices[name], (n_sections, *sizes)
             if array.shape != shape or 0 in shape:
                 raise DefinitionError(
@@ -95,11 +105,18 @@ class LDTP(eqx.Module):
                 )
         require_x64(matrices)
         if coordinates is not None:
-            require_equal("`A` and `coordinates`", "lengths", n_sections, len(coordinates))
+            require_equal(
+                "`A` and `coordinates`", "lengths", n_sections, len(coordinates)
+            )
         self.A, self.B, self.C, self.D = A, B, C, through
         self.dims = _dimensions(dims, n_sections, d)
-        self.inputs, self.outputs = names("inputs", inputs, nu), names("outputs", outputs, ny)
-        self.coordinates = None if coordinates is None else tuple(map(tuple, coordinates))
+        self.inputs, self.outputs = (
+            names("inputs", inputs, nu),
+            names("outputs", outputs, ny),
+        )
+        self.coordinates = (
+            None if coordinates is None else tuple(map(tuple, coordinates))
+        )
         _check_padding(self)
 
     @classmethod
@@ -122,7 +139,9 @@ class LDTP(eqx.Module):
         """
         given = {"A": A, "B": B, "C": C} | ({} if D is None else {"D": D})
         for name, blocks in given.items():
-            require_equal(f"`A` and `{name}`", "numbers of matrices", len(A) or 1, len(blocks))
+            require_equal(
+                f"`A` and `{name}`", "numbers of matrices", len(A) or 1, len(blocks)
+            )
         dims = [np.shape(block)[1] for block in A]
         after, d = [*dims[1:], dims[0]], max(dims)
         ny, nu = np.shape(C[0])[0], np.shape(B[0])[1]
@@ -131,16 +150,25 @@ class LDTP(eqx.Module):
         for name, blocks in given.items():
             full, parts = (d if name in "AB" else ny, d if name in "AC" else nu), []
             for n, block in enumerate(map(xp.asarray, blocks)):
-                shape = after[n] if name in "AB" else ny, dims[n] if name in "AC" else nu
+                shape = (
+                    after[n] if name in "AB" else ny,
+                    dims[n] if name in "AC" else nu,
+                )
                 if block.shape != shape:
                     raise DefinitionError(
                         f"`{name}[{n}]` has shape {block.shape}, but x[{n}] has {dims[n]} and "
                         f"x[{(n + 1) % len(A)}] {after[n]} coordinates, with {nu} inputs and {ny} "
                         f"outputs: it should be {shape}."
                     )
-                parts.append(xp.pad(block, [(0, p - q) for p, q in zip(full, shape, strict=True)]))
+                parts.append(
+                    xp.pad(
+                        block, [(0, p - q) for p, q in zip(full, shape, strict=True)]
+                    )
+                )
             padded[name] = xp.stack(parts)
-        return cls(**padded, dims=dims, inputs=inputs, outputs=outputs, coordinates=coordinates)
+        return cls(
+            **padded, dims=dims, inputs=inputs, outputs=outputs, coordinates=coordinates
+        )
 
     @property
     def n_sections(self) -> int:
@@ -149,7 +177,9 @@ class LDTP(eqx.Module):
 
     def __repr__(self) -> str:
         ports = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        return folded(f"LDTP({self.n_sections} sections, dimension {self._dimension()}: {ports})")
+        return folded(
+            f"LDTP({self.n_sections} sections, dimension {self._dimension()}: {ports})"
+        )
 
     def _dimension(self) -> str:
         if is_traced(self.dims):
@@ -214,7 +244,9 @@ class LDTP(eqx.Module):
         require_x64(self, f)
         f = from_host(to_host(f).reshape(-1))
         self._refuse_resonance(f)
-        H = to_host(harmonic_transfer(*self.matrices[:4], f))[np.array(harmonics) % self.n_sections]
+        H = to_host(harmonic_transfer(*self.matrices[:4], f))[
+            np.array(harmonics) % self.n_sections
+        ]
         return HTF(f, H, harmonics, self.n_sections, self.inputs, self.outputs, "exact")
 
     def __matmul__(self, other: "LDTP") -> "LDTP":
@@ -225,7 +257,11 @@ class LDTP(eqx.Module):
         """
         require_chain("@", other.outputs, self.inputs, self, other)
         (ny, nu), (inner, nr) = (np.shape(x.D)[1:] for x in (self, other))
-        K, L, M = np.zeros((nu + nr, ny + inner)), np.zeros((nu + nr, nr)), np.eye(ny, ny + inner)
+        K, L, M = (
+            np.zeros((nu + nr, ny + inner)),
+            np.zeros((nu + nr, nr)),
+            np.eye(ny, ny + inner),
+        )
         K[:nu, ny:], L[nu:] = np.eye(nu), np.eye(nr)
         return self._connected(other.matrices, K, L, M, other.inputs, self.outputs)
 
@@ -246,16 +282,20 @@ class LDTP(eqx.Module):
         **Raises:** `DefinitionError` if D is not square and invertible at all sections: an inverse
         then has to know later outputs. The inverse of its HTFs needs no D.
         """
-        if self.D.shape[1] != self.D.shape[2] or not is_traced(self.D) and (
-            np.linalg.matrix_rank(np.asarray(self.D)) < self.D.shape[1]
-        ).any():  # fmt: skip
+        if (
+            self.D.shape[1] != self.D.shape[2]
+            or not is_traced(self.D)
+            and (np.linalg.matrix_rank(np.asarray(self.D)) < self.D.shape[1]).any()
+        ):
             raise DefinitionError(
                 "an inverse needs a square and invertible D at all sections, since it would have "
                 "to know later outputs without: invert the HTFs, `model.htf(f).inverse()`."
             )
         A, B, C, D = to_host(self.matrices[:4])
         D = namespace(D).linalg.inv(D)
-        return LDTP(A - B @ D @ C, B @ D, -D @ C, D, self.dims, self.outputs, self.inputs)
+        return LDTP(
+            A - B @ D @ C, B @ D, -D @ C, D, self.dims, self.outputs, self.inputs
+        )
 
     def feedback(self, controller: "LDTP | Gain") -> "LDTP":
         r"""The loop of this system and a controller, $u = r - F y$: $(I + P F)^{-1} P$.
@@ -289,7 +329,9 @@ class LDTP(eqx.Module):
 
     def _connected(self, other, K, L, M, inputs, outputs) -> "LDTP":
         A, B, C, D, dims = algebra.connect(self.matrices, other, K, L, M)
-        d = A.shape[1] if is_traced(dims) else int(np.asarray(dims).max())  # without common padding
+        d = (
+            A.shape[1] if is_traced(dims) else int(np.asarray(dims).max())
+        )  # without common padding
         return LDTP(A[:, :d, :d], B[:, :d], C[:, :, :d], D, dims, inputs, outputs)
 
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
@@ -341,7 +383,9 @@ class LDTP(eqx.Module):
         return self.periodic_states(self._input(u)[None], periods)[0]
 
     def periodic_states(
-        self, u: Annotated[Numbers, Reals("experiments samples inputs")], periods: PeriodCount
+        self,
+        u: Annotated[Numbers, Reals("experiments samples inputs")],
+        periods: PeriodCount,
     ) -> Float[Array, "S d"]:
         """The states of `periodic_state` for S inputs (S, P N, nu)."""
         u = self._input(u)
@@ -387,11 +431,14 @@ class LDTP(eqx.Module):
                 "outside, or use `characteristic_polynomial` or `monodromy` there."
             )
         if self.A.ndim != 3:
-            raise DefinitionError(f"`{method}` takes one LDTP at a time, not a batch of them.")
+            raise DefinitionError(
+                f"`{method}` takes one LDTP at a time, not a batch of them."
+            )
         A, dims = np.asarray(self.A), np.asarray(self.dims)
-        return [factor[:rows, :columns] for factor, rows, columns in zip(
-            A, np.roll(dims, -1), dims, strict=True
-        )]  # fmt: skip
+        return [
+            factor[:rows, :columns]
+            for factor, rows, columns in zip(A, np.roll(dims, -1), dims, strict=True)
+        ]
 
     def _refuse_resonance(self, f):
         if is_traced(self.A, self.dims, f):
@@ -420,7 +467,9 @@ def _dimensions(dims, n_sections, d):
     if not is_traced(dims):
         dims = np.asarray(dims)
         if np.any((dims < 1) | (dims > d)):
-            raise DefinitionError(f"`dims` must lie between 1 and {d}, the size of `A[n]`: {dims}.")
+            raise DefinitionError(
+                f"`dims` must lie between 1 and {d}, the size of `A[n]`: {dims}."
+            )
     return from_host(dims)
 
 

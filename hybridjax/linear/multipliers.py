@@ -38,7 +38,9 @@ def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
     return basis.shape[1]
 
 
-def product_eigenvalues(factors: Sequence[Matrix], rtol: float) -> Complex[np.ndarray, " r"]:
+def product_eigenvalues(
+    factors: Sequence[Matrix], rtol: float
+) -> Complex[np.ndarray, " r"]:
     """The non-zero eigenvalues of the product, the largest first, conjugate pairs exact. Those that
     are too small for a number are zero.
 
@@ -64,13 +66,17 @@ def _balanced(factors):
     factors = [np.array(factor, float) for factor in factors]
     for n, factor in enumerate(factors):
         if not np.all(np.isfinite(factor)):
-            raise ComputationError(f"A[{n}] holds NaN or infinity, so there are no multipliers.")
+            raise ComputationError(
+                f"A[{n}] holds NaN or infinity, so there are no multipliers."
+            )
     for _ in range(8):  # more rounds change nothing
         for n in range(len(factors)):
             incoming = np.linalg.norm(factors[n - 1], axis=1)
             outgoing = np.linalg.norm(factors[n], axis=0)
             both = (incoming > 0) & (outgoing > 0)
-            ratio = np.divide(outgoing, incoming, out=np.ones_like(incoming), where=both)
+            ratio = np.divide(
+                outgoing, incoming, out=np.ones_like(incoming), where=both
+            )
             unit = 2.0 ** np.round(np.log2(ratio) / 2)
             factors[n - 1] *= unit[:, None]
             factors[n] /= unit

@@ -15,7 +15,9 @@ from .algebra import Matrices
 def monodromy(A: Float[Array, "N *S d d"]) -> Float[Array, "*S d d"]:
     """The product `A[N-1] ... A[0]`."""
     xp = namespace(A)
-    return scan(_multiplied, xp.zeros_like(A[0]) + xp.eye(A.shape[-1], dtype=A.dtype), A)[0]
+    return scan(
+        _multiplied, xp.zeros_like(A[0]) + xp.eye(A.shape[-1], dtype=A.dtype), A
+    )[0]
 
 
 @functools.partial(jax.jit, static_argnames="section")
@@ -31,7 +33,10 @@ def _multiplied(product, factor):
 
 @jax.jit
 def response(
-    m: Matrices, u: Float[Array, "n nu"], x0: Float[Array, " d"], sections: Int[Array, " n"]
+    m: Matrices,
+    u: Float[Array, "n nu"],
+    x0: Float[Array, " d"],
+    sections: Int[Array, " n"],
 ) -> tuple[Float[Array, "time d"], Float[Array, "n ny"]]:
     """`x0` and the states after each input, and the outputs; `sections`, where each input acts."""
 
@@ -71,11 +76,15 @@ def periodic_states(
     w = xp.tensordot(u, after[::-1] @ B, ((2, 3), (0, 2)))
     z_N = np.exp(2j * np.pi * np.arange(periods) / periods)
     resolvent = z_N[:, None, None] * identity - phi
-    return solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1)).mean(axis=0).real.T
+    return (
+        solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1)).mean(axis=0).real.T
+    )
 
 
 @jax.jit
-def characteristic_polynomial(matrix: Float[Array, "d d"]) -> Float[Array, " coefficients"]:
+def characteristic_polynomial(
+    matrix: Float[Array, "d d"],
+) -> Float[Array, " coefficients"]:
     """Coefficients of det(x I - matrix), highest power first (Faddeev-LeVerrier recursion)."""
     d = matrix.shape[0]
     identity = jnp.eye(d)

@@ -45,7 +45,9 @@ class Impact(NamedTuple):
     """Of the contacts on the mechanism, along the k coordinates of the contacts."""
 
 
-_DEPENDENT = "the coordinates of `contact` must be independent; their inverse mass matrix is"
+_DEPENDENT = (
+    "the coordinates of `contact` must be independent; their inverse mass matrix is"
+)
 
 
 def _no_potential(q):
@@ -83,14 +85,19 @@ class Mechanism(eqx.Module):
     links: Callable[[Any], Mapping[str, Any]] | None = None
 
     def draw(
-        self, q: Float[Array, " n"], ground: ArrayLike | None = None, body: str | None = None
+        self,
+        q: Float[Array, " n"],
+        ground: ArrayLike | None = None,
+        body: str | None = None,
     ) -> Drawing:
         """The links, with a point at the end of each that has its name (see `Drawing`).
 
         **Raises:** `DefinitionError` for a mechanism without `links`.
         """
         if self.links is None:
-            raise DefinitionError("the mechanism has no `links` to draw: give them to Mechanism.")
+            raise DefinitionError(
+                "the mechanism has no `links` to draw: give them to Mechanism."
+            )
         lines = {name: jnp.asarray(link, float) for name, link in self.links(q).items()}
         points = {name: link[-1] for name, link in lines.items()}
         below = {} if ground is None else {"ground": ground}
@@ -135,7 +142,9 @@ class Mechanism(eqx.Module):
         speed = lambda q: jax.jvp(place, (q,), (v,))[1]  # noqa: E731
         # (The drift is the part of the contact's acceleration that the velocities make.)
         jacobian, drift = jax.jacfwd(place)(q), jax.jvp(speed, (q,), (v,))[1]
-        solved = _solve(self.mass(q), jnp.concatenate([(force - self.bias(q, v))[None], jacobian]))
+        solved = _solve(
+            self.mass(q), jnp.concatenate([(force - self.bias(q, v))[None], jacobian])
+        )
         free, by_force = solved[0], solved[1:].T
         constraint = _solve(jacobian @ by_force, -(drift + jacobian @ free), _DEPENDENT)
         return Constrained(free + by_force @ constraint, constraint)
@@ -159,7 +168,9 @@ class Mechanism(eqx.Module):
         """
         jacobian = jax.jacfwd(lambda q: as_vector(contact(q)).ravel())(q)
         by_impulse = _solve(self.mass(q), jacobian).T
-        impulse = _solve(jacobian @ by_impulse, -(1 + restitution) * (jacobian @ v), _DEPENDENT)
+        impulse = _solve(
+            jacobian @ by_impulse, -(1 + restitution) * (jacobian @ v), _DEPENDENT
+        )
         return Impact(v + by_impulse @ impulse, impulse)
 
     def along(self, placement: Callable[[Any], Any]) -> "Mechanism":

@@ -31,7 +31,9 @@ class BouncingBall(HybridSystem):
 
     def transitions(self):
         bounced = lambda t, q, u: (0.0, -self.restitution * q[1])  # noqa: E731
-        return (Transition("bounce", "fall", "fall", lambda t, q, u: q[0], reset=bounced),)
+        return (
+            Transition("bounce", "fall", "fall", lambda t, q, u: q[0], reset=bounced),
+        )
 
 
 class PaddleJuggler(HybridSystem):
@@ -73,7 +75,11 @@ class PaddleJuggler(HybridSystem):
         return t, y, v, jnp.stack([trace / 2 + root, trace / 2 - root])
 
     def charts(self):
-        return {"fall": FieldChart(lambda t, q, u: (q[1], -self.g), ("y", "v"), ("m", "m/s"))}
+        return {
+            "fall": FieldChart(
+                lambda t, q, u: (q[1], -self.g), ("y", "v"), ("m", "m/s")
+            )
+        }
 
     def transitions(self):
         def bounce(t, q, u):
@@ -133,7 +139,9 @@ class BouncingChain(HybridSystem):
     input_units = ("N",)
     time_unit = "s"
 
-    n: Count = eqx.field(static=True, default=2, metadata={"unit": "", "doc": "number of masses"})
+    n: Count = eqx.field(
+        static=True, default=2, metadata={"unit": "", "doc": "number of masses"}
+    )
     m: Parameter = parameter(1.0, unit="kg", doc="mass of each")
     k: Parameter = parameter(0.3, unit="N/m", doc="stiffness between neighbors")
     c: Parameter = parameter(0.05, unit="N s/m", doc="damping between neighbors")
@@ -144,7 +152,11 @@ class BouncingChain(HybridSystem):
 
     def charts(self):
         states = tuple(f"{x}{i}" for x in "yv" for i in range(1, self.n + 1))
-        return {"flight": FieldChart(self._flight, states, ("m",) * self.n + ("m/s",) * self.n)}
+        return {
+            "flight": FieldChart(
+                self._flight, states, ("m",) * self.n + ("m/s",) * self.n
+            )
+        }
 
     def _flight(self, t, q, u):
         y, v = q[: self.n], q[self.n :]
@@ -164,7 +176,9 @@ class BouncingChain(HybridSystem):
 
     def guess(self):
         """The cycle of masses that are not coupled (see `PaddleJuggler.exact`)."""
-        first, lift, v, _ = PaddleJuggler(self.A, self.T, self.g, self.restitution).exact()
+        first, lift, v, _ = PaddleJuggler(
+            self.A, self.T, self.g, self.restitution
+        ).exact()
         past = -(first + jnp.arange(self.n) * self.T / self.n) % self.T
         y = lift + v * past - self.g * past**2 / 2
         return Guess("flight", jnp.concatenate([y, v - self.g * past]))

@@ -101,11 +101,15 @@ class TorsoWalker(HybridSystem):
     m: Parameter = parameter(5.0, unit="kg", doc="mass of a leg")
     mH: Parameter = parameter(15.0, unit="kg", doc="mass of the hip")
     mT: Parameter = parameter(10.0, unit="kg", doc="mass of the torso")
-    r: Parameter = parameter(1.0, unit="m", doc="length of a leg, with its mass in the middle")
+    r: Parameter = parameter(
+        1.0, unit="m", doc="length of a leg, with its mass in the middle"
+    )
     l: Parameter = parameter(0.5, unit="m", doc="from the hip to the torso's mass")  # noqa: E741
     g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
     lean: Parameter = parameter(math.pi / 6, unit="rad", doc="angle of the torso")
-    stride: Parameter = parameter(math.pi / 8, unit="rad", doc="angle of the leg that ends a step")
+    stride: Parameter = parameter(
+        math.pi / 8, unit="rad", doc="angle of the leg that ends a step"
+    )
     stiffness: Parameter = parameter(20.0, unit="1/s", doc="rate at which errors decay")
 
     def mechanism(self) -> Mechanism:
@@ -115,8 +119,14 @@ class TorsoWalker(HybridSystem):
         arms = legs + self.l * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
         ends = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, 0, 1]])
         ends = ends * jnp.stack([self.r, self.r, self.l])
-        drawn = {"stance": ends[:2], "swing": ends[1:3], "torso": ends[np.array([1, 3])]}
-        return chain(arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g, drawn)
+        drawn = {
+            "stance": ends[:2],
+            "swing": ends[1:3],
+            "torso": ends[np.array([1, 3])],
+        }
+        return chain(
+            arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g, drawn
+        )
 
     def charts(self):
         states = ("th1", "th2", "th3", "w1", "w2", "w3")
@@ -127,13 +137,20 @@ class TorsoWalker(HybridSystem):
         upright = held(q[2] - self.lean, v[2], self.stiffness)
         mirrored = held(q[0] + q[1], v[0] + v[1], self.stiffness)
         desired = jnp.stack([jnp.zeros_like(upright), mirrored, upright])
-        direction, torque = jnp.array([1.0, -1.0, 0.0]), u[0] * jnp.array([0.0, -1.0, 1.0])
-        a = accelerations_under_feedback(self.mechanism(), q, v, desired, direction, torque)
+        direction, torque = (
+            jnp.array([1.0, -1.0, 0.0]),
+            u[0] * jnp.array([0.0, -1.0, 1.0]),
+        )
+        a = accelerations_under_feedback(
+            self.mechanism(), q, v, desired, direction, torque
+        )
         return jnp.concatenate([v, a])
 
     def transitions(self):
         angle = lambda t, q, u: q[0] - self.stride  # noqa: E731
-        return (Transition("touchdown", "step", "step", angle, "rising", self._touchdown),)
+        return (
+            Transition("touchdown", "step", "step", angle, "rising", self._touchdown),
+        )
 
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:3], state[3:]))
@@ -187,18 +204,34 @@ class FiveLinkBiped(HybridSystem):
     torso_mass: Parameter = parameter(12.0, unit="kg", doc="mass of the torso")
     thigh_mass: Parameter = parameter(6.8, unit="kg", doc="mass of a thigh")
     shin_mass: Parameter = parameter(3.2, unit="kg", doc="mass of a shin")
-    torso_inertia: Parameter = parameter(1.33, unit="kg m^2", doc="of the torso, about the hip")
-    thigh_inertia: Parameter = parameter(0.47, unit="kg m^2", doc="of a thigh, about the hip")
-    shin_inertia: Parameter = parameter(0.20, unit="kg m^2", doc="of a shin, about the knee")
+    torso_inertia: Parameter = parameter(
+        1.33, unit="kg m^2", doc="of the torso, about the hip"
+    )
+    thigh_inertia: Parameter = parameter(
+        0.47, unit="kg m^2", doc="of a thigh, about the hip"
+    )
+    shin_inertia: Parameter = parameter(
+        0.20, unit="kg m^2", doc="of a shin, about the knee"
+    )
     length: Parameter = parameter(0.4, unit="m", doc="length of a thigh, and of a shin")
-    torso_center: Parameter = parameter(0.24, unit="m", doc="from the hip to the torso's mass")
-    thigh_center: Parameter = parameter(0.11, unit="m", doc="from the hip to a thigh's mass")
-    shin_center: Parameter = parameter(0.24, unit="m", doc="from the knee to a shin's mass")
+    torso_center: Parameter = parameter(
+        0.24, unit="m", doc="from the hip to the torso's mass"
+    )
+    thigh_center: Parameter = parameter(
+        0.11, unit="m", doc="from the hip to a thigh's mass"
+    )
+    shin_center: Parameter = parameter(
+        0.24, unit="m", doc="from the knee to a shin's mass"
+    )
     g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
     lean: Parameter = parameter(0.2, unit="rad", doc="angle of the torso")
-    stride: Parameter = parameter(0.2, unit="rad", doc="angle of the stance leg that ends a step")
+    stride: Parameter = parameter(
+        0.2, unit="rad", doc="angle of the stance leg that ends a step"
+    )
     knee: Parameter = parameter(0.2, unit="rad", doc="flexion of a knee that carries")
-    lift: Parameter = parameter(0.4, unit="rad", doc="further flexion of the swing knee")
+    lift: Parameter = parameter(
+        0.4, unit="rad", doc="further flexion of the swing knee"
+    )
     stiffness: Parameter = parameter(20.0, unit="1/s", doc="rate at which errors decay")
 
     def mechanism(self) -> Mechanism:
@@ -206,14 +239,26 @@ class FiveLinkBiped(HybridSystem):
         the stance foot."""
         order = np.array([0, 1, 2, 1, 0])
         m = jnp.stack([self.shin_mass, self.thigh_mass, self.torso_mass])[order]
-        about_joint = jnp.stack([self.shin_inertia, self.thigh_inertia, self.torso_inertia])[order]
-        center = jnp.stack([self.shin_center, self.thigh_center, self.torso_center])[order]
+        about_joint = jnp.stack(
+            [self.shin_inertia, self.thigh_inertia, self.torso_inertia]
+        )[order]
+        center = jnp.stack([self.shin_center, self.thigh_center, self.torso_center])[
+            order
+        ]
         # Along whole links from the foot on, then along a part of the link itself.
         links = np.array(
-            [[1, 0, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, -1, 0]]
+            [
+                [1, 0, 0, 0, 0],
+                [1, 1, 0, 0, 0],
+                [1, 1, 0, 0, 0],
+                [1, 1, 0, 0, 0],
+                [1, 1, 0, -1, 0],
+            ]
         )
         arms = self.length * links + center[:, None] * np.diag([-1, -1, 1, -1, -1])
-        ends = self.length * np.vstack([0 * links[0], links[:2], links[4], [1, 1, 0, -1, -1]])
+        ends = self.length * np.vstack(
+            [0 * links[0], links[:2], links[4], [1, 1, 0, -1, -1]]
+        )
         torso = jnp.stack([ends[2], ends[2] + 2 * self.torso_center * np.eye(5)[2]])
         drawn = {"stance": ends[:3], "swing": ends[2:], "torso": torso}
         return chain(arms, m, about_joint - m * center**2, self.g, drawn)
@@ -238,26 +283,42 @@ class FiveLinkBiped(HybridSystem):
         bend, slope = lift * (1 - (leg / stride) ** 2), -2 * lift * leg / stride**2
         knee = held(q[0] - q[1] - self.knee, v[0] - v[1], self.stiffness)
         torso = held(q[2] - self.lean, v[2], self.stiffness)
-        mirrored = held((q[3] + q[4]) / 2 + leg, (v[3] + v[4]) / 2 + leg_rate, self.stiffness)
+        mirrored = held(
+            (q[3] + q[4]) / 2 + leg, (v[3] + v[4]) / 2 + leg_rate, self.stiffness
+        )
         error, rate = q[4] - q[3] - self.knee - bend, v[4] - v[3] - slope * leg_rate
-        swing_knee = held(error, rate, self.stiffness) - 2 * lift * (leg_rate / stride) ** 2
-        desired = [knee / 2, -knee / 2, torso, mirrored - swing_knee / 2, mirrored + swing_knee / 2]
+        swing_knee = (
+            held(error, rate, self.stiffness) - 2 * lift * (leg_rate / stride) ** 2
+        )
+        desired = [
+            knee / 2,
+            -knee / 2,
+            torso,
+            mirrored - swing_knee / 2,
+            mirrored + swing_knee / 2,
+        ]
         unit, goal = jnp.ones_like(slope), jnp.stack(desired)
         direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
         torque = u[0] * jnp.array([0.0, 0.0, 1.0, -1.0, 0.0])
-        a = accelerations_under_feedback(self.mechanism(), q, v, goal, direction, torque)
+        a = accelerations_under_feedback(
+            self.mechanism(), q, v, goal, direction, torque
+        )
         return jnp.concatenate([v, a])
 
     def transitions(self):
         height = lambda t, q, u: self._swing_foot(q)[1]  # noqa: E731
         ahead = lambda t, q, u: self._swing_foot(q)[0] > 0  # noqa: E731
-        landing = Transition("touchdown", "step", "step", height, "falling", self._touchdown, ahead)
+        landing = Transition(
+            "touchdown", "step", "step", height, "falling", self._touchdown, ahead
+        )
         return (landing,)
 
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:5], state[5:]))
         foot = lambda q: q[5:] + self._swing_foot(q[:5])  # noqa: E731
-        return jnp.concatenate([q[4::-1], self.mechanism().impact(q, v, foot).velocity[4::-1]])
+        return jnp.concatenate(
+            [q[4::-1], self.mechanism().impact(q, v, foot).velocity[4::-1]]
+        )
 
     def draw(self, chart, t, q):
         return self.mechanism().draw(jnp.stack(list(q.values())[:5]), _GROUND, "stance")

@@ -32,7 +32,9 @@ class BuckConverter(HybridSystem):
     upper: Parameter = parameter(8.2, unit="V", doc="end of the ramp")
     T: Parameter = parameter(400e-6, unit="s", doc="period of the ramp")
 
-    def control(self, t: ArrayLike, q: Float[Array, "3"], u: Float[Array, "1"]) -> Array:
+    def control(
+        self, t: ArrayLike, q: Float[Array, "3"], u: Float[Array, "1"]
+    ) -> Array:
         """Amplified error less the ramp: the switch is closed where this is negative."""
         return self.gain * (q[0] - self.Vref - u[0]) - q[2]
 
@@ -52,7 +54,9 @@ class BuckConverter(HybridSystem):
         anew = lambda t, q, u: (q[0], q[1], self.lower)  # noqa: E731
         return (
             Transition("switch on", "open", "closed", self.control),
-            Transition("switch off", "closed", "open", self.control, direction="rising"),
+            Transition(
+                "switch off", "closed", "open", self.control, direction="rising"
+            ),
             Transition("ramp ends", "closed", "open", tick, reset=anew),
             Transition("ramp ends (open)", "open", "open", tick, reset=anew),
         )
@@ -98,7 +102,11 @@ class CukConverter(HybridSystem):
             i1, v1, i2, v2 = q
             # The capacitor between the coils stands in the loop of one or the other.
             first, charge, second = (0.0, -i2, v1) if closed else (v1, i1, 0.0)
-            rates = (self.E - first) / self.L1, charge / self.C1, (second - v2) / self.L2
+            rates = (
+                (self.E - first) / self.L1,
+                charge / self.C1,
+                (second - v2) / self.L2,
+            )
             return *rates, (i2 - v2 / self.R) / self.C2
 
         return FieldChart(field, ("i1", "v1", "i2", "v2"), ("A", "V", "A", "V"))

@@ -52,9 +52,16 @@ class VerticalHopper(HybridSystem):
         return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(self.omega * t)
 
     def charts(self):
-        pushed = lambda t, q, u: (q[1], (self.leg(t, q[0], 0.0) + u[0]) / self.M - self.g)  # noqa: E731
+        def pushed(t, q, u):
+            return (
+                q[1],
+                (self.leg(t, q[0], 0.0) + u[0]) / self.M - self.g,
+            )
+
         names, units = _MASSES
-        stance = FieldChart(pushed, names[:2], units[:2], absent=dict.fromkeys(names[2:], 0.0))
+        stance = FieldChart(
+            pushed, names[:2], units[:2], absent=dict.fromkeys(names[2:], 0.0)
+        )
         return {"flight": self._flight(), "stance": stance}
 
     def _flight(self) -> FieldChart:
@@ -138,7 +145,9 @@ def _absent(down: tuple[int, ...]) -> dict[str, float]:
 
 def _part(down: tuple[int, ...], whole: Sequence) -> list:
     """Those of all eight states that a chart has."""
-    return [x for name, x in zip(_STATES, whole, strict=True) if name not in _absent(down)]
+    return [
+        x for name, x in zip(_STATES, whole, strict=True) if name not in _absent(down)
+    ]
 
 
 def _whole(down: tuple[int, ...], q: Array) -> list[Array]:
@@ -159,8 +168,12 @@ class HopperPair(VerticalHopper):
     inputs = ("u1", "u2")
     input_units = ("N", "N")
 
-    coupling: Parameter = parameter(1.0, unit="N/m", doc="stiffness of the spring between bodies")
-    lag: Parameter = parameter(0.3, unit="s", doc="by which the second actuator runs behind")
+    coupling: Parameter = parameter(
+        1.0, unit="N/m", doc="stiffness of the spring between bodies"
+    )
+    lag: Parameter = parameter(
+        0.3, unit="s", doc="by which the second actuator runs behind"
+    )
 
     def charts(self):
         return {name: self._standing(down) for down, name in _PAIR_CHARTS.items()}
@@ -171,7 +184,10 @@ class HopperPair(VerticalHopper):
             pull = self.coupling * (whole[2] - whole[0])
             bodies, feet = [], []
             for i, between in enumerate((pull, -pull)):
-                (y, v), (ym, vm) = whole[2 * i : 2 * i + 2], whole[2 * i + 4 : 2 * i + 6]
+                (y, v), (ym, vm) = (
+                    whole[2 * i : 2 * i + 2],
+                    whole[2 * i + 4 : 2 * i + 6],
+                )
                 leg = self.leg(t - i * self.lag, y, ym)
                 bodies += [v, (leg + between + u[i]) / self.M - self.g]
                 feet += [vm, -(leg + self.b * vm) / self.m - self.g]
@@ -201,13 +217,20 @@ class HopperPair(VerticalHopper):
             return _part(after, whole)
 
         name = f"{'liftoff' if lifts else 'touchdown'} {i + 1} ({_PAIR_CHARTS[down]})"
-        return Transition(name, _PAIR_CHARTS[down], _PAIR_CHARTS[after], guard, reset=reset)
+        return Transition(
+            name, _PAIR_CHARTS[down], _PAIR_CHARTS[after], guard, reset=reset
+        )
 
     def draw(self, chart, t, q):
         hoppers = [_hopper(i, q[f"yM{i + 1}"], q[f"ym{i + 1}"]) for i in (0, 1)]
         (first, circles), (second, more) = hoppers
         between = Drawing.spring((0.3, q["yM1"]), (1.2, q["yM2"]))
-        lines = {"ground": [(-1.0, 0.0), (2.5, 0.0)], **first, **second, "coupling": between}
+        lines = {
+            "ground": [(-1.0, 0.0), (2.5, 0.0)],
+            **first,
+            **second,
+            "coupling": between,
+        }
         return Drawing(lines, circles={**circles, **more})
 
     def guess(self):

@@ -31,7 +31,9 @@ class DrivenNeuron(HybridSystem):
 
     def transitions(self):
         below = lambda t, q, u: self.peak - q[0]  # noqa: E731
-        return (Transition("spike", "membrane", "membrane", below, reset=self.after_spike),)
+        return (
+            Transition("spike", "membrane", "membrane", below, reset=self.after_spike),
+        )
 
     def period(self):
         return self.T
@@ -55,7 +57,9 @@ class AdExNeuron(DrivenNeuron):
 
     C: Parameter = parameter(281.0, unit="pF", doc="capacitance")
     gL: Parameter = parameter(30.0, unit="nS", doc="leak")
-    EL: Parameter = parameter(-70.6, unit="mV", doc="potential of the leak, and after a spike")
+    EL: Parameter = parameter(
+        -70.6, unit="mV", doc="potential of the leak, and after a spike"
+    )
     threshold: Parameter = parameter(-50.4, unit="mV")
     slope: Parameter = parameter(2.0, unit="mV", doc="how sharply a spike sets in")
     tau: Parameter = parameter(144.0, unit="ms", doc="time constant of the adaptation")
@@ -126,7 +130,9 @@ class FitzHughNagumo(HybridSystem):
     simulating nerve axon, Proc. IRE 50 (1962) 2061-2070.
     """
 
-    eps: Parameter = parameter(0.01, doc="time scale of the membrane, of that of its recovery")
+    eps: Parameter = parameter(
+        0.01, doc="time scale of the membrane, of that of its recovery"
+    )
     current: Parameter = parameter(0.5, doc="I")
     a: Parameter = parameter(0.7)
     b: Parameter = parameter(0.8)

@@ -10,7 +10,9 @@ from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
-def _block(x: Array, reach: Parameter | float, speed: Parameter | float = 0.0) -> Drawing:
+def _block(
+    x: Array, reach: Parameter | float, speed: Parameter | float = 0.0
+) -> Drawing:
     """A block at x on a spring, whose rest length is twice the `reach`, above a ground that moves
     with this speed."""
     half, wall = 0.25 * reach, -2 * reach
@@ -82,7 +84,9 @@ class Mathieu(HybridSystem):
 
     def _line(self, t, q, u):
         x, v = q
-        return v, u[0] - 2 * self.damping * v - (self.delta + self.epsilon * jnp.cos(t)) * x
+        return v, u[0] - 2 * self.damping * v - (
+            self.delta + self.epsilon * jnp.cos(t)
+        ) * x
 
     def period(self):
         return jnp.asarray(2 * jnp.pi)
@@ -101,7 +105,9 @@ class RotorFlap(HybridSystem):
     reversed flow.
     """
 
-    lock: Parameter = parameter(12.0, doc="Lock number, aerodynamic over inertial forces")
+    lock: Parameter = parameter(
+        12.0, doc="Lock number, aerodynamic over inertial forces"
+    )
     p: Parameter = parameter(1.0, doc="natural frequency over the rotor's")
     mu: Parameter = parameter(0.3, doc="advance ratio")
 
@@ -111,7 +117,9 @@ class RotorFlap(HybridSystem):
     def _blade(self, t, q, u):
         (b, vb), lock, mu = q, self.lock / 8, self.mu
         damping = lock * (1 + 4 / 3 * mu * jnp.sin(t))
-        stiffness = self.p**2 + lock * (4 / 3 * mu * jnp.cos(t) + mu**2 * jnp.sin(2 * t))
+        stiffness = self.p**2 + lock * (
+            4 / 3 * mu * jnp.cos(t) + mu**2 * jnp.sin(2 * t)
+        )
         return vb, u[0] - damping * vb - stiffness * b
 
     def period(self):
@@ -184,8 +192,12 @@ class BeltOscillator(HybridSystem):
     m: Parameter = parameter(1.0, unit="kg", doc="mass")
     k: Parameter = parameter(1.0, unit="N/m", doc="stiffness")
     belt: Parameter = parameter(0.2, unit="m/s", doc="speed of the belt")
-    friction: Parameter = parameter(1.0, unit="N", doc="friction of a block that begins to slip")
-    decay: Parameter = parameter(3.0, unit="s/m", doc="how fast friction decreases with the speed")
+    friction: Parameter = parameter(
+        1.0, unit="N", doc="friction of a block that begins to slip"
+    )
+    decay: Parameter = parameter(
+        3.0, unit="s/m", doc="how fast friction decreases with the speed"
+    )
 
     def charts(self):
         return self._parts().charts
@@ -235,7 +247,9 @@ class ChuaCircuit(HybridSystem):
     def _slab(self, side: float) -> FieldChart:
         def field(t, q, u):
             x, y, z = q
-            resistor = self.outer * (x - side) + self.inner * side if side else self.inner * x
+            resistor = (
+                self.outer * (x - side) + self.inner * side if side else self.inner * x
+            )
             return self.alpha * (y - resistor) + u[0], x - y + z, -self.beta * y
 
         return FieldChart(field, ("x", "y", "z"))

@@ -18,7 +18,12 @@ Leg = Literal["hind", "front"]
 Legs = tuple[Leg, ...]
 _LEGS: Legs = ("hind", "front")
 # Charts by the legs that stand on the table.
-_CHARTS: dict[Legs, str] = {(): "air", ("hind",): "hind", ("front",): "front", _LEGS: "both"}
+_CHARTS: dict[Legs, str] = {
+    (): "air",
+    ("hind",): "hind",
+    ("front",): "front",
+    _LEGS: "both",
+}
 
 
 @checked_methods
@@ -104,7 +109,9 @@ class TwoLeggedBar(HybridSystem):
     def _impact(self, leg, t, state):
         y, v, q, p = state
         s = self.hip(leg)
-        impulse = -(1 - self.rho) * self.speed(leg, t, state) / (1 / self.m + s**2 / self.J)
+        impulse = (
+            -(1 - self.rho) * self.speed(leg, t, state) / (1 / self.m + s**2 / self.J)
+        )
         return y, v + impulse / self.m, q, p + s * impulse / self.J
 
     def period(self):
@@ -116,7 +123,9 @@ class TwoLeggedBar(HybridSystem):
         hips = [(self.hip(leg), q["y"] + self.hip(leg) * q["q"]) for leg in _LEGS]
         lines: dict = {"ground": [(-1.0, table), (1.0, table)], "bar": hips}
         for leg, (x, y) in zip(_LEGS, hips, strict=True):
-            lines[leg] = Drawing.spring((x, jnp.maximum(table, y - self.l0)), (x, y), 0.05)
+            lines[leg] = Drawing.spring(
+                (x, jnp.maximum(table, y - self.l0)), (x, y), 0.05
+            )
         return Drawing(lines, circles={"center": (0.0, q["y"], 0.08)})
 
     def guess(self):
@@ -143,7 +152,9 @@ class TrottingQuadruped(TwoLeggedBar):
     hind: Parameter = parameter(-0.5, unit="m", doc="position of the hind hip")
     front: Parameter = parameter(0.5, unit="m", doc="position of the front hip")
     rho: Parameter = parameter(1.0, doc="relative speed of a foot kept when it lands")
-    thrust: Parameter = parameter(0.0, unit="N", doc="force of the reflex, of both legs")
+    thrust: Parameter = parameter(
+        0.0, unit="N", doc="force of the reflex, of both legs"
+    )
 
     def reflex(self, legs: Legs) -> Parameter:
         return self.thrust if len(legs) == 2 else 0.0
@@ -175,7 +186,9 @@ class SLIPRunner(HybridSystem):
     g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
     angle: Parameter = parameter(math.radians(68.0), unit="rad", doc="angle of attack")
 
-    def energy(self, t: ArrayLike, q: Float[Array, " n"], u: Float[Array, " l"]) -> Array:
+    def energy(
+        self, t: ArrayLike, q: Float[Array, " n"], u: Float[Array, " l"]
+    ) -> Array:
         """Energy of the mass, and in stance of the spring."""
         *x, y, vx, vy = q
         spring = 0.5 * self.k * (self.l0 - jnp.hypot(x[0], y)) ** 2 if x else 0.0
@@ -188,7 +201,9 @@ class SLIPRunner(HybridSystem):
         flight = lambda t, q, u: (q[2], 0.0 * q[1], -self.g)  # noqa: E731
         return {
             "flight": FieldChart(flight, ("y", "vx", "vy"), ("m", "m/s", "m/s")),
-            "stance": FieldChart(self._stance, ("x", "y", "vx", "vy"), ("m", "m", "m/s", "m/s")),
+            "stance": FieldChart(
+                self._stance, ("x", "y", "vx", "vy"), ("m", "m", "m/s", "m/s")
+            ),
         }
 
     def _stance(self, t, q, u):
@@ -204,7 +219,9 @@ class SLIPRunner(HybridSystem):
         stretch = lambda t, q, u: jnp.hypot(q[0], q[1]) - self.l0  # noqa: E731
         lifted = lambda t, q, u: q[1:]  # noqa: E731
         return (
-            Transition("touchdown", "flight", "stance", height, reset=landed, enabled=down),
+            Transition(
+                "touchdown", "flight", "stance", height, reset=landed, enabled=down
+            ),
             Transition("liftoff", "stance", "flight", stretch, "rising", lifted),
         )
 
@@ -214,8 +231,13 @@ class SLIPRunner(HybridSystem):
         x = -self.l0 * jnp.cos(self.angle) if flies else q["x"]
         foot = y - self.l0 * jnp.sin(self.angle) if flies else 0.0
         speed = (q["vx"], 0.0) if flies else (0.0, 0.0)
-        lines = {"ground": [(-1.0, 0.0), (1.0, 0.0)], "leg": Drawing.spring((0.0, foot), (x, y))}
-        return Drawing(lines, circles={"mass": (x, y, 0.15)}, body="mass", velocity=speed)
+        lines = {
+            "ground": [(-1.0, 0.0), (1.0, 0.0)],
+            "leg": Drawing.spring((0.0, foot), (x, y)),
+        }
+        return Drawing(
+            lines, circles={"mass": (x, y, 0.15)}, body="mass", velocity=speed
+        )
 
     def guess(self):
         return Guess("flight", (0.95, 5.07, 0.0))

@@ -17,15 +17,25 @@ def _slope(angle: Parameter, length: Parameter | float = 1.0) -> Array:
     return jnp.stack([-way, way])
 
 
-def _two_legs(slope: Parameter, length: Parameter | float, stance: Array, swing: Array) -> Drawing:
+def _two_legs(
+    slope: Parameter, length: Parameter | float, stance: Array, swing: Array
+) -> Drawing:
     """Legs by their angles from the vertical, positive backward."""
     way = lambda angle: length * jnp.stack([-jnp.sin(angle), jnp.cos(angle)])  # noqa: E731
     hip = way(stance)
     foot = hip - way(swing)
-    lines = {"ground": _slope(slope, length), "stance": [0 * hip, hip], "swing": [hip, foot]}
+    lines = {
+        "ground": _slope(slope, length),
+        "stance": [0 * hip, hip],
+        "swing": [hip, foot],
+    }
     circles = {"hip": jnp.append(hip, 0.08 * length)}
-    return Drawing(lines, circles=circles, points={"stance foot": 0 * hip, "swing foot": foot},
-                   body="hip")  # fmt: skip
+    return Drawing(
+        lines,
+        circles=circles,
+        points={"stance foot": 0 * hip, "swing foot": foot},
+        body="hip",
+    )
 
 
 class RimlessWheel(HybridSystem):
@@ -63,7 +73,13 @@ class RimlessWheel(HybridSystem):
 
     def transitions(self):
         angle = lambda t, q, u: q[0] - self.slope - self.alpha  # noqa: E731
-        after = lambda t, q, u: (self.slope - self.alpha, jnp.cos(2 * self.alpha) * q[1])  # noqa: E731
+
+        def after(t, q, u):
+            return (
+                self.slope - self.alpha,
+                jnp.cos(2 * self.alpha) * q[1],
+            )
+
         return (Transition("impact", "swing", "swing", angle, "rising", after),)
 
     def draw(self, chart, t, q):
@@ -71,7 +87,9 @@ class RimlessWheel(HybridSystem):
         angles = q["th"] + 2 * self.alpha * (jnp.arange(24) % self.spokes)
         hub = jnp.stack([jnp.sin(q["th"]), jnp.cos(q["th"])])
         tips = hub - jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1)
-        spokes = jnp.stack([jnp.broadcast_to(hub, tips.shape), tips], axis=1).reshape(-1, 2)
+        spokes = jnp.stack([jnp.broadcast_to(hub, tips.shape), tips], axis=1).reshape(
+            -1, 2
+        )
         lines = {"ground": _slope(self.slope), "spokes": spokes}
         return Drawing(lines, circles={"hub": jnp.append(hub, 0.08)}, body="hub")
 
@@ -94,7 +112,11 @@ class SimplestWalker(HybridSystem):
     slope: Parameter = parameter(0.009, unit="rad", doc="angle of the slope")
 
     def charts(self):
-        return {"step": FieldChart(self._step, ("th", "phi", "w", "p"), ("rad", "rad", "", ""))}
+        return {
+            "step": FieldChart(
+                self._step, ("th", "phi", "w", "p"), ("rad", "rad", "", "")
+            )
+        }
 
     def _step(self, t, q, u):
         th, phi, w, p = q
@@ -105,7 +127,11 @@ class SimplestWalker(HybridSystem):
     def transitions(self):
         foot = lambda t, q, u: q[1] - 2 * q[0]  # noqa: E731
         ahead = lambda t, q, u: q[0] < 0  # noqa: E731
-        return (Transition("heelstrike", "step", "step", foot, "rising", _heelstrike, ahead),)
+        return (
+            Transition(
+                "heelstrike", "step", "step", foot, "rising", _heelstrike, ahead
+            ),
+        )
 
     def draw(self, chart, t, q):
         """With legs of 1 m."""
@@ -151,7 +177,9 @@ class CompassGait(HybridSystem):
     a: Parameter = parameter(0.5, unit="m", doc="from the foot to the leg's mass")
     b: Parameter = parameter(0.5, unit="m", doc="from the leg's mass to the hip")
     g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
-    slope: Parameter = parameter(3.0 * math.pi / 180, unit="rad", doc="angle of the slope")
+    slope: Parameter = parameter(
+        3.0 * math.pi / 180, unit="rad", doc="angle of the slope"
+    )
 
     @property
     def l(self):  # noqa: E743
@@ -173,12 +201,19 @@ class CompassGait(HybridSystem):
         # The inverse of [[A, B], [B, D]].
         A, B, D = m * b**2, -coupling * c, (mH + m) * length**2 + m * a**2
         det = A * D - B**2
-        return vn, vs, (D * torque_n - B * torque_s) / det, (A * torque_s - B * torque_n) / det
+        return (
+            vn,
+            vs,
+            (D * torque_n - B * torque_s) / det,
+            (A * torque_s - B * torque_n) / det,
+        )
 
     def transitions(self):
         foot = lambda t, q, u: q[0] + q[1] + 2 * self.slope  # noqa: E731
         ahead = lambda t, q, u: q[1] < 0  # noqa: E731
-        hit = Transition("heelstrike", "step", "step", foot, reset=self._heelstrike, enabled=ahead)
+        hit = Transition(
+            "heelstrike", "step", "step", foot, reset=self._heelstrike, enabled=ahead
+        )
         return (hit,)
 
     def _heelstrike(self, t, q, u):
@@ -186,9 +221,15 @@ class CompassGait(HybridSystem):
         n, s, vn, vs = q
         m, mH, a, b, length = self.m, self.mH, self.a, self.b, self.l
         c = jnp.cos(s - n)
-        whole = -m * a * b * vn + (-m * a * b + (mH * length**2 + 2 * m * a * length) * c) * vs
+        whole = (
+            -m * a * b * vn
+            + (-m * a * b + (mH * length**2 + 2 * m * a * length) * c) * vs
+        )
         leg = -m * a * b * vs
-        A, B = m * b * (b - length * c), m * length * (length - b * c) + m * a**2 + mH * length**2
+        A, B = (
+            m * b * (b - length * c),
+            m * length * (length - b * c) + m * a**2 + mH * length**2,
+        )
         C, D = m * b**2, -m * b * length * c
         det = A * D - B * C
         return s, n, (D * whole - B * leg) / det, (A * leg - C * whole) / det

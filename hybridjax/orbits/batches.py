@@ -77,7 +77,9 @@ def _settle(map: ReturnMap, periods: int):
     u = np.zeros((s.nu, len(expected)))
     moved = move(s, anchor, u, until(anchor.t + periods * expected), patient).moved
     if map.base is not None:
-        target = toward(np.full_like(expected, np.inf), -1, moved.lanes.t + 3 * expected)
+        target = toward(
+            np.full_like(expected, np.inf), -1, moved.lanes.t + 3 * expected
+        )
         target = to_section(target, map.base, map.event)
         moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result).moved
     q = np.where(moved.result == Result.OK, moved.lanes.q, np.nan)
@@ -88,7 +90,9 @@ def _turns(systems, map: ReturnMap, anchor: Lanes, period, wanted):
     """`_turn` of every system from its anchor, in JAX."""
 
     def of_one(system, anchor, expected):
-        other = dataclasses.replace(map, system=system, anchor=anchor, expected=expected)
+        other = dataclasses.replace(
+            map, system=system, anchor=anchor, expected=expected
+        )
         return _turn(other, wanted)
 
     return eqx.filter_vmap(of_one)(systems, anchor, period)
@@ -162,9 +166,15 @@ class Tiles(NamedTuple):
 
         def neighbors(rows, out: Rounds | None, moved: bool = True):
             """Guesses for some systems from the known cycles and those of the rounds so far."""
-            sources = [] if self.known is None else [(before, self.known._replace(systems=None))]
+            sources = (
+                []
+                if self.known is None
+                else [(before, self.known._replace(systems=None))]
+            )
             if out is not None:
-                cycles = Known(None, out.anchor, out.period, out.turn.jacobian, out.result)
+                cycles = Known(
+                    None, out.anchor, out.period, out.turn.jacobian, out.result
+                )
                 sources.insert(0, (parameters[order[: len(out.result)]], cycles))
             near, cycles = _join(*sources)
             return self._by_neighbors(near, cycles, parameters[rows], moved)
@@ -181,7 +191,9 @@ class Tiles(NamedTuple):
                 call.done = done
                 more = slice(done, max(4 * done, self.size))
                 rows = order[more]
-                rows = rows[_tree(parameters[rows]).indices]  # systems of one call are neighbors
+                rows = rows[
+                    _tree(parameters[rows]).indices
+                ]  # systems of one call are neighbors
                 order[more] = rows
                 anchor, period, jacobian = neighbors(rows, out)
                 anchor, period = self._first_step(rows, anchor, period, jacobian)
@@ -190,14 +202,21 @@ class Tiles(NamedTuple):
                 out = part if out is None else _join(out, part)
         assert out is not None
         near = self.known is not None or (out.result == Result.OK).any()
-        settle, nearest = _SETTLE if near else (), ft.partial(neighbors, out=out, moved=False)
+        settle, nearest = (
+            _SETTLE if near else (),
+            ft.partial(neighbors, out=out, moved=False),
+        )
         return _pick(self._again(order, out, nearest, settle), np.argsort(order))
 
     def _given(self, rows) -> tuple[Lanes, Float[np.ndarray, " S"]]:
         given = self.map.anchor, self.map.expected
-        return jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], len(rows), 0), given)
+        return jax.tree_util.tree_map(
+            lambda x: np.repeat(np.asarray(x)[None], len(rows), 0), given
+        )
 
-    def _again(self, rows, out: Rounds, guesses: Callable, settle: tuple[int, ...]) -> Rounds:
+    def _again(
+        self, rows, out: Rounds, guesses: Callable, settle: tuple[int, ...]
+    ) -> Rounds:
         """More attempts for the systems that failed: from guesses, or from the ends of simulations
         of so many periods."""
         for periods in settle:
@@ -206,7 +225,9 @@ class Tiles(NamedTuple):
                 break
             begin = guesses(rows[failed])[:2]
             if periods:
-                begin = self._in_tiles(_settle, rows[failed], *begin, options=(periods,))
+                begin = self._in_tiles(
+                    _settle, rows[failed], *begin, options=(periods,)
+                )
             arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
             if arrived.any():
                 failed, (anchor, period) = failed[arrived], _pick(begin, arrived)
@@ -228,7 +249,9 @@ class Tiles(NamedTuple):
         _, near = _tree(parameters).query(wanted, min(2 * terms + 3, len(ok)))
         near = near.reshape(len(wanted), -1)
         first = near[:, 0]
-        anchor, period, jacobian = _pick((cycles.anchor, cycles.period, cycles.jacobian), ok)
+        anchor, period, jacobian = _pick(
+            (cycles.anchor, cycles.period, cycles.jacobian), ok
+        )
         if not moved:
             return _pick((anchor, period, jacobian), first)
         flat = jacobian.reshape(len(ok), -1)
@@ -238,7 +261,9 @@ class Tiles(NamedTuple):
         change = (values[near] - values[first][:, None]) * same
         gram, moment = (np.swapaxes(apart, 1, 2) @ x for x in (apart, change))
         slope = np.linalg.pinv(gram, rcond=ROUNDING, hermitian=True) @ moment
-        guess = values[first] + (_powers(wanted - parameters[first])[:, None] @ slope)[:, 0]
+        guess = (
+            values[first] + (_powers(wanted - parameters[first])[:, None] @ slope)[:, 0]
+        )
         d = anchor.q.shape[1]
         anchor = _pick(anchor, first)._replace(q=guess[:, :d, None])
         return anchor, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
@@ -259,8 +284,12 @@ class Tiles(NamedTuple):
             if not len(going):
                 break
             part = self._step(rows[going], *_pick((out.anchor, out.period), going))
-            out = _replace(out, going, part._replace(steps=part.steps + out.steps[going]))
-        anchor, period, result = self._in_tiles(_verdict, rows, out.anchor, out.period, out.turn)
+            out = _replace(
+                out, going, part._replace(steps=part.steps + out.steps[going])
+            )
+        anchor, period, result = self._in_tiles(
+            _verdict, rows, out.anchor, out.period, out.turn
+        )
         return out._replace(anchor=anchor, period=period, result=result)
 
     def _step(self, rows, anchor: Lanes, period) -> Rounds:
@@ -271,7 +300,9 @@ class Tiles(NamedTuple):
         size = excess(q / sizes, step)
         # A turn that closes but met its section too often was given too long a period.
         extra = turn.closed & (turn.meetings > self.map.multiplicity)
-        period[extra] = self.map.multiplicity * turn.period[extra] / turn.meetings[extra]
+        period[extra] = (
+            self.map.multiplicity * turn.period[extra] / turn.meetings[extra]
+        )
         # (Newton's method does not lead to a cycle that begins in another chart: turns do.)
         other = (turn.result == Result.OK) & (turn.end.chart != anchor.chart)[:, 0]
         anchor = anchor._replace(q=q[..., None])
@@ -295,12 +326,27 @@ class Tiles(NamedTuple):
             at_event = isinstance(self.map.base, AtEvent)
             begin = anchor.t[:, 0] if at_event else np.full(len(codes), -np.inf)
             coincide = together(codes, times, begin, turn.period)
-            return anchor, expected, turn._replace(codes=None, times=None), front(codes), coincide
+            return (
+                anchor,
+                expected,
+                turn._replace(codes=None, times=None),
+                front(codes),
+                coincide,
+            )
 
-        return self._in_tiles(_turn, rows, anchor, period, options=(wanted,), then=events)
+        return self._in_tiles(
+            _turn, rows, anchor, period, options=(wanted,), then=events
+        )
 
     def _in_tiles(
-        self, function, rows, anchor: Lanes, period, *others, options=(), then=lambda x: x
+        self,
+        function,
+        rows,
+        anchor: Lanes,
+        period,
+        *others,
+        options=(),
+        then=lambda x: x,
     ):
         """`function` of the return maps of some systems, and of further arguments, in calls of few
         sizes. (JAX compiles operations on numbers of systems for each size.)"""
@@ -324,10 +370,14 @@ class Tiles(NamedTuple):
                 last = jax.tree_util.tree_map(lambda x: np.moveaxis(x, 0, -1), systems)
                 split = (True,) * len(jax.tree_util.tree_leaves(last))
                 side = PerLane(eqx.combine(jax.device_put(last), static), split)
-                begin = jax.tree_util.tree_map(lambda x: np.moveaxis(x[..., 0], 0, -1), begin)
+                begin = jax.tree_util.tree_map(
+                    lambda x: np.moveaxis(x[..., 0], 0, -1), begin
+                )
                 replaced: Any = dict(system=side, anchor=begin, expected=expected)
                 with on_the_cpu(), at_ease():
-                    results = function(dataclasses.replace(map, **replaced), *further, *options)
+                    results = function(
+                        dataclasses.replace(map, **replaced), *further, *options
+                    )
             return _pick(then(results), slice(left))
 
         tiles = range(0, len(rows), self.size)
@@ -339,7 +389,9 @@ def tiles_of(
 ) -> Tiles:
     """Systems, of so many in `total`, and how they are solved."""
     arrays, static = eqx.partition(systems, eqx.is_array)
-    require_similar(map, eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
+    require_similar(
+        map, eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static)
+    )
     large, periods = total > SMALL, None
     if map.base is None:
         of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731

@@ -11,7 +11,13 @@ from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
 from ..engine import kernels, unresolved
 from ..engine.trajectory import simulate
-from ..engine.unresolved import column_name, jumps, lines_of_jumps, may_be_sudden, passed_over
+from ..engine.unresolved import (
+    column_name,
+    jumps,
+    lines_of_jumps,
+    may_be_sudden,
+    passed_over,
+)
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
 from ..systems.check import check_output, check_system
@@ -51,11 +57,15 @@ def check_clock(s: Structure) -> None:
         raise DefinitionError(f"`period()` must return one number, not {given}.")
     period = np.nan if given is None else float(given)
     if given is not None and not (np.isfinite(period) and period > 0):
-        raise DefinitionError(f"`period()` must return a positive number, not {period}.")
+        raise DefinitionError(
+            f"`period()` must return a positive number, not {period}."
+        )
     for transition in s.transitions:
         if isinstance(transition.guard, Scheduled):
             if given is None:
-                raise DefinitionError(_no_period(s.system, f"'{transition.name}' is scheduled"))
+                raise DefinitionError(
+                    _no_period(s.system, f"'{transition.name}' is scheduled")
+                )
             ratio = period / float(transition.guard.period)
             if not abs(ratio - round(min(ratio, 1e9))) < SAME:
                 raise DefinitionError(
@@ -102,7 +112,14 @@ def check_claims(
         every = -(-_TIMES // len(rows)) if may_be_sudden(s, a, _all) else 1
         times = t[rows, None] + time * (_BASE + np.arange(every) / every)
         for name, function in _functions(s, a):
-            _compare(s, name, function, times.ravel(), q[:n, rows].repeat(every, axis=1), sizes)
+            _compare(
+                s,
+                name,
+                function,
+                times.ravel(),
+                q[:n, rows].repeat(every, axis=1),
+                sizes,
+            )
 
 
 def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
@@ -117,15 +134,21 @@ def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
     for x in (x for x in given if isinstance(x, Output) and not is_traced(cycle)):
         clocked = list(check_output(s, x))
         if clocked and s.system.period() is None:
-            raise DefinitionError(_no_period(s.system, f"the {clocked[0]} depends on t"))
+            raise DefinitionError(
+                _no_period(s.system, f"the {clocked[0]} depends on t")
+            )
         for a, t, q in points(s, cycle.legs) if clocked else ():
             if s.resolve_outputs(x).defined(a):
-                size = np.append(float(cycle.period), np.asarray(cycle.settings.scale)[a, : len(q)])
+                size = np.append(
+                    float(cycle.period), np.asarray(cycle.settings.scale)[a, : len(q)]
+                )
                 _compare(s, *_output(s, a, x), t, q, size)
     return z
 
 
-def _compare(s: Structure, name: str, function, t, q, size: Float[np.ndarray, " 1+n"]) -> None:
+def _compare(
+    s: Structure, name: str, function, t, q, size: Float[np.ndarray, " 1+n"]
+) -> None:
     """**Raises:** `DefinitionError` if a function of (t, q) differs one period of the clock later
     by more than rounding, for times and states of this `size`."""
     clock: Any = s.system.period()
@@ -135,7 +158,9 @@ def _compare(s: Structure, name: str, function, t, q, size: Float[np.ndarray, " 
     slope = np.sum(np.abs(now[:, 1 : 1 + len(size)]) * size[:, None], axis=1)
     differs = change[:, 0] > SAME * np.abs(now[:, 0]) + ROUNDING * slope
     gains = slice(1 + len(size), None)  # derivatives by inputs
-    if np.any(differs) or np.any(change[:, gains] > SAME * np.abs(now)[:, gains].max(initial=0.0)):
+    if np.any(differs) or np.any(
+        change[:, gains] > SAME * np.abs(now)[:, gains].max(initial=0.0)
+    ):
         raise DefinitionError(
             f"{name} does not have the period {period:.6g} that {type(s.system).__name__}.period() "
             "states."
@@ -145,7 +170,9 @@ def _compare(s: Structure, name: str, function, t, q, size: Float[np.ndarray, " 
 def _all(s: Structure, a: int, *point: Array) -> list[Array]:
     """Values of all of the user's functions of chart a."""
     watched = [s.guard(g, *point) for g in s.guards(a)]
-    after = [(s.reset(g, *point), s.enabled(g, *point)) for g in s.guards(a) + s.schedules(a)]
+    after = [
+        (s.reset(g, *point), s.enabled(g, *point)) for g in s.guards(a) + s.schedules(a)
+    ]
     outputs = [s.resolve_outputs(x) for x in s.system.outputs()]
     values = [x(a, *point) for x in outputs if x.defined(a)]
     return [s.field(a, *point), *watched, *after, *values]
@@ -154,7 +181,10 @@ def _all(s: Structure, a: int, *point: Array) -> list[Array]:
 def _functions(s: Structure, a: int) -> Iterator:
     """The user's functions of chart a, by name, as functions (t, q) with derivatives."""
     u, index = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
-    yield f"the field of chart '{s.names[a]}'", lambda t, q: kernels.field(s, a, t, q, u)
+    yield (
+        f"the field of chart '{s.names[a]}'",
+        lambda t, q: kernels.field(s, a, t, q, u),
+    )
     for k, g in enumerate(s.guards(a)):
         guard = lambda t, q, k=k: kernels.watched(s, a, None, t, q, u, index)[k : k + 1]  # noqa: E731
         yield f"the guard of '{s.transitions[g].name}'", guard
@@ -175,7 +205,9 @@ def _functions(s: Structure, a: int) -> Iterator:
 
 def _output(s: Structure, a: int, output: Output) -> tuple[str, Callable]:
     u = np.zeros((s.nu, 1))
-    return f"the output '{output.name}'", lambda t, q: kernels.outputs(s, a, (output,), t, q, u)
+    return f"the output '{output.name}'", lambda t, q: kernels.outputs(
+        s, a, (output,), t, q, u
+    )
 
 
 def _no_period(system: HybridSystem, problem: str) -> str:
@@ -192,7 +224,9 @@ def check_found(cycle: LimitCycle) -> None:
     """
     s, legs = cycle.structure, to_host(cycle.legs)
     check_clock(s)
-    check_claims(s, legs.t, legs.chart, legs.q, cycle.settings.scale, float(cycle.period))
+    check_claims(
+        s, legs.t, legs.chart, legs.q, cycle.settings.scale, float(cycle.period)
+    )
     if int(cycle.result) in (Result.OK, Result.SINGULAR):
         check_jumps(cycle)
 
@@ -223,7 +257,9 @@ def check_jumps(cycle: LimitCycle) -> None:
         k = np.flatnonzero((chart[1:] == a) & (chart[:-1] == a) & (np.diff(t) > 0))
         points = np.column_stack([t, q[:, : s.dims[a]]])
         sizes = np.append(period, scale[a, : s.dims[a]])
-        for time, j, jump in jumps(s, a, points[k], points[k + 1], sizes) if len(k) else ():
+        for time, j, jump in (
+            jumps(s, a, points[k], points[k + 1], sizes) if len(k) else ()
+        ):
             apart = np.abs(time - events + period / 2) % period - period / 2
             if np.abs(apart).min(initial=np.inf) > SAME * period:
                 raise DefinitionError(
@@ -237,7 +273,9 @@ def check_jumps(cycle: LimitCycle) -> None:
 
 def check_conserved(cycle: LimitCycle) -> None:
     """**Raises:** `DefinitionError` for a quantity in `conserved` that the system changes."""
-    if lost := cycle.conserved.keys() - _conserved_outputs(cycle, tuple(cycle.conserved)):
+    if lost := cycle.conserved.keys() - _conserved_outputs(
+        cycle, tuple(cycle.conserved)
+    ):
         raise DefinitionError(
             f"'{min(lost)}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
             "cycle change it in one turn. Leave it out of `conserved`."
@@ -253,12 +291,20 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     changes = gradients @ monodromy(cycle.factors) - gradients
     changes = np.abs(changes * map.sizes).max(axis=1)
     kept = changes <= SAME * np.abs(gradients * map.sizes).max(axis=1)
-    return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
+    return {
+        name: float(x)
+        for name, x, same in zip(names, values, kept, strict=True)
+        if same
+    }
 
 
 def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> str:
     """The reason why a search failed that expected this period and has settled, with advice."""
-    name, code, s = type(cycle.system).__name__, Result(int(cycle.result)), cycle.structure
+    name, code, s = (
+        type(cycle.system).__name__,
+        Result(int(cycle.result)),
+        cycle.structure,
+    )
     if code == Result.COINCIDENCE and (pair := coincident(cycle.return_map, turn)):
         first, second = (s.transitions[g].name for g in pair)
         return (
@@ -268,8 +314,12 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> st
             "derivatives of each. Let them happen at different times, or write them as one event."
         )
     if code == Result.SINGULAR:
-        kept = _conserved_outputs(cycle, tuple(output.name for output in cycle.system.outputs()))
-        example = {name: float(f"{x:.4g}") for name, x in kept.items()} or {"energy": 1.0}
+        kept = _conserved_outputs(
+            cycle, tuple(output.name for output in cycle.system.outputs())
+        )
+        example = {name: float(f"{x:.4g}") for name, x in kept.items()} or {
+            "energy": 1.0
+        }
         return (
             f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
             "cycles form a family: a quantity is conserved, or there is a symmetry. Say which one "
@@ -311,9 +361,14 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
     if int(turn.result) == Result.STEP_COLLAPSE:
         a = int(lanes.chart[0])
         path = simulate(
-            cycle.system, s.names[a], np.asarray(lanes.q)[: s.dims[a], 0], expected,
-            time=float(lanes.t[0]), settings=cycle.settings, throw=False,
-        )  # fmt: skip
+            cycle.system,
+            s.names[a],
+            np.asarray(lanes.q)[: s.dims[a], 0],
+            expected,
+            time=float(lanes.t[0]),
+            settings=cycle.settings,
+            throw=False,
+        )
         if path.result != Result.OK:
             return f" It stopped at t = {path.t[-1]:.6g} in chart '{s.names[path.chart[-1]]}'."
     if int(turn.result) != Result.STEP_LIMIT:
@@ -359,4 +414,7 @@ def _about_guards(s: Structure, turn: Turn, better: str) -> str:
         for g, x in values.items()
     )
     advice = "Check its direction, and that the system does not come to rest."
-    return f" In the last turn tried no event happened: {text}. {advice}{better}" * bool(text)
+    return (
+        f" In the last turn tried no event happened: {text}. {advice}{better}"
+        * bool(text)
+    )

@@ -69,7 +69,12 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
         cycle.require_found()
     # (A little more than one turn, for events at its end. Rounding may spoil another one, where
     # events coincide.)
-    s, period, path, groups = cycle.structure, float(cycle.period), cycle.trajectory(1.01), []
+    s, period, path, groups = (
+        cycle.structure,
+        float(cycle.period),
+        cycle.trajectory(1.01),
+        [],
+    )
     at = np.flatnonzero(path.event >= 0)
     times = path.t[at]
     starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)
@@ -84,9 +89,13 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
             n = s.dims[a]
             before = _Order((), a, path.before[k, :n], np.eye(n))
             orders = list(_orders(s, t, before, len(events), 10 * TOGETHER * period))
-            names = tuple(tuple(s.transitions[g].name for g in x.events) for x in orders)
+            names = tuple(
+                tuple(s.transitions[g].name for g in x.events) for x in orders
+            )
             commute = _commute(np.asarray(cycle.settings.scale), a, orders)
-            groups.append(Coincidence(t, names, tuple(x.derivative for x in orders), commute))
+            groups.append(
+                Coincidence(t, names, tuple(x.derivative for x in orders), commute)
+            )
     return groups
 
 
@@ -143,7 +152,12 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
         return set()
     ends = ((s.transitions[g].source, s.transitions[g].target) for g in group)
     charts = {s.chart_index(name) for pair in ends for name in pair}
-    due = {g for a in charts for g in s.schedules(a) if _scheduled_at(s, g, t, TOGETHER * period)}
+    due = {
+        g
+        for a in charts
+        for g in s.schedules(a)
+        if _scheduled_at(s, g, t, TOGETHER * period)
+    }
     return due - set(group)
 
 
@@ -163,7 +177,9 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
     return bool(np.max(np.ptp(rows, axis=0) / scale[orders[0].chart, :m, None]) < SAME)
 
 
-def _orders(s: Structure, t: float, before: _Order, left: int, due: float) -> Iterator[_Order]:
+def _orders(
+    s: Structure, t: float, before: _Order, left: int, due: float
+) -> Iterator[_Order]:
     """All orders in which `left` more events can happen at once."""
     if not left:
         yield before
@@ -171,7 +187,9 @@ def _orders(s: Structure, t: float, before: _Order, left: int, due: float) -> It
     a, q, u = before.chart, before.state[:, None], np.zeros((s.nu, 1))
     time, n = np.array([t]), len(before.state)
     field = kernels.field(s, a, time, q, u)[:, 0, 0]
-    events = [(g, np.zeros(n), 0.0) for g in s.schedules(a) if _scheduled_at(s, g, t, due)]
+    events = [
+        (g, np.zeros(n), 0.0) for g in s.schedules(a) if _scheduled_at(s, g, t, due)
+    ]
     if guards := s.guards(a):
         rows = kernels.watched(s, a, None, time, q, u, np.zeros(1, np.int32))[..., 0]
         for g, row in zip(guards, rows, strict=True):
@@ -187,7 +205,9 @@ def _orders(s: Structure, t: float, before: _Order, left: int, due: float) -> It
         state, by_t, saltation = reset[:, 0], reset[:, 1], reset[:, 2 : 2 + n]
         if rate < 0:
             after = kernels.field(s, b, time, state[:, None], u)[:, 0, 0]
-            saltation = saltation + np.outer(after - saltation @ field - by_t, slope) / rate
+            saltation = (
+                saltation + np.outer(after - saltation @ field - by_t, slope) / rate
+            )
         order = _Order((*before.events, g), b, state, saltation @ before.derivative)
         yield from _orders(s, t, order, left - 1, due)
 
@@ -206,7 +226,11 @@ def check_begin(map: ReturnMap) -> None:
         due[map.event] = False
     if due.any():
         name = s.transitions[int(np.argmax(due))].name
-        begins = "the beginning of every turn" if base is None else f"'{base.name}', its beginning"
+        begins = (
+            "the beginning of every turn"
+            if base is None
+            else f"'{base.name}', its beginning"
+        )
         raise ComputationError(
             f"the event '{name}' coincides with {begins}, so that it may or may not belong to the "
             "turn: take another section, or a guess at another time."

@@ -116,7 +116,9 @@ class Branch(eqx.Module):
 
         **Raises:** `DefinitionError` for a name that does not exist.
         """
-        return np.array([np.nanmax(self[k].trajectory()(output)[1]) for k in range(len(self))])
+        return np.array(
+            [np.nanmax(self[k].trajectory()(output)[1]) for k in range(len(self))]
+        )
 
     def summary(self) -> str:
         """One line for each marked point and each end."""
@@ -124,7 +126,9 @@ class Branch(eqx.Module):
         lines = [f"from {self.parameter} = {begin.value:.9g}: {begin.message}"]
         for p in self.points:
             at = ", ".join(map(number, p.critical))
-            lines.append(f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})")
+            lines.append(
+                f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})"
+            )
         lines.append(f"to {self.parameter} = {end.value:.9g}: {end.message}")
         return "\n  ".join(lines)
 
@@ -137,7 +141,10 @@ class Branch(eqx.Module):
         marks = [p.index for p in self.points]
         begin, end = self.ends
         rows = [("from", begin.value, begin.message)]
-        rows += [(p.kind, p.value, ", ".join(map(complex_number, p.critical))) for p in self.points]
+        rows += [
+            (p.kind, p.value, ", ".join(map(complex_number, p.critical)))
+            for p in self.points
+        ]
         rows += [("to", end.value, end.message)]
         rows = [(name, f"{value:.9g}", text) for name, value, text in rows]
         curves = [
@@ -215,17 +222,23 @@ def continuation(
         for k, point in enumerate(points)
         if point.kind
     )
-    return Branch(parameter, np.array([p.value for p in points]), cycles, marked, (begin, end))
+    return Branch(
+        parameter, np.array([p.value for p in points]), cycles, marked, (begin, end)
+    )
 
 
 def _check(cycle, values) -> np.ndarray:
     require_x64(cycle)
     cycle.require_current()
     if int(cycle.result) != Result.OK:
-        raise DefinitionError(f"`cycle` was not found ({Result(int(cycle.result)).message}).")
+        raise DefinitionError(
+            f"`cycle` was not found ({Result(int(cycle.result)).message})."
+        )
     steps = np.diff(np.asarray(values))
     if not len(steps) or abs(np.sign(steps).sum()) < len(steps):
-        raise DefinitionError(f"values must be two or more, ascending or descending; got {values}.")
+        raise DefinitionError(
+            f"values must be two or more, ascending or descending; got {values}."
+        )
     return np.asarray(values)
 
 
@@ -253,7 +266,9 @@ class _Trace(NamedTuple):
                 point = Result.NOT_CONVERGED
             if isinstance(point, Point):
                 points, before = points + self.between(last, point), last
-                length = min(self.step, length * (1.5 if point.steps <= USUAL_STEPS else 1.0))
+                length = min(
+                    self.step, length * (1.5 if point.steps <= USUAL_STEPS else 1.0)
+                )
                 continue
             length, over = length / 2, False
             if length >= _SHORTEST * self.step:
@@ -279,10 +294,14 @@ class _Trace(NamedTuple):
                 continue  # the parameter turns back
             if (located := self.locate(a, b, kind)) is not None:
                 where, point = located
-                marked.setdefault((round(where, 9), point.kind), point)  # (once for a pair)
+                marked.setdefault(
+                    (round(where, 9), point.kind), point
+                )  # (once for a pair)
         points, last = [], a
         for point in [*(marked[key] for key in sorted(marked)), b]:
-            passed = [v for v in self.values if (last.value - v) * (point.value - v) < 0]
+            passed = [
+                v for v in self.values if (last.value - v) * (point.value - v) < 0
+            ]
             for value in sorted(passed, key=lambda v: abs(v - last.value)):
                 landed = self.curve.land(last, point, value)
                 points += [landed] if isinstance(landed, Point) else []
@@ -310,7 +329,9 @@ class _Trace(NamedTuple):
             return points[where].tests[kind]
 
         try:
-            where: Any = brentq(test, 0.0, 1.0, xtol=1e-13, rtol=np.float64(1e-14), maxiter=60)
+            where: Any = brentq(
+                test, 0.0, 1.0, xtol=1e-13, rtol=np.float64(1e-14), maxiter=60
+            )
             test(where)
         except (KeyError, RuntimeError):
             return None
@@ -320,7 +341,9 @@ class _Trace(NamedTuple):
             if critical.imag == 0 and critical.real > 0:
                 return None  # (a fold, or a branch point)
             kind = "Neimark-Sacker" if critical.imag else "flip"
-        return where, dataclasses.replace(point, kind="branch point" if crossing else kind)
+        return where, dataclasses.replace(
+            point, kind="branch point" if crossing else kind
+        )
 
 
 def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
@@ -328,12 +351,24 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
     cycle, stack = curve.cycle, lambda *x: np.stack([np.asarray(y) for y in x])
     systems = [eqx.filter(curve.system_at(p.value), eqx.is_array) for p in points]
     systems = eqx.combine(jax.tree_util.tree_map(stack, *systems), cycle.system)
-    anchor, turn = jax.tree_util.tree_map(stack, *((p.departure, p.turn) for p in points))
+    anchor, turn = jax.tree_util.tree_map(
+        stack, *((p.departure, p.turn) for p in points)
+    )
     cycles = LimitCycles(
-        systems, cycle.base, turn.period, anchor, turn.legs, turn.factors, turn.distance,
-        np.array([p.steps for p in points]), np.zeros(len(points), np.int32),
-        front(turn.codes.reshape(len(points), -1)), cycle.settings, cycle.conserved,
-        cycle.multiplicity, copies_of(systems),
-    )  # fmt: skip
+        systems,
+        cycle.base,
+        turn.period,
+        anchor,
+        turn.legs,
+        turn.factors,
+        turn.distance,
+        np.array([p.steps for p in points]),
+        np.zeros(len(points), np.int32),
+        front(turn.codes.reshape(len(points), -1)),
+        cycle.settings,
+        cycle.conserved,
+        cycle.multiplicity,
+        copies_of(systems),
+    )
     together = [coincident(cycle.return_map, p.turn) is not None for p in points]
     return examined(cycles, np.array(together))

@@ -44,7 +44,9 @@ _LARGEST = 2**21
 _kept = Memory()
 
 
-def linear_outputs(s: Structure, flow: LinearFlow, z: Outputs) -> tuple[Array, Array, Array]:
+def linear_outputs(
+    s: Structure, flow: LinearFlow, z: Outputs
+) -> tuple[Array, Array, Array]:
     """Outputs at the nodes (P, K, ny), and their derivatives by states and inputs."""
     outputs = lambda a, *point: kernels.outputs(s, a, tuple(z.items), *point)  # noqa: E731
     make = ft.partial(flow.evaluated, s, outputs, len(z.names))
@@ -58,7 +60,9 @@ def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> flo
     """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of the
     root of 2, so that calls with similar frequencies share a linearization."""
     fastest = max(1.25 * np.max(np.abs(f)), np.max(np.abs(harmonics)), 0.1)
-    longest = float(2.0 ** (np.floor(2 * np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))) / 2))
+    longest = float(
+        2.0 ** (np.floor(2 * np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))) / 2)
+    )
     if max(len(f), 64) / longest > _LARGEST:
         raise DefinitionError(
             f"{len(f)} frequencies up to {np.abs(f).max():.3g} per period and harmonics up to "
@@ -68,7 +72,10 @@ def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> flo
 
 
 def asked(
-    s: Structure, events: tuple[int, ...], outputs: OutputNames | None, inputs: SignalNames | None
+    s: Structure,
+    events: tuple[int, ...],
+    outputs: OutputNames | None,
+    inputs: SignalNames | None,
 ):
     """Outputs that exist all along a cycle with these events, and the names and indices of
     inputs."""
@@ -87,7 +94,10 @@ def continuous_htf(
     inputs: SignalNames | None,
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
-    harmonics, frequencies = check_harmonics(harmonics, 0), np.asarray(f, float).reshape(-1)
+    harmonics, frequencies = (
+        check_harmonics(harmonics, 0),
+        np.asarray(f, float).reshape(-1),
+    )
     if not len(frequencies):
         raise DefinitionError("`f` holds no frequency: give one or more.")
     map = cycle.return_map
@@ -98,7 +108,9 @@ def continuous_htf(
     return HTF(frequencies, H[..., columns], harmonics, 0, names, z.names, "exact")
 
 
-def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _interpolation(
+    f: Float[np.ndarray, " F"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """f, Chebyshev's frequencies where these are fewer than f, else f again, and the matrix from
     values there to values at f, of functions of the frequency that are sums of exp(-2 pi i f s), s
     from 0 to 1.
@@ -110,7 +122,10 @@ def _interpolation(f: Float[np.ndarray, " F"]) -> tuple[np.ndarray, np.ndarray, 
     k, chebyshev = np.arange(n), np.polynomial.chebyshev
     x = np.cos(np.pi * (k + 0.5) / n)
     values = chebyshev.chebvander(x, n - 1).T * (2 - (k == 0))[:, None] / n
-    coarse, mix = middle + half * x, chebyshev.chebvander((f - middle) / half, n - 1) @ values
+    coarse, mix = (
+        middle + half * x,
+        chebyshev.chebvander((f - middle) / half, n - 1) @ values,
+    )
     # Their mean exponent, s = 1/2, is taken out: the others turn half as fast.
     turn = lambda x: np.exp(1j * np.pi * x)  # noqa: E731
     return f, coarse, mix * turn(coarse) * turn(-f)[:, None]
@@ -127,10 +142,17 @@ def _transfer(
     s, xp, h, period = map.structure, namespace(flow.q), flow.length, map.expected
     z, (f, coarse, fine) = s.resolve_outputs(outputs), interpolation
     values, by_state, by_input = linear_outputs(s, flow, z)
-    (P, K, d), nu, size, rows = flow.q.shape, s.nu, map.sizes, len(harmonics) * len(z.names)
+    (P, K, d), nu, size, rows = (
+        flow.q.shape,
+        s.nu,
+        map.sizes,
+        len(harmonics) * len(z.names),
+    )
     whole = flow.monodromy(map.valid)
     if on_host(whole):
-        apart = np.abs(np.exp(2j * np.pi * f)[:, None] - np.linalg.eigvals(whole)).min(axis=1)
+        apart = np.abs(np.exp(2j * np.pi * f)[:, None] - np.linalg.eigvals(whole)).min(
+            axis=1
+        )
         if (apart < _POLE).any():
             where = "every whole number" if map.base else "its multipliers of modulus 1"
             raise DefinitionError(
@@ -138,19 +160,27 @@ def _transfer(
                 f"lie at {where}: leave it out."
             )
     # Responses to inputs, and to states at phase 0, are columns.
-    inside = xp.exp((h[:, None] * rule().nodes / period)[..., None] * (2j * np.pi * coarse))
+    inside = xp.exp(
+        (h[:, None] * rule().nodes / period)[..., None] * (2j * np.pi * coarse)
+    )
     back, (begin, delay, end) = xp.conj(inside), flow.driven(inside)
     pushed = (by_state @ flow.pushed.reshape(P, K, d, -1)).reshape(*by_input.shape, K)
     pushed = pushed + by_input[..., None] * xp.eye(K)[:, None, None]
     # Fourier integrals of outputs by deviations where pieces begin, and by inputs within them.
-    waves = xp.exp(-2j * np.pi * np.asarray(harmonics)[:, None, None] * flow.after(map) / period)
+    waves = xp.exp(
+        -2j * np.pi * np.asarray(harmonics)[:, None, None] * flow.after(map) / period
+    )
     weighted = waves * h[:, None] * rule().weights
     of_begin = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ flow.forward[0])
     of_begin = of_begin.reshape(P, -1, K) @ back
-    of_begin = of_begin.reshape(P, rows, d, -1).transpose(3, 1, 0, 2).reshape(-1, rows, P * d)
+    of_begin = (
+        of_begin.reshape(P, rows, d, -1).transpose(3, 1, 0, 2).reshape(-1, rows, P * d)
+    )
     H = of_begin @ xp.moveaxis(begin, -1, 0).reshape(-1, P * d, nu + d)
     pushed = (pushed.reshape(P, -1, K) @ inside).reshape(P, K, -1, len(coarse))
-    pushed = weighted.reshape(-1, P * K) @ (pushed * back[:, :, None]).reshape(P * K, -1)
+    pushed = weighted.reshape(-1, P * K) @ (pushed * back[:, :, None]).reshape(
+        P * K, -1
+    )
     pushed = xp.pad(pushed.reshape(rows, nu, -1), [(0, 0), (0, d), (0, 0)])
     # Events whose time moves: the jump of the output at the moment of the event.
     jump = values[:, -1] - xp.roll(values[:, 0], -1, axis=0)
@@ -159,7 +189,11 @@ def _transfer(
     # The deviation at phase 0 is that one period later.
     H = xp.concatenate([H, xp.moveaxis(end, -1, 0)], axis=1).reshape(len(coarse), -1)
     H, end = xp.split((fine @ H).reshape(len(f), rows + d, -1), [rows], axis=1)
-    turned = xp.eye(d) - xp.exp(-2j * np.pi * f)[:, None, None] * (whole * size / size[:, None])
+    turned = xp.eye(d) - xp.exp(-2j * np.pi * f)[:, None, None] * (
+        whole * size / size[:, None]
+    )
     start = solve(turned, end[..., :nu] / size[:, None]) * size[:, None]
-    H = (H[..., :nu] + H[..., nu:] @ start).reshape(-1, len(harmonics), len(z.names), nu)
+    H = (H[..., :nu] + H[..., nu:] @ start).reshape(
+        -1, len(harmonics), len(z.names), nu
+    )
     return xp.moveaxis(H, 0, 1) / period

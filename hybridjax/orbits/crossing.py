@@ -128,12 +128,18 @@ class ListLevels(AbstractLevels):
                 return lambda: item.level(s, a, t, q)
             return lambda: jnp.ones(())
 
-        return jax.lax.switch(i + 1, [lambda: jnp.ones(()), *(branch(x) for x in self.items)])
+        return jax.lax.switch(
+            i + 1, [lambda: jnp.ones(()), *(branch(x) for x in self.items)]
+        )
 
 
-def to_section(target: Target, section: Crossing | AtEvent | None, event: int = -1) -> Target:
+def to_section(
+    target: Target, section: Crossing | AtEvent | None, event: int = -1
+) -> Target:
     """A target that ends on a section: at its level, or after the event of this index."""
     if isinstance(section, Crossing):
         return dataclasses.replace(target, levels=ListLevels((section,)))
     xp = namespace(target.time)
-    return dataclasses.replace(target, event=xp.full(target.event.shape, event, xp.int32))
+    return dataclasses.replace(
+        target, event=xp.full(target.event.shape, event, xp.int32)
+    )

@@ -62,7 +62,9 @@ class Point:
     def oriented(self, sign: float) -> "Point":
         """The point with a tangent along which the parameter grows (or falls)."""
         same = self.tangent[-1] * sign >= 0
-        return dataclasses.replace(self, tangent=self.tangent if same else -self.tangent)
+        return dataclasses.replace(
+            self, tangent=self.tangent if same else -self.tangent
+        )
 
     def cosine(self, other: "Point") -> float:
         """The cosine of the angle between two tangents."""
@@ -77,7 +79,9 @@ class Point:
     @ft.cached_property
     def multipliers(self) -> Complex[np.ndarray, " d"]:
         """All multipliers, by decreasing modulus, padded with zeros."""
-        values = np.linalg.eigvals(turn_product(self.turn.factors[None])[0]).astype(complex)
+        values = np.linalg.eigvals(turn_product(self.turn.factors[None])[0]).astype(
+            complex
+        )
         return values[np.argsort(-np.abs(values))]
 
     @ft.cached_property
@@ -97,7 +101,10 @@ class Curve:
 
     def __init__(self, cycle: LimitCycle, parameter: str, span: float):
         self.cycle, self.parameter, self.span = cycle, parameter, span
-        self.map, self.sequence = to_host(cycle.return_map), _rotated(cycle.event_sequence)
+        self.map, self.sequence = (
+            to_host(cycle.return_map),
+            _rotated(cycle.event_sequence),
+        )
         self.value = float(parameter_of(cycle.system, parameter))
 
     def system_at(self, value: float) -> HybridSystem:
@@ -116,8 +123,12 @@ class Curve:
         ahead, row = length * last.tangent * last.size, last.tangent / last.size
         guess = last.z + ahead
         if before and before.anchor is last.anchor:
-            guess = _cubic(before, last, row, 1 + float(length / (row @ (last.z - before.z))))
-        point = self._correct(last.z + ahead, row, last.size, last.tangent, last.anchor, guess)
+            guess = _cubic(
+                before, last, row, 1 + float(length / (row @ (last.z - before.z)))
+            )
+        point = self._correct(
+            last.z + ahead, row, last.size, last.tangent, last.anchor, guess
+        )
         if isinstance(point, Result):
             return point
         astray = np.linalg.norm((point.z - last.z - ahead) / last.size)
@@ -135,7 +146,9 @@ class Curve:
         change = b.z - a.z
         z = a.z + (value - a.value) / change[-1] * change
         z[-1] = value
-        point = self._correct(z, self._by_value(a.size), a.size, change / a.size, a.anchor)
+        point = self._correct(
+            z, self._by_value(a.size), a.size, change / a.size, a.anchor
+        )
         if not isinstance(point, Result):
             point.z[-1] = value
         return point
@@ -157,13 +170,21 @@ class Curve:
         moved = self._correct(z, row, point.size, forward, anchor)
         return None if k == 0 or isinstance(moved, Result) else moved
 
-    def _by_value(self, size: float | Float[np.ndarray, " n"] = 1.0) -> Float[np.ndarray, " n"]:
+    def _by_value(
+        self, size: float | Float[np.ndarray, " n"] = 1.0
+    ) -> Float[np.ndarray, " n"]:
         """The derivative of the parameter with respect to z, in sizes."""
         return np.append(np.zeros(self.map.structure.d), 1.0) / size
 
-    def _correct(self, z0, row, size, forward, anchor: Lanes, guess=None) -> Point | Result:
+    def _correct(
+        self, z0, row, size, forward, anchor: Lanes, guess=None
+    ) -> Point | Result:
         """Newton's method for a point with row @ (z - z0) = 0, from a guess (default: z0)."""
-        z, last, rounding = z0 if guess is None else guess, np.inf, len(z0) * np.finfo(float).eps
+        z, last, rounding = (
+            z0 if guess is None else guess,
+            np.inf,
+            len(z0) * np.finfo(float).eps,
+        )
         map = dataclasses.replace(self.map, anchor=anchor)
         for k in range(FEW_STEPS):
             turn = self.turn(map, z)
@@ -211,7 +232,9 @@ class Curve:
         return dataclasses.replace(point, tangent=tangent)
 
 
-def _cubic(a: Point, b: Point, row: Float[np.ndarray, " n"], x: float) -> Float[np.ndarray, " n"]:
+def _cubic(
+    a: Point, b: Point, row: Float[np.ndarray, " n"], x: float
+) -> Float[np.ndarray, " n"]:
     """The polynomial through two points with their tangents, at a part of their distance along the
     derivative `row`."""
     chord = b.z - a.z

@@ -12,7 +12,15 @@ from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers, Positive, SignalNames
 from .._core.boundary.values import Reals
 from .._core.executor import is_traced, is_tracer, to_host
-from .._core.html import CHARTS, Curve, card, facts, multiplier_table, picture, unit_circle
+from .._core.html import (
+    CHARTS,
+    Curve,
+    card,
+    facts,
+    multiplier_table,
+    picture,
+    unit_circle,
+)
 from .._core.meaning import code_digest
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
@@ -98,9 +106,14 @@ class LimitCycle(eqx.Module):
     def return_map(self) -> ReturnMap:
         """The map that has the cycle as a fixed point."""
         return ReturnMap(
-            self.system, self.settings, self.anchor, self.base, self.period, self.conserved,
+            self.system,
+            self.settings,
+            self.anchor,
+            self.base,
+            self.period,
+            self.conserved,
             self.multiplicity,
-        )  # fmt: skip
+        )
 
     def require_current(self) -> None:
         """**Raises:** `DefinitionError` if the system's code, or a parameter, has changed since the
@@ -157,7 +170,10 @@ class LimitCycle(eqx.Module):
         _require_values(self, "multipliers")
         self.require_found()
         # The factors in sizes of the states, without padding.
-        dims, scale = self.dims, np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
+        dims, scale = (
+            self.dims,
+            np.asarray(self.settings.scale)[np.asarray(self.legs.chart)],
+        )
         after = np.roll(np.arange(len(dims)), -1)
         factors = np.asarray(self.factors) * scale[:, None, :] / scale[after, :, None]
         blocks = [f[: dims[after[n]], : dims[n]] for n, f in enumerate(factors)]
@@ -171,7 +187,9 @@ class LimitCycle(eqx.Module):
         if strong and has_implicit(self.structure):
             lost = np.abs(values) < _LEAST_OF_IMPLICIT
             values = np.where(lost, 0.0, values)
-            if lost.sum() == 1 and not self.event_sequence:  # it follows from the product of all
+            if (
+                lost.sum() == 1 and not self.event_sequence
+            ):  # it follows from the product of all
                 resolved = np.prod(values[~lost]).real
                 values[lost] = np.exp(log_determinant(self)) / resolved
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
@@ -219,7 +237,9 @@ class LimitCycle(eqx.Module):
         a = int(anchor.chart[0])
         begin = s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods
         options: Any = dict(time=float(anchor.t[0]), settings=self.settings)
-        return _trajectories.recall(self, periods, lambda: simulate(self.system, *begin, **options))
+        return _trajectories.recall(
+            self, periods, lambda: simulate(self.system, *begin, **options)
+        )
 
     def responses(self, modes: Index | None = None) -> Responses:
         """Responses to brief pushes, at every phase: of the phase, and of the amplitudes of modes.
@@ -329,7 +349,9 @@ class LimitCycle(eqx.Module):
         if self.conserved:
             multipliers += f" (1: conserved {', '.join(self.conserved)})"
         lines = (
-            f"\n  {name}   {value}" if name.startswith("at t") else f"\n  {name:<11}  {value}"
+            f"\n  {name}   {value}"
+            if name.startswith("at t")
+            else f"\n  {name:<11}  {value}"
             for name, value in self._facts({"multipliers": multipliers}).items()
         )
         return f"LimitCycle({self._title()}){''.join(lines)}"
@@ -341,12 +363,19 @@ class LimitCycle(eqx.Module):
             return card("LimitCycle", self._title(), facts(self._facts()))
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
         orbit = orbit_picture(self.trajectory())
-        return card("LimitCycle", self._title(), facts(self._facts()), orbit, *multipliers)
+        return card(
+            "LimitCycle", self._title(), facts(self._facts()), orbit, *multipliers
+        )
 
     def _title(self) -> str:
-        message = what_changed(self.system, self.numbers) or Result(int(self.result)).message
+        message = (
+            what_changed(self.system, self.numbers) or Result(int(self.result)).message
+        )
         # (By rounding, those of neutral cycles are a little larger than 1.)
-        grows = message == Result.OK.message and np.abs(self.multipliers).max(initial=0) > 1 + 1e-6
+        grows = (
+            message == Result.OK.message
+            and np.abs(self.multipliers).max(initial=0) > 1 + 1e-6
+        )
         return f"{type(self.system).__name__}: {message}{', unstable' if grows else ''}"
 
     def _facts(self, multipliers: Mapping[str, str] = {}) -> dict[str, str]:  # noqa: B006
@@ -409,14 +438,18 @@ def require_unchanged(system: HybridSystem, numbers: Mapping[str, Any]) -> None:
 
 
 def _differ(x: Any, y: Any) -> bool:
-    if is_tracer(x) or is_tracer(y):  # (a parameter alone is, if it was replaced in there)
+    if is_tracer(x) or is_tracer(
+        y
+    ):  # (a parameter alone is, if it was replaced in there)
         return not is_tracer(y)
     return x is not y and np.asarray(x).tobytes() != np.asarray(y).tobytes()
 
 
 def orbit_picture(
     orbit: Trajectory,
-    sections: tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"], Float[np.ndarray, "N d"]]
+    sections: tuple[
+        Float[np.ndarray, " N"], Int[np.ndarray, " N"], Float[np.ndarray, "N d"]
+    ]
     | None = None,
 ) -> str:
     """An SVG for notebooks, in the plane of the first two states that every chart has, or of time
@@ -433,7 +466,9 @@ def orbit_picture(
     curves = []
     for a in np.unique(chart):
         name = s.names[a] if len(s.names) > 1 else ""
-        curves.append(Curve(np.where(chart == a, x, np.nan), y, name, CHARTS[a % len(CHARTS)]))
+        curves.append(
+            Curve(np.where(chart == a, x, np.nan), y, name, CHARTS[a % len(CHARTS)])
+        )
     if sections is not None:
         x, y = axes(*sections)
         curves.append(Curve(x, y, color="currentColor", points=True))
@@ -450,13 +485,17 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     map, record = hosted(cycle).return_map, last_turn(cycle)
     structure, moves = map.structure, recorded_moves(*record)
     by = linear_moves(structure, moves, recorded_ends(map, record[0]))[1]
-    fields = slopes(structure, moves.t, moves.chart, moves.q, np.zeros((structure.nu, 1))).T
+    fields = slopes(
+        structure, moves.t, moves.chart, moves.q, np.zeros((structure.nu, 1))
+    ).T
     frames: list[tuple[int, np.ndarray, Matrix]] = []
     for chart, f in zip(moves.chart, fields, strict=True):
         n = structure.dims[chart]
         size, basis = np.append(map.expected, map.scale[chart, :n]), np.eye(1 + n)
         if map.base is not None:
-            basis = np.pad(np.linalg.svd(f[None, :n] / size[1:])[2][1:].T, [(1, 0), (0, 0)])
+            basis = np.pad(
+                np.linalg.svd(f[None, :n] / size[1:])[2][1:].T, [(1, 0), (0, 0)]
+            )
         frames.append((1 + n, size, basis))
     factors: list[Matrix] = []
     for k, (n, size, basis) in enumerate(frames):
@@ -481,7 +520,9 @@ def log_determinant(cycle: LimitCycle) -> float:
     Steps of an implicit method lose a mode that decays within them; this gives its decay.
     """
     flow = linear_flow(cycle)
-    return float(flow.length @ np.trace(flow.by_state, axis1=2, axis2=3) @ rule().weights)
+    return float(
+        flow.length @ np.trace(flow.by_state, axis1=2, axis2=3) @ rule().weights
+    )
 
 
 def orbit(cycle: LimitCycle) -> Trajectory:
@@ -497,4 +538,8 @@ def weakest(factor: Matrix, weaker: int = 0) -> float:
     """The gain of a factor in its weakest direction but for so many `weaker` ones, relative to the
     gain in its strongest, or to 1 if that is smaller."""
     singular = np.linalg.svd(factor, compute_uv=False)
-    return singular[-1 - weaker] / max(singular[0], 1.0) if len(singular) > weaker else np.inf
+    return (
+        singular[-1 - weaker] / max(singular[0], 1.0)
+        if len(singular) > weaker
+        else np.inf
+    )

@@ -34,7 +34,15 @@ from .guess import require_similar, return_map_near
 from .linear_flow import keep_turn, last_turn
 from .newton import Solution, search, solve
 from .return_map import PATIENCE, ReturnMap
-from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_on, stiff_charts
+from .scale import (
+    Sizes,
+    given_sizes,
+    has_implicit,
+    scale_of,
+    sizes_of,
+    sizes_on,
+    stiff_charts,
+)
 
 
 # A cycle is computed again, in the sizes of its states, if a rough size was larger by more than
@@ -114,9 +122,17 @@ def find_limit_cycle(
     """
     settings = Settings() if settings is None else settings
     if settings.solver == "auto":
-        again: Any = dict(section=section, multiplicity=multiplicity, conserved=conserved)
-        again |= dict(settings=dataclasses.replace(settings, solver=None), scale=scale, throw=throw)
-        return _find_with_auto(system, guess, dict(settle=settle, max_period=max_period), again)
+        again: Any = dict(
+            section=section, multiplicity=multiplicity, conserved=conserved
+        )
+        again |= dict(
+            settings=dataclasses.replace(settings, solver=None),
+            scale=scale,
+            throw=throw,
+        )
+        return _find_with_auto(
+            system, guess, dict(settle=settle, max_period=max_period), again
+        )
     system = settings.system(system)
     traced = is_traced((system, conserved))
     if not traced:
@@ -125,7 +141,9 @@ def find_limit_cycle(
     s, settings = Structure(system), settings.filled(LIMIT_CYCLE)
     patient = settings.max_steps == Settings().max_steps
     if has_implicit(s) or has_kinks(s):
-        settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
+        settings = dataclasses.replace(
+            settings, max_steps=max(settings.max_steps, PATIENCE)
+        )
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
     if section is not None:
@@ -142,9 +160,13 @@ def find_limit_cycle(
         conserved = guess.conserved if conserved is None else conserved
         moving = [name for name, x in arrays_of(system).items() if is_tracer(x)]
         for name in [] if is_traced(guess) else moving:
-            check_symmetry(guess.system, guess.structure.sizes(guess.settings.scale), name)
+            check_symmetry(
+                guess.system, guess.structure.sizes(guess.settings.scale), name
+            )
         map = guess.return_map.at_phase_of(system)
-        settings = dataclasses.replace(settings, scale=scale_of(s, given, guess.settings.scale))
+        settings = dataclasses.replace(
+            settings, scale=scale_of(s, given, guess.settings.scale)
+        )
         base = map.base if section is None else section
         map = dataclasses.replace(map, settings=settings, base=base)
     elif traced:
@@ -156,14 +178,18 @@ def find_limit_cycle(
         map = return_map_near(
             s, guess, section, multiplicity or 1, settle, max_period, settings, given
         )
-    map = dataclasses.replace(map, conserved={k: real(v) for k, v in (conserved or {}).items()})
+    map = dataclasses.replace(
+        map, conserved={k: real(v) for k, v in (conserved or {}).items()}
+    )
     near = last_turn(guess) if isinstance(guess, LimitCycle) else None
     if isinstance(guess, LimitCycle) and traced:
         solution = solve(map, True, True, near)
         cycle = _cycle(map, solution, guess.event_sequence)
         keep_turn(cycle, solution.turn)
         return cycle
-    s.resolve_outputs(tuple(map.conserved)).require(int(np.asarray(map.anchor.chart)[0]))
+    s.resolve_outputs(tuple(map.conserved)).require(
+        int(np.asarray(map.anchor.chart)[0])
+    )
     if isinstance(map.base, AtEvent) and not isinstance(guess, LimitCycle):
         check_begin(map)
     solution = search(map, patient, near)
@@ -175,15 +201,25 @@ def find_limit_cycle(
             solution = search(map, patient)
     # (Where the end is out of reach even for steps that are 256 times as long, more do not help.)
     reach = float(solution.turn.period) * _ENOUGH
-    if patient and int(solution.result) == Result.STEP_LIMIT and reach > float(map.expected):
+    if (
+        patient
+        and int(solution.result) == Result.STEP_LIMIT
+        and reach > float(map.expected)
+    ):
         say("the same with more steps")
         settings = dataclasses.replace(map.settings, max_steps=_ENOUGH)
         map = dataclasses.replace(map, settings=settings)
         solution = search(map)
     map, solution = _in_own_sizes(map, solution, given)
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
-    if solution.is_fixed_point and coincident(map, solution.turn) and not commutes(cycle):
-        cycle = dataclasses.replace(cycle, result=jax.device_put(np.int32(Result.COINCIDENCE)))
+    if (
+        solution.is_fixed_point
+        and coincident(map, solution.turn)
+        and not commutes(cycle)
+    ):
+        cycle = dataclasses.replace(
+            cycle, result=jax.device_put(np.int32(Result.COINCIDENCE))
+        )
     keep_turn(cycle, solution.turn)
     code = Result(int(cycle.result))
     checks.check_found(cycle)
@@ -192,7 +228,9 @@ def find_limit_cycle(
         if conserved:
             checks.check_conserved(cycle)
     if throw and code != Result.OK:
-        raise ComputationError(checks.explain(cycle, solution.turn, float(map.expected), settle))
+        raise ComputationError(
+            checks.explain(cycle, solution.turn, float(map.expected), settle)
+        )
     return cycle
 
 
@@ -206,13 +244,17 @@ def _find_with_auto(system, guess, first: dict, options: dict) -> LimitCycle:
         return cycle
     fitting = integrated(system, dict.fromkeys(stiff, Radau()))
     settings = options["settings"]
-    settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
+    settings = dataclasses.replace(
+        settings, max_steps=max(settings.max_steps, PATIENCE)
+    )
     options |= dict(settings=settings, throw=False)
     faster = find_limit_cycle(fitting, cycle, **options)
     return faster if faster.result == Result.OK else cycle
 
 
-def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[ReturnMap, Solution]:
+def _in_own_sizes(
+    map: ReturnMap, solution: Solution, given: Sizes
+) -> tuple[ReturnMap, Solution]:
     """A cycle that was found in rough sizes, in the sizes that states have on it."""
     s = map.structure
     while solution.is_fixed_point:
@@ -228,7 +270,9 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
             anchor=solution.anchor,
             expected=map.expected if map.base is None else turn.period,
         )
-        if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # accurate enough
+        if all(
+            rough[name] <= _OFF * size for name, size in sizes.items()
+        ):  # accurate enough
             residual, before = np.abs(turn.residual), to_host(map).sizes
             after = to_host(fine).sizes
             # (Gaps between moves are part of the distance, too.)
@@ -243,17 +287,32 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     return map, solution
 
 
-def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) -> LimitCycle:
+def _cycle(
+    map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]
+) -> LimitCycle:
     turn = solution.turn
     period = map.expected if map.base is None else turn.period
     return LimitCycle(
-        map.system, map.base, period, solution.anchor, turn.legs, turn.factors, turn.distance,
-        solution.steps, solution.result, event_sequence, map.settings, map.conserved,
-        map.multiplicity, copies_of(map.system),
-    )  # fmt: skip
+        map.system,
+        map.base,
+        period,
+        solution.anchor,
+        turn.legs,
+        turn.factors,
+        turn.distance,
+        solution.steps,
+        solution.result,
+        event_sequence,
+        map.settings,
+        map.conserved,
+        map.multiplicity,
+        copies_of(map.system),
+    )
 
 
-def _check_fits(guess: LimitCycle, s: Structure, multiplicity: int | None, waits: bool) -> None:
+def _check_fits(
+    guess: LimitCycle, s: Structure, multiplicity: int | None, waits: bool
+) -> None:
     """**Raises:** `DefinitionError` for arguments that contradict a cycle as the guess."""
     require_similar(guess.return_map, s.system)
     if multiplicity not in (None, guess.multiplicity):
@@ -261,7 +320,9 @@ def _check_fits(guess: LimitCycle, s: Structure, multiplicity: int | None, waits
             f"the guess has multiplicity {guess.multiplicity}, not {multiplicity}: give a Guess."
         )
     if guess.clocked != (s.system.period() is not None):
-        raise DefinitionError("of the guess and the system, only one has a clock: give a Guess.")
+        raise DefinitionError(
+            "of the guess and the system, only one has a clock: give a Guess."
+        )
     if waits:
         raise DefinitionError(
             "the search begins on the cycle that is the guess, and knows its period: leave out "

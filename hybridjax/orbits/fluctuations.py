@@ -71,7 +71,9 @@ class Fluctuations(eqx.Module):
         **Raises:** `ComputationError` if an implicit method steps over fast decays.
         """
         if on_host(self.period) and self.unresolved > SINGULAR:
-            raise ComputationError("steps skip fast decays: use an explicit method or `durations`.")
+            raise ComputationError(
+                "steps skip fast decays: use an explicit method or `durations`."
+            )
         C, d = self.at_nodes, self.at_nodes.shape[-1]
         if lag:
             turns = namespace(C).linalg.matrix_power(self.step[:d, :d], lag - 1)
@@ -83,33 +85,47 @@ class Fluctuations(eqx.Module):
         before, with those `lag` turns before. The sum of all entries is the covariance of periods
         from the last event to the next such event."""
         n = len(self.joint) - len(self.events)
-        return (namespace(self.joint).linalg.matrix_power(self.step, lag) @ self.joint)[n:, n:]
+        return (namespace(self.joint).linalg.matrix_power(self.step, lag) @ self.joint)[
+            n:, n:
+        ]
 
     def __repr__(self):
-        name, unit = type(self.structure.system).__name__, self.structure.system.time_unit
+        name, unit = (
+            type(self.structure.system).__name__,
+            self.structure.system.time_unit,
+        )
         if is_traced(self):
             return f"Fluctuations({name}, traced)"
         rows = [f"{number(self.diffusion, unit=unit)}: diffusion of the phase"]
         rows = rows if self.diffusion else []
-        before, spread = [*self.events[-1:], *self.events], np.sqrt(np.diag(self.durations()))
+        before, spread = (
+            [*self.events[-1:], *self.events],
+            np.sqrt(np.diag(self.durations())),
+        )
         for a, b, x in zip(before, self.events, spread, strict=False):
             rows.append(f"{number(x, 6, unit)}: standard deviation from {a} to {b}")
         return f"Fluctuations({name})" + "".join(f"\n  {x}" for x in rows)
 
 
-def fluctuations(cycle: Any, white: Strengths, guards: Strengths, resets: Resets) -> Fluctuations:
+def fluctuations(
+    cycle: Any, white: Strengths, guards: Strengths, resets: Resets
+) -> Fluctuations:
     """Deviations from a cycle under noise (see `LimitCycle.fluctuations`)."""
     return _noisy(cycle, linear_flow(cycle), white, guards, resets)
 
 
 @one_program
-def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -> Fluctuations:
+def _noisy(
+    cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any
+) -> Fluctuations:
     map, events = cycle.return_map, cycle.event_sequence
     s, period = map.structure, map.expected
     levels, scatter = _at_events(s, guards, resets)
     xp, jumps = namespace(flow.q), flow.jumps
     (P, _, d), clocked, f = flow.q.shape, map.base is None, flow.field[0, 0]
-    names = [s.transitions[g].name for g in events] or ([] if clocked else [str(map.base)])
+    names = [s.transitions[g].name for g in events] or (
+        [] if clocked else [str(map.base)]
+    )
     n, E = d + 1 + len(names), len(names)
     # Noise in the states, collected over each piece.
     B, (free, _) = _columns(s, flow, white), flow.forward
@@ -123,11 +139,13 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
         hit, delay = put(hit, -1, True), put(delay, -1, section_delay(map, f)[0])
     slot = (xp.cumsum(hit)[:, None] - 1 == np.arange(E)) & hit[:, None]
     each, none = slot[..., None], xp.zeros((P, d, 1 + E))
-    jump = xp.block([
-        [jumps.by_state, none],
-        [delay[:, None], 1.0 - hit[:, None, None], none[:, :1, 1:]],
-        [each * delay[:, None], -1.0 * each, (1.0 - each) * np.eye(E)],
-    ])  # fmt: skip
+    jump = xp.block(
+        [
+            [jumps.by_state, none],
+            [delay[:, None], 1.0 - hit[:, None, None], none[:, :1, 1:]],
+            [each * delay[:, None], -1.0 * each, (1.0 - each) * np.eye(E)],
+        ]
+    )
     late = xp.asarray(levels)[flow.event] * jumps.delay_by_level
     late = late[:, None] * xp.concatenate([jumps.slip, xp.ones((P, 1)), slot], axis=1)
     added = late[:, :, None] * late[:, None]
@@ -150,11 +168,18 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
     across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
     step, Q = last @ M, last @ Q @ last.T
     states, noise = step[:d, :d], Q[:d, :d]
-    if on_host(step) and not np.abs(np.linalg.eigvals(states)).max(initial=0.0) < 1 - SINGULAR:
-        raise ComputationError("noise drives deviations away, because the cycle is not stable.")
+    if (
+        on_host(step)
+        and not np.abs(np.linalg.eigvals(states)).max(initial=0.0) < 1 - SINGULAR
+    ):
+        raise ComputationError(
+            "noise drives deviations away, because the cycle is not stable."
+        )
     joint = xp.linalg.solve(np.eye(d * d) - xp.kron(states, states), noise.ravel())
     joint = _pad(joint.reshape(d, d), n)
-    for _ in range(2):  # durations follow from the states of this turn and from the last
+    for _ in range(
+        2
+    ):  # durations follow from the states of this turn and from the last
         joint = step @ joint @ step.T + Q
     _, (_, C, after) = scan(turn, (xp.eye(n), joint), pieces)
     inward = solve(free, B)
@@ -168,9 +193,18 @@ def _noisy(cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any) -
     C = across @ C @ xp.swapaxes(across, -1, -2)
     to_end = last[:d, :d] @ xp.swapaxes(to_end, -1, -2)
     return Fluctuations(
-        diffusion, tuple(names), s, flow, period, step, joint, C, unresolved,
-        across @ free @ begin[:, None, :d, :d], to_end,
-    )  # fmt: skip
+        diffusion,
+        tuple(names),
+        s,
+        flow,
+        period,
+        step,
+        joint,
+        C,
+        unresolved,
+        across @ free @ begin[:, None, :d, :d],
+        to_end,
+    )
 
 
 def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:
@@ -178,7 +212,9 @@ def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:
     return namespace(x).pad(x, [(0, 0)] * (x.ndim - 2) + [(0, more), (0, more)])
 
 
-def _columns(s: Structure, flow: LinearFlow, white: Strengths) -> Float[Array, "P K d r"]:
+def _columns(
+    s: Structure, flow: LinearFlow, white: Strengths
+) -> Float[Array, "P K d r"]:
     """Effects of white noise of strength 1 on the states."""
     xp = namespace(flow.q)
     require_among("state or input", white, [*s.state_names(), *s.inputs], "`white`: ")
@@ -196,7 +232,10 @@ def _at_events(s: Structure, guards: Strengths, resets: Resets):
         require_among("transition", given, names, f"`{argument}`: ")
     scatter = np.zeros((len(names) + 1, s.d))
     for row, x in zip(scatter, s.transitions, strict=False):
-        states, chosen = s.charts[s.chart_index(x.target)].states, resets.get(x.name, {})
+        states, chosen = (
+            s.charts[s.chart_index(x.target)].states,
+            resets.get(x.name, {}),
+        )
         require_among("state", chosen, states, f"`resets`: after '{x.name}' ")
         row[: len(states)] = [chosen.get(y, 0.0) for y in states]
     return np.array([*(guards.get(x, 0.0) for x in names), 0.0]), scatter

@@ -65,8 +65,12 @@ def return_map_near(
     near = lambda x: np.asarray(x) if isinstance(x, jax.Array) and not x.ndim else x  # noqa: E731
     guess = jax.tree_util.tree_map(near, system).guess() if guess is None else guess
     if guess is None:
-        raise DefinitionError(f"{type(system).__name__} has no guess: pass `Guess(chart, state)`.")
-    time, (a,), q, *_ = lanes = lane_at(s, guess.chart, guess.state, guess.time, "the guess")
+        raise DefinitionError(
+            f"{type(system).__name__} has no guess: pass `Guess(chart, state)`."
+        )
+    time, (a,), q, *_ = lanes = lane_at(
+        s, guess.chart, guess.state, guess.time, "the guess"
+    )
     if guess.after is not None:
         event = s.transitions[s.transition_index(guess.after)]
         if event.target != guess.chart:
@@ -85,11 +89,22 @@ def return_map_near(
     near = sizes_near(s, a, time[0], q[:, 0], None if period is None else float(period))
     settings = dataclasses.replace(settings, scale=scale_of(s, near.sizes | given))
     charts = np.arange(len(s.charts))
-    check_claims(s, np.repeat(time, len(charts)), charts, near.points.T, settings.scale, near.time)
+    check_claims(
+        s,
+        np.repeat(time, len(charts)),
+        charts,
+        near.points.T,
+        settings.scale,
+        near.time,
+    )
     map = ReturnMap(system, settings, lanes, None, real(np.nan), {}, multiplicity)
     if settle:
         say("settling")
-        wait = float(settle) if period is None else np.ceil(settle / period) * float(period)
+        wait = (
+            float(settle)
+            if period is None
+            else np.ceil(settle / period) * float(period)
+        )
         end = np.asarray(lanes.t) + wait
         lanes = _go(map, "settling", lanes, toward(end, -1, end))
         if period is not None:
@@ -101,11 +116,17 @@ def return_map_near(
         max_period = _PATIENCE * max(near.time, slow_time(s, time[0], near.points))
     after = None if guess.after is None else AtEvent(guess.after)
     base = after if section is None else section
-    return _on_section(map, base, bool(section is None and not settle), near.time, max_period)
+    return _on_section(
+        map, base, bool(section is None and not settle), near.time, max_period
+    )
 
 
 def _on_section(
-    map: ReturnMap, section: Crossing | AtEvent | None, is_after: bool, time: float, wait: float
+    map: ReturnMap,
+    section: Crossing | AtEvent | None,
+    is_after: bool,
+    time: float,
+    wait: float,
 ) -> ReturnMap:
     """The map of an autonomous system, with its anchor on the section and a rough period.
 
@@ -134,7 +155,9 @@ def _on_section(
         place = "through the guess, across the flow"
         events = [f"AtEvent({transition.name!r})" for transition in s.transitions]
         example = [*events, f"Crossing({s.state_names()[0]!r}, 'rising')"][0]
-        advice = f"Choose a section that each turn crosses once, e.g. `section={example}`. "
+        advice = (
+            f"Choose a section that each turn crosses once, e.g. `section={example}`. "
+        )
     map = dataclasses.replace(map, base=section)
 
     late = (
@@ -165,7 +188,12 @@ def _at_anchor(map: ReturnMap):
 
 
 def _go(
-    map: ReturnMap, doing: str, lanes: Lanes, target: Target, advice: str = "", if_late: str = ""
+    map: ReturnMap,
+    doing: str,
+    lanes: Lanes,
+    target: Target,
+    advice: str = "",
+    if_late: str = "",
 ) -> Lanes:
     """The lane at a target, however many steps it takes.
 
@@ -195,4 +223,6 @@ def require_similar(guess: ReturnMap, system: HybridSystem) -> None:
     """**Raises:** `DefinitionError` if the cycle of a map cannot be a guess for another system."""
     maps = guess, dataclasses.replace(guess, system=system)
     sizes = [(len(x.structure.charts), x.structure.d) for x in maps]
-    require_equal("`guess` (a cycle) and the system", "numbers of charts and states", *sizes)
+    require_equal(
+        "`guess` (a cycle) and the system", "numbers of charts and states", *sizes
+    )

@@ -74,12 +74,21 @@ class LimitCycles(eqx.Module):
         pick = lambda tree: from_host(jax.tree_util.tree_map(take, tree))  # noqa: E731
         arrays, static = eqx.partition(self.systems, eqx.is_array)
         return LimitCycle(
-            eqx.combine(pick(arrays), static), self.base, pick(self.period), pick(self.anchor),
-            pick(self.legs), pick(self.factors), pick(self.residual), pick(self.iterations),
+            eqx.combine(pick(arrays), static),
+            self.base,
+            pick(self.period),
+            pick(self.anchor),
+            pick(self.legs),
+            pick(self.factors),
+            pick(self.residual),
+            pick(self.iterations),
             pick(self.result),
-            tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
-            self.conserved, self.multiplicity, pick(self.numbers),
-        )  # fmt: skip
+            tuple(int(g) for g in self.codes[i] if g >= 0),
+            self.settings,
+            self.conserved,
+            self.multiplicity,
+            pick(self.numbers),
+        )
 
     @property
     def scale(self) -> dict[str, float]:
@@ -114,7 +123,9 @@ class LimitCycles(eqx.Module):
     def summary(self, limit: Index = 5) -> str:
         """`10000/10000 found`, or the reasons of the first `limit` failures. Default: 5."""
         text = [f"{self.ok.sum()}/{len(self)} found"]
-        text += [f"#{i}: {Result(int(self.result[i])).message}" for i in self.failed[:limit]]
+        text += [
+            f"#{i}: {Result(int(self.result[i])).message}" for i in self.failed[:limit]
+        ]
         if len(self.failed) > limit:
             text.append(f"and {len(self.failed) - limit} more")
         return folded("; ".join(text))
@@ -179,10 +190,21 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
     """The last rounds of Newton's method as cycles."""
     turn, map = rounds.turn, tiles.map
     cycles = LimitCycles(
-        tiles.systems, map.base, rounds.period, rounds.anchor, turn.legs, turn.factors,
-        turn.distance, rounds.steps, rounds.result, rounds.codes, map.settings, map.conserved,
-        map.multiplicity, copies_of(tiles.systems),
-    )  # fmt: skip
+        tiles.systems,
+        map.base,
+        rounds.period,
+        rounds.anchor,
+        turn.legs,
+        turn.factors,
+        turn.distance,
+        rounds.steps,
+        rounds.result,
+        rounds.codes,
+        map.settings,
+        map.conserved,
+        map.multiplicity,
+        copies_of(tiles.systems),
+    )
     return examined(cycles, rounds.together)
 
 
@@ -193,7 +215,9 @@ def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycl
     **Raises:** `DefinitionError` as `check_found`, for one of eight cycles.
     """
     good = np.flatnonzero(cycles.ok)
-    for k in np.unique(np.linspace(0, len(good) - 1, min(len(good), _TESTED)).astype(int)):
+    for k in np.unique(
+        np.linspace(0, len(good) - 1, min(len(good), _TESTED)).astype(int)
+    ):
         check_found(cycles[int(good[k])])
     rows = np.flatnonzero(together & cycles.ok)
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
@@ -206,7 +230,10 @@ def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycl
 
 def _stacked(systems) -> HybridSystem:
     if isinstance(systems, HybridSystem):
-        shapes = {x.shape[:1] for x in jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_array))}
+        shapes = {
+            x.shape[:1]
+            for x in jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_array))
+        }
         if len(shapes) != 1 or () in shapes:
             raise DefinitionError(
                 "all arrays of `systems` need the same leading axis, one entry for each system: "
@@ -216,7 +243,9 @@ def _stacked(systems) -> HybridSystem:
     parts = [jax.tree_util.tree_flatten(x) for x in systems]
     kinds = {(structure, *map(eqx.is_array, leaves)) for leaves, structure in parts}
     if len(kinds) != 1:
-        raise DefinitionError("`systems` must be at least one system, all of the same class.")
+        raise DefinitionError(
+            "`systems` must be at least one system, all of the same class."
+        )
     # (By NumPy: a program of JAX with thousands of arguments compiles for minutes.)
     stack = lambda x: jax.device_put(np.stack([np.asarray(y) for y in x]))  # noqa: E731
     columns = zip(*(leaves for leaves, _ in parts), strict=True)

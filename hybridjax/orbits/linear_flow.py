@@ -62,10 +62,14 @@ class Rule(NamedTuple):
 def rule() -> Rule:
     legendre = np.polynomial.legendre
     # (Roots are real here, and complex numbers since NumPy 2.5.)
-    x = np.r_[-1.0, np.sort(legendre.legroots(legendre.legder(np.eye(NODES)[-1])).real), 1.0]
+    x = np.r_[
+        -1.0, np.sort(legendre.legroots(legendre.legder(np.eye(NODES)[-1])).real), 1.0
+    ]
     x = (x - x[::-1]) / 2
     vander = legendre.legvander(x, NODES - 1)
-    slopes = np.stack([legendre.legval(x, legendre.legder(e)) for e in np.eye(NODES)], axis=1)
+    slopes = np.stack(
+        [legendre.legval(x, legendre.legder(e)) for e in np.eye(NODES)], axis=1
+    )
     inverse = np.linalg.inv(vander)
     return Rule((x + 1) / 2, inverse[0], 2 * slopes @ inverse, inverse)
 
@@ -118,7 +122,9 @@ class LinearFlow(eqx.Module):
         """Times of the beginnings of the pieces, from that of the turn."""
         return self.t[:, 0] - self.t[0, 0]
 
-    def evaluated(self, s: Structure, function: Callable, rows: int) -> Float[Array, "P K rows n"]:
+    def evaluated(
+        self, s: Structure, function: Callable, rows: int
+    ) -> Float[Array, "P K rows n"]:
         """A function (see `with_derivatives`) at the nodes, and its derivatives."""
         chart, (P, K, d) = namespace(self.q).repeat(self.chart, NODES), self.q.shape
         at = chart, self.t.ravel(), self.q.reshape(P * K, d).T
@@ -129,15 +135,21 @@ class LinearFlow(eqx.Module):
         """Times of the nodes: those of the clock, or since the anchor of an autonomous cycle."""
         return self.t if map.base is None else self.t - self.t[0, 0]
 
-    def _implicit(self, sign: float, rows: slice, matrix: Float[Array, "P K d d"], size: Array):
+    def _implicit(
+        self, sign: float, rows: slice, matrix: Float[Array, "P K d d"], size: Array
+    ):
         """The inverse of (derivative + sign h matrix) on some of the nodes, computed in sizes."""
         ratio = size[:, :, None] / size[:, None]
         d, D = self.q.shape[2], rule().derivative[rows, rows]
         n, xp = len(D), namespace(self.q)
-        field = xp.eye(n)[:, None, :, None] * (matrix / ratio[:, None])[:, rows, :, None, :]
+        field = (
+            xp.eye(n)[:, None, :, None] * (matrix / ratio[:, None])[:, rows, :, None, :]
+        )
         whole = D[:, None, :, None] * np.eye(d)[:, None, :]
         whole = whole + sign * self.length[:, None, None, None, None] * field
-        inverse = solve(whole.reshape(-1, n * d, n * d), np.eye(n * d)).reshape(-1, n, d, n, d)
+        inverse = solve(whole.reshape(-1, n * d, n * d), np.eye(n * d)).reshape(
+            -1, n, d, n, d
+        )
         return inverse * ratio[:, None, :, None, :]
 
     @remembered
@@ -147,7 +159,9 @@ class LinearFlow(eqx.Module):
         xp, d = namespace(self.q), self.q.shape[2]
         inverse = self._implicit(-1.0, slice(1, None), self.by_state, self.size)
         free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[1:, 0])
-        free = xp.concatenate([xp.broadcast_to(xp.eye(d), (len(free), 1, d, d)), free], axis=1)
+        free = xp.concatenate(
+            [xp.broadcast_to(xp.eye(d), (len(free), 1, d, d)), free], axis=1
+        )
         return free, xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
 
     @remembered
@@ -157,7 +171,9 @@ class LinearFlow(eqx.Module):
         by_state = xp.swapaxes(self.by_state, -1, -2)
         inverse = self._implicit(1.0, slice(0, -1), by_state, 1 / self.size)
         free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[:-1, -1])
-        return xp.concatenate([free, xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))], axis=1)
+        return xp.concatenate(
+            [free, xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))], axis=1
+        )
 
     def covectors(self, end: Inexact[Array, "d r"]) -> Inexact[Array, "P K d r"]:
         """Covectors at the nodes by those at the end of the turn."""
@@ -209,11 +225,16 @@ class LinearFlow(eqx.Module):
             through, kick, back = piece
             return ((through @ x.reshape(d, -1)).reshape(x.shape) + kick) * back, x
 
-        begin = xp.pad(xp.eye(d), [(0, 0), (self.by_input.shape[3], 0)])[..., None] + 0 * kick[0]
+        begin = (
+            xp.pad(xp.eye(d), [(0, 0), (self.by_input.shape[3], 0)])[..., None]
+            + 0 * kick[0]
+        )
         through, back = xp.asarray(self.through, dtype=waves.dtype), 1 / last[:, 0]
         end, x = scan(advance, begin, (through, kick, back))
         by_begin = (jumps.delay_by_state[:, None] @ self.forward[0][:, -1])[:, 0]
-        by_input = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived.reshape(shape))
+        by_input = xp.einsum(
+            "pa,pauf->puf", jumps.delay_by_state, arrived.reshape(shape)
+        )
         by_input = wide(by_input + jumps.delay_by_input[..., None] * last)
         return x, (xp.einsum("pa,pacf->pcf", by_begin, x) + by_input) / last, end
 
@@ -225,7 +246,9 @@ class LinearFlow(eqx.Module):
     def monodromy(self, valid: Bool[Array, " d"]) -> Float[Array, "d d"]:
         """Derivative of the state at the end of the turn by that at its beginning, at fixed times;
         zero outside of the `valid` rows and columns."""
-        return namespace(self.q).where(valid[:, None] & valid, monodromy(self.through), 0.0)
+        return namespace(self.q).where(
+            valid[:, None] & valid, monodromy(self.through), 0.0
+        )
 
 
 _hosted, _flows, _turns = Memory(), Memory(), Memory()
@@ -251,14 +274,22 @@ def last_turn(cycle: Any) -> Any:
     traces the cycle, and the host did not take them."""
     cycle = hosted(cycle)
     make = lambda: side_by_side(to_host(cycle.return_map).pieces())  # noqa: E731
-    return _turns.get(cycle, None) if is_hidden(cycle) else _turns.recall(cycle, None, make)
+    return (
+        _turns.get(cycle, None)
+        if is_hidden(cycle)
+        else _turns.recall(cycle, None, make)
+    )
 
 
 def begin_later(cycle: Any, k: int) -> Any:
     """A guess for neighbors of a clocked cycle that begins with its piece k, with its last turn."""
-    lanes, tape = jax.tree_util.tree_map(lambda x: np.roll(x, -k, axis=-1), last_turn(cycle))
+    lanes, tape = jax.tree_util.tree_map(
+        lambda x: np.roll(x, -k, axis=-1), last_turn(cycle)
+    )
     later = float(cycle.period) * (np.arange(len(lanes.t)) >= len(lanes.t) - k)
-    anchor = cycle.anchor._replace(t=lanes.t[:1], chart=lanes.chart[:1], q=lanes.q[:, :1])
+    anchor = cycle.anchor._replace(
+        t=lanes.t[:1], chart=lanes.chart[:1], q=lanes.q[:, :1]
+    )
     guess = dataclasses.replace(cycle, anchor=anchor)
     turn = lanes._replace(t=lanes.t + later), tape._replace(t=tape.t + later)
     _turns.recall(hosted(guess), None, lambda: turn)
@@ -269,10 +300,14 @@ def recorded_ends(map: ReturnMap, lanes: Lanes) -> Target:
     """The ends of pieces that begin as recorded. (The search may have expected another period.)"""
     ends = map.ends()
     time = np.append(lanes.t[1:], ends.time[-1])
-    return dataclasses.replace(ends, time=np.where(np.isfinite(ends.time), time, ends.time))
+    return dataclasses.replace(
+        ends, time=np.where(np.isfinite(ends.time), time, ends.time)
+    )
 
 
-def linear_flow(cycle: Any, longest: float = np.inf, parameter: str | None = None) -> LinearFlow:
+def linear_flow(
+    cycle: Any, longest: float = np.inf, parameter: str | None = None
+) -> LinearFlow:
     """Linearize the flow along a cycle, in pieces no longer than this part of the period. Inputs
     are those of the system, or a change of a parameter.
 
@@ -293,7 +328,9 @@ def with_inputs(system: HybridSystem, parameter: str | None) -> Structure:
 _STEPS = 4
 
 
-def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = None) -> LinearFlow:
+def _linear_flow(
+    cycle: Any, longest: float, parameter: str | None, by: Any = None
+) -> LinearFlow:
     """The flow linearized at nodes of pieces, whose states follow from the recorded steps; or its
     derivatives in the directions `by` of the cycle."""
     if not on_host(cycle.period):
@@ -320,7 +357,9 @@ def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = No
     first = np.flatnonzero((k - begins) % most == 0)
     last = np.append(first[1:], len(k)) - 1
     h, code = t[last + 1] - t[first], np.maximum(moves.code[last], -1)
-    parts = np.maximum(np.ceil(np.real(h[:, 0]) / (longest * period) - 1e-9), 1).astype(int)
+    parts = np.maximum(np.ceil(np.real(h[:, 0]) / (longest * period) - 1e-9), 1).astype(
+        int
+    )
     whole = np.repeat(np.arange(len(first)), parts)
     part = np.arange(len(whole)) - np.repeat(np.cumsum(parts) - parts, parts)
     first, last, h, parts = first[whole], last[whole], h[whole], parts[whole, None]
@@ -335,17 +374,30 @@ def _linear_flow(cycle: Any, longest: float, parameter: str | None, by: Any = No
     states = _ahead(s, *begin, u, (time - t[step]).ravel())
     at = charts, time.ravel(), states, d, kernels.unpushed(of, each)
     with_field = with_derivatives(of, ft.partial(kernels.field, of), *at)
-    lay = lambda x: np.moveaxis(x.reshape(*x.shape[:-1], P, K, D), (-1, -3, -2), (0, 1, 2))  # noqa: E731
+
+    def lay(x):
+        return np.moveaxis(x.reshape(*x.shape[:-1], P, K, D), (-1, -3, -2), (0, 1, 2))
+
     states, f = lay(states), lay(with_field[:, 0])
     u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(D), P))
-    ends = (x.reshape(-1, d) for x in (states[:, :, -1], f[:, :, -1], np.roll(f[:, :, 0], -1, 1)))
+    ends = (
+        x.reshape(-1, d)
+        for x in (states[:, :, -1], f[:, :, -1], np.roll(f[:, :, 0], -1, 1))
+    )
     jumps = _jumps(of, np.tile(code, D), time[:, -1].T.ravel(), u, *ends)
     jumps = Jumps(*(x.reshape(D, P, *x.shape[1:]) for x in jumps))
     arrays = LinearFlow(
-        lay(time.ravel()), (h / parts).T, None, None, states, f,
-        lay(with_field[:, 2 : 2 + d]), lay(with_field[:, 2 + d :]), jumps,
+        lay(time.ravel()),
+        (h / parts).T,
+        None,
+        None,
+        states,
+        f,
+        lay(with_field[:, 2 : 2 + d]),
+        lay(with_field[:, 2 + d :]),
+        jumps,
         np.broadcast_to(map.scale[moves.chart[first]], (D, P, d)),
-    )  # fmt: skip
+    )
     if by is not None:
         return jax.tree_util.tree_map(lambda x: x.imag / kernels.TINY, arrays)
     arrays = jax.tree_util.tree_map(lambda x: x[0], arrays)
@@ -360,7 +412,9 @@ def _along(
     # A turn that ends on a section ends at a time, too.
     start, full = map.anchor.t[0], map.expected
     time = np.where(np.isfinite(ends.time), ends.time, start + full)
-    tape = tape._replace(code=np.where(tape.code == ARRIVE_LEVEL, ARRIVE_TIME, tape.code))
+    tape = tape._replace(
+        code=np.where(tape.code == ARRIVE_LEVEL, ARRIVE_TIME, tape.code)
+    )
     times = begin[0][:, None] + np.outer(longer, (time - start) / full)
     ends = dataclasses.replace(ends, time=time, levels=None)
     return Variation(s, lanes, ends, tape, times, twice=False).tangents(begin)
@@ -384,7 +438,9 @@ def of_flow(tangents: Any) -> Any:
 
 def _flow_along(arguments: tuple, by: tuple) -> tuple[LinearFlow, LinearFlow]:
     cycle, longest, parameter = arguments
-    return _linear_flow(cycle, longest, parameter), _linear_flow(cycle, longest, parameter, by[0])
+    return _linear_flow(cycle, longest, parameter), _linear_flow(
+        cycle, longest, parameter, by[0]
+    )
 
 
 _of_cycle = by_columns(_linear_flow, _flow_along, of_flow, np.inf)
@@ -412,7 +468,12 @@ def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
         a = s.chart_index(tr.source)
         n, point = s.dims[a], (t[now], q[now, : s.dims[a]].T, u[:, now])
         by = np.moveaxis(kernels.reset(s, s.member(g), *point), -1, 0)
-        m, by_t, by_q, by_u = by.shape[1], by[:, :, 1], by[:, :, 2 : 2 + n], by[:, :, 2 + n :]
+        m, by_t, by_q, by_u = (
+            by.shape[1],
+            by[:, :, 1],
+            by[:, :, 2 : 2 + n],
+            by[:, :, 2 + n :],
+        )
         if isinstance(tr.guard, Scheduled):
             guard = kernels.due(s, g, *point)[0].T
         else:
@@ -423,7 +484,9 @@ def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
         out.delay_by_input[now] = guard[:, 2 + n :] * delay[:, None]
         slip = by_t + (by_q @ f[now, :n, None])[..., 0] - after[now, :m]
         out.by_state[now] = 0.0
-        out.by_state[now, :m, :n] = by_q + slip[..., None] * out.delay_by_state[now, None, :n]
+        out.by_state[now, :m, :n] = (
+            by_q + slip[..., None] * out.delay_by_state[now, None, :n]
+        )
         out.by_input[now, :m] = by_u + slip[..., None] * out.delay_by_input[now, None]
         out.slip[now, :m], out.delay_by_level[now] = slip, delay
     return out

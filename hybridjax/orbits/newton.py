@@ -27,7 +27,15 @@ from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
 from .crossing import ListLevels
 from .return_map import SINGULAR, ReturnMap, Turn, across
-from .shooting import ATOL, RTOL, excess, fixed_point, follow_moves, newton_steps, travel
+from .shooting import (
+    ATOL,
+    RTOL,
+    excess,
+    fixed_point,
+    follow_moves,
+    newton_steps,
+    travel,
+)
 
 
 # Steps that a good guess needs: a continuation then takes longer steps, and a system of a sweep
@@ -68,7 +76,9 @@ def search(map: ReturnMap, patient: bool = False, near: Any = None) -> Solution:
     if int(solution.result) == Result.EXTRA_TURNS:
         turn = solution.turn
         expected = turn.period * map.multiplicity / turn.meetings
-        solution = solve(dataclasses.replace(map, anchor=solution.anchor, expected=expected))
+        solution = solve(
+            dataclasses.replace(map, anchor=solution.anchor, expected=expected)
+        )
     final = (Result.EQUILIBRIUM, Result.STEP_LIMIT)[: 1 + patient]
     if not solution.is_fixed_point and int(solution.result) not in final:
         # Newton's method may have left the domain of the return map.
@@ -80,9 +90,13 @@ def search(map: ReturnMap, patient: bool = False, near: Any = None) -> Solution:
 
 def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
     q, turn, steps = root(map, False, MAX_STEPS, near)
-    if once_more and not on_host(q):  # (where the host's last turn begins, a step is rounding)
+    if once_more and not on_host(
+        q
+    ):  # (where the host's last turn begins, a step is rounding)
         turn = map.turn_with_jacobian(q, record=turn.record)
-    return Solution(map.departure(q), turn._replace(record=None), steps, map.judge(q, turn))
+    return Solution(
+        map.departure(q), turn._replace(record=None), steps, map.judge(q, turn)
+    )
 
 
 def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solution]:
@@ -98,7 +112,9 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     begin = np.zeros((1 + len(sizes), P))
     begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
     longer = np.zeros(P) if by.expected is None else by.expected
-    along = begin[0][:, None] + np.outer(longer, (ends.time - map.anchor.t) / map.expected)
+    along = begin[0][:, None] + np.outer(
+        longer, (ends.time - map.anchor.t) / map.expected
+    )
     times = np.where(np.isfinite(ends.time), along, 0.0)
     orbit = Variation(s, turn.legs, ends, side_by_side(turn.tapes), times, factors)
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
@@ -109,9 +125,14 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     nothing = jax.tree_util.tree_map(lambda _: None, solution)
     moving = nothing.turn._replace(period=tangents[-1, 0] - begin[0])
     if factors:
-        legs, by_factor = turn.legs, orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)]
+        legs, by_factor = (
+            turn.legs,
+            orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)],
+        )
         if map.base is not None:
-            f = slopes(s, *orbit.points(tangents, orbit.first)).T.reshape(*by_factor.shape[:3])
+            f = slopes(s, *orbit.points(tangents, orbit.first)).T.reshape(
+                *by_factor.shape[:3]
+            )
             by_factor = across(f, map.scale[legs.chart][:, None], by_factor)
         t_legs = np.moveaxis(tangents[orbit.first], 0, -1)
         moving = moving._replace(
@@ -140,7 +161,9 @@ def solve(
 @host_first
 def _solve_damped(map: ReturnMap) -> Solution:
     q, turn, steps = root(map, True, 2 * MAX_STEPS)
-    return Solution(map.departure(q), turn._replace(record=None), steps, map.judge(q, turn))
+    return Solution(
+        map.departure(q), turn._replace(record=None), steps, map.judge(q, turn)
+    )
 
 
 def root(
@@ -152,10 +175,16 @@ def root(
     """
     if not on_host(map.expected):
         return _root(map, damped, max_steps)
-    return _damped_on_host(map, max_steps) if damped else _root_on_host(map, max_steps, near)
+    return (
+        _damped_on_host(map, max_steps)
+        if damped
+        else _root_on_host(map, max_steps, near)
+    )
 
 
-def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray, Turn, np.ndarray]:
+def _root_on_host(
+    map: ReturnMap, max_steps: int, near: Any
+) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Newton's method from the fixed point of the moves of a `near` turn, or from where rough turns
     lead; if these lead nowhere, from the anchor's state."""
     begin = map.anchor.q[:, 0] / map.sizes
@@ -165,19 +194,27 @@ def _root_on_host(map: ReturnMap, max_steps: int, near: Any) -> tuple[np.ndarray
     return end if np.isfinite(end[0]).all() else _newton(map, begin, None, 0, max_steps)
 
 
-def _by_rough_turns(map: ReturnMap, x: np.ndarray) -> tuple[np.ndarray, Moves | None, int]:
+def _by_rough_turns(
+    map: ReturnMap, x: np.ndarray
+) -> tuple[np.ndarray, Moves | None, int]:
     """Newton's method on turns with errors of `TRANSIENT`, until the moves of one have a fixed
     point: that of these moves, divided at full accuracy, the moves, and the number of steps."""
-    rough = Settings(np.array(TRANSIENT), np.array(TRANSIENT), map.settings.max_steps, map.scale)
+    rough = Settings(
+        np.array(TRANSIENT), np.array(TRANSIENT), map.settings.max_steps, map.scale
+    )
     rough_map, moves = dataclasses.replace(map, settings=rough), None
     for steps in range(1, FEW_STEPS + 1):  # noqa: B007
         turn, step = _step_from(rough_map, x)
         x = newton = x + step
         if np.isfinite(x).all():
-            x, moves = fixed_point(rough_map, (turn.legs, side_by_side(turn.tapes)), newton)
+            x, moves = fixed_point(
+                rough_map, (turn.legs, side_by_side(turn.tapes)), newton
+            )
         if x is not newton or not np.isfinite(x).all():
             break
-    pieces = moves and follow_moves(map, map.departure(x * map.sizes), map.ends(), moves)
+    pieces = moves and follow_moves(
+        map, map.departure(x * map.sizes), map.ends(), moves
+    )
     x, moves = fixed_point(map, pieces[::2], x) if pieces else (x, None)
     return x, moves, steps
 
@@ -192,9 +229,15 @@ def _newton(
         turn, step = _step_from(map, x, travelled)
         x = x + step
         # (Gaps between moves may be as large as errors of steps.)
-        close = turn.distance < ATOL + (np.asarray(map.settings.rtol) if travelled else 0.0)
+        close = turn.distance < ATOL + (
+            np.asarray(map.settings.rtol) if travelled else 0.0
+        )
         # (The first state need not be as accurate as a Newton step.)
-        done = excess(x[None], step[None])[0] < 1 and close and (travelled or steps > first + 1)
+        done = (
+            excess(x[None], step[None])[0] < 1
+            and close
+            and (travelled or steps > first + 1)
+        )
         if done or steps == max_steps or not np.isfinite(x).all():
             break
         moves = None
@@ -204,14 +247,18 @@ def _newton(
     return x * map.sizes, turn, np.asarray(steps)
 
 
-def _step_from(map: ReturnMap, x: np.ndarray, travelled: Any = None) -> tuple[Turn, np.ndarray]:
+def _step_from(
+    map: ReturnMap, x: np.ndarray, travelled: Any = None
+) -> tuple[Turn, np.ndarray]:
     """The turn from a state, in sizes, and the Newton step."""
     turn, sizes = map.turn_with_jacobian(x * map.sizes, travelled=travelled), map.sizes
     jacobian, residual = turn.jacobian * sizes / sizes[:, None], turn.residual / sizes
     return turn, newton_steps(jacobian[None], residual[None])[0]
 
 
-def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
+def _damped_on_host(
+    map: ReturnMap, max_steps: int
+) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Levenberg-Marquardt steps, with the constants of optimistix."""
     sizes, least, damping, best = map.sizes, np.inf, 1.0, None
     x, step = map.anchor.q[:, 0] / sizes, 0.0
@@ -220,7 +267,9 @@ def _damped_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, n
         residual = turn.residual / sizes
         if (size := np.linalg.norm(residual)) < least:
             x, least, damping, best = x + step, size, damping / 3.5, turn
-            jacobian = np.vstack([turn.jacobian * sizes / sizes[:, None], np.eye(len(x))])
+            jacobian = np.vstack(
+                [turn.jacobian * sizes / sizes[:, None], np.eye(len(x))]
+            )
             error = np.append(residual, 0 * x)
         elif best is None:  # (no turn closes from here)
             break
@@ -243,11 +292,20 @@ def _root(map, damped, max_steps):
     else:
         solver = optx.Newton(rtol=RTOL, atol=ATOL, linear_solver=_linear_solver())
     solution = optx.root_find(
-        _residual, solver, map.anchor.q[:, 0] / map.sizes, map,
-        has_aux=True, max_steps=max_steps, throw=False,
-    )  # fmt: skip
+        _residual,
+        solver,
+        map.anchor.q[:, 0] / map.sizes,
+        map,
+        has_aux=True,
+        max_steps=max_steps,
+        throw=False,
+    )
     # An integer of JAX, not a weakly typed one, for which later programs would compile again.
-    return solution.value * map.sizes, solution.aux, jnp.asarray(solution.stats["num_steps"], int)
+    return (
+        solution.value * map.sizes,
+        solution.aux,
+        jnp.asarray(solution.stats["num_steps"], int),
+    )
 
 
 @_root.def_jvp
@@ -263,9 +321,13 @@ def _root_jvp(primals, tangents):
     # (The steps of the last turn are taken again: a search would take as long to compile.)
     again = lambda map: map.turn(q, turn.record).residual  # noqa: E731
     _, by_parameters = eqx.filter_jvp(again, (map,), (t_map,))
-    jacobian = map.turn_with_jacobian(q, record=turn.record).jacobian * sizes / sizes[:, None]
+    jacobian = (
+        map.turn_with_jacobian(q, record=turn.record).jacobian * sizes / sizes[:, None]
+    )
     operator = lx.MatrixLinearOperator(jacobian)
-    step = lx.linear_solve(operator, by_parameters / sizes, _linear_solver(), throw=False)
+    step = lx.linear_solve(
+        operator, by_parameters / sizes, _linear_solver(), throw=False
+    )
     nothing = jax.tree_util.tree_map(lambda _: None, (turn, steps))
     return (q, turn, steps), (-step.value * sizes, *nothing)
 

@@ -21,7 +21,15 @@ from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease, one_program
-from .._core.executor import Array, is_traced, namespace, on_host, stop_gradient, svdvals, to_host
+from .._core.executor import (
+    Array,
+    is_traced,
+    namespace,
+    on_host,
+    stop_gradient,
+    svdvals,
+    to_host,
+)
 from .._core.results import Result
 from .._core.signal import unit_of
 from .._core.text import number
@@ -128,7 +136,10 @@ class Coupling(eqx.Module):
         grid = (np.arange(steps + 1) - 0.5) / steps
         sign, value = np.sign(self(grid)), lambda x: float(self([x])[0])
         crossed = np.flatnonzero(sign[:-1] * sign[1:] < 0)
-        roots = [optimize.brentq(value, *grid[k : k + 2], full_output=True)[0] for k in crossed]
+        roots = [
+            optimize.brentq(value, *grid[k : k + 2], full_output=True)[0]
+            for k in crossed
+        ]
         return tuple(Locked(x % 1.0, float(self._slope([x])[0])) for x in roots)
 
 
@@ -163,7 +174,9 @@ class Responses(eqx.Module):
     surface: Float[Array, "P K d d"]
     """The effect of a push, less what sliding undoes."""
 
-    def phase(self, phase: Phases, unit: Unit = "time") -> dict[str, Float[Array, " p"]]:
+    def phase(
+        self, phase: Phases, unit: Unit = "time"
+    ) -> dict[str, Float[Array, " p"]]:
         """Change of the phase after a brief push at some phases, by names of states and inputs.
 
         For a state, it is the change of phase per change of the state; for an input, per unit of
@@ -172,7 +185,11 @@ class Responses(eqx.Module):
 
         **Raises:** `DefinitionError` for a cycle that is driven by a clock.
         """
-        scale = {"time": 1.0, "cycles": 1 / self.period, "radians": 2 * np.pi / self.period}[unit]
+        scale = {
+            "time": 1.0,
+            "cycles": 1 / self.period,
+            "radians": 2 * np.pi / self.period,
+        }[unit]
         return self._named(self._covector(None), phase, scale)
 
     def amplitude(self, mode: Index, phase: Phases) -> dict[str, Inexact[Array, " p"]]:
@@ -196,7 +213,11 @@ class Responses(eqx.Module):
         place = xp.argsort(self.flow.event < 0, stable=True)
         phases = (self.flow.turn + self.flow.length) / self.period
         return tuple(
-            Impulse(s.transitions[g].name, phases[k], dict(zip(s.inputs, weight[k], strict=True)))
+            Impulse(
+                s.transitions[g].name,
+                phases[k],
+                dict(zip(s.inputs, weight[k], strict=True)),
+            )
             for g, k in zip(self.event_sequence, place, strict=False)
         )
 
@@ -214,8 +235,12 @@ class Responses(eqx.Module):
         phase = (flow.t - flow.t[0, 0]) / period
         tail = np.where(flow.event >= 0, np.nan, pushed[:, -1]) / period
         pairs = (phase, phase[:, -1]), (pushed / period, tail)
-        phase, values = (np.concatenate([x, y[:, None]], axis=1).ravel() for x, y in pairs)
-        return PhaseCurve(phase, values, signal, time_unit=self.structure.system.time_unit)
+        phase, values = (
+            np.concatenate([x, y[:, None]], axis=1).ravel() for x, y in pairs
+        )
+        return PhaseCurve(
+            phase, values, signal, time_unit=self.structure.system.time_unit
+        )
 
     def coupling(
         self, push: Callable | str, input: str | None = None, harmonics: Count = 64
@@ -237,7 +262,9 @@ class Responses(eqx.Module):
         parts, (x, weight) = 1 + harmonics // 2, np.polynomial.legendre.leggauss(NODES)
         x = ((np.arange(parts)[:, None] + (x + 1) / 2) / parts).ravel()
         phase = ((flow.turn[:, None] + flow.length[:, None] * x) / period).ravel()
-        weight = (flow.length[:, None] / period * np.tile(weight / 2 / parts, parts)).ravel()
+        weight = (
+            flow.length[:, None] / period * np.tile(weight / 2 / parts, parts)
+        ).ravel()
         chart, Z, states = flow.at(phase, period, pushed, flow.q)
         if isinstance(push, str):
             require_among("state", [push], self.structure.state_names(), "`push`: ")
@@ -251,7 +278,9 @@ class Responses(eqx.Module):
             response += xp.exp(-2j * np.pi * n * x.phase) * x.weight[signal] / period
         c = xp.conj(response) * wave / period
         if on_host(c) and np.abs(c[len(c) * 3 // 4 :]).max() > 1e-3 * np.abs(c).max():
-            raise DefinitionError(f"`harmonics` = {harmonics} does not resolve jumps of the push.")
+            raise DefinitionError(
+                f"`harmonics` = {harmonics} does not resolve jumps of the push."
+            )
         return Coupling(c)
 
     def __repr__(self):
@@ -259,7 +288,9 @@ class Responses(eqx.Module):
         if is_traced(self):
             return f"Responses({name}, traced)"
         kinds = ["no phase (driven by a clock)" if self.of_phase is None else "phase"]
-        kinds += [f"amplitude {k}: exponent {number(x)}" for k, x in enumerate(self.exponents)]
+        kinds += [
+            f"amplitude {k}: exponent {number(x)}" for k, x in enumerate(self.exponents)
+        ]
         if self.left_out:
             kinds.append(f"{self.left_out} faster modes left out")
         acting = self.flow.event[np.any(self.flow.jumps.by_input, axis=(1, 2))]
@@ -267,11 +298,15 @@ class Responses(eqx.Module):
             names = dict.fromkeys(self.structure.transitions[g].name for g in acting)
             kinds.append(f"inputs act at {', '.join(names)}: see `impulses()`")
         period = number(self.period, 9, self.structure.system.time_unit)
-        return f"Responses({name}: period {period})" + "".join(f"\n  {x}" for x in kinds)
+        return f"Responses({name}: period {period})" + "".join(
+            f"\n  {x}" for x in kinds
+        )
 
     def _pushed(self, name: str | None) -> tuple[str, Float[Array, "P K"]]:
         """An input (Default: the first), and the response of the phase to it at the nodes."""
-        (name, *_), columns = self.structure.inputs_among(name if name is None else [name])
+        (name, *_), columns = self.structure.inputs_among(
+            name if name is None else [name]
+        )
         by_input = self.flow.by_input[..., columns[0]]
         return name, namespace(by_input).sum(self._covector(None) * by_input, axis=-1)
 
@@ -312,7 +347,9 @@ def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
     _, Z = loop(map, whole, flow.field[0, 0])
     whole = whole - flow.field[0, 0, :, None] * Z
     if modes is None and not host:
-        raise DefinitionError("`responses` needs the number of `modes` inside of `grad` and `jvp`.")
+        raise DefinitionError(
+            "`responses` needs the number of `modes` inside of `grad` and `jvp`."
+        )
     values, right, left = _modes(whole, map.sizes, modes)
     exponents = xp.log(values + 0j) / period
     phase = None if clocked else flow.covectors(Z[:, None])[..., 0]
@@ -324,16 +361,29 @@ def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
         slip = xp.einsum("rpki,pki->rpk", amplitudes, flow.field)
         amplitudes = amplitudes - slip[..., None] * phase
     if host and not np.any(np.iscomplex(exponents)):
-        amplitudes, right, exponents = (np.real(x) for x in (amplitudes, right, exponents))
+        amplitudes, right, exponents = (
+            np.real(x) for x in (amplitudes, right, exponents)
+        )
     total = int(np.sum(map.valid)) - (not clocked) if host else len(values)
     off = surface(map.structure, flow)
     return Responses(
-        map.structure, flow, period, values, exponents, right, total - len(values),
-        cycle.event_sequence, phase, amplitudes, off,
-    )  # fmt: skip
+        map.structure,
+        flow,
+        period,
+        values,
+        exponents,
+        right,
+        total - len(values),
+        cycle.event_sequence,
+        phase,
+        amplitudes,
+        off,
+    )
 
 
-def asymptotic_phase(cycle: Any, chart: str, state: Float[np.ndarray, " n"], turns: int) -> float:
+def asymptotic_phase(
+    cycle: Any, chart: str, state: Float[np.ndarray, " n"], turns: int
+) -> float:
     """The asymptotic phase of a state (see `LimitCycle.asymptotic_phase`)."""
     map, period = cycle.return_map, float(cycle.period)
     s, a = map.structure, map.structure.chart_index(chart)
@@ -342,7 +392,9 @@ def asymptotic_phase(cycle: Any, chart: str, state: Float[np.ndarray, " n"], tur
     near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase
     surface = getattr(s.charts[a], "surface", None)
     if surface is not None and abs(float(surface(map.anchor.t[0], state))) > near:
-        raise DefinitionError(f"`state` does not lie on the surface on which '{chart}' slides.")
+        raise DefinitionError(
+            f"`state` does not lie on the surface on which '{chart}' slides."
+        )
     for _ in range(turns):
         target = toward(np.full(1, np.inf), -1, lanes.t + 3 * period)
         target = to_section(target, map.base, map.event)
@@ -395,7 +447,9 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
         kept = int(np.sum(np.abs(values) > _LEAST))
         count = kept if count is None else count
         if count > kept:
-            raise DefinitionError(f"{count} modes were asked for; {kept} have amplitudes.")
+            raise DefinitionError(
+                f"{count} modes were asked for; {kept} have amplitudes."
+            )
     modes = [_mode(scaled, size, values[k], right[:, k]) for k in order[:count]]
     if not modes:
         return values[:0], right[:0], right[:0]
@@ -419,7 +473,10 @@ def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
         return x - step[:n], value - step[n]
 
     *_, rows = xp.linalg.svd(still.T - value * np.eye(n))  # the last is contracted most
-    (right, root), (left, _) = pair(M, still, right), pair(M.T, still.T, xp.conj(rows[-1]))
+    (right, root), (left, _) = (
+        pair(M, still, right),
+        pair(M.T, still.T, xp.conj(rows[-1])),
+    )
     if on_host(M):
         apart = np.abs(left @ right) / (np.linalg.norm(left) * np.linalg.norm(right))
         if not apart > SINGULAR:
@@ -428,7 +485,9 @@ def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
                 "ask for the phase alone by `modes=0`, or change a parameter."
             )
     largest, left = left[xp.argmax(xp.abs(left))], left / size
-    left = left * xp.conj(largest) / xp.abs(largest) / xp.sqrt(xp.sum(xp.abs(left) ** 2))
+    left = (
+        left * xp.conj(largest) / xp.abs(largest) / xp.sqrt(xp.sum(xp.abs(left) ** 2))
+    )
     return root, right * size / (left @ (right * size)), left
 
 

@@ -16,7 +16,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import at_ease
-from .._core.executor import namespace, on_host, put, scan, stop_gradient, svdvals, to_host
+from .._core.executor import (
+    namespace,
+    on_host,
+    put,
+    scan,
+    stop_gradient,
+    svdvals,
+    to_host,
+)
 from .._core.lanes import PerLane
 from .._core.memo import remembered
 from .._core.results import Result
@@ -157,7 +165,11 @@ class ReturnMap(eqx.Module):
     def event(self) -> int:
         """Index of the transition with which every turn begins and ends; -1 for none."""
         base = self.base
-        return self.structure.transition_index(base.name) if isinstance(base, AtEvent) else -1
+        return (
+            self.structure.transition_index(base.name)
+            if isinstance(base, AtEvent)
+            else -1
+        )
 
     def each(self, x: Array) -> Array:
         """Entries of lanes (on the first axis), or that of the only lane."""
@@ -169,9 +181,13 @@ class ReturnMap(eqx.Module):
             return dataclasses.replace(self, system=system)
         period = jnp.asarray(system.period(), float)
         # (With arrays of the host JAX would compile a program for each operation.)
-        expected = self.multiplicity * (to_host(period) if on_host(self.expected) else period)
+        expected = self.multiplicity * (
+            to_host(period) if on_host(self.expected) else period
+        )
         anchor = self.anchor._replace(t=self.anchor.t * (expected / self.expected))
-        return dataclasses.replace(self, system=system, anchor=anchor, expected=expected)
+        return dataclasses.replace(
+            self, system=system, anchor=anchor, expected=expected
+        )
 
     def watch(self, lanes: Lanes, target: Target) -> Watch:
         """Guards and levels at lanes, without input."""
@@ -209,7 +225,9 @@ class ReturnMap(eqx.Module):
         def flow(lanes, target, h, result, piece):
             return follow(s, lanes, u, target, piece, False).moved, None
 
-        return self.travel(q, Options(new_input=False) if record is None else flow, record)[0]
+        return self.travel(
+            q, Options(new_input=False) if record is None else flow, record
+        )[0]
 
     def turn_with_jacobian(
         self,
@@ -230,7 +248,9 @@ class ReturnMap(eqx.Module):
 
         def flow(lanes, target, h, result, piece):
             if piece is None:
-                jacobian, moved, tape = flow_jacobian(s, lanes, target, settings, h, result, wanted)
+                jacobian, moved, tape = flow_jacobian(
+                    s, lanes, target, settings, h, result, wanted
+                )
             else:
                 moved, tape = piece
                 jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
@@ -239,40 +259,78 @@ class ReturnMap(eqx.Module):
             return moved, (lanes, each(jacobian[:, 1:]), tape, Recorded(moved, steps))
 
         if on_host(q):  # (all pieces are linearized together)
-            options = Options(True, new_input=False, tangents=wanted, at_once=varied is not None)
+            options = Options(
+                True, new_input=False, tangents=wanted, at_once=varied is not None
+            )
             travelled = travelled or (*self.travel(q, options), 0.0)
             end, (legs, _, tapes), gap = travelled
             record = None
         else:
-            (end, (legs, factors, tapes, record)), gap = self.travel(q, flow, record), 0.0
+            (end, (legs, factors, tapes, record)), gap = (
+                self.travel(q, flow, record),
+                0.0,
+            )
         (ends, levels), d = self.ends().split(), s.d
         lanes, tape, ends = side_by_side((legs, tapes, ends))
         if on_host(q):
             many, ends = varied or self._structure_of(lanes), ends.with_levels(levels)
             by, at = tape_jacobian(many, lanes, ends, tape, varied is None, wanted)
-            factors = by[:, 1:, 1 : 1 + d] if varied else by[:, 1:].reshape(LEGS, *q.shape, d)
+            factors = (
+                by[:, 1:, 1 : 1 + d] if varied else by[:, 1:].reshape(LEGS, *q.shape, d)
+            )
         codes, valid = each(xp.moveaxis(tapes.code, -1, 0)), self.valid
         off, held = self.held(q, varied)
         returned = monodromy(factors)
         if varied is not None:
-            returned = np.column_stack([returned, self._by_parameter(varied, by[:, 1:], at)])
-        jacobian = xp.where(valid[..., None], returned, 0.0) - np.eye(*held.shape[-2:]) - held
+            returned = np.column_stack(
+                [returned, self._by_parameter(varied, by[:, 1:], at)]
+            )
+        jacobian = (
+            xp.where(valid[..., None], returned, 0.0) - np.eye(*held.shape[-2:]) - held
+        )
         if self.base is not None:
             f, scale = self.slopes(lanes).T, self.scale[lanes.chart]
-            factors = across(f.reshape(LEGS, *q.shape), scale.reshape(LEGS, *q.shape), factors)
-        distance = xp.max((xp.abs(end.residual) + xp.abs(off)) / self.sizes, axis=-1) + gap
-        times, meetings = each(xp.moveaxis(tapes.t, -1, 0)), self._meetings(lanes, codes)
-        legs = jax.tree_util.tree_map(lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs)
+            factors = across(
+                f.reshape(LEGS, *q.shape), scale.reshape(LEGS, *q.shape), factors
+            )
+        distance = (
+            xp.max((xp.abs(end.residual) + xp.abs(off)) / self.sizes, axis=-1) + gap
+        )
+        times, meetings = (
+            each(xp.moveaxis(tapes.t, -1, 0)),
+            self._meetings(lanes, codes),
+        )
+        legs = jax.tree_util.tree_map(
+            lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs
+        )
         factors = xp.moveaxis(factors, 0, -3)
-        return Turn(*end, jacobian, legs, factors, codes, times, distance, meetings, record, tapes)
+        return Turn(
+            *end,
+            jacobian,
+            legs,
+            factors,
+            codes,
+            times,
+            distance,
+            meetings,
+            record,
+            tapes,
+        )
 
     def _by_parameter(
-        self, varied: Varied, by: Float[np.ndarray, "K d m"], ends: Float[np.ndarray, "n K"]
+        self,
+        varied: Varied,
+        by: Float[np.ndarray, "K d m"],
+        ends: Float[np.ndarray, "n K"],
     ) -> Float[np.ndarray, " d"]:
         """Derivative of the end of a turn by a parameter, from those of its pieces by (t, q, u)."""
         later, t0 = 0.0, self.anchor.t[0]
         if self.base is None:
-            later = kernels.by_parameter_of_period(varied) * self.multiplicity / self.expected
+            later = (
+                kernels.by_parameter_of_period(varied)
+                * self.multiplicity
+                / self.expected
+            )
         column = later * t0 * by[0, :, 0] + by[0, :, -1]
         for piece in by[1:]:
             column = piece[:, 1:-1] @ column + piece[:, -1]
@@ -292,7 +350,9 @@ class ReturnMap(eqx.Module):
         code = xp.where(turn.closed & ~xp.isnan(smallest), closed, code)
         if self.base is not None:
             same = turn.legs.chart == self.each(self.anchor.chart)[..., None]
-            apart = xp.max(xp.abs(turn.legs.q - q[..., None]) / sizes[..., None], axis=-2)
+            apart = xp.max(
+                xp.abs(turn.legs.q - q[..., None]) / sizes[..., None], axis=-2
+            )
             farthest = xp.max(xp.where(same, apart, np.inf), axis=-1)
             still = farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
             extra = turn.meetings > self.multiplicity
@@ -317,25 +377,36 @@ class ReturnMap(eqx.Module):
         """
         xp, sizes = namespace(q), self.sizes
         if not self.conserved:
-            return xp.zeros_like(q), xp.zeros((*q.shape, q.shape[-1] + (varied is not None)))
+            return xp.zeros_like(q), xp.zeros(
+                (*q.shape, q.shape[-1] + (varied is not None))
+            )
         values, gradient = self.outputs(q, tuple(self.conserved), varied)
         excess = values - xp.stack(list(self.conserved.values()))
         scaled = gradient[..., : q.shape[-1]] * sizes[..., None, :]
         steep = xp.linalg.norm(scaled, axis=-1, keepdims=True)
         steep = xp.where(steep > 0, steep, 1.0)
-        back = sizes[..., None] * xp.linalg.pinv(scaled / steep) / xp.swapaxes(steep, -1, -2)
+        back = (
+            sizes[..., None]
+            * xp.linalg.pinv(scaled / steep)
+            / xp.swapaxes(steep, -1, -2)
+        )
         back = stop_gradient(back)
         return (back @ excess[..., None])[..., 0], back @ gradient
 
     def outputs(
-        self, q: Float[Array, " d"], names: tuple[str, ...], varied: Varied | None = None
+        self,
+        q: Float[Array, " d"],
+        names: tuple[str, ...],
+        varied: Varied | None = None,
     ) -> tuple[Float[Array, " c"], Float[Array, "c n"]]:
         """Outputs at the anchor's time in its chart, and their derivatives by the state, and the
         parameter of `varied`."""
         s, (t, chart, *_) = varied or self.structure, self.anchor
         outputs = lambda a, *point: kernels.outputs(s, a, names, *point)  # noqa: E731
         q = namespace(q).atleast_2d(q).T
-        by = self.each(with_derivatives(s, outputs, chart, t, q, len(names)).transpose(2, 0, 1))
+        by = self.each(
+            with_derivatives(s, outputs, chart, t, q, len(names)).transpose(2, 0, 1)
+        )
         return by[..., 0], by[..., 2 : 2 + s.d + (varied is not None)]
 
     def travel(
@@ -359,8 +430,13 @@ class ReturnMap(eqx.Module):
         lanes, each = self.departure(q), self.each  # (no `events` is `Result.OK`)
         h = xp.atleast_1d(0.5 * self.expected / LEGS)
         if isinstance(flow, Options):
-            u, begin = xp.zeros((self.structure.nu, len(h))), (lanes, stride(h), lanes.events)
-            (end, _, result), extra = through(self.structure, begin, u, ends, self.settings, flow)
+            u, begin = (
+                xp.zeros((self.structure.nu, len(h))),
+                (lanes, stride(h), lanes.events),
+            )
+            (end, _, result), extra = through(
+                self.structure, begin, u, ends, self.settings, flow
+            )
         else:
             rows = ends.time, ends.index, ends.event, ends.limit, record
             (end, _, result), extra = scan(leg, (lanes, h, lanes.events), rows)
@@ -378,7 +454,11 @@ class ReturnMap(eqx.Module):
 
     def ends(self) -> Target:
         """The ends of the pieces, as lanes; of several lanes, by piece and lane."""
-        t0, expected, xp = self.each(self.anchor.t), self.expected, namespace(self.expected)
+        t0, expected, xp = (
+            self.each(self.anchor.t),
+            self.expected,
+            namespace(self.expected),
+        )
         k = xp.arange(1, LEGS + 1).reshape(LEGS, *[1] * expected.ndim)
         if self.base is None:
             return toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
@@ -405,7 +485,9 @@ class ReturnMap(eqx.Module):
 
 
 def across(
-    f: Float[Array, "K *b d"], sizes: Float[Array, "K *b d"], factors: Float[Array, "K *b d d"]
+    f: Float[Array, "K *b d"],
+    sizes: Float[Array, "K *b d"],
+    factors: Float[Array, "K *b d d"],
 ) -> Float[Array, "K *b d d"]:
     """Factors of an autonomous system on the states modulo the direction f of the flow.
 
@@ -445,4 +527,6 @@ def with_derivatives(
 
 def turn_product(factors: Float[np.ndarray, "S K d d"]) -> Float[np.ndarray, "S d d"]:
     """Products of the factors of S turns, on the host."""
-    return ft.reduce(lambda product, factor: factor @ product, np.moveaxis(factors, 1, 0))
+    return ft.reduce(
+        lambda product, factor: factor @ product, np.moveaxis(factors, 1, 0)
+    )

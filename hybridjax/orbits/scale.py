@@ -66,7 +66,9 @@ def sizes_near(
     """
     points = _reached(s, chart, t, q)
     reached = np.flatnonzero(np.isfinite(points).all(axis=1))
-    reached = np.roll(reached, -int(np.argmax(reached == chart)))  # the guess's chart first
+    reached = np.roll(
+        reached, -int(np.argmax(reached == chart))
+    )  # the guess's chart first
     # Of the clock's phases an odd number, since an even one may repeat a symmetry.
     phases = np.zeros(1) if period is None else period * np.arange(7) / 7
     R, n = len(reached), len(phases)
@@ -99,7 +101,9 @@ def given_sizes(s: Structure, scale: Mapping[str, float] | None) -> Sizes:
 
 
 def scale_of(
-    s: Structure, sizes: Mapping[str, float], otherwise: Float[ArrayLike, "A d"] | None = None
+    s: Structure,
+    sizes: Mapping[str, float],
+    otherwise: Float[ArrayLike, "A d"] | None = None,
 ) -> Float[Array, "A d"]:
     """Sizes by chart, padded, as in `Settings.scale`. States whose names are not among the `sizes`
     take those of another such array, or 1."""
@@ -114,7 +118,11 @@ def scale_of(
 def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
     """Sizes by name, from `Settings.scale`."""
     by_chart, charts = np.asarray(scale), list(enumerate(s.charts))
-    return {n: float(by_chart[a, k]) for a, c in reversed(charts) for k, n in enumerate(c.states)}
+    return {
+        n: float(by_chart[a, k])
+        for a, c in reversed(charts)
+        for k, n in enumerate(c.states)
+    }
 
 
 def stiff_charts(s: Structure, legs: Lanes, period: float) -> dict[str, float]:
@@ -205,8 +213,14 @@ def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
     moved = q[..., None] * (1 + eps * shifts[:, None])
     later = t[:, None] * (1 + eps * np.append(np.zeros(len(_SHIFTS) + 1), _SHIFTS))
     u = np.zeros((s.nu, 1))
-    rows = kernels.field(s, a, later.ravel(), moved.reshape(n, -1), u).reshape(n, -1, *later.shape)
-    values, by_time, derivative = rows[:, 0], rows[:, 1, :, :1], rows[:, 2 : 2 + n, :, 0]
+    rows = kernels.field(s, a, later.ravel(), moved.reshape(n, -1), u).reshape(
+        n, -1, *later.shape
+    )
+    values, by_time, derivative = (
+        rows[:, 0],
+        rows[:, 1, :, :1],
+        rows[:, 2 : 2 + n, :, 0],
+    )
     f = values[..., 0]
     change = by_time[..., 0] + np.einsum("ijk,jk->ik", derivative, f)
     smooth = np.einsum("ijk,jks->iks", derivative, moved - q[..., None])
@@ -217,7 +231,9 @@ def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
     in_time = in_time - 2 * eps * np.abs(by_time * t[:, None])
     # A field that jumps with the clock jumps on one side of a time only: earlier, or later.
     sides = [x.max(axis=-1) for x in np.split(in_time, 2, axis=-1)]
-    rounding = np.maximum(by_state.max(axis=-1), np.minimum(*sides))  # without a shift it is zero
+    rounding = np.maximum(
+        by_state.max(axis=-1), np.minimum(*sides)
+    )  # without a shift it is zero
     return _Fields(f, change, derivative, rounding)
 
 
@@ -247,7 +263,9 @@ def _time_scale(q: Float[np.ndarray, "d K"], near: _Fields) -> float:
     return float(min(times[(times > 0) & (times < np.inf)], default=1.0))
 
 
-def _by_name(s: Structure, chart: Int[np.ndarray, " K"], size: Float[np.ndarray, "d K"]) -> Sizes:
+def _by_name(
+    s: Structure, chart: Int[np.ndarray, " K"], size: Float[np.ndarray, "d K"]
+) -> Sizes:
     """The largest size of each state in any chart; 1 for one that is zero everywhere."""
     sizes = dict.fromkeys(s.state_names(), 0.0)
     for a, column in zip(chart, size.T, strict=True):

@@ -78,7 +78,12 @@ def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
 @one_program
 def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     map, period, events = cycle.return_map, cycle.period, cycle.event_sequence
-    s, xp, f0, clocked = map.structure, namespace(flow.q), flow.field[0, 0], map.base is None
+    s, xp, f0, clocked = (
+        map.structure,
+        namespace(flow.q),
+        flow.field[0, 0],
+        map.base is None,
+    )
     # The parameter is an input of frequency 0; the other columns are those of the state at phase 0.
     starts, late, total = (x[..., 0] for x in flow.driven(xp.ones((*flow.t.shape, 1))))
     whole = xp.where(map.valid[:, None] & map.valid, total[:, 1:], 0.0)
@@ -86,13 +91,19 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     longer = -(Z @ total[:, 0])
     if clocked:
         longer = map.multiplicity * kernels.by_parameter_of_period(varied)
-        if on_host(whole) and svdvals(closed * map.sizes / map.sizes[:, None])[-1] < SINGULAR:
+        if (
+            on_host(whole)
+            and svdvals(closed * map.sizes / map.sizes[:, None])[-1] < SINGULAR
+        ):
             raise ComputationError(
                 "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
                 "branch by `continuation`."
             )
     begin = xp.linalg.solve(closed, -(total[:, 0] + f0 * longer))
-    starts, late = starts[..., 0] + starts[..., 1:] @ begin, late[:, 0] + late[:, 1:] @ begin
+    starts, late = (
+        starts[..., 0] + starts[..., 1:] @ begin,
+        late[:, 0] + late[:, 1:] @ begin,
+    )
     change = xp.einsum("pkab,pb->pka", flow.forward[0], starts)
     change = change + xp.sum(flow.pushed[..., 0, :], axis=-1)
     if not clocked:  # phase 0 stays on the section
@@ -107,7 +118,9 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     times = late[place]
     wrapped = xp.concatenate([times[1:], times[:1] + longer]) - times
     names = tuple(s.transitions[g].name for g in events)
-    return Sensitivity(varied.parameter, longer, names, times, wrapped, s, flow, period, change)
+    return Sensitivity(
+        varied.parameter, longer, names, times, wrapped, s, flow, period, change
+    )
 
 
 def section_delay(

@@ -37,11 +37,15 @@ def newton_steps(
     NaN for systems that are not finite."""
     step = np.full(residual.shape, np.nan)
     good = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
-    step[good] = -(np.linalg.pinv(jacobian[good], rcond=rcond) @ residual[good, :, None])[..., 0]
+    step[good] = -(
+        np.linalg.pinv(jacobian[good], rcond=rcond) @ residual[good, :, None]
+    )[..., 0]
     return step
 
 
-def excess(q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]) -> Float[np.ndarray, " S"]:
+def excess(
+    q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]
+) -> Float[np.ndarray, " S"]:
     """The largest part of each step relative to the tolerance of `solve`, all in sizes."""
     return np.max(np.abs(step) / (ATOL + RTOL * np.abs(q)), axis=1)
 
@@ -118,7 +122,9 @@ def one_by_one(x: np.ndarray) -> np.ndarray:
     return np.moveaxis(x, -1, 0)[..., None]
 
 
-def follow_moves(map: ReturnMap, begin: Lanes, ends: Target, expected: Moves) -> tuple | None:
+def follow_moves(
+    map: ReturnMap, begin: Lanes, ends: Target, expected: Moves
+) -> tuple | None:
     """The flow to one of the `ends` after the other, where its moves are known but for rounding:
     each is a lane of one search. None if one does not end as the next one begins.
 
@@ -129,26 +135,40 @@ def follow_moves(map: ReturnMap, begin: Lanes, ends: Target, expected: Moves) ->
     """
     s, moves, settings = map.structure, expected, map.settings
     code, piece, later = moves.code, moves.lane, np.append(moves.t[1:], np.inf)
-    time = np.where(code == ARRIVE_TIME, ends.time[piece], np.where(code == MOVE, later, np.inf))
+    time = np.where(
+        code == ARRIVE_TIME, ends.time[piece], np.where(code == MOVE, later, np.inf)
+    )
     timed = np.isfinite(time)
-    index, event = (np.broadcast_to(x, ends.time.shape)[piece] for x in (ends.index, ends.event))
+    index, event = (
+        np.broadcast_to(x, ends.time.shape)[piece] for x in (ends.index, ends.event)
+    )
     target = dataclasses.replace(
-        ends, time=time, index=index, event=np.where(code >= 0, code, event).astype(np.int32),
+        ends,
+        time=time,
+        index=index,
+        event=np.where(code >= 0, code, event).astype(np.int32),
         limit=np.where(timed, np.nextafter(time, np.inf), moves.t + 2 * moves.h),
-    )  # fmt: skip
+    )
     lanes = start_lanes(s, moves.t, moves.chart.astype(np.int32), moves.q)
     lanes = arm(s, lanes, map.watch(lanes, until(lanes.t)), map.expected)
-    lanes = lanes._replace(events=begin.events + np.cumsum(code >= 0, dtype=np.int32) - (code >= 0))
+    lanes = lanes._replace(
+        events=begin.events + np.cumsum(code >= 0, dtype=np.int32) - (code >= 0)
+    )
     lanes.armed[:, :1] = begin.armed
     # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
-    h = np.where(timed, np.where(moves.h > 0, 2 * moves.h, map.expected), 1.01 * moves.h)
+    h = np.where(
+        timed, np.where(moves.h > 0, 2 * moves.h, map.expected), 1.01 * moves.h
+    )
     setout = stride(h)._replace(lead=0 * h)
     if has_implicit(s):  # (a deviation goes on until a piece ends or an event happens)
         along, (_, by) = deviation(s, lanes, settings), linear_moves(s, moves, ends)
         for k in np.flatnonzero((np.diff(piece) == 0) & (code[:-1] < 0)):
             along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
         setout = setout._replace(along=along)
-    u, options = np.zeros((s.nu, len(code))), Options(True, new_input=False, tangents=True)
+    u, options = (
+        np.zeros((s.nu, len(code))),
+        Options(True, new_input=False, tangents=True),
+    )
     for _ in range(2):
         moved, tape = move(s, lanes, u, target, settings, setout, None, options)
         end, in_chart = moved.lanes, belongs(s, lanes.chart)[:-1, 1:]
@@ -169,5 +189,7 @@ def follow_moves(map: ReturnMap, begin: Lanes, ends: Target, expected: Moves) ->
     legs = jax.tree_util.tree_map(lambda x: x[..., first], lanes)
     moved = jax.tree_util.tree_map(lambda x: x[..., last], moved)
     on_the_way = (tape.code == ARRIVE_TIME) & (code == MOVE)
-    tape = regrouped(tape._replace(code=np.where(on_the_way, MOVE, tape.code)), piece, legs)
+    tape = regrouped(
+        tape._replace(code=np.where(on_the_way, MOVE, tape.code)), piece, legs
+    )
     return legs, moved, tape, gap

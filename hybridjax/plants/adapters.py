@@ -12,7 +12,13 @@ import numpy as np
 
 from .._core.arguments import package, require_among
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, FilePath, NewOptionalNames, Positive, SignalNames
+from .._core.boundary.kinds import (
+    Count,
+    FilePath,
+    NewOptionalNames,
+    Positive,
+    SignalNames,
+)
 from ..errors import ComputationError, DefinitionError
 
 
@@ -63,7 +69,9 @@ class MuJoCoPlant(_Made):
     def __post_init__(self) -> None:
         mujoco, model = package("mujoco"), self.model
         if not isinstance(model, mujoco.MjModel):
-            raise DefinitionError("`model` must be a `mujoco.MjModel`: see `from_xml_path`.")
+            raise DefinitionError(
+                "`model` must be a `mujoco.MjModel`: see `from_xml_path`."
+            )
         actuators = [model.actuator(i).name for i in range(model.nu)]
         require_among("actuator", list(self.inputs), actuators, "MuJoCoPlant: ")
         self._actuators = [actuators.index(name) for name in self.inputs]
@@ -71,19 +79,25 @@ class MuJoCoPlant(_Made):
         joints = [model.joint(i).name or f"joint{i}" for i in range(model.njnt)]
         sensors = [model.sensor(i).name or f"sensor{i}" for i in range(model.nsensor)]
         q = _numbered(joints, np.diff([*model.jnt_qposadr, model.nq]))
-        v = _numbered([f"{x}_rate" for x in joints], np.diff([*model.jnt_dofadr, model.nv]))
+        v = _numbered(
+            [f"{x}_rate" for x in joints], np.diff([*model.jnt_dofadr, model.nv])
+        )
         self._names = [*q, *v, *_numbered(sensors, model.sensor_dim)]
         self.states = ("time", *q, *v, *(f"act{i}" for i in range(model.na)))
         # (With the memory of controllers, and where the solver of contacts begins.)
         self._kept = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         # The positions of bodies, contacts and sensors belong to the present state after `mj_step1`
         # but not after `mj_step`. (Those of 1, Runge-Kutta, cannot be divided.)
-        self._integrate = mujoco.mj_step if model.opt.integrator == 1 else mujoco.mj_step2
+        self._integrate = (
+            mujoco.mj_step if model.opt.integrator == 1 else mujoco.mj_step2
+        )
         self._mujoco = mujoco
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin at the first keyframe."""
-        self._mujoco.mj_resetDataKeyframe(self.model, self.data, 0)  # (or `qpos0` if there is none)
+        self._mujoco.mj_resetDataKeyframe(
+            self.model, self.data, 0
+        )  # (or `qpos0` if there is none)
         self._mujoco.mj_step1(self.model, self.data)
         return self._observe()
 
@@ -91,7 +105,9 @@ class MuJoCoPlant(_Made):
         """Hold the inputs for some time."""
         model, data, whole = self.model, self.data, self.dt / self.substeps
         steps = int(duration / whole + 1e-9)
-        for h in [whole] * steps + [duration - steps * whole] * (duration > (steps + 1e-9) * whole):
+        for h in [whole] * steps + [duration - steps * whole] * (
+            duration > (steps + 1e-9) * whole
+        ):
             model.opt.timestep = h
             data.ctrl[:] = 0.0 if self.control is None else self.control(model, data)
             data.ctrl[self._actuators] += u
@@ -148,11 +164,18 @@ class FMUPlant(_Made):
         except Exception:  # (of many kinds)
             can = None
         if can is None:
-            raise DefinitionError(f"'{self.file}' is no FMU of FMI 2.0 for co-simulation.")
+            raise DefinitionError(
+                f"'{self.file}' is no FMU of FMI 2.0 for co-simulation."
+            )
         self.fixed_step = not can.canHandleVariableCommunicationStepSize
-        real, names = {x.name: x for x in about.modelVariables if x.type == "Real"}, self.signals
+        real, names = (
+            {x.name: x for x in about.modelVariables if x.type == "Real"},
+            self.signals,
+        )
         require_among("real variable", [*self.inputs, *names], real, "FMUPlant: ")
-        self._at = [[real[x].valueReference for x in group] for group in (self.inputs, names)]
+        self._at = [
+            [real[x].valueReference for x in group] for group in (self.inputs, names)
+        ]
         self.units = {x: real[x].unit for x in names if real[x].unit}
         folder = fmpy.extract(self.file)
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
@@ -219,5 +242,7 @@ class GymnasiumPlant(_Made):
         action = action.astype(self._made.action_space.dtype)
         self._z, _, terminated, truncated, _ = self._made.step(action)
         if terminated or truncated:
-            raise ComputationError(f"the episode was {'terminated' if terminated else 'truncated'}")
+            raise ComputationError(
+                f"the episode was {'terminated' if terminated else 'truncated'}"
+            )
         return dict(zip(self.signals, self._z.tolist(), strict=True))

@@ -57,7 +57,9 @@ class Returns(MultiplierEstimate):
 
     def _about(self) -> str:
         more = f"{len(self.coordinates) - len(self.multipliers)} more below {self.bound:.1g}"
-        return f"{more}; {len(self.coordinates)} coordinates, residual {self.residual:.1g}"
+        return (
+            f"{more}; {len(self.coordinates)} coordinates, residual {self.residual:.1g}"
+        )
 
 
 class Recorded(system.HybridSystem):
@@ -84,9 +86,13 @@ class _Map:
     def __init__(self, cycle: Any, names: Any = None):
         self.drive, plant = cycle.drive, cycle.plant
         if not self.drive.sets or self.drive.fixed:
-            raise DefinitionError("use a plant whose state can be set, with steps of any size.")
+            raise DefinitionError(
+                "use a plant whose state can be set, with steps of any size."
+            )
         self.base = np.array(cycle.state, float)
-        states = tuple(getattr(plant, "states", [f"x{i}" for i in range(self.base.size)]))
+        states = tuple(
+            getattr(plant, "states", [f"x{i}" for i in range(self.base.size)])
+        )
         period = getattr(plant, "period", None)
         timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
         names = names or [x for x in states if not (timeless and x == "time")]
@@ -101,13 +107,17 @@ class _Map:
         self(self.x, points)
         rows = np.array([x.state for x in points], float)[:, self.columns]
         size, top = np.ptp(rows, axis=0), np.abs(rows).max(axis=0)
-        self.size = np.where(size > 1e-9 * top, size, np.where(self.x, np.abs(self.x), 1.0))
+        self.size = np.where(
+            size > 1e-9 * top, size, np.where(self.x, np.abs(self.x), 1.0)
+        )
         self.noise = self._noise()
         # Steps at which noise and the error of fourth order are nearly equal for a function of unit
         # derivatives; at most one percent of the range.
         self.h = self.size * min((self.noise / self.size).max() ** 0.2 / 2, 0.01)
 
-    def __call__(self, x: Float[np.ndarray, " d"], points: Any = None) -> Float[np.ndarray, " d"]:
+    def __call__(
+        self, x: Float[np.ndarray, " d"], points: Any = None
+    ) -> Float[np.ndarray, " d"]:
         """Return the coordinates after one cycle, and append the points of its steps."""
         state, drive = self.base.copy(), self.drive
         state[self.columns] = x
@@ -128,13 +138,17 @@ class _Map:
         signs = np.random.default_rng(0).choice([-1, 1], (3, len(self.x)))
         for along in np.array([[1e-6], [1e-4], [1e-3]]) * self.size * signs:
             line = [self(self.x + j * along) for j in range(-7, 8)]
-            noise = np.maximum(noise, np.sqrt((np.diff(line, 4, axis=0) ** 2 / 70).mean(axis=0)))
+            noise = np.maximum(
+                noise, np.sqrt((np.diff(line, 4, axis=0) ** 2 / 70).mean(axis=0))
+            )
         return noise
 
     def slopes(self, steps: float) -> Any:
         """Return central differences of second order with so many steps."""
         moves = counted(np.diag(steps * self.h), "coordinates", len(self.x))
-        return np.array([(self(self.x + e) - self(self.x - e)) / (2 * e.sum()) for e in moves]).T
+        return np.array(
+            [(self(self.x + e) - self(self.x - e)) / (2 * e.sum()) for e in moves]
+        ).T
 
     def solve(self) -> float:
         """Move x to the fixed point by Newton's method, and return the largest residual, in units
@@ -231,12 +245,16 @@ class SettledCycle:
         def run(rows: list[int]) -> Iterator[Trial]:
             items = ((self.seed + 1 + s, u[s].tolist()) for s in rows)
             many = run_all(self.drive, items, count, limit) if count else None
-            yield from counted(many or starmap(self.drive.run, items), "experiments", len(rows))
+            yield from counted(
+                many or starmap(self.drive.run, items), "experiments", len(rows)
+            )
 
         with working("run_experiments"):
             about = ""
             if store is not None:
-                self.drive.reset(self.seed)  # (its state would be another one at each call)
+                self.drive.reset(
+                    self.seed
+                )  # (its state would be another one at each call)
                 cycle = self.outputs, self.cycle_outputs, self.sections, self.seed
                 about = digest_of(self.drive.plant, *cycle, u)
             trials = resume(store, about, len(u), run)
@@ -247,7 +265,9 @@ class SettledCycle:
         causes = tuple(cause for _, cause in trials)
         failed_at = np.array([len(values) if cause else -1 for values, cause in trials])
         result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
-        simulated = Simulated(failed_at, None, self.sections.label, rows[..., -1], causes)
+        simulated = Simulated(
+            failed_at, None, self.sections.label, rows[..., -1], causes
+        )
         return ExperimentData(
             u,
             rows[..., :-1] - np.tile(self.cycle_outputs, (u.shape[1] // N, 1)),
@@ -288,9 +308,13 @@ class SettledCycle:
         error, scale = np.hypot(noise, J - coarse), map.size / map.size[:, None]
         values, coefficients, spread, bound = _resolved(J * scale, error * scale)
         # (10: eleven differences in each line.)
-        return Returns(values, coefficients, spread, 10.0, map.noise, map.names, residual, bound)
+        return Returns(
+            values, coefficients, spread, 10.0, map.noise, map.names, residual, bound
+        )
 
-    def trajectory(self, draw: Draw | None = None, u: Inputs | None = None) -> Trajectory:
+    def trajectory(
+        self, draw: Draw | None = None, u: Inputs | None = None
+    ) -> Trajectory:
         """Record the signals after each step from section 0 on, for `hj.plot.animate`.
 
         **Arguments:**
@@ -304,7 +328,11 @@ class SettledCycle:
 
         **Raises:** any other error of the plant.
         """
-        u = np.zeros((self.sections.n_sections, len(self.inputs))) if u is None else np.asarray(u)
+        u = (
+            np.zeros((self.sections.n_sections, len(self.inputs)))
+            if u is None
+            else np.asarray(u)
+        )
         drive, points, result = self.drive, list[At](), Result.OK
         drive.begin(self.seed)
         try:
@@ -316,7 +344,9 @@ class SettledCycle:
         q, t = np.array([x.z for x in points]), np.array([x.t for x in points])
         n, s = len(t), Structure(Recorded(drive.names, draw))
         rates, events = np.gradient(q, t, axis=0) if n > 1 else 0 * q, np.full(n, -1)
-        return Trajectory(s, t - t[0], np.zeros(n, int), q, q, rates, rates, events, result)
+        return Trajectory(
+            s, t - t[0], np.zeros(n, int), q, q, rates, rates, events, result
+        )
 
     def __repr__(self) -> str:
         names = f"{listed(self.inputs)} -> {listed(self.outputs)}"
@@ -387,34 +417,56 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
     start, at = turn()
     drive.longest = 2 * (at[-1].t - start.t)
     turns = [turn() for _ in range(cycles + 1)]
-    values = np.array([[[x.z[c] for c in drive.columns] for x in at] for _, at in turns])
+    values = np.array(
+        [[[x.z[c] for c in drive.columns] for x in at] for _, at in turns]
+    )
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
     drive.start, at = turns[-1]
-    half, size = len(values) // 2, np.ptp([x.z for x in points], axis=0)[list(drive.columns)]
+    half, size = (
+        len(values) // 2,
+        np.ptp([x.z for x in points], axis=0)[list(drive.columns)],
+    )
     change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
     # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
-    if cycles > 1 and (change > np.maximum(1e-4 * size, 1.6 * values.std(axis=0))).any():
-        raise ComputationError("the plant has not settled: give more `cycles` or a `guess`.")
+    if (
+        cycles > 1
+        and (change > np.maximum(1e-4 * size, 1.6 * values.std(axis=0))).any()
+    ):
+        raise ComputationError(
+            "the plant has not settled: give more `cycles` or a `guess`."
+        )
     if drive.sets:
         drive.restore(drive.start)
         change = np.abs(np.array([x.z for x in turn()[1]]) - [x.z for x in at])
         if (change[:, list(drive.columns)] > 1e-6 * size).any():
-            raise DefinitionError("`set_state` does not continue as before: save all of the state.")
+            raise DefinitionError(
+                "`set_state` does not continue as before: save all of the state."
+            )
     names, units = [drive.names[c] for c in drive.columns], getattr(plant, "units", {})
     outputs = signals(names, [units.get(name, "") for name in names])
     about = plant, family, Names(units=True, empty=True).take(plant.inputs), outputs
     period = float(np.diff([at[-1].t for _, at in turns]).mean())
-    return SettledCycle(*about, period, values.mean(axis=0), drive.start.state, drive, seed)
+    return SettledCycle(
+        *about, period, values.mean(axis=0), drive.start.state, drive, seed
+    )
 
 
 def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     """Return the sections as a plant is taken to them. An angle first makes so many turns."""
-    N, names, period = family.n_sections, drive.names, getattr(drive.plant, "period", None)
+    N, names, period = (
+        family.n_sections,
+        drive.names,
+        getattr(drive.plant, "period", None),
+    )
     items: Any = getattr(family, "items", ())
-    if items and all(isinstance(getattr(x, "function", None), str) and not x.charts for x in items):
+    if items and all(
+        isinstance(getattr(x, "function", None), str) and not x.charts for x in items
+    ):
         require_among("signal", [x.function for x in items], names, "Crossing: ")
         signs = {"falling": 1.0, "rising": -1.0}
-        rows = [(names.index(x.function), signs[x.direction], float(x.value)) for x in items]
+        rows = [
+            (names.index(x.function), signs[x.direction], float(x.value)) for x in items
+        ]
         return Phase(N, crossings=rows)
     kinds = [families.KinematicPhase, *[families.ClockPhase] * (period is not None)]
     if type(family) not in kinds or isinstance(family.anchor, Crossing):
@@ -431,7 +483,9 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     began = phase.turns
     while abs(phase.turns - began) < turns:
         if drive.t > drive.longest:
-            raise ComputationError(f"{pair} do not circle around {center}: set `center`")
+            raise ComputationError(
+                f"{pair} do not circle around {center}: set `center`"
+            )
         drive.step(drive.zero, drive.dt)
         phase.level(0, drive.t, drive.z)
     phase.sense = float(np.sign(phase.turns - began))

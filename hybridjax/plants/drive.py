@@ -91,8 +91,12 @@ class Phase:
             return sign * (z[c] - value)
         if self.axes:
             (i, a, p), (j, b, q) = self.axes
-            angle = self.sense * (math.atan2((z[j] - b) / q, (z[i] - a) / p) - self.first)
-            self.turns = angle / (2 * math.pi) + round(self.turns - angle / (2 * math.pi))
+            angle = self.sense * (
+                math.atan2((z[j] - b) / q, (z[i] - a) / p) - self.first
+            )
+            self.turns = angle / (2 * math.pi) + round(
+                self.turns - angle / (2 * math.pi)
+            )
         else:
             self.turns = (t - self.first) / self.period
         return (self.start + k / self.n - self.turns) * self.period
@@ -131,7 +135,11 @@ class Drive:
         self.sets = hasattr(plant, "get_state") and hasattr(plant, "set_state")
         self.zero = [0.0] * len(plant.inputs)
         self.t, self.warmup, self.longest = 0.0, 0.0, 1e6 * self.dt
-        self.names, self.columns, self.z = tuple[str, ...](), tuple[int, ...](), tuple[float, ...]()
+        self.names, self.columns, self.z = (
+            tuple[str, ...](),
+            tuple[int, ...](),
+            tuple[float, ...](),
+        )
         self.phase, self.start, self.last = Phase(1), At(0.0, ()), At(0.0, ())
 
     def _take(self, observation: Any, t: float) -> None:
@@ -176,12 +184,19 @@ class Drive:
         phase, began, armed = self.phase, self.t, not self.phase.crossings
         clock = not phase.axes and armed
         lands = self.sets and not self.fixed and not clock
-        last = self.last if self.last.z else At(self.t, self.z)  # (a step may cross two sections)
+        last = (
+            self.last if self.last.z else At(self.t, self.z)
+        )  # (a step may cross two sections)
         x, y = phase.level(k, last.t, last.z), phase.level(k, self.t, self.z)
         while y > 1e-9 * self.dt * clock or not armed:  # (rounding is no step)
             if self.t - began > self.longest:
-                raise ComputationError(f"a section was not reached within {self.longest:.4g}")
-            last, x = self.here() if lands or points is not None else At(self.t, self.z), y
+                raise ComputationError(
+                    f"a section was not reached within {self.longest:.4g}"
+                )
+            last, x = (
+                self.here() if lands or points is not None else At(self.t, self.z),
+                y,
+            )
             if points is not None:
                 points.append(last)
             self.step(u, min(y, self.dt) if clock and not self.fixed else self.dt)
@@ -208,7 +223,9 @@ class Drive:
         rows, ended = list[At](), ""
         try:
             if self.begun(seed) != self.begun(seed):
-                raise ComputationError("the plant is not deterministic after `reset(seed)`")
+                raise ComputationError(
+                    "the plant is not deterministic after `reset(seed)`"
+                )
             rows.append(self.begin(seed))
             for k, held in enumerate(u[:-1], 1):
                 rows.append(self.advance(held, k))
@@ -251,7 +268,9 @@ def serve() -> None:
             answers.flush()
 
 
-def run_all(drive: Drive, items: Iterable[Any], processes: int, limit: float) -> Iterator[Trial]:
+def run_all(
+    drive: Drive, items: Iterable[Any], processes: int, limit: float
+) -> Iterator[Trial]:
     """Run experiments (seed, inputs) in processes with a limit of time, and yield them in order.
     Processes that ended are replaced.
     """
@@ -267,13 +286,17 @@ def run_all(drive: Drive, items: Iterable[Any], processes: int, limit: float) ->
             answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
             local.worker, code, waits = None, worker.wait(), timer.is_alive()
-            ended = f"the process ended with code {code} (its error is on standard error)"
+            ended = (
+                f"the process ended with code {code} (its error is on standard error)"
+            )
             return [], ended if waits else f"no answer within the limit of {limit:g} s"
         finally:
             timer.cancel()
         if isinstance(answer, str):
             text = "define it in a module that can be imported, or use `processes=0`"
-            raise DefinitionError(f"another process cannot make the plant ({answer}): {text}.")
+            raise DefinitionError(
+                f"another process cannot make the plant ({answer}): {text}."
+            )
         return answer
 
     with ThreadPoolExecutor(processes) as pool:
@@ -285,28 +308,44 @@ def run_all(drive: Drive, items: Iterable[Any], processes: int, limit: float) ->
                 worker.communicate()
 
 
-def resume(file: Any, about: str, count: int, run: Callable[[list[int]], Any]) -> list[Trial]:
+def resume(
+    file: Any, about: str, count: int, run: Callable[[list[int]], Any]
+) -> list[Trial]:
     """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends.
 
     **Raises:** `DefinitionError` for a file of another kind, or in a folder that is not there.
     """
     try:
-        with contextlib.closing(sqlite3.connect(file or ":memory:", isolation_level=None)) as base:
-            base.execute("create table if not exists trials (about, s, trial, unique (about, s))")
-            kept = dict(base.execute("select s, trial from trials where about = ?", [about]))
+        with contextlib.closing(
+            sqlite3.connect(file or ":memory:", isolation_level=None)
+        ) as base:
+            base.execute(
+                "create table if not exists trials (about, s, trial, unique (about, s))"
+            )
+            kept = dict(
+                base.execute("select s, trial from trials where about = ?", [about])
+            )
             missing = [s for s in range(count) if s not in kept]
             for s, trial in zip(missing, run(missing), strict=True):
                 kept[s] = json.dumps(trial)
-                base.execute("replace into trials values (?, ?, ?)", (about, s, kept[s]))
+                base.execute(
+                    "replace into trials values (?, ?, ?)", (about, s, kept[s])
+                )
     except sqlite3.Error as error:
-        raise DefinitionError(f"'{file}' is no store of experiments ({error}).") from error
+        raise DefinitionError(
+            f"'{file}' is no store of experiments ({error})."
+        ) from error
     return [json.loads(kept[s]) for s in range(count)]
 
 
 def _start(packed: bytes, begun: list[Any]) -> Any:
     # (One thread of BLAS, because the processes use all cores.)
     path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), *sys.path]))
-    command = [sys.executable, "-c", "from hybridjax.plants.drive import serve; serve()"]
+    command = [
+        sys.executable,
+        "-c",
+        "from hybridjax.plants.drive import serve; serve()",
+    ]
     changes = {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     pipe, environment = subprocess.PIPE, os.environ | changes
     begun.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment))
@@ -330,4 +369,6 @@ def _pack(drive: Drive) -> bytes:
         return packer.dumps(drive)
     except Exception as error:
         text = "give it `__getstate__`, or use `processes=0`"
-        raise DefinitionError(f"the plant cannot be pickled ({error}): {text}.") from error
+        raise DefinitionError(
+            f"the plant cannot be pickled ({error}): {text}."
+        ) from error

@@ -20,7 +20,18 @@ from ..recordings.data import SectionData, input_spectrum
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase import Phase
 from . import look
-from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, axis_of, legend, letters, panels
+from .look import (
+    COLORS,
+    COLUMN,
+    CYCLE,
+    PAGE,
+    AxesLike,
+    Plot,
+    axis_of,
+    legend,
+    letters,
+    panels,
+)
 
 
 @checked
@@ -37,7 +48,9 @@ def phase(phase: Phase, *, ax: AxesLike | None = None) -> Plot:
             first += len(periods)
         left.axhline(phase.period, color="black", lw=0.6)
         left.set(xlabel="cycle (trials in different colors)", ylabel="period (s)")
-        right.hist(np.concatenate(rounded), 30, orientation="horizontal", color=COLORS["gray"])
+        right.hist(
+            np.concatenate(rounded), 30, orientation="horizontal", color=COLORS["gray"]
+        )
         right.tick_params(labelleft=False)
         right.set(xlabel="cycles", ylim=left.get_ylim())
         letters(axes)
@@ -56,7 +69,9 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
     values = np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in data.records])
-    at = np.concatenate([(r.first_section + np.arange(len(r.u))) % N for r in data.records])
+    at = np.concatenate(
+        [(r.first_section + np.arange(len(r.u))) % N for r in data.records]
+    )
     thin = slice(None, None, max(1, len(at) // 20000))
     f, power = input_spectrum(data)
     phase = np.arange(N) / N
@@ -65,7 +80,9 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
             average, spread, last = axes[i]
             average.plot(phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
             average.set_ylabel(axis_of(name))
-            spread.plot(at[thin] / N, x[thin], ",", color=COLORS["gray"], rasterized=True)
+            spread.plot(
+                at[thin] / N, x[thin], ",", color=COLORS["gray"], rasterized=True
+            )
             std = np.array([np.nanstd(x[at == n]) for n in range(N)])
             for sign in (-2, 2):
                 spread.plot(phase, sign * std, color=CYCLE[0])
@@ -73,7 +90,11 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
             for panel in (average, spread):
                 _powers_of_ten(panel)
             if i < nu:
-                last.semilogy(f, np.maximum(power[:, i], 1e-12 * power[:, i].max()), color=CYCLE[1])
+                last.semilogy(
+                    f,
+                    np.maximum(power[:, i], 1e-12 * power[:, i].max()),
+                    color=CYCLE[1],
+                )
                 last.set(xlabel="f (1/period)", ylabel=with_unit("power", square(name)))
             else:
                 last.plot(x[at == np.argmax(std)], lw=0.5, color=CYCLE[1])
@@ -116,9 +137,15 @@ def impulse_responses(
             for k, m in enumerate(dict.fromkeys([0, N // 4, N // 2, 3 * N // 4])):
                 band = 1.96 * responses.errors[m, :, i, pushing]
                 line = {"color": CYCLE[k % len(CYCLE)]}
-                arrow = {"marker": 9, "clip_on": False, "transform": plane.get_yaxis_transform()}
+                arrow = {
+                    "marker": 9,
+                    "clip_on": False,
+                    "transform": plane.get_yaxis_transform(),
+                }
                 plane.plot(1.0, responses.phase[m], **line, **arrow)
-                curves.plot(responses.lag, values[m], label=f"{responses.phase[m]:.2f}", **line)
+                curves.plot(
+                    responses.lag, values[m], label=f"{responses.phase[m]:.2f}", **line
+                )
                 if theory is not None:
                     curves.plot(responses.lag, theory[m, :, i, pushing], "k--", lw=0.8)
                 low, high = values[m] - band, values[m] + band
@@ -156,20 +183,26 @@ def phase_response(
             label = "model"
             if isinstance(drawn, PhaseResponse):
                 low, high = (scale * x for x in drawn.interval(drawn.phase))
-                panel.fill_between(drawn.phase, low, high, color=color, alpha=0.25, lw=0)
+                panel.fill_between(
+                    drawn.phase, low, high, color=color, alpha=0.25, lw=0
+                )
                 label = "estimated, 95 %"
             panel.plot(drawn.phase, scale * drawn.values, color=color, label=label)
             for phase in drawn.phase[np.isnan(drawn.values)]:
                 panel.axvline(phase, color=color, lw=0.8, ls=":")
         panel.axhline(0, color="black", lw=0.4)
         name = f"response to {curve.input}"
-        panel.set(xlabel="phase (cycles)", ylabel=f"{name}\n({curve.unit})", xlim=(0, 1))
+        panel.set(
+            xlabel="phase (cycles)", ylabel=f"{name}\n({curve.unit})", xlim=(0, 1)
+        )
         panel.legend()
     return Plot(axes)
 
 
 @checked
-def experiment(data: ExperimentData, index: int = 0, *, ax: AxesLike | None = None) -> Plot:
+def experiment(
+    data: ExperimentData, index: int = 0, *, ax: AxesLike | None = None
+) -> Plot:
     """Inputs and deviations of the outputs of one experiment, against time in cycles.
 
     One row per signal; cycles before the window that estimates use are shaded, and a failed
@@ -191,7 +224,9 @@ def experiment(data: ExperimentData, index: int = 0, *, ax: AxesLike | None = No
                 panel.plot(time, values, lw=0.5, color=CYCLE[0])
             panel.set_ylabel(axis_of(name, deviation=not is_input))
             if data.window.start:
-                panel.axvspan(0, data.window.start / data.n_sections, color="0.92", zorder=0)
+                panel.axvspan(
+                    0, data.window.start / data.n_sections, color="0.92", zorder=0
+                )
             if not data.ok[index] and data.failed_at[index] >= 0:
                 panel.axvline(time[data.failed_at[index]], color=COLORS["red"], lw=0.8)
             _powers_of_ten(panel)
@@ -223,7 +258,9 @@ def validation(
     with panels(ax, ny, 3, width=PAGE, height=0.6 + 1.6 * ny) as axes:
         for i, name in enumerate(validation.outputs):
             signal, auto, cross = axes[i]
-            signal.plot(time, validation.simulated[shown, i], color=CYCLE[0], label="simulated")
+            signal.plot(
+                time, validation.simulated[shown, i], color=CYCLE[0], label="simulated"
+            )
             measured = dict(ls="", marker=".", ms=3, color="black", label="measured")
             signal.plot(time, validation.measured[shown, i], **measured)
             signal.set_ylabel(axis_of(name, deviation=True))
@@ -233,13 +270,25 @@ def validation(
             _powers_of_ten(signal)
             auto.set_ylabel("standard deviations")
             _stems(auto, 1.0, validation.autocorrelation[:, :, i], CYCLE[0], limit)
-            auto.set_title(f"residuals\n{p_value(validation.whiteness[i])}", loc="right")
+            auto.set_title(
+                f"residuals\n{p_value(validation.whiteness[i])}", loc="right"
+            )
             for j, _ in enumerate(validation.inputs):
                 color = CYCLE[(1 + j) % len(CYCLE)]
-                _stems(cross, 0.2 * j, validation.cross_correlation[:, :, i, j], color, limit)
-            cross.set_title(f"with the input\n{p_value(validation.independence[i])}", loc="right")
+                _stems(
+                    cross,
+                    0.2 * j,
+                    validation.cross_correlation[:, :, i, j],
+                    color,
+                    limit,
+                )
+            cross.set_title(
+                f"with the input\n{p_value(validation.independence[i])}", loc="right"
+            )
         if ax is None:
-            axes[0, 0].fill_between([], [], color="0.9", label="99 % band without correlation")
+            axes[0, 0].fill_between(
+                [], [], color="0.9", label="99 % band without correlation"
+            )
             legend(axes[0, 0], "upper left", ncols=3)
         axes[-1, 0].set_xlabel("time (cycles)")
         for lags in axes[-1, 1:]:

@@ -27,7 +27,9 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
     """
     signals = {*model.inputs, *model.outputs}
     if model.n_sections != plan.design.n_sections or not signals <= set(plan.rms):
-        raise DefinitionError("`model` is not the one that the plan was made for: other signals.")
+        raise DefinitionError(
+            "`model` is not the one that the plan was made for: other signals."
+        )
     with panels(ax, 2, 1, width=COLUMN, height=3.2, sharex=True) as axes:
         above, below = axes[:, 0]
         f = np.unique(plan.frequencies)
@@ -42,7 +44,9 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
             (plan.usual_power, COLORS["gray"], plan.usual_name),
             (plan.power, COLORS["red"], "optimal"),
         ):
-            amplitude = np.sqrt(2 * np.array([power[plan.frequencies == x].sum() for x in f]))
+            amplitude = np.sqrt(
+                2 * np.array([power[plan.frequencies == x].sum() for x in f])
+            )
             used = amplitude > 0
             style = dict(marker="o", ms=2, lw=0, color=color, label=label)
             below.plot(f[used], amplitude[used], **style)
@@ -79,16 +83,30 @@ def strides(
             color = CYCLE[k % len(CYCLE)]
             for number, study in enumerate(several):
                 if not study.blocks:
-                    raise DefinitionError("a study without a block has no errors: `add` data.")
+                    raise DefinitionError(
+                        "a study without a block has no errors: `add` data."
+                    )
                 error = np.linalg.norm(study.standard_errors, axis=1)
-                style = dict(label=label if number == 0 else None, color=color, zorder=2)
+                style = dict(
+                    label=label if number == 0 else None, color=color, zorder=2
+                )
                 panel.plot(study.strides, error, marker="o", ms=3, lw=0.6, **style)
                 reached += study.strides.tolist()
         around = 1.5 if studies else 10.0
         low, high = min(reached) / around, max(reached) * around
         for errors, cycles, color, label in (
-            (plan.usual_standard_errors, plan.usual.cycles(0), COLORS["gray"], plan.usual_name),
-            (plan.standard_errors, plan.strides, COLORS["black"], "optimal, model known"),
+            (
+                plan.usual_standard_errors,
+                plan.usual.cycles(0),
+                COLORS["gray"],
+                plan.usual_name,
+            ),
+            (
+                plan.standard_errors,
+                plan.strides,
+                COLORS["black"],
+                "optimal, model known",
+            ),
         ):
             n = np.array([low, high])
             size = np.linalg.norm(errors) * np.sqrt(cycles / n)

@@ -68,8 +68,13 @@ class Explorer:
 
     def __init__(self, cycle: LimitCycle, sliders: list, plane: tuple[str, str]):
         self.cycle, self.message, self._sliders, self._plane = cycle, "", sliders, plane
-        self.values = {name: float(parameter_of(cycle.system, name)) for name, *_ in sliders}
-        s, places = cycle.structure, {"left": 0.07, "right": 0.99, "bottom": 0.14, "top": 0.84}
+        self.values = {
+            name: float(parameter_of(cycle.system, name)) for name, *_ in sliders
+        }
+        s, places = (
+            cycle.structure,
+            {"left": 0.07, "right": 0.99, "bottom": 0.14, "top": 0.84},
+        )
         with style():
             # (A layout that is computed for each picture takes longer than the cycle.)
             self.figure, self._axes = pyplot.subplots(1, 3, figsize=(9.0, 3.2))
@@ -81,7 +86,9 @@ class Explorer:
             pushed = s.inputs[0] if s.nu else ""
             label = with_unit(f"$|H_0|$, {plane[0]}", ratio(plane[0], pushed))
             gain.set(xlabel=FREQUENCY, ylabel=label)
-            self._lost = self.figure.suptitle("", fontsize=8, color=COLORS["red"], wrap=True)
+            self._lost = self.figure.suptitle(
+                "", fontsize=8, color=COLORS["red"], wrap=True
+            )
         self._easel: Easel | None = None
         self._draw()
         close_in_notebook(self.figure)
@@ -103,7 +110,9 @@ class Explorer:
 
     def _follow(self, values: Mapping[str, float]) -> None:
         self.values |= {name: float(x) for name, x in values.items()}
-        begin = {name: float(parameter_of(self.cycle.system, name)) for name in self.values}
+        begin = {
+            name: float(parameter_of(self.cycle.system, name)) for name in self.values
+        }
         share, step, self.message = 0.0, 1.0, ""
         while share < 1:
             at = min(share + step, 1.0)
@@ -138,7 +147,9 @@ class Explorer:
         self._widgets = []  # (a slider that nobody holds does not move)
         for k, (name, label, low, high) in enumerate(self._sliders, 1):
             ax = window.add_axes((0.25, 1 - k / (len(self._sliders) + 1), 0.55, 0.05))
-            self._widgets.append(Slider(ax, label, low, high, valinit=self.values[name]))
+            self._widgets.append(
+                Slider(ax, label, low, high, valinit=self.values[name])
+            )
             move = lambda value, name=name: self.move({name: value})  # type: ignore[misc]  # noqa: E731
             self._widgets[-1].on_changed(move)
         pyplot.show()
@@ -163,13 +174,20 @@ class Explorer:
 
         return Sliders(asked={"values": self.values, "gain": True, "number": 0})
 
-    def _answer(self, values: Mapping[str, float], gain: bool, number: int) -> dict[str, Any]:
+    def _answer(
+        self, values: Mapping[str, float], gain: bool, number: int
+    ) -> dict[str, Any]:
         if values != self.values:
             self._follow(values)
         self._draw(gain)
         self._easel = self._easel or Easel(self.figure, self._moving, 110)
         picture = png(self._easel.image(self._moving), compress_level=1)
-        return {"picture": picture, "gain": gain, "number": number, "sliders": self._sliders}
+        return {
+            "picture": picture,
+            "gain": gain,
+            "number": number,
+            "sliders": self._sliders,
+        }
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
         try:
@@ -212,8 +230,12 @@ def explore(
         value = float(parameter_of(cycle.system, name))
         low, high = map(float, ranges.get(name, sorted((0.5 * value, 1.5 * value))))
         if not low <= value <= high or low == high:
-            raise DefinitionError(f"`ranges` of '{name}' must enclose its value, {value:.6g}.")
-        sliders.append([name, with_unit(name, unit_of_parameter(cycle.system, name)), low, high])
+            raise DefinitionError(
+                f"`ranges` of '{name}' must enclose its value, {value:.6g}."
+            )
+        sliders.append(
+            [name, with_unit(name, unit_of_parameter(cycle.system, name)), low, high]
+        )
     if not sliders:
         raise DefinitionError("explore: name one parameter or more, such as 'k'.")
     return Explorer(cycle, sliders, plane_of(cycle.structure, x, y))

@@ -53,7 +53,9 @@ class Easel:
     def image(self, moving: Sequence[Artist]) -> Image.Image:
         self._agg.restore_region(self._still)
         for artist in sorted(moving, key=lambda x: x.get_zorder()):
-            artist.draw(self._agg.get_renderer())  # (marimo gives the figure another canvas)
+            artist.draw(
+                self._agg.get_renderer()
+            )  # (marimo gives the figure another canvas)
         return Image.fromarray(np.array(self._agg.buffer_rgba())[..., :3])
 
 
@@ -70,7 +72,9 @@ def frames(
         figure.set_canvas(canvas)
     palette = Image.new("P", (1, 1))
     palette.putpalette(_PALETTE.round().astype(int).ravel().tolist())
-    return [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    return [
+        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
+    ]
 
 
 # White, that of bodies, and each of the palette in four shades, as at the borders of lines.
@@ -104,12 +108,19 @@ def player(images: Sequence[Image.Image], interval: float, alt: str) -> str:
         image.putpalette(palette)
         return png(image, optimize=True, **options)
 
-    files = [encoded(np.where(x == usual, clear, x), transparency=clear) for x in pixels]
+    files = [
+        encoded(np.where(x == usual, clear, x), transparency=clear) for x in pixels
+    ]
     return _PLAYER.format(
-        id=f"motion-{uuid.uuid4().hex[:8]}", width=images[0].width * 4 // 5, alt=alt,
-        still=encoded(usual), first=files[0], last=len(files) - 1, frames=files,
+        id=f"motion-{uuid.uuid4().hex[:8]}",
+        width=images[0].width * 4 // 5,
+        alt=alt,
+        still=encoded(usual),
+        first=files[0],
+        last=len(files) - 1,
+        frames=files,
         milliseconds=round(1000 * interval),
-    )  # fmt: skip
+    )
 
 
 def png(image: Image.Image, **options: Any) -> str:

@@ -23,9 +23,14 @@ Fit = RationalFit | StructuredFit
 Transfer = HTF | LDTP
 """HTFs, and models, whose HTFs are drawn at the frequencies of the first HTF beside them."""
 FREQUENCY = "input frequency $f$ (cycles/period)"
-_OUTPUTS = [COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")]
+_OUTPUTS = [
+    COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")
+]
 _FIT_STYLE = {"color": "black", "lw": 0.8, "ls": (0, (4, 1.5))}
-_FIT_NAMES: dict[type, str] = {RationalFit: "rational fit", StructuredFit: "structured fit"}
+_FIT_NAMES: dict[type, str] = {
+    RationalFit: "rational fit",
+    StructuredFit: "structured fit",
+}
 
 
 @checked
@@ -52,7 +57,10 @@ def magnitude(
     if not harmonics:
         raise DefinitionError("`harmonics` must hold one harmonic or more.")
     first, *_ = drawn = _exact_first(htfs)
-    name, pushed = _pick("output", output, first.outputs), _pick("input", input, first.inputs)
+    name, pushed = (
+        _pick("output", output, first.outputs),
+        _pick("input", input, first.inputs),
+    )
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
         for htf in drawn:
@@ -94,9 +102,13 @@ def harmonics(
             limits = []
             for panel, htfs in zip(row, columns.values(), strict=True):
                 magnitude(
-                    *htfs, output=output, input=input, harmonics=harmonics, decades=decades,
+                    *htfs,
+                    output=output,
+                    input=input,
+                    harmonics=harmonics,
+                    decades=decades,
                     ax=panel,
-                )  # fmt: skip
+                )
                 limits.append(panel.get_ylim())
             row[0].set_ylim(*np.max(limits, axis=0))
     return Plot(axes)
@@ -129,7 +141,9 @@ def bode(
     names = first.outputs if outputs is None else outputs
     pushed = _pick("input", input, first.inputs)
     units = [ratio(_pick("output", name, first.outputs), pushed) for name in names]
-    same = units[0] if len(set(units)) == 1 else ""  # else the label of each curve has its own
+    same = (
+        units[0] if len(set(units)) == 1 else ""
+    )  # else the label of each curve has its own
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         upper, lower = axes[:, 0]
@@ -137,17 +151,23 @@ def bode(
             color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
             label = with_unit(name, "" if same else unit)
             for htf in drawn:
-                f, values, radius = _values(htf, harmonic, name, _same(pushed, input, htf.inputs))
+                f, values, radius = _values(
+                    htf, harmonic, name, _same(pushed, input, htf.inputs)
+                )
                 size, line = np.abs(values), _line(htf, drawn, {"color": color}, label)
                 is_certain = np.full(len(f), True) if radius is None else radius < size
-                is_certain &= np.convolve(is_certain, np.ones(3))[1:-1] > 1  # of a line, no points
+                is_certain &= (
+                    np.convolve(is_certain, np.ones(3))[1:-1] > 1
+                )  # of a line, no points
                 phase = _phase(f, values, is_certain, reference)
                 reference = f[is_certain], phase[is_certain]
                 upper.plot(f, size, **line)
                 lower.plot(f, phase, **line)
                 _band(upper, f, size, radius, color, 0.3 * np.min(size))
                 if radius is not None:
-                    turn = np.degrees(np.arcsin(np.where(is_certain, radius, np.nan) / size))
+                    turn = np.degrees(
+                        np.arcsin(np.where(is_certain, radius, np.nan) / size)
+                    )
                     _band(lower, f, phase, turn, color)
             for fit in fits:
                 values = _values(fit.htf(f), harmonic, name, pushed)[1]
@@ -186,21 +206,34 @@ def bodes(
     require_among("name", fits, families, "`fits`: ")
     with _grid(columns, 2, 3.4, ax) as axes:
         for k, (family, htfs) in enumerate(columns.items()):
-            bode(*htfs, fits=fits.get(family, ()), harmonic=harmonic, input=input, ax=axes[:, k])
+            bode(
+                *htfs,
+                fits=fits.get(family, ()),
+                harmonic=harmonic,
+                input=input,
+                ax=axes[:, k],
+            )
     return Plot(axes)
 
 
 def _columns(families) -> dict[str, list[HTF]]:
-    columns = {k: (v,) if isinstance(v, Transfer) else tuple(v) for k, v in dict(families).items()}
+    columns = {
+        k: (v,) if isinstance(v, Transfer) else tuple(v)
+        for k, v in dict(families).items()
+    }
     if not columns or not all(columns.values()):
         raise DefinitionError("`families` must hold at least one HTF in each family.")
     if len({htf.outputs for htfs in columns.values() for htf in htfs}) > 1:
-        raise DefinitionError("the families must have the same outputs to share a figure.")
+        raise DefinitionError(
+            "the families must have the same outputs to share a figure."
+        )
     return {name: _exact_first(htfs) for name, htfs in columns.items()}
 
 
 @contextlib.contextmanager
-def _grid(columns, rows: int, height: float, ax: AxesLike | None) -> Iterator[np.ndarray]:
+def _grid(
+    columns, rows: int, height: float, ax: AxesLike | None
+) -> Iterator[np.ndarray]:
     """Panels with a column for each family: labels at the edges of the grid and one legend."""
     size = {"width": COLUMN if len(columns) == 1 else PAGE, "height": height}
     with panels(ax, rows, len(columns), **size, sharex=True, sharey="row") as axes:
@@ -217,7 +250,9 @@ def _grid(columns, rows: int, height: float, ax: AxesLike | None) -> Iterator[np
 def _exact_first(htfs: Sequence[Transfer]) -> list[HTF]:
     grids = [htf.f for htf in htfs if isinstance(htf, HTF)]
     if not grids:
-        raise DefinitionError("`htfs` holds no HTF to draw: of a model alone, draw `model.htf(f)`.")
+        raise DefinitionError(
+            "`htfs` holds no HTF to draw: of a model alone, draw `model.htf(f)`."
+        )
     drawn = [htf if isinstance(htf, HTF) else htf.htf(grids[0]) for htf in htfs]
     return sorted(drawn, key=lambda htf: htf.source != "exact")
 
@@ -237,7 +272,10 @@ def _values(
     """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
     hold the true values; None without a variance."""
     order = np.argsort(htf.f)
-    at = channel_index("output", output, htf.outputs), channel_index("input", input, htf.inputs)
+    at = (
+        channel_index("output", output, htf.outputs),
+        channel_index("input", input, htf.inputs),
+    )
     values, radius = np.asarray(htf[m])[(order, *at)], None
     if htf.variance is not None:
         radius = np.asarray(htf.select(m).confidence_radius())[(0, order, *at)]
@@ -271,7 +309,9 @@ def _band(ax: Axes, f, middle, radius, color: str, floor: float = -np.inf) -> No
     if radius is not None:
         radius = np.where(np.isfinite(radius), radius, np.nan)
         low = np.maximum(middle - radius, floor)
-        ax.fill_between(f, low, middle + radius, color=color, alpha=0.25, lw=0, zorder=2)
+        ax.fill_between(
+            f, low, middle + radius, color=color, alpha=0.25, lw=0, zorder=2
+        )
 
 
 def _phase(f, values, known, reference: tuple | None) -> np.ndarray:

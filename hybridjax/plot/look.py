@@ -112,18 +112,29 @@ class Plot:
 
 @contextlib.contextmanager
 def panels(
-    ax: AxesLike | None, rows: int = 1, columns: int = 1, *,
-    width: float = COLUMN, height: float = 2.6, **options,
-):  # fmt: skip
+    ax: AxesLike | None,
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    width: float = COLUMN,
+    height: float = 2.6,
+    **options,
+):
     """The grid of Axes that is given, or a new one in the package's style, (rows, columns).
 
     **Raises:** `DefinitionError` for another number of Axes.
     """
     if ax is None:
-        size: Any = {"figsize": (width, height), "layout": "constrained", "squeeze": False}
+        size: Any = {
+            "figsize": (width, height),
+            "layout": "constrained",
+            "squeeze": False,
+        }
         with style():
             axes = pyplot.subplots(rows, columns, **size, **options)[1]
-            for panel in axes.flat:  # here, since ticks are made when the figure is drawn
+            for (
+                panel
+            ) in axes.flat:  # here, since ticks are made when the figure is drawn
                 panel.tick_params(labelsize=_STYLE["xtick.labelsize"])
             yield axes
             axes[0, 0].figure.align_ylabels(axes)
@@ -142,11 +153,17 @@ def axis_of(name: str, *, deviation: bool = False) -> str:
     return with_unit(rf"$\delta$ {name}" if deviation else name, unit_of(name))
 
 
-def colored(ax: Axes, x, y, values: np.ndarray, label: str, is_size: bool = False) -> None:
+def colored(
+    ax: Axes, x, y, values: np.ndarray, label: str, is_size: bool = False
+) -> None:
     """A map in colors with a bar: around zero, or of magnitudes from zero on."""
     top = np.abs(values).max()
-    look: Any = {"cmap": "viridis", "vmin": 0} if is_size else {"cmap": "RdBu_r", "vmin": -top}
-    image = ax.pcolormesh(x, y, values, **look, vmax=top, rasterized=True, shading="nearest")
+    look: Any = (
+        {"cmap": "viridis", "vmin": 0} if is_size else {"cmap": "RdBu_r", "vmin": -top}
+    )
+    image = ax.pcolormesh(
+        x, y, values, **look, vmax=top, rasterized=True, shading="nearest"
+    )
     cast(Any, ax.figure).colorbar(image, ax=ax, label=label)
 
 
@@ -176,15 +193,21 @@ def save(
 
     **Raises:** `DefinitionError` if they cannot be written, and for a suffix of another format.
     """
-    figure = cast(Figure, plot.get_figure(root=True)) if isinstance(plot, Axes) else plot
+    figure = (
+        cast(Figure, plot.get_figure(root=True)) if isinstance(plot, Axes) else plot
+    )
     figure = figure.figure if isinstance(figure, Plot) else figure
     path = Path(path)
     if path.suffix[1:] in get_args(Format):
         path = path.with_suffix("")
     elif path.suffix[1:].isalpha():
-        raise DefinitionError(f"cannot write '{path}': formats are {', '.join(get_args(Format))}.")
+        raise DefinitionError(
+            f"cannot write '{path}': formats are {', '.join(get_args(Format))}."
+        )
     if not path.name:
-        raise DefinitionError(f"'{path}' is a folder: add the name of a file without its suffix.")
+        raise DefinitionError(
+            f"'{path}' is a folder: add the name of a file without its suffix."
+        )
     paths = tuple(path.with_name(f"{path.name}.{format}") for format in formats)
     with matplotlib.rc_context(_FONTS_IN_FILES):
         for target, format in zip(paths, formats, strict=True):
@@ -193,7 +216,9 @@ def save(
     return paths
 
 
-def save_and_close(path: FilePath, plot: Plot, formats: Sequence[Format]) -> tuple[Path, ...]:
+def save_and_close(
+    path: FilePath, plot: Plot, formats: Sequence[Format]
+) -> tuple[Path, ...]:
     """Write a figure that is not shown, and free its memory."""
     paths = save(path, plot, formats)
     pyplot.close(plot.figure)

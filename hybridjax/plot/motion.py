@@ -32,7 +32,14 @@ from ..systems.structure import Structure
 from ..systems.system import Guess
 from .film import BODY, frames, gif, player
 from .look import COLORS, CYCLE, axis_of, close_in_notebook, style
-from .orbit import CHARTS, at_events, by_chart, cycle as draw_cycle, plane_of, require_same_system
+from .orbit import (
+    CHARTS,
+    at_events,
+    by_chart,
+    cycle as draw_cycle,
+    plane_of,
+    require_same_system,
+)
 from .over_parameters import branch as draw_branch
 from .pictures import Pictures, drawing_of
 from .plane import multipliers as draw_multipliers
@@ -52,16 +59,29 @@ class Motion(FuncAnimation):
     """
 
     def __init__(
-        self, figure: Figure, parts: Sequence[Part], times: np.ndarray, interval: float, title: str
+        self,
+        figure: Figure,
+        parts: Sequence[Part],
+        times: np.ndarray,
+        interval: float,
+        title: str,
     ):
         self.figure, self.times, self.interval = figure, times, interval
         self._parts, self._title = parts, title
         self._draw(0)
         # (What windows do by `blit` is one more drawing for files and notebooks.)
-        options: Any = {"blit": figure.canvas.required_interactive_framework is not None}
-        options |= {"frames": len(times), "interval": 1000 * interval, "cache_frame_data": False}
+        options: Any = {
+            "blit": figure.canvas.required_interactive_framework is not None
+        }
+        options |= {
+            "frames": len(times),
+            "interval": 1000 * interval,
+            "cache_frame_data": False,
+        }
         super().__init__(figure, self._draw, **options)
-        self._draw_was_started = True  # else matplotlib warns of animations that are only saved
+        self._draw_was_started = (
+            True  # else matplotlib warns of animations that are only saved
+        )
         close_in_notebook(figure)
 
     def _draw(self, k: int) -> list[Artist]:
@@ -79,9 +99,13 @@ class Motion(FuncAnimation):
         """
         path = Path(path)
         if path.suffix not in (".gif", ".html", ".mp4"):
-            raise DefinitionError(f"cannot write '{path}': name it .gif, .html or .mp4.")
+            raise DefinitionError(
+                f"cannot write '{path}': name it .gif, .html or .mp4."
+            )
         if path.suffix == ".mp4" and not writers.is_available("ffmpeg"):
-            raise DefinitionError("an .mp4 needs the program ffmpeg: write a .gif or .html.")
+            raise DefinitionError(
+                "an .mp4 needs the program ffmpeg: write a .gif or .html."
+            )
         with replacing(path) as new:
             if path.suffix == ".gif":
                 new.write_bytes(gif(self._frames(86), self.interval))
@@ -89,7 +113,9 @@ class Motion(FuncAnimation):
                 new.write_text(self._repr_html_())
             else:
                 film = new.with_suffix(".mp4")
-                super().save(str(film), writer="ffmpeg", fps=round(1 / self.interval), dpi=172)
+                super().save(
+                    str(film), writer="ffmpeg", fps=round(1 / self.interval), dpi=172
+                )
                 film.rename(new)
         return path
 
@@ -128,7 +154,9 @@ class Track(NamedTuple):
         path, rows = self.trajectory, np.flatnonzero(self.trajectory.event >= 0)
         names = [path.structure.transitions[g].name for g in path.event[rows]]
         ago = np.mod(self.times[:, None] - path.t[rows], self.period)
-        return [list(itertools.compress(names, row)) for row in (ago >= 0) & (ago < flash)]
+        return [
+            list(itertools.compress(names, row)) for row in (ago >= 0) & (ago < flash)
+        ]
 
 
 @checked
@@ -178,15 +206,23 @@ def animate(
         cycle.require_found()
     if isinstance(perturbed, ExperimentData):
         if cycle is None or sections is None:
-            raise DefinitionError("data of experiments need a limit cycle and their `sections`.")
-        from ..experiments.motion import perturbed_trajectory  # (a thirtieth of a second)
+            raise DefinitionError(
+                "data of experiments need a limit cycle and their `sections`."
+            )
+        from ..experiments.motion import (
+            perturbed_trajectory,
+        )  # (a thirtieth of a second)
 
-        perturbed = perturbed_trajectory(sections, perturbed.u[0, : 4 * sections.n_sections])
+        perturbed = perturbed_trajectory(
+            sections, perturbed.u[0, : 4 * sections.n_sections]
+        )
     if cycle is not None and sections is perturbed is None:
         motion = cycle = _both_halves(cycle)
     s, unit = motion.structure, motion.system.time_unit
     if cycle is None and not sections is perturbed is None:
-        raise DefinitionError("`sections` and `perturbed` are for limit cycles: animate the cycle.")
+        raise DefinitionError(
+            "`sections` and `perturbed` are for limit cycles: animate the cycle."
+        )
     require_same_system(s, sections, perturbed)
     everywhere, has_picture = s.states_everywhere(), drawing_of(s, 0) is not None
     plane = plane_of(s, x, y) if len(everywhere) > 1 or (x and y) else None
@@ -195,7 +231,9 @@ def animate(
     path = motion.trajectory() if isinstance(motion, LimitCycle) else motion
     period = math.inf if cycle is None else float(cycle.period)
     last = perturbed or path
-    length = period if cycle is not None and perturbed is None else float(np.ptp(last.t))
+    length = (
+        period if cycle is not None and perturbed is None else float(np.ptp(last.t))
+    )
     pace, note = _pace(length, unit, speed)
     times = np.linspace(0, length, max(12, round(length / pace * rate)), endpoint=False)
     begin = last.t[0] + times
@@ -205,7 +243,9 @@ def animate(
     events = [track.events(0.2 * pace) for track in tracks]
     with style():
         figure, grid = _sheet()
-        cells = (grid[1, 0] if has_picture else grid[:, 0]).subgridspec(len(names), 1, hspace=0.05)
+        cells = (grid[1, 0] if has_picture else grid[:, 0]).subgridspec(
+            len(names), 1, hspace=0.05
+        )
         axes = [figure.add_subplot(cells[i]) for i in range(len(names))]
         parts = _traces(axes, tracks, names, events)
         axes[0].set_title(note, loc="right")
@@ -217,14 +257,18 @@ def animate(
         if plane is not None:
             panel = figure.add_subplot(grid[0, 1] if has_circle else grid[:, 1])
             if cycle is not None:
-                draw_cycle(cycle, *plane, sections=sections, perturbed=perturbed, ax=panel)
+                draw_cycle(
+                    cycle, *plane, sections=sections, perturbed=perturbed, ax=panel
+                )
                 panel.legend([], [])
             parts += _dots(panel, tracks, plane, events, sections)
         if has_circle:
             panel = figure.add_subplot(grid[1, 1])
             draw_multipliers(cycle, zoom=False, ax=panel)
             # (A formula as a label would take a twentieth of a second.)
-            panel.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], xlabel="Re λ", ylabel="Im λ")
+            panel.set(
+                xticks=[-1, 0, 1], yticks=[-1, 0, 1], xlabel="Re λ", ylabel="Im λ"
+            )
         title = f"motion of {type(s.system).__name__}"
         return Motion(figure, parts, times, length / pace / len(times), title)
 
@@ -241,9 +285,16 @@ def _both_halves(cycle: LimitCycle) -> LimitCycle:
 def _sheet() -> tuple[Figure, Any]:
     """A figure and its cells, at fixed places, so that labels find theirs before it is drawn."""
     figure = pyplot.figure(figsize=(5.6, 3.6), dpi=86)
-    borders: dict[str, float] = {"left": 0.13, "right": 0.98, "bottom": 0.11, "top": 0.93}
+    borders: dict[str, float] = {
+        "left": 0.13,
+        "right": 0.98,
+        "bottom": 0.11,
+        "top": 0.93,
+    }
     ratios: Any = {"width_ratios": (1.15, 1), "height_ratios": (1.4, 1)}
-    return figure, figure.add_gridspec(2, 2, **borders, **ratios, wspace=0.3, hspace=0.3)
+    return figure, figure.add_gridspec(
+        2, 2, **borders, **ratios, wspace=0.3, hspace=0.3
+    )
 
 
 def _pace(length: float, unit: str, speed: float | None) -> tuple[float, str]:
@@ -261,7 +312,9 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
     scenes, size = pictures.at(at), float(max(*(pictures.high - pictures.low), 1e-9))
     ax.update_datalim([pictures.low - 0.08 * size, pictures.high + 0.08 * size])
     ax.autoscale_view()
-    ax.set(xticks=[], yticks=[], aspect="equal", adjustable="datalim", title=track.title)
+    ax.set(
+        xticks=[], yticks=[], aspect="equal", adjustable="datalim", title=track.title
+    )
     ax.spines[:].set_visible(False)
     (dots,), nowhere = ax.plot([], [], "ko", ms=2.5, zorder=5), np.full(3, np.nan)
     points = [np.stack([nowhere[:2], *x.points.values()]).T for x in scenes]
@@ -271,27 +324,41 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
         lines, look = [x.lines.get(name, nowhere[None, :2]) for x in scenes], _GROUND
         if name == "ground":
             lines = [to_borders(line, size) for line in lines]
-            (marks,) = ax.plot([], [], ls="", marker=[(0, 0), (-3, -4)], ms=8, **_GROUND)
+            (marks,) = ax.plot(
+                [], [], ls="", marker=[(0, 0), (-3, -4)], ms=8, **_GROUND
+            )
             parts.append((marks, marks.set_data, _marks(lines, pictures, at, size)))
         else:
-            look = {"color": next(colors), "lw": 1.6, "zorder": 3, "solid_joinstyle": "round"}
+            look = {
+                "color": next(colors),
+                "lw": 1.6,
+                "zorder": 3,
+                "solid_joinstyle": "round",
+            }
         (shape,) = ax.plot([], [], **look)
         parts.append((shape, shape.set_data, [line.T for line in lines]))
     for name in dict.fromkeys(name for x in scenes for name in x.circles):
         circle = ax.add_patch(Circle((0, 0), 1, fc=BODY, ec="black", lw=0.8, zorder=4))
         about = [x.circles.get(name, nowhere) for x in scenes]
-        parts.append((circle, circle.update, [{"center": x[:2], "radius": x[2]} for x in about]))
+        parts.append(
+            (circle, circle.update, [{"center": x[:2], "radius": x[2]} for x in about])
+        )
     return parts
 
 
 def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray, "k 2"]:
     """A line with its ends beyond the borders of a picture of this size."""
     first, last = line[0] - line[1], line[-1] - line[-2]
-    ends = [x + 5 * size * way / np.hypot(*way) for x, way in ((line[0], first), (line[-1], last))]
+    ends = [
+        x + 5 * size * way / np.hypot(*way)
+        for x, way in ((line[0], first), (line[-1], last))
+    ]
     return np.vstack([ends[0], line[1:-1], ends[1]])
 
 
-def _marks(lines, pictures: Pictures, at, size: float) -> list[Float[np.ndarray, "2 n"]]:
+def _marks(
+    lines, pictures: Pictures, at, size: float
+) -> list[Float[np.ndarray, "2 n"]]:
     """Places on the ground, at equal distances from one that moves with it."""
     stride = abs(float(pictures.stride[0]))
     spacing = stride / max(1, round(stride / (0.1 * size))) or 0.1 * size
@@ -302,15 +369,24 @@ def _marks(lines, pictures: Pictures, at, size: float) -> list[Float[np.ndarray,
     return marks
 
 
-def _traces(axes: list[Axes], tracks: list[Track], names: Sequence[str], events) -> list[Part]:
+def _traces(
+    axes: list[Axes], tracks: list[Track], names: Sequence[str], events
+) -> list[Part]:
     """Signals over time, where they are now, and the names of events."""
-    times, unit = tracks[0].times - tracks[0].times[0], tracks[0].trajectory.system.time_unit
+    times, unit = (
+        tracks[0].times - tracks[0].times[0],
+        tracks[0].trajectory.system.time_unit,
+    )
     fine = np.linspace(0, 2 * times[-1] - times[-2], 2000, endpoint=False)
     for track in tracks:
-        for ax, values in zip(axes, track.observed(names, track.times[0] + fine), strict=True):
+        for ax, values in zip(
+            axes, track.observed(names, track.times[0] + fine), strict=True
+        ):
             ax.plot(fine, values, color=track.color, lw=0.9)
     text = axes[0].set_title("", loc="left", color=COLORS["red"])
-    texts = [", ".join(dict.fromkeys(itertools.chain(*x))) for x in zip(*events, strict=True)]
+    texts = [
+        ", ".join(dict.fromkeys(itertools.chain(*x))) for x in zip(*events, strict=True)
+    ]
     parts: list[Part] = [(text, text.set_text, texts)]
     for ax, name in zip(axes, names, strict=True):
         ax.set(ylabel=axis_of(name))
@@ -333,7 +409,9 @@ def _dots(ax: Axes, tracks: list[Track], plane, events, sections) -> list[Part]:
             for line in by_chart(track.trajectory, *plane).values():
                 ax.plot(*line, color=track.color, lw=0.6, zorder=1)
         points = track.observed(plane, track.times).T
-        marks.append((points, {"ms": 6, "mfc": track.color, "mec": "white", "zorder": 8}))
+        marks.append(
+            (points, {"ms": 6, "mfc": track.color, "mec": "white", "zorder": 8})
+        )
         rings = np.where([[bool(x)] for x in names], points, np.nan)
         marks.append((rings, {"ms": 13, "mec": track.color, **ring}))
     if sections is not None:
@@ -341,14 +419,20 @@ def _dots(ax: Axes, tracks: list[Track], plane, events, sections) -> list[Part]:
         passed = sections.observe(plane)[ago.argmin(axis=1)]
         marks.append((passed, {"ms": 9, "mec": COLORS["green"], **ring}))
     lines = [ax.plot([], [], "o", **look)[0] for _, look in marks]
-    return [(x, x.set_data, p[..., None]) for x, (p, _) in zip(lines, marks, strict=True)]
+    return [
+        (x, x.set_data, p[..., None]) for x, (p, _) in zip(lines, marks, strict=True)
+    ]
 
 
-def portrait(above: Axes, below: Axes, s: Structure, plane: tuple[str, str]) -> Portrait:
+def portrait(
+    above: Axes, below: Axes, s: Structure, plane: tuple[str, str]
+) -> Portrait:
     """A function that draws a cycle anew in the same Axes: its orbit, colored by chart, dashed if
     it is unstable, its events, and its multipliers."""
     colors = zip(itertools.cycle(CHARTS), s.names, strict=False)
-    orbits = [above.plot([], [], color=color, lw=1.8, label=name)[0] for color, name in colors]
+    orbits = [
+        above.plot([], [], color=color, lw=1.8, label=name)[0] for color, name in colors
+    ]
     (marks,) = above.plot([], [], "ko", ms=4, zorder=5)
     about: Any = {"xytext": (4, 5), "textcoords": "offset points", "zorder": 6}
     notes = [above.annotate(x.name, (0, 0), **about) for x in s.transitions]
@@ -369,8 +453,13 @@ def portrait(above: Axes, below: Axes, s: Structure, plane: tuple[str, str]) -> 
         curve = np.array(path(*plane)[1:])
         center = (np.nanmin(curve, axis=1) + np.nanmax(curve, axis=1)) / 2
         for g, end in zip(events, ends, strict=True):
-            x, y = np.where(center > end, 5, -5)  # the name stands on the side of the center
-            sides = {"ha": "left" if x > 0 else "right", "va": "bottom" if y > 0 else "top"}
+            x, y = np.where(
+                center > end, 5, -5
+            )  # the name stands on the side of the center
+            sides = {
+                "ha": "left" if x > 0 else "right",
+                "va": "bottom" if y > 0 else "top",
+            }
             notes[g].set(position=(x, y), **sides)
             notes[g].xy = end
         points.set_data(cycle.multipliers.real, cycle.multipliers.imag)
@@ -396,20 +485,32 @@ def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) ->
     plane = plane_of(cycles[0].structure, x, y)
     with style():
         figure, grid = _sheet()
-        left, above, below = (figure.add_subplot(x) for x in (grid[:, 0], grid[0, 1], grid[1, 1]))
+        left, above, below = (
+            figure.add_subplot(x) for x in (grid[:, 0], grid[0, 1], grid[1, 1])
+        )
         draw_branch(branch, output=plane[0], ax=left)
         left.legend()
         cursor = left.axvline(values[0], color="black", lw=0.8)
         draw_cycle = portrait(above, below, cycles[0].structure, plane)
         for cycle in cycles:
-            above.plot(*cycle.trajectory()(*plane)[1:], color=COLORS["gray"], lw=0.3, alpha=0.3)
+            above.plot(
+                *cycle.trajectory()(*plane)[1:], color=COLORS["gray"], lw=0.3, alpha=0.3
+            )
             moved = draw_cycle(cycle)
             widened(below)
         text = above.set_title("", loc="left")
         unstable = ["" if x.stable else ", unstable" for x in cycles]
-        texts = [f"{branch.parameter} = {x:.4g}{y}" for x, y in zip(values, unstable, strict=True)]
+        texts = [
+            f"{branch.parameter} = {x:.4g}{y}"
+            for x, y in zip(values, unstable, strict=True)
+        ]
         parts: list[Part] = [(x, lambda _: None, values) for x in moved]
-        parts += [(text, text.set_text, texts), (cursor, cursor.set_xdata, values[:, None])]
+        parts += [
+            (text, text.set_text, texts),
+            (cursor, cursor.set_xdata, values[:, None]),
+        ]
         parts.append((moved[0], draw_cycle, cycles))
         interval = max(interval, 4 / len(values))
-        return Motion(figure, parts, values, interval, f"branch along {branch.parameter}")
+        return Motion(
+            figure, parts, values, interval, f"branch along {branch.parameter}"
+        )

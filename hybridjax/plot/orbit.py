@@ -18,15 +18,21 @@ from ..systems.structure import Structure
 from .look import COLORS, AxesLike, Plot, axis_of, panels
 
 
-CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
+CHARTS = [
+    COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")
+]
 """Colors of the charts of a system."""
 # Half of a section's bar, and the distance from its end to its number, in widths of the picture.
 _BAR = 0.035
 _TURNS = np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
 _NUMBER: dict[str, Any] = {
-    "fontsize": "x-small", "color": "0.35", "ha": "center", "va": "center", "zorder": 6,
+    "fontsize": "x-small",
+    "color": "0.35",
+    "ha": "center",
+    "va": "center",
+    "zorder": 6,
     "path_effects": [withStroke(linewidth=2, foreground="white")],
-}  # fmt: skip
+}
 
 
 @checked
@@ -75,25 +81,37 @@ def cycle(
         center = np.array([(np.nanmin(v) + np.nanmax(v)) / 2 for v in (px, py)])
         # An arrow of the direction, in the middle of the longest time without events.
         ends = np.union1d(orbit.t[orbit.event >= 0], orbit.t[[0, -1]])
-        k = int(np.searchsorted(t, (ends[:-1] + np.diff(ends) / 2)[np.argmax(np.diff(ends))]))
+        k = int(
+            np.searchsorted(
+                t, (ends[:-1] + np.diff(ends) / 2)[np.argmax(np.diff(ends))]
+            )
+        )
         arrow = {"arrowstyle": "-|>", "mutation_scale": 16, "color": "black", "lw": 0}
-        panel.annotate("", (px[k + 1], py[k + 1]), (px[k], py[k]), arrowprops=arrow, zorder=6)
+        panel.annotate(
+            "", (px[k + 1], py[k + 1]), (px[k], py[k]), arrowprops=arrow, zorder=6
+        )
         panel.margins(0.1)
         _events(panel, s, orbit, (x, y), center)
         panel.locator_params(axis="x", nbins=6)
         if sections is not None:
             _sections(panel, s, sections, (x, y), center)
         if perturbed is not None:
-            panel.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
+            panel.plot(
+                [], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed"
+            )
         panel.set(xlabel=axis_of(x), ylabel=axis_of(y))
-        panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
+        panel.legend(
+            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2
+        )
     return Plot(axes)
 
 
 def plane_of(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
     everywhere = s.states_everywhere()
     if (x is None or y is None) and len(everywhere) < 2:
-        raise DefinitionError("no two states are defined in every chart: give `x` and `y`.")
+        raise DefinitionError(
+            "no two states are defined in every chart: give `x` and `y`."
+        )
     x = everywhere[0] if x is None else x
     y = next(n for n in everywhere if n != x) if y is None else y
     x, y = s.resolve_outputs((x, y)).names
@@ -104,13 +122,20 @@ def require_same_system(
     s: Structure, sections: PlacedSections | None, perturbed: Trajectory | None
 ) -> None:
     """**Raises:** `DefinitionError` if something is not of the system of a cycle."""
-    added: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
+    added: dict[str, Any] = {
+        "sections": sections and sections.cycle,
+        "perturbed": perturbed,
+    }
     for name, other in added.items():
         if other is not None and other.structure.names != s.names:
-            raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
+            raise DefinitionError(
+                f"`{name}` and the cycle belong to different systems."
+            )
 
 
-def by_chart(trajectory: Trajectory, x: str, y: str) -> dict[int, Float[np.ndarray, "2 p"]]:
+def by_chart(
+    trajectory: Trajectory, x: str, y: str
+) -> dict[int, Float[np.ndarray, "2 p"]]:
     """The curve in each chart that a trajectory visits, with NaN between its stays."""
     t, chart, _ = trajectory.dense()
     cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
@@ -120,7 +145,9 @@ def by_chart(trajectory: Trajectory, x: str, y: str) -> dict[int, Float[np.ndarr
     return {a: x for a, x in curves.items() if np.isfinite(x).all(axis=0).any()}
 
 
-def at_events(path: Trajectory, *names: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def at_events(
+    path: Trajectory, *names: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the transitions (e,) of the events, and the points (e, n) before and after each."""
     rows, s = np.flatnonzero(path.event >= 0), path.structure
     before = observed(s, names, path.t[rows], path.chart[rows - 1], path.before[rows]).T
@@ -135,7 +162,13 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
         if not np.all(np.isfinite([before, after])):
             continue
         if np.any(np.abs(after - before) > 1e-9 * (1 + np.abs(before))):
-            ax.plot(*np.stack([before, after], axis=1), "--", color="black", lw=0.8, zorder=2)
+            ax.plot(
+                *np.stack([before, after], axis=1),
+                "--",
+                color="black",
+                lw=0.8,
+                zorder=2,
+            )
             ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
         ax.plot(*before, "o", ms=4, color="black", zorder=5)
         if not any(name in there for there in texts.values()):
@@ -150,9 +183,13 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
     """A text beside `point`, rather towards `center`, that covers the fewest of the pixels drawn,
     to which its own are added."""
     note = ax.annotate(
-        text, point, xytext=(0, 0), textcoords="offset points", zorder=6,
+        text,
+        point,
+        xytext=(0, 0),
+        textcoords="offset points",
+        zorder=6,
         path_effects=[withStroke(linewidth=2, foreground="white")],
-    )  # fmt: skip
+    )
     to, at = ax.transData.transform([center, point])
     inwards = np.arctan2(*(to - at)[::-1])
 
@@ -164,7 +201,9 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
             va="bottom" if y > 0.35 else "top" if y < -0.35 else "center",
         )
         box = note.get_window_extent()
-        outside = 4 - ax.bbox.count_contains(box.corners())  # a corner counts as 20 points
+        outside = 4 - ax.bbox.count_contains(
+            box.corners()
+        )  # a corner counts as 20 points
         return 20 * outside + box.padded(4).count_contains(drawn)
 
     covered(min(_TURNS, key=covered))
@@ -198,13 +237,19 @@ def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tup
         mask = charts == a
         at = times[mask], states[: s.dims[a], mask], np.zeros((s.nu, 1))
         flow = kernels.field(s, a, *at)[:, 0]
-        points[mask], by_time, *by_state = kernels.outputs(s, a, items, *at).transpose(1, 2, 0)
-        rates[mask] = by_time + sum(x * f[:, None] for x, f in zip(by_state, flow, strict=False))
+        points[mask], by_time, *by_state = kernels.outputs(s, a, items, *at).transpose(
+            1, 2, 0
+        )
+        rates[mask] = by_time + sum(
+            x * f[:, None] for x, f in zip(by_state, flow, strict=False)
+        )
     for a, normal, point, rate in zip(charts, normals, points, rates, strict=True):
         states = s.charts[a].states
         inside = [1 + states.index(name) for name in names if name in states]
         beyond = np.delete(normal, inside)
-        curve = len(inside) == 2 and np.any(normal) and not np.any(np.abs(beyond) > 1e-12)
+        curve = (
+            len(inside) == 2 and np.any(normal) and not np.any(np.abs(beyond) > 1e-12)
+        )
         x, y = normal[inside] * unit if curve else rate / unit
         step = np.array([-y, x])
         yield point, unit * step / (np.linalg.norm(step) or 1.0)

@@ -15,12 +15,18 @@ from .look import COLORS, CYCLE, AxesLike, Plot, axis_of, panels
 
 
 _MARKS = dict(
-    zip(KINDS, (("o", "red"), ("D", "orange"), ("s", "green"), ("^", "purple")), strict=True)
+    zip(
+        KINDS,
+        (("o", "red"), ("D", "orange"), ("s", "green"), ("^", "purple")),
+        strict=True,
+    )
 )
 
 
 @checked
-def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = None) -> Plot:
+def branch(
+    *branches: Branch, output: str | None = None, ax: AxesLike | None = None
+) -> Plot:
     """Branches of limit cycles, with marks where their stability changes.
 
     Stable cycles are drawn by full lines and unstable ones by dashed lines, one color per branch.
@@ -37,7 +43,9 @@ def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = N
     """
     names = {b.parameter for b in branches}
     if len(names) != 1:
-        raise DefinitionError(f"branches in one figure need one parameter, not {sorted(names)}.")
+        raise DefinitionError(
+            f"branches in one figure need one parameter, not {sorted(names)}."
+        )
     with panels(ax) as axes:
         panel, shown = axes[0, 0], set()
         for b, color in zip(branches, itertools.cycle(CYCLE)):
@@ -45,21 +53,34 @@ def branch(*branches: Branch, output: str | None = None, ax: AxesLike | None = N
             name = first if output is None else output
             height = b.largest(name)
             for part, stable in _parts(b):
-                panel.plot(b.values[part], height[part], "-" if stable else "--", color=color)
+                panel.plot(
+                    b.values[part], height[part], "-" if stable else "--", color=color
+                )
             for p in b.points:
                 marker, tint = _MARKS[p.kind]
                 panel.plot(
-                    p.value, height[p.index], marker, ms=4.5, mfc="white", mec=COLORS[tint],
-                    mew=1.2, zorder=5, label=None if p.kind in shown else p.kind,
-                )  # fmt: skip
+                    p.value,
+                    height[p.index],
+                    marker,
+                    ms=4.5,
+                    mfc="white",
+                    mec=COLORS[tint],
+                    mew=1.2,
+                    zorder=5,
+                    label=None if p.kind in shown else p.kind,
+                )
                 shown.add(p.kind)
         for line, label in (("-", "stable"), ("--", "unstable")):
             panel.plot([], [], line, color=COLORS["gray"], label=label)
-        parameter = Signal(b.parameter, unit_of_parameter(branches[0][0].system, b.parameter))
+        parameter = Signal(
+            b.parameter, unit_of_parameter(branches[0][0].system, b.parameter)
+        )
         (output_name,) = branches[0][0].structure.resolve_outputs(name).names
         panel.set(xlabel=axis_of(parameter), ylabel=f"largest {axis_of(output_name)}")
         panel.locator_params(axis="x", nbins=6)
-        panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
+        panel.legend(
+            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2
+        )
     return Plot(axes)
 
 
@@ -75,7 +96,9 @@ def _parts(branch: Branch) -> list[tuple[slice, bool]]:
 
 
 @checked
-def sweep(maps: Any, name: str = "spectral_radius", *, ax: AxesLike | None = None) -> Plot:
+def sweep(
+    maps: Any, name: str = "spectral_radius", *, ax: AxesLike | None = None
+) -> Plot:
     """Draw a quantity of a sweep: a curve over one parameter, or a map over two.
 
     **Arguments:**
@@ -86,10 +109,14 @@ def sweep(maps: Any, name: str = "spectral_radius", *, ax: AxesLike | None = Non
 
     **Raises:** `DefinitionError` if the dataset has no such quantity over one or two parameters.
     """
-    drawable = [str(key) for key, values in maps.data_vars.items() if 1 <= values.ndim <= 2]
+    drawable = [
+        str(key) for key, values in maps.data_vars.items() if 1 <= values.ndim <= 2
+    ]
     require_among("map", [name], drawable, "over one or two parameters ")
     with panels(ax) as axes:
         quantity = maps[name]
-        quantity.plot(ax=axes[0, 0], **({"x": quantity.dims[0]} if quantity.ndim == 2 else {}))
+        quantity.plot(
+            ax=axes[0, 0], **({"x": quantity.dims[0]} if quantity.ndim == 2 else {})
+        )
         axes[0, 0].set_title("")
     return Plot(axes)

@@ -27,19 +27,26 @@ class Pictures:
         t, chart, q = trajectory.dense(6)
         drawings = drawn(trajectory.structure, t, chart, q)
         place = np.array([drawing.place for drawing in drawings])
-        self._t, self._velocity = t, np.array([drawing.velocity for drawing in drawings])
+        self._t, self._velocity = (
+            t,
+            np.array([drawing.velocity for drawing in drawings]),
+        )
         # Over an event the body stays; between events the origin moves by its velocity.
         moves = 0.5 * (self._velocity[1:] + self._velocity[:-1]) * np.diff(t)[:, None]
         moves = np.where((np.diff(t) == 0)[:, None], place[:-1] - place[1:], moves)
         self._origin = np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
         self.period = min(period, t[-1] - t[0])
-        self.stride = self._origin[-1] + self._velocity[-1] * (self.period - (t[-1] - t[0]))
+        self.stride = self._origin[-1] + self._velocity[-1] * (
+            self.period - (t[-1] - t[0])
+        )
         if np.isinf(period):
             self.stride += place[-1] - place[0]
         places: list[Any] = []  # between which pictures lie, without their ground
         for x in self._seen(t, self._origin, drawings):
             places += [line for name, line in x.lines.items() if name != "ground"]
-            places += [z[:2] + side * z[2] for z in x.circles.values() for side in (-1, 1)]
+            places += [
+                z[:2] + side * z[2] for z in x.circles.values() for side in (-1, 1)
+            ]
             places += x.points.values()
         corners = np.vstack(places)
         self.low, self.high = corners.min(axis=0), corners.max(axis=0)
@@ -77,7 +84,9 @@ def drawn(
         values = s.kernel(_flat, by_lane, a, lanes=4)(t[rows], q[rows, : s.dims[a]].T)
         parts = np.split(values.T, np.cumsum([x.size for x in leaves])[:-1], axis=1)
         for k, row in enumerate(rows):
-            shapes = [part[k].reshape(x.shape) for part, x in zip(parts, leaves, strict=True)]
+            shapes = [
+                part[k].reshape(x.shape) for part, x in zip(parts, leaves, strict=True)
+            ]
             drawings[row] = jax.tree_util.tree_unflatten(form, shapes)
     return drawings
 
@@ -94,4 +103,6 @@ def drawing_of(s: Structure, a: int) -> Any:
 
 
 def _flat(a: int, s: Structure, t, q):
-    return jnp.concatenate([jnp.ravel(x) for x in jax.tree_util.tree_leaves(s.drawing(a, t, q))])
+    return jnp.concatenate(
+        [jnp.ravel(x) for x in jax.tree_util.tree_leaves(s.drawing(a, t, q))]
+    )

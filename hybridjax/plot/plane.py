@@ -9,7 +9,11 @@ from matplotlib.patches import Circle
 
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
-from ..identify.multiplier_estimate import MultiplierEstimate, Multipliers, compare_multipliers
+from ..identify.multiplier_estimate import (
+    MultiplierEstimate,
+    Multipliers,
+    compare_multipliers,
+)
 from ..identify.rational import RationalFit
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
@@ -22,7 +26,8 @@ _MARKERS = "osD^vP*X"
 @checked
 def multipliers(
     true: LimitCycle | LDTP | MultiplierEstimate | Multipliers,
-    estimates: Mapping[str, RationalFit | MultiplierEstimate | Multipliers] | None = None,
+    estimates: Mapping[str, RationalFit | MultiplierEstimate | Multipliers]
+    | None = None,
     *,
     zoom: bool = True,
     ax: AxesLike | None = None,
@@ -62,7 +67,11 @@ def multipliers(
         far = 1.1 * max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
         panel.set(xlim=(-far, far), ylim=(-far, far), aspect="equal")
         panel.locator_params(nbins=5)
-        inset = _zoom(panel, true, series, borders) if zoom and (series or borders) else None
+        inset = (
+            _zoom(panel, true, series, borders)
+            if zoom and (series or borders)
+            else None
+        )
         for box in filter(None, (panel, inset)):
             for label, text, z, line in drawn:
                 box.plot(np.real(z), np.imag(z), ls="", label=text, **line)
@@ -93,7 +102,9 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
     **Raises:** `DefinitionError` if there are none, or their outputs differ.
     """
     if not fits or len({(fit.outputs, fit.n_sections) for fit in fits.values()}) != 1:
-        raise DefinitionError("`fits` must hold one or more fits with the same outputs and N.")
+        raise DefinitionError(
+            "`fits` must hold one or more fits with the same outputs and N."
+        )
     outputs, N = (first := next(iter(fits.values()))).outputs, first.n_sections
     width = COLUMN if len(outputs) == 1 else PAGE
     with panels(ax, 2, len(outputs), width=width, height=4.0) as axes:
@@ -103,11 +114,20 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
                 _unit_circle(panel)
                 for k, (family, fit) in enumerate(fits.items()):
                     # Equal ones stay visible: each family is smaller than the one before.
-                    line = {"ls": "", "mfc": "none", "ms": 8 - 2.5 * (k % 3), "mew": 1.0}
+                    line = {
+                        "ls": "",
+                        "mfc": "none",
+                        "ms": 8 - 2.5 * (k % 3),
+                        "mew": 1.0,
+                    }
                     line["color"] = CYCLE[k % len(CYCLE)]
                     p, z = fit.poles[i], fit.zeros[i]
-                    panel.plot(p.real, p.imag, marker="x", label=f"poles, {family}", **line)
-                    panel.plot(z.real, z.imag, marker="o", label=f"zeros, {family}", **line)
+                    panel.plot(
+                        p.real, p.imag, marker="x", label=f"poles, {family}", **line
+                    )
+                    panel.plot(
+                        z.real, z.imag, marker="o", label=f"zeros, {family}", **line
+                    )
             poles = np.concatenate([fit.poles[i] for fit in fits.values()])
             center = np.real(poles).mean()
             reach = 1.5 * np.abs(poles - center).max() or 1.0
@@ -119,7 +139,9 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
             lower.set_title("enlarged: around the poles")
             _complex_axes(lower, "z")
             _complex_axes(upper, "z")
-            lower.set_xlabel(rf"{lower.get_xlabel()}  (multipliers $\lambda = z^{{{N}}}$)")
+            lower.set_xlabel(
+                rf"{lower.get_xlabel()}  (multipliers $\lambda = z^{{{N}}}$)"
+            )
         legend(axes[0, 0], "upper center", ncols=4 if len(outputs) > 1 else 2)
         letters(axes)
     return Plot(axes)
@@ -151,18 +173,26 @@ def _borders(estimates: Mapping[str, Any]) -> dict[str, list[np.ndarray]]:
     }
 
 
-def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders) -> Axes | None:
+def _zoom(
+    ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders
+) -> Axes | None:
     """An inset around the leading true multiplier, at a place that is free of markers; none where
     it would enlarge less than twice or no place is free."""
     leading = complex(true[np.lexsort((-np.imag(true), -np.abs(true)))[0]])
     nearest = [z[np.argmin(np.abs(z - leading))] for z in series.values()]
     # Of the region next to the leading multiplier, all of it.
-    regions = [min(np.abs(x - leading).max() for x in region) for region in borders.values()]
+    regions = [
+        min(np.abs(x - leading).max() for x in region) for region in borders.values()
+    ]
     reach = 1.35 * max([1e-12, *(np.abs(z - leading) for z in nearest), *regions])
     side, far = 0.36, ax.get_xlim()[1]
     points = (np.concatenate([true, *series.values()]) / far + 1 + 1j) / 2
     places = np.array([0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j])
-    room = np.abs((points - places[:, None])[..., None].view(float)).max(axis=2).min(axis=1)
+    room = (
+        np.abs((points - places[:, None])[..., None].view(float))
+        .max(axis=2)
+        .min(axis=1)
+    )
     place = places[int(room.argmax())]
     if 2 * reach > side * far or room.max() < side / 2:
         return None
@@ -170,10 +200,19 @@ def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders)
         (place.real - side / 2, place.imag - side / 2, side, side),
         xlim=leading.real + np.array([-reach, reach]),
         ylim=leading.imag + np.array([-reach, reach]),
-        aspect="equal", xticks=[], yticks=[],
-    )  # fmt: skip
+        aspect="equal",
+        xticks=[],
+        yticks=[],
+    )
     # (Numbers at its ticks would be long and differ in their last digits.)
-    inset.text(0.5, 0.02, f"{2 * reach:.1e} wide", transform=inset.transAxes, ha="center", size=6)
+    inset.text(
+        0.5,
+        0.02,
+        f"{2 * reach:.1e} wide",
+        transform=inset.transAxes,
+        ha="center",
+        size=6,
+    )
     inset.spines[:].set(visible=True, color="0.4")
     ax.indicate_inset_zoom(inset, edgecolor="0.4")
     return inset

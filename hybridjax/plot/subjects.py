@@ -11,28 +11,38 @@ from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, colored, panels
 
 
 @checked
-def forest(population: Population, quantity: str, *, ax: AxesLike | None = None) -> Plot:
+def forest(
+    population: Population, quantity: str, *, ax: AxesLike | None = None
+) -> Plot:
     """Draw the estimate of each subject with its 95 % interval, its prediction (open circle), and
     the mean of each group and condition (diamond: its 95 % interval)."""
     means, subjects = population.mean(quantity), population.predictions(quantity)
     names, at = [], 0
     with panels(ax, height=0.7 + 0.15 * (len(subjects) + 2 * len(means))) as axes:
         panel, open_circle = axes[0, 0], {"ms": 4, "mfc": "none", "mew": 0.8}
-        cells = zip(means.itertuples(), subjects.groupby("cell", sort=False), strict=True)
+        cells = zip(
+            means.itertuples(), subjects.groupby("cell", sort=False), strict=True
+        )
         for k, (mean, (_, part)) in enumerate(cells):
             rows, bottom = at - np.arange(len(part)), at - len(part)
             line = {"color": CYCLE[k % len(CYCLE)], "lw": 0.8}
             reach = 1.96 * part["standard_error"]
             panel.errorbar(part["estimate"], rows, xerr=reach, fmt="s", ms=3, **line)
-            panel.plot(part["prediction"], rows, "o", color=COLORS["gray"], **open_circle)
+            panel.plot(
+                part["prediction"], rows, "o", color=COLORS["gray"], **open_circle
+            )
             diamond = bottom + 0.35 * np.array([0, 1, 0, -1])
-            panel.fill([mean.low, mean.estimate, mean.high, mean.estimate], diamond, **line)
+            panel.fill(
+                [mean.low, mean.estimate, mean.high, mean.estimate], diamond, **line
+            )
             panel.plot([mean.estimate] * 2, [bottom, at + 0.5], ls=":", **line)
             names += [*zip(rows, part["subject"], strict=True), (bottom, mean.effect)]
             at = bottom - 2
         panel.set_yticks(*zip(*names, strict=True))
         panel.tick_params(axis="y", length=0)
-        panel.set(ylim=(at + 1, 1), xlabel=with_unit(quantity, population.units[quantity]))
+        panel.set(
+            ylim=(at + 1, 1), xlabel=with_unit(quantity, population.units[quantity])
+        )
     return Plot(axes)
 
 
@@ -49,20 +59,32 @@ def paired(
     subjects, means = population.predictions(quantity), population.mean(quantity)
     with panels(ax) as axes:
         panel = axes[0, 0]
-        cells = zip(means.itertuples(), subjects.groupby("cell", sort=False), strict=True)
+        cells = zip(
+            means.itertuples(), subjects.groupby("cell", sort=False), strict=True
+        )
         for mean, (cell, part) in cells:
             side = [k for k, label in enumerate((a, b)) if label in cell.split(", ")]
             for k in side:
                 subjects.loc[part.index, "side"] = k
                 error = part["standard_error"]
-                panel.errorbar([k] * len(part), part["estimate"], error, fmt="o", ms=3, lw=0.5)
+                panel.errorbar(
+                    [k] * len(part), part["estimate"], error, fmt="o", ms=3, lw=0.5
+                )
                 reach = [[mean.estimate - mean.low], [mean.high - mean.estimate]]
-                panel.errorbar(1.3 * k - 0.15, mean.estimate, reach, fmt="D", ms=5, color="black")
+                panel.errorbar(
+                    1.3 * k - 0.15, mean.estimate, reach, fmt="D", ms=5, color="black"
+                )
         for _, part in subjects.groupby("subject"):
-            panel.plot(part["side"], part["estimate"], lw=0.5, color=COLORS["gray"], zorder=1)
+            panel.plot(
+                part["side"], part["estimate"], lw=0.5, color=COLORS["gray"], zorder=1
+            )
         panel.set_xticks([0, 1], [a, b])
-        panel.set(xlim=(-0.4, 1.4), ylabel=with_unit(quantity, population.units[quantity]))
-        panel.set_title(f"{a} - {b}: {test.estimate:.3g} [{test.low:.3g}, {test.high:.3g}]")
+        panel.set(
+            xlim=(-0.4, 1.4), ylabel=with_unit(quantity, population.units[quantity])
+        )
+        panel.set_title(
+            f"{a} - {b}: {test.estimate:.3g} [{test.low:.3g}, {test.high:.3g}]"
+        )
     return Plot(axes)
 
 
@@ -83,7 +105,11 @@ def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
     with panels(ax, width=COLUMN if len(result.axes) == 1 else 0.6 * PAGE) as axes:
         panel, (name, *other) = axes[0, 0], result.axes
         if not other:
-            x, low, high = result.axes[name], values - result.reach, values + result.reach
+            x, low, high = (
+                result.axes[name],
+                values - result.reach,
+                values + result.reach,
+            )
             panel.plot(x, size(result.each).T, color=COLORS["gray"], lw=0.4, alpha=0.7)
             panel.plot(x, values, color=CYCLE[0], lw=1.5, zorder=3)
             panel.fill_between(x, low, high, color=CYCLE[0], alpha=0.3, lw=0, zorder=2)

@@ -73,7 +73,9 @@ class SectionData(eqx.Module):
 
     def _deviations(self) -> Float[np.ndarray, "n nuy"]:
         """Return the deviations of inputs and outputs in all records."""
-        return np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in self.records])
+        return np.concatenate(
+            [np.concatenate([r.u, r.y], axis=1) for r in self.records]
+        )
 
     @property
     def missing(self) -> float:
@@ -82,20 +84,30 @@ class SectionData(eqx.Module):
 
     def rms(self) -> tuple[Float[np.ndarray, " nu"], Float[np.ndarray, " ny"]]:
         """Return root mean squares of the deviations of inputs and outputs."""
-        size, nu = np.sqrt(np.nanmean(self._deviations() ** 2, axis=0)), len(self.inputs)
+        size, nu = (
+            np.sqrt(np.nanmean(self._deviations() ** 2, axis=0)),
+            len(self.inputs),
+        )
         return size[:nu], size[nu:]
 
     def of_inputs(self, names: Sequence[str]) -> "SectionData":
         """Return the data with some of the inputs only."""
         columns = [self.inputs.index(name) for name in names]
-        inputs, cycle = tuple(self.inputs[k] for k in columns), self.cycle_inputs[:, columns]
-        records = tuple(replace(r, u=r.u[:, columns], inputs=inputs) for r in self.records)
+        inputs, cycle = (
+            tuple(self.inputs[k] for k in columns),
+            self.cycle_inputs[:, columns],
+        )
+        records = tuple(
+            replace(r, u=r.u[:, columns], inputs=inputs) for r in self.records
+        )
         spikes = (*(self.spikes[k] for k in columns), *self.spikes[len(self.inputs) :])
         return replace(self, records=records, cycle_inputs=cycle, spikes=spikes)
 
     def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""
-        return replace(self, records=tuple(replace(r, drift=float(cycles)) for r in self.records))
+        return replace(
+            self, records=tuple(replace(r, drift=float(cycles)) for r in self.records)
+        )
 
     @checked
     def experiments(self, periods: PeriodCount) -> ExperimentData:
@@ -118,8 +130,14 @@ class SectionData(eqx.Module):
         phase = np.arange(self.n_sections) / self.n_sections
         cycles = np.concatenate([self.cycle_inputs, self.cycle_outputs], axis=1)
         drawn = [
-            picture([Curve(phase, x, "average cycle", color)], "phase (cycles)", with_unit(*name))
-            for *name, x, color in zip(self.signals[:4], self.units, cycles.T, COLORS, strict=False)
+            picture(
+                [Curve(phase, x, "average cycle", color)],
+                "phase (cycles)",
+                with_unit(*name),
+            )
+            for *name, x, color in zip(
+                self.signals[:4], self.units, cycles.T, COLORS, strict=False
+            )
         ]
         return card("SectionData", "", text(repr(self)), *drawn)
 
@@ -127,7 +145,9 @@ class SectionData(eqx.Module):
         values = zip(self.signals, np.concatenate(self.rms()), self.units, strict=True)
         sizes = ", ".join(f"{name} {x:.3g} {unit}".rstrip() for name, x, unit in values)
         lost = f", {100 * self.missing:.2g} % missing" if self.missing else ""
-        struck = [f"{n} {k}" for n, k in zip(self.signals, self.spikes, strict=True) if k]
+        struck = [
+            f"{n} {k}" for n, k in zip(self.signals, self.spikes, strict=True) if k
+        ]
         spikes = f"; spikes left out: {', '.join(struck)}" if struck else ""
         return folded(
             f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
@@ -136,7 +156,9 @@ class SectionData(eqx.Module):
         )
 
 
-def input_spectrum(data: SectionData) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
+def input_spectrum(
+    data: SectionData,
+) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
     """Return frequencies in cycles per period, and power spectral densities of the inputs (Welch
     1967) from windows of up to 16 cycles."""
     records, N = uninterrupted_records(data), data.n_sections

@@ -44,7 +44,9 @@ def write_design(
     each section, and a file that cannot be written.
     """
     if (period is None) != (rate is None):
-        raise DefinitionError("a table against time needs both the period and the rate.")
+        raise DefinitionError(
+            "a table against time needs both the period and the rate."
+        )
     u = np.asarray(design.inputs(cycles or design.periods))
     S, n, _ = u.shape
     N = design.n_sections
@@ -52,13 +54,20 @@ def write_design(
         header, k = _BY_PHASE, np.arange(n)
         place = np.stack([k // N, k % N, (k % N) / N], axis=1)
     elif period * rate < N:
-        raise DefinitionError(f"`rate` must be {N / period:g} or more: a sample for each section.")
+        raise DefinitionError(
+            f"`rate` must be {N / period:g} or more: a sample for each section."
+        )
     else:
         header = ("experiment", "time")
         time = np.arange(np.ceil(n / N * period * rate - 1e-6)) / rate
-        u = u[:, np.minimum((time * N / period + 1e-9).astype(int), n - 1)]  # (rounding)
+        u = u[
+            :, np.minimum((time * N / period + 1e-9).astype(int), n - 1)
+        ]  # (rounding)
         place = time[:, None]
-    with replacing(Path(path)) as new, open(new, "w", newline="", encoding="utf-8") as file:
+    with (
+        replacing(Path(path)) as new,
+        open(new, "w", newline="", encoding="utf-8") as file,
+    ):
         table = csv.writer(file)
         table.writerow([*header, *design.input_names])
         for s in range(S):
@@ -81,15 +90,23 @@ def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording
     """
     columns = read_tables(Path(path), Wanted("time"))[0].values
     if not set(_BY_PHASE) <= set(columns):
-        raise FileFormatError(f"'{path}' must be a table by phase: leave out `period` and `rate`.")
+        raise FileFormatError(
+            f"'{path}' must be a table by phase: leave out `period` and `rate`."
+        )
     experiment, N = columns["experiment"], int(columns["section"].max()) + 1
     count = np.unique(experiment, return_counts=True)[1]
     if (count != count[0]).any() or (np.diff(experiment) < 0).any():
-        raise FileFormatError(f"'{path}' must have experiments of one length, in order.")
-    require_equal("recording and table", "numbers of trials", len(recording.trials), len(count))
+        raise FileFormatError(
+            f"'{path}' must have experiments of one length, in order."
+        )
+    require_equal(
+        "recording and table", "numbers of trials", len(recording.trials), len(count)
+    )
     names = [k for k in columns if k not in _BY_PHASE]
     command = np.stack([columns[k].reshape(len(count), -1) for k in names], axis=2)
-    command = np.pad(command, ((0, 0), (1, 1), (0, 0)))  # zero before and after the experiment
+    command = np.pad(
+        command, ((0, 0), (1, 1), (0, 0))
+    )  # zero before and after the experiment
     trials = []
     for s, (trial, stretches) in enumerate(phase.by_trial(recording)):
         added = np.full((len(trial.time), len(names)), np.nan)
@@ -98,6 +115,8 @@ def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording
             during = np.isfinite(now)
             k = np.floor((now[during] - np.ceil(w.phase[0])) * N).astype(int)
             added[during] = command[s][np.clip(k + 1, 0, command.shape[1] - 1)]
-        told = Recording(trial.time, dict(zip(names, added.T, strict=True)), name=trial.name)
+        told = Recording(
+            trial.time, dict(zip(names, added.T, strict=True)), name=trial.name
+        )
         trials.append(Recording.beside([recording.with_trials([trial]), told]))
     return Recording.join(trials)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
+from .._core.findings import Finding, print_findings, warn_of
 from .._core.results import Result
 from .._core.text import listed, p_value
 from ..identify.series.fit import SeriesFit
@@ -20,7 +21,7 @@ from ..identify.series.records import MAY_DRIFT, CycleGrid, PreparedRecords
 from ..identify.series.subspace import late_outputs, ordinary_least_squares
 from ..identify.validate import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
-from .findings import NAME_REFERENCE, Finding, print_findings, warn_of
+from .findings import NAME_REFERENCE
 
 
 # Fraction of samples: if fewer remain beyond the number of unknowns, strides are few; if more are
@@ -84,16 +85,22 @@ def advise(
     """
     N, R, _, nu = fit.numerators.shape
     d, records = len(fit.multipliers), PreparedRecords(data, free_start=True)
-    problem = OutputErrorProblem.from_data(records, d, R - 1 - fit.lead - d * N, free_start=True)
+    problem = OutputErrorProblem.from_data(
+        records, d, R - 1 - fit.lead - d * N, free_start=True
+    )
     delayed, grid = late_outputs(problem, d), records.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())
     unknowns, plain = R * nu + len(grid.y) * (d + 1), ordinary_least_squares(delayed)
     warnings: list[Finding] = []
     if sampled - unknowns < _FEW * sampled:
         text = f"a section was sampled {sampled} times for {unknowns} unknowns; record more, take "
-        warnings.append(Finding("few strides", f"{text}fewer sections, or excite fewer inputs."))
+        warnings.append(
+            Finding("few strides", f"{text}fewer sections, or excite fewer inputs.")
+        )
     if fit.doubt:
-        warnings.append(Finding("drift" if fit.doubt == MAY_DRIFT else "order", f"{fit.doubt}."))
+        warnings.append(
+            Finding("drift" if fit.doubt == MAY_DRIFT else "order", f"{fit.doubt}.")
+        )
     band = input_band(data)
     for name in fit.feedback:
         text = f"{name} answers earlier residuals of the outputs: fits are biased. {NAME_REFERENCE}"
@@ -111,12 +118,18 @@ def advise(
     p = np.ones(1) if validation is None else validation.independence
     if validation and not validation.independent and validation.fit[p.argmin()] < 99:
         text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}): raise "
-        warnings.append(Finding("left over", f"{text}`order`, sample faster, or push less."))
+        warnings.append(
+            Finding("left over", f"{text}`order`, sample faster, or push less.")
+        )
     if validation and validation.unexplained:
         text = f"{listed(validation.unexplained)}: the model predicts held-out strides no better "
-        warnings.append(Finding("no fit", f"{text}than the mean cycle does: it explains nothing."))
+        warnings.append(
+            Finding("no fit", f"{text}than the mean cycle does: it explains nothing.")
+        )
     if data.missing > _FEW:
-        warnings.append(Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing."))
+        warnings.append(
+            Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing.")
+        )
     for name, count in zip(data.signals, data.spikes, strict=True):
         if count:
             text = f"isolated outliers of {name} that were left out: {count}."
@@ -125,7 +138,9 @@ def advise(
     strides = (100, 300, 1000, 3000)
     later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
     with np.errstate(divide="ignore"):
-        expected = fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
+        expected = (
+            fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
+        )
     warn_of(warnings)
     warnings = [*findings, *slow_sampling(data), *warnings]
     return Advice(tuple(warnings), plain, tuple(band), strides, expected)
@@ -134,7 +149,9 @@ def advise(
 def slow_sampling(data: SectionData) -> list[Finding]:
     """Find outputs of which interpolation between samples loses as much as they deviate."""
     text = f"without every second sample, outputs would change by {data.unresolved:.2g} times their"
-    finding = Finding("sampling", f"{text} deviations: multipliers may be wrong. Sample faster.")
+    finding = Finding(
+        "sampling", f"{text} deviations: multipliers may be wrong. Sample faster."
+    )
     # (Noise gives up to 1.3, and would be reported below that. Above, wrong fits pass: with 10
     # samples in a cycle, errors were up to four standard errors at 1.6 to 2.1.)
     return [finding] if data.unresolved > 1.5 else []
@@ -147,10 +164,14 @@ def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:
     for z in fit.multipliers:
         if fit.result == Result.OK and z.imag >= 0 and abs(z) > least:
             text = f"the mode of the multiplier {z:.3g} hardly decays in {cycles:.0f} cycles: look "
-            yield Finding("no decay", f"{text}for hum or drift in the spectra of outputs.")
+            yield Finding(
+                "no decay", f"{text}for hum or drift in the spectra of outputs."
+            )
 
 
-def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> Iterator[Finding]:
+def _about_excitation(
+    data: SectionData, fit: SeriesFit, band: list[float]
+) -> Iterator[Finding]:
     f, power = input_spectrum(data)
     for name, edge, strength in zip(fit.inputs, band, power.T, strict=True):
         for z in (x for x in fit.multipliers if x.imag >= 0):
@@ -162,7 +183,9 @@ def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> I
         if edge < WHOLE_BAND * fit.n_sections / 2:
             text = f"transfer functions are determined up to {edge:.3g} cycles per period, where "
             text += f"the power of {name} ends."
-            text += " Responses at different phases can hardly be told apart." * (edge < 1)
+            text += " Responses at different phases can hardly be told apart." * (
+                edge < 1
+            )
             yield Finding("narrow excitation" if edge < 1 else "band", text)
 
 
@@ -171,11 +194,15 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
     for i, j in combinations(range(ny), 2):
         y, sampled = (x[..., [i, j]].reshape(-1, N, 2) for x in (grid.y, grid.sampled))
         both = np.asarray(sampled.all(axis=2))
-        with np.errstate(invalid="ignore"):  # of an output that is constant at a section
+        with np.errstate(
+            invalid="ignore"
+        ):  # of an output that is constant at a section
             matrices = [np.corrcoef(y[both[:, n], n].T) for n in range(N)]
         if np.median(np.nan_to_num(np.abs(matrices)[:, 0, 1])) > _SAME_OUTPUTS:
             text = f"{fit.outputs[i]} and {fit.outputs[j]} carry the same information at sections: "
-            yield Finding("outputs", f"{text}cycles between crossings may have smaller errors.")
+            yield Finding(
+                "outputs", f"{text}cycles between crossings may have smaller errors."
+            )
 
 
 def about_natural_multipliers(result: Any) -> Iterator[Finding]:
@@ -184,7 +211,9 @@ def about_natural_multipliers(result: Any) -> Iterator[Finding]:
     if each < _FEW_CYCLES:
         size = (1 + 3 * abs(result.multipliers[0])) / each
         bias = f"a bias of about {size:.2f} was corrected to first order only."
-        yield Finding("few cycles", f"{each:.3g} in each of {result.records} records; {bias}")
+        yield Finding(
+            "few cycles", f"{each:.3g} in each of {result.records} records; {bias}"
+        )
     if result.strength < 0.5:
         text = f"earlier sections explain {100 * result.strength:.0f} % of the states' variance."
         yield Finding("weak instruments", text)
@@ -198,7 +227,9 @@ def about_natural_multipliers(result: Any) -> Iterator[Finding]:
 def about_phase_response(r: Any) -> Iterator[Finding]:
     """Limits of a result of `phase_response`."""
     if r.p_flat > _LEVEL:
-        yield Finding("shape", f"a flat curve explains the data as well ({p_value(r.p_flat)}).")
+        yield Finding(
+            "shape", f"a flat curve explains the data as well ({p_value(r.p_flat)})."
+        )
     half = np.ptp(r.interval(r.phase), axis=0) / 2
     if half.max() > abs(r.coefficients[0]) / 2:
         worst = int(np.argmax(half))
@@ -209,12 +240,19 @@ def about_phase_response(r: Any) -> Iterator[Finding]:
     yield Finding("resolution", f"{text}{finest} at the end of a cycle.")
     if r.excess > 2:
         text = f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
-        yield Finding("misfit", f"{text}independent errors: the phase model lacks something.")
+        yield Finding(
+            "misfit", f"{text}independent errors: the phase model lacks something."
+        )
     if abs(r.memory) > _MEMORY:
         text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the curve "
-        yield Finding("memory", f"{text}shows the effect of a push on its own interval, not later.")
+        yield Finding(
+            "memory",
+            f"{text}shows the effect of a push on its own interval, not later.",
+        )
     if r.miscounted:
         text = f"{r.miscounted} of {r.intervals} intervals miss the model by half a cycle or more"
-        yield Finding("miscounted", f"{text}, as if an event had been missed; they are not used.")
+        yield Finding(
+            "miscounted", f"{text}, as if an event had been missed; they are not used."
+        )
     if r.result != Result.OK:
         yield Finding("no convergence", f"{Result(r.result).message}.")

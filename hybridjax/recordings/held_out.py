@@ -6,6 +6,7 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
+from .._core.findings import warn_of
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Covariance
@@ -16,7 +17,7 @@ from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.series.subspace import late_outputs, total_least_squares
 from ..identify.validate import Validation, can_be_compared, validate
 from .data import SectionData
-from .findings import untried_orders, warn_of
+from .findings import untried_orders
 
 
 # Cycles from which orders are chosen and held-out fits are made. More: time. Fewer: weak
@@ -53,8 +54,12 @@ class Split(NamedTuple):
         fits: list[SeriesFit] = []
         for d in range(1, most + 1):
             try:
-                problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
-                solution = linearize(problem, total_least_squares(late_outputs(problem, d)))
+                problem = OutputErrorProblem.from_data(
+                    self.early, d, N, free_start=True
+                )
+                solution = linearize(
+                    problem, total_least_squares(late_outputs(problem, d))
+                )
                 missing = missing_cycles(problem, solution, 2 * d + 1)
             except TooFewCycles as error:
                 missing = error.missing + d

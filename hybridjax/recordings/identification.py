@@ -7,6 +7,7 @@ import equinox as eqx
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
+from .._core.findings import Finding, refuse, warn_of
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from .._core.text import listed
@@ -16,7 +17,7 @@ from ..identify.series.in_loop import best_order
 from ..identify.series.records import SLOW
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
-from .findings import Finding, refuse, untried_orders, warn_of
+from .findings import untried_orders
 from .fit_warnings import Advice, advise, undamped
 from .held_out import HeldOut, split
 from .impulse import ImpulseResponses, impulse_responses
@@ -109,7 +110,9 @@ def identify_recording(
     definition = None if isinstance(phase, Phase) else phase
     phase = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
     if drift is not None:
-        drifting = set(outputs) | (set() if definition is None else signals_of(definition))
+        drifting = set(outputs) | (
+            set() if definition is None else signals_of(definition)
+        )
         recording = without_drift(recording, phase, sorted(drifting), drift)
         phase = phase if definition is None else estimate_phase(recording, definition)
     say("data at the sections")
@@ -128,16 +131,31 @@ def identify_recording(
     findings = (*inspection.findings, *inspect_cycles(recording, phase, driving))
     refuse(findings)
     say("order")
-    data, parts, most = whole.of_inputs(inputs), split(whole), 4 if order is None else order + 2
-    best, obstacle = best_order(whole, outside, most) if outside else parts.best_order(most)
+    data, parts, most = (
+        whole.of_inputs(inputs),
+        split(whole),
+        4 if order is None else order + 2,
+    )
+    best, obstacle = (
+        best_order(whole, outside, most) if outside else parts.best_order(most)
+    )
     if order is None:
         order, findings = best, (*findings, *untried_orders(best, obstacle))
     elif best > order:
-        text = "the reference determines" if outside else "held-out strides are predicted better by"
+        text = (
+            "the reference determines"
+            if outside
+            else "held-out strides are predicted better by"
+        )
         text = f"{text} {best} multipliers, not {order}: "
         text += f"{order} may be biased, and their intervals too narrow. Compare order={best}"
-        slow = outside is None and split(whole.with_drift(SLOW)).best_order(most)[0] <= order
-        text += f", and drift={SLOW:g}, with which {order} are as good." if slow else "."
+        slow = (
+            outside is None
+            and split(whole.with_drift(SLOW)).best_order(most)[0] <= order
+        )
+        text += (
+            f", and drift={SLOW:g}, with which {order} are as good." if slow else "."
+        )
         findings = (*findings, Finding("drift" if slow else "order", text))
     say("fit to the first three quarters")
     held = parts.fit(order, outside)
@@ -152,4 +170,6 @@ def identify_recording(
     responses = impulse_responses(fit, data)
     warn_of(findings[len(inspection.findings) :])
     advice = advise(data, fit, held.validation, findings)
-    return Identification(recording, findings, phase, data, fit, held, responses, curve, advice)
+    return Identification(
+        recording, findings, phase, data, fit, held, responses, curve, advice
+    )

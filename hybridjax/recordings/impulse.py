@@ -67,7 +67,9 @@ class ImpulseResponses(eqx.Module):
         return _by_push(h, self.durations, weights)
 
 
-ResponseCycles = Annotated[float, Number("a number above 0, up to 10000", above=0, high=1e4)]
+ResponseCycles = Annotated[
+    float, Number("a number above 0, up to 10000", above=0, high=1e4)
+]
 PushWidth = Annotated[float, Number("a number from 0 to 1000", low=0, high=1e3)]
 
 
@@ -101,12 +103,16 @@ def impulse_responses(
     N, R = fit.numerators.shape[:2]
     if width is None:
         edge = min(input_band(data))
-        width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < WHOLE_BAND * N / 2 else 0.0
+        width = (
+            _SPECTRUM_REACH / (2 * np.pi * edge) if edge < WHOLE_BAND * N / 2 else 0.0
+        )
     if cycles is None:
         cycles = max(3.0, 2 * _PUSH_REACH * width)
     lags = round(cycles * N) + 1
     if lags < 2:
-        raise DefinitionError(f"`cycles` must hold one section or more, but is {cycles:g}.")
+        raise DefinitionError(
+            f"`cycles` must hold one section or more, but is {cycles:g}."
+        )
     weights = _push(width * N)
     reach = len(weights) // 2
     if reach >= lags:
@@ -140,7 +146,9 @@ def impulse_responses(
     durations = average_cycle(np.concatenate(section) % N, steps[:, None], N)[:, 0]
     values, std = (_by_push(x, durations, weights) for x in (pushed(h), std))
     phase, lag, width = np.arange(N) / N, np.arange(lags) / N, float(width)
-    return ImpulseResponses(values, std, phase, lag, width, durations, fit.inputs, fit.outputs)
+    return ImpulseResponses(
+        values, std, phase, lag, width, durations, fit.inputs, fit.outputs
+    )
 
 
 def _push(width: float) -> Series:
@@ -150,7 +158,9 @@ def _push(width: float) -> Series:
     return weights / weights.sum()
 
 
-def _by_push(h: Float[np.ndarray, "lags N ..."], durations: Series, weights: Series) -> Any:
+def _by_push(
+    h: Float[np.ndarray, "lags N ..."], durations: Series, weights: Series
+) -> Any:
     """Responses to a push of area 1 by its section, from those by the section of the response."""
     N, area = len(durations), ndimage.correlate1d(durations, weights, mode="wrap")
     m, r = np.arange(N)[:, None], np.arange(len(h))

@@ -21,10 +21,10 @@ from scipy import stats
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Probability, Seed
 from .._core.boundary.values import Whole
+from .._core.findings import Finding, print_findings
 from .._core.progress import working
 from ..errors import DefinitionError
 from .data import SectionData
-from .findings import Finding, print_findings
 from .fit_warnings import about_natural_multipliers
 
 
@@ -90,9 +90,13 @@ class NaturalMultipliers(eqx.Module):
 
     def __repr__(self) -> str:
         d, b = len(self.multipliers), self.block
-        lines = [f"NaturalMultipliers({self.cycles} cycles, order {d}, blocks of {b} cycles)"]
+        lines = [
+            f"NaturalMultipliers({self.cycles} cycles, order {d}, blocks of {b} cycles)"
+        ]
         for plain, values in enumerate((self.multipliers, self.plain)):
-            for z, (low, high) in zip(values, self.interval(plain=bool(plain)), strict=True):
+            for z, (low, high) in zip(
+                values, self.interval(plain=bool(plain)), strict=True
+            ):
                 name = "least squares" if plain else "by instruments"
                 value = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
                 bounds = f"modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
@@ -158,10 +162,14 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
         np.tensordot(weights, products, (1, 1)) for products in moments[:5]
     )
     first = np.linalg.pinv(square, hermitian=True) @ np.swapaxes(cross, 2, 3)
-    by_instruments = _corrected(_multipliers(ahead @ first @ np.linalg.pinv(cross @ first)), length)
+    by_instruments = _corrected(
+        _multipliers(ahead @ first @ np.linalg.pinv(cross @ first)), length
+    )
     plain = _multipliers(forward @ np.linalg.inv(state))
     explained = cross[0] @ np.linalg.solve(square[0], np.swapaxes(cross[0], 1, 2))
-    shares = np.trace(explained, axis1=1, axis2=2) / np.trace(state[0], axis1=1, axis2=2)
+    shares = np.trace(explained, axis1=1, axis2=2) / np.trace(
+        state[0], axis1=1, axis2=2
+    )
     draws, plain_draws, strength = by_instruments[1:], plain[1:], float(shares.mean())
     return NaturalMultipliers(
         by_instruments[0], plain[0], draws, plain_draws, strength, K, len(counts), block
@@ -190,16 +198,23 @@ def _moments(data: SectionData, order: int) -> _Moments:
 
     **Raises:** `DefinitionError` for too few cycles, or signals, for so many.
     """
-    N, before = data.n_sections, 3 * _EACH + 1  # of instruments there is one section more
+    N, before = (
+        data.n_sections,
+        3 * _EACH + 1,
+    )  # of instruments there is one section more
     size = np.nanstd(np.concatenate([x.y for x in data.records]), axis=0)
     y = [r.y / size for r in data.records]
     if order > _EACH * len(size):
-        raise DefinitionError(f"`order` must be at most {_EACH * len(size)}, the size of a state.")
-    rows = np.array([
-        (s, (r.first_section + k) // N, (r.first_section + k) % N, k)
-        for s, r in enumerate(data.records)
-        for k in range(before - 1, len(r.y) - N)
-    ]).reshape(-1, 4)  # fmt: skip
+        raise DefinitionError(
+            f"`order` must be at most {_EACH * len(size)}, the size of a state."
+        )
+    rows = np.array(
+        [
+            (s, (r.first_section + k) // N, (r.first_section + k) % N, k)
+            for s, r in enumerate(data.records)
+            for k in range(before - 1, len(r.y) - N)
+        ]
+    ).reshape(-1, 4)
     names, cycle = np.unique(rows[:, :2], axis=0, return_inverse=True)
     K, needed = len(names), 2 * (_EACH * order + 2)
     if K < needed:
@@ -207,21 +222,29 @@ def _moments(data: SectionData, order: int) -> _Moments:
         raise DefinitionError(f"{text}: record {needed} or more.")
 
     def values(shift: int, count: int) -> Float[np.ndarray, "rows k"]:
-        return np.array([y[s][k - shift - np.arange(count)].ravel() for s, _, _, k in rows])
+        return np.array(
+            [y[s][k - shift - np.arange(count)].ravel() for s, _, _, k in rows]
+        )
 
     state, after = values(0, _EACH), values(-N, _EACH)
     instruments = values(2 * _EACH - 1, _EACH + 1)
-    finite = np.isfinite(np.concatenate([state, after, instruments], axis=1)).all(axis=1)
+    finite = np.isfinite(np.concatenate([state, after, instruments], axis=1)).all(
+        axis=1
+    )
     r = min(_EACH * (order + 1), instruments.shape[1])
     shapes = ((order, order), (order, order), (r, r), (order, r), (order, r))
     parts = [np.zeros((N, K, *shape)) for shape in shapes]
     for n in range(N):
         at = np.flatnonzero(finite & (rows[:, 2] == n))
         if len(at) <= r + 1:
-            raise DefinitionError(f"section {n} was seen in {len(at)} cycles only: record longer.")
+            raise DefinitionError(
+                f"section {n} was seen in {len(at)} cycles only: record longer."
+            )
         x, z = _principal(state[at], after[at], order)
         q, _ = _principal(instruments[at], instruments[at], r)
-        for part, (a, b) in zip(parts, ((x, x), (z, x), (q, q), (x, q), (z, q)), strict=True):
+        for part, (a, b) in zip(
+            parts, ((x, x), (z, x), (q, q), (x, q), (z, q)), strict=True
+        ):
             part[n, cycle[at]] = a[:, :, None] * b[:, None, :]
     return _Moments._make([*parts, names[:, 0]])
 
@@ -232,7 +255,9 @@ def _principal(
     """Return both in the combinations along which the first varies most, with its variance 1."""
     mean = x.mean(axis=0)
     _, s, axes = np.linalg.svd(x - mean, full_matrices=False)
-    onto = axes[:count].T / np.maximum(s[:count], 1e-9 * s[0]) * np.sqrt(len(x))  # below: rounding
+    onto = (
+        axes[:count].T / np.maximum(s[:count], 1e-9 * s[0]) * np.sqrt(len(x))
+    )  # below: rounding
     return (x - mean) @ onto, (other - other.mean(axis=0)) @ onto
 
 
@@ -243,7 +268,9 @@ def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Draws:
     for k in range(values.shape[2]):
         later = np.pad(c, ((0, 0), (0, 0), (1, 0))) * values[..., k, None]
         c = np.pad(c, ((0, 0), (0, 0), (0, 1))) - later
-    return _largest_first(np.array([np.roots(x) for x in np.real(c).mean(axis=1)], complex))
+    return _largest_first(
+        np.array([np.roots(x) for x in np.real(c).mean(axis=1)], complex)
+    )
 
 
 def _largest_first(z: Draws) -> Draws:
@@ -256,7 +283,9 @@ def _corrected(z: Draws, length: float) -> Draws:
     one multiplier Kendall's (1 + 3 z) / length)."""
     a, b = z[:, :, None], z[:, None, :]
     ab = np.clip(np.abs(a * b), 0, 0.99) * np.exp(1j * np.angle(a * b))
-    return _largest_first(z + (1 + 2 * z + (b * (1 - a**2) / (1 - ab)).sum(axis=2)) / length)
+    return _largest_first(
+        z + (1 + 2 * z + (b * (1 - a**2) / (1 - ab)).sum(axis=2)) / length
+    )
 
 
 def _resampled(

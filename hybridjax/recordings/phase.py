@@ -42,7 +42,9 @@ class Winding(eqx.Module):
 
     def edges(self) -> Float[np.ndarray, " c1"]:
         """Return the times at which the phase is a whole number."""
-        return self.when(np.arange(np.ceil(self.phase[0]), np.floor(self.phase[-1]) + 1))
+        return self.when(
+            np.arange(np.ceil(self.phase[0]), np.floor(self.phase[-1]) + 1)
+        )
 
     def at(self, time: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return the phase at some times; NaN outside of the stretch."""
@@ -74,7 +76,9 @@ class Phase(eqx.Module):
     def __check_init__(self):
         """**Raises:** `DefinitionError` for stretches that hold fewer than two whole cycles."""
         if self.cycles < 2:
-            raise DefinitionError(f"the recording has {self.cycles} whole cycles: record more.")
+            raise DefinitionError(
+                f"the recording has {self.cycles} whole cycles: record more."
+            )
 
     @remembered
     def periods(self) -> tuple[Float[np.ndarray, " _"], ...]:
@@ -104,7 +108,11 @@ class Phase(eqx.Module):
     @property
     def drift(self) -> float:
         """Relative change of the period per cycle: a straight line through each trial."""
-        long = [(np.arange(len(p)) - (len(p) - 1) / 2, p) for p in self.periods if len(p) > 2]
+        long = [
+            (np.arange(len(p)) - (len(p) - 1) / 2, p)
+            for p in self.periods
+            if len(p) > 2
+        ]
         weight = sum(k @ k for k, _ in long)
         return float(sum(k @ p for k, p in long) / max(weight, 1.0) / self.period)
 
@@ -116,9 +124,13 @@ class Phase(eqx.Module):
         return float(np.sqrt(sum(x @ x for x in off) / max(freedom, 1))) / self.period
 
     def __repr__(self) -> str:
-        notes = f"; {100 * self.backwards:.2g} % of samples ran backwards" * bool(self.backwards)
+        notes = f"; {100 * self.backwards:.2g} % of samples ran backwards" * bool(
+            self.backwards
+        )
         notes += f"; {self.dropped} doubled events left out" * bool(self.dropped)
-        notes += f"; {self.missed} cycles with missed events left out" * bool(self.missed)
+        notes += f"; {self.missed} cycles with missed events left out" * bool(
+            self.missed
+        )
         pieces = sum(len(s) for s in self.stretches)
         return folded(
             f"Phase({self.cycles} cycles in {pieces} stretches of {len(self.stretches)} trials; "

@@ -14,7 +14,16 @@ from ..sections.families import KinematicPhase
 from . import smoothing
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
 from .recording import Recording, signal_of
-from .smoothing import FEWEST, Bandwidth, Series, bridgeable, gaps, inside, spline, without_spikes
+from .smoothing import (
+    FEWEST,
+    Bandwidth,
+    Series,
+    bridgeable,
+    gaps,
+    inside,
+    spline,
+    without_spikes,
+)
 
 
 PhaseDefinition: TypeAlias = KinematicPhase | Crossing | AtEvent
@@ -30,7 +39,10 @@ _COMMON = 0.1
 
 @checked
 def estimate_phase(
-    recording: Recording, definition: PhaseDefinition, *, bandwidth: Bandwidth | None = None
+    recording: Recording,
+    definition: PhaseDefinition,
+    *,
+    bandwidth: Bandwidth | None = None,
 ) -> Phase:
     """Estimate the phase of every trial.
 
@@ -61,13 +73,17 @@ def estimate_phase(
     cycles.
     """
     if isinstance(definition, KinematicPhase):
-        return _from_angles(_angles(recording, definition, bandwidth), definition.n_sections)
+        return _from_angles(
+            _angles(recording, definition, bandwidth), definition.n_sections
+        )
     if isinstance(definition, Crossing):
         name = str(definition)
         if bandwidth is None:  # noise adds crossings of the samples themselves
             rough = _from_events(recording.mark(name, definition), name)
             bandwidth = HARMONICS / 2 / rough.period
-        phase = _from_events(recording.mark(name, definition, bandwidth=bandwidth), name)
+        phase = _from_events(
+            recording.mark(name, definition, bandwidth=bandwidth), name
+        )
         smoothing.require_passing(bandwidth, 1 / phase.period)
         return phase
     if bandwidth is not None:
@@ -102,18 +118,26 @@ def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
             phase = np.sign(rate) * np.unwrap(angle[part]) / (2 * np.pi)
             low = np.maximum.accumulate(phase)
             high = np.minimum.accumulate(phase[::-1])[::-1]
-            rising = np.diff((low + high) / 2, prepend=-np.inf) > 1e-12  # more than rounding
+            rising = (
+                np.diff((low + high) / 2, prepend=-np.inf) > 1e-12
+            )  # more than rounding
             if len(part) < FEWEST or rising.sum() < 2:
                 continue
             backwards += int((np.diff(phase) < 0).sum())
             total += len(part)
             t = time[part]
             unseen = gaps(t, bridgeable(t))[1:-1]
-            stretches[-1] += (Winding(t[rising], ((low + high) / 2)[rising], False, unseen),)
-    return Phase(tuple(stretches), n_sections=n_sections, backwards=backwards / max(total, 1))
+            stretches[-1] += (
+                Winding(t[rising], ((low + high) / 2)[rising], False, unseen),
+            )
+    return Phase(
+        tuple(stretches), n_sections=n_sections, backwards=backwards / max(total, 1)
+    )
 
 
-def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | None) -> list[_Angle]:
+def _angles(
+    recording: Recording, family: KinematicPhase, bandwidth: float | None
+) -> list[_Angle]:
     """Return the angle of two signals about a center in each trial; `bandwidth` of the splines in
     Hz."""
     names = family.position, family.velocity
@@ -142,11 +166,15 @@ def _angles(recording: Recording, family: KinematicPhase, bandwidth: float | Non
         angles.append(angle_of(time, np.stack(smooth, axis=1)))
     if isinstance(anchor, Crossing):
         first = _angle_at(recording, anchor, bandwidth, angles)
-        angles = [(time, np.angle(np.exp(1j * (angle - first)))) for time, angle in angles]
+        angles = [
+            (time, np.angle(np.exp(1j * (angle - first)))) for time, angle in angles
+        ]
     return angles
 
 
-def _at_common_times(time: Series, signals: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def _at_common_times(
+    time: Series, signals: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
     """Interpolate two signals with clocks of their own, each at the times of the other, not in
     gaps."""
     finite = np.isfinite(signals)
@@ -169,13 +197,19 @@ def _plane(
     for name in (family.position, family.velocity):
         values = np.concatenate([x[np.isfinite(x)] for _, x in recording.samples(name)])
         if not len(values):
-            raise DefinitionError(f"{name} is missing at every sample: define the phase by others.")
+            raise DefinitionError(
+                f"{name} is missing at every sample: define the phase by others."
+            )
         limits.append(np.quantile(values, [0.01, 0.99]))
         if family.scale is None and limits[-1][0] == limits[-1][1]:
-            raise DefinitionError(f"{name} is constant: define the phase by a signal that varies.")
+            raise DefinitionError(
+                f"{name} is constant: define the phase by a signal that varies."
+            )
     low, high = np.transpose(limits)
     center = (low + high) / 2 if family.center is None else np.asarray(family.center)
-    return center, (high - low) / 2 if family.scale is None else np.asarray(family.scale)
+    return center, (high - low) / 2 if family.scale is None else np.asarray(
+        family.scale
+    )
 
 
 def _angle_at(
@@ -190,7 +224,9 @@ def _angle_at(
         crossed.append(np.interp(at, time, np.unwrap(angle)))
     mean = np.exp(1j * np.concatenate(crossed)).mean()
     if not abs(mean) > 0.5:
-        text = "happens all around the cycle: choose a crossing that comes once in each."
+        text = (
+            "happens all around the cycle: choose a crossing that comes once in each."
+        )
         raise DefinitionError(f"{name}, the anchor of section 0, {text}")
     return float(np.angle(mean))
 
@@ -201,7 +237,9 @@ def _turns_per_time(angles: Sequence[_Angle]) -> float:
     span = sum(float(t[-1] - t[0]) for t, _ in angles)
     if abs(turns) < 2:
         text = "the center must lie within the loop of the signals, and two cycles are needed."
-        raise DefinitionError(f"the phase does not wind: {turns:.2g} turns in {span:.4g}; {text}")
+        raise DefinitionError(
+            f"the phase does not wind: {turns:.2g} turns in {span:.4g}; {text}"
+        )
     return turns / span
 
 
@@ -213,7 +251,9 @@ def _from_events(recording: Recording, name: str) -> Phase:
         times.append(trial.events[name])
     intervals = np.concatenate([np.diff(t) for t in times])
     if len(intervals) < 2:
-        raise DefinitionError(f"two cycles need three events '{name}' in a trial: record more.")
+        raise DefinitionError(
+            f"two cycles need three events '{name}' in a trial: record more."
+        )
     common, dropped, missed, stretches = _period(intervals), 0, 0, []
     for trial, t in zip(recording.trials, times, strict=True):
         period, doubled, longest = common, 0.5, 1.5
@@ -226,10 +266,17 @@ def _from_events(recording: Recording, name: str) -> Phase:
         dropped += len(t) - len(kept)
         t = np.array(kept)
         pauses = gaps(trial.time, bridgeable(trial.time, LONGEST_GAP * period))
-        wide = np.flatnonzero((np.diff(t) > longest * period) | inside(pauses, t[:-1], t[1:])) + 1
+        wide = (
+            np.flatnonzero(
+                (np.diff(t) > longest * period) | inside(pauses, t[:-1], t[1:])
+            )
+            + 1
+        )
         missed += sum(max(round(float(t[k] - t[k - 1]) / period), 1) for k in wide)
         parts = [part for part in np.split(t, wide) if len(part) > 1]
-        stretches.append(tuple(Winding(p, 1.0 * np.arange(len(p)), True) for p in parts))
+        stretches.append(
+            tuple(Winding(p, 1.0 * np.arange(len(p)), True) for p in parts)
+        )
     return Phase(tuple(stretches), dropped=dropped, missed=missed, lead=1)
 
 

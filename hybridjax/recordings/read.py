@@ -65,7 +65,9 @@ def read_recording(
     if not files:
         raise DefinitionError("`read_recording` needs the name of one file or more.")
     wanted = Wanted(time, None if signals is None else tuple(signals))
-    return Recording.join([_recording(x, wanted, dict(units or {})) for x in map(Path, files)])
+    return Recording.join(
+        [_recording(x, wanted, dict(units or {})) for x in map(Path, files)]
+    )
 
 
 _READERS = {
@@ -85,7 +87,9 @@ def read_tables(path: Path, wanted: Wanted) -> list[Columns]:
 
     **Raises:** as `read_recording`.
     """
-    if (reader := read_bag if path.is_dir() else _READERS.get(path.suffix.lower())) is None:
+    if (
+        reader := read_bag if path.is_dir() else _READERS.get(path.suffix.lower())
+    ) is None:
         kinds = ", ".join(_READERS)
         raise DefinitionError(f"'{path}' ends in '{path.suffix}'; formats are {kinds}.")
     try:
@@ -107,10 +111,14 @@ def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
             notes.append(f"the times in '{table.clock}' have no unit: taken as seconds")
         events |= table.events
         names += table.signals
-        signals = {x: values for x, values in table.signals.items() if wanted.includes(x)}
+        signals = {
+            x: values for x, values in table.signals.items() if wanted.includes(x)
+        }
         given = {x: unit for x, unit in table.units.items() if x in signals}
         if signals:
-            parts.append(Recording(table.time, signals, units=given, name=path.stem, notes=notes))
+            parts.append(
+                Recording(table.time, signals, units=given, name=path.stem, notes=notes)
+            )
     wanted.require(path, names)
     if not parts:
         raise DefinitionError(f"'{path}' has no signals beside its times: export some.")
@@ -119,7 +127,9 @@ def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
     for name, at in events.items():
         events[name] = check_events(f"'{path}'", name, at, trial.time)
         if lost := int(np.isfinite(at).sum()) - len(events[name]):
-            notes.append(f"{lost} events '{name}' outside of the recording were left out")
+            notes.append(
+                f"{lost} events '{name}' outside of the recording were left out"
+            )
     return Recording(
         trial.time,
         dict(zip(whole.signals, trial.values.T, strict=True)),

@@ -82,28 +82,44 @@ class Recording(eqx.Module):
         if not signals:
             raise DefinitionError(f"{where} has no signals.")
         columns = {key: numbers(where, key, values) for key, values in signals.items()}
-        happened = {key: numbers(where, key, values) for key, values in (events or {}).items()}
+        happened = {
+            key: numbers(where, key, values) for key, values in (events or {}).items()
+        }
         for key, values in columns.items():
             require_equal(f"{where}: {key} and time", "lengths", len(values), len(time))
         for key, values in (happened | columns).items():
             if np.isinf(values).any():
                 text = f"{key} is infinite at sample {int(np.argmax(np.isinf(values)))}"
-                raise DefinitionError(f"{where}: {text}; put NaN where a sample is bad.")
+                raise DefinitionError(
+                    f"{where}: {text}; put NaN where a sample is bad."
+                )
         if len(time) < 2:
-            raise DefinitionError(f"{where} has {len(time)} samples, but two or more are needed.")
+            raise DefinitionError(
+                f"{where} has {len(time)} samples, but two or more are needed."
+            )
         if not (later := np.diff(np.where(np.isinf(time), np.nan, time)) > 0).all():
             bad = 1 + int(np.argmin(later))
             a, b = time[bad - 1 : bad + 1]
-            advice = "sort, or make a trial of each part" if b < a else "leave out such samples"
+            advice = (
+                "sort, or make a trial of each part"
+                if b < a
+                else "leave out such samples"
+            )
             text = f"time does not increase at sample {bad} ({a:.10g}, then {b:.10g})"
             raise DefinitionError(f"{where}: {text}: {advice}.")
         require_among("signal", units, columns, f"{where}, `units`: ")
         if both := set(happened) & set(columns):
-            raise DefinitionError(f"{where}: '{min(both)}' is a signal and an event: rename one.")
-        happened = {key: np.sort(values[~np.isnan(values)]) for key, values in happened.items()}
+            raise DefinitionError(
+                f"{where}: '{min(both)}' is a signal and an event: rename one."
+            )
+        happened = {
+            key: np.sort(values[~np.isnan(values)]) for key, values in happened.items()
+        }
         for key, values in happened.items():
             check_events(where, key, values, time)
-        self.trials = (Trial(time, np.stack(list(columns.values()), axis=1), happened, name),)
+        self.trials = (
+            Trial(time, np.stack(list(columns.values()), axis=1), happened, name),
+        )
         self.signals = tuple(columns)
         self.units = tuple(units.get(key, "") for key in columns)
         self.notes = tuple(notes)
@@ -130,7 +146,10 @@ class Recording(eqx.Module):
         keys = getattr(frame, "column_names", None) or getattr(frame, "keys", list)()
         columns = Columns({str(key): frame[key] for key in keys})
         table = parse_table(f"trial '{name}'", columns, time)
-        events, units = table.events | dict(events or {}), table.units | dict(units or {})
+        events, units = (
+            table.events | dict(events or {}),
+            table.units | dict(units or {}),
+        )
         return cls(table.time, table.signals, events=events, units=units, name=name)
 
     @staticmethod
@@ -156,7 +175,9 @@ class Recording(eqx.Module):
                 trials.append(t if same else replace(t, values=t.values[:, order]))
         notes = dict.fromkeys(note for other in recordings for note in other.notes)
         signals = dict(zip(units, trials[0].values.T, strict=True))
-        return Recording(trials[0].time, signals, units=units, notes=[*notes]).with_trials(trials)
+        return Recording(
+            trials[0].time, signals, units=units, notes=[*notes]
+        ).with_trials(trials)
 
     @staticmethod
     def beside(recordings: Iterable["Recording"]) -> "Recording":
@@ -171,22 +192,32 @@ class Recording(eqx.Module):
         """
         recordings = list(recordings)
         if len({len(x.trials) for x in recordings}) != 1:
-            raise DefinitionError("`recordings` must have the same number of trials each.")
+            raise DefinitionError(
+                "`recordings` must have the same number of trials each."
+            )
         names = [name for x in recordings for name in x.signals]
-        units = dict(zip(names, (unit for x in recordings for unit in x.units), strict=True))
+        units = dict(
+            zip(names, (unit for x in recordings for unit in x.units), strict=True)
+        )
         notes = [note for x in recordings for note in x.notes]
         if len(units) < len(names):
             twice = next(x for x in names if names.count(x) > 1)
-            raise DefinitionError(f"two recordings have a signal '{twice}': rename one.")
+            raise DefinitionError(
+                f"two recordings have a signal '{twice}': rename one."
+            )
         out = []
         for trials in zip(*(x.trials for x in recordings), strict=True):
             name = trials[0].name
             time = np.unique(np.concatenate([t.time for t in trials]))
             if len(time) * len(names) > limits.RECORDED:
-                text = f"{len(names)} signals at {len(time)} times are too many together"
+                text = (
+                    f"{len(names)} signals at {len(time)} times are too many together"
+                )
                 raise DefinitionError(f"trial '{name}': {text}: choose `signals`.")
             if any(len(t.time) < len(time) for t in trials):
-                notes.append("signals have different rates or clocks: they are missing in between")
+                notes.append(
+                    "signals have different rates or clocks: they are missing in between"
+                )
             values: list[np.ndarray] = []
             events: dict[str, np.ndarray] = {}
             for t in trials:
@@ -194,10 +225,16 @@ class Recording(eqx.Module):
                 values[-1][np.searchsorted(time, t.time)] = t.values
                 events |= t.events
             signals = dict(zip(names, np.concatenate(values, axis=1).T, strict=True))
-            out.append(Recording(time, signals, events=events, units=units, name=name, notes=notes))
+            out.append(
+                Recording(
+                    time, signals, events=events, units=units, name=name, notes=notes
+                )
+            )
         return Recording.join(out)
 
-    def mark(self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf) -> "Recording":
+    def mark(
+        self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf
+    ) -> "Recording":
         """Add an event at each time at which a signal crosses a level.
 
         A jump in the stated direction is an event; a jump in the other direction, as of an angle
@@ -224,7 +261,9 @@ class Recording(eqx.Module):
                 text = f"{signal} is never seen to cross {level:g}, {crossing.direction}: choose a "
                 text += f"`value` between {np.nanmin(x):.4g} and {np.nanmax(x):.4g}."
                 raise DefinitionError(f"trial '{trial.name}': {text}")
-            crossed = find_root(lambda t, curve=curve: curve(t) - level, (t[at], t[at + 1])).x
+            crossed = find_root(
+                lambda t, curve=curve: curve(t) - level, (t[at], t[at + 1])
+            ).x
             trials.append(replace(trial, events=trial.events | {event: crossed}))
         return self.with_trials(trials)
 
@@ -255,12 +294,15 @@ class Recording(eqx.Module):
             step = np.diff(t.time)
             middle = float(np.median(step))
             missing = int(np.isnan(t.values).any(axis=1).sum())
-            lines.append(folded(
-                f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g} s, every "
-                f"{middle:.4g} s ({1 / middle:.4g} Hz, longest {step.max():.4g} s)"
-                + (f"; {missing} with gaps" if missing else "")
-                + "".join(f"; {len(at)} {name}" for name, at in t.events.items()), "  "
-            ))  # fmt: skip
+            lines.append(
+                folded(
+                    f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g} s, every "
+                    f"{middle:.4g} s ({1 / middle:.4g} Hz, longest {step.max():.4g} s)"
+                    + (f"; {missing} with gaps" if missing else "")
+                    + "".join(f"; {len(at)} {name}" for name, at in t.events.items()),
+                    "  ",
+                )
+            )
         return "\n".join([*lines, *(f"  ({note})" for note in self.notes)])
 
 
@@ -270,7 +312,9 @@ def signal_of(crossing: Crossing) -> str:
     **Raises:** `DefinitionError` for a crossing of a function or in charts.
     """
     if not isinstance(crossing.function, str) or crossing.charts is not None:
-        raise DefinitionError("the Crossing of a recording must name a signal, and no charts.")
+        raise DefinitionError(
+            "the Crossing of a recording must name a signal, and no charts."
+        )
     return crossing.function
 
 
@@ -285,5 +329,7 @@ def check_events(
     within = (at >= time[0] - margin) & (at <= time[-1] + margin)
     if len(at) and not within.any():
         text = f"are outside of the recording ({time[0]:.6g} to {time[-1]:.6g} s): check their unit"
-        raise DefinitionError(f"{where}: all events '{name}' ({at[0]:.6g} s, ...) {text}.")
+        raise DefinitionError(
+            f"{where}: all events '{name}' ({at[0]:.6g} s, ...) {text}."
+        )
     return at[within]

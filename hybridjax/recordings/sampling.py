@@ -13,18 +13,27 @@ from .._core.arguments import require_equal
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, SectionCount, SignalNames
 from .._core.boundary.values import Number
+from .._core.findings import warn_of
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record, average_cycle
 from ..identify.descent import ROUNDING
 from . import smoothing
 from .data import SectionData
-from .findings import warn_of
 from .fit_warnings import slow_sampling
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
 from .phase_estimation import PhaseDefinition, estimate_phase
 from .recording import Recording, Trial
-from .smoothing import FEWEST, Bandwidth, Series, bridgeable, gaps, inside, means, spline
+from .smoothing import (
+    FEWEST,
+    Bandwidth,
+    Series,
+    bridgeable,
+    gaps,
+    inside,
+    means,
+    spline,
+)
 
 
 DriftCycles = Annotated[float, Number("four cycles or more", low=4, infinite=True)]
@@ -84,28 +93,42 @@ def section_data(
     for name in (*inputs, *outputs):
         values = [x[np.isfinite(x)] for _, x in recording.samples(name)]
         if not any(len(x) and np.ptp(x) for x in values):
-            raise DefinitionError(f"{name} is constant in all trials: repair it, or leave it out.")
+            raise DefinitionError(
+                f"{name} is constant in all trials: repair it, or leave it out."
+            )
     if not (inputs or outputs):
-        raise DefinitionError("events alone determine no multipliers: name inputs or outputs.")
+        raise DefinitionError(
+            "events alone determine no multipliers: name inputs or outputs."
+        )
     if not outputs and timing is None:
         timing = "duration"
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
     if None not in (n_sections, phase.n_sections):
-        require_equal("`n_sections` and phase", "n_sections", n_sections, phase.n_sections)
+        require_equal(
+            "`n_sections` and phase", "n_sections", n_sections, phase.n_sections
+        )
     N = n_sections or phase.n_sections or HARMONICS
     bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
     smoothing.require_passing(bandwidth, 1 / phase.period)
     nu, columns = len(inputs), [recording.column(x) for x in (*inputs, *outputs)]
     parts, trials, cycles, spikes = [], [], [], np.zeros(len(columns), int)
     for number, (trial, stretches) in enumerate(phase.by_trial(recording)):
-        signals, struck = _without_spikes(trial.time, trial.values[:, columns], nu, stretches)
+        signals, struck = _without_spikes(
+            trial.time, trial.values[:, columns], nu, stretches
+        )
         spikes += struck
-        for name, count in zip((*inputs, *outputs), np.isfinite(signals).sum(axis=0), strict=True):
-            if count < 2 * FEWEST:  # (a half of them is left out to see what interpolation loses)
+        for name, count in zip(
+            (*inputs, *outputs), np.isfinite(signals).sum(axis=0), strict=True
+        ):
+            if (
+                count < 2 * FEWEST
+            ):  # (a half of them is left out to see what interpolation loses)
                 text = f"trial '{trial.name}' has {count} samples of {name}: leave the trial out."
                 raise DefinitionError(text)
-        sections = _sample(trial.time, signals, nu, stretches, N, phase.period, bandwidth, sampled)
+        sections = _sample(
+            trial.time, signals, nu, stretches, N, phase.period, bandwidth, sampled
+        )
         if timing is not None:
             sections = _with_times(sections, N, phase.period, timing)
         if not sections:
@@ -116,14 +139,18 @@ def section_data(
         trials += [number] * len(sections)
         cycles += [mean] * len(sections)
     if not parts:
-        raise DefinitionError("the recording holds no whole cycle without gaps: record longer.")
+        raise DefinitionError(
+            "the recording holds no whole cycle without gaps: record longer."
+        )
     cycle = np.average(cycles, axis=0, weights=[len(x.k) for x in parts])
     _require_changes(parts, cycle, nu, outputs)
     names = [Signal(x, recording.unit(x)) for x in (*inputs, *outputs)]
     if timing is not None:
         names.append(Signal("time" if timing == "clock" else "duration", "s"))
         spikes = np.append(spikes, 0)
-        part, trial = max(zip(parts, trials, strict=True), key=lambda pair: len(pair[0].k))
+        part, trial = max(
+            zip(parts, trials, strict=True), key=lambda pair: len(pair[0].k)
+        )
         _require_times(part, N, float(np.median(np.diff(recording.trials[trial].time))))
     # A smoothing spline averages over neighbors on both sides.
     lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
@@ -133,24 +160,36 @@ def section_data(
     about: dict[str, Any] = {"n_sections": N, "lead": lead, "drift": np.inf}
     about |= {"inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
     records = (
-        Record(*np.split(x.values, [nu], 1), first_section=int(x.k[0]) % N, **about) for x in parts
+        Record(*np.split(x.values, [nu], 1), first_section=int(x.k[0]) % N, **about)
+        for x in parts
     )
     data = SectionData(
-        tuple(records), tuple(x.t for x in parts), tuple(trials), cycle[:, :nu], cycle[:, nu:],
-        phase.period, bandwidth, tuple(spikes.tolist()),
+        tuple(records),
+        tuple(x.t for x in parts),
+        tuple(trials),
+        cycle[:, :nu],
+        cycle[:, nu:],
+        phase.period,
+        bandwidth,
+        tuple(spikes.tolist()),
         float(np.sqrt(change / size).max(initial=0)),
-    )  # fmt: skip
+    )
     warn_of(slow_sampling(data))
     return data
 
 
 def _without_spikes(
-    time: Series, signals: Float[np.ndarray, "n nuy"], nu: int, stretches: Sequence[Winding]
+    time: Series,
+    signals: Float[np.ndarray, "n nuy"],
+    nu: int,
+    stretches: Sequence[Winding],
 ) -> tuple[Float[np.ndarray, "n nuy"], Int[np.ndarray, " nuy"]]:
     """Return signals (nu inputs, then outputs) without isolated spikes, and their numbers."""
     signals, counts = signals.copy(), []
     times, phases, cycle = [np.zeros(0)], [np.zeros(0)], 0.0
-    for w in stretches:  # the phase continues from stretch to stretch, each from a new cycle on
+    for w in (
+        stretches
+    ):  # the phase continues from stretch to stretch, each from a new cycle on
         times.append(w.time)
         phases.append(w.phase - np.floor(w.phase[0]) + cycle)
         cycle = np.ceil(phases[-1][-1])
@@ -178,14 +217,19 @@ class _Sections(NamedTuple):
 
 
 def _require_changes(
-    parts: list[_Sections], cycle: Float[np.ndarray, "N nuy"], nu: int, outputs: Sequence[str]
+    parts: list[_Sections],
+    cycle: Float[np.ndarray, "N nuy"],
+    nu: int,
+    outputs: Sequence[str],
 ) -> None:
     """**Raises:** `DefinitionError` for an output that most cycles repeat, but no input."""
     whole = [x.values[: len(x.k) // len(cycle) * len(cycle)] for x in parts]
     whole = [x.reshape(-1, *cycle.shape) for x in whole]
     steps = np.concatenate([np.abs(np.diff(x, axis=0)).max(axis=1) for x in whole])
     steps = np.sort(np.nan_to_num(steps, nan=np.inf), axis=0)[len(steps) // 2 :]
-    same = steps.min(axis=0, initial=np.inf) <= 1e3 * ROUNDING * np.abs(cycle).max(axis=0)
+    same = steps.min(axis=0, initial=np.inf) <= 1e3 * ROUNDING * np.abs(cycle).max(
+        axis=0
+    )
     for name in compress(outputs, same[nu:] & ~same[:nu].any()):
         text = f"{name} is the same in all cycles, but for rounding: it holds no deviations. "
         raise DefinitionError(f"{text}Record it while it varies, or leave it out.")
@@ -194,10 +238,14 @@ def _require_changes(
 def _require_times(part: _Sections, N: int, step: float) -> None:
     """**Raises:** `DefinitionError` for times that deviate by rounding, or by interpolation, whose
     errors depend on the place of a crossing between samples, which are `step` seconds apart."""
-    at = np.flatnonzero((part.k % N == 0) & np.isfinite(part.values[:, -1]))[3:-3]  # (no ends)
+    at = np.flatnonzero((part.k % N == 0) & np.isfinite(part.values[:, -1]))[
+        3:-3
+    ]  # (no ends)
     if len(at) > 20:  # (of fewer cycles, the seven waves below explain too much)
         t, late = part.t[at], detrend(part.values[at, -1])
-        waves = np.exp(2j * np.pi / step * np.outer(t - detrend(t), np.arange(4))).view(float)
+        waves = np.exp(2j * np.pi / step * np.outer(t - detrend(t), np.arange(4))).view(
+            float
+        )
         left = late - waves @ np.linalg.lstsq(waves, late)[0]
         # (Of interpolation errors 0.4 % are left, of deviations by the rhythm 95 %.)
         if left.std() <= 0.1 * late.std() + ROUNDING * t[-1]:
@@ -225,12 +273,16 @@ def _sample(
     ]
     for w in stretches:
         first, last = w.phase[[0, -1]] * N
-        k = np.arange(np.ceil(first - 1e-9), np.floor(last + 1e-9) + 1).astype(int)  # rounding
+        k = np.arange(np.ceil(first - 1e-9), np.floor(last + 1e-9) + 1).astype(
+            int
+        )  # rounding
         if len(k) <= N:
             continue
         t = np.clip(w.when(k / N), *w.time[[0, -1]])
         start, end = t[:-1], t[1:]
-        observed = ~inside(w.gaps[np.diff(w.gaps, axis=1)[:, 0] > period / N], start, start)
+        observed = ~inside(
+            w.gaps[np.diff(w.gaps, axis=1)[:, 0] > period / N], start, start
+        )
         values, change = (np.zeros((len(start), signals.shape[1] - k)) for k in (0, nu))
         for i, x in enumerate(signals.T):
             finite = np.isfinite(x)
@@ -244,7 +296,9 @@ def _sample(
                 values[:, i] = means(time, x, t)
             else:
                 at = time[finite]
-                values[:, i] = x[finite][np.searchsorted((at[:-1] + at[1:]) / 2, (start + end) / 2)]
+                values[:, i] = x[finite][
+                    np.searchsorted((at[:-1] + at[1:]) / 2, (start + end) / 2)
+                ]
             values[lost, i] = np.nan
         sections.append(_Sections(k[:-1], start, observed, values, change))
     return sections
@@ -259,13 +313,20 @@ def _with_times(
         # A line through the times of each section, t = T cycle + a[section], all with the same
         # slope T; cycles are counted through gaps.
         cycles = [
-            p.k // N + round((p.t[0] - parts[0].t[0]) / period - (p.k[0] - parts[0].k[0]) / N)
+            p.k // N
+            + round((p.t[0] - parts[0].t[0]) / period - (p.k[0] - parts[0].k[0]) / N)
             for p in parts
         ]
         section = np.concatenate([p.k % N for p in parts])
-        both = np.stack([np.concatenate(cycles), np.concatenate([p.t for p in parts])], axis=1)
+        both = np.stack(
+            [np.concatenate(cycles), np.concatenate([p.t for p in parts])], axis=1
+        )
         x, z = (both - average_cycle(section, both, N)[section]).T
-        z = np.where(np.concatenate([p.observed for p in parts]), z - (x @ z) / (x @ x) * x, np.nan)
+        z = np.where(
+            np.concatenate([p.observed for p in parts]),
+            z - (x @ z) / (x @ x) * x,
+            np.nan,
+        )
         late = np.split(z, np.cumsum([len(p.k) for p in parts])[:-1])
     pairs = zip(parts, late, strict=True)
     return [p._replace(values=np.column_stack([p.values, z])) for p, z in pairs]
@@ -291,8 +352,12 @@ def without_drift(
             middle, level = cycle_means(
                 trial, smoothing.without_spikes(values[:, k]), stretches, phase.period
             )
-            if len(middle) >= FEWEST and cycles < np.inf:  # (a constant drift is the mean)
-                slow = spline(middle, level - level.mean(), 0.5 / (cycles * phase.period))
+            if (
+                len(middle) >= FEWEST and cycles < np.inf
+            ):  # (a constant drift is the mean)
+                slow = spline(
+                    middle, level - level.mean(), 0.5 / (cycles * phase.period)
+                )
                 values[:, k] -= slow(np.clip(trial.time, middle[0], middle[-1]))
         trials.append(replace(trial, values=values))
     return recording.with_trials(trials)

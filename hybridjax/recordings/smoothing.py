@@ -58,7 +58,9 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     """
     finite = np.isfinite(values)
     if finite.sum() < FEWEST:
-        raise DefinitionError(f"a spline needs {FEWEST} samples, not {int(finite.sum())}.")
+        raise DefinitionError(
+            f"a spline needs {FEWEST} samples, not {int(finite.sum())}."
+        )
     time, values = time[finite], values[finite]
     step = float(np.median(np.diff(time)))
     h = np.diff(time) / step
@@ -70,7 +72,9 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     band[1, :-1] = h[1:-1] / 6 + weight * (q[1, :-1] * q[0, 1:] + q[2, :-1] * q[1, 1:])
     band[2, :-2] = weight * q[2, :-2] * q[0, 2:]
     right = q[0] * values[:-2] + q[1] * values[1:-1] + q[2] * values[2:]
-    curvature = solveh_banded(band, right, lower=True, overwrite_ab=True, check_finite=False)
+    curvature = solveh_banded(
+        band, right, lower=True, overwrite_ab=True, check_finite=False
+    )
     smooth = values.copy()
     for k in range(3):
         smooth[k : len(values) - 2 + k] -= weight * q[k] * curvature
@@ -80,7 +84,9 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
 def require_passing(bandwidth: float, rate: float) -> None:
     """**Raises:** `DefinitionError` for a bandwidth that removes a rhythm of this rate (Hz)."""
     if bandwidth < rate:
-        raise DefinitionError(f"`bandwidth` removes the rhythm of {rate:.3g} Hz: raise or omit it.")
+        raise DefinitionError(
+            f"`bandwidth` removes the rhythm of {rate:.3g} Hz: raise or omit it."
+        )
 
 
 def bridgeable(time: Series, longest: int | float = 0.0) -> float:
@@ -96,14 +102,18 @@ def gaps(time: Series, longest: int | float) -> Float[np.ndarray, "g 2"]:
     return np.stack([edges[wide], edges[wide + 1]], axis=1)
 
 
-def inside(parts: Float[np.ndarray, "g 2"], start: Series, end: Series) -> Bool[np.ndarray, " n"]:
+def inside(
+    parts: Float[np.ndarray, "g 2"], start: Series, end: Series
+) -> Bool[np.ndarray, " n"]:
     """Return which intervals from start to end touch any of the given ones (disjoint, sorted)."""
     before: Int[np.ndarray, " n"] = np.searchsorted(parts[:, 0], end, side="left")
     over: Int[np.ndarray, " n"] = np.searchsorted(parts[:, 1], start, side="right")
     return before > over
 
 
-def means(time: Series, values: Series, edges: Float[np.ndarray, " m1"]) -> Float[np.ndarray, " m"]:
+def means(
+    time: Series, values: Series, edges: Float[np.ndarray, " m1"]
+) -> Float[np.ndarray, " m"]:
     """Return means of a signal between successive edges; it is linear between its samples."""
     finite = np.isfinite(values)
     area = make_interp_spline(time[finite], values[finite], k=1).antiderivative()
@@ -143,7 +153,9 @@ def spike_heights(values: Series) -> Series:
     around = np.sort(x[first[:, None] + np.arange(_NEIGHBORHOOD)], axis=1)
     closest_half = (around[:, half:] - around[:, : half + 1]).min(axis=1)
     large = large[np.abs(out[large]) > RANGES * closest_half]
-    near = np.searchsorted(large, large + _NEAR + 1) - np.searchsorted(large, large - _NEAR)
+    near = np.searchsorted(large, large + _NEAR + 1) - np.searchsorted(
+        large, large - _NEAR
+    )
     large = large[near <= 2 * _LONGEST]
     heights[np.flatnonzero(finite)[large]] = out[large]
     return heights
@@ -157,7 +169,9 @@ def noise_of(x: Series) -> float:
 
 
 def recurring(
-    heights: Float[np.ndarray, " k"], phase: Float[np.ndarray, " k"], cycles: int | float
+    heights: Float[np.ndarray, " k"],
+    phase: Float[np.ndarray, " k"],
+    cycles: int | float,
 ) -> Bool[np.ndarray, " k"]:
     """Return which spikes are transients of the motion: similar ones at this phase of most cycles.
 

@@ -92,8 +92,12 @@ class Draws:
     def begin(self) -> tuple["Draws", Layout]:
         """Return the job with the form of its results."""
         variables = self.first()
-        number: dict[str, Any] = {"draw": (("draw",), np.arange(self.blocks.shape[0]), {})}
-        layout = Layout(("draw",), self.blocks, variables, number, ("draw",), self.description)
+        number: dict[str, Any] = {
+            "draw": (("draw",), np.arange(self.blocks.shape[0]), {})
+        }
+        layout = Layout(
+            ("draw",), self.blocks, variables, number, ("draw",), self.description
+        )
         return dataclasses.replace(self, variables=variables), layout
 
     def arrays(self) -> list[np.ndarray]:
@@ -118,7 +122,9 @@ class Draws:
         (rows,) = self.blocks.slices(k)
         lost = dict.fromkeys(self.variables) | {"failed": np.array(1)}
         drawn = map(self._draw, range(rows.start, rows.stop))
-        drawn = [lost if isinstance(values, ComputationError) else values for values in drawn]
+        drawn = [
+            lost if isinstance(values, ComputationError) else values for values in drawn
+        ]
         if other := {name for values in drawn for name in values.keys() ^ lost.keys()}:
             raise DefinitionError(
                 f"`function` must always give the same names: `{min(other)}` is in some draws only."
@@ -136,6 +142,8 @@ class Draws:
             return error
         named = values if isinstance(values, Mapping) else {"value": values}
         if not named.keys().isdisjoint(("failed", "draw")):
-            raise DefinitionError("results of `function` cannot be named `failed` or `draw`.")
+            raise DefinitionError(
+                "results of `function` cannot be named `failed` or `draw`."
+            )
         numbers = {name: as_numbers(name, value) for name, value in named.items()}
         return numbers | {"failed": np.array(0)}

@@ -41,11 +41,17 @@ class Points:
         lengths = sorted({len(x) for x in self.values.values()})
         if len(lengths) != 1 or lengths == [0]:
             numbers = ", ".join(map(str, lengths)) or "none"
-            raise DefinitionError(f"`values` must hold as many of each parameter, not {numbers}.")
+            raise DefinitionError(
+                f"`values` must hold as many of each parameter, not {numbers}."
+            )
 
     @classmethod
     def sobol(
-        cls, ranges: Mapping[str, tuple[float, float]], count: ExperimentCount, *, seed: Seed = 0
+        cls,
+        ranges: Mapping[str, tuple[float, float]],
+        count: ExperimentCount,
+        *,
+        seed: Seed = 0,
     ) -> "Points":
         """Return points that cover a box evenly, from a scrambled Sobol sequence (Owen 1998).
 
@@ -58,7 +64,9 @@ class Points:
 
         for name, (low, high) in ranges.items():
             if not low < high:
-                raise DefinitionError(f"the range of `{name}` must go up: {low} to {high}.")
+                raise DefinitionError(
+                    f"the range of `{name}` must go up: {low} to {high}."
+                )
         if not ranges:
             raise DefinitionError("`ranges` must name at least one parameter.")
         sequence = qmc.Sobol(len(ranges), rng=np.random.default_rng(seed))
@@ -94,19 +102,26 @@ class Space:
     def at(self, index: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
         """Return the parameters at some points, given one index array per dimension."""
         each = index if self.grid else index * len(self.axes)
-        return {name: x[i] for (name, x), i in zip(self.axes.items(), each, strict=True)}
+        return {
+            name: x[i] for (name, x), i in zip(self.axes.items(), each, strict=True)
+        }
 
     def constants(self, units: Mapping[str, str]) -> dict[str, Constant]:
         """Return the parameters as coordinates of results."""
         dims = self.dims if self.grid else self.dims * len(self.axes)
         about = {name: {"units": unit} if unit else {} for name, unit in units.items()}
-        return {n: ((d,), x, about[n]) for d, (n, x) in zip(dims, self.axes.items(), strict=True)}
+        return {
+            n: ((d,), x, about[n])
+            for d, (n, x) in zip(dims, self.axes.items(), strict=True)
+        }
 
 
 class Family:
     """A system some of whose parameters vary, or a function of parameters that returns a system."""
 
-    def __init__(self, model: HybridSystem | Callable[..., HybridSystem], names: Sequence[str]):
+    def __init__(
+        self, model: HybridSystem | Callable[..., HybridSystem], names: Sequence[str]
+    ):
         self.model, self.names = model, tuple(names)
         allowed, required = _parameters(model)
         if allowed is not None:
@@ -134,7 +149,9 @@ class Family:
         system = self.system({name: jnp.asarray(x) for name, x in values.items()})
         if not isinstance(system, HybridSystem):
             text = "a system, or a function of parameters that returns one"
-            raise DefinitionError(f"`model` must be {text}, not a {type(system).__name__}.")
+            raise DefinitionError(
+                f"`model` must be {text}, not a {type(system).__name__}."
+            )
         require_x64(system)
         check_periodic(system)
         return system
@@ -143,7 +160,9 @@ class Family:
         """Return the units of the parameters, "" if unknown."""
         units = dict.fromkeys(self.names, "")
         for name in self.names:
-            with contextlib.suppress(AttributeError, KeyError):  # a parameter of a function
+            with contextlib.suppress(
+                AttributeError, KeyError
+            ):  # a parameter of a function
                 units[name] = unit_of_parameter(system, name)
         return units
 
@@ -164,5 +183,7 @@ def _parameters(model: Any) -> tuple[list[str] | None, list[str]]:
     parameters = inspect.signature(model).parameters.values()
     if any(x.kind is x.VAR_KEYWORD for x in parameters):
         return None, []
-    usual = [x for x in parameters if x.kind in (x.POSITIONAL_OR_KEYWORD, x.KEYWORD_ONLY)]
+    usual = [
+        x for x in parameters if x.kind in (x.POSITIONAL_OR_KEYWORD, x.KEYWORD_ONLY)
+    ]
     return [x.name for x in usual], [x.name for x in usual if x.default is x.empty]

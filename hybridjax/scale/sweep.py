@@ -98,7 +98,9 @@ def sweep(
     given = over.values if isinstance(over, Points) else over
     axes = {name: np.asarray(x, float) for name, x in given.items()}
     if not axes or not all(map(len, axes.values())):
-        raise DefinitionError("`over` must name at least one parameter, each with a value or more.")
+        raise DefinitionError(
+            "`over` must name at least one parameter, each with a value or more."
+        )
     space = Space(axes, not isinstance(over, Points))
     family = Family(model, list(space.axes))
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
@@ -132,7 +134,11 @@ class Begun(NamedTuple):
     def parts(self) -> Any:
         """Return all arrays but those that follow from the model."""
         x = self.map
-        return (x.anchor, x.expected, x.settings.scale, x.conserved), self.index, self.coarse
+        return (
+            (x.anchor, x.expected, x.settings.scale, x.conserved),
+            self.index,
+            self.coarse,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,12 +167,18 @@ class SweepJob:
         variables, units = self.wanted.variables(cycles), self.family.units(self.system)
         points, states = self.space.constants(units), self.wanted.constants()
         layout = Layout(
-            self.space.dims, self.blocks, variables, {**points, **states}, (*points, *states),
+            self.space.dims,
+            self.blocks,
+            variables,
+            {**points, **states},
+            (*points, *states),
             self.description,
-        )  # fmt: skip
+        )
         begun = begun._replace(coarse=solved)
         whole = cycles if len(self.blocks) == 1 else None
-        return dataclasses.replace(self, begun=begun, variables=variables, cycles=whole), layout
+        return dataclasses.replace(
+            self, begun=begun, variables=variables, cycles=whole
+        ), layout
 
     def arrays(self) -> list[np.ndarray]:
         """Return the arrays of the common beginning."""
@@ -205,25 +217,38 @@ class SweepJob:
         tiles = self._tiles(index, None)
         rounds = tiles.solve(len(index[0]))
         jacobian, result = np.asarray(rounds.turn.jacobian), np.asarray(rounds.result)
-        return Known(None, rounds.anchor, rounds.period, jacobian, result), as_cycles(tiles, rounds)
+        return Known(None, rounds.anchor, rounds.period, jacobian, result), as_cycles(
+            tiles, rounds
+        )
 
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
-        systems, total = self.family.systems(self.space.at(index)), math.prod(self.blocks.shape)
+        systems, total = (
+            self.family.systems(self.space.at(index)),
+            math.prod(self.blocks.shape),
+        )
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
         size = min(BATCH, math.prod(self.blocks.block)) if total > SMALL else None
-        return tiles_of(systems, self.begun.map, size, Execution(workers=workers).threads, total)
+        return tiles_of(
+            systems, self.begun.map, size, Execution(workers=workers).threads, total
+        )
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""
         map = _rounded(map_for_sweep(self._guess(), Settings()))
         # (A Halton sequence: to import that of scipy takes 0.7 s.)
-        base = np.resize([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31], len(self.blocks.shape))[:, None]
+        base = np.resize(
+            [2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31], len(self.blocks.shape)
+        )[:, None]
         k, power = np.arange(1, 1 + _COARSE)[:, None, None], base ** np.arange(16.0)
         unit = (k // power % base / (power * base)).sum(axis=2)
-        index = tuple(np.unique((unit * np.array(self.blocks.shape)).astype(int), axis=0).T)
+        index = tuple(
+            np.unique((unit * np.array(self.blocks.shape)).astype(int), axis=0).T
+        )
         index = self._points(0) if len(self.blocks) == 1 else index
         n, d = len(index[0]), map.anchor.q.shape[0]
-        anchor = jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor)
+        anchor = jax.tree_util.tree_map(
+            lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor
+        )
         blank = Known(None, anchor, np.zeros(n), np.zeros((n, d, d)), np.zeros(n, int))
         return Begun(map, index, blank)
 
@@ -247,7 +272,9 @@ def _rounded(map: ReturnMap) -> ReturnMap:
     return _with(map, anchor, period, scale, map.conserved)
 
 
-def _with(map: ReturnMap, anchor: Any, expected: Any, scale: Any, conserved: Any) -> ReturnMap:
+def _with(
+    map: ReturnMap, anchor: Any, expected: Any, scale: Any, conserved: Any
+) -> ReturnMap:
     settings = dataclasses.replace(map.settings, scale=scale)
     return dataclasses.replace(
         map, anchor=anchor, expected=expected, settings=settings, conserved=conserved

@@ -22,21 +22,31 @@ Measure = Callable[[LimitCycle], Any]
 class Wanted:
     """Quantities to keep of each cycle: those with a name, and users' functions."""
 
-    def __init__(self, want: Want | Measure | Sequence[Want | Measure], system: HybridSystem):
+    def __init__(
+        self, want: Want | Measure | Sequence[Want | Measure], system: HybridSystem
+    ):
         items = [want] if isinstance(want, str) or callable(want) else list(want)
         self.names = tuple(dict.fromkeys(x for x in items if isinstance(x, str)))
         functions = [x for x in items if not isinstance(x, str)]
         self.measures = {getattr(f, "__name__", ""): f for f in functions}
         taken = {*get_args(Want), "result", "chart", "state_name", "state_unit"}
         for name in self.measures:
-            if not name.isidentifier() or name in taken or len(functions) > len(self.measures):
+            if (
+                not name.isidentifier()
+                or name in taken
+                or len(functions) > len(self.measures)
+            ):
                 text = f"names of their own, other than {', '.join(sorted(taken))}"
-                raise DefinitionError(f"functions of `want` need {text}: define them by `def`.")
+                raise DefinitionError(
+                    f"functions of `want` need {text}: define them by `def`."
+                )
         # (Words only: workers get a copy.)
         s = Structure(system)
         self._charts, self._time_unit = tuple(s.names), str(system.time_unit or "")
         self._states = [tuple(s.states(a)) for a in range(len(s.charts))]
-        self._all_states = list(dict.fromkeys(x for names in self._states for x in names))
+        self._all_states = list(
+            dict.fromkeys(x for names in self._states for x in names)
+        )
 
     def variables(self, cycles: LimitCycles) -> dict[str, Variable]:
         """Return the form of results, given some cycles.
@@ -54,7 +64,9 @@ class Wanted:
         }
         forms = {name: form(name, x[0]) for name, x in values.items()}
         return {
-            name: x._replace(dims=dims.get(name, x.dims), attributes=attributes.get(name, {}))
+            name: x._replace(
+                dims=dims.get(name, x.dims), attributes=attributes.get(name, {})
+            )
             for name, x in forms.items()
         }
 
@@ -64,9 +76,13 @@ class Wanted:
             return {}
         texts = {"state_name": map(str, self._all_states)}
         texts["state_unit"] = map(unit_of, self._all_states)
-        return {name: (("state_name",), np.array([*x]), {}) for name, x in texts.items()}
+        return {
+            name: (("state_name",), np.array([*x]), {}) for name, x in texts.items()
+        }
 
-    def values(self, cycles: LimitCycles, chosen: Mapping[str, Variable]) -> dict[str, np.ndarray]:
+    def values(
+        self, cycles: LimitCycles, chosen: Mapping[str, Variable]
+    ) -> dict[str, np.ndarray]:
         """Return the results of some cycles."""
         values = self._values(cycles)
         for name, measure in self.measures.items():
@@ -76,7 +92,10 @@ class Wanted:
     def _values(self, cycles: LimitCycles) -> dict[str, np.ndarray]:
         """Return the quantities with a name."""
         ok = cycles.ok
-        q, chart = np.asarray(cycles.anchor.q)[..., 0], np.asarray(cycles.anchor.chart)[:, 0]
+        q, chart = (
+            np.asarray(cycles.anchor.q)[..., 0],
+            np.asarray(cycles.anchor.chart)[:, 0],
+        )
         state = np.full((len(ok), len(self._all_states)), np.nan)
         for a, names in enumerate(self._states):
             rows = np.flatnonzero(ok & (chart == a))
@@ -107,7 +126,9 @@ class Wanted:
         raise ComputationError(f"`{name}` succeeds on none of {text}.")
 
 
-def _measured(cycles: LimitCycles, name: str, measure: Measure) -> Iterator[np.ndarray | None]:
+def _measured(
+    cycles: LimitCycles, name: str, measure: Measure
+) -> Iterator[np.ndarray | None]:
     """Yield the value of a function on each cycle, None where it fails."""
     for i, ok in enumerate(cycles.ok):
         try:
@@ -120,7 +141,9 @@ def as_numbers(name: str, values: Any) -> np.ndarray:
     """Return what a user's function gives as an array of real or complex numbers."""
     array = np.asarray(values)
     if array.dtype.kind not in "biufc":
-        raise DefinitionError(f"`{name}` must give numbers, not a {type(values).__name__}.")
+        raise DefinitionError(
+            f"`{name}` must give numbers, not a {type(values).__name__}."
+        )
     return array.astype(complex if array.dtype.kind == "c" else float)
 
 
@@ -130,7 +153,9 @@ def form(name: str, values: np.ndarray) -> Variable:
     return Variable(values.dtype.str, dims, values.shape)
 
 
-def stacked(name: str, values: Iterable[np.ndarray | None], variable: Variable) -> np.ndarray:
+def stacked(
+    name: str, values: Iterable[np.ndarray | None], variable: Variable
+) -> np.ndarray:
     """Return values of a user's function in one array, the variable's fill where it failed (None).
 
     **Raises:** `DefinitionError` for another shape, and for complex numbers after real ones.
@@ -139,5 +164,7 @@ def stacked(name: str, values: Iterable[np.ndarray | None], variable: Variable) 
     for x in rows:
         if x.shape != variable.shape or not np.can_cast(x.dtype, variable.dtype):
             text = f"{variable.dtype} {variable.shape}, then {x.dtype.str} {x.shape}"
-            raise DefinitionError(f"`{name}` must always give one type and shape: first {text}.")
+            raise DefinitionError(
+                f"`{name}` must always give one type and shape: first {text}."
+            )
     return np.array(rows, variable.dtype)

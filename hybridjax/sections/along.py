@@ -24,12 +24,20 @@ from ..systems.transition import TOGETHER
 
 
 def flow_along(
-    map: ReturnMap, turn: tuple[Lanes, Tape], carry: tuple[Lanes, Any, Any], targets: Target
+    map: ReturnMap,
+    turn: tuple[Lanes, Tape],
+    carry: tuple[Lanes, Any, Any],
+    targets: Target,
 ) -> tuple[tuple[Lanes, Any, Any], Any] | None:
     """The flow along a cycle from a lane on it to one of the `targets` after the other, all at
     known times or all at states: what `through` returns. None if a target is not reached once in a
     turn, and for implicit methods, whose steps have errors that decay before the turn ends."""
-    s, begin, period, late = map.structure, carry[0], map.expected, TOGETHER * map.expected
+    s, begin, period, late = (
+        map.structure,
+        carry[0],
+        map.expected,
+        TOGETHER * map.expected,
+    )
     if has_implicit(s):
         return None
     moves, M = recorded_moves(*turn), np.sum(turn[1].code != IDLE)
@@ -37,7 +45,9 @@ def flow_along(
     # (Targets lie in the first two turns, and what follows them at most at the begin of a third.)
     moves = Moves(*(np.concatenate([x] * 3, axis=-1) for x in moves))
     later = period * np.repeat([0, 1, 2], M)
-    moves = moves._replace(t=moves.t + later, code=np.where(moves.code < 0, MOVE, moves.code))
+    moves = moves._replace(
+        t=moves.t + later, code=np.where(moves.code < 0, MOVE, moves.code)
+    )
     if (places := _places_on(map, moves, before, begin, targets)) is None:
         return None
     # Moves start at the beginning, where recorded moves do, and at targets, which take the place of
@@ -53,16 +63,31 @@ def flow_along(
     piece, event = np.cumsum(is_target)[:-1], np.broadcast_to(targets.event, key.shape)
     h, ends_in, new = np.diff(times), moves.code[keys[:-1]], np.diff(keys) > 0
     arrives = is_target[1:] & (event[np.minimum(piece, len(key) - 1)] < 0)
-    code = np.where(arrives, ARRIVE_TIME if np.isfinite(targets.time[0]) else ARRIVE_LEVEL, ends_in)
+    code = np.where(
+        arrives, ARRIVE_TIME if np.isfinite(targets.time[0]) else ARRIVE_LEVEL, ends_in
+    )
     # (Where events and sections coincide, a search decides which comes first.)
     if (arrives & new & (ends_in >= 0) | (code >= 0) & (h == 0) | (h < 0)).any():
         return None
-    at, chart, none = np.flatnonzero(is_target), moves.chart[keys], np.zeros(len(key), np.int32)
-    fired, count = np.maximum(code[at - 1], -1), begin.events + np.cumsum(code >= 0, dtype=np.int32)
-    ends = lanes.start_lanes(s, times[at], chart[at], q[:, at])._replace(events=count[at - 1])
+    at, chart, none = (
+        np.flatnonzero(is_target),
+        moves.chart[keys],
+        np.zeros(len(key), np.int32),
+    )
+    fired, count = (
+        np.maximum(code[at - 1], -1),
+        begin.events + np.cumsum(code >= 0, dtype=np.int32),
+    )
+    ends = lanes.start_lanes(s, times[at], chart[at], q[:, at])._replace(
+        events=count[at - 1]
+    )
     watched, u = map.watch(ends, until(ends.t)), np.zeros((s.nu, 1))
-    ends = rearm(s, arm(s, ends, watched, period), watched, fired, none > 0, period, u, none)
-    legs = Lanes(*(np.append(x, y[..., :-1], axis=-1) for x, y in zip(begin, ends, strict=True)))
+    ends = rearm(
+        s, arm(s, ends, watched, period), watched, fired, none > 0, period, u, none
+    )
+    legs = Lanes(
+        *(np.append(x, y[..., :-1], axis=-1) for x, y in zip(begin, ends, strict=True))
+    )
     before = np.where(code >= 0, before[:, keys[:-1] % M], q[:, 1:])
     tape = Tape(*(x[None] for x in (h, code, times[1:], before, q[:, 1:], chart[1:])))
     flow = legs, Moved(ends, none, none, none), lanes.regrouped(tape, piece, legs)
@@ -93,7 +118,9 @@ def _places_on(map: ReturnMap, moves: Moves, ends: Any, begin: Lanes, targets: T
         h = part * np.diff(moves.t)[move]
     cut, change = np.flatnonzero(event < 0), period
     start = Moves(*(x[..., move[cut]] for x in moves))
-    start = start._replace(code=np.full(len(cut), ARRIVE_TIME if clock else ARRIVE_LEVEL), lane=cut)
+    start = start._replace(
+        code=np.full(len(cut), ARRIVE_TIME if clock else ARRIVE_LEVEL), lane=cut
+    )
     while change > late:  # (Newton's method finds levels.)
         goal = dataclasses.replace(targets, time=moves.t[move] + h)
         end, _ = linear_moves(s, start._replace(h=h[cut]), goal)
@@ -118,7 +145,11 @@ def _levels_on(
     """Levels of targets at the starts and the ends of moves; the same where a move follows another
     without an event, so that each crossing lies in one of them."""
     index = np.broadcast_to(targets.index, targets.time.shape)
-    point = np.tile(once.t, 2), np.tile(once.chart, 2), np.concatenate([once.q, ends], axis=1)
+    point = (
+        np.tile(once.t, 2),
+        np.tile(once.chart, 2),
+        np.concatenate([once.q, ends], axis=1),
+    )
     level = levels_at(s, targets.levels, 1 + max(index), *point)[0]
     start, end = np.split(level, 2, axis=1)
     start = np.where(np.roll(once.code, 1) < 0, np.roll(end, 1, axis=1), start)

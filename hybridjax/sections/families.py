@@ -50,9 +50,13 @@ class BoundSections(eqx.Module):
         return cls(time, jnp.full(time.shape, -1, jnp.int32))
 
     @classmethod
-    def at_levels(cls, levels: AbstractLevels, n_sections: SectionCount) -> "BoundSections":
+    def at_levels(
+        cls, levels: AbstractLevels, n_sections: SectionCount
+    ) -> "BoundSections":
         """Sections at which level functions fall through zero."""
-        return cls(jnp.full(n_sections, jnp.inf), jnp.full(n_sections, -1, jnp.int32), levels)
+        return cls(
+            jnp.full(n_sections, jnp.inf), jnp.full(n_sections, -1, jnp.int32), levels
+        )
 
 
 class AbstractSections(Definition):
@@ -247,7 +251,10 @@ class KinematicPhase(_Anchored):
         self.anchor = _as_anchor(anchor)
 
     def check(self, s: Structure) -> None:
-        where, names = "KinematicPhase(position, velocity): ", (self.position, self.velocity)
+        where, names = (
+            "KinematicPhase(position, velocity): ",
+            (self.position, self.velocity),
+        )
         require_among("output", names, s.output_names(), where)
         super().check(s)
 
@@ -279,7 +286,9 @@ def _along(s: Structure, function: Callable, t, chart, q) -> tuple[Array, Array]
         value = lambda t, q: function(a, t, q, u)  # noqa: E731
         return jax.jvp(value, (t, state), (jnp.ones_like(t), s.field(a, t, state, u)))
 
-    return jax.lax.switch(chart, [lambda a=a: in_chart(a) for a in range(len(s.charts))])
+    return jax.lax.switch(
+        chart, [lambda a=a: in_chart(a) for a in range(len(s.charts))]
+    )
 
 
 class _AngleLevels(AbstractLevels):
@@ -294,7 +303,9 @@ class _AngleLevels(AbstractLevels):
         return self._signals(s).defined(a)
 
     def level(self, s, a, i, t, q):
-        position, velocity = self.phase._scaled(self._signals(s)(a, t, q, jnp.zeros(s.nu)))
+        position, velocity = self.phase._scaled(
+            self._signals(s)(a, t, q, jnp.zeros(s.nu))
+        )
         across = self.across[:, i]
         return jnp.where(i < 0, 1.0, across[0] * position + across[1] * velocity)
 
@@ -313,7 +324,9 @@ class SectionList(AbstractSections):
         """**Raises:** `DefinitionError` for an empty list."""
         self.items = tuple(items)
         if not self.items:
-            raise DefinitionError("a list of sections needs one Crossing or AtEvent, or more.")
+            raise DefinitionError(
+                "a list of sections needs one Crossing or AtEvent, or more."
+            )
 
     n_sections = property(lambda self: len(self.items))  # type: ignore[assignment]
     anchor = property(lambda self: None)  # type: ignore[assignment]
@@ -323,7 +336,10 @@ class SectionList(AbstractSections):
             item.check(s)
 
     def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
-        event = [s.transition_index(x.name) if isinstance(x, AtEvent) else -1 for x in self.items]
+        event = [
+            s.transition_index(x.name) if isinstance(x, AtEvent) else -1
+            for x in self.items
+        ]
         crossed = any(isinstance(x, Crossing) for x in self.items)
         never = jnp.full(self.n_sections, jnp.inf)
         levels = ListLevels(self.items) if crossed else None
@@ -333,7 +349,9 @@ class SectionList(AbstractSections):
         return f"section {i} ({self.items[i]})"
 
 
-FamilyLike: TypeAlias = AbstractSections | Crossing | AtEvent | Sequence[Crossing | AtEvent]
+FamilyLike: TypeAlias = (
+    AbstractSections | Crossing | AtEvent | Sequence[Crossing | AtEvent]
+)
 """A family, a single section, or a list of sections."""
 
 

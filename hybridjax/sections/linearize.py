@@ -75,10 +75,14 @@ def linearize(
     of_family = traced and not isinstance(sections, PlacedSections)
     placed: Any = sections if of_family else as_placed(cycle, sections)
     z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
-    z.require(*(range(len(s.charts)) if traced else np.unique(placed.lanes.chart).tolist()))
+    z.require(
+        *(range(len(s.charts)) if traced else np.unique(placed.lanes.chart).tolist())
+    )
     names, columns = s.inputs_among(inputs)
     if of_family:
-        A, B, C, D, dims = _of_family(cycle, as_family(placed), tuple(z.items), last_turn(cycle))
+        A, B, C, D, dims = _of_family(
+            cycle, as_family(placed), tuple(z.items), last_turn(cycle)
+        )
     else:
         A, B, C, D, dims = _matrices_of(placed, tuple(z.items))
     if not traced:
@@ -86,18 +90,28 @@ def linearize(
         d = int(np.max(np.asarray(dims)))
         A, B, C = A[:, :d, :d], B[:, :d], C[:, :, :d]
     return LDTP(
-        A, B[..., columns], C, D[..., columns], dims,
-        inputs=names, outputs=z.names,
+        A,
+        B[..., columns],
+        C,
+        D[..., columns],
+        dims,
+        inputs=names,
+        outputs=z.names,
         coordinates=None if traced else placed.coordinates(),
-    )  # fmt: skip
+    )
 
 
-def _matrices_of(placed: PlacedSections, outputs: tuple[str | Output, ...]) -> tuple[Any, ...]:
+def _matrices_of(
+    placed: PlacedSections, outputs: tuple[str | Output, ...]
+) -> tuple[Any, ...]:
     return *placed.flow_jacobians, *_output_jacobians(placed, outputs), placed.dims
 
 
 def _matrices(
-    cycle: LimitCycle, family: AbstractSections, outputs: tuple[str | Output, ...], _: Any
+    cycle: LimitCycle,
+    family: AbstractSections,
+    outputs: tuple[str | Output, ...],
+    _: Any,
 ):
     return _matrices_of(place_sections(cycle, family), outputs)
 
@@ -155,7 +169,9 @@ class _Departures(AbstractSections):
     def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
         leave, step = self.phase.bind(s, orbit).time - self.delay[1], orbit.period
         change = leave + self.delay.sum() - self.lag * step / self.phase.n_sections
-        return BoundSections.at_times(jnp.stack([leave, change][: self.parts], axis=1).ravel())
+        return BoundSections.at_times(
+            jnp.stack([leave, change][: self.parts], axis=1).ravel()
+        )
 
     def describe(self, i: int) -> str:
         when = ("when outputs leave", "when the next input acts")[i % self.parts]
@@ -201,7 +217,9 @@ class Delayed(NamedTuple):
         model = LDTP(A[1::2] @ A[::2], B, C[::2], D, dims[::2], names, model.outputs)
         return cls(model, lag, names[: len(names) // 2])
 
-    def htf(self, f: Float[Array, " F"], harmonics: tuple[int, ...]) -> Complex[Array, "M F ny nu"]:
+    def htf(
+        self, f: Float[Array, " F"], harmonics: tuple[int, ...]
+    ) -> Complex[Array, "M F ny nu"]:
         """Return the HTFs, also for a traced lag."""
         H = self.model.htf(f, harmonics).H
         turn = -2j * jnp.pi * f[:, None, None] / self.model.n_sections
@@ -228,4 +246,6 @@ class Delayed(NamedTuple):
             np.split(rows[:, part], [nu], axis=2)
             for part in (slice(past), slice(first, first + wide))
         )
-        return self.model @ LDTP(A, B, C, D, inputs=self.inputs, outputs=self.model.inputs)
+        return self.model @ LDTP(
+            A, B, C, D, inputs=self.inputs, outputs=self.model.inputs
+        )

@@ -11,7 +11,15 @@ from jaxtyping import Int
 
 from .._core.boundary.checked import checked
 from .._core.compilation import at_ease, host_first, quick_jit
-from .._core.executor import Array, is_traced, namespace, on_host, put, stop_gradient, to_host
+from .._core.executor import (
+    Array,
+    is_traced,
+    namespace,
+    on_host,
+    put,
+    stop_gradient,
+    to_host,
+)
 from .._core.host_derivatives import NotOnHostError, by_columns, require_program
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
@@ -66,7 +74,9 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     require_x64(cycle, family)
     cycle.require_found()
     for placed in () if is_traced((cycle, family)) else list(_recent):
-        if placed.cycle is cycle and eqx.tree_equal(*jax.device_get((placed.family, family))):
+        if placed.cycle is cycle and eqx.tree_equal(
+            *jax.device_get((placed.family, family))
+        ):
             return placed
     family.check(cycle.structure)
     if traced := is_traced((cycle, family)):
@@ -84,7 +94,9 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
 def _patient(cycle: LimitCycle) -> ReturnMap:
     map = cycle.return_map
     steps = max(map.settings.max_steps, PATIENCE)
-    return dataclasses.replace(map, settings=dataclasses.replace(map.settings, max_steps=steps))
+    return dataclasses.replace(
+        map, settings=dataclasses.replace(map.settings, max_steps=steps)
+    )
 
 
 def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
@@ -111,13 +123,17 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
 
 
 @host_first
-def _place(map: ReturnMap, family: AbstractSections, turn: Any) -> tuple[Int[Array, ""], tuple]:
+def _place(
+    map: ReturnMap, family: AbstractSections, turn: Any
+) -> tuple[Int[Array, ""], tuple]:
     """The `Result` of the flow to section 0, which lies at the anchor if that is a crossing, and
     the fields of `PlacedSections` from `bound` on. The host begins with the last `turn`."""
     return _locate(map, family, turn, [])
 
 
-def _locate(map: ReturnMap, family: AbstractSections, turn: Any, flows: list) -> tuple[Any, Any]:
+def _locate(
+    map: ReturnMap, family: AbstractSections, turn: Any, flows: list
+) -> tuple[Any, Any]:
     """Do as `_place`; on the host `flows` gets the start, target and tape of every flow."""
     s, N = Structure(map.system), family.n_sections
     period, begin, xp = map.expected, map.anchor, namespace(map.expected)
@@ -125,12 +141,21 @@ def _locate(map: ReturnMap, family: AbstractSections, turn: Any, flows: list) ->
 
     def go(carry, targets, patience=np.inf):
         options = Options(tape=True, tangents=True)
-        beside = turn is not None and on_host(period) and flow_along(map, turn, carry, targets)
-        carry, flow = beside or through(s, carry, u, targets, map.settings, options, patience)
+        beside = (
+            turn is not None
+            and on_host(period)
+            and flow_along(map, turn, carry, targets)
+        )
+        carry, flow = beside or through(
+            s, carry, u, targets, map.settings, options, patience
+        )
         flows.append((flow[0], targets, flow[2]))
         return carry, flow
 
-    carry, before = (begin, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)), None
+    carry, before = (
+        (begin, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)),
+        None,
+    )
     if isinstance(family.anchor, Crossing):
         target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
         carry, before = go(carry, to_section(target, family.anchor))
@@ -139,7 +164,9 @@ def _locate(map: ReturnMap, family: AbstractSections, turn: Any, flows: list) ->
     k = xp.arange(int(before is not None), N + 1)
     i = k % N
     time, never = bound.time[i] + (k // N) * period, xp.full(k.shape, np.inf)
-    targets = Target(time, i, bound.event[i], never, None, bound.levels, Result.SECTION_MISSED)
+    targets = Target(
+        time, i, bound.event[i], never, None, bound.levels, Result.SECTION_MISSED
+    )
     _, pieces = go(carry, targets, 1.5 * period)
     if before is None:
         before = pieces
@@ -151,12 +178,20 @@ def _locate(map: ReturnMap, family: AbstractSections, turn: Any, flows: list) ->
     share = xp.abs(normal.T * xp.concatenate([xp.ones((1, N)), f]))
     flat = xp.max(share, axis=0) == 0
     drop = xp.where(flat, -1, xp.argmax(share, axis=0))
-    dims = xp.asarray(s.dims)[lanes.chart] + (xp.isinf(bound.time) & (map.base is None)) - ~flat
+    dims = (
+        xp.asarray(s.dims)[lanes.chart]
+        + (xp.isinf(bound.time) & (map.base is None))
+        - ~flat
+    )
     duration, result = moved.lanes.t - lanes.t, moved.result
     # Rounding would decide on which side of an event a clock section lies. (Not of the clock's.)
-    by_clock = xp.asarray([*(isinstance(x.guard, Scheduled) for x in s.transitions), True])
+    by_clock = xp.asarray(
+        [*(isinstance(x.guard, Scheduled) for x in s.transitions), True]
+    )
     when = xp.where(by_clock[xp.maximum(tape.code, -1)], xp.nan, tape.t)
-    near = [(abs(when - x.t) <= TOGETHER * period).any(axis=0) for x in (lanes, moved.lanes)]
+    near = [
+        (abs(when - x.t) <= TOGETHER * period).any(axis=0) for x in (lanes, moved.lanes)
+    ]
     near = xp.isfinite(bound.time) & (near[0] | xp.roll(near[1], 1))
     result = update_result(result, near, Result.COINCIDENCE)
     if not on_host(period):  # (on the host `_check` says more)
@@ -200,7 +235,9 @@ def place_along(
         flow, points, _ = follow(flows.pop(0), None, times)
         points = points[flow.first]
     moving = longer, np.moveaxis(points[:, 0], 1, 0), np.moveaxis(points[:, 1:], 2, 0)
-    raw, by_bound = to_host(_bind_along(s, family, orbit, (by_cycle.structure, by_family, moving)))
+    raw, by_bound = to_host(
+        _bind_along(s, family, orbit, (by_cycle.structure, by_family, moving))
+    )
     clock = np.isfinite(bound.time)
     late = np.rint((bound.time[0] - raw.time[0]) / cycle.period) if clock[0] else 0.0
     k = np.arange(N + 1)[-len(flows[0][1].time) :]
@@ -217,7 +254,9 @@ def place_along(
     return moved, along, flow.jacobians(tangents, placed.across)[-N:]
 
 
-def _observed(cycle: LimitCycle, family: AbstractSections, outputs: tuple[str, ...], _: Any):
+def _observed(
+    cycle: LimitCycle, family: AbstractSections, outputs: tuple[str, ...], _: Any
+):
     placed = place_sections(cycle, family)
     return placed.lanes.t, placed.observe(outputs) if outputs else None
 
@@ -238,7 +277,9 @@ observed_at = by_columns(_observed, _observed_along, of_flow)
 
 
 @quick_jit
-def _bind_along(s: Structure, family: AbstractSections, orbit: Orbit, directions: tuple):
+def _bind_along(
+    s: Structure, family: AbstractSections, orbit: Orbit, directions: tuple
+):
     def bind(s, family, moving):
         period, t, q = moving
         return family.bind(s, Orbit(period, t, orbit.chart, q))
@@ -261,14 +302,20 @@ def _bind(
         times = anchor.t + period * xp.arange(1, M + 1) / M
         lanes = side_by_side(go(carry, toward(times, -1, times))[1][0])
     orbit = Orbit(period, lanes.t, lanes.chart, lanes.q.T)
-    bound = to_host(_bind_program(map, family, orbit)) if on_host(period) else family.bind(s, orbit)
+    bound = (
+        to_host(_bind_program(map, family, orbit))
+        if on_host(period)
+        else family.bind(s, orbit)
+    )
     late = xp.ceil((t - bound.time[0]) / period)
     late = xp.where(xp.isfinite(bound.time[0]), stop_gradient(late), 0.0)
     return dataclasses.replace(bound, time=bound.time + late * period)
 
 
 @quick_jit
-def _bind_program(map: ReturnMap, family: AbstractSections, orbit: Orbit) -> BoundSections:
+def _bind_program(
+    map: ReturnMap, family: AbstractSections, orbit: Orbit
+) -> BoundSections:
     return family.bind(map.structure, orbit)
 
 
@@ -309,10 +356,14 @@ def _check(placed: PlacedSections, first: int) -> None:
             text = text if i else f"the cycle does not reach {name(0)}{place}"
             hint = _remedy(placed, i % N) if code == Result.SECTION_MISSED else "."
             if code == Result.STEP_LIMIT:
-                hint = ". Give them to the search for the cycle, or place more sections."
+                hint = (
+                    ". Give them to the search for the cycle, or place more sections."
+                )
             raise ComputationError(f"{text}: {Result(code).message}{hint}")
     if isinstance(anchor, Crossing) and len(_met(placed, 0)[2]) > 1:
-        raise ComputationError(f"{name(0)} lies at {anchor}, which {again}{_remedy(placed, 0)}")
+        raise ComputationError(
+            f"{name(0)} lies at {anchor}, which {again}{_remedy(placed, 0)}"
+        )
     moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
     if not placed.cycle.clocked and len(moving):
         raise ComputationError(
@@ -326,7 +377,9 @@ def _check(placed: PlacedSections, first: int) -> None:
     apart = np.abs(duration - period * np.rint(duration / period))
     i, j = sorted((k := int(np.argmin(apart)), (k + 1) % N))
     if i < j and apart[k] <= TOGETHER * period:
-        raise ComputationError(f"{name(j)} coincides with section {i} on the cycle: leave one out.")
+        raise ComputationError(
+            f"{name(j)} coincides with section {i} on the cycle: leave one out."
+        )
     if rounds > 1 + SAME:
         late = int(np.argmax(duration))
         raise ComputationError(
@@ -373,12 +426,18 @@ def _remedy(placed: PlacedSections, i: int) -> str:
     section, ends, _, points = _met(placed, i)
     hint = f", at {points}" * bool(points)
     if section is None:
-        return f"{hint}. Choose a phase that rises through each section once in a period."
+        return (
+            f"{hint}. Choose a phase that rises through each section once in a period."
+        )
     sign, span = 1 if section.direction == "falling" else -1, "nowhere"
     if ends.size:
         ends = ends[0].max(), ends[1].min()
-        span = "from {:.4g} to {:.4g}".format(*(float(section.value) + sign * x for x in ends))
-    change = "choose another function, `value`, `direction` or `charts`, not at an event"
+        span = "from {:.4g} to {:.4g}".format(
+            *(float(section.value) + sign * x for x in ends)
+        )
+    change = (
+        "choose another function, `value`, `direction` or `charts`, not at an event"
+    )
     return f"{hint}. Values of {section} on the cycle: {span}; {change}."
 
 
@@ -400,7 +459,9 @@ def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
     """The number of crossings of each section in one period, and their steepness: the rate of a
     level on its section as a fraction of its fastest rate on the cycle."""
     event, levels = np.asarray(placed.bound.event), placed.bound.levels
-    counts = np.array([placed.cycle.event_sequence.count(g) if g >= 0 else 1 for g in event])
+    counts = np.array(
+        [placed.cycle.event_sequence.count(g) if g >= 0 else 1 for g in event]
+    )
     steepness = np.ones(placed.n_sections)
     if levels is None:
         return counts, steepness
@@ -434,4 +495,8 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     falls[:, -1] &= ~np.roll(itself, -1, axis=1)
     f = slopes(s, lanes.t, lanes.chart, lanes.q, still)
     on_section = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * f.T, axis=1)
-    return np.sum(falls, axis=(1, 2)), np.max(np.nan_to_num(np.abs(rate)), axis=1), on_section
+    return (
+        np.sum(falls, axis=(1, 2)),
+        np.max(np.nan_to_num(np.abs(rate)), axis=1),
+        on_section,
+    )

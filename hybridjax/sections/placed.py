@@ -68,13 +68,17 @@ class PlacedSections(eqx.Module):
         if is_traced(self):
             return f"{head}, traced)"
         sections, dimension, start, _ = self._facts().values()
-        return folded(f"{head}: {sections}; dimension {dimension}; section 0 at t = {start})")
+        return folded(
+            f"{head}: {sections}; dimension {dimension}; section 0 at t = {start})"
+        )
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
         lanes = to_host(self.lanes)
-        drawn = orbit_picture(self.cycle.trajectory(), (lanes.t, lanes.chart, lanes.q.T))
+        drawn = orbit_picture(
+            self.cycle.trajectory(), (lanes.t, lanes.chart, lanes.q.T)
+        )
         title = f"{self.n_sections} of a {type(self.family).__name__}"
         return card("PlacedSections", title, facts(self._facts()), drawn)
 
@@ -83,10 +87,15 @@ class PlacedSections(eqx.Module):
         t, charts, *_ = to_host(self.lanes)
         durations, dims = np.asarray(self.duration), np.asarray(self.dims)
         shortest, longest = np.min(durations), np.max(durations)
-        inside = (f"{np.sum(charts == a)} in {names[a]}" for a in dict.fromkeys(charts.tolist()))
+        inside = (
+            f"{np.sum(charts == a)} in {names[a]}"
+            for a in dict.fromkeys(charts.tolist())
+        )
         return {
             "sections": ", ".join(inside),
-            "dimension": " to ".join(str(n) for n in np.unique([np.min(dims), np.max(dims)])),
+            "dimension": " to ".join(
+                str(n) for n in np.unique([np.min(dims), np.max(dims)])
+            ),
             "section 0 at t": number(t[0], unit=unit),
             "from one to the next": f"{shortest:.4g} to {number(longest, 4, unit)}",
         }
@@ -127,9 +136,13 @@ class PlacedSections(eqx.Module):
         kept = (k != drop) & ((k > 0) | self.time_is_state[:, None])
         kept_first = xp.argsort(~kept, axis=1, stable=True)
         # One column more than a chart has states is never needed: (t, q) less the dropped entry.
-        select = xp.where((k < self.dims[:, None])[:, :, None], xp.eye(n)[kept_first], 0.0)
+        select = xp.where(
+            (k < self.dims[:, None])[:, :, None], xp.eye(n)[kept_first], 0.0
+        )
         slope = -normal / xp.where(drops, xp.take_along_axis(normal, drop, axis=1), 1.0)
-        along = xp.where((k == drop)[:, :, None] & drops[:, None], slope[:, None, :], 0.0)
+        along = xp.where(
+            (k == drop)[:, :, None] & drops[:, None], slope[:, None, :], 0.0
+        )
         return (xp.eye(n) + along) @ xp.swapaxes(select, 1, 2), select
 
     @property
@@ -139,9 +152,13 @@ class PlacedSections(eqx.Module):
         s, n, sizes = self.structure(), 1 + placed.lanes.q.shape[0], placed.across
         following, _, target = placed.onwards()
         with at_ease():
-            jacobian, _ = tape_jacobian(s, placed.lanes, target, placed.tape, across=sizes)
+            jacobian, _ = tape_jacobian(
+                s, placed.lanes, target, placed.tape, across=sizes
+            )
         xp = namespace(jacobian)
-        jacobian = xp.where((placed.result == Result.OK)[:, None, None], jacobian, xp.nan)
+        jacobian = xp.where(
+            (placed.result == Result.OK)[:, None, None], jacobian, xp.nan
+        )
         embed, select = placed.frames()
         after = select[following]
         return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
@@ -150,7 +167,9 @@ class PlacedSections(eqx.Module):
     def across(self) -> Float[Array, "A d"] | None:
         """Sizes of the states, on the host, of an autonomous system between sections that depend on
         the state only: the direction of its flow must not drown strong contraction."""
-        hidden = is_hidden(self) or self.cycle.clocked or np.isfinite(self.bound.time).any()
+        hidden = (
+            is_hidden(self) or self.cycle.clocked or np.isfinite(self.bound.time).any()
+        )
         return None if hidden else to_host(self.cycle.settings.scale)
 
     def coordinates(self) -> tuple[tuple[str, ...], ...]:
@@ -172,7 +191,9 @@ class PlacedSections(eqx.Module):
 
     def onwards(self) -> tuple[Int[Array, " N"], Int[Array, " N"], Target]:
         """The section after each, the turns until it, and the target on it."""
-        following = (namespace(self.lanes.t).arange(self.n_sections) + 1) % self.n_sections
+        following = (
+            namespace(self.lanes.t).arange(self.n_sections) + 1
+        ) % self.n_sections
         turns = (following == 0).astype(np.int32)
         return following, turns, self.target(following, self.lanes.t, turns)
 
@@ -190,7 +211,9 @@ def section_target(
     xp, arrival = namespace(t), lanes.t[i] + turns * period
     time = xp.broadcast_to(bound.time[i] + turns * period, t.shape)
     limit = xp.maximum(arrival, t) + 0.5 * period
-    return Target(time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED)
+    return Target(
+        time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED
+    )
 
 
 SectionsLike: TypeAlias = FamilyLike | PlacedSections
@@ -198,7 +221,9 @@ SectionsLike: TypeAlias = FamilyLike | PlacedSections
 
 
 @host_first
-def _observe(placed: PlacedSections, outputs: tuple[str | Output, ...]) -> Float[Array, "N ny"]:
+def _observe(
+    placed: PlacedSections, outputs: tuple[str | Output, ...]
+) -> Float[Array, "N ny"]:
     s = placed.structure()
     u = namespace(placed.lanes.t).zeros((s.nu, placed.n_sections))
     return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T
@@ -211,7 +236,9 @@ def observe(
     xp, L = namespace(lanes.t), lanes.t.shape[0]
 
     def work(a, mask, out):
-        point = needed(mask, [only(mask, x) for x in (lanes.t, lanes.q[: s.dims[a]], u)])
+        point = needed(
+            mask, [only(mask, x) for x in (lanes.t, lanes.q[: s.dims[a]], u)]
+        )
         if on_host(mask):
             values = kernels.outputs(s, a, tuple(z.items), *point)[:, 0]
         else:

@@ -40,7 +40,9 @@ class Quadratic(NamedTuple):
     def _states(self) -> Float[np.ndarray, "N n n"]:
         return self.step[:, :, : self.step.shape[1]]
 
-    def second_order(self, u: Float[np.ndarray, "S time nu"]) -> Float[np.ndarray, "S time ny"]:
+    def second_order(
+        self, u: Float[np.ndarray, "S time nu"]
+    ) -> Float[np.ndarray, "S time ny"]:
         """The response of second order to inputs that repeat after a whole number of periods."""
         N, n, _ = self.step.shape
         S, steps, _ = u.shape
@@ -89,7 +91,9 @@ class Quadratic(NamedTuple):
             x = (step @ x + push) * back
         return np.stack(states)
 
-    def products(self, f: Float[np.ndarray, " K"], channel: Int[np.ndarray, " K"]) -> "Products":
+    def products(
+        self, f: Float[np.ndarray, " K"], channel: Int[np.ndarray, " K"]
+    ) -> "Products":
         """Responses of second order to all pairs of cosines."""
         N, n, _ = self.step.shape
         K, ny = len(f), self.show.shape[1]
@@ -102,8 +106,12 @@ class Quadratic(NamedTuple):
             forcing = _pairs(self.bend, w[:, :, first], second)
             f_first, f_second = f[first][:, None], f[begin:]
             sums = np.concatenate([f_first + f_second, f_first - f_second], axis=1)
-            y = self.show[:, :, :n] @ self._steady(forcing.reshape(N, n, -1), sums.ravel())
-            y = y.reshape(N, ny, *sums.shape) + _pairs(self.show_bend, w[:, :, first], second)
+            y = self.show[:, :, :n] @ self._steady(
+                forcing.reshape(N, n, -1), sums.ravel()
+            )
+            y = y.reshape(N, ny, *sums.shape) + _pairs(
+                self.show_bend, w[:, :, first], second
+            )
             both = y.reshape(N, ny, len(first), 2, -1)
             mean[:, :, first] = np.moveaxis(np.real(both), 0, 1)[
                 :, :, np.arange(len(first)), 1, np.arange(len(first))
@@ -137,7 +145,9 @@ class Products(NamedTuple):
 
     def _shift(self) -> Float[np.ndarray, "ny K K"]:
         """The part of the mean over time at each section."""
-        return np.einsum("onk,onl->okl", self.mean, self.mean) / (4 * self.mean.shape[1])
+        return np.einsum("onk,onl->okl", self.mean, self.mean) / (
+            4 * self.mean.shape[1]
+        )
 
 
 def _bent(bend, w):
@@ -156,7 +166,10 @@ def _pairs(bend, first, second) -> Complex[np.ndarray, "N rows some both"]:
 
 
 def second_order(
-    cycle: LimitCycle, sections: FamilyLike, outputs: tuple[str, ...], inputs: tuple[str, ...]
+    cycle: LimitCycle,
+    sections: FamilyLike,
+    outputs: tuple[str, ...],
+    inputs: tuple[str, ...],
 ) -> Quadratic:
     """First and second derivatives with respect to time and state at each section and to the inputs
     that are held from it on: exact, through all events.
@@ -202,7 +215,9 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
         return lambda x: jax.jvp(work, (x,), (tangent,))[1]
 
     def twice(first, second):
-        return jax.jvp(along(first), (x,), (jnp.broadcast_to(second[:, None], x.shape),))
+        return jax.jvp(
+            along(first), (x,), (jnp.broadcast_to(second[:, None], x.shape),)
+        )
 
     i, j = np.triu_indices(m)
     first, second = jax.vmap(twice)(jnp.eye(m)[i], jnp.eye(m)[j])

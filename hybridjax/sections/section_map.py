@@ -55,7 +55,9 @@ class SectionMap(eqx.Module):
     def __repr__(self):
         system = type(self.placed.cycle.system).__name__
         ends = " to ".join(map(self.placed.family.describe, (self.i, self.j)))
-        return folded(f"SectionMap({system}: from {ends}; {self.dims[0]} states to {self.dims[1]})")
+        return folded(
+            f"SectionMap({system}: from {ends}; {self.dims[0]} states to {self.dims[1]})"
+        )
 
     @property
     def fixed_point(self) -> Float[Array, " n"]:
@@ -78,7 +80,10 @@ class SectionMap(eqx.Module):
         held = np.zeros(nu) if u is None else u
         require_axes("`u`", held, {}, {"inputs": nu})
         arrival = _map(self, q, held, t)
-        if not is_traced(arrival) and (code := Result(int(arrival.result))) != Result.OK:
+        if (
+            not is_traced(arrival)
+            and (code := Result(int(arrival.result))) != Result.OK
+        ):
             raise ComputationError(
                 f"{self.placed.family.describe(self.j)} is not reached from section {self.i}: "
                 f"{code.message}."
@@ -87,7 +92,9 @@ class SectionMap(eqx.Module):
 
 
 @checked
-def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -> SectionMap:
+def section_map(
+    cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index
+) -> SectionMap:
     """Return the map P_{i->j} between two sections of a family on a cycle, for any i and j.
 
     For i = j it is the Poincaré return map. Call it with `q` (n_i,), a state near section i of the
@@ -103,7 +110,11 @@ def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -
     for k in (i, j):
         require_index("section", k, placed.n_sections)
     s, chart = placed.structure(), placed.lanes.chart
-    dims = (s.d, s.d) if is_traced(chart) else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
+    dims = (
+        (s.d, s.d)
+        if is_traced(chart)
+        else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
+    )
     return SectionMap(placed, i, j, dims)
 
 
@@ -113,11 +124,17 @@ def _map(map: SectionMap, q, u, t) -> Arrival:
     s, xp, lanes = placed.structure(), namespace(q), placed.lanes
     t = lanes.t[i] if t is None else t
     q = put(xp.zeros((s.d, 1)), (slice(len(q)), 0), q)
-    start = jax.tree_util.tree_map(lambda x: x[..., i : i + 1], lanes)._replace(t=t[None], q=q)
+    start = jax.tree_util.tree_map(lambda x: x[..., i : i + 1], lanes)._replace(
+        t=t[None], q=q
+    )
     u = xp.broadcast_to(u, s.nu)[:, None]
     target = placed.target(xp.array([j]), t[None], xp.array([1 if j <= i else 0]))
     moved = move(s, start, u, target, placed.cycle.settings).moved
     end = moved.lanes
-    result = update_result(moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER)
-    keep = xp.where(result == Result.OK, 1.0, xp.nan)  # a factor makes derivatives NaN, too
+    result = update_result(
+        moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER
+    )
+    keep = xp.where(
+        result == Result.OK, 1.0, xp.nan
+    )  # a factor makes derivatives NaN, too
     return Arrival((keep * end.t)[0], (keep * end.q)[: map.dims[1], 0], result[0])

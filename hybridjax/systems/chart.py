@@ -58,7 +58,9 @@ class Chart(eqx.Module):
     solver: ClassVar[Solver | Method | None] = None
 
     @abc.abstractmethod
-    def field(self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " l"]) -> Any:
+    def field(
+        self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " l"]
+    ) -> Any:
         """The vector field dq/dt = f(t, q, u), eq. (2).
 
         It should extend smoothly a little beyond the chart's guards, since integration steps end
@@ -81,7 +83,12 @@ class FieldChart(Chart):
     absent: Mapping[str, float] = eqx.field(default_factory=dict)  # type: ignore[misc]
 
     def __init__(self, function, states, units=(), solver=None, absent=None):
-        self.function, self.states, self.units, self.solver = function, states, units, solver
+        self.function, self.states, self.units, self.solver = (
+            function,
+            states,
+            units,
+            solver,
+        )
         self.absent = absent or {}
 
     def field(self, t, q, u):

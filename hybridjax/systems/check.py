@@ -41,7 +41,9 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
     for name, leaf in arrays_of(system).items():
         real = jnp.issubdtype(leaf.dtype, jnp.inexact) and not is_traced(leaf)
         if real and not np.all(np.isfinite(leaf)):
-            text = f"parameter `{name}` of {type(system).__name__} is {np.asarray(leaf)}"
+            text = (
+                f"parameter `{name}` of {type(system).__name__} is {np.asarray(leaf)}"
+            )
             raise DefinitionError(f"{text}; every parameter must be finite.")
     leaves, structure = jax.tree_util.tree_flatten(system)
     parts = ((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves)
@@ -63,9 +65,13 @@ def _check_functions(s: Structure) -> Iterator[str]:
         ("transitions", system.transitions(), Transition),
         ("outputs", system.outputs(), Output),
     ):
-        if not isinstance(items, Iterable) or not all(isinstance(x, type_) for x in items):
+        if not isinstance(items, Iterable) or not all(
+            isinstance(x, type_) for x in items
+        ):
             several = "a dict {name: chart}" if type_ is Chart else "a list"
-            raise DefinitionError(f"{kind}.{name}() must return {several} of `{type_.__name__}`.")
+            raise DefinitionError(
+                f"{kind}.{name}() must return {several} of `{type_.__name__}`."
+            )
     if not s.charts:
         raise DefinitionError(f"{kind} has no charts.")
     _check_names(kind, "inputs", system.inputs, system.input_units)
@@ -77,11 +83,17 @@ def _check_functions(s: Structure) -> Iterator[str]:
         _check_names(f"chart '{name}'", "states", (*chart.states, *chart.absent))
         _check_names(f"chart '{name}'", "states", chart.states, chart.units)
         s.method(a)
-        states = f"the chart has the states {quoted(chart.states)}: return one rate for each"
+        states = (
+            f"the chart has the states {quoted(chart.states)}: return one rate for each"
+        )
         field = lambda s, *x, a=a: s.field(a, *x)  # noqa: E731
-        yield from _check_shape(s, a, f"field of chart '{name}'", field, (s.dims[a],), states)
+        yield from _check_shape(
+            s, a, f"field of chart '{name}'", field, (s.dims[a],), states
+        )
     if len(set(map(str, s.state_names()))) < len(s.state_names()):
-        raise DefinitionError(f"{kind} gives a state two units: {quoted(s.state_names())}.")
+        raise DefinitionError(
+            f"{kind} gives a state two units: {quoted(s.state_names())}."
+        )
     _check_names(kind, "transitions", [tr.name for tr in s.transitions])
     # Transitions of one kind are one program; the first and the last may index beyond the states.
     for g in sorted({g for kind in s.kinds for g in (kind[0], kind[-1])}):
@@ -111,13 +123,22 @@ def _check_transition(s: Structure, g: int) -> Iterator[str]:
         guard = lambda s, *x: s.guard(g, *x)  # noqa: E731
         yield from _check_shape(s, a, f"guard {of}", guard, (), "it must be one number")
     holds = lambda s, *x: s.enabled(g, *x)  # noqa: E731
-    yield from _check_shape(s, a, f"`enabled` {of}", holds, (), "it must be one truth value")
+    yield from _check_shape(
+        s, a, f"`enabled` {of}", holds, (), "it must be one truth value"
+    )
     states = f"chart '{tr.target}' has the states {quoted(s.charts[b].states)}: return one for each"
-    yield from _check_shape(s, a, f"reset {of}", lambda s, *x: s.reset(g, *x), (s.dims[b],), states)
+    yield from _check_shape(
+        s, a, f"reset {of}", lambda s, *x: s.reset(g, *x), (s.dims[b],), states
+    )
 
 
 def _check_shape(
-    s: Structure, a: int, what: str, function: Callable, shape: tuple[int, ...], reason: str
+    s: Structure,
+    a: int,
+    what: str,
+    function: Callable,
+    shape: tuple[int, ...],
+    reason: str,
 ) -> Iterator[str]:
     """Check the shape of a function of a structure and (t, q, u) in chart a. `reason`: why it must
     be this one. Yield its name, `what`, if it uses t."""
@@ -168,10 +189,14 @@ def evaluating(what: str, takes: str = "") -> Iterator[None]:
         raise DefinitionError(f"the {what} cannot be evaluated: {problem}") from error
 
 
-def _check_names(what: str, kind: str, names: Sequence[str], units: Sequence[str] = ()) -> None:
+def _check_names(
+    what: str, kind: str, names: Sequence[str], units: Sequence[str] = ()
+) -> None:
     """Check that names are distinct, and units as many, or none."""
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-        raise DefinitionError(f"{kind} of {what} must be a tuple of names, not {names!r}.")
+        raise DefinitionError(
+            f"{kind} of {what} must be a tuple of names, not {names!r}."
+        )
     if len(set(names)) < len(names):
         raise DefinitionError(f"{what} has {kind} of the same name: {quoted(names)}.")
     if len(units) not in (0, len(names)):

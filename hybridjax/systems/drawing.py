@@ -17,7 +17,9 @@ def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
     fits = [n in (None, m) for n, m in zip(shape, array.shape, strict=False)]
     if array.ndim != len(shape) or not all(fits):
         text = str(shape).replace("None", "k")
-        raise DefinitionError(f"Drawing: '{name}' must have the shape {text}, not {array.shape}.")
+        raise DefinitionError(
+            f"Drawing: '{name}' must have the shape {text}, not {array.shape}."
+        )
     return array
 
 
@@ -66,7 +68,9 @@ class Drawing(eqx.Module):
 
     def __check_init__(self):
         if self.body is not None and self.body not in {**self.circles, **self.points}:
-            raise DefinitionError(f"Drawing: `body` must be a circle or point, not '{self.body}'.")
+            raise DefinitionError(
+                f"Drawing: `body` must be a circle or point, not '{self.body}'."
+            )
 
     @property
     def place(self) -> Float[Array, "2"]:
@@ -84,7 +88,9 @@ class Drawing(eqx.Module):
         """The points of a zigzag line of this half width, in meters. Default: 0.08."""
         a, b = jnp.asarray(start, float), jnp.asarray(end, float)
         along = b - a
-        length = jnp.sqrt(jnp.maximum(along @ along, 1e-18))  # (hypot takes longer to compile)
+        length = jnp.sqrt(
+            jnp.maximum(along @ along, 1e-18)
+        )  # (hypot takes longer to compile)
         across = width * jnp.stack([-along[1], along[0]]) / length
         part = np.array([0.0, *np.linspace(0.15, 0.85, 13), 1.0])
         side = np.array([0.0, 0.0, *[1.0, -1.0] * 5, 1.0, 0.0, 0.0])

@@ -109,8 +109,12 @@ class Quotient(Derived):
         for kept, image in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[image].states):
-                text = f"{sorted(mirrored)}, but '{image}' {sorted(charts[image].states)}"
-                raise DefinitionError(f"Quotient: '{kept}' mirrored has {text}: use `relabel`.")
+                text = (
+                    f"{sorted(mirrored)}, but '{image}' {sorted(charts[image].states)}"
+                )
+                raise DefinitionError(
+                    f"Quotient: '{kept}' mirrored has {text}: use `relabel`."
+                )
         if self.half_period:
             self._check_half_period()
 
@@ -121,23 +125,35 @@ class Quotient(Derived):
         for x in self.system.transitions():
             if isinstance(x.guard, Scheduled) and not is_traced(x.guard):
                 if abs(math.remainder(x.guard.offset / x.guard.period, 1.0)) < TOGETHER:
-                    text = f"'{x.name}' must not be scheduled at t = 0, where halves begin"
-                    raise DefinitionError(f"Quotient: {text}: let the clock begin earlier.")
-        for name, x in self.system.charts().items() if isinstance(self.half_period, str) else ():
-            require_among("state", [str(self.half_period)], x.states, f"Quotient: in '{name}' ")
+                    text = (
+                        f"'{x.name}' must not be scheduled at t = 0, where halves begin"
+                    )
+                    raise DefinitionError(
+                        f"Quotient: {text}: let the clock begin earlier."
+                    )
+        for name, x in (
+            self.system.charts().items() if isinstance(self.half_period, str) else ()
+        ):
+            require_among(
+                "state", [str(self.half_period)], x.states, f"Quotient: in '{name}' "
+            )
 
     def period(self):
         return None if self.half_period else self.system.period()
 
     def charts(self):
-        return {x: self._reduced(x) for x in self.system.charts() if x not in self._kept_of}
+        return {
+            x: self._reduced(x) for x in self.system.charts() if x not in self._kept_of
+        }
 
     def transitions(self):
         events = [x for x in self.system.transitions() if x.source not in self._kept_of]
         made = [self._transition(x, self._kept_of, 1.0) for x in events]
         return made + [self._transition(x, self.swap, 0.0) for x in self._halves()]
 
-    def _transition(self, x: Transition, images: Mapping[str, str], clock: float) -> Transition:
+    def _transition(
+        self, x: Transition, images: Mapping[str, str], clock: float
+    ) -> Transition:
         """A transition, with the state in the image of its target; the clock is multiplied."""
         chart, guard, direction = self._reduced(x.source), x.guard, x.direction
         target, landed = self._landing(x, images)
@@ -151,7 +167,11 @@ class Quotient(Derived):
 
     def _halves(self):
         """The ends of half a period, as transitions of the original system."""
-        rises, period, charts = self.half_period, self.system.period(), self.system.charts()
+        rises, period, charts = (
+            self.half_period,
+            self.system.period(),
+            self.system.charts(),
+        )
         for name in self.swap if rises else ():
             if period is not None:
                 guard = lambda t, q, u: t - period / 2  # noqa: E731
@@ -176,15 +196,25 @@ class Quotient(Derived):
     def outputs(self):
         charts, outputs = self.charts(), []
         for x in self.system.outputs():
-            functions = dict.fromkeys(charts, x.function) if callable(x.function) else x.function
-            kept = {name: charts[name].lifted(f) for name, f in functions.items() if name in charts}
+            functions = (
+                dict.fromkeys(charts, x.function)
+                if callable(x.function)
+                else x.function
+            )
+            kept = {
+                name: charts[name].lifted(f)
+                for name, f in functions.items()
+                if name in charts
+            }
             outputs.append(Output(x.name, kept, x.unit))
         return outputs
 
     def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]):
         """The picture of the original system, which stands at the translation 0 and moves."""
         whole, still = self.system.charts()[chart], dict.fromkeys(self.translation, 0.0)
-        state = jnp.stack([jnp.asarray((still | dict(q))[x], float) for x in whole.states])
+        state = jnp.stack(
+            [jnp.asarray((still | dict(q))[x], float) for x in whole.states]
+        )
         time = q["clock"] if self.charts()[chart].clocked else t
         drawing = self.system.draw(chart, time, {**q, **still})
         if drawing is None or len(self.translation) != 1:
@@ -207,7 +237,9 @@ class Quotient(Derived):
         (t, q, u) that are equal. The first numbers of q are the state without translations, in
         its `sizes`."""
         for name in self.system.charts() if self.translation else ():
-            parts = (self._parts(name, self._kept_of, sizes, shift=x) for x in (0.0, 0.7))
+            parts = (
+                self._parts(name, self._kept_of, sizes, shift=x) for x in (0.0, 0.7)
+            )
             for (what, before), (_, after) in zip(*parts, strict=True):
                 yield f"the {what} changes under the translation", before, after
         clock: Any = self.system.period()
@@ -216,27 +248,43 @@ class Quotient(Derived):
         for kept, other in self.swap.items():
             ours = list(self._parts(kept, self._kept_of, sizes))
             # In a chart that is its own mirror image, the last transition is that of the first.
-            theirs = list(self._parts(other, images, sizes, later=later, back=kept == other))
+            theirs = list(
+                self._parts(other, images, sizes, later=later, back=kept == other)
+            )
             if len(ours) != len(theirs):
-                sentence = f"'{kept}' and '{other}' have different numbers of transitions"
+                sentence = (
+                    f"'{kept}' and '{other}' have different numbers of transitions"
+                )
                 yield sentence, lambda *_: 0.0, lambda *_: 1.0
             for (what, function), (name, image) in zip(ours, theirs, strict=False):
-                yield f"the {name} is not the mirror image of the {what}", function, image
+                yield (
+                    f"the {name} is not the mirror image of the {what}",
+                    function,
+                    image,
+                )
 
     def _parts(self, name, images, sizes, shift=None, later=0.0, back=False):
         """All functions of a chart, of points of the reduced one, with rates and states mirrored if
         the chart is among the `images`; transitions in the order of their list, or `back`; under a
         translation by `shift`, outputs, too."""
         kept = images.get(name, name)
-        chart, mirrored = self._reduced(kept), self._mirrored if name in images else _same
+        chart, mirrored = (
+            self._reduced(kept),
+            self._mirrored if name in images else _same,
+        )
         n, moves = len(chart.kept), np.isin(chart.chart.states, self.translation)
         size = sizes[kept][:n]
         state = lambda q: mirrored(kept, chart.full(size * q[:n], shift or 0.0))  # noqa: E731
-        field, used = (getattr(self.system.charts()[name], x) for x in ("field", "inputs"))
+        field, used = (
+            getattr(self.system.charts()[name], x) for x in ("field", "inputs")
+        )
         used = slice(None if used is None else len(used))
         at = lambda f: lambda t, q, u: f(t + later, state(q), u[used])  # noqa: E731
         rates = lambda *point: mirrored(kept, as_vector(field(*point)), back=True)  # noqa: E731
-        yield f"field of chart '{name}'", at(lambda *point: chart.less(rates(*point)) / size)
+        yield (
+            f"field of chart '{name}'",
+            at(lambda *point: chart.less(rates(*point)) / size),
+        )
         yield f"field of chart '{name}'", at(lambda *point: rates(*point)[moves])
         for x in list(self.system.transitions())[:: -1 if back else 1]:
             if x.source == name:
@@ -244,8 +292,14 @@ class Quotient(Derived):
                 if isinstance(guard, Scheduled):
                     guard = _phase_of(guard)
                 into = sizes[target][: len(self._reduced(target).kept)]
-                yield f"transition '{x.name}'", at(lambda *y, r=reset, c=into: r(*y) / c)
-                yield f"transition '{x.name}'", at(lambda *y, g=guard, x=x: x.sign * g(*y))
+                yield (
+                    f"transition '{x.name}'",
+                    at(lambda *y, r=reset, c=into: r(*y) / c),
+                )
+                yield (
+                    f"transition '{x.name}'",
+                    at(lambda *y, g=guard, x=x: x.sign * g(*y)),
+                )
         for x in self.system.outputs() if shift is not None else ():
             function = x.function if callable(x.function) else x.function.get(name)
             if function is not None:
@@ -253,13 +307,18 @@ class Quotient(Derived):
         sign = -1.0 if name in images else 1.0
         for x in self._halves() if self.system.period() is None else ():
             if x.source == name and callable(x.guard):
-                yield f"sign of '{x.name}'", at(lambda *point, g=x.guard: sign * g(*point))
+                yield (
+                    f"sign of '{x.name}'",
+                    at(lambda *point, g=x.guard: sign * g(*point)),
+                )
 
     def _reduced(self, name: str) -> "_Reduced":
         clocked = bool(self.half_period) and self.system.period() is not None
         return _Reduced(self.system.charts()[name], self.translation, clocked)
 
-    def _landing(self, x: Transition, images: Mapping[str, str]) -> tuple[str, Callable]:
+    def _landing(
+        self, x: Transition, images: Mapping[str, str]
+    ) -> tuple[str, Callable]:
         """The chart to which a transition leads, or its image, and the state there."""
         target = images.get(x.target, x.target)
         mirrored = self._mirrored if x.target in images else _same
@@ -282,11 +341,15 @@ class Quotient(Derived):
             source, target = target, source
         order = [source.index(self._partner(name)) for name in target]
         names = target if back else map(self._partner, target)
-        return q[np.array(order)] * np.array([-1.0 if x in self.flipped else 1.0 for x in names])
+        return q[np.array(order)] * np.array(
+            [-1.0 if x in self.flipped else 1.0 for x in names]
+        )
 
 
 @jax.ensure_compile_time_eval()
-def check_symmetry(system: HybridSystem, sizes: Any = None, along: str | None = None) -> None:
+def check_symmetry(
+    system: HybridSystem, sizes: Any = None, along: str | None = None
+) -> None:
     """Raise an error if functions, or with `along` their derivatives by this parameter, do not have
     the symmetry that a `Quotient` states.
 
@@ -296,7 +359,9 @@ def check_symmetry(system: HybridSystem, sizes: Any = None, along: str | None = 
     if not isinstance(system, Quotient):
         return
     check_symmetry(system.system, None, along and along.removeprefix("system."))
-    sizes = sizes or {name: np.ones(len(x.states)) for name, x in system.charts().items()}
+    sizes = sizes or {
+        name: np.ones(len(x.states)) for name, x in system.charts().items()
+    }
     clock, rng = system.system.period(), np.random.default_rng(0)
     q = rng.normal(size=(3, max(map(len, sizes.values()))))
     t = rng.normal(size=3) * (1.0 if clock is None else clock)
@@ -306,7 +371,9 @@ def check_symmetry(system: HybridSystem, sizes: Any = None, along: str | None = 
         x, y = (values / size for values in pair)
         if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
             text = f"{type(system.system).__name__} does not have the symmetry of its Quotient"
-            raise DefinitionError(f"{text}{f' once {along!r} changes' * bool(along)}: {sentence}.")
+            raise DefinitionError(
+                f"{text}{f' once {along!r} changes' * bool(along)}: {sentence}."
+            )
 
 
 @eqx.filter_jit
@@ -315,8 +382,13 @@ def _sides(quotient: Any, sizes: Any, q: Any, t: Any, along: str | None) -> list
     if along:
         at = lambda x: _sides(with_parameters(quotient, {along: x}), sizes, q, t, None)  # noqa: E731
         return jax.jvp(at, (parameter_of(quotient, along),), (1.0,))[1]
-    u, claims = jnp.zeros(len(quotient.inputs)), [x for _, *x in quotient._claims(sizes)]
-    return jax.vmap(lambda q, t: [tuple(as_vector(f(t, q, u)) for f in x) for x in claims])(q, t)
+    u, claims = (
+        jnp.zeros(len(quotient.inputs)),
+        [x for _, *x in quotient._claims(sizes)],
+    )
+    return jax.vmap(
+        lambda q, t: [tuple(as_vector(f(t, q, u)) for f in x) for x in claims]
+    )(q, t)
 
 
 def _same(kept: str, q: Any, back: bool = False):
@@ -336,7 +408,9 @@ class _Reduced(DerivedChart):
 
     @property
     def kept(self) -> np.ndarray:
-        return np.array([k for k, x in enumerate(self.chart.states) if x not in self.translation])
+        return np.array(
+            [k for k, x in enumerate(self.chart.states) if x not in self.translation]
+        )
 
     @property
     def states(self) -> tuple[str, ...]:  # type: ignore[override]

@@ -28,7 +28,9 @@ class Sliding(NamedTuple):
 
 @checked
 def sliding(
-    charts: Mapping[str, Chart], surface: Callable[[Any, Any], Any], name: str = "slides"
+    charts: Mapping[str, Chart],
+    surface: Callable[[Any, Any], Any],
+    name: str = "slides",
 ) -> Sliding:
     """Charts and transitions of a system whose field jumps at a surface.
 
@@ -60,10 +62,14 @@ def sliding(
     **Raises:** `DefinitionError` if the charts are not two with the same states and inputs.
     """
     if len(charts) != 2:
-        raise DefinitionError(f"sliding takes two charts, above and below, not {len(charts)}.")
+        raise DefinitionError(
+            f"sliding takes two charts, above and below, not {len(charts)}."
+        )
     (above, f), (below, g) = charts.items()
     if f.states != g.states or f.inputs != g.inputs:
-        raise DefinitionError(f"charts '{above}' and '{below}' need the same states and inputs.")
+        raise DefinitionError(
+            f"charts '{above}' and '{below}' need the same states and inputs."
+        )
     middle = SlidingChart(f, g, surface)
     height = lambda t, q, u: surface(t, q)  # noqa: E731
     up, down = (lambda t, q, u, k=k: middle.rates(t, q, u)[k] for k in (0, 1))
@@ -72,7 +78,9 @@ def sliding(
     no = lambda predicate: lambda t, q, u: ~predicate(t, q, u)  # noqa: E731
 
     def event(source, target, guard, sense: Direction = "falling", enabled=None):
-        return Transition(f"{source} to {target}", source, target, guard, sense, enabled=enabled)
+        return Transition(
+            f"{source} to {target}", source, target, guard, sense, enabled=enabled
+        )
 
     transitions = [
         event(above, name, height, enabled=held),

@@ -71,7 +71,9 @@ class ByChart(NamedTuple):
     solvers: tuple[Any, ...]
 
     def __repr__(self):
-        return ", ".join(f"{name}: {solver}" for name, solver in zip(*self, strict=True))
+        return ", ".join(
+            f"{name}: {solver}" for name, solver in zip(*self, strict=True)
+        )
 
     def get(self, name: str) -> Any:
         return dict(zip(*self, strict=True)).get(name)
@@ -87,7 +89,11 @@ def solvers(
     for solver in given.values() if isinstance(given, Mapping) else (given,):
         if not isinstance(solver, Method | eqx.Module | ByChart | None):
             raise _no_solver(solver)
-    return ByChart(tuple(given), tuple(given.values())) if isinstance(given, Mapping) else given
+    return (
+        ByChart(tuple(given), tuple(given.values()))
+        if isinstance(given, Mapping)
+        else given
+    )
 
 
 @ft.lru_cache
@@ -104,9 +110,14 @@ def as_method(solver: Any) -> Method:
 
     name = type(solver).__name__
     if isinstance(solver, diffrax.ImplicitEuler):
-        return Method(name, ((0.0, 0.0), (0.0, 1.0)), (0.0, 1.0), (0.0, 1.0), (-0.5, 0.5), 2.0)
+        return Method(
+            name, ((0.0, 0.0), (0.0, 1.0)), (0.0, 1.0), (0.0, 1.0), (-0.5, 0.5), 2.0
+        )
     tableau = getattr(solver, "tableau", None)
-    single = getattr(solver, "term_structure", None) in (diffrax.AbstractTerm, diffrax.ODETerm)
+    single = getattr(solver, "term_structure", None) in (
+        diffrax.AbstractTerm,
+        diffrax.ODETerm,
+    )
     adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver)
     if not (single and adaptive and isinstance(tableau, diffrax.ButcherTableau)):
         raise _no_solver(solver)
@@ -129,7 +140,9 @@ def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) ->
         a += np.diag(tableau.a_diagonal)
     if a[0, 0] != 0 or tableau.c1 != 0:
         raise _no_solver(name)
-    return _method(name, a, tableau.b_sol, np.array((0.0, *tableau.c)), tableau.b_error, order)
+    return _method(
+        name, a, tableau.b_sol, np.array((0.0, *tableau.c)), tableau.b_error, order
+    )
 
 
 def _method(name: str, a, b, c, error, order: float, **controls: Any) -> Method:
@@ -145,7 +158,9 @@ def _radau(s: int) -> Method:
     c = np.append((1 + special.roots_jacobi(s - 1, 1, 0)[0]) / 2, 1.0)
     # Integrals of the Lagrange polynomials from 0 to each point.
     x, weights = np.polynomial.legendre.leggauss(s)
-    a = np.array([y / 2 * weights @ [_lagrange(c, y * (1 + z) / 2) for z in x] for y in c])
+    a = np.array(
+        [y / 2 * weights @ [_lagrange(c, y * (1 + z) / 2) for z in x] for y in c]
+    )
     eigenvalues = np.linalg.eigvals(a)
     gamma = float(eigenvalues[np.argmin(np.abs(eigenvalues.imag))].real)
     # The quadrature formula of order s that has the weight gamma at the start of the step.
@@ -154,12 +169,21 @@ def _radau(s: int) -> Method:
     error = np.concatenate([[gamma], np.linalg.solve(powers, moments) - a[-1]])
     full = np.pad(a, ((1, 0), (1, 0)))
     return _method(
-        f"Radau({s})", full, full[-1], np.concatenate([[0.0], c]), error, 2.0 * s,
-        gain=2 * s / (s + 1), filter=gamma, rough=tuple(-_lagrange(c, 0.0) @ full[1:]),
-    )  # fmt: skip
+        f"Radau({s})",
+        full,
+        full[-1],
+        np.concatenate([[0.0], c]),
+        error,
+        2.0 * s,
+        gain=2 * s / (s + 1),
+        filter=gamma,
+        rough=tuple(-_lagrange(c, 0.0) @ full[1:]),
+    )
 
 
 def _lagrange(c: Float[np.ndarray, " s"], x: float) -> Float[np.ndarray, " s"]:
     """Values at x of the Lagrange polynomials at the points c."""
     others = [np.delete(c, j) for j in range(len(c))]
-    return np.array([np.prod((x - o) / (y - o)) for y, o in zip(c, others, strict=True)])
+    return np.array(
+        [np.prod((x - o) / (y - o)) for y, o in zip(c, others, strict=True)]
+    )

@@ -69,7 +69,9 @@ def member_of(alike: Sequence[Any], place: Any) -> Any:
         on_device = any(isinstance(x, jax.Array) for x in column)
         return jnp.asarray(jnp.stack(column) if on_device else np.stack(column))[place]
 
-    return structures[0].unflatten([select(column) for column in zip(*leaves, strict=True)])
+    return structures[0].unflatten(
+        [select(column) for column in zip(*leaves, strict=True)]
+    )
 
 
 def counts_alike(program: jex.Jaxpr) -> bool:
@@ -77,7 +79,10 @@ def counts_alike(program: jex.Jaxpr) -> bool:
     by the bits of the exponent: a negative or too large one would give another number.)"""
     return not any(
         (eqn.primitive.name.startswith("shift") or eqn.primitive.name == "pow")
-        and all(jnp.issubdtype(getattr(v.aval, "dtype", object), jnp.integer) for v in eqn.invars)
+        and all(
+            jnp.issubdtype(getattr(v.aval, "dtype", object), jnp.integer)
+            for v in eqn.invars
+        )
         or not all(map(counts_alike, jaxprs(eqn.params)))
         for eqn in program.eqns
     )
@@ -88,7 +93,9 @@ def _form(x: Transition) -> Hashable:
     if isinstance(x.guard, Scheduled):
         return None
     leaves, structure = jax.tree_util.tree_flatten((x.guard, x.reset, x.enabled))
-    return hashable((x.source, x.target, x.direction, structure, *map(_form_of_leaf, leaves)))
+    return hashable(
+        (x.source, x.target, x.direction, structure, *map(_form_of_leaf, leaves))
+    )
 
 
 def hashable(form: Hashable) -> Hashable:
@@ -112,7 +119,9 @@ def _form_of_leaf(leaf: Any) -> Hashable:
 def as_vector(value: Any) -> jax.Array:
     """Numbers returned by a user's function, as one floating-point vector."""
     if isinstance(value, tuple | list):
-        return jnp.stack([jnp.asarray(v, float) for v in value]) if value else jnp.zeros(0)
+        return (
+            jnp.stack([jnp.asarray(v, float) for v in value]) if value else jnp.zeros(0)
+        )
     return jnp.asarray(value, float)
 
 
@@ -209,7 +218,9 @@ class Structure:
         """Number of inputs."""
         return len(self.inputs)
 
-    def by_lane(self, function: Callable, *trees: Any, name: Hashable = None) -> Callable:
+    def by_lane(
+        self, function: Callable, *trees: Any, name: Hashable = None
+    ) -> Callable:
         """Vectorize `function(structure, *trees, *arguments)` over the lanes on the last axis of
         `arguments`. Lanes may have parameters of their own (see `PerLane`).
 
@@ -224,12 +235,16 @@ class Structure:
 
         return make() if name is None else self.once(name, trees, make)
 
-    def kernel(self, function: Callable, form, *static: Hashable, trees=(), lanes=1) -> Callable:
+    def kernel(
+        self, function: Callable, form, *static: Hashable, trees=(), lanes=1
+    ) -> Callable:
         """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
         compiled (see `_core/compilation.py`)."""
         name = function, form, static, lanes
         every = self, *trees
-        return self.once(name, trees, lambda: kernel(function, form, static, every, lanes))
+        return self.once(
+            name, trees, lambda: kernel(function, form, static, every, lanes)
+        )
 
     # Whether lanes of the host have systems of their own (see `engine.kernels.Systems`).
     by_system = False
@@ -288,7 +303,11 @@ class Structure:
         def make():
             groups = []
             for kind in kinds(self.transitions):
-                groups += [kind] if len(kind) == 1 or self._is_one(kind) else [(g,) for g in kind]
+                groups += (
+                    [kind]
+                    if len(kind) == 1 or self._is_one(kind)
+                    else [(g,) for g in kind]
+                )
             return groups
 
         return _kinds.recall(self.source, None, make)
@@ -303,7 +322,10 @@ class Structure:
             return s.guard(x, *point), s.reset(x, *point), s.enabled(x, *point)
 
         real, array = jnp.result_type(float), jax.ShapeDtypeStruct
-        place, single = array((), jnp.result_type(int)), Structure(one_lane(self.source))
+        place, single = (
+            array((), jnp.result_type(int)),
+            Structure(one_lane(self.source)),
+        )
         point = array((), real), array((n,), real), array((single.nu,), real)
         try:
             program, *_ = eqx.filter_make_jaxpr(at_a_point)(single, place, *point)
@@ -327,11 +349,15 @@ class Structure:
 
     def schedules(self, a: int) -> list[int]:
         """Indices of the scheduled transitions out of chart a."""
-        return [g for g in range(len(self.transitions)) if self._leaves(g, a, by_clock=True)]
+        return [
+            g for g in range(len(self.transitions)) if self._leaves(g, a, by_clock=True)
+        ]
 
     def _leaves(self, g: int, a: int, by_clock: bool) -> bool:
         tr = self.transitions[g]
-        return tr.source == self.names[a] and isinstance(tr.guard, Scheduled) == by_clock
+        return (
+            tr.source == self.names[a] and isinstance(tr.guard, Scheduled) == by_clock
+        )
 
     def transition(self, g: int | Member) -> Transition:
         """A transition by its index, or as a member of its kind (of a single lane)."""
@@ -340,18 +366,26 @@ class Structure:
         alike = [self.transitions[x] for x in g.kind]
         if len(alike) == 1:
             return alike[0]
-        guard, reset, enabled = member_of([(x.guard, x.reset, x.enabled) for x in alike], g.place)
+        guard, reset, enabled = member_of(
+            [(x.guard, x.reset, x.enabled) for x in alike], g.place
+        )
         return dataclasses.replace(alike[0], guard=guard, reset=reset, enabled=enabled)
 
     def guard(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
         """Transition g's guard, signed so that it falls through zero at the event."""
         tr = self.transition(g)
         assert not isinstance(tr.guard, Scheduled)
-        if (value := jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)))).dtype == bool:
-            raise DefinitionError(f"the guard of '{tr.name}' must be `a - b`, not `a > b`.")
+        if (
+            value := jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)))
+        ).dtype == bool:
+            raise DefinitionError(
+                f"the guard of '{tr.name}' must be `a - b`, not `a > b`."
+            )
         return tr.sign * jnp.asarray(value, float)
 
-    def guard_values(self, kinds: Sequence[Kind], t: Array, q: Array, u: Array) -> list[jax.Array]:
+    def guard_values(
+        self, kinds: Sequence[Kind], t: Array, q: Array, u: Array
+    ) -> list[jax.Array]:
         """All guards of some kinds, in parts: a vector for each kind, or numbers if each guard is
         the only one of its kind."""
         if all(len(kind) == 1 for kind in kinds):
@@ -363,7 +397,9 @@ class Structure:
         tr = self.transition(g)
         return as_vector(tr.reset(t, q, self._input_of(tr, t, u)))
 
-    def enabled(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
+    def enabled(
+        self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array
+    ) -> jax.Array:
         tr = self.transition(g)
         if tr.enabled is None:
             return jnp.asarray(True)
@@ -372,7 +408,9 @@ class Structure:
     def _input_of(self, tr: Transition, t: ArrayLike, u: Array) -> Array:
         return self.chart_input(self.chart_index(tr.source), t, u)
 
-    def state_function(self, name: str, a: int) -> Callable[[Any, Any, Any], Any] | None:
+    def state_function(
+        self, name: str, a: int
+    ) -> Callable[[Any, Any, Any], Any] | None:
         """The state called `name` in chart a as a function (t, q, u), `None` if it is not there."""
         chart = self.charts[a]
         if name in chart.states:
@@ -397,7 +435,11 @@ class Structure:
     def states_everywhere(self) -> list[str]:
         """The states that every chart defines."""
         charts = range(len(self.charts))
-        return [x for x in self.state_names() if all(self.state_function(x, a) for a in charts)]
+        return [
+            x
+            for x in self.state_names()
+            if all(self.state_function(x, a) for a in charts)
+        ]
 
     def states(self, a: int) -> tuple[Signal, ...]:
         """The names of chart a's states, with their units."""
@@ -405,7 +447,9 @@ class Structure:
 
     def sizes(self, scale: Any) -> dict[str, np.ndarray]:
         """Sizes of the states of each chart, by its name, from `Settings.scale`."""
-        return {x: np.asarray(scale)[a, : self.dims[a]] for a, x in enumerate(self.names)}
+        return {
+            x: np.asarray(scale)[a, : self.dims[a]] for a, x in enumerate(self.names)
+        }
 
     def by_name(self, a: int, q: np.ndarray) -> dict[str, float]:
         """A state of chart a by names."""
@@ -414,13 +458,19 @@ class Structure:
     def drawing(self, a: int, t: Any, q: Any) -> Any:
         """The drawing of a state of chart a, or `None`."""
         values = {name: self.state_function(name, a) for name in self.state_names()}
-        named = {str(name): f(t, q, None) for name, f in values.items() if f is not None}
+        named = {
+            str(name): f(t, q, None) for name, f in values.items() if f is not None
+        }
         return self.system.draw(self.names[a], t, ByName(named))
 
-    def resolve_outputs(self, outputs: Sequence[str | Output] | str | Output) -> "Outputs":
+    def resolve_outputs(
+        self, outputs: Sequence[str | Output] | str | Output
+    ) -> "Outputs":
         """Outputs by name or by `Output`, checked and ready to evaluate in any chart."""
         outputs = (outputs,) if isinstance(outputs, str | Output) else tuple(outputs)
-        return self.once((Outputs, len(outputs)), outputs, lambda: Outputs(self, outputs))
+        return self.once(
+            (Outputs, len(outputs)), outputs, lambda: Outputs(self, outputs)
+        )
 
 
 class Outputs:
@@ -431,13 +481,18 @@ class Outputs:
         defined = {o.name: o for o in structure.system.outputs()}
         items = [defined.get(x, x) if isinstance(x, str) else x for x in outputs]
         self.items: list[str | Output] = items
-        require_among("output", [x for x in items if isinstance(x, str)], structure.output_names())
+        require_among(
+            "output", [x for x in items if isinstance(x, str)], structure.output_names()
+        )
         states = {str(name): name for name in structure.state_names()}
         self.names = tuple(
-            states[o] if isinstance(o, str) else Signal(o.name, o.unit) for o in self.items
+            states[o] if isinstance(o, str) else Signal(o.name, o.unit)
+            for o in self.items
         )
         if len(set(self.names)) < len(self.names):
-            raise DefinitionError(f"two outputs have the same name: {quoted(self.names)}.")
+            raise DefinitionError(
+                f"two outputs have the same name: {quoted(self.names)}."
+            )
 
     def __call__(self, a: int, t, q, u) -> jax.Array:
         """All outputs in chart a, shape (ny,); NaN where a chart does not define one."""

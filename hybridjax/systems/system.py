@@ -80,7 +80,10 @@ def unit_of_parameter(system: Any, path: str) -> str:
 def arrays_of(system: "HybridSystem") -> dict[str, Array]:
     """The arrays of a system by name, those of its parts by a path with dots."""
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array))
-    return {".".join(str(getattr(x, "name", x)) for x in path): leaf for path, leaf in leaves}
+    return {
+        ".".join(str(getattr(x, "name", x)) for x in path): leaf
+        for path, leaf in leaves
+    }
 
 
 def copies_of(system: "HybridSystem") -> dict[str, Array]:
@@ -98,13 +101,21 @@ def parameters_of(system: "HybridSystem") -> dict[str, Array]:
 def describe(system: "HybridSystem") -> dict[str, Any]:
     """The class of a system, its numbers by name, and a digest of its code, for stored results."""
     arrays = arrays_of(system).items()
-    numbers = {name: float(x) if np.ndim(x) == 0 else digest_of(x) for name, x in arrays}
-    return {"class": type(system).__qualname__, "numbers": numbers, "code": code_digest(system)}
+    numbers = {
+        name: float(x) if np.ndim(x) == 0 else digest_of(x) for name, x in arrays
+    }
+    return {
+        "class": type(system).__qualname__,
+        "numbers": numbers,
+        "code": code_digest(system),
+    }
 
 
 def own_fields(system: Any) -> tuple[dataclasses.Field, ...]:
     """The fields of a system or its class that its author wrote: its parameters."""
-    return tuple(x for x in dataclasses.fields(system) if x.name not in ("solver", "code_digest"))
+    return tuple(
+        x for x in dataclasses.fields(system) if x.name not in ("solver", "code_digest")
+    )
 
 
 def _number(x: Scalar) -> Array:
@@ -124,8 +135,15 @@ class Guess(eqx.Module):
     time: Float[Array, ""]
     after: str | None = eqx.field(static=True, default=None)
 
-    def __init__(self, chart: str, state: Vector, time: Scalar = 0.0, *, after: str | None = None):
-        self.chart, self.state, self.time, self.after = chart, real(state), real(time), after
+    def __init__(
+        self, chart: str, state: Vector, time: Scalar = 0.0, *, after: str | None = None
+    ):
+        self.chart, self.state, self.time, self.after = (
+            chart,
+            real(state),
+            real(time),
+            after,
+        )
 
     __repr__ = fields
 
@@ -199,7 +217,9 @@ class HybridSystem(Definition):
         """The default guess for the search of the limit cycle, or `None`."""
         return None
 
-    def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]) -> Drawing | None:
+    def draw(
+        self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]
+    ) -> Drawing | None:
         """What the system looks like in a chart, for `hj.plot.animate`: a `Drawing`, written for
         one state as a vector field is. `q` holds the states of the chart and the values of those
         that it lacks (`Chart.absent`) by name. `None`, the default: states are drawn over time."""
@@ -209,7 +229,9 @@ class HybridSystem(Definition):
         rows = []
         for field in own_fields(self):
             unit, doc = (field.metadata.get(key, "") for key in ("unit", "doc"))
-            rows.append((field.name, f"{value(getattr(self, field.name))} {unit}".rstrip(), doc))
+            rows.append(
+                (field.name, f"{value(getattr(self, field.name))} {unit}".rstrip(), doc)
+            )
         if self.solver is not None:
             rows.append(("solver", repr(self.solver), "how charts are integrated"))
         return type(self).__name__ + columns(rows)
@@ -227,7 +249,10 @@ class Derived(HybridSystem):
 
     system: HybridSystem
 
-    inputs, time_unit = attribute_of("system", "inputs"), attribute_of("system", "time_unit")
+    inputs, time_unit = (
+        attribute_of("system", "inputs"),
+        attribute_of("system", "time_unit"),
+    )
     input_units = attribute_of("system", "input_units")
 
     def charts(self):

@@ -53,7 +53,9 @@ class Scheduled(eqx.Module):
     def nearest(self, t: Array) -> Array:
         """The event's time that is nearest to t, as a function of `offset` and `period`."""
         offset, period = self.numbers(t)
-        return offset + stop_gradient(namespace(t).round((t - offset) / period)) * period
+        return (
+            offset + stop_gradient(namespace(t).round((t - offset) / period)) * period
+        )
 
 
 def _identity(t, q, u):

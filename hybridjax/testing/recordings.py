@@ -11,7 +11,14 @@ from scipy import signal
 
 from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Fraction, NonNegative, Positive, Seed, SignalNames
+from .._core.boundary.kinds import (
+    Count,
+    Fraction,
+    NonNegative,
+    Positive,
+    Seed,
+    SignalNames,
+)
 from .._core.boundary.values import Reals
 from .._core.compilation import quick_jit
 from .._core.limits import PERIODS, SECTIONS
@@ -53,7 +60,9 @@ def random_force(
         raise DefinitionError(
             f"`bandwidth` must be less than half of `rate`, {rate / 2:g}, but is {bandwidth:g}."
         )
-    transient = 4 * rate / bandwidth  # samples cut off at either end, where the filter starts
+    transient = (
+        4 * rate / bandwidth
+    )  # samples cut off at either end, where the filter starts
     samples = duration * rate + 2 * transient
     if not samples <= PERIODS:
         raise DefinitionError(
@@ -209,7 +218,11 @@ def simulate_beats(
         raise DefinitionError(f"`rhythm` must be one number or {S}, none above `rate`.")
     w = np.broadcast_to(np.asarray(rhythm, float), S)
     steps = int(np.ceil(w.max() / (rate * _STEP)))
-    h, nodes, table = 1 / (rate * steps), np.arange(n + 1) / n, np.append(table, table[0])
+    h, nodes, table = (
+        1 / (rate * steps),
+        np.arange(n + 1) / n,
+        np.append(table, table[0]),
+    )
     rng = np.random.default_rng(seed)
 
     def at(phase):

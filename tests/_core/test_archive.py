@@ -49,7 +49,13 @@ def overlapping(path):
         entry = archive.infolist()[0]
         for k in range(200):
             twin = zipfile.ZipInfo(f"x{k}.npy")
-            for name in ("header_offset", "file_size", "compress_size", "CRC", "compress_type"):
+            for name in (
+                "header_offset",
+                "file_size",
+                "compress_size",
+                "CRC",
+                "compress_type",
+            ):
                 setattr(twin, name, getattr(entry, name))
             archive.filelist.append(twin)
         archive._didModify = True
@@ -58,12 +64,18 @@ def overlapping(path):
 HOSTILE = {
     "a bomb": (bomb, "declares arrays of 134217856 bytes"),
     "overlapping members": (overlapping, "declares arrays of"),
-    "a huge shape": (lambda p: pack(p, [("time.npy", npy((10**12,)))]), "not that large"),
+    "a huge shape": (
+        lambda p: pack(p, [("time.npy", npy((10**12,)))]),
+        "not that large",
+    ),
     "a shape that is too small": (
         lambda p: pack(p, [("time.npy", npy((1,), bytes(80)))]),
         "not that large",
     ),
-    "a negative shape": (lambda p: pack(p, [("time.npy", npy((-1,), bytes(8)))]), "is damaged"),
+    "a negative shape": (
+        lambda p: pack(p, [("time.npy", npy((-1,), bytes(8)))]),
+        "is damaged",
+    ),
     "two of one name": (
         lambda p: pack(p, [("time.npy", npy((0,))), ("time.npy", npy((0,)))]),
         "two of its arrays have one name",
@@ -74,7 +86,10 @@ HOSTILE = {
 DECLARED = {
     "sections": (dict(n_sections=10**12), "n_sections is 1000000000000"),
     "experiments that are not there": (dict(experiments=10**6), "needs a frequency"),
-    "a window": (dict(n_sections=10**5, periods=10**6), "more samples than an experiment"),
+    "a window": (
+        dict(n_sections=10**5, periods=10**6),
+        "more samples than an experiment",
+    ),
     "a name that is none": (dict(input_names=[["u"]]), "input_names is"),
 }
 
@@ -89,11 +104,15 @@ def refused(call, path, says):
     finally:
         tracemalloc.stop()
     assert peak < 2**25
-    assert str(path) in str(error.value) and len(str(error.value)) < 400 + len(str(path))
+    assert str(path) in str(error.value) and len(str(error.value)) < 400 + len(
+        str(path)
+    )
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
-@pytest.mark.parametrize("read", [hj.load, hj.read_recording], ids=["load", "read_recording"])
+@pytest.mark.parametrize(
+    "read", [hj.load, hj.read_recording], ids=["load", "read_recording"]
+)
 @pytest.mark.parametrize(("make", "says"), HOSTILE.values(), ids=HOSTILE)
 def test_hostile_archives(tmp_path, read, make, says):
     path = tmp_path / "hostile.npz"
@@ -125,7 +144,11 @@ def test_a_parquet_file_that_declares_more_than_it_holds(tmp_path):
     values = pyarrow.DictionaryArray.from_arrays(np.zeros(2**24, np.int8), [0.0])
     parquet.write_table(pyarrow.table({"time": values}), path)
     assert path.stat().st_size < 2**20
-    refused(hj.read_recording, path, "it declares .*, and is not that large|declares 16777216 rows")
+    refused(
+        hj.read_recording,
+        path,
+        "it declares .*, and is not that large|declares 16777216 rows",
+    )
 
 
 @pytest.mark.parametrize("error", [MemoryError(), OSError(5, "Input/output error")])

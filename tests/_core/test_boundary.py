@@ -18,7 +18,14 @@ from jaxtyping import Array, Float
 import hybridjax as hj
 from hybridjax._core.boundary.checked import checked
 from hybridjax._core.boundary.containers import Names
-from hybridjax._core.boundary.kinds import Count, FilePath, Numbers, Positive, Scalar, SignalNames
+from hybridjax._core.boundary.kinds import (
+    Count,
+    FilePath,
+    Numbers,
+    Positive,
+    Scalar,
+    SignalNames,
+)
 from hybridjax._core.boundary.values import Complexes, Integers, Number, Reals
 
 
@@ -32,7 +39,13 @@ TAKEN = [
     (Count | None, None, None),
     (float, 3, 3.0),
     (float, jnp.array(0.5), 0.5),
-    (Annotated[float, Number("no bound or a positive number", above=0, infinite=True)], INF, INF),
+    (
+        Annotated[
+            float, Number("no bound or a positive number", above=0, infinite=True)
+        ],
+        INF,
+        INF,
+    ),
     (bool, np.True_, True),
     (Literal["a", "b"], "b", "b"),
     (Sequence[int], np.arange(2), [0, 1]),
@@ -45,7 +58,11 @@ TAKEN = [
     (Annotated[Numbers, Reals()], [1, 2], np.array([1.0, 2.0])),
     (Annotated[Numbers, Reals("n 2")], np.ones((3, 2), np.float32), np.ones((3, 2))),
     (GAPS, np.ma.masked_less([1, 2], 2), np.array([NAN, 2.0])),
-    (Annotated[Numbers, Reals("n", missing=True, infinite=True)], [INF, NAN], np.array([INF, NAN])),
+    (
+        Annotated[Numbers, Reals("n", missing=True, infinite=True)],
+        [INF, NAN],
+        np.array([INF, NAN]),
+    ),
     (Annotated[Numbers, Reals("n")], jnp.arange(2), jnp.arange(2.0)),
     (Annotated[Numbers, Complexes("n")], [1, 2j], np.array([1, 2j])),
     (Annotated[Numbers, Integers("n")], np.arange(2, dtype=np.uint8), np.arange(2)),
@@ -64,7 +81,11 @@ REFUSED = [
     (int | str | None, 0.5, "must be an integer, a string or None, not 0.5"),
     (FilePath, "", "must be the name of a file or folder, not ''"),
     (Sequence[str], "ab", "must be a sequence (each item a string), not 'ab'"),
-    (tuple[float, float], (1.0,), "must be a tuple of 2 (a finite number, a finite number)"),
+    (
+        tuple[float, float],
+        (1.0,),
+        "must be a tuple of 2 (a finite number, a finite number)",
+    ),
     (Mapping[str, Positive], {"a": -1}, "`x['a']` must be a positive number, not -1"),
     (Mapping[str, int], {1: 2}, "[1]` must be a string, not 1"),
     (SignalNames, ["a", "a"], "must name each only once, not ('a', 'a')"),
@@ -75,11 +96,27 @@ REFUSED = [
     (MATRIX, np.zeros((2, 2), complex), "must be real, not an array of complex128"),
     (MATRIX, "x", "must be an array of real numbers with shape (N, d), not 'x'"),
     (MATRIX, [[0, 1], [NAN, 0]], "must be finite, but is nan at index (1, 0)"),
-    (MATRIX, SimpleNamespace(columns=["b"]), "not a table: give `table[names].to_numpy()`"),
+    (
+        MATRIX,
+        SimpleNamespace(columns=["b"]),
+        "not a table: give `table[names].to_numpy()`",
+    ),
     (GAPS, [0, INF], "must be finite, but is inf at index 1"),
-    (Annotated[Numbers, Reals("n", sign="positive")], [1, 0], "must be positive, but is 0 at"),
-    (Annotated[Numbers, Reals("n", sign="nonnegative")], [1, -2], "must be zero or positive, but"),
-    (Annotated[Numbers, Reals("N N")], np.zeros((2, 3)), "must be of shape (N, N), not of"),
+    (
+        Annotated[Numbers, Reals("n", sign="positive")],
+        [1, 0],
+        "must be positive, but is 0 at",
+    ),
+    (
+        Annotated[Numbers, Reals("n", sign="nonnegative")],
+        [1, -2],
+        "must be zero or positive, but",
+    ),
+    (
+        Annotated[Numbers, Reals("N N")],
+        np.zeros((2, 3)),
+        "must be of shape (N, N), not of",
+    ),
     (Annotated[Numbers, Integers("n")], [0.5], "must hold integers, not float64"),
 ]
 
@@ -135,7 +172,13 @@ def test_every_parameter_is_checked_however_it_is_given():
 
 def test_a_checked_function_looks_as_before():
     assert several.__doc__ == "What it does." and several.__name__ == "several"
-    assert list(inspect.signature(several).parameters) == ["a", "b", "rest", "c", "options"]
+    assert list(inspect.signature(several).parameters) == [
+        "a",
+        "b",
+        "rest",
+        "c",
+        "options",
+    ]
     assert pickle.loads(pickle.dumps(several)) is several
     assert "an integer from 1 to" in str(inspect.signature(several))
 
@@ -143,7 +186,9 @@ def test_a_checked_function_looks_as_before():
 @checked
 class Module(eqx.Module):
     n: Count = eqx.field(static=True)
-    x: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+    x: Float[Array, ""] = eqx.field(
+        converter=lambda x: jnp.asarray(x, float), default=0.0
+    )
 
     def method(self, k: Count):
         return k
@@ -169,7 +214,11 @@ class Heir(Module):
 
 def test_a_class_is_checked_where_it_is_built_and_used():
     module = Module(np.int64(3), 1)
-    assert type(module.n) is int and module.make(2).n == 2 and module.alone(1) == module(1) == 1
+    assert (
+        type(module.n) is int
+        and module.make(2).n == 2
+        and module.alone(1) == module(1) == 1
+    )
     for bad, name in [
         (lambda: Module(0), "Module: `n`"),
         (lambda: module.method(0), "Module.method: `k`"),
@@ -201,12 +250,16 @@ class Data:
 def test_named_tuples_and_dataclasses_are_checked(cls):
     assert type(cls(1).first) is float
     assert pickle.loads(pickle.dumps(cls(1))) == cls(1)
-    with pytest.raises(hj.DefinitionError, match=f"^{cls.__name__}: `second` must be a string"):
+    with pytest.raises(
+        hj.DefinitionError, match=f"^{cls.__name__}: `second` must be a string"
+    ):
         cls(1, second=2)
 
 
 @checked
-def summed(x: Annotated[Numbers, Reals("n")], scale: Scalar = 1.0, *, power: Positive = 1.0):
+def summed(
+    x: Annotated[Numbers, Reals("n")], scale: Scalar = 1.0, *, power: Positive = 1.0
+):
     return jnp.sum(jnp.asarray(x) ** power) * scale
 
 
@@ -226,19 +279,29 @@ def test_arrays_may_be_traced():
     assert jax.grad(lambda s: summed(x, s))(2.0) == 6
     assert jax.grad(lambda s: summed([s, 1.0], s))(2.0) == 5
     np.testing.assert_array_equal(jax.vmap(summed)(jnp.stack([x, x])), [6, 6])
-    with pytest.raises(hj.DefinitionError, match=r"^summed: `x` must be of shape \(n,\)"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"^summed: `x` must be of shape \(n,\)"
+    ):
         jax.jit(summed)(1.0)
 
 
-TRANSFORMS = {"jit": jax.jit, "vmap": lambda f: lambda x: jax.vmap(f)(x[None]), "grad": jax.grad}
+TRANSFORMS = {
+    "jit": jax.jit,
+    "vmap": lambda f: lambda x: jax.vmap(f)(x[None]),
+    "grad": jax.grad,
+}
 
 
 @pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
 def test_where_values_are_needed_a_sentence_says_so(transform):
     x = jnp.arange(3.0)
-    with pytest.raises(hj.DefinitionError, match="^summed: `power` must be .* traces it: call"):
+    with pytest.raises(
+        hj.DefinitionError, match="^summed: `power` must be .* traces it: call"
+    ):
         transform(lambda x: summed(x, power=x[0]))(x)
     for function, name in [(on_host, "on_host"), (around, "around")]:
-        with pytest.raises(hj.DefinitionError, match=f"^{name} needs values, but JAX traces them"):
+        with pytest.raises(
+            hj.DefinitionError, match=f"^{name} needs values, but JAX traces them"
+        ):
             transform(function)(x)
     assert eqx.filter_jit(lambda n: several(1, n))(2) == (1, 2, (), "x", {})

@@ -88,7 +88,9 @@ def test_later_jobs_take_the_optimized_program(tiers, monkeypatch):
     assert tiers == ["quick", "full"]
     job(X + 1, jnp.sin, 1)
     (program,) = compilation._by_kind.values()
-    assert [x[1] for x in job._chosen.values()] == [program._quick]  # one program for one job
+    assert [x[1] for x in job._chosen.values()] == [
+        program._quick
+    ]  # one program for one job
     later = TwoTiers(total, large=False)
     np.testing.assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
     assert [x[1] for x in later._chosen.values()] == [program._full] and len(tiers) == 2
@@ -99,7 +101,11 @@ def test_functions_that_are_written_anew_share_a_program(tiers):
     for _ in range(3):
         job(X, lambda x: 2 * x, 1)
     assert tiers == ["quick"]
-    values = [job(X, lambda x: 3 * x, 1), job(X[:2], lambda x: 2 * x, 1), job(X, jnp.cos, 4)]
+    values = [
+        job(X, lambda x: 3 * x, 1),
+        job(X[:2], lambda x: 2 * x, 1),
+        job(X, jnp.cos, 4),
+    ]
     np.testing.assert_allclose([x.sum for x in values], [10, 3, jnp.cos(X).sum() + 4])
     assert len(tiers) == 4
 
@@ -121,7 +127,9 @@ def test_a_kernel_of_any_number_of_lanes(lanes):
         np.testing.assert_allclose(values, k * 3 * np.sin(x) ** 2 + y, rtol=1e-15)
     assert compilation._kernel_program.cache_info().misses == before + 1
     some = np.array([False, True, False, True])
-    values = kernel(point, plain, (2,), ({"k": jnp.asarray(1.0)},), lanes)(x, y, some=some)
+    values = kernel(point, plain, (2,), ({"k": jnp.asarray(1.0)},), lanes)(
+        x, y, some=some
+    )
     expected = (3 * np.sin(x) ** 2 + y)[:, some]
     np.testing.assert_allclose(values[:, some], expected, rtol=1e-15)
 
@@ -168,7 +176,10 @@ def test_the_cache_is_a_folder_of_its_own(tmp_path, monkeypatch, cache_setting):
     assert jax.config.jax_compilation_cache_dir == str(folder)
     assert folder.stat().st_mode & 0o777 == 0o700
     assert (tmp_path / "shared/jit_f-cache").read_bytes() == b"a colleague's"
-    assert {x.name for x in (tmp_path / "shared").iterdir()} == {"jit_f-cache", "programs"}
+    assert {x.name for x in (tmp_path / "shared").iterdir()} == {
+        "jit_f-cache",
+        "programs",
+    }
 
 
 def test_programs_are_not_unpickled(monkeypatch):
@@ -190,13 +201,15 @@ ATTACKS = {
     "exchanged by the owner of the folder above": lambda x: os.chown(x, 12345, -1),
     "of another user": lambda x: os.chown(x / "programs", 12345, -1),
     "a link": lambda x: (x / "programs").symlink_to((x / "programs").rename(x / "y")),
-    "a copy": lambda x: shutil.copytree((x / "programs").rename(x / "y"), x / "programs"),
+    "a copy": lambda x: shutil.copytree(
+        (x / "programs").rename(x / "y"), x / "programs"
+    ),
     "a pipe in it": lambda x: os.mkfifo(x / "programs/jit_f-cache"),
     "a link in it": lambda x: (x / "programs/jit_f-cache").symlink_to(x),
     "a file of 30 GiB in it": lambda x: os.truncate(
         os.open(x / "programs/jit_f-cache", os.O_CREAT | os.O_WRONLY), 30 * 2**30
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
@@ -280,7 +293,10 @@ def test_loop_kernels_that_come_too_late_are_refused():
     printed = run(LATE)
     if printed.strip() == "done True":
         pytest.skip("this XLA makes single kernels of loops by default")
-    assert printed.startswith(" XLA has read") and "before JAX computes anything" in printed
+    assert (
+        printed.startswith(" XLA has read")
+        and "before JAX computes anything" in printed
+    )
 
 
 @pytest.mark.slow

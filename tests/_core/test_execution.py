@@ -29,13 +29,17 @@ def test_a_machine_with_a_gpu_computes_few_lanes_on_its_cpu(monkeypatch):
     executors = []
     function = host_first(lambda x: (executors.append(on_host(x)), 2 * x)[1])
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert function(jnp.ones(1)).devices() == {jax.devices("cpu")[0]} and executors == [True]
+    assert function(jnp.ones(1)).devices() == {jax.devices("cpu")[0]} and executors == [
+        True
+    ]
 
 
 def test_programs_factorize_one_matrix_at_a_time():
     """Two stacks in one program wait for each other's threads for ever on two cores (JAX 0.10)."""
     rng = np.random.default_rng(0)
-    A, B, C, u = (rng.normal(size=x) for x in ((8, 3, 3), (8, 3, 2), (8, 1, 3), (1, 5, 8, 2)))
+    A, B, C, u = (
+        rng.normal(size=x) for x in ((8, 3, 3), (8, 3, 2), (8, 1, 3), (1, 5, 8, 2))
+    )
     matrices, right = rng.normal(size=(3, 2, 4, 4)), rng.normal(size=(4, 1))
     exact = np.linalg.solve(matrices, right)
     np.testing.assert_allclose(jax.jit(solve)(matrices, right), exact, rtol=1e-10)
@@ -44,7 +48,12 @@ def test_programs_factorize_one_matrix_at_a_time():
         (harmonic_transfer, (A, B, C, np.zeros((8, 1, 2)), np.arange(9.0) / 9)),
         (periodic_states, (A, B, u)),
     ):
-        calls = jax.jit(program).lower(*map(jnp.asarray, arguments)).as_text().split("getrf_ffi")
+        calls = (
+            jax.jit(program)
+            .lower(*map(jnp.asarray, arguments))
+            .as_text()
+            .split("getrf_ffi")
+        )
         assert len(calls) == 2 and 'num_batch_dims = "0"' in calls[1]
 
 
@@ -91,6 +100,10 @@ def test_threads_come_back(library):
 
 def test_work_on_all_cores_is_in_order_under_the_callers_settings(library):
     with np.errstate(over="ignore"):
-        assert on_all_cores(lambda k: np.float64(1e308) * k, range(3)) == [0.0, 1e308, np.inf]
+        assert on_all_cores(lambda k: np.float64(1e308) * k, range(3)) == [
+            0.0,
+            1e308,
+            np.inf,
+        ]
     with pytest.raises(ZeroDivisionError):
         on_all_cores(lambda k: 1 / k, [1, 0])

@@ -54,7 +54,9 @@ def test_values_and_derivatives_are_those_of_lapack(name):
 
 
 @pytest.mark.parametrize(
-    "function", [jnp.linalg.qr, jnp.linalg.eigh, jnp.linalg.svd], ids=["qr", "eigh", "svd"]
+    "function",
+    [jnp.linalg.qr, jnp.linalg.eigh, jnp.linalg.svd],
+    ids=["qr", "eigh", "svd"],
 )
 def test_other_factorizations_are_left_to_lapack(function):
     A = definite(samples(4)[0][..., 1])
@@ -64,5 +66,7 @@ def test_other_factorizations_are_left_to_lapack(function):
 def test_matrices_that_are_not_positive_are_seen():
     singular = jnp.array([[1.0, 2.0], [2.0, 4.0]])
     tiny, matrices = 1e-30 * jnp.eye(2), [singular, -jnp.eye(2), jnp.zeros((2, 2))]
-    x = jax.jit(jax.vmap(solve_positive))(jnp.stack([*matrices, tiny]), jnp.ones((4, 2)))
+    x = jax.jit(jax.vmap(solve_positive))(
+        jnp.stack([*matrices, tiny]), jnp.ones((4, 2))
+    )
     np.testing.assert_allclose(x, [[np.nan] * 2] * 3 + [[1e30] * 2], rtol=1e-15)

@@ -13,10 +13,22 @@ from hybridjax.errors import DefinitionError
 
 # What a function computes, before and after one statement.
 WAYS = {
-    "a global of a helper": ("K = 1.0\ndef h(x): return K * x\ndef f(x): return h(x)", "K = 2.0"),
-    "a global in an inner function": ("K = 1\ndef f(x): return (lambda y: K * y)(x)", "K = 2"),
-    "a helper anew": ("def h(x): return x\ndef f(x): return h(x)", "def h(x): return 2 * x"),
-    "an array in place": ("import numpy as np\nK = np.ones(3)\ndef f(x): return K * x", "K[1] = 2"),
+    "a global of a helper": (
+        "K = 1.0\ndef h(x): return K * x\ndef f(x): return h(x)",
+        "K = 2.0",
+    ),
+    "a global in an inner function": (
+        "K = 1\ndef f(x): return (lambda y: K * y)(x)",
+        "K = 2",
+    ),
+    "a helper anew": (
+        "def h(x): return x\ndef f(x): return h(x)",
+        "def h(x): return 2 * x",
+    ),
+    "an array in place": (
+        "import numpy as np\nK = np.ones(3)\ndef f(x): return K * x",
+        "K[1] = 2",
+    ),
     "an array of objects": (
         "import numpy as np\nK = np.array([{'k': 1}, None])\ndef f(x): return K[0]['k'] * x",
         "K[0]['k'] = 2",
@@ -28,8 +40,14 @@ WAYS = {
         "set(2)",
     ),
     "a default": ("def f(x, k=1): return k * x", "f.__defaults__ = (2,)"),
-    "a default by name": ("def f(x, *, k=1): return k * x", "f.__kwdefaults__['k'] = 2"),
-    "the code": ("def f(x): return x\ndef g(x): return 2 * x", "f.__code__ = g.__code__"),
+    "a default by name": (
+        "def f(x, *, k=1): return k * x",
+        "f.__kwdefaults__['k'] = 2",
+    ),
+    "the code": (
+        "def f(x): return x\ndef g(x): return 2 * x",
+        "f.__code__ = g.__code__",
+    ),
     "an attribute of a function": ("def f(x): return f.k * x\nf.k = 1", "f.k = 2"),
     "a constant of a partial": (
         "import functools\nK = [1]\nf = functools.partial(lambda k, x: k[0] * x, K)",
@@ -80,7 +98,10 @@ WAYS = {
         "    def h(x): return 2 * g(x)\n    return h\n@twice\ndef f(x): return K * x",
         "K = 2",
     ),
-    "a function of jax.jit": ("import jax\nK = 1\n@jax.jit\ndef f(x): return K * x", "K = 2"),
+    "a function of jax.jit": (
+        "import jax\nK = 1\n@jax.jit\ndef f(x): return K * x",
+        "K = 2",
+    ),
     "a random key": (
         "import jax\nK = jax.random.key(1)\ndef f(x): return K",
         "K = jax.random.key(2)",
@@ -96,8 +117,14 @@ WAYS = {
         "other.inner.K = 2",
     ),
     "an attribute of a module": ("def f(x): return other.K * x", "other.K = 2"),
-    "an attribute of a module, by a word": ("def f(x): return getattr(other, 'K')", "other.K = 2"),
-    "a function of a module": ("def f(x): return other.h(x)", "other.h = lambda x: 3 * x"),
+    "an attribute of a module, by a word": (
+        "def f(x): return getattr(other, 'K')",
+        "other.K = 2",
+    ),
+    "a function of a module": (
+        "def f(x): return other.h(x)",
+        "other.h = lambda x: 3 * x",
+    ),
     "a module as an argument": (
         "def g(m, x): return m.h(x)\ndef f(x): return g(other, x)",
         "other.h = lambda x: 3 * x",
@@ -153,10 +180,14 @@ def test_a_change_is_noticed(way, named, monkeypatch):
 def test_what_is_not_read_is_not_noticed(monkeypatch, tmp_path):
     """A global, or a module of Python, that has the name of an attribute; code of packages."""
     assert is_of_package("/home/a/.local/lib/python3.11/site-packages/jax/x.py")
-    assert is_of_package("/usr/lib/python3/dist-packages/x.py") and not is_of_package("/home/x.py")
+    assert is_of_package("/usr/lib/python3/dist-packages/x.py") and not is_of_package(
+        "/home/x.py"
+    )
     (tmp_path / "a-1.dist-info").mkdir()  # of `pip install --target`
     (tmp_path / "a-1.dist-info/RECORD").write_text("a/x.py,sha256=k,4\nb.py,,")
-    assert [is_of_package(f"{tmp_path}/{x}") for x in ("a/x.py", "b.py", "mine.py")] == [1, 1, 0]
+    assert [
+        is_of_package(f"{tmp_path}/{x}") for x in ("a/x.py", "b.py", "mine.py")
+    ] == [1, 1, 0]
     space = {"__name__": "users_module", "m": 1.0}
     exec("class A:\n    m = 1\na = A()\ndef f(x): return a.m * x", space)
     digest = meaning(space["f"])
@@ -167,14 +198,25 @@ def test_what_is_not_read_is_not_noticed(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(
     "code",
-    ["eval('K')", "importlib.import_module('K')", "open('K').read()", "np.loadtxt('K')",
-     "sys.modules['K']", "os.getenv('K')", "pathlib.Path('K').read_bytes()", "P()",
-     "f.__globals__['K']", "sys._getframe().f_globals['K']"],
-)  # fmt: skip
+    [
+        "eval('K')",
+        "importlib.import_module('K')",
+        "open('K').read()",
+        "np.loadtxt('K')",
+        "sys.modules['K']",
+        "os.getenv('K')",
+        "pathlib.Path('K').read_bytes()",
+        "P()",
+        "f.__globals__['K']",
+        "sys._getframe().f_globals['K']",
+    ],
+)
 def test_values_that_are_not_named_are_refused(code):
     space = {"__name__": "users_module"}
     exec("import functools, importlib, os, pathlib, sys, numpy as np", space)
-    exec(f"P = functools.partial(lambda: eval('K'))\ndef f(x): return {code} * x", space)
+    exec(
+        f"P = functools.partial(lambda: eval('K'))\ndef f(x): return {code} * x", space
+    )
     with pytest.raises(DefinitionError, match="` uses `"):
         meaning(space["f"])
 

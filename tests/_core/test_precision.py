@@ -16,7 +16,9 @@ DEFINITIONS = {
     "settings": lambda: hj.Settings(1e-11, 1e-13, scale=np.full((2, 4), 0.1)),
     "crossing": lambda: hj.Crossing("vM", "falling", value=0.1),
     "clock": lambda: hj.ClockPhase(8, anchor=0.1),
-    "kinematic": lambda: hj.KinematicPhase(8, "yM", "vM", (1.9, 0.1), [0.3, 1.9], anchor=0.2),
+    "kinematic": lambda: hj.KinematicPhase(
+        8, "yM", "vM", (1.9, 0.1), [0.3, 1.9], anchor=0.2
+    ),
     "schedule": lambda: hj.Scheduled(0.1, 0.7),
 }
 
@@ -27,14 +29,23 @@ def test_definitions_may_be_built_before_the_switch(define):
         early = define()
     numbers = [jax.tree_util.tree_leaves(x) for x in (early, define())]
     for a, b in zip(*numbers, strict=True):
-        assert a == b if isinstance(a, str) else a.dtype == b.dtype == float and (a == b).all()
+        assert (
+            a == b
+            if isinstance(a, str)
+            else a.dtype == b.dtype == float and (a == b).all()
+        )
 
 
 def test_arrays_that_have_lost_their_digits_are_refused():
     with jax.enable_x64(False):
         k = jnp.asarray(10.1)
-        early, guess = hj.models.VerticalHopper(k=k), hj.Guess("stance", jnp.asarray([2.0, 1.9]))
-    with pytest.raises(hj.errors.PrecisionError, match="`k` is float32: it was built before"):
+        early, guess = (
+            hj.models.VerticalHopper(k=k),
+            hj.Guess("stance", jnp.asarray([2.0, 1.9])),
+        )
+    with pytest.raises(
+        hj.errors.PrecisionError, match="`k` is float32: it was built before"
+    ):
         hj.find_limit_cycle(early)
     with pytest.raises(hj.errors.PrecisionError, match="`state` is float32"):
         hj.find_limit_cycle(hj.models.VerticalHopper(), guess)
@@ -68,6 +79,8 @@ def late(hopper_cycle, placed_isochrons, isochron_ldtp):
 def test_single_precision_is_refused_at_the_call(late):
     with jax.enable_x64(False):
         for name, call in late.items():
-            with pytest.raises(hj.errors.PrecisionError, match="call `hybridjax.enable_x64"):
+            with pytest.raises(
+                hj.errors.PrecisionError, match="call `hybridjax.enable_x64"
+            ):
                 call()
                 pytest.fail(name)

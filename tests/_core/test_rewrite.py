@@ -30,12 +30,16 @@ def left(function, *xs):
 
 def looped(x, y):
     z = jax.lax.fori_loop(0, 3, lambda _, z: jnp.sin(z) + y, x)
-    return jax.lax.while_loop(lambda z: jnp.cos(z) > 2, lambda z: jax.jit(jnp.tan)(z) + 1, z)
+    return jax.lax.while_loop(
+        lambda z: jnp.cos(z) > 2, lambda z: jax.jit(jnp.tan)(z) + 1, z
+    )
 
 
 def test_vectorized_replaces_everything():
     assert left(looped, 0.3, 0.7) and not left(vectorized(looped), 0.3, 0.7)
-    np.testing.assert_allclose(vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13)
+    np.testing.assert_allclose(
+        vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13
+    )
 
 
 def test_other_types_and_requested_accuracies_stay():
@@ -46,15 +50,28 @@ def test_other_types_and_requested_accuracies_stay():
 
 def test_types_are_kept():
     def function(x, n):
-        return jnp.sin(x), jnp.arctan2(x, 1.0), x**2, n + 1, n > 0, 2.0, x.astype(jnp.float32), None
+        return (
+            jnp.sin(x),
+            jnp.arctan2(x, 1.0),
+            x**2,
+            n + 1,
+            n > 0,
+            2.0,
+            x.astype(jnp.float32),
+            None,
+        )
 
     for x in (0.5, jnp.float64(0.5), jnp.ones(3), jnp.ones((2, 0))):
         x = jnp.asarray(x)
-        ours, truth = (jax.eval_shape(f, x, 3) for f in (vectorized(function), function))
+        ours, truth = (
+            jax.eval_shape(f, x, 3) for f in (vectorized(function), function)
+        )
         assert ours == truth
         weak = [[v.weak_type for v in jax.tree.leaves(tree)] for tree in (ours, truth)]
         assert weak[0] == weak[1]
-    assert all(isinstance(v, jax.Array) for v in vectorized(lambda x: (x, 2.0, x + 1))(0.5))
+    assert all(
+        isinstance(v, jax.Array) for v in vectorized(lambda x: (x, 2.0, x + 1))(0.5)
+    )
 
 
 def test_closures_over_tracers():
@@ -62,7 +79,10 @@ def test_closures_over_tracers():
         return jax.vmap(f(lambda x: jnp.sin(a * x) * a**2))(x).sum()
 
     x = jnp.linspace(0, 1, 5)
-    for transform, a in ((jax.hessian, 0.7), (lambda f: jax.vmap(jax.grad(f)), [0.7, 1.3])):
+    for transform, a in (
+        (jax.hessian, 0.7),
+        (lambda f: jax.vmap(jax.grad(f)), [0.7, 1.3]),
+    ):
         ours, truth = (
             jax.jit(transform(lambda a, f=f: response(f, a, x)))(jnp.asarray(a))
             for f in (vectorized, same)
@@ -91,7 +111,9 @@ def test_off_away_from_cpu(monkeypatch):
 def test_vectors_of_several_functions_are_put_together_row_by_row():
     def field(t, q):
         a, b = jnp.sin(t) + q[0], jnp.cos(2 * t) * q[1]
-        return jnp.stack([a, q[0], a * b, jnp.tan(b)]), jnp.concatenate([q, jnp.sin(t)[None]])
+        return jnp.stack([a, q[0], a * b, jnp.tan(b)]), jnp.concatenate(
+            [q, jnp.sin(t)[None]]
+        )
 
     t, q = jnp.asarray(0.7), jnp.array([0.3, -1.2])
     program = str(jax.make_jaxpr(vectorized(field))(t, q))
@@ -113,14 +135,22 @@ ZOO = {
     "angle": lambda x, y: jnp.angle(x + 1j * y),
     "where": lambda x, y: jnp.where(x > 0, jnp.sin(x), jnp.cos(y)),
     "switch": lambda x, y: jax.lax.switch(1, [jnp.sin, jnp.cos, jnp.arctan], x),
-    "cond": lambda x, y: jax.lax.cond(x > y, lambda: jnp.sin(x), lambda: y * jnp.cos(x)),
-    "scan": lambda x, y: jax.lax.scan(lambda c, k: (jnp.sin(k * c), c), x, jnp.arange(3))[0],
+    "cond": lambda x, y: jax.lax.cond(
+        x > y, lambda: jnp.sin(x), lambda: y * jnp.cos(x)
+    ),
+    "scan": lambda x, y: jax.lax.scan(
+        lambda c, k: (jnp.sin(k * c), c), x, jnp.arange(3)
+    )[0],
     "gradient": lambda x, y: jax.grad(lambda x: jnp.sin(x) * jnp.arctan(x * y))(x),
     "checkpoint": lambda x, y: jax.checkpoint(lambda x: jnp.sin(jnp.cos(x)))(x),
     "custom jvp": lambda x, y: jax.nn.silu(x) * jnp.sin(y),
-    "interp": lambda x, y: jnp.interp(jnp.sin(x), jnp.linspace(-1, 1, 5), jnp.arange(5.0)),
+    "interp": lambda x, y: jnp.interp(
+        jnp.sin(x), jnp.linspace(-1, 1, 5), jnp.arange(5.0)
+    ),
     "matrix": lambda x, y: rotation(x) @ jnp.stack([y, 1.0 * y]),
-    "concatenate": lambda x, y: jnp.concatenate([jnp.sin(x)[None], jnp.cos(y)[None], y[None]]),
+    "concatenate": lambda x, y: jnp.concatenate(
+        [jnp.sin(x)[None], jnp.cos(y)[None], y[None]]
+    ),
     "integers": lambda x, y: jnp.sin(jnp.arange(4)) * x,
     "nothing": lambda x, y: {"exp": jnp.exp(x) * jnp.tanh(y)},
 }
@@ -142,10 +172,15 @@ def test_a_zoo_of_functions_gives_what_it_gave_before():
         return values, rates, slopes
 
     ours, truth = jax.jit(
-        lambda: [{k: evaluated(wrap(f)) for k, f in ZOO.items()} for wrap in (vectorized, same)]
+        lambda: [
+            {k: evaluated(wrap(f)) for k, f in ZOO.items()}
+            for wrap in (vectorized, same)
+        ]
     )()
     tolerance = 2e-14
-    pairs = zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(truth), strict=True)
+    pairs = zip(
+        jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(truth), strict=True
+    )
     for (path, a), b in pairs:
         assert a.dtype == b.dtype and a.shape == b.shape
         atol = tolerance * max(1.0, np.abs(b).max())

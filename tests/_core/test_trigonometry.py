@@ -14,7 +14,9 @@ from hybridjax._core.vector_math import trigonometry
 
 BOUNDS = {"sin": 2, "cos": 2, "tan": 4, "arctan": 2, "arcsin": 4, "arccos": 4}
 NAMES = list(BOUNDS)
-PI = Fraction("3.14159265358979323846264338327950288419716939937510582097494459230781640628620899")
+PI = Fraction(
+    "3.14159265358979323846264338327950288419716939937510582097494459230781640628620899"
+)
 RNG = np.random.default_rng(0)
 
 
@@ -26,15 +28,23 @@ def compiled(name):
 def ulps(value, truth):
     """Distance in units in the last place of the truth."""
     unit = np.spacing(np.abs(np.asarray(truth, float)))
-    return np.asarray(np.abs(np.asarray(value).astype(np.longdouble) - truth) / unit, float)
+    return np.asarray(
+        np.abs(np.asarray(value).astype(np.longdouble) - truth) / unit, float
+    )
 
 
 def arguments(name):
     if name in ("arcsin", "arccos"):
-        return np.concatenate([RNG.uniform(-1, 1, 20000), 1 - np.exp(RNG.uniform(-36, 0, 2000))])
-    spread = np.exp(RNG.uniform(-700, math.log(1e6), 20000)) * RNG.choice([-1, 1], 20000)
+        return np.concatenate(
+            [RNG.uniform(-1, 1, 20000), 1 - np.exp(RNG.uniform(-36, 0, 2000))]
+        )
+    spread = np.exp(RNG.uniform(-700, math.log(1e6), 20000)) * RNG.choice(
+        [-1, 1], 20000
+    )
     near = np.arange(-20000, 20000, 7) * (math.pi / 4)
-    return np.concatenate([spread, RNG.uniform(-10, 10, 20000), RNG.uniform(-1e6, 1e6, 9000), near])
+    return np.concatenate(
+        [spread, RNG.uniform(-10, 10, 20000), RNG.uniform(-1e6, 1e6, 9000), near]
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -54,14 +64,20 @@ def test_hardest_arguments():
     """Near multiples of pi/2, where sin or cos is x - k pi/2: the closest doubles, and others."""
     k = np.concatenate([29 * 2 ** np.arange(7), np.arange(1, 640000, 997)])
     x = np.array([float(int(i) * PI / 2) for i in k])
-    truth = np.array([float(Fraction(v) - int(i) * PI / 2) for v, i in zip(x, k, strict=True)])
-    sign = np.array([1, -1, -1, 1])[k % 4]  # sin(k pi/2 + r) = r, cos r, -r, ..., and so on
+    truth = np.array(
+        [float(Fraction(v) - int(i) * PI / 2) for v, i in zip(x, k, strict=True)]
+    )
+    sign = np.array([1, -1, -1, 1])[
+        k % 4
+    ]  # sin(k pi/2 + r) = r, cos r, -r, ..., and so on
     small = np.where(k % 2 == 0, compiled("sin")(x), compiled("cos")(x))
     np.testing.assert_array_less(ulps(small * sign, truth), 2)
     assert np.min(np.abs(truth)) < 1e-18
 
 
-SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan, 1e300, -1e300, 1e-300, 5e-324])
+SPECIAL = np.array(
+    [0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan, 1e300, -1e300, 1e-300, 5e-324]
+)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -95,7 +95,9 @@ def test_what_is_in_the_way_stays(full, block, early):
     """Refused before anything is computed, if the names of results are known by then."""
     block(full)
     before = tree(full.parent)
-    with pytest.raises(hj.DefinitionError, match="is in the way, and was not written by hybridjax"):
+    with pytest.raises(
+        hj.DefinitionError, match="is in the way, and was not written by hybridjax"
+    ):
         with results_folder(full, "report", RESULTS if early else ()) as new:
             assert not early
             (new / "figures").mkdir()
@@ -145,7 +147,9 @@ def test_an_interruption_while_results_take_their_places(full, monkeypatch):
     assert all((full / name).exists() for name in RESULTS)
     write(full, new)
     assert {k: v for k, v in tree(full).items() if v == "new"} == new
-    assert not [name for name in tree(full) if name.startswith(".hybridjax-") and name != LIST]
+    assert not [
+        name for name in tree(full) if name.startswith(".hybridjax-") and name != LIST
+    ]
 
 
 DESIGN = hj.multisine(n_sections=4, periods=4, band=(0.25, 0.5))

@@ -15,7 +15,9 @@ def model():
     turn = 2 * np.pi * np.arange(8) / 8
     A = 0.97 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
     B = np.stack([np.cos(turn), np.sin(turn)], axis=1)[:, :, None]
-    C = np.stack([np.ones((8, 2)), np.stack([np.sin(turn), np.cos(turn)], axis=1)], axis=1)
+    C = np.stack(
+        [np.ones((8, 2)), np.stack([np.sin(turn), np.cos(turn)], axis=1)], axis=1
+    )
     return hj.LDTP(np.broadcast_to(A, (8, 2, 2)), B, C, inputs="u", outputs=("x", "v"))
 
 
@@ -41,7 +43,10 @@ def optimal_two(two, two_usual):
 def expected_htf(model, design, noise, harmonics=None):
     """Return the exact HTFs at the lines of a design, with the variance of their estimates."""
     htf = model.htf(design.frequencies, harmonics)
-    variance = design.expected_variance()[:, None, :] * np.square(list(noise.values()))[:, None]
+    variance = (
+        design.expected_variance()[:, None, :]
+        * np.square(list(noise.values()))[:, None]
+    )
     return dataclasses.replace(htf, variance=np.broadcast_to(variance, htf.H.shape))
 
 

@@ -10,7 +10,9 @@ from hybridjax.designs.criterion import Channel, Criterion, LinearCriterion
 from hybridjax.designs.limits import PowerLimits
 
 
-pytestmark = pytest.mark.filterwarnings("ignore:Values in x were outside bounds")  # older SLSQP
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Values in x were outside bounds"
+)  # older SLSQP
 
 
 def criterion(slopes):
@@ -18,13 +20,17 @@ def criterion(slopes):
     d, K = slopes.shape
     names = tuple(f"x{k}" for k in range(d))
     channels = (Channel(np.arange(K), slopes.T),)
-    return Criterion((LinearCriterion(names, names, channels, np.eye(d), np.arange(d)),))
+    return Criterion(
+        (LinearCriterion(names, names, channels, np.eye(d), np.arange(d)),)
+    )
 
 
 def limits(cost, curved=None):
     cost = np.atleast_2d(cost)
     empty = np.zeros((0, cost.shape[1], cost.shape[1]))
-    return PowerLimits(tuple("abc"[: len(cost)]), cost, empty if curved is None else curved)
+    return PowerLimits(
+        tuple("abc"[: len(cost)]), cost, empty if curved is None else curved
+    )
 
 
 @pytest.mark.parametrize("linear, quadratic", [(3, 0), (0, 2), (1, 2)])
@@ -41,15 +47,23 @@ def test_several_limits(linear, quadratic):
 
     within = {"type": "ineq", "fun": lambda p: 1 - np.append(cost @ p, curved @ p @ p)}
     other = minimize(
-        value, np.full(14, 0.01), method="SLSQP", bounds=[(1e-9, 9)] * 14,
-        constraints=[within], options={"maxiter": 500, "ftol": 1e-10},
-    )  # fmt: skip
+        value,
+        np.full(14, 0.01),
+        method="SLSQP",
+        bounds=[(1e-9, 9)] * 14,
+        constraints=[within],
+        options={"maxiter": 500, "ftol": 1e-10},
+    )
     allowed = limits(cost, curved)
     result = allocate(criterion(slopes), allowed, np.ones(14))
     assert allowed.use(result.power).max() == pytest.approx(1)
     assert 1 - 1e-9 < result.certificate.excess < 1.021
     least = result.bound.criterion
-    assert other.fun * (1 - 1e-6) < least < other.fun * result.certificate.excess * (1 + 1e-6)
+    assert (
+        other.fun * (1 - 1e-6)
+        < least
+        < other.fun * result.certificate.excess * (1 + 1e-6)
+    )
     assert value(result.power) == pytest.approx(least)
     poor = allowed.scaled(np.ones(14))
     excess = certify(criterion(slopes).bound(poor), poor, allowed).excess
@@ -58,7 +72,11 @@ def test_several_limits(linear, quadratic):
 
 def test_unidentifiable_unknowns_are_named():
     same = criterion(np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]))
-    with pytest.raises(hj.DefinitionError, match=r"no response changes along .*x0 .*x1"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"no response changes along .*x0 .*x1"
+    ):
         allocate(same, limits(np.ones(3)), np.ones(3))
     with pytest.raises(hj.DefinitionError, match="x1 changes no response"):
-        allocate(criterion(np.array([[1.0, 2], [0, 0]])), limits(np.ones(2)), np.ones(2))
+        allocate(
+            criterion(np.array([[1.0, 2], [0, 0]])), limits(np.ones(2)), np.ones(2)
+        )

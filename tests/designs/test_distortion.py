@@ -64,14 +64,18 @@ def two_charts():
         hj.Transition("up", "one", "two", hj.Scheduled(1.0), reset=up),
         hj.Transition("down", "two", "one", hj.Scheduled(1.0, 0.5), reset=down),
     )
-    return toy(charts, transitions, 1.0, (hj.Output("z", shown),), inputs=("push", "pull"))
+    return toy(
+        charts, transitions, 1.0, (hj.Output("z", shown),), inputs=("push", "pull")
+    )
 
 
 SHORT = hj.multisine(4, periods=8, inputs=("push", "pull")).scaled(1e-3)
 
 
 def about(system):
-    cycle = hj.find_limit_cycle(system, hj.Guess("rest", (0.0,), time=0.5), scale={"x": 1.0})
+    cycle = hj.find_limit_cycle(
+        system, hj.Guess("rest", (0.0,), time=0.5), scale={"x": 1.0}
+    )
     sections = hj.ClockPhase(4)
     return cycle, sections, hj.linearize(cycle, sections, "x")
 
@@ -90,7 +94,12 @@ def two():
 def even_part(cycle, sections, u, outputs):
     """(y(u) + y(-u)) / 2 of the nonlinear system, as it deviates from the cycle."""
     y = hj.run_experiments(
-        cycle, sections, np.concatenate([u, -u]), outputs, start="steady", accuracy=1e-11
+        cycle,
+        sections,
+        np.concatenate([u, -u]),
+        outputs,
+        start="steady",
+        accuracy=1e-11,
     ).y
     return (y[: len(u)] + y[len(u) :]) / 2
 
@@ -158,16 +167,27 @@ def test_one_cosine_in_closed_form(quadratic, f):
     the square of the input, too."""
     a, z = 0.01, np.exp(2j * np.pi * f)
     design = hj.Design(
-        experiment=[0], line=[round(8 * f)], channel=[0], amplitude=[a], phase=[0.4], n_sections=4,
-        periods=8, experiments=1, input_names=("u",),
-    )  # fmt: skip
+        experiment=[0],
+        line=[round(8 * f)],
+        channel=[0],
+        amplitude=[a],
+        phase=[0.4],
+        n_sections=4,
+        periods=8,
+        experiments=1,
+        input_names=("u",),
+    )
     cosines = Candidates.of(design)
     limit = Distortion(quadratic[0], quadratic[1], {"x": 1.0, "z": 1.0})
     found = products(limit, cosines, ("u",), cosines.power_of(design))
     x1 = a / np.abs(z - 0.6)
     mean, twice = 0.7 * x1**2 / 2 / 0.4, 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
-    assert found.rms(design)[0] == pytest.approx(np.sqrt(mean**2 + twice**2 / 2), rel=1e-9)
-    np.testing.assert_allclose(found.rms(design, phases=True), found.rms(design), rtol=1e-9)
+    assert found.rms(design)[0] == pytest.approx(
+        np.sqrt(mean**2 + twice**2 / 2), rel=1e-9
+    )
+    np.testing.assert_allclose(
+        found.rms(design, phases=True), found.rms(design), rtol=1e-9
+    )
     u2 = design.inputs()[0, :, 0] ** 2
     both = found.quadratic.second_order(design.inputs())[0]
     np.testing.assert_allclose(both[:, 1], both[:, 0] + u2, atol=1e-15)
@@ -177,13 +197,22 @@ def test_one_cosine_in_closed_form(quadratic, f):
 def test_designs_within_a_distortion(hopper_cycle):
     """The limit holds for the experiments that are made, and those of equal amplitudes."""
     sections = hj.ClockPhase(8, anchor=APEX)
-    model, usual = hj.linearize(hopper_cycle, sections, OUTPUTS), hj.multisine(8, periods=32)
+    model, usual = (
+        hj.linearize(hopper_cycle, sections, OUTPUTS),
+        hj.multisine(8, periods=32),
+    )
     distortion = Distortion(hopper_cycle, sections, LEVEL)
-    plan = hj.optimal_design(model, usual, limit=Limits(distortion=distortion), noise=NOISE)
-    ends = {f"distortion of {n}": plan.rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL}
+    plan = hj.optimal_design(
+        model, usual, limit=Limits(distortion=distortion), noise=NOISE
+    )
+    ends = {
+        f"distortion of {n}": plan.rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL
+    }
     assert plan.limited == tuple(n for n, share in ends.items() if share > 0.99) != ()
     for rms in (plan.rms, plan.usual_rms):
-        assert max(rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL) == pytest.approx(1)
+        assert max(
+            rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL
+        ) == pytest.approx(1)
     assert plan.saved > 1.2 and 1 <= plan.certificate < 1.1
     assert f"With the {' and '.join(plan.limited)} limited, one stride" in plan.advice
     assert "of distortion: an upper bound" in repr(plan)
@@ -193,7 +222,9 @@ def test_designs_within_a_distortion(hopper_cycle):
     assert more.criterion == pytest.approx(plan.criterion / 2, rel=0.02)
     # What one draw of the phases does, as the nonlinear hopper does by the test above.
     quadratic = second_order(hopper_cycle, sections, OUTPUTS, ("u",))
-    seen = np.sqrt(np.mean(quadratic.second_order(plan.design.inputs()) ** 2, axis=(0, 1)))
+    seen = np.sqrt(
+        np.mean(quadratic.second_order(plan.design.inputs()) ** 2, axis=(0, 1))
+    )
     said = [plan.rms[f"distortion of {n}"] for n in OUTPUTS]
     np.testing.assert_allclose(seen, said, rtol=0.1)
 
@@ -210,9 +241,12 @@ def test_beside_other_limits(quadratic):
     assert peaked.rms["distortion of x"] <= 1e-3 * (1 + 1e-9)
     assert peaked.certificate >= 1
     both = hj.optimal_design(
-        [model, model], usual, limit=Limits(rms={"u": 0.01}, distortion=distortion),
-        robust="worst", **options,
-    )  # fmt: skip
+        [model, model],
+        usual,
+        limit=Limits(rms={"u": 0.01}, distortion=distortion),
+        robust="worst",
+        **options,
+    )
     assert both.limited == ("u",) and both.rms["distortion of x"] < 1e-3
     assert both.rms["u"] <= 0.01 * (1 + 1e-9) and both.certificate >= 1
 
@@ -223,7 +257,9 @@ def test_without_distortion(quadratic):
     usual = hj.multisine(4, periods=16).scaled(0.01)
     linear = Distortion(cycle, sections, {"x": 1e-3})
     options = dict(noise={"x": 1e-4}, goal=GOAL)
-    with pytest.raises(hj.DefinitionError, match="moves no signal of `limit`: limit the input"):
+    with pytest.raises(
+        hj.DefinitionError, match="moves no signal of `limit`: limit the input"
+    ):
         hj.optimal_design(model, usual, limit=Limits(distortion=linear), **options)
     both = Limits(rms={"u": 0.01}, distortion=linear)
     plan = hj.optimal_design(model, usual, limit=both, **options)

@@ -17,7 +17,9 @@ GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
 @pytest.fixture(scope="module")
 def model():
     """Two real multipliers."""
-    A = np.array([np.eye(2), [[0.9, 0.1], [0.0, 0.5]], [[1, 0], [0.2, 1]], np.diag([0.7, -0.6])])
+    A = np.array(
+        [np.eye(2), [[0.9, 0.1], [0.0, 0.5]], [[1, 0], [0.2, 1]], np.diag([0.7, -0.6])]
+    )
     rng = np.random.default_rng(1)
     return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
 
@@ -34,7 +36,10 @@ def test_transfer_functions_in_a_band(model, usual):
     assert plan.names == ("H_0 of y", "H_1 of y") and plan.certificate < 1.03
     f = 0.2 + 0.6 * (np.arange(200) + 0.5) / 200
     size = (np.abs(model.htf(f, (0, 1)).H) ** 2).mean(axis=1).sum()
-    for design, said in ((plan.usual, plan.usual_variances), (plan.design, plan.variances)):
+    for design, said in (
+        (plan.usual, plan.usual_variances),
+        (plan.design, plan.variances),
+    ):
         fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
         variance = fit.htf(f, (0, 1)).variance.mean(axis=1)[:, 0, 0] / size
         np.testing.assert_allclose(said, variance, rtol=0.02)
@@ -47,12 +52,20 @@ def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
     goal = hj.designs.Multipliers(estimator="fit_ldtp", harmonics=harmonics)
     plan = optimal_two(goal=goal, limit={"u0": 0.1, "u1": 0.1})
     assert plan.certificate < 1.03
-    bound = hj.identify.ldtp_bound(two, expected_htf(two, plan.usual, TWO_NOISE, harmonics))
-    np.testing.assert_allclose(plan.usual_variances.sum(), total_variance(bound), rtol=1e-5)
+    bound = hj.identify.ldtp_bound(
+        two, expected_htf(two, plan.usual, TWO_NOISE, harmonics)
+    )
+    np.testing.assert_allclose(
+        plan.usual_variances.sum(), total_variance(bound), rtol=1e-5
+    )
     for other in random_designs(3, 0.1, 6, 32, band=(0, 3), inputs=two.inputs):
-        bound = hj.identify.ldtp_bound(two, expected_htf(two, other, TWO_NOISE, harmonics))
+        bound = hj.identify.ldtp_bound(
+            two, expected_htf(two, other, TWO_NOISE, harmonics)
+        )
         assert total_variance(bound) > plan.criterion / plan.certificate
-    assert optimal_two(limit={"u0": 0.1, "u1": 0.1}).usual_criterion > plan.usual_criterion
+    assert (
+        optimal_two(limit={"u0": 0.1, "u1": 0.1}).usual_criterion > plan.usual_criterion
+    )
     only = hj.optimal_design(two, two_usual, goal=goal, noise={"y1": 0.02})
     assert only.usual_criterion > plan.usual_criterion
 
@@ -60,7 +73,9 @@ def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
 def test_multipliers_keep_the_numbers_of_the_model():
     """Three multipliers, the first of which no input excites."""
     A, ones = np.diag([0.9, 0.6, 0.3]), np.array([0.0, 1.0, 1.0])
-    model = hj.LDTP(np.stack([A, np.eye(3)]), np.stack([ones, ones])[..., None], np.ones((2, 1, 3)))
+    model = hj.LDTP(
+        np.stack([A, np.eye(3)]), np.stack([ones, ones])[..., None], np.ones((2, 1, 3))
+    )
     usual = hj.multisine(2, 32, band=(0, 1))
 
     def plan(which):
@@ -75,7 +90,11 @@ def test_multipliers_keep_the_numbers_of_the_model():
 def test_bad_goals(model, usual):
     close = np.array([np.eye(2), [[0.5, 0.01], [0, 0.5 + 1e-9]]])
     double = hj.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
-    M, walker, at = hj.designs.Multipliers, hj.models.SimplestWalker(), hj.AtEvent("heelstrike")
+    M, walker, at = (
+        hj.designs.Multipliers,
+        hj.models.SimplestWalker(),
+        hj.AtEvent("heelstrike"),
+    )
     short = hj.find_limit_cycle(walker, walker.short_gait(), section=at)
     cases = (
         (model, hj.designs.Parameters(short, at, "slope"), "a stable `cycle`"),
@@ -90,7 +109,9 @@ def test_bad_goals(model, usual):
 
 def with_angle(angle):
     """Return a model with a pair of multipliers of modulus 0.9 and this angle."""
-    turn = 0.9 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = 0.9 * np.array(
+        [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    )
     A = np.array([turn, np.eye(2), [[1, 0.1], [0, 1]], [[1, -0.1], [0, 1]]])
     B = np.array([[1, 0.2], [0.5, -1], [0.3, 0.1], [1, 1]])[..., None]
     return hj.LDTP(A, B, np.array([[1, 0.4], [0.2, 1], [1, -1], [0.5, 0.5]])[:, None])
@@ -119,18 +140,27 @@ def test_several_models(robust, exponent):
     assert mean(plan.design) == pytest.approx(plan.criterion, rel=2e-3)
     for other in random_designs(5, 0.1, N, 32, band=(0, 2)):
         assert mean(other) > plan.criterion / plan.certificate
-    alone = hj.optimal_design(models[0], usual, noise=NOISE, goal=GOAL, limit={"u": 0.1})
+    alone = hj.optimal_design(
+        models[0], usual, noise=NOISE, goal=GOAL, limit={"u": 0.1}
+    )
     assert mean(alone.design) > 1.2 * plan.criterion
     small = hj.optimal_design(models, usual, noise={"y": 2e-15}, **about)
     assert small.saved == pytest.approx(plan.saved, rel=0.05)
     about = dict(goal=GOAL, noise=NOISE, limit={"u": 9.0, "y": 0.1})
     limited = hj.optimal_design(models, usual, **about).design
-    data = [hj.experiments.simulate_experiments(m, limited, start="periodic").y for m in models]
+    data = [
+        hj.experiments.simulate_experiments(m, limited, start="periodic").y
+        for m in models
+    ]
     assert max(np.sqrt(np.mean(y**2)) for y in data) == pytest.approx(0.1, rel=1e-2)
-    with pytest.raises(hj.DefinitionError, match="model 1 and model 0 have different n_sections"):
+    with pytest.raises(
+        hj.DefinitionError, match="model 1 and model 0 have different n_sections"
+    ):
         hj.optimal_design([models[0], hj.testing.synthetic_ldtp()], usual)
     with pytest.raises(hj.DefinitionError, match="model 1 is unstable"):
-        hj.optimal_design([models[0], dataclasses.replace(models[1], A=1.1 * models[1].A)], usual)
+        hj.optimal_design(
+            [models[0], dataclasses.replace(models[1], A=1.1 * models[1].A)], usual
+        )
     with pytest.raises(hj.DefinitionError, match="not an empty list"):
         hj.optimal_design([], usual)
 
@@ -138,8 +168,12 @@ def test_several_models(robust, exponent):
 def test_draws_have_the_covariance_of_the_fit():
     model, design = with_angle(1.0), hj.multisine(N, 32, band=(0, 2), amplitude=0.05)
     fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
-    c = np.array([np.poly(draw.multipliers).real[1:] for draw in hj.designs.draws(fit, 400)])
-    np.testing.assert_allclose(np.cov(c.T), fit.covariance, atol=0.3 * fit.covariance.max())
+    c = np.array(
+        [np.poly(draw.multipliers).real[1:] for draw in hj.designs.draws(fit, 400)]
+    )
+    np.testing.assert_allclose(
+        np.cov(c.T), fit.covariance, atol=0.3 * fit.covariance.max()
+    )
 
 
 @pytest.mark.slow
@@ -154,8 +188,12 @@ def test_physical_parameters():
     assert plan.certificate < 1.03 and plan.saved > 10
 
     htf = model.htf(usual.frequencies, (-1, 0, 1))
-    variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], (3, len(htf.f), 1, 1))
-    x = hj.HTF(htf.f, htf.H[:, :, :1], (-1, 0, 1), 8, htf.inputs, "x", variance=variance)
+    variance = np.broadcast_to(
+        usual.expected_variance(1e-4)[:, None], (3, len(htf.f), 1, 1)
+    )
+    x = hj.HTF(
+        htf.f, htf.H[:, :, :1], (-1, 0, 1), 8, htf.inputs, "x", variance=variance
+    )
     observed = hj.ObservedHTF(x, sections)
     S = hj.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
     bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))

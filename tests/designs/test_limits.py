@@ -21,7 +21,9 @@ def test_peaks_hold_in_every_experiment(optimal_two):
     assert 1.5 < plan.criterion / free.criterion < 5 and plan.certificate > 1.5
     # The usual amplitudes get phases for low peaks, too: the design saves strides by its powers.
     assert set(np.abs(plan.usual.inputs()).max(axis=1)[:, 0].round(6)) == {0.0, 0.1}
-    np.testing.assert_allclose(np.mean(plan.design.inputs()[..., 1] ** 2), plan.rms["u1"] ** 2)
+    np.testing.assert_allclose(
+        np.mean(plan.design.inputs()[..., 1] ** 2), plan.rms["u1"] ** 2
+    )
     # A peak that nothing exceeds changes nothing.
     loose = optimal_two(limit=Limits(rms=RMS, peak={"u0": 9.0}))
     assert loose.criterion == pytest.approx(free.criterion)

@@ -30,11 +30,16 @@ def plan(isochron_ldtp, usual):
 
 def test_standard_errors_are_the_cramer_rao_bound(plan, isochron_ldtp):
     """That of `multiplier_bound`; for any weights of H_m and H_{-m}."""
-    for design, said in ((plan.usual, plan.usual_variances), (plan.design, plan.variances)):
+    for design, said in (
+        (plan.usual, plan.usual_variances),
+        (plan.design, plan.variances),
+    ):
         htf = with_variance(isochron_ldtp, design)
         bound = hj.identify.multiplier_bound(isochron_ldtp, htf)
         np.testing.assert_allclose(said, bound.standard_errors[:1] ** 2, rtol=2e-3)
-        unequal = dataclasses.replace(htf, variance=(htf.variance.T * (1 + 1e-6 * np.arange(5))).T)
+        unequal = dataclasses.replace(
+            htf, variance=(htf.variance.T * (1 + 1e-6 * np.arange(5))).T
+        )
         other = hj.identify.multiplier_bound(isochron_ldtp, unequal)
         np.testing.assert_allclose(other.covariance, bound.covariance, rtol=2e-3)
 
@@ -47,8 +52,13 @@ def test_the_hopper_with_its_input_limited(isochron_ldtp):
     assert 1 <= plan.certificate < 1.03
     assert plan.rms["yM"] / plan.usual_rms["yM"] == pytest.approx(5.83, abs=0.05)
     assert plan.frequencies[np.argmax(plan.power)] == pytest.approx(0.3, abs=0.04)
-    assert f"stride of this design replaces {plan.saved:.2g} with equal amplitudes." in repr(plan)
-    assert re.search(r"strides +1280 +1280\n  standard error of -0.249\+0.6993i", repr(plan))
+    assert (
+        f"stride of this design replaces {plan.saved:.2g} with equal amplitudes."
+        in repr(plan)
+    )
+    assert re.search(
+        r"strides +1280 +1280\n  standard error of -0.249\+0.6993i", repr(plan)
+    )
     np.testing.assert_allclose(plan.rms["u"], plan.usual_rms["u"])
 
 
@@ -57,7 +67,9 @@ def test_the_hopper_with_deviations_limited(isochron_ldtp, usual):
     assert 1 < plan.saved < 1.05 and plan.certificate < 1.03
     assert plan.advice.endswith("limited, equal amplitudes are nearly optimal.")
     assert all(plan.rms[n] <= plan.usual_rms[n] * (1 + 1e-9) for n in ("yM", "vM"))
-    both = hj.optimal_design(isochron_ldtp, usual, limit={"u": 0.02, "yM": 0.001}, noise=NOISE)
+    both = hj.optimal_design(
+        isochron_ldtp, usual, limit={"u": 0.02, "yM": 0.001}, noise=NOISE
+    )
     assert both.rms["u"] <= 0.02 * (1 + 1e-9) and both.rms["yM"] <= 0.001 * (1 + 1e-9)
     assert both.limited == ("u", "yM") and both.certificate < 1.04
 
@@ -66,7 +78,9 @@ def test_experiments_are_as_promised(plan, isochron_ldtp):
     """Power and deviations are those of the signals themselves, the same in all experiments."""
     powers = np.mean(plan.design.inputs() ** 2, axis=(1, 2))
     np.testing.assert_allclose(powers, plan.rms["u"] ** 2, rtol=1e-3)
-    data = hj.experiments.simulate_experiments(isochron_ldtp, plan.design, start="periodic")
+    data = hj.experiments.simulate_experiments(
+        isochron_ldtp, plan.design, start="periodic"
+    )
     rms = np.sqrt(np.mean(data.y**2, axis=(0, 1)))
     np.testing.assert_allclose(rms, [plan.rms["yM"], plan.rms["vM"]], rtol=1e-3)
     assert plan.strides == plan.usual.cycles(0)
@@ -77,7 +91,9 @@ def test_fits_reach_what_is_promised(model):
     """The plain analysis of a plan, most of whose lines stand in one experiment: their power
     weights them. 16 draws of the noise."""
     noise = {"x": 0.02, "v": 0.06}
-    plan = hj.optimal_design(model, hj.multisine(8, periods=32).scaled(0.01), noise=noise)
+    plan = hj.optimal_design(
+        model, hj.multisine(8, periods=32).scaled(0.01), noise=noise
+    )
     data = hj.experiments.simulate_experiments(model, plan.design, start="periodic")
     errors = []
     for seed in range(16):
@@ -90,9 +106,16 @@ def test_fits_reach_what_is_promised(model):
 
 def test_units_and_estimates(isochron_ldtp, usual):
     """Forces of 1e-16, 0.01 and 1e6; an estimate in place of the model."""
-    a, b, c = (hj.optimal_design(isochron_ldtp, usual.scaled(rms)) for rms in (1e-16, 0.01, 1e6))
-    assert a.saved == pytest.approx(b.saved, rel=1e-6) == pytest.approx(c.saved, rel=1e-6)
-    assert (a.certificate, a.criterion) == pytest.approx((b.certificate, b.criterion), rel=1e-6)
+    a, b, c = (
+        hj.optimal_design(isochron_ldtp, usual.scaled(rms))
+        for rms in (1e-16, 0.01, 1e6)
+    )
+    assert (
+        a.saved == pytest.approx(b.saved, rel=1e-6) == pytest.approx(c.saved, rel=1e-6)
+    )
+    assert (a.certificate, a.criterion) == pytest.approx(
+        (b.certificate, b.criterion), rel=1e-6
+    )
     fit = hj.fit_multipliers(with_variance(isochron_ldtp, usual), 2)
     for goal in ("multipliers", hj.designs.Multipliers(0, "modulus")):
         estimated = hj.optimal_design(fit, usual, goal=goal, noise=NOISE)

@@ -21,7 +21,9 @@ def first():
 def measured(model, design, seed=0, factor=1.0):
     """A laboratory."""
     data = hj.experiments.simulate_experiments(model, design, start="periodic")
-    return hj.experiments.add_noise(data, std=factor * np.array(list(NOISE.values())), seed=seed)
+    return hj.experiments.add_noise(
+        data, std=factor * np.array(list(NOISE.values())), seed=seed
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +38,19 @@ def studies(model, first):
 def test_it_stops_at_the_precision_that_was_asked(studies, model, first):
     end = studies[-1]
     assert end.blocks == len(studies) - 1 >= 2
-    assert end.standard_errors[-1].max() <= ASKED < studies[-2].standard_errors[-1].max()
+    assert (
+        end.standard_errors[-1].max() <= ASKED < studies[-2].standard_errors[-1].max()
+    )
     assert end.fit.contains(model.multipliers, 0.999).all()
     plan = hj.optimal_design(model, first, noise=NOISE)
-    equal = plan.usual_criterion * plan.usual.cycles(0) / end.standard_errors[-1, 0] ** 2
+    equal = (
+        plan.usual_criterion * plan.usual.cycles(0) / end.standard_errors[-1, 0] ** 2
+    )
     assert equal > 4 * end.strides[-1]
     # The bound of as many strides, all of them with the best design for the true model.
-    bound = np.linalg.norm(plan.standard_errors) * np.sqrt(plan.strides / end.strides[-1])
+    bound = np.linalg.norm(plan.standard_errors) * np.sqrt(
+        plan.strides / end.strides[-1]
+    )
     assert end.standard_errors[-1, 0] > 0.95 * bound
 
 
@@ -72,10 +80,14 @@ def test_too_much_noise_to_begin_with(model, first):
     found = lost.add(measured(model, lost.design))
     assert np.isnan(found.standard_errors[0]).all() and found.plan is not None
     unstable = dataclasses.replace(model, A=1.05 * model.A)
-    assert "again, since the estimate is unstable" in repr(study.add(measured(unstable, first)))
+    assert "again, since the estimate is unstable" in repr(
+        study.add(measured(unstable, first))
+    )
 
 
-@pytest.mark.parametrize("goal", [dict(which=0), dict(part="modulus", harmonics=(-1, 0, 1))])
+@pytest.mark.parametrize(
+    "goal", [dict(which=0), dict(part="modulus", harmonics=(-1, 0, 1))]
+)
 def test_goals(model, first, goal):
     study = hj.designs.Study(first, 2, 1e-4, goal=hj.designs.Multipliers(**goal))
     study = study.add(measured(model, first))
@@ -86,7 +98,9 @@ def test_goals(model, first, goal):
 
 def test_repeated_windows_count(model, first):
     """Twice the windows, half the variance."""
-    long = hj.experiments.simulate_experiments(model, first, discard=32, start="periodic")
+    long = hj.experiments.simulate_experiments(
+        model, first, discard=32, start="periodic"
+    )
     noisy = hj.experiments.add_noise(long, std=list(NOISE.values()), seed=1)
     study = hj.designs.Study(first, 2, 1e-5)
     once, twice = study.add(noisy), study.add(noisy, repeats=2)
@@ -103,7 +117,9 @@ def test_an_order_that_is_too_low_is_named(model, first):
 
 
 def test_bad_data(model, first):
-    with pytest.raises(hj.DefinitionError, match="`limit` .*no signal 'nope'; signals are u"):
+    with pytest.raises(
+        hj.DefinitionError, match="`limit` .*no signal 'nope'; signals are u"
+    ):
         hj.designs.Study(first, 2, 1e-4, limit={"nope": 1.0})
     study, data = hj.designs.Study(first, 2, 1e-4), measured(model, first)
     for change, message in (
@@ -143,7 +159,10 @@ def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
     half = hj.designs.Study(first, 2, 0.4 * error).add(data)
     monkeypatch.setattr("hybridjax.designs.study._student", lambda fit: 1.5)
     assert not hj.designs.Study(first, 2, asked).add(data).done
-    assert hj.designs.Study(first, 2, 0.4 * error).add(data).plan.strides > half.plan.strides
+    assert (
+        hj.designs.Study(first, 2, 0.4 * error).add(data).plan.strides
+        > half.plan.strides
+    )
 
 
 N, P, S = 4, 8, 40

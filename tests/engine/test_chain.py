@@ -26,7 +26,9 @@ def flow(s, t, q, u, end):
     lanes = start_lanes(s, np.array([t]), np.zeros(1, np.int32), q[:, None])
     target, sizes = until(np.array([end])), np.ones((len(s.charts), s.d))
     settings = Settings(1e-12, 1e-12, 2000, sizes)
-    done = move(s, lanes, u[:, None], target, settings, options=Options(True, tangents=True))
+    done = move(
+        s, lanes, u[:, None], target, settings, options=Options(True, tangents=True)
+    )
     moved = done.moved.lanes
     return np.concatenate([moved.t, moved.q[:, 0]]), lanes, target, done
 
@@ -55,9 +57,13 @@ def test_jacobians_are_the_slopes_of_the_flow(name):
             for sign in (1, -1):
                 after, *_, other = run(x + sign * STEP * (np.arange(len(x)) == k))
                 happened = other.tape.code[:, 0]
-                np.testing.assert_array_equal(happened[happened >= 0], codes[codes >= 0])
+                np.testing.assert_array_equal(
+                    happened[happened >= 0], codes[codes >= 0]
+                )
                 ends.append(after)
             slope = (ends[0] - ends[1]) / (2 * STEP)
             size = 1 + np.abs(slope).max()
-            np.testing.assert_allclose(exact[:, k] / size, slope / size, atol=1e-6, err_msg=str(k))
+            np.testing.assert_allclose(
+                exact[:, k] / size, slope / size, atol=1e-6, err_msg=str(k)
+            )
     assert (codes >= 0).any()

@@ -27,18 +27,32 @@ def test_no_operation_outside_of_programs_compiles_one():
             data = hj.run_experiments(cycle, FAMILY, u, OUTPUTS, start=start, discard=0)
         trajectory = cycle.trajectory()
         trajectory(*OUTPUTS)
-        print(cycle, model, hj.place_sections(cycle, FAMILY), data, trajectory, trajectory.events)
+        print(
+            cycle,
+            model,
+            hj.place_sections(cycle, FAMILY),
+            data,
+            trajectory,
+            trajectory.events,
+        )
     assert names <= NAMED
 
 
 def test_harmonic_transfer_functions_compile_nothing():
-    ports, f = {"inputs": ("a", "b"), "outputs": ("a", "b")}, np.arange((SECTIONS + 1) // 2)
-    model = hj.LDTP(*0.1 * np.random.default_rng(0).normal(size=(4, SECTIONS, 2, 2)), **ports)
+    ports, f = (
+        {"inputs": ("a", "b"), "outputs": ("a", "b")},
+        np.arange((SECTIONS + 1) // 2),
+    )
+    model = hj.LDTP(
+        *0.1 * np.random.default_rng(0).normal(size=(4, SECTIONS, 2, 2)), **ports
+    )
     with compiled() as names:
         exact, loop = model.htf(f), model.feedback(np.eye(2)).inverse()
         size, more = np.ones(exact.H.shape), {"n_sections": SECTIONS, **ports}
         scatter = hj.Scatter(np.full(len(f), 4.0), size)
-        htf = hj.HTF(f, exact.H, exact.harmonics, **more, variance=size, scatter=scatter)
+        htf = hj.HTF(
+            f, exact.H, exact.harmonics, **more, variance=size, scatter=scatter
+        )
         print(htf @ exact, htf.feedback(exact).inverse(), (htf + exact)[0], loop)
         print(htf.error(exact), htf.select(1).confidence_radius())
     assert names <= {"_constant", "stage"}

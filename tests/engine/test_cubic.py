@@ -28,7 +28,9 @@ def truth(v0, v1, d0, d1, armed):
     # The guard must have been positive before: at once if it is armed, else after a rise.
     falls = [r for r, s in zip(roots, slope, strict=True) if 0 < r <= 1 and s < 0]
     if not armed and falls:
-        rises = [r for r, s in zip(roots, slope, strict=True) if 0 <= r < falls[0] and s > 0]
+        rises = [
+            r for r, s in zip(roots, slope, strict=True) if 0 <= r < falls[0] and s > 0
+        ]
         falls = falls if rises or v0 > 0 else falls[1:]
     return (falls[0] if falls else np.inf), extrema[np.abs(extrema.imag) < 1e-9].real, c
 
@@ -48,7 +50,9 @@ def test_first_crossing_is_a_root(v0, v1, d0, d1):
 
 def test_a_dip_within_the_step_is_found():
     # (s - 0.4)^2 - 0.01: falls through zero at 0.3, rises at 0.5.
-    np.testing.assert_allclose(crossing(0.15, 0.35, -0.8, 1.2).position[0], 0.3, atol=1e-12)
+    np.testing.assert_allclose(
+        crossing(0.15, 0.35, -0.8, 1.2).position[0], 0.3, atol=1e-12
+    )
 
 
 def test_touching_and_nearly_touching():

@@ -49,8 +49,12 @@ X = jnp.array([1.0, 0.3, 9.81, 0.7, 0.2, 0.9])  # one bounce
 
 
 def test_reverse_mode_and_second_derivatives_have_a_closed_form():
-    found, first = jax.jit(jax.jacfwd(lambda x: (jax.jacrev(ball)(x),) * 2, has_aux=True))(X)
-    slope, exact = jax.jit(lambda x: (jax.jacfwd(ball_exact)(x), jax.hessian(ball_exact)(x)))(X)
+    found, first = jax.jit(
+        jax.jacfwd(lambda x: (jax.jacrev(ball)(x),) * 2, has_aux=True)
+    )(X)
+    slope, exact = jax.jit(
+        lambda x: (jax.jacfwd(ball_exact)(x), jax.hessian(ball_exact)(x))
+    )(X)
     np.testing.assert_allclose(first, slope, rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
 
@@ -86,7 +90,9 @@ def roots(a):
     rise = Field(("z",), lambda t, q, u: (jnp.sqrt(q[0]),))
     charts = {"fall": Field(("x",), lambda t, q, u: (-a,)), "rise": rise}
     turn = lambda t, q, u: q[0] + 1.0  # noqa: E731
-    return charts, (hj.Transition("turn", "fall", "rise", turn, reset=lambda t, q, u: -q),)
+    return charts, (
+        hj.Transition("turn", "fall", "rise", turn, reset=lambda t, q, u: -q),
+    )
 
 
 def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywhere():
@@ -101,5 +107,7 @@ def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywher
     x, a = jnp.array([-0.5, 0.2]), 1.3
     loss = lambda f: lambda x, a: jnp.sum(jax.vmap(f, (0, None))(x, a) ** 2)  # noqa: E731
     gradient = jax.jit(jax.grad(loss(end), argnums=(0, 1)))(x, a)
-    for value, true in zip(gradient, jax.grad(loss(exact), argnums=(0, 1))(x, a), strict=True):
+    for value, true in zip(
+        gradient, jax.grad(loss(exact), argnums=(0, 1))(x, a), strict=True
+    ):
         np.testing.assert_allclose(value, true, rtol=1e-10)

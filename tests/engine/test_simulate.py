@@ -63,7 +63,9 @@ def dip(depth):
     """y = (t - 1)^2 - depth as a state: below zero for 2 sqrt(depth), then back."""
     mark = lambda t, q, u: (q[0], q[1] + 1.0)  # noqa: E731
     charts = {"dip": Field(("y", "n"), lambda t, q, u: (2 * (t - 1.0), 0.0))}
-    return charts, [hj.Transition("dip", "dip", "dip", lambda t, q, u: q[0] - 0.0, reset=mark)]
+    return charts, [
+        hj.Transition("dip", "dip", "dip", lambda t, q, u: q[0] - 0.0, reset=mark)
+    ]
 
 
 BLOWUP = toy({"x": Field(("x",), lambda t, q, u: q**2)})  # infinite at t = 1 / x(0)
@@ -86,17 +88,23 @@ def test_zeno_is_seen_before_its_limit(e):
     assert limit * (1 - 1e-3) < found.t[-1] < limit
     expected = FALL * (1 + 2 * e * (1 - e ** np.arange(len(found.events))) / (1 - e))
     np.testing.assert_allclose(times(found), expected, rtol=1e-10)
-    with pytest.raises(hj.ComputationError, match=r"in chart 'fall': events accumulate .*Zeno"):
+    with pytest.raises(
+        hj.ComputationError, match=r"in chart 'fall': events accumulate .*Zeno"
+    ):
         ball(e)
 
 
 @pytest.mark.parametrize("gap", [1e-12, -1e-12, 1e-9, -1e-9])
 def test_grazing(gap):
     """A ball that would rise to 1 + 1e-16, under a ceiling at 1 + gap."""
-    found = hj.simulate(Toys(ceiling, [1 + gap]), "air", (0.0, np.sqrt(2.0)), 2.0, throw=False)
+    found = hj.simulate(
+        Toys(ceiling, [1 + gap]), "air", (0.0, np.sqrt(2.0)), 2.0, throw=False
+    )
     hit = np.sqrt(2.0) - np.sqrt(max(-2 * gap, 0.0))
     if abs(gap) < 1e-10:
-        assert found.result == hj.Result.GRAZING and np.all(np.abs(times(found) - hit) < 1e-6)
+        assert found.result == hj.Result.GRAZING and np.all(
+            np.abs(times(found) - hit) < 1e-6
+        )
     else:
         assert found.result == hj.Result.OK
         np.testing.assert_allclose(times(found), [hit] if gap < 0 else [], atol=1e-10)
@@ -122,7 +130,8 @@ def test_blow_up():
 
 
 @pytest.mark.parametrize(
-    "low, high, first", [(0.4999999, 0.5, "high"), (0.5, 0.4999999, "low"), (0.5, 0.5, "low")]
+    "low, high, first",
+    [(0.4999999, 0.5, "high"), (0.5, 0.4999999, "low"), (0.5, 0.5, "low")],
 )
 def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, first):
     found = hj.simulate(Toys(turning, [low, high]), "turn", (0.0, -1.0, 0.0), 2 * np.pi)
@@ -135,7 +144,9 @@ def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, fi
 
 
 @settings(max_examples=10)
-@example(gap=2e-12, sign=1, k=1.0)  # the later one is found first, then the other is behind
+@example(
+    gap=2e-12, sign=1, k=1.0
+)  # the later one is found first, then the other is behind
 @given(
     gap=st.floats(-12.0, -2.0).map(lambda x: 10**x),
     sign=st.sampled_from([-1, 1]),
@@ -167,10 +178,14 @@ def test_a_tick_at_the_end_of_a_piece_happens_once(k, pieces):
 
 def test_an_input_that_varies_in_time():
     system = hj.models.BouncingBall()
-    found = hj.simulate(system, "fall", (5.0, 0.0), 1.0, input=lambda t: jnp.sin(3 * t) + G)
+    found = hj.simulate(
+        system, "fall", (5.0, 0.0), 1.0, input=lambda t: jnp.sin(3 * t) + G
+    )
     t, y = found("y")
     np.testing.assert_allclose(y[-1], 5 + 1 / 3 - np.sin(3.0) / 9, rtol=1e-10)
-    np.testing.assert_allclose(y, 5 + t / 3 - np.sin(3 * t) / 9, atol=2e-5)  # between steps too
+    np.testing.assert_allclose(
+        y, 5 + t / 3 - np.sin(3 * t) / 9, atol=2e-5
+    )  # between steps too
     constant = hj.simulate(system, "fall", (5.0, 0.0), 1.0, input=G)
     np.testing.assert_allclose(constant.after[-1], [5.0, 0.0], atol=1e-14)
 
@@ -215,14 +230,20 @@ def test_every_turn_of_a_fast_guard_is_seen():
     fast = toy(LINE, [hj.Transition("fall", "line", "line", guard)])
     run = hj.simulate(fast, "line", (0.1,), 3.0)
     falls = (2 * np.arange(1000) + 1) * np.pi / 61.0 - 0.1
-    np.testing.assert_allclose(times(run), falls[(falls > 0) & (falls < 3.0)], atol=1e-12)
+    np.testing.assert_allclose(
+        times(run), falls[(falls > 0) & (falls < 3.0)], atol=1e-12
+    )
 
 
 def test_an_event_at_a_tick():
     """Where x falls to zero, and starts again from 1: both happen once; n and m count them."""
     again, count = jnp.array([1.0, 0.0, 1.0]), jnp.array([0.0, 1.0, 0.0])
-    fall = hj.Transition("fall", "a", "a", lambda t, q, u: q[0], reset=lambda t, q, u: q + again)
-    tick = hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=lambda t, q, u: q + count)
+    fall = hj.Transition(
+        "fall", "a", "a", lambda t, q, u: q[0], reset=lambda t, q, u: q + again
+    )
+    tick = hj.Transition(
+        "tick", "a", "a", hj.Scheduled(1.0), reset=lambda t, q, u: q + count
+    )
     charts = {"a": Field(("x", "n", "m"), lambda t, q, u: (-1.0, 0.0, 0.0))}
     run = hj.simulate(toy(charts, (fall, tick)), "a", (1.0, 0.0, 0.0), 3.5)
     np.testing.assert_allclose(run.after[-1], [0.5, 3.0, 3.0], atol=1e-12)
@@ -236,7 +257,9 @@ def test_a_first_step_that_is_far_too_long_is_rejected(duration):
     def rates(t, q, u=None, cos=jnp.cos):
         return q[1], -0.3 * q[1] - q[0] - q[0] ** 3 + 0.3 * cos(1.2 * t)
 
-    run = hj.simulate(toy({"all": Field(("x", "v"), rates)}), "all", (1.0, 0.0), duration)
+    run = hj.simulate(
+        toy({"all": Field(("x", "v"), rates)}), "all", (1.0, 0.0), duration
+    )
     options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13, "args": (None, np.cos)}
     path = solve_ivp(rates, (0, duration), [1.0, 0.0], **options)
     np.testing.assert_allclose(run.after[-1], path.y[:, -1], rtol=0, atol=1e-9)

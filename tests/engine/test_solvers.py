@@ -31,7 +31,8 @@ FAST, SLOW = sorted(np.linalg.eigvals(STIFF))
 
 # One mode decays in 3 s, one in 0.3 ms.
 DAMPED = toy(
-    {"a": Field(("y", "v"), lambda t, q, u: (q[1], STIFF[1] @ q + force(t) + u[0]))}, period=1.0
+    {"a": Field(("y", "v"), lambda t, q, u: (q[1], STIFF[1] @ q + force(t) + u[0]))},
+    period=1.0,
 )
 
 
@@ -63,7 +64,9 @@ def test_no_error_of_a_stiff_step_is_hidden(rate):
     """Of a mode that follows, or is excited, by however little, and dies out within the step."""
     field = lambda t, q: -rate * (q - jnp.cos(t)) - jnp.sin(t)  # noqa: E731
     excited, h = np.array([[0.0, 1.0, 1e-4, 1e-8]]), 0.4
-    step = take_step(as_method(hj.Radau()), field, jnp.zeros(4), 1.0 + excited, jnp.array([h]))
+    step = take_step(
+        as_method(hj.Radau()), field, jnp.zeros(4), 1.0 + excited, jnp.array([h])
+    )
     error = np.abs(np.asarray(step.q) - np.cos(h) - excited * np.exp(-rate * h))
     assert np.all(error < 5 * np.asarray(step.error) + 1e-15)
 
@@ -77,7 +80,9 @@ def test_a_landing_is_as_stiff_as_its_chart():
     levels = ListLevels((hj.Crossing("x", "rising", 1.0),))
     one, none = np.ones(1), np.zeros(1, np.int32)
     lanes = to_host(start_lanes(s, np.zeros(1), none, np.array([[0.0], [1e-3]])))
-    target = Target(np.array([np.inf]), none, none - 1, 2 * one, None, levels, hj.Result.OK)
+    target = Target(
+        np.array([np.inf]), none, none - 1, 2 * one, None, levels, hj.Result.OK
+    )
     settings = Settings(1e-9, 1e-9, 64, np.ones((1, 2)))
     stride = Stride(one, 0.9975 * one, 1e7 * one)
     moved = move(s, lanes, np.zeros((s.nu, 1)), target, settings, stride)
@@ -101,7 +106,9 @@ def test_inverses_of_many_matrices():
     matrix = np.random.default_rng(0).normal(size=(5, 5, 3))
     matrix[0, 0] = 0.0  # pivots are needed
     found = np.moveaxis(jax.jit(inverse)(matrix), -1, 0)
-    np.testing.assert_allclose(found, np.linalg.inv(np.moveaxis(matrix, -1, 0)), atol=1e-12)
+    np.testing.assert_allclose(
+        found, np.linalg.inv(np.moveaxis(matrix, -1, 0)), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -120,7 +127,9 @@ def test_derivatives_of_implicit_steps(solver):
         return take_step(method, field, jnp.zeros(1), q, h, still=still).q[:, 0]
 
     d = 1e-2
-    lowest, low, middle, high, highest = jax.jit(jax.vmap(end))(d * jnp.arange(-2.0, 3.0))
+    lowest, low, middle, high, highest = jax.jit(jax.vmap(end))(
+        d * jnp.arange(-2.0, 3.0)
+    )
     first = jax.jit(jax.jacfwd(end))(0.0)
     second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(0.0)
     by_differences = (lowest - 8 * low + 8 * high - highest) / (12 * d)
@@ -131,20 +140,28 @@ def test_derivatives_of_implicit_steps(solver):
 
 @pytest.fixture(scope="module")
 def damped():
-    return hj.find_limit_cycle(integrated(DAMPED, hj.Radau()), hj.Guess("a", (0.01, 0.02)))
+    return hj.find_limit_cycle(
+        integrated(DAMPED, hj.Radau()), hj.Guess("a", (0.01, 0.02))
+    )
 
 
 def test_a_stiff_cycle_with_default_settings(damped):
-    np.testing.assert_allclose(list(damped.state.values()), exact(), rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(
+        list(damped.state.values()), exact(), rtol=1e-9, atol=1e-13
+    )
     np.testing.assert_allclose(damped.multipliers, [np.exp(SLOW), 0.0], rtol=1e-10)
     np.testing.assert_allclose(damped.log_multipliers, [SLOW, FAST], rtol=1e-9)
 
 
 def test_linearization_of_a_stiff_system(damped):
     model = hj.linearize(damped, hj.ClockPhase(4), outputs="y")
-    exactly = expm(np.block([[STIFF, np.array([[0.0], [1.0]])], [np.zeros((1, 3))]]) / 4)
+    exactly = expm(
+        np.block([[STIFF, np.array([[0.0], [1.0]])], [np.zeros((1, 3))]]) / 4
+    )
     A, B = model.A[0], model.B[0]
     size = np.array([damped.scale["y"], damped.scale["v"]])
     ratio = size / size[:, None]
     np.testing.assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
-    np.testing.assert_allclose(B[:, 0] / size, exactly[:2, 2] / size, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(
+        B[:, 0] / size, exactly[:2, 2] / size, rtol=1e-8, atol=1e-8
+    )

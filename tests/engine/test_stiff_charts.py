@@ -19,7 +19,9 @@ class Thermostat(hj.HybridSystem):
     slow: hj.Parameter = hj.parameter(5.0)
 
     def charts(self):
-        sensed = lambda heat, rate: lambda t, q, u: (heat - q[0] + u[0], rate * (q[0] - q[1]))  # noqa: E731
+        def sensed(heat, rate):
+            return lambda t, q, u: (heat - q[0] + u[0], rate * (q[0] - q[1]))  # noqa: E731
+
         heated = FieldChart(sensed(1.0, self.fast), ("x", "z"), solver=hj.Radau())
         return {"on": heated, "off": FieldChart(sensed(0.0, self.slow), ("x", "z"))}
 
@@ -33,7 +35,10 @@ class Thermostat(hj.HybridSystem):
 def stay(heat, rate, x, z, end):
     """How long it takes until z is `end`, and x then."""
     part = (x - heat) * rate / (rate - 1)  # of exp(-t) in z - heat
-    sensor = lambda t: heat + part * np.exp(-t) + (z - heat - part) * np.exp(-rate * t) - end  # noqa: E731
+
+    def sensor(t):
+        return heat + part * np.exp(-t) + (z - heat - part) * np.exp(-rate * t) - end  # noqa: E731
+
     t = brentq(sensor, 1e-2, 10.0, xtol=1e-15, rtol=1e-15)
     return t, heat + (x - heat) * np.exp(-t)
 
@@ -90,7 +95,9 @@ def test_experiments(cycle, start):
     placed = hj.place_sections(cycle, [hj.AtEvent("on"), hj.AtEvent("off")])
     model = hj.linearize(cycle, placed, outputs="x")
     u = 1e-5 * np.random.default_rng(0).normal(size=(4, 16, 1))
-    data = hj.run_experiments(cycle, placed, u, outputs="x", start=start, discard=0, accuracy=1e-12)
+    data = hj.run_experiments(
+        cycle, placed, u, outputs="x", start=start, discard=0, accuracy=1e-12
+    )
     assert (data.result == 0).all()
     x0 = np.zeros(2) if start == "cycle" else model.periodic_state(u[0], 8)
     np.testing.assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)

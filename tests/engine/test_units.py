@@ -30,7 +30,9 @@ def sizes(length, time):
 def begin(system, length, time):
     """A lane at the top of a hop, and one on the ground."""
     q = np.array([[2.2, 0.0, 0.3, 0.1], [2.0, 1.9, 0.0, 0.0]]) * sizes(length, time)
-    return start_lanes(Structure(system), jnp.zeros(2), jnp.array([0, 1], jnp.int32), q.T)
+    return start_lanes(
+        Structure(system), jnp.zeros(2), jnp.array([0, 1], jnp.int32), q.T
+    )
 
 
 @ft.partial(jax.jit, static_argnums=3)
@@ -41,12 +43,19 @@ def flow(length, time, scale, tangents):
     settings = Settings(1e-10, 1e-10, 256, scale)
     end = until(jnp.full(2, 1.5 * time))
     moved, tape = move(
-        Structure(system), lanes, u, end, settings, options=Options(True, tangents=tangents)
+        Structure(system),
+        lanes,
+        u,
+        end,
+        settings,
+        options=Options(True, tangents=tangents),
     )
     return tape.h / time, tape.code, moved.lanes.q.T / sizes(length, time), moved.result
 
 
-@pytest.mark.parametrize("tangents", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "tangents", [False, pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_the_same_steps_in_all_units(tangents):
     h, code, q, result = flow(1.0, 1.0, SIZES, tangents)
     np.testing.assert_array_equal(result, hj.Result.OK)
@@ -69,10 +78,16 @@ CHAIN = lambda t, q, u: (*q[1:], jnp.cos(t))  # noqa: E731
     [
         pytest.param(lambda t, q, u: (q[1], -q[0]), (0.0, 0.0), (0.0, 0.0), id="zero"),
         pytest.param(
-            SPRING, (0.1 + 9.81 / 100.3, 0.0), (0.1 + 9.81 / 100.3, 0.0), id="rest up to rounding"
+            SPRING,
+            (0.1 + 9.81 / 100.3, 0.0),
+            (0.1 + 9.81 / 100.3, 0.0),
+            id="rest up to rounding",
         ),
         pytest.param(
-            lambda t, q, u: (-q[0], 1e-17 * q[0]), (1.0, 0.0), (np.exp(-10), 0), id="rounding level"
+            lambda t, q, u: (-q[0], 1e-17 * q[0]),
+            (1.0, 0.0),
+            (np.exp(-10), 0),
+            id="rounding level",
         ),
         pytest.param(CHAIN, (0.0,) * 5, None, id="a chain of integrators from zero"),
     ],

@@ -22,14 +22,19 @@ def test_simulation_from_the_cycle_is_the_definition(model):
     data = hj.experiments.simulate_experiments(model, DESIGN, discard=3)
     assert data.u.shape == (DESIGN.experiments, 8 * 4, 2)
     for u, y in zip(data.u, data.y, strict=True):
-        np.testing.assert_allclose(y, simulate_blocks(BLOCKS, u, np.zeros(2))[1], atol=1e-14)
+        np.testing.assert_allclose(
+            y, simulate_blocks(BLOCKS, u, np.zeros(2))[1], atol=1e-14
+        )
     assert (data.inputs, data.outputs) == (("a", "b"), ("y0", "y1"))
     assert data.summary() == f"{DESIGN.experiments}/{DESIGN.experiments} ok"
     for start, cycles in (("cycle", 25), ("periodic", 5)):
         data = hj.experiments.simulate_experiments(model, DESIGN, start=start)
         assert data.u.shape[1] == cycles * 4
     unstable = hj.LDTP(
-        2 * np.ones((4, 1, 1)), np.ones((4, 1, 2)), np.ones((4, 2, 1)), inputs=("a", "b")
+        2 * np.ones((4, 1, 1)),
+        np.ones((4, 1, 2)),
+        np.ones((4, 2, 1)),
+        inputs=("a", "b"),
     )
     with pytest.raises(hj.DefinitionError, match="the model is unstable"):
         hj.experiments.simulate_experiments(unstable, DESIGN)
@@ -41,11 +46,15 @@ def test_failed_experiments_are_named():
     result, failed_at = np.zeros(80, int), np.full(80, -1)
     result[17], failed_at[17] = hj.Result.SECTION_MISSED, 41 * 32 + 21
     usual = dict(n_sections=32, periods=64, result=result)
-    data = hj.ExperimentData(np.ones_like(y), y, **usual, simulated=Simulated(failed_at))
+    data = hj.ExperimentData(
+        np.ones_like(y), y, **usual, simulated=Simulated(failed_at)
+    )
     assert data.summary() == (
         "79/80 ok; #17: section 21, cycle 41: the section was not crossed within the time allowed"
     )
     assert data.ok.sum() == 79 and not data.ok[17]
     assert "79/80 ok" in repr(data)
     result[:8] = hj.Result.BLOW_UP
-    assert hj.ExperimentData(np.ones_like(y), y, **usual).summary().endswith("and 4 more")
+    assert (
+        hj.ExperimentData(np.ones_like(y), y, **usual).summary().endswith("and 4 more")
+    )

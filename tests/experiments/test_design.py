@@ -33,12 +33,16 @@ bands = st.tuples(st.integers(1, 9), st.integers(2, 12)).flatmap(
     st.integers(1, 3),
     st.integers(0, 9),
 )
-def test_every_multisine_obeys_the_rules_at_the_exact_minimum(band, seed, lines, nu, more):
+def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
+    band, seed, lines, nu, more
+):
     N, P, top = band
     arguments = dict(n_sections=N, periods=P, band=(0, top / P), lines=lines, inputs=nu)
     wanted = [j for j in range(top + 1) if lines == "two-phase" or (2 * j) % P]
     if not wanted:
-        with pytest.raises(hj.DefinitionError, match="take more periods or a wider band"):
+        with pytest.raises(
+            hj.DefinitionError, match="take more periods or a wider band"
+        ):
             hj.multisine(**arguments, seed=seed)
         with pytest.raises(hj.DefinitionError, match="must increase in"):
             hj.multisine(N, P, band=(1.0, 0.5))
@@ -74,23 +78,40 @@ def test_the_numbers_of_the_paper():
     paper, smallest = hj.paper_design(), hj.multisine()
     both = hj.multisine(lines="two-phase")
     assert len(paper.frequencies) == len(smallest.frequencies) == 620
-    assert (paper.experiments, smallest.experiments, paper.cycles()) == (80, 20, 80 * 84)
+    assert (paper.experiments, smallest.experiments, paper.cycles()) == (
+        80,
+        20,
+        80 * 84,
+    )
     assert set(np.bincount(paper.experiment)) == {7, 8}
     assert set(np.bincount(smallest.experiment)) == {31}
     assert (len(both.frequencies), both.experiments) == (641, 21)
-    assert "80 experiments of 64 periods" in repr(paper) and "620, 0.01562" in repr(paper)
+    assert "80 experiments of 64 periods" in repr(paper) and "620, 0.01562" in repr(
+        paper
+    )
     with pytest.raises(hj.DefinitionError, match="must be 20 to 620"):
         hj.multisine(experiments=19)
-    with pytest.raises(hj.DefinitionError, match="take `periods` that 3 does not divide"):
-        hj.multisine(periods=12, band=(0, 2.0), lines="all", experiments=9, division="sum-free")
+    with pytest.raises(
+        hj.DefinitionError, match="take `periods` that 3 does not divide"
+    ):
+        hj.multisine(
+            periods=12, band=(0, 2.0), lines="all", experiments=9, division="sum-free"
+        )
 
 
 def test_signals_are_sums_of_cosines():
-    design = hj.multisine(7, 6, (0, 3.5), 0.2, lines="two-phase", inputs=("left", "right"))
+    design = hj.multisine(
+        7, 6, (0, 3.5), 0.2, lines="two-phase", inputs=("left", "right")
+    )
     n = np.arange(9 * 7)
     expected = np.zeros((design.experiments, len(n), 2))
     for e, j, i, a, phase in zip(
-        design.experiment, design.line, design.channel, design.amplitude, design.phase, strict=True
+        design.experiment,
+        design.line,
+        design.channel,
+        design.amplitude,
+        design.phase,
+        strict=True,
     ):
         expected[e, :, i] += a * np.cos(2 * np.pi * j / (6 * 7) * n + phase)
     np.testing.assert_allclose(design.inputs(9), expected, atol=1e-14)
@@ -102,7 +123,10 @@ def test_signals_are_sums_of_cosines():
 
 
 BAD = {
-    "experiment 1: f = 1.25 and 2.25 differ by an integer": [[0.25], [1.25, 0.125, 2.25]],
+    "experiment 1: f = 1.25 and 2.25 differ by an integer": [
+        [0.25],
+        [1.25, 0.125, 2.25],
+    ],
     "experiment 0: f = 0.25 and 1.75 add up to an integer": [[0.25, 1.75]],
     "experiment 0: f = 0.25 is excited twice": [[0.25, 0.25]],
     "experiment 0: f = 1.5 lies on a multiple of 1/2": [[1.5], [1.5]],
@@ -121,9 +145,13 @@ def test_designs_that_break_a_rule_name_what_breaks_it(message):
 
 
 def test_half_integers_by_hand():
-    design = hj.Design.from_lines([[1.5], [1.5]], 0.1, [[0.0], [1.0]], n_sections=8, periods=8)
+    design = hj.Design.from_lines(
+        [[1.5], [1.5]], 0.1, [[0.0], [1.0]], n_sections=8, periods=8
+    )
     assert design.experiments == 2
-    hj.Design.from_lines([[0.0, 0.5], [4.0, 0.5]], 0.1, [[0, 0], [0, 1]], n_sections=8, periods=8)
+    hj.Design.from_lines(
+        [[0.0, 0.5], [4.0, 0.5]], 0.1, [[0, 0], [0, 1]], n_sections=8, periods=8
+    )
     with pytest.raises(hj.DefinitionError, match="f = 0 is zero at every section"):
         hj.Design.from_lines([[0.0]], 0.1, np.pi / 2, n_sections=8, periods=8)
 
@@ -131,12 +159,19 @@ def test_half_integers_by_hand():
 @pytest.mark.parametrize("lines, periods, count", [("odd", 64, 20), ("all", 32, 80)])
 def test_even_products_miss_the_lines(lines, periods, count):
     """Sums and differences of odd lines; of any lines in a division that is sum-free."""
-    more = {} if lines == "odd" else dict(band=(0, 8.0), experiments=count, division="sum-free")
+    more = (
+        {}
+        if lines == "odd"
+        else dict(band=(0, 8.0), experiments=count, division="sum-free")
+    )
     design = hj.multisine(periods=periods, lines=lines, **more)
     assert design.experiments == count
     for s in range(count):
         j = np.array(lines_of(design, s))
-        both = np.concatenate([(j[:, None] + j).ravel(), (j[:, None] - j).ravel()]) % periods
+        both = (
+            np.concatenate([(j[:, None] + j).ravel(), (j[:, None] - j).ravel()])
+            % periods
+        )
         products = set(np.minimum(both, periods - both).tolist())
         assert products.isdisjoint(np.minimum(j % periods, -j % periods).tolist())
 
@@ -147,16 +182,22 @@ def test_several_inputs(division, lines=12):
     design = hj.multisine(4, 8, (0, 2.0), 1.0, inputs=3, division=division)
     assert design.experiments == 3 * 4 and len(design.frequencies) == lines
     together = np.abs(design.inputs()).max(axis=1) > 0
-    assert together.mean() == {"random": 1 / 3, "orthogonal": 1.0}.get(division, together.mean())
+    assert together.mean() == {"random": 1 / 3, "orthogonal": 1.0}.get(
+        division, together.mean()
+    )
     assert together.mean() > 0.6 or division == "random"
-    data = hj.experiments.simulate_experiments(model, design.realizations(2), start="periodic")
+    data = hj.experiments.simulate_experiments(
+        model, design.realizations(2), start="periodic"
+    )
     estimate = hj.estimate_htf(data)
     assert len(estimate.f) == lines
     assert np.abs(estimate.H - model.htf(estimate.f).H).max() < 1e-11
     # As many experiments give nu times the power, and less variance.
     power = 1 / design.expected_variance()
     np.testing.assert_allclose(power, power[0, 0])
-    np.testing.assert_allclose(power[0, 0], (3 if division == "orthogonal" else 1) * 4 * 8 / 4)
+    np.testing.assert_allclose(
+        power[0, 0], (3 if division == "orthogonal" else 1) * 4 * 8 / 4
+    )
 
 
 def test_crest_factors(hopper):
@@ -168,32 +209,47 @@ def test_crest_factors(hopper):
     again = hj.Design.from_lines(
         [np.array(lines_of(low, s)) / 32 for s in range(6)] * 2,
         0.01,
-        [*(low.phase[low.experiment == s] for s in range(6)),
-         *(hj.experiments.optimize_phases(random, 5).phase[low.experiment == s] for s in range(6))],
+        [
+            *(low.phase[low.experiment == s] for s in range(6)),
+            *(
+                hj.experiments.optimize_phases(random, 5).phase[low.experiment == s]
+                for s in range(6)
+            ),
+        ],
         periods=32,
-    )  # fmt: skip
-    data = hj.experiments.simulate_experiments(hopper, again, start="periodic", discard=32)
+    )
+    data = hj.experiments.simulate_experiments(
+        hopper, again, start="periodic", discard=32
+    )
     data = hj.experiments.add_noise(data, snr=20)
-    with pytest.raises(hj.DefinitionError, match=r"the phases are not random \(12 of 12"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"the phases are not random \(12 of 12"
+    ):
         hj.estimate_htf(data, 0, repeats=2, variance="total")
     auto = hj.estimate_htf(data, 0, repeats=2)
     assert auto.noise_variance is None
     np.testing.assert_array_equal(auto.scatter.freedom, 2)
     with pytest.raises(hj.DefinitionError, match="no phase of this design is free"):
-        hj.experiments.optimize_phases(hj.multisine(4, 8, (0, 2), inputs=2, division="orthogonal"))
+        hj.experiments.optimize_phases(
+            hj.multisine(4, 8, (0, 2), inputs=2, division="orthogonal")
+        )
 
 
 def test_realizations_pairs_and_scales():
     design = hj.multisine(8, 6, (0, 4.0), lambda f: 1 / (1 + f), lines="two-phase")
     np.testing.assert_allclose(design.amplitude, 1 / (1 + design.f))
     many = design.realizations(5, seed=2)
-    assert many.experiments == 5 * design.experiments and many.cycles(0) == 5 * design.cycles(0)
+    assert many.experiments == 5 * design.experiments and many.cycles(
+        0
+    ) == 5 * design.cycles(0)
     np.testing.assert_array_equal(many.f, np.tile(design.f, 5))
     assert len(np.unique(many.phase)) > 4 * len(design.f) - 20
     pairs = design.with_negatives().inputs()
     np.testing.assert_allclose(pairs[::2], design.inputs(), atol=1e-14)
     np.testing.assert_allclose(pairs[1::2], -design.inputs(), atol=1e-14)
-    np.testing.assert_allclose(np.sqrt(np.mean(design.scaled(0.3).inputs() ** 2, axis=1)), 0.3)
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(design.scaled(0.3).inputs() ** 2, axis=1)), 0.3
+    )
     for bad in (lambda: design.scaled(0.0), lambda: design.realizations(0)):
         with pytest.raises(hj.DefinitionError):
             bad()
@@ -213,7 +269,9 @@ def test_inputs_in_another_order_are_refused():
     """By position, the amplitudes of one input would be those of another one."""
     model, inputs = hj.testing.synthetic_ldtp(), ("u1", "u0")
     design = hj.multisine(model.n_sections, periods=4, inputs=inputs)
-    with pytest.raises(hj.DefinitionError, match="different orders of inputs: .'u1', 'u0'. and"):
+    with pytest.raises(
+        hj.DefinitionError, match="different orders of inputs: .'u1', 'u0'. and"
+    ):
         hj.experiments.simulate_experiments(model, design)
     other = hj.multisine(model.n_sections, periods=4, inputs=("force", "torque"))
     assert hj.experiments.simulate_experiments(model, other).inputs == model.inputs

@@ -15,7 +15,13 @@ from ..conftest import APEX
 KINEMATIC = hj.KinematicPhase(7, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 PLANE = hj.KinematicPhase(7, position="x", velocity="v")
 FAMILIES = {"VanDerPol": PLANE, "VerticalHopper": KINEMATIC}
-MODELS = ("VanDerPol", "VerticalHopper", "BuckConverter", "CompassGait", "PaddleJuggler")
+MODELS = (
+    "VanDerPol",
+    "VerticalHopper",
+    "BuckConverter",
+    "CompassGait",
+    "PaddleJuggler",
+)
 
 
 @pytest.mark.slow
@@ -51,7 +57,9 @@ def test_errors_are_followed_from_their_section_on():
     np.testing.assert_allclose(worst, [[0.1 / (1 - 0.2), 1 / (1 - 0.2)]], rtol=1e-12)
 
 
-@pytest.mark.parametrize("scale, largest", [([1.0, 100.0], 1.375), ([100.0, 1.0], 3.75)])
+@pytest.mark.parametrize(
+    "scale, largest", [([1.0, 100.0], 1.375), ([100.0, 1.0], 3.75)]
+)
 def test_errors_of_all_sections_add_up(scale, largest):
     """x1 = 2 x0 + 1 and x0 = x1 / 10 + 1, once they have."""
     found = plan._accumulated(BACK_AND_FORTH, np.ones((2, 1)), np.array(scale)[:, None])

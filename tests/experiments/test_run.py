@@ -85,7 +85,9 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     others = np.arange(80) != 17
     np.testing.assert_allclose(broken.y[others], data.y[others], atol=1e-9)
     after = broken.failed_at[17] + 1
-    assert np.all(np.isfinite(broken.y[17, :after])) and np.all(np.isnan(broken.y[17, after:]))
+    assert np.all(np.isfinite(broken.y[17, :after])) and np.all(
+        np.isnan(broken.y[17, after:])
+    )
     estimate = hj.estimate_htf(broken)
     lost = design.f[design.experiment == 17]
     np.testing.assert_array_equal(estimate.f, np.setdiff1d(design.frequencies, lost))
@@ -95,7 +97,9 @@ def test_large_inputs_that_change_the_order_of_events_are_reported(
     hopper_cycle, placed_isochrons, design
 ):
     u = design.inputs(CYCLES) * 100
-    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20, **BATCH)
+    data = hj.run_experiments(
+        hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20, **BATCH
+    )
     assert 0 < data.ok.sum() < 80
     assert {hj.Result(int(r)) for r in data.result[~data.ok]} == {hj.Result.EVENT_ORDER}
 
@@ -109,7 +113,10 @@ def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (dict(design=hj.multisine(16, band=(0, 7.0))), "different n_sections: 16 and 32"),
+        (
+            dict(design=hj.multisine(16, band=(0, 7.0))),
+            "different n_sections: 16 and 32",
+        ),
         (dict(design=np.zeros((2, 33, 1))), "periods x 32, 1"),
         (dict(design=np.zeros((2, 64, 1)), discard=2), "leaves none"),
         (dict(start="steady", discard=7), "needs inputs of whole windows"),
@@ -148,8 +155,14 @@ def test_one_section_whose_way_to_the_next_is_a_whole_turn(vanderpol_cycle):
             field = lambda t, q: (q[1], (1 - q[0] ** 2) * q[1] - q[0] + value)  # noqa: B023, E731
             x = lambda t, q: q[0]  # noqa: E731
             x.direction = -1
-            run = solve_ivp(field, (0, 9), (0.0, v), "DOP853", events=x, rtol=1e-13, atol=1e-13)
-            v = next(q[1] for t, q in zip(run.t_events[0], run.y_events[0], strict=True) if t > 1)
+            run = solve_ivp(
+                field, (0, 9), (0.0, v), "DOP853", events=x, rtol=1e-13, atol=1e-13
+            )
+            v = next(
+                q[1]
+                for t, q in zip(run.t_events[0], run.y_events[0], strict=True)
+                if t > 1
+            )
 
     true = np.array([list(speeds(row)) for row in u[:, :, 0]])
     size = np.abs(true).max()
@@ -158,30 +171,40 @@ def test_one_section_whose_way_to_the_next_is_a_whole_turn(vanderpol_cycle):
     assert np.all(error <= data.error) and np.all(data.error < 1e-8)
 
 
-def test_sections_that_are_too_far_apart_for_the_steps_allowed(hopper_cycle, monkeypatch):
+def test_sections_that_are_too_far_apart_for_the_steps_allowed(
+    hopper_cycle, monkeypatch
+):
     monkeypatch.setattr("hybridjax.experiments.plan.PATIENCE", 3)
     settings = hj.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
     cycle = dataclasses.replace(hopper_cycle, settings=settings)
     with pytest.raises(hj.ComputationError, match="too few steps .*max_steps"):
-        hj.run_experiments(cycle, hj.ClockPhase(3), np.zeros((1, 6, 1)), "yM", discard=0)
+        hj.run_experiments(
+            cycle, hj.ClockPhase(3), np.zeros((1, 6, 1)), "yM", discard=0
+        )
 
 
 @pytest.mark.slow
 def test_clock_sections_of_an_autonomous_system(vanderpol_cycle):
     family = hj.ClockPhase(8, anchor=hj.Crossing("v", "falling"))
     design = hj.multisine(n_sections=8, periods=4, band=(0, 2.0))
-    with pytest.raises(hj.DefinitionError, match=r"has no clock.*multiplier of exactly 1.*Kinemat"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"has no clock.*multiplier of exactly 1.*Kinemat"
+    ):
         hj.run_experiments(vanderpol_cycle, family, design, "x")
     # Between such sections the multiplier 1 is there, and makes whole frequencies resonant.
     model = hj.linearize(vanderpol_cycle, family, "x")
     assert abs(model.multipliers[0] - 1) < 1e-9
-    with pytest.raises(hj.DefinitionError, match="use sections that depend on the state"):
+    with pytest.raises(
+        hj.DefinitionError, match="use sections that depend on the state"
+    ):
         model.htf([1.0])
     model.htf([0.5])
 
 
 def test_experiments_judge_errors_by_the_sizes_of_the_cycle():
-    resting = hj.find_limit_cycle(RESTING, hj.Guess("all", (0.0, 0.0, 0.0)), scale={"w": 1.0})
+    resting = hj.find_limit_cycle(
+        RESTING, hj.Guess("all", (0.0, 0.0, 0.0)), scale={"w": 1.0}
+    )
     family = hj.ClockPhase(4)
     design = hj.Design.from_lines([[0.25], [0.75]], n_sections=4, periods=4)
     data = hj.run_experiments(resting, family, design, ("x", "w"))
@@ -217,7 +240,9 @@ def test_reverse_and_forward_mode_agree_with_differences(family, lossy_cycle):
 
     value = jax.jit(loss)
     assert value(parameters, u)[1] == hj.Result.OK
-    (by_x, by_u), _ = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(parameters, u)
+    (by_x, by_u), _ = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(
+        parameters, u
+    )
     forward, _ = jax.jit(jax.jacfwd(loss, has_aux=True))(parameters, u)
     np.testing.assert_allclose(forward, by_x, rtol=1e-9)
     true = central(lambda x: value(x, u)[0], parameters)

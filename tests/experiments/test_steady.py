@@ -15,7 +15,9 @@ ALONE = hj.Execution(workers=1)
 
 @pytest.fixture(scope="module")
 def placed(vanderpol_cycle):
-    return hj.place_sections(vanderpol_cycle, hj.KinematicPhase(4, position="x", velocity="v"))
+    return hj.place_sections(
+        vanderpol_cycle, hj.KinematicPhase(4, position="x", velocity="v")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -24,12 +26,16 @@ def run(placed):
     usual = dict(discard=3, execution=ALONE)
 
     def run(design, **options):
-        return hj.run_experiments(placed.cycle, placed, design, ("x", "v"), **usual | options)
+        return hj.run_experiments(
+            placed.cycle, placed, design, ("x", "v"), **usual | options
+        )
 
     return run
 
 
-@pytest.mark.parametrize("start, least, most", [("periodic", 1e-5, 1e-2), ("steady", 0, 1e-8)])
+@pytest.mark.parametrize(
+    "start, least, most", [("periodic", 1e-5, 1e-2), ("steady", 0, 1e-8)]
+)
 def test_experiments_start_in_their_periodic_response(run, start, least, most):
     data, n = run(DESIGN, start=start), DESIGN.inputs().shape[1]
     assert least <= np.abs(data.y[:, :n] - data.y[:, n:]).max() < most
@@ -39,7 +45,9 @@ def test_experiments_start_in_their_periodic_response(run, start, least, most):
 
 def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
     whole = run(DESIGN.inputs(6), start="steady", discard=0)
-    np.testing.assert_allclose(whole.y, run(DESIGN, start="steady").y, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        whole.y, run(DESIGN, start="steady").y, rtol=0, atol=1e-8
+    )
 
 
 def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
@@ -51,21 +59,32 @@ def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
     for system, controller in ((model, None), (model.feedback(F), F)):
         data = run(r, discard=0, feedback=controller)
         exact = np.stack([system.simulate(x) for x in r])
-        np.testing.assert_allclose(data.y, exact, rtol=0, atol=1e-3 * np.abs(exact).max())
+        np.testing.assert_allclose(
+            data.y, exact, rtol=0, atol=1e-3 * np.abs(exact).max()
+        )
     u = r - np.stack([F.simulate(x) for x in exact])
-    np.testing.assert_allclose(data.u, np.dstack([u, r]), rtol=0, atol=1e-3 * np.abs(u).max())
+    np.testing.assert_allclose(
+        data.u, np.dstack([u, r]), rtol=0, atol=1e-3 * np.abs(u).max()
+    )
 
 
 def test_a_steady_start_that_is_not_there_is_named(run, monkeypatch):
     monkeypatch.setattr(steady, "MOST_STEPS", 1)
-    u = np.tile(DESIGN.inputs(6)[:1], (3, 1, 1)) * np.array([0.0, 1.0, 0.0])[:, None, None]
-    with pytest.raises(hj.ComputationError, match="experiment 1: no periodic response was found"):
+    u = (
+        np.tile(DESIGN.inputs(6)[:1], (3, 1, 1))
+        * np.array([0.0, 1.0, 0.0])[:, None, None]
+    )
+    with pytest.raises(
+        hj.ComputationError, match="experiment 1: no periodic response was found"
+    ):
         run(u, start="steady")
 
 
 def test_process_noise_acts_but_is_not_recorded(run):
     def noisy(std):
-        return run(DESIGN, start="periodic", process_noise=hj.experiments.ProcessNoise(std))
+        return run(
+            DESIGN, start="periodic", process_noise=hj.experiments.ProcessNoise(std)
+        )
 
     still, once = run(DESIGN, start="periodic"), noisy(1e-3)
     np.testing.assert_array_equal(once.u, DESIGN.inputs(6))

@@ -60,7 +60,9 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
     parts = [DESIGN.inputs(9, slice(k, k + 5)) for k in range(0, COUNT, 5)]
     np.testing.assert_array_equal(np.concatenate(parts), u)
     for wrong in (slice(3, 3), slice(0, 9, 2), slice(COUNT, None)):
-        with pytest.raises(hj.DefinitionError, match="a slice of consecutive experiments"):
+        with pytest.raises(
+            hj.DefinitionError, match="a slice of consecutive experiments"
+        ):
             DESIGN.inputs(experiments=wrong)
 
 
@@ -79,7 +81,9 @@ def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, who
 
 def test_workers_and_batches_change_nothing(arguments, whole):
     def run(workers=1):
-        return hj.run_experiments(*arguments, execution=hj.Execution(batch=5, workers=workers))
+        return hj.run_experiments(
+            *arguments, execution=hj.Execution(batch=5, workers=workers)
+        )
 
     with no_compilation(after=run):
         for workers in (1, 3):
@@ -106,14 +110,18 @@ def test_stored_experiments_are_those_of_the_whole(made, whole):
     assert len(made) == 3 and made.experiments == COUNT and made.missing() == []
     np.testing.assert_array_equal(records(made), whole.y)
     np.testing.assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
-    np.testing.assert_array_equal(np.concatenate([part.error for part in made]), whole.error)
+    np.testing.assert_array_equal(
+        np.concatenate([part.error for part in made]), whole.error
+    )
     np.testing.assert_array_equal(made[0].cycle_outputs, whole.cycle_outputs)
     assert made[0].outputs[0].unit == "m"
     assert made.summary() == whole.summary() == "12/12 ok"
     assert "12 experiments, 3 of 3 chunks" in repr(StoredExperiments(made.address))
     assert made.dataset.y.dims == ("experiment", "sample", "output")
     np.testing.assert_array_equal(made.dataset.y.sel(output="v"), whole.y[..., 1])
-    np.testing.assert_allclose(hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9)
+    np.testing.assert_allclose(
+        hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9
+    )
 
 
 def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):
@@ -148,26 +156,38 @@ def test_other_experiments_are_refused(made, arguments):
     other = eqx.tree_at(where, placed, (jnp.asarray(0.11),) * 2)
     velocity = hj.Output("v", lambda t, q, u: -q[1], "m/s")
     cases = (
-        (dict(design=hj.multisine(8, 8, (0, 4.0), experiments=COUNT, seed=1)), "`design"),
+        (
+            dict(design=hj.multisine(8, 8, (0, 4.0), experiments=COUNT, seed=1)),
+            "`design",
+        ),
         (dict(outputs=("x", velocity)), "`outputs"),
         (dict(sections=hj.ClockPhase(8, anchor=hj.Crossing("v", "rising"))), "`family"),
         (NOISE, "`process_noise"),
-        (dict(cycle=other.cycle, sections=other), "`model.numbers.damping` is 0.1, not 0.11"),
+        (
+            dict(cycle=other.cycle, sections=other),
+            "`model.numbers.damping` is 0.1, not 0.11",
+        ),
     )
     names = ("cycle", "sections", "design", "outputs")
     for change, difference in cases:
         call = dict(zip(names, arguments, strict=True)) | dict(chunk=5) | BATCH | change
         options = {name: call.pop(name) for name in [*call] if hasattr(Options, name)}
-        with pytest.raises(hj.DefinitionError, match=f"holds other results: .*{difference}"):
+        with pytest.raises(
+            hj.DefinitionError, match=f"holds other results: .*{difference}"
+        ):
             stream(**call, options=Options(**options), store=made.address)
 
 
-@pytest.mark.parametrize("start", ["periodic", pytest.param("steady", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "start", ["periodic", pytest.param("steady", marks=pytest.mark.slow)]
+)
 def test_another_process_can_run_a_piece(arguments, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")
     options = Options(start=start, discard=8)
-    job = ExperimentJob(prepare(*arguments, options, 2, one_program=True), Blocks((COUNT,), (2,)))
+    job = ExperimentJob(
+        prepare(*arguments, options, 2, one_program=True), Blocks((COUNT,), (2,))
+    )
     _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
     mine, theirs = job.run(0, None), sent.run(0, 1)
@@ -176,11 +196,15 @@ def test_another_process_can_run_a_piece(arguments, start):
         np.testing.assert_array_equal(theirs[name], values)
 
 
-def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(whole, arguments, tmp_path):
+def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(
+    whole, arguments, tmp_path
+):
     other = hj.ExperimentData(whole.u, whole.y, n_sections=8, periods=4)
     n = np.arange(64)[None, :, None]
     good, high = np.cos(2 * np.pi * n / 64 * 3), np.cos(2 * np.pi * n / 64 * 19)
-    good, bad = (hj.ExperimentData(u, u, n_sections=4, periods=16) for u in (good, good + high))
+    good, bad = (
+        hj.ExperimentData(u, u, n_sections=4, periods=16) for u in (good, good + high)
+    )
     for parts, message in (
         ([whole, other], "`data` have different sections, periods or signals"),
         ([], "not an empty list"),

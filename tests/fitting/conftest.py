@@ -41,7 +41,9 @@ def oscillation():
 
 @pytest.fixture(scope="session")
 def hopper_htf(hopper_cycle):
-    return hj.linearize(hopper_cycle, SECTIONS, OUTPUTS).htf(np.arange(0.1, 4, 0.2), (-1, 0, 1))
+    return hj.linearize(hopper_cycle, SECTIONS, OUTPUTS).htf(
+        np.arange(0.1, 4, 0.2), (-1, 0, 1)
+    )
 
 
 @pytest.fixture(scope="session")
@@ -62,4 +64,6 @@ def hopper_observed(hopper_cycle):
 
 @pytest.fixture(scope="session")
 def seen_in_cycle(hopper_cycle, hopper_observed):
-    return hj.identifiability(hopper_cycle.system, hopper_observed, HOPPER, guess=hopper_cycle)
+    return hj.identifiability(
+        hopper_cycle.system, hopper_observed, HOPPER, guess=hopper_cycle
+    )

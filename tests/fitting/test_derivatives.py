@@ -32,7 +32,9 @@ def by_differences(cycle, look):
         system = eqx.tree_at(lambda s: getattr(s, name), cycle.system, value)
         return look(hj.find_limit_cycle(system, cycle)) / (2 * STEP)
 
-    return np.stack([at(name, 1 + STEP) - at(name, 1 - STEP) for name in HOPPER], axis=-1)
+    return np.stack(
+        [at(name, 1 + STEP) - at(name, 1 - STEP) for name in HOPPER], axis=-1
+    )
 
 
 def test_htfs(hopper_htf, seen_in_htf):
@@ -45,7 +47,9 @@ def test_htfs(hopper_htf, seen_in_htf):
     assert np.abs(S[:, HOPPER.index("a")] + S[:, HOPPER.index("g")]).max() < 1e-9 * size
 
 
-def test_states_on_sections_and_times_of_events(hopper_cycle, hopper_observed, seen_in_cycle):
+def test_states_on_sections_and_times_of_events(
+    hopper_cycle, hopper_observed, seen_in_cycle
+):
     S = seen_in_cycle.sensitivity
     size = np.abs(S).max()
     np.testing.assert_allclose(S[:, FORCES].sum(axis=1), 0, atol=1e-9 * size)
@@ -55,7 +59,9 @@ def test_states_on_sections_and_times_of_events(hopper_cycle, hopper_observed, s
         for one in hopper_observed:
             now = hj.ObservedCycle.of(cycle, one.sections, one.outputs)
             scales = one.prepare(hopper_cycle).scales
-            parts += [np.ravel(x / s) for x, s in zip(now.measured, scales, strict=True)]
+            parts += [
+                np.ravel(x / s) for x, s in zip(now.measured, scales, strict=True)
+            ]
         return np.concatenate(parts)
 
     np.testing.assert_allclose(S, by_differences(hopper_cycle, look), atol=1e-6 * size)
@@ -75,6 +81,8 @@ def test_reverse_mode_gives_the_same(hopper_cycle, hopper_htf, seen_in_htf):
         return (direction[0] * H.real + direction[1] * H.imag).sum()
 
     slopes = gradient(hopper_cycle.system)
-    found = [float(getattr(slopes, n) * getattr(hopper_cycle.system, n)) for n in HOPPER]
+    found = [
+        float(getattr(slopes, n) * getattr(hopper_cycle.system, n)) for n in HOPPER
+    ]
     true = direction.ravel() @ seen_in_htf.sensitivity
     np.testing.assert_allclose(found, true, atol=1e-9 * np.abs(true).max())

@@ -36,11 +36,17 @@ def test_a_fit_that_stops_where_cycles_end_has_not_converged(monkeypatch):
 
 def test_the_unit_of_residuals_does_not_count(monkeypatch):
     def evaluate(scale, x, guess):  # two residuals that no x removes
-        return scale * np.append(np.exp(x) - 3, x), scale * np.stack([np.exp(x), [1.0]]), guess
+        return (
+            scale * np.append(np.exp(x) - 3, x),
+            scale * np.stack([np.exp(x), [1.0]]),
+            guess,
+        )
 
     monkeypatch.setattr(problem, "evaluate", evaluate)
     ends = [problem.descend(scale, np.array([4.0]), None) for scale in (1.0, 1e-3)]
-    assert ends[0][0] == pytest.approx(ends[1][0], rel=1e-3) and ends[1][4] <= ends[0][4]
+    assert (
+        ends[0][0] == pytest.approx(ends[1][0], rel=1e-3) and ends[1][4] <= ends[0][4]
+    )
 
 
 def test_errors_that_no_residual_shows_are_unknown():
@@ -49,18 +55,29 @@ def test_errors_that_no_residual_shows_are_unknown():
     assert fit.result == hj.Result.OK and np.isnan(fit.standard_errors).all()
     with pytest.raises(hj.DefinitionError, match="no residual is left"):
         fit.contains({"A": 0.2})
-    speed = hj.ObservedCycle(impact, "v", [[-3.0]])  # which is g T / 2 for any amplitude
+    speed = hj.ObservedCycle(
+        impact, "v", [[-3.0]]
+    )  # which is g T / 2 for any amplitude
     fit = hj.fit_model(juggler, speed, "A")
-    assert fit.result == hj.Result.OK and fit.identifiability.rank == 0 and fit.contains({"A": 0.2})
+    assert (
+        fit.result == hj.Result.OK
+        and fit.identifiability.rank == 0
+        and fit.contains({"A": 0.2})
+    )
     with pytest.raises(hj.DefinitionError, match="of all data, or of none"):
-        hj.identifiability(juggler, [speed, hj.ObservedCycle(impact, period=1, period_std=1)], "A")
+        hj.identifiability(
+            juggler, [speed, hj.ObservedCycle(impact, period=1, period_std=1)], "A"
+        )
 
 
 def test_times_of_autonomous_cycles_count_from_any_moment():
     where = [hj.Crossing("x", "rising"), hj.Crossing("v", "rising")]
     cycles = [hj.find_limit_cycle(hj.models.VanDerPol(mu=mu)) for mu in (1.1, 1.101)]
     (gap,), (other,) = (np.diff(hj.place_sections(x, where).lanes.t) for x in cycles)
-    error, rough = np.sqrt(2) * 0.1 / abs(other - gap) * 1e-3, []  # of a difference of two times
+    error, rough = (
+        np.sqrt(2) * 0.1 / abs(other - gap) * 1e-3,
+        [],
+    )  # of a difference of two times
     for begin in (0.0, 9.0):
         data = hj.ObservedCycle(where, times=[begin, begin + gap], times_std=0.1)
         fit = hj.fit_model(hj.models.VanDerPol(), data, "mu")
@@ -69,8 +86,12 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
         data = hj.ObservedCycle(where, "x", [[0.1], [-2.0]], times=[begin, begin + gap])
         rough.append(hj.fit_model(hj.models.VanDerPol(), data, {"mu": (0.0, np.inf)}))
     assert rough[0].values == pytest.approx(rough[1].values, rel=1e-6)
-    assert rough[0].result == 0 and "mu reaches its bound 0 within its error" in repr(rough[0])
-    with pytest.raises(hj.DefinitionError, match="another 'mass', which was not fitted"):
+    assert rough[0].result == 0 and "mu reaches its bound 0 within its error" in repr(
+        rough[0]
+    )
+    with pytest.raises(
+        hj.DefinitionError, match="another 'mass', which was not fitted"
+    ):
         rough[0].chi_square({"mu": 1.1, "mass": 1.0})
 
 
@@ -81,11 +102,15 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     assert fit.result == hj.Result.OK and fit.cost < 1e-12
     assert fit.system.w == pytest.approx(1.0, rel=1e-9)
     assert fit.system.p * fit.system.q == pytest.approx(1.0, rel=1e-9)
-    assert fit.system.p / fit.system.q == pytest.approx(0.6 / 2.1, rel=1e-6)  # it did not move
+    assert fit.system.p / fit.system.q == pytest.approx(
+        0.6 / 2.1, rel=1e-6
+    )  # it did not move
     assert fit.identifiability.descriptions() == ["p and q apart, only their product"]
     assert np.isinf(fit.standard_errors).tolist() == [True, True, False]
     assert float(fit.cycle.period) == pytest.approx(float(oscillation.period), rel=1e-9)
-    assert "not identified: p and q apart" in repr(fit) and "1 of 1 guesses" in repr(fit)
+    assert "not identified: p and q apart" in repr(fit) and "1 of 1 guesses" in repr(
+        fit
+    )
 
 
 @pytest.mark.slow
@@ -100,7 +125,9 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
 
     def numbers(**change):
         cycle = hj.find_limit_cycle(Oscillator(**change), oscillation)
-        return np.concatenate([np.ravel(x) for x in observed(cycle).measured]) / STD["std"]
+        return (
+            np.concatenate([np.ravel(x) for x in observed(cycle).measured]) / STD["std"]
+        )
 
     usual = numbers()
     J = np.stack([numbers(p=0.501) - usual, numbers(w=1.001) - usual], axis=1) / 1e-3
@@ -122,18 +149,28 @@ def test_advice_about_searches_names_their_function(oscillation):
         lambda: hj.sweep(still, {"p": [1.0, 2.0]}),
         lambda: hj.explore(still, "p"),
     ):
-        with pytest.raises(hj.ComputationError, match=r"\(These arguments .*`find_limit_cycle`: "):
+        with pytest.raises(
+            hj.ComputationError, match=r"\(These arguments .*`find_limit_cycle`: "
+        ):
             call()
 
 
 @pytest.mark.slow
 def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     nothing_fits = hj.ObservedCycle(
-        PHASES, ("x", "v"), np.arange(8.0).reshape(4, 2) - 3.0, period=oscillation.period, **STD
+        PHASES,
+        ("x", "v"),
+        np.arange(8.0).reshape(4, 2) - 3.0,
+        period=oscillation.period,
+        **STD,
     )
     free = ("p", "q", "w")
-    several = hj.fit_model(oscillation.system, nothing_fits, free, guess=oscillation, guesses=2)
-    assert len(several.guesses) == 2 and several.cost == min(g.cost for g in several.guesses)
+    several = hj.fit_model(
+        oscillation.system, nothing_fits, free, guess=oscillation, guesses=2
+    )
+    assert len(several.guesses) == 2 and several.cost == min(
+        g.cost for g in several.guesses
+    )
     assert np.ptp([g.values[0] for g in several.guesses]) > 0
     one = hj.fit_model(
         oscillation.system, observed(oscillation), free, guess=oscillation, guesses=2
@@ -144,14 +181,21 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
 @pytest.mark.slow
 def test_data_of_the_hopper_do_not_see_all_parameters(seen_in_htf, seen_in_cycle):
     assert seen_in_htf.rank == 5 and seen_in_cycle.rank == 6
-    assert sorted(seen_in_htf.descriptions()) == ["a common factor of (a, g), only a/g", "l0"]
+    assert sorted(seen_in_htf.descriptions()) == [
+        "a common factor of (a, g), only a/g",
+        "l0",
+    ]
     assert seen_in_cycle.descriptions() == ["a common factor of (m, M, k, b, a)"]
 
 
 @pytest.mark.slow
-def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(hopper_cycle, hopper_htf):
+def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(
+    hopper_cycle, hopper_htf
+):
     u = 0.05 * np.random.default_rng(0).normal(size=(2, 8 * SECTIONS.n_sections, 1))
-    data = hj.run_experiments(hopper_cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0)
+    data = hj.run_experiments(
+        hopper_cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0
+    )
     wrong = hj.models.VerticalHopper(m=1.1, M=1.8, k=11.0, b=4.2, l0=2.2, a=18.0, g=2.2)
     true = np.array([getattr(hopper_cycle.system, name) for name in HOPPER])
     observed = hj.ObservedHTF(hopper_htf, SECTIONS), hj.ObservedSeries(data, SECTIONS)
@@ -169,7 +213,9 @@ def fitted(hopper_cycle):
     """A fit of a stiffness and both delays, which begins near the cycle of another stiffness."""
     lines = np.arange(1, 33) / 16 + 0.01
     htf = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS, delay=(0.037, 0.081)).htf(lines)
-    data = hj.ObservedHTF(htf, SECTIONS, delay=(0.0625, 0.0625))  # (together a whole section)
+    data = hj.ObservedHTF(
+        htf, SECTIONS, delay=(0.0625, 0.0625)
+    )  # (together a whole section)
     free = "k", "input_delay", "output_delay"
     return lambda near: hj.fit_model(near.system, data, free, guess=near)
 
@@ -182,7 +228,9 @@ def test_both_delays_come_back(hopper_cycle, hopper_htf, fitted):
     with pytest.raises(hj.DefinitionError, match="must have a value of 'input_delay'"):
         fit.contains(hopper_cycle.system)
     with pytest.raises(hj.DefinitionError, match="no data have a delay"):
-        hj.fit_model(hopper_cycle.system, hj.ObservedHTF(hopper_htf, SECTIONS), "input_delay")
+        hj.fit_model(
+            hopper_cycle.system, hj.ObservedHTF(hopper_htf, SECTIONS), "input_delay"
+        )
 
 
 @pytest.mark.slow

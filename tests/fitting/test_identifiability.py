@@ -23,18 +23,29 @@ def blind(rows, residuals=30, seed=0):
         ([[0, 1, -1, 0]], ["b and c apart, only their product"]),
         ([[0, 1, -2, 0]], ["a common factor, with these powers, of (b, c^-2)"]),
         ([[1, 1, 1, 0], [0, 0, 0, 1]], ["a common factor of (a, b, c)", "d"]),
-        ([[1, 1, 1, 1], [0, 0, 1, 1]],
-         ["a common factor of (a, b), only a/b", "a common factor of (c, d), only c/d"]),
+        (
+            [[1, 1, 1, 1], [0, 0, 1, 1]],
+            [
+                "a common factor of (a, b), only a/b",
+                "a common factor of (c, d), only c/d",
+            ],
+        ),
     ],
-)  # fmt: skip
+)
 def test_directions_are_said_in_words(rows, words):
-    found = diagnose(tuple("abcd"), blind(rows, 300_000))  # (whose square no memory holds)
+    found = diagnose(
+        tuple("abcd"), blind(rows, 300_000)
+    )  # (whose square no memory holds)
     assert found.rank == 4 - len(rows) and not found.complete
     assert sorted(found.descriptions()) == sorted(words)
     assert all(f"not identified: {text}" in repr(found) for text in words)
 
 
-@given(st.lists(st.lists(st.integers(-3, 3), min_size=5, max_size=5), min_size=1, max_size=3))
+@given(
+    st.lists(
+        st.lists(st.integers(-3, 3), min_size=5, max_size=5), min_size=1, max_size=3
+    )
+)
 def test_the_basis_spans_what_is_not_seen(rows):
     rows = np.array(rows, float)
     assume(np.linalg.svd(rows, compute_uv=False)[-1] > 1e-3)
@@ -42,4 +53,6 @@ def test_the_basis_spans_what_is_not_seen(rows):
     found = diagnose(tuple("abcde"), S)
     assert found.unseen.shape == rows.shape
     assert np.abs(S @ found.unseen.T).max() < 1e-2 * np.abs(S).max()
-    assert np.linalg.matrix_rank(np.concatenate([rows, found.unseen]), tol=1e-2) == len(rows)
+    assert np.linalg.matrix_rank(np.concatenate([rows, found.unseen]), tol=1e-2) == len(
+        rows
+    )

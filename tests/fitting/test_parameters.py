@@ -12,7 +12,9 @@ from .conftest import SECTIONS
 
 
 HOPPER = hj.models.VerticalHopper
-BOUNDS = st.sampled_from([None, (-np.inf, np.inf), (0.5, np.inf), (-np.inf, 40.0), (0.5, 40.0)])
+BOUNDS = st.sampled_from(
+    [None, (-np.inf, np.inf), (0.5, np.inf), (-np.inf, 40.0), (0.5, 40.0)]
+)
 VALUES = st.floats(0.6, 39.0)
 COORDINATES = st.floats(-8.0, 8.0)
 
@@ -21,7 +23,9 @@ COORDINATES = st.floats(-8.0, 8.0)
 def test_values_come_back_and_keep_to_their_bounds(value, bounds, x):
     parameters = free_parameters(HOPPER(k=value), {"k": bounds})
     values = parameters.read(HOPPER(k=value), ())
-    np.testing.assert_allclose(parameters.decode(parameters.encode(values)), values, rtol=1e-12)
+    np.testing.assert_allclose(
+        parameters.decode(parameters.encode(values)), values, rtol=1e-12
+    )
     low, high = (0.0, np.inf) if bounds is None else bounds
     assert low <= parameters.decode(jnp.array([x]))[0] <= high
 
@@ -50,19 +54,49 @@ def records(**options):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS), "different n_sections: 16 and 8"),
-        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS), "variance"),
-        (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "different n_sections: 8 and 4"),
-        (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran to"),
-        (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), r"of shape \(1 outputs\)"),
-        (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "zero throughout"),
-        (lambda: hj.ObservedSeries(records(begin=0.8), SECTIONS), "do not begin on the cycle"),
-        (lambda: hj.ObservedSeries(records(begin=0.8), SECTIONS, 0.1), "do not begin on the cycle"),
+        (
+            lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS),
+            "different n_sections: 16 and 8",
+        ),
+        (
+            lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS),
+            "variance",
+        ),
+        (
+            lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)),
+            "different n_sections: 8 and 4",
+        ),
+        (
+            lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS),
+            "no experiment ran to",
+        ),
+        (
+            lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)),
+            r"of shape \(1 outputs\)",
+        ),
+        (
+            lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS),
+            "zero throughout",
+        ),
+        (
+            lambda: hj.ObservedSeries(records(begin=0.8), SECTIONS),
+            "do not begin on the cycle",
+        ),
+        (
+            lambda: hj.ObservedSeries(records(begin=0.8), SECTIONS, 0.1),
+            "do not begin on the cycle",
+        ),
         (lambda: hj.ObservedCycle(SECTIONS), "`times`, or a `period`"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM"), "`outputs` with their `values`"),
-        (lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))), r"shape \(8 sections, 1 out"),
+        (
+            lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))),
+            r"shape \(8 sections, 1 out",
+        ),
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))), "zero throughout"),
-        (lambda: hj.ObservedCycle(SECTIONS, times=TIMES, period=1.0, period_std=0.1), "or of none"),
+        (
+            lambda: hj.ObservedCycle(SECTIONS, times=TIMES, period=1.0, period_std=0.1),
+            "or of none",
+        ),
     ],
 )
 def test_bad_data_are_refused(make, message):

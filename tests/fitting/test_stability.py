@@ -47,5 +47,11 @@ def test_its_derivative_tends_to_that_of_the_radius():
         A = (1 + p) * skew @ jnp.array([[c, -s], [s, c]]) @ jnp.linalg.inv(skew)
         return hj.spectral_radius(model(A[None]), smoothing)
 
-    errors = [abs(float(jax.grad(radius)(0.0, eps)) - 0.8) for eps in (1e-2, 1e-4, 1e-6)]
-    assert errors[1] < 0.05 * errors[0] and errors[2] < 0.05 * errors[1] and errors[2] < 1e-4
+    errors = [
+        abs(float(jax.grad(radius)(0.0, eps)) - 0.8) for eps in (1e-2, 1e-4, 1e-6)
+    ]
+    assert (
+        errors[1] < 0.05 * errors[0]
+        and errors[2] < 0.05 * errors[1]
+        and errors[2] < 1e-4
+    )

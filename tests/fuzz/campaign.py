@@ -57,8 +57,13 @@ class Report:
             f"{self.name}: {self.compared} of {self.systems} compared, {self.events} events; "
             "errors {:.1e} in time, {:.1e} in state".format(*self.error)
         ]
-        lines += [f"excluded, {reason}: {numbers}" for reason, numbers in self.excluded.items()]
-        return "\n".join(lines + [f"FAILED {self.name}:{k}: {x}" for k, x in self.failures.items()])
+        lines += [
+            f"excluded, {reason}: {numbers}"
+            for reason, numbers in self.excluded.items()
+        ]
+        return "\n".join(
+            lines + [f"FAILED {self.name}:{k}: {x}" for k, x in self.failures.items()]
+        )
 
 
 def shares(systems: int) -> dict[str, range]:
@@ -90,7 +95,9 @@ def check(name: str, numbers, seed: int = 0, accuracy: float = ACCURACY) -> Repo
             error = difference(trial, run, end=not full)
             report.error = tuple(map(max, report.error, error))
             if not max(error) <= TOLERANCE:
-                report.failures[k] = "errors {:.1e} in time, {:.1e} in state".format(*error)
+                report.failures[k] = "errors {:.1e} in time, {:.1e} in state".format(
+                    *error
+                )
     return report
 
 
@@ -100,7 +107,10 @@ def truth(plan: Plan, sample: Sample) -> Run:
     if run.excluded is None:
         rough = scipy_loop.run(plan, sample, EVENTS, 1e-11, 1e-12)
         full = len(run.events) == EVENTS
-        if order(rough) != order(run) or max(difference(rough, run, not full)) > CONDITION:
+        if (
+            order(rough) != order(run)
+            or max(difference(rough, run, not full)) > CONDITION
+        ):
             run.excluded = "ill-conditioned"
     return run
 
@@ -140,11 +150,15 @@ def engine(
         piece = samples[k : k + BATCH]
         fill = piece + piece[-1:] * (BATCH - len(piece))
         stops = ends[k : k + BATCH] + ends[-1:] * (BATCH - len(piece))
-        many = jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *fill)
+        many = jax.tree_util.tree_map(
+            lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *fill
+        )
         moved = _flow(plan, many, jnp.asarray(stops), jnp.asarray(accuracy))
         moved = jax.tree_util.tree_map(np.asarray, moved)
         for i in range(len(piece)):
-            result, count, events, t, chart, q = jax.tree_util.tree_map(lambda x, i=i: x[i], moved)
+            result, count, events, t, chart, q = jax.tree_util.tree_map(
+                lambda x, i=i: x[i], moved
+            )
             events = [
                 Event(float(at), int(code), int(b), after[: plan.dims[b]])
                 for at, code, b, after in zip(*events, strict=True)
@@ -162,21 +176,34 @@ def _flow(plan: Plan, many: Sample, ends, accuracy):
         q = jnp.zeros((s.d, 1)).at[: plan.dims[0], 0].set(q)
         settings = Settings(rtol=accuracy, atol=accuracy, max_steps=STEPS)
         lanes = start_lanes(s, t[None], jnp.zeros(1, jnp.int32), q)
-        moved, tape = move(s, lanes, u[:, None], until(end[None]), settings, options=Options(True))
+        moved, tape = move(
+            s, lanes, u[:, None], until(end[None]), settings, options=Options(True)
+        )
         happens = tape.code[:, 0] >= 0
         (rows,) = jnp.nonzero(happens, size=EVENTS, fill_value=0)
         events = [x[rows, ..., 0] for x in (tape.t, tape.code, tape.chart, tape.after)]
         end = moved.lanes
-        return moved.result[0], happens.sum(), events, end.t[0], end.chart[0], end.q[:, 0]
+        return (
+            moved.result[0],
+            happens.sum(),
+            events,
+            end.t[0],
+            end.chart[0],
+            end.q[:, 0],
+        )
 
     return jax.vmap(one)(many, ends)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.campaign")
-    parser.add_argument("--systems", type=int, default=1000, help="number, over all structures")
+    parser.add_argument(
+        "--systems", type=int, default=1000, help="number, over all structures"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--accuracy", type=float, default=ACCURACY, help="tolerances of hybridjax")
+    parser.add_argument(
+        "--accuracy", type=float, default=ACCURACY, help="tolerances of hybridjax"
+    )
     arguments = parser.parse_args()
     hj.enable_x64()
     reports = []
@@ -184,7 +211,9 @@ def main() -> int:
         if numbers:
             reports.append(check(name, numbers, arguments.seed, arguments.accuracy))
             print(reports[-1], flush=True)
-    excluded = sum(r.systems - r.compared for r in reports) / sum(r.systems for r in reports)
+    excluded = sum(r.systems - r.compared for r in reports) / sum(
+        r.systems for r in reports
+    )
     print(f"excluded {excluded:.2%} (by scipy alone)")
     return int(any(r.failures for r in reports))
 

@@ -14,8 +14,19 @@ from .structures import Arrow, Plan, Sample, Start
 def still(n: int, /, **given) -> dict[str, Any]:
     """Numbers of a chart that are all zero but for those given."""
     zero = np.zeros(n)
-    flat = {"b": zero, "cube": zero, "a": zero, "w": 1.0, "p": 0.0, "B": np.zeros((n, 2))}
-    return flat | {"A": np.zeros((n, n)), "S": np.zeros((n, n)), "T": np.zeros((n, n))} | given
+    flat = {
+        "b": zero,
+        "cube": zero,
+        "a": zero,
+        "w": 1.0,
+        "p": 0.0,
+        "B": np.zeros((n, 2)),
+    }
+    return (
+        flat
+        | {"A": np.zeros((n, n)), "S": np.zeros((n, n)), "T": np.zeros((n, n))}
+        | given
+    )
 
 
 def swinging(rng, n: int, rate=(0.8, 2.5), damping=(0.0, 0.1)) -> dict[str, Any]:
@@ -94,12 +105,19 @@ def unit(n: int, k: int = 0) -> np.ndarray:
 
 def wave(rng, size, rate) -> dict[str, Any]:
     """A term of a guard that changes with time."""
-    return {"a": rng.uniform(*size), "w": rng.uniform(*rate), "p": rng.uniform(0.0, 2 * np.pi)}
+    return {
+        "a": rng.uniform(*size),
+        "w": rng.uniform(*rate),
+        "p": rng.uniform(0.0, 2 * np.pi),
+    }
 
 
 def beside(rng, x, sign: float) -> dict[str, Any]:
     """A curved guard that crosses shortly before or after the flat guard of the arrow `x`."""
-    gap, bend = rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-5.5, -1.5), rng.normal(0.0, 3.0)
+    gap, bend = (
+        rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-5.5, -1.5),
+        rng.normal(0.0, 3.0),
+    )
     n, c = x["n"], x["c"]  # sign * (n.q + c + gap + bend * (n.q + c)^2)
     return {
         "n": sign * (1 + 2 * bend * c) * n,
@@ -115,7 +133,9 @@ STRUCTURES: dict[str, tuple[Plan, Callable[[np.random.Generator], Sample]]] = {}
 def structure(*arrows, dims):
     """List a function that draws systems of this plan."""
     plan = Plan(dims, tuple(Arrow(*a) for a in arrows))
-    return lambda function: STRUCTURES.setdefault(function.__name__, (plan, function))[1]
+    return lambda function: STRUCTURES.setdefault(function.__name__, (plan, function))[
+        1
+    ]
 
 
 @structure((0, 0, "falling"), (0, 0, "rising"), (0, 0, "falling", True), dims=(3,))
@@ -140,9 +160,11 @@ def dips(rng) -> Sample:
         normal, level = normal / np.linalg.norm(normal), rng.uniform(-0.6, 0.6)
         width = 10 ** rng.uniform(-2.5, -0.5)  # (n.q - level)^2 - width^2
         return {
-            "n": -2 * level * normal, "Q": 2 * np.outer(normal, normal),
-            "c": level**2 - width**2, "m": np.zeros(2),
-        }  # fmt: skip
+            "n": -2 * level * normal,
+            "Q": 2 * np.outer(normal, normal),
+            "c": level**2 - width**2,
+            "m": np.zeros(2),
+        }
 
     arrows = [arrow(rng, 2, 2, **layer()) for _ in range(2)]
     return Sample([swinging(rng, 2)], arrows, start(rng, 2))
@@ -171,13 +193,19 @@ def ladder(rng) -> Sample:
         back[0, 0] = rng.uniform(-0.5, 0.5)
         back[1:, :] = rng.normal(0.0, 0.5, (after - 1, n))
         c = -level * rng.uniform(0.5, 1.5)
-        arrows.append(arrow(rng, n, after, n=unit(n), c=c, R=back, r=rng.normal(0.0, 0.3, after)))
+        arrows.append(
+            arrow(rng, n, after, n=unit(n), c=c, R=back, r=rng.normal(0.0, 0.3, after))
+        )
     return Sample(charts, arrows, start(rng, 1, size=0.3))
 
 
 @structure(
-    (0, 1, "falling"), (0, 2, "rising"), (1, 0, "falling"), (2, 0, "rising"), dims=(2, 3, 2)
-)  # fmt: skip
+    (0, 1, "falling"),
+    (0, 2, "rising"),
+    (1, 0, "falling"),
+    (2, 0, "rising"),
+    dims=(2, 3, 2),
+)
 def fork(rng) -> Sample:
     """Whichever of two guards comes first, one close to the other, decides on the next chart."""
     charts = [swinging(rng, 2), swinging(rng, 3), swinging(rng, 2)]
@@ -194,15 +222,26 @@ def switch(rng) -> Sample:
     keep = {"R": np.eye(2), "r": np.zeros(2), "V": np.zeros((2, 2))}
     arrows = [
         arrow(rng, 2, 2, period=period, offset=offset, **keep),
-        arrow(rng, 2, 2, period=period, offset=offset + rng.uniform(0.2, 0.8) * period, **keep),
+        arrow(
+            rng,
+            2,
+            2,
+            period=period,
+            offset=offset + rng.uniform(0.2, 0.8) * period,
+            **keep,
+        ),
         arrow(rng, 2, 2),
     ]
     return Sample([swinging(rng, 2), swinging(rng, 2)], arrows, start(rng, 2))
 
 
 @structure(
-    (0, 0, "falling"), (0, 0, "rising"), (0, 0, "falling", True), (0, 0, "rising", True), dims=(5,)
-)  # fmt: skip
+    (0, 0, "falling"),
+    (0, 0, "rising"),
+    (0, 0, "falling", True),
+    (0, 0, "rising", True),
+    dims=(5,),
+)
 def crowd(rng) -> Sample:
     """Five dimensions and four guards of all kinds, in slow motion: many crossings in one step."""
     chart = swinging(rng, 5, rate=(0.1, 0.5))
@@ -219,9 +258,13 @@ def crowd(rng) -> Sample:
 
 
 @structure(
-    (0, 1, "falling"), (0, 2, "rising"), (1, 2, "falling"), (2, 0, "rising", True),
-    (2, 2, "scheduled"), dims=(5, 1, 4),
-)  # fmt: skip
+    (0, 1, "falling"),
+    (0, 2, "rising"),
+    (1, 2, "falling"),
+    (2, 0, "rising", True),
+    (2, 2, "scheduled"),
+    dims=(5, 1, 4),
+)
 def tour(rng) -> Sample:
     """Three charts of dimensions 5, 1 and 4, a clock, and a guard of every kind."""
     charts = [swinging(rng, 5), drifting(rng, 1, -1.0), swinging(rng, 4)]

@@ -85,7 +85,9 @@ class _Stay:
     def guard(self, g, t, q):
         """Guard g at one state, or at states (n, m), signed so that it falls at its event."""
         x = self.arrows[g]
-        flat = x["n"] @ q + x["c"] + x["m"] @ self.u + x["a"] * np.sin(x["w"] * t + x["p"])
+        flat = (
+            x["n"] @ q + x["c"] + x["m"] @ self.u + x["a"] * np.sin(x["w"] * t + x["p"])
+        )
         value = flat + 0.5 * np.sum(q * (x["Q"] @ q), axis=0)
         return value if self.plan.arrows[g].kind == "falling" else -value
 
@@ -129,7 +131,9 @@ class _Stay:
         """The first event in a step: time, state, transition."""
         t = np.linspace(a, b, SAMPLES + 1)
         q = dense(t)
-        crossings = sorted(c for g in self.guards for c in self.crossings(g, t, q, dense))
+        crossings = sorted(
+            c for g in self.guards for c in self.crossings(g, t, q, dense)
+        )
         for k, (time, g) in enumerate(crossings):
             state = dense(time)
             if self.enabled(g, state):
@@ -145,10 +149,14 @@ class _Stay:
             return self.guard(g, time, dense(time))
 
         v = self.guard(g, t, q)
-        dips = np.flatnonzero((v[1:-1] > 0) & (v[1:-1] <= v[:-2]) & (v[1:-1] <= v[2:])) + 1
+        dips = (
+            np.flatnonzero((v[1:-1] > 0) & (v[1:-1] <= v[:-2]) & (v[1:-1] <= v[2:])) + 1
+        )
         for k in dips[::-1]:
             span = t[k - 1], t[k + 1]
-            low = minimize_scalar(value, bounds=span, method="bounded", options={"xatol": 1e-12})
+            low = minimize_scalar(
+                value, bounds=span, method="bounded", options={"xatol": 1e-12}
+            )
             if low.fun < 0 and low.x != t[k]:
                 place = k if low.x < t[k] else k + 1
                 t, v = np.insert(t, place, low.x), np.insert(v, place, low.fun)
@@ -159,7 +167,9 @@ class _Stay:
             self.armed[g] |= v[k - 1] > LEFT
             if self.armed[g] and v[k] <= 0:
                 lo = t[k - 1]
-                found.append((brentq(value, lo, t[k], xtol=1e-15) if v[k - 1] > 0 else lo, g))
+                found.append(
+                    (brentq(value, lo, t[k], xtol=1e-15) if v[k - 1] > 0 else lo, g)
+                )
                 self.armed[g] = False
         self.armed[g] |= v[-1] > LEFT
         return found

@@ -46,7 +46,9 @@ def two_pieces(x, first, second):
     lanes = start_lanes(s, jnp.zeros(1), jnp.zeros(1, jnp.int32), jnp.full((1, 1), x))
     h = None
     for end, u in ((1.0, first), (2.0, second)):
-        moved = move(s, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), SETTINGS, h).moved
+        moved = move(
+            s, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), SETTINGS, h
+        ).moved
         lanes, h = moved.lanes, moved.h
     return hj.Result(int(moved.result[0])), int(lanes.events[0])
 

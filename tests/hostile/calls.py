@@ -55,7 +55,9 @@ def sections(t):
     yield hj.Crossing, dict(function="y", direction="falling", value=0.0)
     yield hj.AtEvent, dict(name="hit")
     yield hj.ClockPhase, dict(n_sections=8, anchor=0.0)
-    turn = dict(n_sections=8, position="x", velocity="y", center=(0.0, 0.0), scale=(1.0, 1.0))
+    turn = dict(
+        n_sections=8, position="x", velocity="y", center=(0.0, 0.0), scale=(1.0, 1.0)
+    )
     yield hj.KinematicPhase, turn
     yield hj.SectionList, dict(items=[APEX])
     yield hj.place_sections, dict(cycle=t.cycle, sections=PHASE)
@@ -69,9 +71,15 @@ def cycles(t):
     yield hj.find_limit_cycle, dict(system=t.system, guess=t.cycle)
     yield hj.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle)
     yield t.cycles.__getitem__, dict(i=0)
-    yield hj.continuation, dict(cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05)
+    yield (
+        hj.continuation,
+        dict(cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05),
+    )
     yield t.cycle.responses, dict(modes=0)
-    yield t.cycle.asymptotic_phase, dict(chart="plane", state=np.array([2.0, 0.1]), turns=9)
+    yield (
+        t.cycle.asymptotic_phase,
+        dict(chart="plane", state=np.array([2.0, 0.1]), turns=9),
+    )
     yield t.cycle.htf, dict(f=np.array([0.3]), harmonics=0, outputs=STATES)
     yield t.cycle.sensitivity, dict(parameter="mu")
     yield t.cycle.fluctuations, dict(white={"v": 0.1}, guards={}, resets={})
@@ -92,11 +100,16 @@ def linear(t):
         yield getattr(t.model, name), dict(u=v, periods=2)
     yield t.model.impulse_response, dict(n_lags=3)
     yield t.model.htf, dict(f=np.array([0.1, 0.2]))
-    yield t.model.feedback, dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs))))
+    yield (
+        t.model.feedback,
+        dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs)))),
+    )
     f, H = (np.asarray(t.estimate.f), np.asarray(t.estimate.H))
     size = np.ones(H.shape)
     scatter = hj.Scatter(f, size)
-    errors = dict(variance=size, noise_variance=size, scatter=hj.Scatter(np.ones(len(f)), size))
+    errors = dict(
+        variance=size, noise_variance=size, scatter=hj.Scatter(np.ones(len(f)), size)
+    )
     yield hj.HTF, dict(f=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors
     yield hj.Scatter, dict(freedom=f, roundness=size)
     yield scatter.quantile, dict(level=0.9)
@@ -104,7 +117,9 @@ def linear(t):
     lines = np.arange(12) / 4 + 0.125
     signals = dict(inputs=t.model.outputs, outputs=t.model.inputs)
     gain = np.zeros((6, len(t.model.inputs), len(t.model.outputs)))
-    still = hj.LDTP(np.zeros((6, 1, 1)), 0 * gain[:, :1], 0 * gain[:, :, :1], gain, **signals)
+    still = hj.LDTP(
+        np.zeros((6, 1, 1)), 0 * gain[:, :1], 0 * gain[:, :, :1], gain, **signals
+    )
     yield t.model.htf(lines).feedback, dict(controller=still.htf(lines))
     yield t.estimate.require_sampled, dict(name="a fit")
     htf = t.estimate
@@ -118,10 +133,15 @@ def linear(t):
 def designs(t):
     lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
-    yield hj.paper_design, dict(n_sections=20, periods=16, experiments=40, division="random")
+    yield (
+        hj.paper_design,
+        dict(n_sections=20, periods=16, experiments=40, division="random"),
+    )
     cosines = dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0)
     yield hj.Design.from_lines, cosines | dict(n_sections=6, periods=16)
-    good = {name: getattr(t.one_input, name) for name in t.one_input.__dataclass_fields__}
+    good = {
+        name: getattr(t.one_input, name) for name in t.one_input.__dataclass_fields__
+    }
     yield hj.Design, good
     yield t.design.scaled, dict(rms=1.0)
     yield t.design.realizations, dict(count=2)
@@ -133,7 +153,10 @@ def experiments(t):
     yield hj.run_experiments, to_run
     yield hj.experiments.stream_experiments, to_run
     yield hj.experiments.StoredExperiments, dict(store="nope")
-    yield hj.response_function, {name: to_run[name] for name in ("cycle", "sections", "outputs")}
+    yield (
+        hj.response_function,
+        {name: to_run[name] for name in ("cycle", "sections", "outputs")},
+    )
     yield t.response, dict(u=np.zeros((1, 8, 1)))
     yield hj.experiments.simulate_experiments, dict(ldtp=t.model, design=t.design)
     yield hj.experiments.ProcessNoise, dict(std=0.1)
@@ -181,7 +204,9 @@ def fitting(t):
     yield hj.spectral_radius, dict(model=t.model)
     yield hj.ObservedHTF, dict(htf=t.htf, sections=PHASE)
     yield hj.ObservedSeries, dict(data=t.series, sections=PHASE)
-    seen = dict(outputs=STATES, values=np.ones((4, 2)), times=np.arange(4.0), period=1.0)
+    seen = dict(
+        outputs=STATES, values=np.ones((4, 2)), times=np.arange(4.0), period=1.0
+    )
     yield hj.ObservedCycle, dict(sections=PHASE) | seen
     yield hj.ObservedCycle.of, dict(cycle=t.cycle, sections=PHASE, outputs=STATES)
     for name in ("ObservedCycle", "ObservedHTF"):
@@ -213,22 +238,37 @@ def recordings(t):
     yield t.recording.with_trials, dict(trials=t.recording.trials)
     yield hj.Recording.join, dict(recordings=[t.recording])
     yield hj.Recording.beside, dict(recordings=[t.recording])
-    rises, angle = (hj.Crossing("x", "rising"), hj.KinematicPhase(4, position="x", velocity="v"))
+    rises, angle = (
+        hj.Crossing("x", "rising"),
+        hj.KinematicPhase(4, position="x", velocity="v"),
+    )
     yield t.recording.mark, dict(event="e", crossing=rises)
     for name in ("column", "samples", "unit"):
         yield getattr(t.recording, name), dict(name="x")
     yield hj.recordings.estimate_phase, dict(recording=t.recording, definition=angle)
-    take = dict(recording=t.recording, phase=t.phase, inputs="f", outputs=("x", "v"), n_sections=2)
+    take = dict(
+        recording=t.recording,
+        phase=t.phase,
+        inputs="f",
+        outputs=("x", "v"),
+        n_sections=2,
+    )
     yield hj.recordings.section_data, take
     yield hj.identify_recording, take | dict(order=1)
     yield t.section_data.experiments, dict(periods=4)
-    yield hj.recordings.inspect, dict(recording=t.recording, inputs="f", outputs=("x", "v"))
+    yield (
+        hj.recordings.inspect,
+        dict(recording=t.recording, inputs="f", outputs=("x", "v")),
+    )
     yield hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit)
     yield hj.recordings.choose_order, dict(data=t.section_data)
     yield hj.recordings.hold_out, dict(data=t.section_data, order=1)
     yield hj.recordings.impulse_responses, dict(fit=t.found.fit, data=t.found.data)
     yield t.found.responses.of_model, dict(model=t.model)
-    yield without_drift, dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0)
+    yield (
+        without_drift,
+        dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0),
+    )
     table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
     yield hj.recordings.add_command, table
     yield hj.recordings.write_design, dict(path="missing/d.csv", design=t.one_input)
@@ -253,7 +293,10 @@ def subjects(t):
 
 
 def plants(t):
-    yield hj.plants.settle, dict(plant=t.plant, sections=hj.ClockPhase(4), outputs=("x", "v"))
+    yield (
+        hj.plants.settle,
+        dict(plant=t.plant, sections=hj.ClockPhase(4), outputs=("x", "v")),
+    )
     yield t.settled.run_experiments, dict(design=np.zeros((1, 88, 1)))
     yield t.settled.trajectory, dict(u=np.zeros((4, 1)))
     yield t.settled.perturbed_returns, dict(coordinates=("x", "v"))
@@ -267,7 +310,10 @@ def testing(t):
     yield hj.testing.spoil, dict(recording=t.recording, signals=("x",))
     yield hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5)
     force = np.zeros((1, 50, 1))
-    yield hj.testing.simulate_recording, dict(cycle=t.cycle, force=force, outputs=STATES, rate=16)
+    yield (
+        hj.testing.simulate_recording,
+        dict(cycle=t.cycle, force=force, outputs=STATES, rate=16),
+    )
 
 
 def files(t):
@@ -331,16 +377,46 @@ def without_arguments(t):
     natural = hj.recordings.natural_multipliers(t.variability)
     data, design = t.data, t.design
     for call in (
-        hj.Execution, hj.designs.Multipliers, hj.experiments.Options, natural.interval,
-        t.trajectory, t.trajectory.dense, t.cycle.trajectory, t.cycles.summary, t.model.monodromy,
-        t.model.rank, t.estimate.confidence_radius, design.inputs, design.expected_variance,
-        design.cycles, data.windows, data.summary, t.structured.ellipse,
-    ):  # fmt: skip
+        hj.Execution,
+        hj.designs.Multipliers,
+        hj.experiments.Options,
+        natural.interval,
+        t.trajectory,
+        t.trajectory.dense,
+        t.cycle.trajectory,
+        t.cycles.summary,
+        t.model.monodromy,
+        t.model.rank,
+        t.estimate.confidence_radius,
+        design.inputs,
+        design.expected_variance,
+        design.cycles,
+        data.windows,
+        data.summary,
+        t.structured.ellipse,
+    ):
         yield call, {}
 
 
 PARTS = (
-    without_arguments, scale, systems, sections, cycles, linear, designs, experiments, estimates,
-    series, fitting, designs_data, recordings, subjects, plants, testing,
-    files, conversions, plots, rhythms,
-)  # fmt: skip
+    without_arguments,
+    scale,
+    systems,
+    sections,
+    cycles,
+    linear,
+    designs,
+    experiments,
+    estimates,
+    series,
+    fitting,
+    designs_data,
+    recordings,
+    subjects,
+    plants,
+    testing,
+    files,
+    conversions,
+    plots,
+    rhythms,
+)

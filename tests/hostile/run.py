@@ -41,21 +41,73 @@ SECONDS = 5  # of computing, which no refusal takes
 NAN, INF, HUGE = float("nan"), float("inf"), 10**12
 TRACED = "the good argument, traced by JAX"
 VALUES = [
-    None, "missing/nope", "", ["x", "x"], 3, -1, 0, 0.5, HUGE, NAN, INF, -INF, 1j, True, [], (), {},
-    {"x": NAN}, {3: "x"}, [[1.0, 2.0], [3.0]], np.zeros(3), np.zeros((2, 2, 2)), np.zeros((0, 2)),
-    np.full((8, 2), NAN), np.array(["a"]), Other(), hj.Execution(), lambda *_: "x", TRACED,
-]  # fmt: skip
+    None,
+    "missing/nope",
+    "",
+    ["x", "x"],
+    3,
+    -1,
+    0,
+    0.5,
+    HUGE,
+    NAN,
+    INF,
+    -INF,
+    1j,
+    True,
+    [],
+    (),
+    {},
+    {"x": NAN},
+    {3: "x"},
+    [[1.0, 2.0], [3.0]],
+    np.zeros(3),
+    np.zeros((2, 2, 2)),
+    np.zeros((0, 2)),
+    np.full((8, 2), NAN),
+    np.array(["a"]),
+    Other(),
+    hj.Execution(),
+    lambda *_: "x",
+    TRACED,
+]
 # What messages call an argument that they do not name.
-CALLED = {"frequencies": "f =", "line": "f =", "frame": "column|signals", "definition": "phase"}
+CALLED = {
+    "frequencies": "f =",
+    "line": "f =",
+    "frame": "column|signals",
+    "definition": "phase",
+}
 # What compiles, or computes for seconds, where a value is right: a value must be wrong by its kind.
 SLOW = {
-    "LimitCycle.trajectory", "ObservedCycle.of", "ResponseFunction", "SectionMap", "continuation",
-    "find_limit_cycle", "find_limit_cycles", "fit_model", "identifiability", "identify_recording",
-    "linearize", "optimize_phases", "place_sections", "response_function", "run_experiments",
-    "section_map", "simulate", "simulate_recording", "stream_experiments", "sweep", "monte_carlo",
-    "write_report", "ObservedCycle.prepare", "ObservedCycle.residuals", "ObservedHTF.prepare",
-    "ObservedHTF.residuals", "enable_compilation_cache",
-}  # fmt: skip
+    "LimitCycle.trajectory",
+    "ObservedCycle.of",
+    "ResponseFunction",
+    "SectionMap",
+    "continuation",
+    "find_limit_cycle",
+    "find_limit_cycles",
+    "fit_model",
+    "identifiability",
+    "identify_recording",
+    "linearize",
+    "optimize_phases",
+    "place_sections",
+    "response_function",
+    "run_experiments",
+    "section_map",
+    "simulate",
+    "simulate_recording",
+    "stream_experiments",
+    "sweep",
+    "monte_carlo",
+    "write_report",
+    "ObservedCycle.prepare",
+    "ObservedCycle.residuals",
+    "ObservedHTF.prepare",
+    "ObservedHTF.residuals",
+    "enable_compilation_cache",
+}
 
 
 class Hang(BaseException):
@@ -78,9 +130,15 @@ def name_of(function) -> str:
 
 def kinds_of(function) -> dict:
     """The kinds by which the boundary checks the arguments, by name."""
-    for place in (function, getattr(function, "__init__", None), type(function).__call__):
+    for place in (
+        function,
+        getattr(function, "__init__", None),
+        type(function).__call__,
+    ):
         if hasattr(place, "kinds"):
-            return {k: v for k, v in place.kinds.by_name.items() if k not in ("self", "cls")}
+            return {
+                k: v for k, v in place.kinds.by_name.items() if k not in ("self", "cls")
+            }
     return {}
 
 
@@ -96,7 +154,9 @@ def attempt(function, good: dict, name: str, value) -> str:
             warnings.simplefilter("ignore")  # of overflows, which huge numbers deserve
             if value is TRACED:
                 arrays, rest = eqx.partition(traceable(good.get(name, 1)), eqx.is_array)
-                jax.make_jaxpr(lambda given: (call(eqx.combine(given, rest)), 0)[1])(arrays)
+                jax.make_jaxpr(lambda given: (call(eqx.combine(given, rest)), 0)[1])(
+                    arrays
+                )
             else:
                 call(value)
     except Hang:
@@ -116,7 +176,9 @@ def attempt(function, good: dict, name: str, value) -> str:
 def traceable(value):
     """Numbers as arrays, so that `jit` traces them."""
     numbers = value if isinstance(value, tuple | list) else [value]
-    return np.asarray(value) if all(isinstance(x, int | float) for x in numbers) else value
+    return (
+        np.asarray(value) if all(isinstance(x, int | float) for x in numbers) else value
+    )
 
 
 def wrong_with(error: hj.HybridJaxError, good: dict, name: str, value) -> str:
@@ -137,7 +199,11 @@ def wrong_with(error: hj.HybridJaxError, good: dict, name: str, value) -> str:
     named = any(re.search(rf"\b({word})", text, re.IGNORECASE) for word in words)
     named = named or bool(set(good) & set(re.findall(r"`(\w+)", text)))
     named = named or any(word in repr(value) for word in re.findall(r"'(\w+)'", text))
-    return "" if named or repr(value) in text or str(value) in text else f"UNNAMED {name}: {text}"
+    return (
+        ""
+        if named or repr(value) in text or str(value) in text
+        else f"UNNAMED {name}: {text}"
+    )
 
 
 def refused_by(kind, value) -> bool:
@@ -150,8 +216,12 @@ def refused_by(kind, value) -> bool:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m tests.hostile.run", description=__doc__)
-    parser.add_argument("--all", action="store_true", help="all values of all arguments")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.hostile.run", description=__doc__
+    )
+    parser.add_argument(
+        "--all", action="store_true", help="all values of all arguments"
+    )
     options = parser.parse_args()
     hj.enable_x64()
     matplotlib.use("agg")
@@ -168,7 +238,11 @@ def main() -> None:
                     continue
                 for value in VALUES if options.all else VALUES[turn % 16 :: 16]:
                     kind = kinds.get(argument)
-                    alone = value is not TRACED and kind is not None and refused_by(kind, value)
+                    alone = (
+                        value is not TRACED
+                        and kind is not None
+                        and refused_by(kind, value)
+                    )
                     if name in SLOW and not (alone or value is TRACED):
                         continue
                     what = attempt(function, good, argument, value)

@@ -28,7 +28,9 @@ def repeated(t):
 def record(t):
     u = np.random.default_rng(0).normal(size=(300, 2))
     y = np.asarray(t.model.simulate(u))
-    return hj.Record(u, y + 1e-3 * np.random.default_rng(1).normal(size=y.shape), n_sections=6)
+    return hj.Record(
+        u, y + 1e-3 * np.random.default_rng(1).normal(size=y.shape), n_sections=6
+    )
 
 
 def run(t, u):
@@ -42,7 +44,10 @@ def recording(t):
     z = [1.0 + 0j]
     force = np.random.default_rng(0).normal(size=121).repeat(20)[: len(TIME)]
     for f in force[:-1]:
-        z.append(z[-1] * np.exp(2j * np.pi * TIME[1] + 0.01 * (1 - abs(z[-1]) ** 2)) + 0.004 * f)
+        z.append(
+            z[-1] * np.exp(2j * np.pi * TIME[1] + 0.01 * (1 - abs(z[-1]) ** 2))
+            + 0.004 * f
+        )
     signals = {"f": force, "x": np.real(z), "v": np.imag(z)}
     return hj.Recording(TIME, signals, units={"f": "N"}).mark("strike", RISES)
 
@@ -53,7 +58,9 @@ def section_data(t, inputs, **options):
 
 
 def branch(t):
-    ends = [BranchEnd(mu, hj.Result.OK, "end of the parameter range") for mu in (0.1, 0.2)]
+    ends = [
+        BranchEnd(mu, hj.Result.OK, "end of the parameter range") for mu in (0.1, 0.2)
+    ]
     return Branch("mu", np.array([0.1, 0.2]), t.cycles, (), tuple(ends))
 
 
@@ -63,14 +70,20 @@ def plot(t):
 
 
 def population(t):
-    table = {"subject": list("abcdef"), "group": ["old", "new"] * 3, "strides": [50.0] * 6}
+    table = {
+        "subject": list("abcdef"),
+        "group": ["old", "new"] * 3,
+        "strides": [50.0] * 6,
+    }
     values = {"m": np.array([0.5, 0.6, 0.55, 0.7, 0.52, 0.63])}
     return hj.recordings.Population(table, values, {"m": np.full(6, 0.01)})
 
 
 def maps(t):
     values = np.random.default_rng(0).normal(size=(6, 5))
-    return hj.recordings.PopulationMaps(t.population.table, values, {"lag": np.arange(5.0)})
+    return hj.recordings.PopulationMaps(
+        t.population.table, values, {"lag": np.arange(5.0)}
+    )
 
 
 class Turning:
@@ -82,7 +95,9 @@ class Turning:
 
     def step(self, u, duration):
         t, x = self.state
-        self.state = np.array([t + duration, 1 + (x - 1 + u[0] * duration) * np.exp(-duration)])
+        self.state = np.array(
+            [t + duration, 1 + (x - 1 + u[0] * duration) * np.exp(-duration)]
+        )
         return self.signals()
 
     def signals(self):
@@ -118,7 +133,9 @@ MAKE = {
     "model": lambda t: hj.testing.synthetic_ldtp(),
     "design": lambda t: hj.multisine(6, 16, band=(0, 3.0), inputs=2),
     "one_input": lambda t: hj.multisine(4, 16, band=(0, 2.0)),
-    "data": lambda t: hj.experiments.simulate_experiments(t.model, t.design, start="periodic"),
+    "data": lambda t: hj.experiments.simulate_experiments(
+        t.model, t.design, start="periodic"
+    ),
     "repeated": repeated,
     "estimate": lambda t: hj.estimate_htf(t.data, (-1, 0, 1)),
     "uncertain": lambda t: dataclasses.replace(
@@ -128,11 +145,16 @@ MAKE = {
     "rational": lambda t: hj.fit_rational(t.estimate, output=0, poles=1, zeros=1),
     "structured": lambda t: hj.fit_multipliers(t.estimate, 2, overhang=6),
     "plan": lambda t: hj.optimal_design(t.model, t.design, goal=CURVE),
-    "decaying": lambda t: hj.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1))),
-    "block": lambda t: hj.experiments.add_noise(
-        hj.experiments.simulate_experiments(t.decaying, t.one_input, start="periodic"), snr=30
+    "decaying": lambda t: hj.LDTP(
+        np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1))
     ),
-    "study": lambda t: hj.designs.Study(t.one_input, order=1, standard_error=1e-9, goal=GOAL),
+    "block": lambda t: hj.experiments.add_noise(
+        hj.experiments.simulate_experiments(t.decaying, t.one_input, start="periodic"),
+        snr=30,
+    ),
+    "study": lambda t: hj.designs.Study(
+        t.one_input, order=1, standard_error=1e-9, goal=GOAL
+    ),
     "studied": lambda t: t.study.add(t.block),
     "joint": lambda t: hj.fit_ldtp(t.uncertain, t.model),
     "record": record,
@@ -144,7 +166,9 @@ MAKE = {
     "phase": lambda t: hj.recordings.estimate_phase(t.recording, RISES),
     "section_data": lambda t: section_data(t, "f", timing="clock"),
     "variability": lambda t: section_data(t, ()),
-    "beats": lambda t: hj.recordings.phase_response(t.recording, hj.AtEvent("strike"), input="f"),
+    "beats": lambda t: hj.recordings.phase_response(
+        t.recording, hj.AtEvent("strike"), input="f"
+    ),
     "found": lambda t: hj.identify_recording(
         t.recording, t.phase, inputs="f", outputs=("x",), order=1, n_sections=2
     ),
@@ -154,7 +178,7 @@ MAKE = {
     ),
     "observed": lambda t: hj.ObservedCycle.of(t.cycle, PHASE, NAMES),
     "plot": plot,
-}  # fmt: skip
+}
 
 
 class Things:

@@ -14,7 +14,9 @@ def scaled(seed, dims, ny, nu, modulus=0.7):
     """A random system whose largest multiplier has this modulus."""
     A, B, C, D = blocks_at_random(seed, dims, ny, nu)
     size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers[0])
-    return hj.LDTP.from_blocks([a * (modulus / size) ** (1 / len(dims)) for a in A], B, C, D)
+    return hj.LDTP.from_blocks(
+        [a * (modulus / size) ** (1 / len(dims)) for a in A], B, C, D
+    )
 
 
 @pytest.fixture(scope="session")

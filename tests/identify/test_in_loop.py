@@ -49,15 +49,21 @@ def series(model, seed, strides=300, **options):
     rng = np.random.default_rng(seed)
     r = rng.normal(size=(1, N * strides))
     u, y = run(model, r, 0 * r, rng, **options)
-    return hj.Record(np.stack([u[0], r[0]], axis=1), y[0, :, None], n_sections=N, inputs=("u", "r"))
+    return hj.Record(
+        np.stack([u[0], r[0]], axis=1), y[0, :, None], n_sections=N, inputs=("u", "r")
+    )
 
 
 def experiments(model, seed, count, noise=0.0, discard=30, together=False):
-    design = hj.multisine(N, 8, band=(0, N / 2), inputs=2, division="orthogonal", amplitude=1.0)
+    design = hj.multisine(
+        N, 8, band=(0, N / 2), inputs=2, division="orthogonal", amplitude=1.0
+    )
     z = design.realizations(count, seed).inputs(8 + discard)
     r, d = (z.sum(axis=2), 0 * z[..., 0]) if together else np.moveaxis(z, 2, 0)
     u, y = run(model, r, d, np.random.default_rng(seed), noise)
-    inputs = np.concatenate([u[..., None], z * [1, 1e-9]], axis=2)  # (a unit of its own)
+    inputs = np.concatenate(
+        [u[..., None], z * [1, 1e-9]], axis=2
+    )  # (a unit of its own)
     return hj.ExperimentData(inputs, y[..., None], n_sections=N, periods=8, inputs=SEEN)
 
 
@@ -67,7 +73,9 @@ def controller():
 
 
 def test_plant_and_controller_of_exact_data(plant):
-    loop = hj.identify.loop(experiments(plant, 0, 2, discard=200), at_input="r", at_output="d")
+    loop = hj.identify.loop(
+        experiments(plant, 0, 2, discard=200), at_input="r", at_output="d"
+    )
     f, exact = loop.plant.f, plant.feedback(GAIN)
     assert len(f) == 12 and not loop.missing
     assert loop.plant.error(plant.htf(f)) < 1e-9
@@ -77,14 +85,18 @@ def test_plant_and_controller_of_exact_data(plant):
     entered = -np.array((controller().htf(f) @ exact.htf(f)).H)
     entered[loop.closed.harmonics.index(0)] += 1
     np.testing.assert_allclose(loop.sensitivity.H, entered, atol=1e-9)
-    both = hj.estimate_htf(experiments(plant, 0, 2, 0, 200, together=True), reference=SEEN[1:])
+    both = hj.estimate_htf(
+        experiments(plant, 0, 2, 0, 200, together=True), reference=SEEN[1:]
+    )
     assert both.error(plant.htf(both.f)) < 1e-9
     fit = hj.fit_multipliers(loop.plant, 2, check=False)  # (of exact data)
     assert fit.compare(plant.multipliers).max_error < 1e-8
     closed = hj.fit_multipliers(loop.closed, 2, check=False)
     assert closed.compare(exact.multipliers).max_error < 1e-8
     data = experiments(plant, 0, 2)
-    data = hj.ExperimentData(data.u[..., :2], data.y, n_sections=N, periods=8, inputs=SEEN[:2])
+    data = hj.ExperimentData(
+        data.u[..., :2], data.y, n_sections=N, periods=8, inputs=SEEN[:2]
+    )
     one = hj.identify.loop(data, at_input="r")
     assert one.controller is None and "controller is not estimated" in repr(one)
 
@@ -96,7 +108,9 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
     u, y = run(plant, r, 0 * r, np.random.default_rng(0))
     u, r, y = (np.fft.ifft(faint * np.fft.fft(z[:, -8 * N :])).real for z in (u, r, y))
     inputs = np.stack([u, r], axis=2)
-    data = hj.ExperimentData(inputs, y[..., None], n_sections=N, periods=8, inputs=("u", "r"))
+    data = hj.ExperimentData(
+        inputs, y[..., None], n_sections=N, periods=8, inputs=("u", "r")
+    )
     for lines, threshold in ((12, 1e-4), (8, 1e-2)):
         htf = hj.estimate_htf(data, reference="r", threshold=threshold)
         assert len(htf.f) == lines and htf.error(plant.htf(htf.f)) < 1e-9
@@ -117,8 +131,12 @@ def test_discs_and_multipliers_of_transfer_functions_hold(plant):
 
 
 def test_regions_of_series_hold_in_the_loop(plant):
-    fits = (hj.fit_ldtp(series(plant, k, noise=0.5), 2, reference="r") for k in range(20))
-    assert sum(fit.contains(plant.multipliers)[0] for fit in fits) >= 16  # (less: one in 2500)
+    fits = (
+        hj.fit_ldtp(series(plant, k, noise=0.5), 2, reference="r") for k in range(20)
+    )
+    assert (
+        sum(fit.contains(plant.multipliers)[0] for fit in fits) >= 16
+    )  # (less: one in 2500)
 
 
 def test_instruments_of_series_hold_in_the_loop(plant):
@@ -130,20 +148,30 @@ def test_instruments_of_series_hold_in_the_loop(plant):
         held.append(fit.contains(plant.multipliers)[0])
         htf = fit.htf(truth.f)
         discs.append(np.mean(np.abs(htf.H - truth.H) <= htf.confidence_radius()))
-        few = hj.fit_series(series(plant, seed, 40, noise=0.5), 2, reference="r", check=False)
-        off.append(abs(few.multipliers[0] - plant.multipliers[0]) / few.standard_errors[0])
+        few = hj.fit_series(
+            series(plant, seed, 40, noise=0.5), 2, reference="r", check=False
+        )
+        off.append(
+            abs(few.multipliers[0] - plant.multipliers[0]) / few.standard_errors[0]
+        )
     assert sum(held) >= 25  # (of 30 with 95 %: less in one of 600)
-    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3  # (few cycles are divided into blocks)
+    assert (
+        0.7 < np.sqrt(np.mean(np.square(off))) < 1.3
+    )  # (few cycles are divided into blocks)
     assert 0.88 < np.mean(discs) < 0.98
     assert not fit.doubt
     moved = dataclasses.replace(series(plant, 0, 150, noise=0.5), drift=20)
     moved.y[:, 0] += 30 * np.sin(np.arange(600) / 38)
     moved.u[:] += 1e3  # (offsets of inputs make a drift, too)
     assert hj.fit_series(moved, 2, reference="r").standard_errors[0] < 0.2
-    with pytest.raises(hj.DefinitionError, match="the reference determines 2 multipliers, not 3"):
+    with pytest.raises(
+        hj.DefinitionError, match="the reference determines 2 multipliers, not 3"
+    ):
         hj.fit_series(series(plant, 0, noise=0.7), 3, reference="r")
     assert best_order(series(plant, 0), ("r",), 4) == (2, "")
-    assert "3 times too few" in best_order(series(plant, 0, 20, noise=0.1), ("r",), 4)[1]
+    assert (
+        "3 times too few" in best_order(series(plant, 0, 20, noise=0.1), ("r",), 4)[1]
+    )
 
 
 def test_an_order_that_is_too_low_is_noticed_in_the_loop():
@@ -182,7 +210,9 @@ def test_whether_outputs_answer_at_once_is_found(plant):
         assert bool(np.asarray(fit.model.D).any()) == bool(through)
         np.testing.assert_allclose(fit.model.D, through, atol=0.1)
         assert fit.contains(plant.multipliers, 0.999).all()
-    r = np.sin(0.2 * np.pi * np.arange(60 * N))[None]  # (a statistic of -5e-4, by rounding)
+    r = np.sin(0.2 * np.pi * np.arange(60 * N))[
+        None
+    ]  # (a statistic of -5e-4, by rounding)
     u, y = run(plant, r, 0 * r, np.random.default_rng(0), waits=True)
     data = hj.Record(np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r"))
     assert "not determine D" in repr(hj.fit_ldtp(data, 2, reference="r", check=False))
@@ -198,8 +228,13 @@ def test_a_plant_that_is_stable_in_its_loop_only():
     r, e = np.random.default_rng(0).normal(size=(2, N * 400))
     x = np.asarray(plant.feedback([[0.9]]).simulate((r - 0.27 * e)[:, None]))[:, 0]
     y = x + 0.3 * e
-    data = hj.Record(np.stack([r - 0.9 * y, r], 1), y[:, None], n_sections=N, inputs=("u", "r"))
-    for fit in (hj.fit_ldtp(data, 1, reference="r"), hj.fit_series(data, 1, reference="r")):
+    data = hj.Record(
+        np.stack([r - 0.9 * y, r], 1), y[:, None], n_sections=N, inputs=("u", "r")
+    )
+    for fit in (
+        hj.fit_ldtp(data, 1, reference="r"),
+        hj.fit_series(data, 1, reference="r"),
+    ):
         assert fit.contains(plant.multipliers, 0.999).all()
         assert abs(fit.multipliers[0] - 1.2**N) < 0.1
 
@@ -215,8 +250,13 @@ def test_residuals_tell_of_the_loop(plant):
     assert not hj.validate(biased, late, reference="r").independent
     driven = dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",))
     for record, answers in (alone, True), (driven, False):
-        fit, grid = hj.fit_series(record, 2, check=False), CycleGrid.from_records([record])
-        assert (feedback_test(grid, grid.y - fit.predict(grid, True))[0] < 1e-3) == answers
+        fit, grid = (
+            hj.fit_series(record, 2, check=False),
+            CycleGrid.from_records([record]),
+        )
+        assert (
+            feedback_test(grid, grid.y - fit.predict(grid, True))[0] < 1e-3
+        ) == answers
     unstable = hj.LDTP(1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1)))
     unstable = dataclasses.replace(unstable, inputs=("u",), outputs=early.outputs)
     with pytest.raises(hj.DefinitionError, match="grows without bound: validate"):
@@ -237,10 +277,14 @@ def test_what_does_not_fit_is_refused(plant):
         hj.fit_ldtp(same, 2, reference="r")
     shape = {"n_sections": N, "periods": 8, "inputs": ("u", "r")}
     with refused("u and r are equal"):
-        hj.identify.loop(hj.ExperimentData(data.u[..., [1, 1]], data.y, **shape), at_input="r")
+        hj.identify.loop(
+            hj.ExperimentData(data.u[..., [1, 1]], data.y, **shape), at_input="r"
+        )
     with refused("name those that enter at the plant's input"):
         hj.identify.loop(data)
     with refused("excites too little: at f = .* tells 2 of 4 components apart"):
-        hj.estimate_htf(hj.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape), reference="r")
+        hj.estimate_htf(
+            hj.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape), reference="r"
+        )
     with refused("`reference`, `noise` and `start` are for time series"):
         hj.fit_ldtp(plant.htf([0.3]), 2, reference="r")

@@ -11,7 +11,11 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.joint.frequency import transfer, transfer_slopes
-from hybridjax.identify.periodic import PeriodicModel, characteristic_slopes, local_coordinates
+from hybridjax.identify.periodic import (
+    PeriodicModel,
+    characteristic_slopes,
+    local_coordinates,
+)
 from hybridjax.linear.frequency_response import harmonic_transfer
 
 from .conftest import scaled
@@ -44,7 +48,9 @@ def shaken(model, rng, size=0.02):
     """Other matrices nearby, in which zeros of the padding stay zero."""
     parts = lambda m: (m.A, m.B, m.C, m.D)  # noqa: E731
     return eqx.tree_at(
-        parts, model, tuple(x * (1 + size * rng.normal(size=x.shape)) for x in parts(model))
+        parts,
+        model,
+        tuple(x * (1 + size * rng.normal(size=x.shape)) for x in parts(model)),
     )
 
 
@@ -61,31 +67,54 @@ def test_the_coordinates_are_as_many_as_there_are_models(model, exact, growth):
     assert coordinates.size == entries - (dims**2).sum()
     found = transfer(coordinates.model, F, exact.harmonics)
     np.testing.assert_allclose(found, model.htf(F).H, rtol=1e-9, atol=1e-9)
-    J = np.concatenate([s.reshape(len(s), -1) for _, s in
-                        transfer_slopes(coordinates, F, exact.harmonics)], axis=1)  # fmt: skip
-    assert np.linalg.matrix_rank(np.concatenate([J.real, J.imag], axis=1)) == coordinates.size
+    J = np.concatenate(
+        [
+            s.reshape(len(s), -1)
+            for _, s in transfer_slopes(coordinates, F, exact.harmonics)
+        ],
+        axis=1,
+    )
+    assert (
+        np.linalg.matrix_rank(np.concatenate([J.real, J.imag], axis=1))
+        == coordinates.size
+    )
 
 
 @pytest.mark.parametrize("errors", (0, 2))
 def test_derivatives_are_those_of_jax(model, errors):
     rng = np.random.default_rng(0)
     matrices = PeriodicModel.of(model, ONE, errors)
-    matrices = matrices._replace(K=[x + 0.3 * rng.normal(size=x.shape) for x in matrices.K])
+    matrices = matrices._replace(
+        K=[x + 0.3 * rng.normal(size=x.shape) for x in matrices.K]
+    )
     coordinates = local_coordinates(matrices, direct=True)
     step = rng.normal(size=coordinates.size)
     arrays = lambda m: [  # noqa: E731
-        jnp.asarray(getattr(m.to_ldtp(ONE, model.inputs, model.outputs), x)) for x in "ABCD"
+        jnp.asarray(getattr(m.to_ldtp(ONE, model.inputs, model.outputs), x))
+        for x in "ABCD"
     ]
-    here, *ends = map(arrays, (coordinates.model, *map(coordinates.moved, (-step, step))))
-    change = [(b - a) / 2 for a, b in zip(*ends, strict=True)]  # (no terms of third order)
-    _, true = jax.jvp(lambda *x: harmonic_transfer(*x, jnp.asarray(F)), tuple(here), tuple(change))
+    here, *ends = map(
+        arrays, (coordinates.model, *map(coordinates.moved, (-step, step)))
+    )
+    change = [
+        (b - a) / 2 for a, b in zip(*ends, strict=True)
+    ]  # (no terms of third order)
+    _, true = jax.jvp(
+        lambda *x: harmonic_transfer(*x, jnp.asarray(F)), tuple(here), tuple(change)
+    )
     harmonics = (-2, 0, 1)
-    slopes = np.concatenate([s for _, s in transfer_slopes(coordinates, F, harmonics)], axis=2)
+    slopes = np.concatenate(
+        [s for _, s in transfer_slopes(coordinates, F, harmonics)], axis=2
+    )
     true = np.asarray(true)[np.array(harmonics)]
     np.testing.assert_allclose(np.tensordot(step, slopes, 1), true, atol=1e-11)
     c, by_step = characteristic_slopes(coordinates)
-    np.testing.assert_allclose(c, np.poly(np.asarray(model.multipliers)).real[1:], atol=1e-12)
-    moved = (local_coordinates(coordinates.moved(h * step), True) for h in (1e-6, -1e-6))
+    np.testing.assert_allclose(
+        c, np.poly(np.asarray(model.multipliers)).real[1:], atol=1e-12
+    )
+    moved = (
+        local_coordinates(coordinates.moved(h * step), True) for h in (1e-6, -1e-6)
+    )
     ahead, back = (characteristic_slopes(x)[0] for x in moved)
     np.testing.assert_allclose(by_step @ step, (ahead - back) / 2e-6, rtol=1e-6)
 
@@ -98,10 +127,14 @@ def test_exact_htfs_give_the_exact_model(model, exact, variance):
     assert "too few dimensions" in repr(hj.fit_ldtp(htf, 1))
     dense = model.htf(np.linspace(0.01, 0.49, 97))
     assert "`order` may be too low" in repr(hj.fit_multipliers(dense, 1))
-    off = 1e-8 if variance is None else 1e-5  # (where they are known, 0.1 standard errors do)
+    off = (
+        1e-8 if variance is None else 1e-5
+    )  # (where they are known, 0.1 standard errors do)
     assert fit.compare(model.multipliers).max_error < off
     assert np.max(fit.model.htf(F).error(exact)) < off
-    np.testing.assert_allclose(fit.htf(F).H, fit.model.htf(F, fit.harmonics).H, atol=1e-12)
+    np.testing.assert_allclose(
+        fit.htf(F).H, fit.model.htf(F, fit.harmonics).H, atol=1e-12
+    )
 
 
 def test_too_few_dimensions_are_named_in_strong_noise(hopper_cycle):
@@ -151,7 +184,9 @@ def test_errors_are_as_small_as_the_bound(model, exact):
 
 def test_with_one_section_the_bound_is_that_of_free_numerators():
     """Then both have as many unknowns, and describe the same systems."""
-    one = hj.LDTP([[[0.6, 0.3], [-0.4, 0.5]]], [[[1.0], [0.5]]], [[[1.0, -0.3]]], [[[0.2]]])
+    one = hj.LDTP(
+        [[[0.6, 0.3], [-0.4, 0.5]]], [[[1.0], [0.5]]], [[[1.0, -0.3]]], [[[0.2]]]
+    )
     f = np.linspace(0.02, 0.48, 30)
     htf = with_values(one.htf(f), one.htf(f).H, 1e-4)
     free = hj.identify.multiplier_bound(one, htf, overhang=0)

@@ -9,7 +9,11 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.periodic import PeriodicModel, local_coordinates
-from hybridjax.identify.series.prediction import SeriesPart, SeriesProblem, noise_spectrum
+from hybridjax.identify.series.prediction import (
+    SeriesPart,
+    SeriesProblem,
+    noise_spectrum,
+)
 from hybridjax.identify.series.records import CycleGrid
 from hybridjax.identify.series.residuals import about_misfit, answering
 
@@ -71,7 +75,9 @@ def test_predictions_are_those_of_the_recursion_sample_by_sample(small, gappy):
             e = y - model.C[n] @ x - model.D[n] @ u
             seen, S = np.isfinite(e), COVARIANCES[n]
             mean = S[:, seen] @ np.linalg.solve(S[np.ix_(seen, seen)], e[seen])
-            np.testing.assert_allclose(path.error[n][r, cycle], np.where(seen, e, 0.0), atol=1e-11)
+            np.testing.assert_allclose(
+                path.error[n][r, cycle], np.where(seen, e, 0.0), atol=1e-11
+            )
             x = model.A[n] @ x + model.B[n] @ u + model.K[n] @ mean
 
 
@@ -93,7 +99,9 @@ def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
 def test_series_without_noise_are_met_exactly(small, start):
     x0 = np.ones(3) if start == "free" else None
     data = with_gaps(record(small, 4 * 60 + 3, 0, first_section=1, x0=x0), 0.02, 0)
-    fit = hj.fit_ldtp(data, eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start=start)
+    fit = hj.fit_ldtp(
+        data, eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start=start
+    )
     assert fit.compare(small.multipliers).max_error < 1e-9
     f = np.array([0.1, 0.4])
     assert fit.htf(f).error(small.htf(f)).max() < 1e-9
@@ -105,7 +113,9 @@ def test_a_drift_is_found_where_samples_are_missing(small):
     whole = record(small, 4 * 60, 0)
     y = whole.y + np.tile(np.arange(8.0).reshape(4, 2), (60, 1))
     data = with_gaps(hj.Record(whole.u, y, n_sections=4, drift=np.inf), 0.05, 0)
-    fit = hj.fit_ldtp(data, eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start="cycle")
+    fit = hj.fit_ldtp(
+        data, eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start="cycle"
+    )
     assert fit.compare(small.multipliers).max_error < 1e-9
     assert fit.freedom == np.isfinite(data.y).sum() - 8 - fit.unknowns  # (8 constants)
 
@@ -113,7 +123,11 @@ def test_a_drift_is_found_where_samples_are_missing(small):
 def test_too_few_dimensions_are_named(small):
     """Of plants with strong noise, and of exact ones (residuals are rounding); too many, too."""
     for noise, spare in ((0.3, "dimension less"), (0.0, "not determine")):
-        for dims, doubt in ((small.dims, ""), (2, "depend on the inputs"), (small.dims + 1, spare)):
+        for dims, doubt in (
+            (small.dims, ""),
+            (2, "depend on the inputs"),
+            (small.dims + 1, spare),
+        ):
             fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
             assert doubt in fit.doubt and bool(doubt) == bool(fit.doubt)
 
@@ -123,7 +137,9 @@ def test_inputs_that_their_past_determines(through):
     """Only fits with D and without it tell whether outputs answer two lines at once."""
     model = scaled(5, (2, 2, 2), 1, 1)
     model = eqx.tree_at(lambda m: m.D, model, through * model.D)
-    u = np.cos(2 * np.pi / 3 * np.outer(np.arange(1200), (0.3, 1.1))).sum(axis=1, keepdims=True)
+    u = np.cos(2 * np.pi / 3 * np.outer(np.arange(1200), (0.3, 1.1))).sum(
+        axis=1, keepdims=True
+    )
     noise = 0.03 * np.random.default_rng(0).normal(size=u.shape)
     data = hj.Record(u, np.asarray(model.simulate(u)) + noise, n_sections=3)
     fit = hj.fit_ldtp(data, 2, noise="innovations", check=False)
@@ -133,7 +149,9 @@ def test_inputs_that_their_past_determines(through):
 def test_residuals_of_exact_data_tell_nothing(small):
     """What depends on the input, but is rounding."""
     grid = CycleGrid.from_records([record(small, 4 * 100, 0)])
-    response = grid.u[..., :1] + 0.1 * np.random.default_rng(0).normal(size=grid.y.shape)
+    response = grid.u[..., :1] + 0.1 * np.random.default_rng(0).normal(
+        size=grid.y.shape
+    )
     for size, told in ((1e-3, True), (1e-13, False)):
         text = about_misfit(grid, grid, size * response, innovations=False)
         assert bool(text) == told == bool("noise='innovations'" in text)
@@ -143,8 +161,12 @@ def test_residuals_of_exact_data_tell_nothing(small):
 
 def test_outputs_that_do_not_answer_are_refused(small):
     data = record(small, 4 * 60, 0)
-    noise = hj.Record(data.u, np.random.default_rng(0).normal(size=data.y.shape), n_sections=4)
-    with pytest.raises(hj.DefinitionError, match="the outputs do not answer the inputs"):
+    noise = hj.Record(
+        data.u, np.random.default_rng(0).normal(size=data.y.shape), n_sections=4
+    )
+    with pytest.raises(
+        hj.DefinitionError, match="the outputs do not answer the inputs"
+    ):
         hj.fit_ldtp(noise, small)
 
 
@@ -153,7 +175,9 @@ def test_periodic_series_and_their_htfs_agree(small):
     design = hj.multisine(periods=32, n_sections=4, band=(0, 2), lines="odd", seed=0)
     data = hj.experiments.simulate_experiments(small, design, start="periodic")
     rng = np.random.default_rng(0)
-    data = eqx.tree_at(lambda d: d.y, data, data.y + 0.05 * rng.normal(size=data.y.shape))
+    data = eqx.tree_at(
+        lambda d: d.y, data, data.y + 0.05 * rng.normal(size=data.y.shape)
+    )
     in_time = hj.fit_ldtp(data, small)
     htf = hj.estimate_htf(data)
     sigma = np.sqrt(in_time.noise_spectrum(htf.f[:1], (0,))[0, 0])
@@ -163,7 +187,9 @@ def test_periodic_series_and_their_htfs_agree(small):
     in_frequency = hj.fit_ldtp(htf, small)
     apart = np.abs(in_time.multipliers - in_frequency.multipliers).max()
     assert apart < 0.5 * in_time.standard_errors[0]
-    np.testing.assert_allclose(in_time.standard_errors, in_frequency.standard_errors, rtol=0.2)
+    np.testing.assert_allclose(
+        in_time.standard_errors, in_frequency.standard_errors, rtol=0.2
+    )
 
 
 def test_noise_that_drives_the_system_is_found(small):
@@ -189,15 +215,21 @@ def test_errors_are_as_large_as_said(small):
     ]
     square = [fit.distance(small.multipliers)[0] for fit in fits]
     assert 1e-3 < stats.chi2(2 * runs).cdf(sum(square)) < 1 - 1e-3
-    assert covered(sum(int(fit.contains(small.multipliers[0]).all()) for fit in fits), runs)
+    assert covered(
+        sum(int(fit.contains(small.multipliers[0]).all()) for fit in fits), runs
+    )
 
 
 def test_the_spectrum_of_noise(small):
     """White: its variance, everywhere. Else, by Parseval, the sum over all lines that end there."""
     assert noise_spectrum(driven(small, 0.3), []).shape == (4, 0, 2)
     f, N = np.array([0.1, 0.3]), 4
-    white = hj.LDTP(np.zeros((N, 1, 1)), np.zeros((N, 1, 2)), np.zeros((N, 2, 1)),
-                    np.broadcast_to(0.3 * np.eye(2), (N, 2, 2)))  # fmt: skip
+    white = hj.LDTP(
+        np.zeros((N, 1, 1)),
+        np.zeros((N, 1, 2)),
+        np.zeros((N, 2, 1)),
+        np.broadcast_to(0.3 * np.eye(2), (N, 2, 2)),
+    )
     np.testing.assert_allclose(noise_spectrum(white, f), 0.09)
     noise = driven(small, 0.3)
     found = noise_spectrum(noise, f, (-1, 1))

@@ -23,7 +23,9 @@ def test_any_system_is_identified_exactly(shape, seed):
     N = len(dims)
     top = N * periods // 2 / periods
     design = hj.multisine(N, periods, (0, top), 1.0, seed, lines="two-phase", inputs=nu)
-    estimate = hj.estimate_htf(hj.experiments.simulate_experiments(model, design, start="periodic"))
+    estimate = hj.estimate_htf(
+        hj.experiments.simulate_experiments(model, design, start="periodic")
+    )
     np.testing.assert_array_equal(estimate.f, design.frequencies)
     exact = model.htf(estimate.f)
     assert np.abs(estimate.H - exact.H).max() < 1e-11 * np.abs(exact.H).max()
@@ -48,7 +50,9 @@ def test_repeated_frequencies_are_averaged_by_their_power():
     u = design.inputs(9)
     y = u * np.array([1.0, 3.0])[:, None, None]
     estimate = hj.estimate_htf(hj.ExperimentData(u, y, n_sections=4, periods=4))
-    np.testing.assert_allclose(estimate[0][0, 0, 0], (1 * 1 + 4 * 3) / (1 + 4), atol=1e-13)
+    np.testing.assert_allclose(
+        estimate[0][0, 0, 0], (1 * 1 + 4 * 3) / (1 + 4), atol=1e-13
+    )
     np.testing.assert_allclose(estimate[1], 0, atol=1e-13)
 
 
@@ -74,17 +78,24 @@ def test_failed_experiments_are_left_out(paper_data, paper_estimate):
 def record(*cosines, n_sections=8, periods=8, cycles=8):
     """One experiment per argument, a list of (f, phase); the output repeats the input."""
     n = np.arange(n_sections * cycles)
-    u = [sum(np.cos(2 * np.pi * f * n / n_sections + phase) for f, phase in c) for c in cosines]
+    u = [
+        sum(np.cos(2 * np.pi * f * n / n_sections + phase) for f, phase in c)
+        for c in cosines
+    ]
     u = np.stack(u)[..., None]
     return hj.ExperimentData(u, u, n_sections=n_sections, periods=periods)
 
 
 def test_half_integers_need_two_phases():
-    np.testing.assert_array_equal(hj.estimate_htf(record([(1.5, 0.3), (0.25, 0.0)])).f, [0.25])
+    np.testing.assert_array_equal(
+        hj.estimate_htf(record([(1.5, 0.3), (0.25, 0.0)])).f, [0.25]
+    )
     opposite = record([(1.5, 0.3)], [(1.5, 0.3 + np.pi)])
     with pytest.raises(hj.DefinitionError, match="multiples of 1/2 with two phases"):
         hj.estimate_htf(opposite)
     uneven = hj.estimate_htf(record([(1.5, 0.3)], [(1.5, 0.9)], [(1.5, 2.0)]))
     np.testing.assert_allclose(uneven[0], 1.0, atol=1e-13)
     np.testing.assert_allclose(uneven[-3], 0.0, atol=1e-13)
-    np.testing.assert_array_equal(uneven.scatter.freedom, 1)  # (of three for two unknowns)
+    np.testing.assert_array_equal(
+        uneven.scatter.freedom, 1
+    )  # (of three for two unknowns)

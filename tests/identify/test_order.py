@@ -6,7 +6,13 @@ import pytest
 import hybridjax as hj
 
 from .conftest import scaled
-from .test_uncertainty import covered, noisy, small as small, variance as variance, with_variance
+from .test_uncertainty import (
+    covered,
+    noisy,
+    small as small,
+    variance as variance,
+    with_variance,
+)
 
 
 @pytest.mark.parametrize("size", [1.0, 100.0])
@@ -14,7 +20,9 @@ def test_two_multipliers_are_two(size, small, variance):
     _, htf = small
     data = noisy(htf, size * variance, np.random.default_rng(0))
     found = hj.select_order(data, 4)
-    assert np.all(found.deviation[:2] > 10) and np.all(np.abs(found.strength[2:] - 1) < 0.2)
+    assert np.all(found.deviation[:2] > 10) and np.all(
+        np.abs(found.strength[2:] - 1) < 0.2
+    )
     np.testing.assert_allclose(found.cost[2:] / found.freedom[2:], 1.0, atol=0.2)
     blind = hj.select_order(with_variance(htf, data.H, None), 4)
     assert all((x.by_rank, x.by_mdl, x.order) == (2, 2, 2) for x in (found, blind))
@@ -42,9 +50,16 @@ def test_the_level_of_the_rank_test(small, variance, few, runs):
 
 def test_exact_htfs_have_no_more_multipliers(small):
     _, htf = small
-    with pytest.raises(hj.DefinitionError, match="the data support 2 multipliers, not 3"):
+    with pytest.raises(
+        hj.DefinitionError, match="the data support 2 multipliers, not 3"
+    ):
         hj.fit_multipliers(htf, 3)
     spurious = hj.fit_multipliers(htf, 3, check=False)
     assert np.isinf(spurious.standard_errors).all() and "± inf" in repr(spurious)
-    assert spurious.contains(0.5).all() and "support 2 multipliers, not 3" in spurious.doubt
-    assert hj.select_order(scaled(12, (1, 1), 1, 1).htf(np.arange(1, 46) / 46)).order == 1
+    assert (
+        spurious.contains(0.5).all()
+        and "support 2 multipliers, not 3" in spurious.doubt
+    )
+    assert (
+        hj.select_order(scaled(12, (1, 1), 1, 1).htf(np.arange(1, 46) / 46)).order == 1
+    )

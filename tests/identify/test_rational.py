@@ -30,14 +30,20 @@ def test_no_start_finds_a_better_fit(exact):
         return np.concatenate([e.real, e.imag])
 
     own = [*fit.denominator[0, 1:], *fit.numerator[0]]
-    np.testing.assert_allclose(np.linalg.norm(residual(own)), fit.residual[0], rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.norm(residual(own)), fit.residual[0], rtol=1e-9
+    )
     rng = np.random.default_rng(0)
-    for radius, angle in zip(rng.uniform(0.5, 1.0, 20), rng.uniform(0, 2, 20), strict=True):
+    for radius, angle in zip(
+        rng.uniform(0.5, 1.0, 20), rng.uniform(0, 2, 20), strict=True
+    ):
         a = [-2 * radius * np.cos(angle), radius**2]
         columns = [rational(f, b, [1, *a], 32) for b in ([1], [0, 1])]
         columns = np.stack([np.concatenate([c.real, c.imag]) for c in columns], axis=1)
         b = np.linalg.lstsq(columns, np.concatenate([h.real, h.imag]))[0]
-        found = scipy.optimize.least_squares(residual, [*a, *b], x_scale="jac", max_nfev=50)
+        found = scipy.optimize.least_squares(
+            residual, [*a, *b], x_scale="jac", max_nfev=50
+        )
         assert np.linalg.norm(found.fun) > fit.residual[0] * (1 - 1e-6)
 
 
@@ -49,7 +55,9 @@ def test_a_rational_function_is_found_exactly():
     fit = hj.fit_rational(hj.HTF(f, h[None, :, None, None], 0, 5), poles=3, zeros=2)
     np.testing.assert_allclose(fit.poles[0], poles, atol=1e-7)
     np.testing.assert_allclose(fit.numerator[0], numerator, atol=1e-6)
-    np.testing.assert_allclose(np.sort_complex(fit.zeros[0]), np.roots(numerator)[::-1], atol=1e-6)
+    np.testing.assert_allclose(
+        np.sort_complex(fit.zeros[0]), np.roots(numerator)[::-1], atol=1e-6
+    )
     np.testing.assert_allclose(fit.htf(f).H[0, :, 0, 0], h, atol=1e-6)
     assert fit.residual[0] < 1e-7
     # More poles than there are: the fit stays good and the true ones are among them.

@@ -35,14 +35,20 @@ def test_random_systems(shape, seed):
     for source in (htf, model.impulse_response(40)):
         found = hj.identify.realize(source)
         assert np.all(np.asarray(found.dims) <= np.asarray(model.dims))
-        assert found.htf(f).error(hj.HTF(f, htf.H, htf.harmonics, N, found.inputs,
-            found.outputs)).max() < 1e-7  # fmt: skip
+        assert (
+            found.htf(f)
+            .error(hj.HTF(f, htf.H, htf.harmonics, N, found.inputs, found.outputs))
+            .max()
+            < 1e-7
+        )
 
 
 def test_from_a_fit_to_a_noisy_record(hopper, multipliers):
     """States below the noise are left out, and what is left predicts well."""
     data = record(hopper, 32 * 300, 3)
-    y = data.y + 0.01 * data.y.std(axis=0) * np.random.default_rng(4).normal(size=data.y.shape)
+    y = data.y + 0.01 * data.y.std(axis=0) * np.random.default_rng(4).normal(
+        size=data.y.shape
+    )
     fit = hj.fit_series(hj.Record(data.u, y, n_sections=32, outputs=("yM", "vM")), 2)
     model = hj.identify.realize(fit, order=2)
     assert np.all((np.asarray(model.dims) >= 2) & (np.asarray(model.dims) <= 4))
@@ -56,6 +62,8 @@ def test_from_noisy_htfs(exact, hopper, multipliers):
     variance = np.full(exact.H.shape, (1e-4 * np.abs(exact.H).max()) ** 2)
     error = rng.normal(size=exact.H.shape) + 1j * rng.normal(size=exact.H.shape)
     H = exact.H + np.sqrt(variance / 2) * error
-    model = hj.identify.realize(dataclasses.replace(exact, H=H, variance=variance), order=2)
+    model = hj.identify.realize(
+        dataclasses.replace(exact, H=H, variance=variance), order=2
+    )
     assert np.all(np.asarray(model.dims) <= MINIMAL)
     assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3

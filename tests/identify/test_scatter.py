@@ -48,7 +48,9 @@ def inside(model, count, repeats, variance, runs=40, **more):
         (2, 3, "noise", dict(noise=0.1, process_noise=0.02)),
     ],
 )
-def test_discs_hold_the_truth_as_often_as_they_say(model, count, repeats, variance, noise):
+def test_discs_hold_the_truth_as_often_as_they_say(
+    model, count, repeats, variance, noise
+):
     hits, of = inside(model, count, repeats, variance, **noise)
     assert stats.binomtest(int(hits), of, 0.95).pvalue > 1e-3
 
@@ -62,7 +64,9 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     error = constant * np.exp(2j * np.pi * rng.random((R, runs)))
     error += noise * rng.normal(size=(R, runs, 2)) @ [np.sqrt(0.5), 1j * np.sqrt(0.5)]
     shares = np.full((R, 1), 1 / R)
-    if constant == 0:  # Of experiments of different strengths; Gaussian errors know nothing of it.
+    if (
+        constant == 0
+    ):  # Of experiments of different strengths; Gaussian errors know nothing of it.
         shares = rng.dirichlet(np.full(R, 3.0))[:, None]
         error /= np.sqrt(shares)
     mean = np.sum(shares * error, axis=0)
@@ -129,8 +133,12 @@ def test_a_failed_realization_leaves_the_others(model):
     lost = np.isin(estimate.f, LINES.f[LINES.experiment == 0])
     ratio = np.mean(estimate.variance[:, lost]) / np.mean(estimate.variance[:, ~lost])
     assert ratio == pytest.approx(2, rel=0.3)  # of one experiment instead of two
-    np.testing.assert_array_equal(estimate.scatter.freedom, np.where(lost, (~lost).sum(), 1))
-    with pytest.raises(hj.DefinitionError, match="single realization, as at f = .* does not show"):
+    np.testing.assert_array_equal(
+        estimate.scatter.freedom, np.where(lost, (~lost).sum(), 1)
+    )
+    with pytest.raises(
+        hj.DefinitionError, match="single realization, as at f = .* does not show"
+    ):
         hj.estimate_htf(data, variance="total")
 
 
@@ -155,7 +163,9 @@ def test_repeated_phases_show_no_distortion(model):
     data = realized(model, 1, noise=0.1)
     twice = [np.concatenate([x, x + 1e-3 * k]) for k, x in ((0, data.u), (1, data.y))]
     with pytest.raises(hj.DefinitionError, match="repeat the same phases"):
-        hj.estimate_htf(hj.ExperimentData(*twice, n_sections=N, periods=P), variance="total")
+        hj.estimate_htf(
+            hj.ExperimentData(*twice, n_sections=N, periods=P), variance="total"
+        )
 
 
 @pytest.mark.parametrize("freedom", [3, 8])
@@ -168,7 +178,9 @@ def test_weights_from_estimated_variances_widen_the_errors_of_fits(freedom):
     misfit = np.mean(weight * (error - estimate[:, None]) ** 2) * 300 / 299
     _, deviation = estimated_noise(freedom / (freedom - 1), misfit)
     actual = np.mean(estimate**2) / np.mean(1 / weight.sum(axis=1))
-    assert actual == pytest.approx(deviation**2, rel=0.12)  # (freedom / (freedom - 2) at most)
+    assert actual == pytest.approx(
+        deviation**2, rel=0.12
+    )  # (freedom / (freedom - 2) at most)
 
 
 def test_fits_know_of_estimated_variances(model):
@@ -179,12 +191,20 @@ def test_fits_know_of_estimated_variances(model):
     fits = [
         hj.fit_ldtp(
             hj.HTF(
-                exact.f, H + np.sqrt(0.2) * (drawn[0] + 1j * drawn[1]), exact.harmonics, N,
-                exact.inputs, exact.outputs, "estimate", variance=variance, scatter=scatter,
-            ), 2,
+                exact.f,
+                H + np.sqrt(0.2) * (drawn[0] + 1j * drawn[1]),
+                exact.harmonics,
+                N,
+                exact.inputs,
+                exact.outputs,
+                "estimate",
+                variance=variance,
+                scatter=scatter,
+            ),
+            2,
         )
         for scatter in (hj.Scatter(np.full(31, x)) for x in (4.0, 1e9))
-    ]  # fmt: skip
+    ]
     level = fits[0].cost / fits[0].freedom
     ratio = fits[0].covariance / fits[1].covariance
     np.testing.assert_allclose(ratio, level / (2 - level), rtol=1e-6)

@@ -11,10 +11,18 @@ import hybridjax as hj
 from hybridjax.errors import FindingWarning
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 from hybridjax.identify.series.fit import gradient_covariance
-from hybridjax.identify.series.linearization import each_fit, filtered_response, linearize
+from hybridjax.identify.series.linearization import (
+    each_fit,
+    filtered_response,
+    linearize,
+)
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.records import PreparedRecords, with_drift
-from hybridjax.identify.series.subspace import late_outputs, subspace_model, total_least_squares
+from hybridjax.identify.series.subspace import (
+    late_outputs,
+    subspace_model,
+    total_least_squares,
+)
 
 from .conftest import SHAPES, scaled
 from .test_uncertainty import covered
@@ -26,7 +34,9 @@ def record(model, samples, seed=0, noise=0.0, first_section=0, x0=None, **about)
     u = rng.normal(size=(samples, len(model.inputs)))
     y = np.array(model.simulate(u, x0, first_section))
     y += noise * rng.normal(size=y.shape)
-    about |= dict(n_sections=model.n_sections, inputs=model.inputs, outputs=model.outputs)
+    about |= dict(
+        n_sections=model.n_sections, inputs=model.inputs, outputs=model.outputs
+    )
     return hj.Record(u, y, first_section=first_section, **about)
 
 
@@ -35,15 +45,21 @@ def with_outputs(data, y):
 
 
 def problem_of(data, order, overhang, free_start=True):
-    return OutputErrorProblem.from_data(PreparedRecords(data), order, overhang, free_start)
+    return OutputErrorProblem.from_data(
+        PreparedRecords(data), order, overhang, free_start
+    )
 
 
 def test_the_hopper_is_identified_to_rounding(hopper, multipliers):
-    fit = hj.fit_series(record(hopper, 32 * 120, x0=np.array([0.01, -0.02, 0.01, 0.0])), hopper)
+    fit = hj.fit_series(
+        record(hopper, 32 * 120, x0=np.array([0.01, -0.02, 0.01, 0.0])), hopper
+    )
     assert fit.compare(multipliers).max_error < 1e-13
     f = np.array([0.0, 0.3, 1.7, 16.0])
     assert fit.htf(f).error(hopper.htf(f)).max() < 1e-12
-    np.testing.assert_allclose(fit.impulse_response(200), hopper.impulse_response(200), atol=1e-12)
+    np.testing.assert_allclose(
+        fit.impulse_response(200), hopper.impulse_response(200), atol=1e-12
+    )
     assert fit.result == hj.Result.OK and np.all(fit.noise < 1e-14)
 
 
@@ -61,9 +77,13 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
         whole.u[25 * N + 2, 0] = np.nan
         records.append(whole)
     fit = hj.fit_series(records, model)
-    np.testing.assert_allclose(fit.coefficients, np.poly(model.multipliers).real[1:], atol=1e-7)
+    np.testing.assert_allclose(
+        fit.coefficients, np.poly(model.multipliers).real[1:], atol=1e-7
+    )
     lags = fit.numerators.shape[1]
-    np.testing.assert_allclose(fit.impulse_response(lags), model.impulse_response(lags), atol=1e-7)
+    np.testing.assert_allclose(
+        fit.impulse_response(lags), model.impulse_response(lags), atol=1e-7
+    )
 
 
 def test_inputs_before_the_start_act_through_all_lags():
@@ -83,7 +103,9 @@ def test_outputs_that_depend_on_later_inputs(small):
     fit = hj.fit_series(hj.Record(data.u[:-2], data.y[2:], n_sections=4, lead=2), 2)
     expected = np.roll(small.impulse_response(22), -2, axis=0)[:, 2:]
     np.testing.assert_allclose(fit.impulse_response(20), expected, atol=1e-9)
-    ahead = np.exp(1j * np.pi * (f + np.reshape(fit.htf(f).harmonics, (-1, 1))))[..., None, None]
+    ahead = np.exp(1j * np.pi * (f + np.reshape(fit.htf(f).harmonics, (-1, 1))))[
+        ..., None, None
+    ]
     np.testing.assert_allclose(fit.htf(f).H, ahead * small.htf(f).H, atol=1e-9)
 
 
@@ -100,7 +122,9 @@ def test_regions_cover(small):
     square = np.mean([np.abs(x.H - exact.H) ** 2 / x.variance for x in htfs], axis=0)
     np.testing.assert_allclose(square, 1.0, atol=0.7)
     assert abs(np.mean(square) - 1) < 0.15
-    np.testing.assert_allclose(np.mean([fit.noise for fit in fits], axis=0), 0.3, rtol=0.02)
+    np.testing.assert_allclose(
+        np.mean([fit.noise for fit in fits], axis=0), 0.3, rtol=0.02
+    )
 
 
 def slopes_of(problem, solution):
@@ -129,7 +153,10 @@ def test_the_covariance_of_the_gradient_with_process_noise():
         clean = record(model, N * cycles, seed)
         problem = problem_of(with_outputs(clean, clean.y + noise()), 1, 12)
         solution = linearize(problem, np.array([-true]))
-        draws = np.stack([noise() for _ in range(50)]).reshape(-1, cycles, N) / problem.scale
+        draws = (
+            np.stack([noise() for _ in range(50)]).reshape(-1, cycles, N)
+            / problem.scale
+        )
         products = np.einsum("btn,tn->b", draws, slopes_of(problem, solution))
         measured += np.mean(products**2) / runs
         estimated += gradient_covariance(problem, solution, 11).matrix[0, 0] / runs
@@ -145,17 +172,24 @@ def test_experiments_are_used_from_their_start(small):
     data = dataclasses.replace(data, y=y, result=result)
     fit = hj.fit_series(data, 2)
     assert fit.compare(small.multipliers).max_error < 1e-8
-    assert f"SeriesFit(multipliers (± standard error) {small.multipliers[0].real:.4f}" in repr(fit)
+    assert (
+        f"SeriesFit(multipliers (± standard error) {small.multipliers[0].real:.4f}"
+        in repr(fit)
+    )
     same = (data, data.records, [data], iter(data.records))
     fit, *fits = (hj.fit_series(x, 2, start="cycle") for x in same)
     assert fit.compare(small.multipliers).max_error < 1e-8
-    np.testing.assert_array_equal([x.coefficients for x in fits], [fit.coefficients] * 3)
+    np.testing.assert_array_equal(
+        [x.coefficients for x in fits], [fit.coefficients] * 3
+    )
 
 
 def test_spurious_multipliers_raise_an_error(small):
     for seed in range(4):
         data = record(small, 400, seed, 0.3)
-        with pytest.raises(hj.DefinitionError, match="the data support 2 multipliers, not 3"):
+        with pytest.raises(
+            hj.DefinitionError, match="the data support 2 multipliers, not 3"
+        ):
             hj.fit_series(data, 3)
     assert "support 2 multipliers, not 3" in repr(hj.fit_series(data, 3, check=False))
 
@@ -168,7 +202,9 @@ def test_an_order_that_is_too_low_is_noticed(small):
         with pytest.warns(FindingWarning, match=text) as caught:
             fit = hj.fit_series(data, 1)
         assert caught[0].filename == __file__
-        assert fit.doubt in " ".join(repr(fit).split()) and "too low" in fit._repr_html_()
+        assert (
+            fit.doubt in " ".join(repr(fit).split()) and "too low" in fit._repr_html_()
+        )
         bent = with_outputs(data, data.y + 0.1 * data.y**2 / data.y.std())
         assert not hj.fit_series(bent, 2).doubt
     design = hj.multisine(4, 8, amplitude=1.0).realizations(4)
@@ -180,11 +216,15 @@ def test_an_order_that_is_too_low_is_noticed(small):
 
 def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
     """A drift with the right order or one less, and an offset with one multiplier too many."""
-    slow = np.cos(np.pi / 100 * (np.arange(100) + 0.5) * np.arange(1, 5)[:, None]).sum(axis=0)
+    slow = np.cos(np.pi / 100 * (np.arange(100) + 0.5) * np.arange(1, 5)[:, None]).sum(
+        axis=0
+    )
 
     def moved(change, seed=1):
         data = record(small, 400, seed, 0.1)
-        return with_outputs(data, data.y + np.reshape(change, (-1, 1)) * data.y.std(axis=0))
+        return with_outputs(
+            data, data.y + np.reshape(change, (-1, 1)) * data.y.std(axis=0)
+        )
 
     drift, offset, far = moved(slow.repeat(4)), moved(0.3), moved(1.0)
     for fit, cases in (
@@ -197,12 +237,19 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
             assert np.abs(multipliers - small.multipliers[0]).max() > 0.1
     first = mock.Mock(wraps=subspace_model)
     monkeypatch.setattr("hybridjax.identify.joint.fit.subspace_model", first)
-    for data in (moved(0.0), *(dataclasses.replace(x, drift=20) for x in (drift, offset, far))):
+    for data in (
+        moved(0.0),
+        *(dataclasses.replace(x, drift=20) for x in (drift, offset, far)),
+    ):
         assert not hj.fit_series(data, 2).doubt
         fit = hj.fit_ldtp(data, small.dims, noise="innovations")
         assert fit.result == hj.Result.OK and not fit.doubt
-    assert first.call_count == 8  # (Fits, smaller ones; trials of a drift begin at the fit.)
-    with pytest.raises(hj.DefinitionError, match="not 2.*outputs may drift: `with_drift"):
+    assert (
+        first.call_count == 8
+    )  # (Fits, smaller ones; trials of a drift begin at the fit.)
+    with pytest.raises(
+        hj.DefinitionError, match="not 2.*outputs may drift: `with_drift"
+    ):
         hj.fit_series(moved(3 * slow.repeat(4), seed=0), 2)
     (begun,) = with_drift([record(small, 4100)])  # (Longer ones take too long.)
     assert (len(begun.u), begun.drift, with_drift([begun])) == (4000, 20, [])
@@ -224,8 +271,12 @@ def test_how_far_another_fit_contradicts():
     """By 1, 2.5 and 4 standard errors: an order does at 95 %, a drift at 99.9 %."""
     covariance = np.array([[0.01]]), np.inf
     fit = MultiplierEstimate(np.array([0.5 + 0j]), np.array([-0.5]), *covariance)
-    others = [[lambda c=c: (np.array([c]), lambda: covariance)] for c in (-0.6, -0.75, -0.9)]
-    doubts = [bool(fit.contradiction(x, drift)) for x in others for drift in ("", "drift")]
+    others = [
+        [lambda c=c: (np.array([c]), lambda: covariance)] for c in (-0.6, -0.75, -0.9)
+    ]
+    doubts = [
+        bool(fit.contradiction(x, drift)) for x in others for drift in ("", "drift")
+    ]
     assert doubts == [False, False, True, False, True, True]
 
 
@@ -238,7 +289,9 @@ def test_announced_drift_is_removed(small):
     fits = [hj.fit_series(data, 2) for data in (plain, moved)]
     np.testing.assert_allclose(fits[0].coefficients, fits[1].coefficients, atol=1e-6)
     assert fits[1].contains(small.multipliers, 0.999).all()
-    piece, *_ = PreparedRecords(record(small, 4100, drift=10, lead=1), free_start=True).records
+    piece, *_ = PreparedRecords(
+        record(small, 4100, drift=10, lead=1), free_start=True
+    ).records
     assert len(piece.u) == 1367 and np.isnan(piece.y[-1]).all()
     assert hj.validate(fits[1], moved).fit.min() > 90
 
@@ -255,7 +308,9 @@ def test_bad_records(small, monkeypatch):
         with pytest.raises(hj.DefinitionError, match=message):
             hj.fit_series(data, 2)
     monkeypatch.setattr("hybridjax.identify.series.output_error.on_all_cores", None)
-    with pytest.raises(hj.DefinitionError, match="sampled 10 times, too few.* 9 or more cycles"):
+    with pytest.raises(
+        hj.DefinitionError, match="sampled 10 times, too few.* 9 or more cycles"
+    ):
         hj.fit_series(record(small, 40), 2)
 
 
@@ -264,7 +319,9 @@ def test_absolute_outputs_are_refused(small):
     lines = dict(frequencies=[[0.25, 1.0]] * 2, phases=[[0.0, 0.0], [0.0, np.pi / 2]])
     design = hj.Design.from_lines(**lines, amplitudes=0.1, n_sections=4, periods=8)
     good = hj.experiments.simulate_experiments(small, design, start="periodic")
-    data = dataclasses.replace(good, y=good.y + 1e2 * np.tile([[0], [1], [2], [1]], (8, 1)))
+    data = dataclasses.replace(
+        good, y=good.y + 1e2 * np.tile([[0], [1], [2], [1]], (8, 1))
+    )
     for door, *arguments in (
         (hj.fit_series, data, 2),
         (hj.fit_ldtp, data, 2),
@@ -283,7 +340,9 @@ def test_inputs_have_units_of_their_own(unit):
     """The HTFs are those of the same data in other units. Inputs that are equal are refused."""
     u = np.random.default_rng(0).normal(size=(400, 2))
     two_inputs = scaled(0, (2, 2, 2, 2), 2, 2)
-    y = np.asarray(two_inputs.simulate(u)) + 1e-3 * np.random.default_rng(1).normal(size=(400, 2))
+    y = np.asarray(two_inputs.simulate(u)) + 1e-3 * np.random.default_rng(1).normal(
+        size=(400, 2)
+    )
     units = np.array([1, unit])
     fits = [hj.fit_series(hj.Record(v, y, n_sections=4), 2) for v in (u, u * units)]
     htfs = [fit.htf([0.3]).H for fit in fits]
@@ -292,11 +351,15 @@ def test_inputs_have_units_of_their_own(unit):
     np.testing.assert_allclose(*found, rtol=1e-6)
     design = hj.multisine(4, 8, lines="odd", inputs=2, division="disjoint")
     data = hj.experiments.simulate_experiments(two_inputs, design, discard=2)
-    data = hj.identify.remove_transient(dataclasses.replace(data, u=data.u * units), 2).data
+    data = hj.identify.remove_transient(
+        dataclasses.replace(data, u=data.u * units), 2
+    ).data
     htf = hj.estimate_htf(data)
     np.testing.assert_allclose(htf.f, design.frequencies)
     np.testing.assert_allclose(htf.H * units, two_inputs.htf(htf.f).H, atol=1e-9)
     with pytest.raises(hj.DefinitionError, match="are no pair"):
-        hj.ExperimentData(units * [u, [-1, 1] * u], [y, y], n_sections=4, periods=8).odd_part()
+        hj.ExperimentData(
+            units * [u, [-1, 1] * u], [y, y], n_sections=4, periods=8
+        ).odd_part()
     with pytest.raises(hj.DefinitionError, match="u0, u1 cannot be told apart"):
         hj.fit_series(hj.Record(u[:, :1] * units, y, n_sections=4), 2)

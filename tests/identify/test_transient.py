@@ -21,7 +21,9 @@ def errors(model, data, harmonics=(-1, 0, 1)):
 
 def test_the_transient_of_a_linear_system_is_removed_exactly(hopper, full):
     """The window begins one period after the start."""
-    odd = hj.Design.from_lines([[j / 16] for j in range(1, 48, 2)], n_sections=32, periods=16)
+    odd = hj.Design.from_lines(
+        [[j / 16] for j in range(1, 48, 2)], n_sections=32, periods=16
+    )
     for design, discard in ((full, 10), (odd, 1)):
         data = hj.experiments.simulate_experiments(hopper, design, discard=discard)
         assert data.window.start == 32 * discard and errors(hopper, data) > 1e-3
@@ -36,8 +38,12 @@ def test_noise_is_not_mistaken_for_a_transient(hopper, full):
     """The order is found, and the estimate is as good as that of records without a transient."""
     rest = hj.experiments.simulate_experiments(hopper, full, discard=12)
     data = hj.experiments.add_noise(rest, snr=30, seed=1)
-    still = hj.experiments.simulate_experiments(hopper, full, start="periodic", discard=12)
-    still = hj.ExperimentData(still.u, still.y + data.y - rest.y, n_sections=32, periods=12)
+    still = hj.experiments.simulate_experiments(
+        hopper, full, start="periodic", discard=12
+    )
+    still = hj.ExperimentData(
+        still.u, still.y + data.y - rest.y, n_sections=32, periods=12
+    )
     fit = hj.identify.remove_transient(data)
     assert len(fit.multipliers) == 2
     assert np.abs(fit.multipliers - hopper.multipliers).max() < 0.03

@@ -17,10 +17,15 @@ from .conftest import scaled
 
 def noisy(htf, variance, rng, correlation=0.0):
     """HTFs with circular errors; a share of them is common to all harmonics and outputs."""
-    parts = [rng.normal(size=htf.H.shape) + 1j * rng.normal(size=htf.H.shape) for _ in range(2)]
+    parts = [
+        rng.normal(size=htf.H.shape) + 1j * rng.normal(size=htf.H.shape)
+        for _ in range(2)
+    ]
     own, common = parts[0], parts[1][:1, :, :1]
     error = np.sqrt(1 - correlation) * own + np.sqrt(correlation) * common
-    return with_variance(htf, np.asarray(htf.H) + np.sqrt(variance / 2) * error, variance)
+    return with_variance(
+        htf, np.asarray(htf.H) + np.sqrt(variance / 2) * error, variance
+    )
 
 
 def with_variance(htf, H, variance, freedom=None):
@@ -54,8 +59,12 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
     """Errors that are common to all harmonics, too: the residuals know."""
     model, htf = small
     true, runs = model.multipliers, 60
-    bound = hj.identify.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
-    draws = (noisy(htf, variance, np.random.default_rng(k), correlation) for k in range(runs))
+    bound = hj.identify.multiplier_bound(
+        model, with_variance(htf, htf.H, variance)
+    ).standard_errors
+    draws = (
+        noisy(htf, variance, np.random.default_rng(k), correlation) for k in range(runs)
+    )
     fits = [hj.fit_multipliers(draw, 2, errors=errors) for draw in draws]
     assert covered(sum(fit.contains(true).all() for fit in fits), runs)
     rms = np.sqrt(np.mean([fit.compare(true).error ** 2 for fit in fits], axis=0))
@@ -85,7 +94,9 @@ def test_without_variances_the_misfit_tells(small):
     """One output is a hundred times as noisy, which nobody said."""
     model, htf = small
     variance = np.broadcast_to(np.array([1e-2, 1.0])[:, None], htf.H.shape)
-    said = hj.identify.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
+    said = hj.identify.multiplier_bound(
+        model, with_variance(htf, htf.H, variance)
+    ).standard_errors
     data = noisy(htf, variance, np.random.default_rng(0))
     blind = hj.fit_multipliers(with_variance(htf, data.H, None), 2)
     np.testing.assert_allclose(blind.standard_errors, said, rtol=0.3)
@@ -105,7 +116,9 @@ def test_the_spectrum_of_errors_is_found(small):
     variance = np.broadcast_to(true[..., None] * lines, htf.H.shape)
     found = []
     for seed in range(50):
-        groups = group_htf(noisy(htf, variance, np.random.default_rng(seed)), supposed, 13)
+        groups = group_htf(
+            noisy(htf, variance, np.random.default_rng(seed)), supposed, 13
+        )
         found.append(error_spectrum(groups, c, f, lines, 2))
     np.testing.assert_allclose(np.mean(found, axis=0), variance[0], rtol=0.06)
 
@@ -116,7 +129,9 @@ def pair_and_real():
     true = np.array([0.6 + 0.3j, 0.6 - 0.3j, -0.4])
     rng = np.random.default_rng(1)
     square = rng.normal(size=(3, 3))
-    return MultiplierEstimate(true, np.poly(true).real[1:], 1e-6 * square @ square.T, np.inf), rng
+    return MultiplierEstimate(
+        true, np.poly(true).real[1:], 1e-6 * square @ square.T, np.inf
+    ), rng
 
 
 def test_first_order_covariances_and_regions(pair_and_real):
@@ -136,7 +151,9 @@ def test_first_order_covariances_and_regions(pair_and_real):
     np.testing.assert_allclose(estimate.standard_errors, radius, rtol=0.05)
     # The border of the first-order region has the distance of the exact one.
     for i, degrees, freedom in ((0, 2, 1e9), (2, 1, 1e9), (0, 2, 9), (2, 1, 9)):
-        border = dataclasses.replace(estimate, covariance_freedom=freedom).ellipse(i, 0.9)
+        border = dataclasses.replace(estimate, covariance_freedom=freedom).ellipse(
+            i, 0.9
+        )
         if degrees == 1:
             border = border[[np.argmin(border.real), np.argmax(border.real)]].real
         left = freedom - degrees + 1  # Hotelling's distribution
@@ -144,6 +161,7 @@ def test_first_order_covariances_and_regions(pair_and_real):
         np.testing.assert_allclose(estimate.distance(border), quantile, rtol=0.05)
     # The share of draws that a region around the truth holds.
     held = [
-        MultiplierEstimate(true, draw, estimate.covariance, np.inf).contains(true) for draw in draws
+        MultiplierEstimate(true, draw, estimate.covariance, np.inf).contains(true)
+        for draw in draws
     ]
     assert np.all([covered(n, 2000) for n in np.sum(held, axis=0)])

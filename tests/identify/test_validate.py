@@ -46,7 +46,9 @@ def test_the_fit_is_the_share_explained(small):
 
 def test_a_wrong_model_is_refused(small):
     data = record(small, 4 * 200, 0, 0.3)
-    found = hj.validate(eqx.tree_at(lambda m: m.B, small, small.B.at[2].multiply(1.3)), data)
+    found = hj.validate(
+        eqx.tree_at(lambda m: m.B, small, small.B.at[2].multiply(1.3)), data
+    )
     assert found.independence.min() < 1e-6 and "with the input: yes" in repr(found)
     turned = hj.validate(eqx.tree_at(lambda m: m.C, small, -small.C), data)
     assert "no better than by the mean cycle: y0, y1" in repr(turned)
@@ -69,7 +71,9 @@ def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
         noticed += hj.validate(small, data).independence[1] < found.level / 2
     assert covered(noticed, runs, 0.8)
     assert "noticed in four of five such data: " in repr(found)
-    few, more = (hj.validate(small, record(small, N * n, 0, 0.5)).visible for n in (80, 320))
+    few, more = (
+        hj.validate(small, record(small, N * n, 0, 0.5)).visible for n in (80, 320)
+    )
     np.testing.assert_allclose(more / few, 0.5, rtol=0.15)
 
 
@@ -101,10 +105,14 @@ def test_records_shorter_than_the_lags(small):
     np.testing.assert_array_equal(found.measured, whole.y[106:])
     assert found.white and found.independent
     assert hj.validate(small, pieces, start="cycle").left_out == 0
-    with pytest.raises(hj.DefinitionError, match="0.75 cycles without gaps are too few"):
+    with pytest.raises(
+        hj.DefinitionError, match="0.75 cycles without gaps are too few"
+    ):
         hj.validate(small, [whole.part(0, 3), whole.part(3, 6)])
     with pytest.raises(hj.DefinitionError, match="^u is zero or missing"):
-        hj.validate(small, hj.Record(0 * whole.u, whole.y, n_sections=4, outputs=whole.outputs))
+        hj.validate(
+            small, hj.Record(0 * whole.u, whole.y, n_sections=4, outputs=whole.outputs)
+        )
     many = [whole.part(k, k + 2) for k in range(0, 400, 2)]
     assert hj.validate(small, many, start="cycle").autocorrelation.shape[1] == 1
 

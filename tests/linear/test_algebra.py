@@ -27,7 +27,9 @@ def lifted(ldtp, z):
     """The transfer matrices from all inputs of a period to all outputs of it."""
     A, B, C, D = map(np.asarray, (ldtp.A, ldtp.B, ldtp.C, ldtp.D))
     n, nu = A.shape[1], D.shape[2]
-    x = np.eye(n, n + N * nu)  # as a function of the state at section 0, and of all inputs
+    x = np.eye(
+        n, n + N * nu
+    )  # as a function of the state at section 0, and of all inputs
     rows = []
     for k in range(N):
         u = np.eye(N * nu, n + N * nu, n)[k * nu : (k + 1) * nu]
@@ -55,7 +57,9 @@ def test_systems_against_lifted_ones(pair):
         (P.feedback(0.1 * np.eye(2)), np.linalg.solve(one + 0.1 * a, a)),
     ):
         np.testing.assert_allclose(lifted(ours, z), exact, rtol=0, atol=1e-12)
-    assert P.feedback(F).inputs == tuple(IN) and (P @ F).inputs == (P @ F).outputs == tuple(OUT)
+    assert P.feedback(F).inputs == tuple(IN) and (P @ F).inputs == (
+        P @ F
+    ).outputs == tuple(OUT)
     inside = eqx.filter_jit(lambda P, F: P.feedback(F).htf(0.3).H)(P, F)
     np.testing.assert_allclose(inside, P.feedback(F).htf(0.3).H, rtol=0, atol=1e-12)
 
@@ -84,7 +88,9 @@ def test_variances_are_those_of_draws(pair):
         return np.asarray(x.H) + noise
 
     def known(x):
-        return dataclasses.replace(x, source="estimate", variance=np.full(x.H.shape, size**2))
+        return dataclasses.replace(
+            x, source="estimate", variance=np.full(x.H.shape, size**2)
+        )
 
     for operation in (hj.HTF.__matmul__, lambda H, G: H.inverse(), hj.HTF.feedback):
 

@@ -34,7 +34,10 @@ def test_three_ways_agree(seed, shape, f):
     w, m = 2 * np.pi * f / N, np.array(htf.harmonics)
     h = np.asarray(ldtp.impulse_response(120))
     G = np.einsum("nrij,r->nij", h, np.exp(-1j * w * np.arange(120)))
-    H = np.einsum("mn,nij->mij", np.exp(-2j * np.pi * np.outer(m, np.arange(N)) / N), G) / N
+    H = (
+        np.einsum("mn,nij->mij", np.exp(-2j * np.pi * np.outer(m, np.arange(N)) / N), G)
+        / N
+    )
     np.testing.assert_allclose(np.asarray(htf.H)[:, 0], H, rtol=0, atol=1e-12)
 
     # The DFT of the response to a cosine, once the transient has died.
@@ -46,7 +49,9 @@ def test_three_ways_agree(seed, shape, f):
     Y, U = np.fft.fft(y[settle * N :], axis=0), np.fft.fft(u[settle * N :, j])
     k = round(f * periods)
     lines = (k + m * periods) % (periods * N)
-    np.testing.assert_allclose(np.asarray(htf.H)[:, 0, :, j], Y[lines] / U[k], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.asarray(htf.H)[:, 0, :, j], Y[lines] / U[k], rtol=0, atol=1e-12
+    )
 
 
 @settings(max_examples=4)
@@ -92,10 +97,14 @@ def test_a_multiplier_on_the_unit_circle_is_named():
     ldtp = hj.LDTP.from_blocks([turn] * 3, [np.ones((2, 1))] * 3, [np.ones((1, 2))] * 3)
     f = 3 * np.arctan2(0.8, 0.6) / (2 * np.pi)
     assert np.all(np.isfinite(ldtp.htf([0.1, f + 1e-6]).H))
-    with pytest.raises(hj.DefinitionError, match=rf"f = {f:g} .* unbounded: the multiplier"):
+    with pytest.raises(
+        hj.DefinitionError, match=rf"f = {f:g} .* unbounded: the multiplier"
+    ):
         ldtp.htf([0.1, f])
     integrator = hj.LDTP(np.ones((4, 1, 1)), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
-    with pytest.raises(hj.DefinitionError, match="f = 2 cycles per period is unbounded"):
+    with pytest.raises(
+        hj.DefinitionError, match="f = 2 cycles per period is unbounded"
+    ):
         integrator.htf([0.3, 2.0, 0.7])
     with pytest.raises(hj.DefinitionError, match="`f` holds 0.1 .* twice"):
         hj.HTF([0.1, 0.1], np.ones((1, 2, 1, 1)), 0, 4)

@@ -49,7 +49,9 @@ def test_periodic_state_of_an_unstable_system():
 def test_jit_vmap_and_gradients(synthetic):
     u = np.random.default_rng(1).normal(size=(18, 2))
     plain = synthetic.simulate(u)
-    np.testing.assert_allclose(eqx.filter_jit(hj.LDTP.simulate)(synthetic, u), plain, atol=1e-14)
+    np.testing.assert_allclose(
+        eqx.filter_jit(hj.LDTP.simulate)(synthetic, u), plain, atol=1e-14
+    )
     many = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
     np.testing.assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
@@ -60,7 +62,9 @@ def test_jit_vmap_and_gradients(synthetic):
 
     @jax.jit
     def scaled(s):
-        ldtp = hj.LDTP(s * synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims)
+        ldtp = hj.LDTP(
+            s * synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims
+        )
         return jnp.concatenate([ldtp.simulate(u)[-1], ldtp.periodic_state(u, 3)])
 
     jax.test_util.check_grads(scaled, (0.9,), order=1, modes=("rev",), eps=1e-6)
@@ -69,7 +73,9 @@ def test_jit_vmap_and_gradients(synthetic):
 def test_systems_known_outside_of_jit_work_inside(synthetic):
     @jax.jit
     def inside(u):
-        ldtp = hj.LDTP(synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims)
+        ldtp = hj.LDTP(
+            synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims
+        )
         htf = ldtp.htf([0.3, 0.4], (0, 1))
         repr(ldtp), repr(htf), repr(synthetic.htf([0.3]))
         x0 = synthetic.periodic_state(u, 2)
@@ -77,7 +83,9 @@ def test_systems_known_outside_of_jit_work_inside(synthetic):
 
     u = np.random.default_rng(2).normal(size=(12, 2))
     y, error = inside(u)
-    np.testing.assert_allclose(y, synthetic.simulate(u, synthetic.periodic_state(u, 2)), atol=1e-13)
+    np.testing.assert_allclose(
+        y, synthetic.simulate(u, synthetic.periodic_state(u, 2)), atol=1e-13
+    )
     np.testing.assert_allclose(error, 0, atol=1e-14)
 
 
@@ -105,7 +113,11 @@ def test_single_precision_is_refused():
 
 
 def test_a_response_without_bounds_is_refused():
-    rotation = hj.LDTP([[[0.0, -1.0], [1.0, 0.0]]], np.ones((1, 2, 1)), np.ones((1, 1, 2)))
+    rotation = hj.LDTP(
+        [[[0.0, -1.0], [1.0, 0.0]]], np.ones((1, 2, 1)), np.ones((1, 1, 2))
+    )
     rotation.periodic_state(np.ones((3, 1)), 3)
-    with pytest.raises(hj.DefinitionError, match="f = 0.25 cycles per period is unbounded"):
+    with pytest.raises(
+        hj.DefinitionError, match="f = 0.25 cycles per period is unbounded"
+    ):
         rotation.periodic_state(np.ones((4, 1)), 4)

@@ -39,7 +39,10 @@ def chain(rng, multipliers, extra):
         for m in multipliers:
             if np.iscomplex(m):
                 z = abs(m) ** share[n] * np.exp(1j * np.angle(m) * share[n])
-                core[place : place + 2, place : place + 2] = [[z.real, -z.imag], [z.imag, z.real]]
+                core[place : place + 2, place : place + 2] = [
+                    [z.real, -z.imag],
+                    [z.imag, z.real],
+                ]
                 place += 2
             else:
                 sign = np.sign(m) if n == 0 else 1.0
@@ -83,7 +86,9 @@ def test_widely_spread_multipliers_keep_their_digits(multipliers, sections=32):
     assert_conjugate_and_sorted(found)
 
 
-@pytest.mark.parametrize("multipliers", [[1.0, 1e-9], [0.3 + 0.7j, -1e-6], [0.9, 0.5 + 0.1j, 2.0]])
+@pytest.mark.parametrize(
+    "multipliers", [[1.0, 1e-9], [0.3 + 0.7j, -1e-6], [0.9, 0.5 + 0.1j, 2.0]]
+)
 def test_dimensions_that_vary_add_no_multipliers(multipliers):
     # The extra coordinates drive the modes: the smaller a mode, the more its digits depend on them.
     rng = np.random.default_rng(5)
@@ -141,7 +146,9 @@ def test_defective_and_cyclic_products():
     roots = product_eigenvalues([np.roll(np.eye(6), 1, axis=0)], RTOL)
     np.testing.assert_allclose(roots**6, 1, atol=1e-13)
     assert_conjugate_and_sorted(roots)
-    np.testing.assert_array_equal(product_eigenvalues([np.eye(3)] * 4, RTOL), np.ones(3))
+    np.testing.assert_array_equal(
+        product_eigenvalues([np.eye(3)] * 4, RTOL), np.ones(3)
+    )
 
 
 def test_hopper(hopper, reference):
@@ -149,13 +156,17 @@ def test_hopper(hopper, reference):
     found = hopper.multipliers
     np.testing.assert_allclose(found, data["eig_nonzero"][0], rtol=0, atol=1e-13)
     assert [hopper.rank(n) for n in range(32)] == list(data["rank_monodromy"])
-    np.testing.assert_allclose(hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14
+    )
 
 
 def test_the_synthetic_system(synthetic):
     assert list(synthetic.dims) == [3, 2, 3, 2, 3, 2]
     pair = 0.3270675 + 0.0596405918293070j
-    np.testing.assert_allclose(synthetic.multipliers, [pair, pair.conjugate()], rtol=1e-13)
+    np.testing.assert_allclose(
+        synthetic.multipliers, [pair, pair.conjugate()], rtol=1e-13
+    )
 
 
 def test_characteristic_polynomial(synthetic, hopper):

@@ -33,7 +33,9 @@ def test_the_radius_is_that_of_the_f_distribution(htf):
         np.testing.assert_allclose(radius(htf), expected, rtol=1e-9)
     known = an_htf(variance=htf.variance).confidence_radius(0.9)
     np.testing.assert_allclose(
-        known, np.sqrt(stats.chi2.ppf(0.9, 2) / 2 * np.asarray(htf.variance)), rtol=1e-12
+        known,
+        np.sqrt(stats.chi2.ppf(0.9, 2) / 2 * np.asarray(htf.variance)),
+        rtol=1e-12,
     )
 
 

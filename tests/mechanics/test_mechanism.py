@@ -28,7 +28,9 @@ def double_pendulum():
 
 
 def free_ball():
-    return hj.Mechanism(lambda q, v: 0.5 * M * jnp.sum(v**2) + v[0], lambda q: M * G * q[1])
+    return hj.Mechanism(
+        lambda q, v: 0.5 * M * jnp.sum(v**2) + v[0], lambda q: M * G * q[1]
+    )
 
 
 def test_a_double_pendulum_moves_as_textbooks_say():
@@ -57,8 +59,13 @@ def test_a_contact_that_holds_is_a_rod():
     pendulum = free_ball().along(place)
     a = jax.jit(pendulum.acceleration)(jnp.array([angle]), jnp.array([rate]))
     np.testing.assert_allclose(a, [-G / L * np.sin(angle)], rtol=1e-13)
-    q, v = place([angle]), jax.jvp(place, (jnp.array([angle]),), (jnp.array([rate]),))[1]
-    found = jax.jit(lambda q, v: free_ball().constrained(q, v, 0.0, lambda q: rod(q)[0]))(q, v)
+    q, v = (
+        place([angle]),
+        jax.jvp(place, (jnp.array([angle]),), (jnp.array([rate]),))[1],
+    )
+    found = jax.jit(
+        lambda q, v: free_ball().constrained(q, v, 0.0, lambda q: rod(q)[0])
+    )(q, v)
     tension = M * (G * np.cos(angle) + L * rate**2)
     np.testing.assert_allclose(found.force * L, [-tension], rtol=1e-13)
     along = jnp.array([np.cos(angle), np.sin(angle)])

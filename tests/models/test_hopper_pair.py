@@ -29,10 +29,16 @@ def test_small_multipliers_are_not_dropped(placed):
 @pytest.mark.parametrize("amplitude, accuracy", [(1e-2, 1e-3), (1e-5, 1e-6)])
 def test_both_inputs_are_told_apart(placed, amplitude, accuracy):
     """All harmonics from both inputs to both outputs, estimated from a steady start."""
-    design = hj.multisine(16, 32, (0, 4), amplitude=amplitude, lines="odd", inputs=("u1", "u2"))
-    data = hj.run_experiments(placed.cycle, placed, design, OUTPUTS, start="steady", accuracy=1e-11)
+    design = hj.multisine(
+        16, 32, (0, 4), amplitude=amplitude, lines="odd", inputs=("u1", "u2")
+    )
+    data = hj.run_experiments(
+        placed.cycle, placed, design, OUTPUTS, start="steady", accuracy=1e-11
+    )
     assert data.ok.all(), data.summary()
     estimate = hj.estimate_htf(data, harmonics=(-1, 0, 1))
-    exact = hj.linearize(placed.cycle, placed, OUTPUTS).htf(estimate.f, harmonics=(-1, 0, 1))
+    exact = hj.linearize(placed.cycle, placed, OUTPUTS).htf(
+        estimate.f, harmonics=(-1, 0, 1)
+    )
     assert estimate.H.shape[-2:] == (2, 2)
     assert np.max(estimate.error(exact)) < accuracy

@@ -18,19 +18,28 @@ LET_GO = [[1.528341, 0.235829], [0.0, 2.5]]
 LAND = [[-2.390006, -0.195003], [0.0, -2.5]]
 
 
-@pytest.mark.parametrize("n", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 5, 10))])
+@pytest.mark.parametrize(
+    "n", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 5, 10))]
+)
 def test_the_cycle_and_its_multipliers(n):
     cycle, truth = hj.find_limit_cycle(hj.models.BouncingChain(n=n)), TRUTH[str(n)]
     np.testing.assert_allclose(list(cycle.state.values()), truth["state"], atol=1e-12)
-    apart = np.abs((np.array(truth["multipliers"]) @ [1, 1j])[:, None] - cycle.multipliers)
+    apart = np.abs(
+        (np.array(truth["multipliers"]) @ [1, 1j])[:, None] - cycle.multipliers
+    )
     assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < 1e-12
     events = cycle.trajectory().events
-    np.testing.assert_allclose([e.time for e in events], [t for t, _ in truth["impacts"]])
+    np.testing.assert_allclose(
+        [e.time for e in events], [t for t, _ in truth["impacts"]]
+    )
     assert [e.name for e in events] == [f"impact {i}" for _, i in truth["impacts"]]
 
 
 def test_events_that_coincide_neither_graze_nor_accumulate():
-    assert len(hj.find_limit_cycle(hj.models.TrottingQuadruped()).trajectory(2.0).events) == 8
+    assert (
+        len(hj.find_limit_cycle(hj.models.TrottingQuadruped()).trajectory(2.0).events)
+        == 8
+    )
     pace, event = np.array([[0.0], [np.inf], [0.0], [0.0]]), np.ones(1, bool)
     for moved in [1.0, 0.0] * 9:
         pace, zeno = keep_pace(pace, np.array([moved]), event, ~event)
@@ -42,7 +51,9 @@ def test_each_order_of_the_feet_has_its_derivative():
     cycle = hj.find_limit_cycle(hj.models.TrottingQuadruped(thrust=1.0), throw=False)
     assert cycle.result == hj.Result.COINCIDENCE
     found = sorted(hj.coincidences(cycle), key=lambda x: x.time)
-    np.testing.assert_allclose([x.time for x in found], [0.48890534976601, 0.79608769379953])
+    np.testing.assert_allclose(
+        [x.time for x in found], [0.48890534976601, 0.79608769379953]
+    )
     for both, expected in zip(found, (LET_GO, LAND), strict=True):
         assert not both.commute and len(both.orders) == 2
         for order, derivative in zip(both.orders, both.derivatives, strict=True):

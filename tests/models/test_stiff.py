@@ -13,21 +13,33 @@ RISING = hj.Crossing("v", "rising")
 PLANAR = {
     "van der Pol, mu = 100": (
         lambda: m.VanDerPol(100.0, solver=hj.Radau()),
-        hj.Crossing("v", "falling"), 162.83707109237002, 2.001318681177219, -28997.98845728604,
+        hj.Crossing("v", "falling"),
+        162.83707109237002,
+        2.001318681177219,
+        -28997.98845728604,
     ),
     "van der Pol, mu = 1000": (
         lambda: m.VanDerPol(1000.0, solver=hj.Radau()),
-        hj.Crossing("v", "falling"), 1614.401125808362, 2.0000729660025987, -2886973.413087638,
+        hj.Crossing("v", "falling"),
+        1614.401125808362,
+        2.0000729660025987,
+        -2886973.413087638,
     ),
     "FitzHugh-Nagumo, eps = 0.01": (
         lambda: m.FitzHughNagumo(0.01),
-        RISING, 2.2664798709184097, 1.979875977597529, -307.861545527702,
+        RISING,
+        2.2664798709184097,
+        1.979875977597529,
+        -307.861545527702,
     ),
     "FitzHugh-Nagumo, eps = 0.001": (
         lambda: m.FitzHughNagumo(0.001),
-        RISING, 2.0236220375464753, 1.9983293349844484, -3042.5861564245006,
+        RISING,
+        2.0236220375464753,
+        1.9983293349844484,
+        -3042.5861564245006,
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow
@@ -53,10 +65,16 @@ def _top(cycle, near):
 def test_the_hopper_on_a_compliant_ground():
     """With default settings; mpmath gives 20 digits."""
     cycle = hj.find_limit_cycle(m.CompliantHopper())
-    state = [1.9651439811723552967, 1.8755349450317062059, -7.3255629625297901e-5,
-             0.0016616904927162742]  # fmt: skip
+    state = [
+        1.9651439811723552967,
+        1.8755349450317062059,
+        -7.3255629625297901e-5,
+        0.0016616904927162742,
+    ]
     found = np.array(list(cycle.state.values())) / list(cycle.scale.values())
-    np.testing.assert_allclose(found, state / np.array(list(cycle.scale.values())), atol=1e-11)
+    np.testing.assert_allclose(
+        found, state / np.array(list(cycle.scale.values())), atol=1e-11
+    )
     z = -0.24885118328047069434 + 0.69922500780850327787j
     np.testing.assert_allclose(cycle.multipliers[:2], [z, z.conjugate()], atol=1e-12)
     assert cycle.multipliers[2] == pytest.approx(1.6159409134125691e-4, abs=1e-14)

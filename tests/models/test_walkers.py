@@ -30,14 +30,25 @@ def placed(name):
 @pytest.mark.parametrize("name", WALKERS)
 def test_A_and_B(name):
     truth, sections = np.load(DATA / "walkers.npz"), placed(name)
-    model = hj.linearize(sections.cycle, sections, sections.cycle.system.charts()["step"].states[0])
-    state, by_state, by_input = (truth[f"{name}.{x}"] for x in ("state", "by_state", "by_input"))
+    model = hj.linearize(
+        sections.cycle, sections, sections.cycle.system.charts()["step"].states[0]
+    )
+    state, by_state, by_input = (
+        truth[f"{name}.{x}"] for x in ("state", "by_state", "by_input")
+    )
     np.testing.assert_allclose(sections.lanes.q[:, 0], state, rtol=0, atol=1e-10)
-    leg, d = np.pad(WALKERS[name][0], (0, len(state) - len(WALKERS[name][0]))), len(state)
+    leg, d = (
+        np.pad(WALKERS[name][0], (0, len(state) - len(WALKERS[name][0]))),
+        len(state),
+    )
     for n in range(4):
         # A move in one coordinate takes the one that is left out along the section.
         out, dropped = int(sections.drop[n]) - 1, int(sections.drop[(n + 1) % 4]) - 1
-        moves = np.eye(d) if out < 0 else np.eye(d) - np.outer(np.eye(d)[out], leg / leg[out])
+        moves = (
+            np.eye(d)
+            if out < 0
+            else np.eye(d) - np.outer(np.eye(d)[out], leg / leg[out])
+        )
         rows, columns = (np.flatnonzero(np.arange(d) != k) for k in (dropped, out))
         A, B = (by_state[n] @ moves)[np.ix_(rows, columns)], by_input[n][rows]
         ours = model.A[n][: len(rows), : len(columns)], model.B[n][: len(rows), 0]

@@ -60,18 +60,27 @@ def flow(point, section, u=0.0, retention=1.0):
         for function in watched:
             function.terminal, function.direction = True, -1.0
         run = solve_ivp(
-            lambda t, q: _field(t, q, u), (t, t + 2.0), q,
-            method="DOP853", rtol=1e-13, atol=1e-14, events=watched,
-        )  # fmt: skip
+            lambda t, q: _field(t, q, u),
+            (t, t + 2.0),
+            q,
+            method="DOP853",
+            rtol=1e-13,
+            atol=1e-14,
+            events=watched,
+        )
         assert run.status == 1, f"nothing happens after {point}"
         which = int(len(run.t_events[1]) > 0)
         # Once more over the last step, so that its end is a true step and no interpolant.
         last, start = run.t[-2], run.y[:, -2]
         if run.t[-1] > last:
             again = solve_ivp(
-                lambda t, q: _field(t, q, u), (last, run.t[-1]), start,
-                method="DOP853", rtol=1e-13, atol=1e-14,
-            )  # fmt: skip
+                lambda t, q: _field(t, q, u),
+                (last, run.t[-1]),
+                start,
+                method="DOP853",
+                rtol=1e-13,
+                atol=1e-14,
+            )
             t, q = _polish(watched[which], run.t[-1], again.y[:, -1], u)
         if which == 1:
             return np.array([t, *q])
@@ -110,5 +119,7 @@ def jacobian(point, here, there, names, names_after, retention=1.0, e=2e-4):
             start = onto(here, start, names)
             return flow(start, there, x if k is None else 0.0, retention)[rows]
 
-        out[:, j] = (8 * (value(e) - value(-e)) - (value(2 * e) - value(-2 * e))) / (12 * e)
+        out[:, j] = (8 * (value(e) - value(-e)) - (value(2 * e) - value(-2 * e))) / (
+            12 * e
+        )
     return out

@@ -26,7 +26,11 @@ KICKED = toy({"fall": Field(("x",), lambda t, q, u: (PULSE(t) - q[0],))}, period
 @pytest.mark.parametrize(
     "system, state, message",
     [
-        (Unclocked(), (0.1, 4.7), "guard .*'impact' .* on t, but Unclocked states no period"),
+        (
+            Unclocked(),
+            (0.1, 4.7),
+            "guard .*'impact' .* on t, but Unclocked states no period",
+        ),
         (WrongPaddle(), (0.1, 4.7), "guard of 'impact' does not have the period 1.1"),
         (KICKED, (0.0,), "field .*does not have the period 1"),
     ],
@@ -38,13 +42,21 @@ def test_another_period_or_none(system, state, message):
 
 def test_a_period_that_does_not_follow_a_parameter():
     fixed = type("Fixed", (hj.models.Duffing,), {"period": lambda self: 4 * np.pi})
-    with pytest.raises(hj.DefinitionError, match="does not have the period 12.5664 that Fixed"):
+    with pytest.raises(
+        hj.DefinitionError, match="does not have the period 12.5664 that Fixed"
+    ):
         hj.continuation(hj.find_limit_cycle(fixed()), "rate", (0.5, 0.51))
     every = lambda self: hj.Scheduled(20 * np.pi * self.damping, 1.0)  # noqa: E731
-    tick = {"transitions": lambda self: [hj.Transition("tick", "line", "line", every(self))]}
+    tick = {
+        "transitions": lambda self: [hj.Transition("tick", "line", "line", every(self))]
+    }
     ticks = type("Ticks", (hj.models.Duffing,), tick)
-    with pytest.raises(hj.DefinitionError, match="the schedule of 'tick' must divide the clock's"):
-        hj.find_limit_cycles([ticks(), ticks(damping=0.11)], hj.find_limit_cycle(ticks()))
+    with pytest.raises(
+        hj.DefinitionError, match="the schedule of 'tick' must divide the clock's"
+    ):
+        hj.find_limit_cycles(
+            [ticks(), ticks(damping=0.11)], hj.find_limit_cycle(ticks())
+        )
 
 
 def test_a_force_that_jumps_with_the_clock():
@@ -52,7 +64,9 @@ def test_a_force_that_jumps_with_the_clock():
 
     force = lambda t: jnp.where(t % 1.0 < 0.5, 1.0, 0.0)  # noqa: E731
     charts = {"a": Field(("x",), lambda t, q, u: (-q[0] + force(t),))}
-    square = toy(charts, [hj.Transition("half", "a", "a", hj.Scheduled(0.5))], period=1.0)
+    square = toy(
+        charts, [hj.Transition("half", "a", "a", hj.Scheduled(0.5))], period=1.0
+    )
     cycle = hj.find_limit_cycle(square, hj.Guess("a", (0.3,), 0.25))
     x = (1 - np.exp(-0.5)) * np.exp(-0.5) / (1 - np.exp(-1.0))
     np.testing.assert_allclose(cycle.state["x"], 1 + (x - 1) * np.exp(-0.25), rtol=1e-6)

@@ -16,14 +16,23 @@ PAIR = toy(
     {"a": Field(("x", "y"), lambda t, q, u: (1.0 - q[0], 1.0 - q[1]))},
     [
         hj.Transition(
-            "x", "a", "a", lambda t, q, u: q[0] - 0.5, "rising",
+            "x",
+            "a",
+            "a",
+            lambda t, q, u: q[0] - 0.5,
+            "rising",
             lambda t, q, u: (0.5 * (q[1] - 0.5), q[1]),
         ),
         hj.Transition(
-            "y", "a", "a", lambda t, q, u: q[1] - 0.5, "rising", lambda t, q, u: (q[0], 0.0)
+            "y",
+            "a",
+            "a",
+            lambda t, q, u: q[1] - 0.5,
+            "rising",
+            lambda t, q, u: (q[0], 0.0),
         ),
     ],
-)  # fmt: skip
+)
 
 
 def ticked(height=1.0, other=0.0):
@@ -34,15 +43,24 @@ def ticked(height=1.0, other=0.0):
         hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=back),
     ]
     if other:
-        transitions.append(hj.Transition("tock", "a", "a", hj.Scheduled(0.5, other), reset=back))
-    charts = {"a": Field(("x",), lambda t, q, u: (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),))}
+        transitions.append(
+            hj.Transition("tock", "a", "a", hj.Scheduled(0.5, other), reset=back)
+        )
+    charts = {
+        "a": Field(("x",), lambda t, q, u: (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),))
+    }
     return toy(charts, transitions, period=1.0)
 
 
 def race():
     """x and y rise to 1 together; the other goes on at its own speed when one is there. Both fall
     then, until the clock starts them again."""
-    speeds = {"a": (1.0, 1.0), "x first": (1.0, 2.0), "y first": (3.0, 1.0), "c": (-4.0, -5.0)}
+    speeds = {
+        "a": (1.0, 1.0),
+        "x first": (1.0, 2.0),
+        "y first": (3.0, 1.0),
+        "c": (-4.0, -5.0),
+    }
     charts = {
         name: Field(("x", "y"), lambda t, q, u, speed=speed: speed)
         for name, speed in speeds.items()
@@ -75,7 +93,9 @@ def test_derivatives_of_both_orders():
 
 
 def test_an_event_that_coincides_with_the_one_at_the_anchor():
-    with pytest.raises(hj.ComputationError, match="'y' coincides with 'x', its beginning"):
+    with pytest.raises(
+        hj.ComputationError, match="'y' coincides with 'x', its beginning"
+    ):
         hj.find_limit_cycle(PAIR, hj.Guess("a", (0.1, 0.1)), section=hj.AtEvent("x"))
 
 
@@ -95,10 +115,14 @@ def test_cycles_of_a_sweep_and_of_a_branch_on_which_events_coincide():
 def test_an_event_that_coincides_with_a_schedule():
     """Without the clock, it would be full at the time 1: which of the two sets it back?"""
     height = 10 - 9.8 * np.exp(-0.1)
-    with pytest.raises(hj.ComputationError, match="'full' and 'tick' coincide|'tick' and 'full'"):
+    with pytest.raises(
+        hj.ComputationError, match="'full' and 'tick' coincide|'tick' and 'full'"
+    ):
         hj.find_limit_cycle(ticked(height), hj.Guess("a", (0.5,), 0.3))
 
 
 def test_two_schedules_for_one_time():
-    with pytest.raises(hj.DefinitionError, match="'tick' and 'tock' are scheduled for the same"):
+    with pytest.raises(
+        hj.DefinitionError, match="'tick' and 'tock' are scheduled for the same"
+    ):
         hj.find_limit_cycle(ticked(other=0.5), hj.Guess("a", (0.5,), 0.3))

@@ -35,7 +35,9 @@ def test_fold_and_flip_of_the_juggler(juggling):
 
     branch = hj.continuation(juggling, "A", (0.1, 0.2, 0.35))
     assert [x.kind for x in branch.points] == ["fold", "flip"]
-    np.testing.assert_allclose([x.value for x in branch.points], [fold, flip], rtol=1e-11)
+    np.testing.assert_allclose(
+        [x.value for x in branch.points], [fold, flip], rtol=1e-11
+    )
     np.testing.assert_allclose(branch.points[0].multipliers, [1, a**2], atol=2e-6)
     np.testing.assert_allclose(branch.points[1].multipliers, [-1, -(a**2)], rtol=1e-9)
     # From the fold on, two cycles, one of them unstable: the branch begins with this one.
@@ -74,8 +76,13 @@ def test_neimark_sacker_of_the_juggler(juggling):
     np.testing.assert_allclose(point.value, 1.0, rtol=1e-11)
     np.testing.assert_allclose(np.abs(point.multipliers), 1, rtol=1e-9)
     assert point.kind == "Neimark-Sacker"
-    assert branch.stable[: point.index].all() and not branch.stable[point.index + 1 :].any()
-    assert str(branch[point.index]).startswith("LimitCycle(PaddleJuggler: ok)")  # neutral
+    assert (
+        branch.stable[: point.index].all()
+        and not branch.stable[point.index + 1 :].any()
+    )
+    assert str(branch[point.index]).startswith(
+        "LimitCycle(PaddleJuggler: ok)"
+    )  # neutral
     assert "Neimark-Sacker at restitution = 1 (multipliers" in repr(branch)
 
 
@@ -88,7 +95,9 @@ def test_neimark_sacker_of_the_juggler(juggling):
 def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
     """Any parameter, either way, in long steps and short ones; with T the clock changes, too."""
     own = float(getattr(juggling.system, parameter))
-    branch = hj.continuation(juggling, parameter, np.sort([own, own * factor]), step=step)
+    branch = hj.continuation(
+        juggling, parameter, np.sort([own, own * factor]), step=step
+    )
     for k in (0, len(branch) - 1):
         p = branch[k].system
         a, g, T = float(p.restitution), float(p.g), float(p.T)
@@ -112,7 +121,10 @@ def test_derivatives_of_a_turn_by_a_clock_are_differences(system):
 
 def test_bad_input(juggling):
     follow = hj.continuation
-    for words, values in {"ascending": (0.1, 0.3, 0.2), "outside of the": (0.2, 0.3)}.items():
+    for words, values in {
+        "ascending": (0.1, 0.3, 0.2),
+        "outside of the": (0.2, 0.3),
+    }.items():
         with pytest.raises(hj.DefinitionError, match=words):
             follow(juggling, "A", values)
     with pytest.raises(hj.DefinitionError, match="outside of jit"):
@@ -125,10 +137,14 @@ def test_bad_input(juggling):
 def test_period_2_of_the_buck_converter():
     """It ends in the flip of the cycle of period 1, where the two halves change places."""
     buck = m.BuckConverter(Vin=25.0)
-    cycle = hj.find_limit_cycle(buck, hj.Guess("open", (12.04, 0.627, 3.8)), multiplicity=2)
+    cycle = hj.find_limit_cycle(
+        buck, hj.Guess("open", (12.04, 0.627, 3.8)), multiplicity=2
+    )
     np.testing.assert_allclose(cycle.period, 800e-6)
     np.testing.assert_allclose(
-        [cycle.state["v"], cycle.state["i"]], [12.0384992252652, 0.626948841497016], rtol=1e-11
+        [cycle.state["v"], cycle.state["i"]],
+        [12.0384992252652, 0.626948841497016],
+        rtol=1e-11,
     )
     pair = 0.613891423607179 + 0.290590765487630j
     np.testing.assert_allclose(cycle.multipliers, [pair, np.conj(pair)], rtol=1e-9)
@@ -137,7 +153,9 @@ def test_period_2_of_the_buck_converter():
     assert point.kind == "branch point"
     np.testing.assert_allclose(point.value, 24.5165728285634, rtol=1e-7)
     assert branch.values[0] == branch.values[-1] == 25.5
-    at = np.abs([branch.values[1 : point.index].min(), branch.values[point.index + 1 :].min()])
+    at = np.abs(
+        [branch.values[1 : point.index].min(), branch.values[point.index + 1 :].min()]
+    )
     assert np.all(at > 24.5165)
 
 
@@ -166,7 +184,11 @@ class Maps(hj.HybridSystem):
     growth: Growth = eqx.field(default_factory=Growth)
 
     def charts(self):
-        return {"a": Field(tuple("abcdef"), lambda t, q, u: 0.0 * jnp.sin(2 * jnp.pi * t) * q)}
+        return {
+            "a": Field(
+                tuple("abcdef"), lambda t, q, u: 0.0 * jnp.sin(2 * jnp.pi * t) * q
+            )
+        }
 
     def transitions(self):
         def step(t, q, u):
@@ -185,5 +207,9 @@ def test_multipliers_that_cross_the_circle_together_or_beside_others():
     with pytest.raises(hj.DefinitionError, match="'growth.c'; parameters are growth.r"):
         hj.continuation(cycle, "growth.c", (1.0, 2.0))
     points = hj.continuation(cycle, "growth.r", (1.9, 3.1), step=1.0).points
-    assert [(x.kind[0], len(x.critical)) for x in points] == [("N", 2), ("N", 2), ("f", 2)]
+    assert [(x.kind[0], len(x.critical)) for x in points] == [
+        ("N", 2),
+        ("N", 2),
+        ("f", 2),
+    ]
     np.testing.assert_allclose([x.value for x in points], [1.99, 2.0, 3.0], atol=1e-8)

@@ -21,12 +21,16 @@ VANDERPOL = {
 
 def vanderpol(mu, guess=None, section=FALL, **options):
     guess = None if guess is None else hj.Guess("oscillation", guess)
-    return hj.find_limit_cycle(hj.models.VanDerPol(mu=mu), guess, section=section, **options)
+    return hj.find_limit_cycle(
+        hj.models.VanDerPol(mu=mu), guess, section=section, **options
+    )
 
 
 def test_the_hopper_and_its_events(reference, hopper_cycle):
     data = reference("limit_cycle")
-    np.testing.assert_allclose(hopper_cycle.anchor.q[:2, 0], data["state_clock_half"], atol=1e-10)
+    np.testing.assert_allclose(
+        hopper_cycle.anchor.q[:2, 0], data["state_clock_half"], atol=1e-10
+    )
     assert hopper_cycle.result == hj.Result.OK and hopper_cycle.stable
     assert hopper_cycle.period == 1.0 and hopper_cycle.residual < 1e-12
     liftoff, touchdown = hopper_cycle.trajectory().events
@@ -35,8 +39,12 @@ def test_the_hopper_and_its_events(reference, hopper_cycle):
     np.testing.assert_allclose(touchdown.time % 1, data["touchdown_clock"], atol=1e-10)
     for event in (liftoff, touchdown):
         for x, when in ((event.before, "pre"), (event.after, "post")):
-            np.testing.assert_allclose(list(x.values()), data[f"{event.name}_{when}"], atol=1e-10)
-    (before, _), (after, _) = map(last_turn, (hopper_cycle, begin_later(hopper_cycle, 2)))
+            np.testing.assert_allclose(
+                list(x.values()), data[f"{event.name}_{when}"], atol=1e-10
+            )
+    (before, _), (after, _) = map(
+        last_turn, (hopper_cycle, begin_later(hopper_cycle, 2))
+    )
     np.testing.assert_array_equal(after.t, np.append(before.t[2:], before.t[:2] + 1.0))
     text = repr(hopper_cycle)
     assert "liftoff, touchdown" in text and "-0.248983335+0.699333252j" in text
@@ -45,7 +53,9 @@ def test_the_hopper_and_its_events(reference, hopper_cycle):
 def test_a_cycle_can_be_donated(hopper_cycle):
     """No buffer is in it twice: XLA refuses to write over one twice."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    moved = eqx.filter_jit(lambda c: eqx.tree_at(lambda c: c.period, c, 1.0), donate="all")(cycle)
+    moved = eqx.filter_jit(
+        lambda c: eqx.tree_at(lambda c: c.period, c, 1.0), donate="all"
+    )(cycle)
     np.testing.assert_array_equal(moved.multipliers, hopper_cycle.multipliers)
 
 
@@ -55,13 +65,20 @@ def test_the_lossy_hopper(lossy_cycle):
     multiplier = -0.317897006349938 + 0.694628822735891j
     np.testing.assert_allclose(lossy_cycle.multipliers[0], multiplier, atol=1e-9)
     events = [e.time % 1 for e in lossy_cycle.trajectory().events]
-    np.testing.assert_allclose(events, [0.522453086774101, 0.332748511553392], atol=1e-10)
+    np.testing.assert_allclose(
+        events, [0.522453086774101, 0.332748511553392], atol=1e-10
+    )
 
 
 @pytest.mark.slow
 def test_the_two_legged_bar():
     bar_cycle = hj.find_limit_cycle(hj.models.TwoLeggedBar())
-    state = [0.400516754055274, -0.764126541534894, -0.00728487463290610, 0.399159213578728]
+    state = [
+        0.400516754055274,
+        -0.764126541534894,
+        -0.00728487463290610,
+        0.399159213578728,
+    ]
     np.testing.assert_allclose(bar_cycle.anchor.q[:, 0], state, atol=1e-9)
     first = -0.153520955429110 + 0.361043052961495j
     second = 0.151655665357578 + 0.227749294883360j
@@ -72,7 +89,12 @@ def test_the_two_legged_bar():
     assert names == "front lifts, hind lifts, front lands, hind lands"
     times = [0.485372036855771, 0.520707713616307, 0.745498454894426, 0.759897208341559]
     np.testing.assert_allclose([e.time for e in events], times, atol=1e-9)
-    landed = [0.788200918259240, -1.71180954225949, -0.0243713338437363, -0.268770117871700]
+    landed = [
+        0.788200918259240,
+        -1.71180954225949,
+        -0.0243713338437363,
+        -0.268770117871700,
+    ]
     np.testing.assert_allclose(list(events[3].after.values()), landed, atol=1e-9)
 
 
@@ -85,7 +107,9 @@ def test_van_der_pol(mu):
     cycle = vanderpol(mu, (2.0, 0.0) if mu < 0 else None)
     np.testing.assert_allclose(cycle.anchor.q[:, 0], [amplitude, 0.0], atol=1e-9)
     np.testing.assert_allclose(cycle.period, period, atol=1e-9)
-    np.testing.assert_allclose(cycle.multipliers, [multiplier ** np.sign(mu)], rtol=1e-7, atol=0)
+    np.testing.assert_allclose(
+        cycle.multipliers, [multiplier ** np.sign(mu)], rtol=1e-7, atol=0
+    )
     assert not cycle.clocked and cycle.event_sequence == () and cycle.stable == (mu > 0)
 
 
@@ -103,18 +127,27 @@ def test_an_equilibrium_is_no_cycle():
     with pytest.raises(hj.ComputationError, match="starts at an equilibrium"):
         vanderpol(-0.5, (0.0, 0.0))
     far = hj.Crossing("x", "falling", value=10.0)
-    with pytest.raises(hj.ComputationError, match=r"looking for the section \(x falling\) failed"):
+    with pytest.raises(
+        hj.ComputationError, match=r"looking for the section \(x falling\) failed"
+    ):
         vanderpol(1.0, section=far, max_period=20.0)
     still = vanderpol(-0.5, (0.1, 0.0), throw=False)
     linearize = lambda: hj.linearize(still, far)  # noqa: E731
-    for use in (still.responses, linearize, lambda: still.multipliers, lambda: still.htf(0.1)):
+    for use in (
+        still.responses,
+        linearize,
+        lambda: still.multipliers,
+        lambda: still.htf(0.1),
+    ):
         with pytest.raises(hj.DefinitionError, match="search for this cycle failed"):
             use()
 
 
 def test_a_lossy_ball_has_no_cycle():
     ball = hj.models.BouncingBall(restitution=0.7)
-    with pytest.raises(hj.ComputationError, match="no limit cycle of BouncingBall|accumulate"):
+    with pytest.raises(
+        hj.ComputationError, match="no limit cycle of BouncingBall|accumulate"
+    ):
         hj.find_limit_cycle(
             ball, hj.Guess("fall", (1.0, 0.0)), section=hj.AtEvent("bounce"), settle=5.0
         )

@@ -57,7 +57,10 @@ def test_events_that_coincide_in_either_order():
     """Balls that know nothing of each other: twice the multipliers of one."""
     cycle = hj.find_limit_cycle(Balls(), BALLS)
     (both,) = hj.coincidences(cycle)
-    assert both.commute and set(both.orders) == {("impact0", "impact1"), ("impact1", "impact0")}
+    assert both.commute and set(both.orders) == {
+        ("impact0", "impact1"),
+        ("impact1", "impact0"),
+    }
     z = 0.399920196836063 + 0.574511824214789j
     np.testing.assert_allclose(cycle.multipliers.real, [z.real] * 4, rtol=1e-7)
     np.testing.assert_allclose(np.abs(cycle.multipliers.imag), [z.imag] * 4, rtol=1e-7)
@@ -84,18 +87,37 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
         step = np.zeros(4)
         step[2 * early] = -1e-6  # this ball is lower, and lands first
         change = (ends(start + step) - ends(start)) / 1e-6
-        np.testing.assert_allclose(change, fall @ derivative @ fall @ step / 1e-6, atol=1e-4)
+        np.testing.assert_allclose(
+            change, fall @ derivative @ fall @ step / 1e-6, atol=1e-4
+        )
 
 
 @pytest.mark.parametrize(
     "system, guess, message, steps",
     [
-        (WRONG_WAY, (0.2, 0.5), "'impact', which should be rising, began past zero, at", 100),
-        (DAMPED, (0.0, 0.0), r'it from 100 .*\. The system is stiff: a mode .*solver="auto"', 100),
-        (hj.models.VerticalHopper(k=1e7), (2.0, 1.9), r"256 \(reached.* of 1\).* `settle=60`", 256),
+        (
+            WRONG_WAY,
+            (0.2, 0.5),
+            "'impact', which should be rising, began past zero, at",
+            100,
+        ),
+        (
+            DAMPED,
+            (0.0, 0.0),
+            r'it from 100 .*\. The system is stiff: a mode .*solver="auto"',
+            100,
+        ),
+        (
+            hj.models.VerticalHopper(k=1e7),
+            (2.0, 1.9),
+            r"256 \(reached.* of 1\).* `settle=60`",
+            256,
+        ),
     ],
 )
 def test_causes(system, guess, message, steps):
     *_, chart = system.charts()
     with pytest.raises(hj.ComputationError, match=message):
-        hj.find_limit_cycle(system, hj.Guess(chart, guess), settings=hj.Settings(max_steps=steps))
+        hj.find_limit_cycle(
+            system, hj.Guess(chart, guess), settings=hj.Settings(max_steps=steps)
+        )

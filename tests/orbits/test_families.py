@@ -20,7 +20,9 @@ APEX = hj.Crossing("vy", "falling")
 
 @pytest.fixture(scope="module")
 def running():
-    return hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX, conserved={"energy": 1784.8})
+    return hj.find_limit_cycle(
+        hj.models.SLIPRunner(), section=APEX, conserved={"energy": 1784.8}
+    )
 
 
 @pytest.mark.slow
@@ -43,18 +45,26 @@ def test_what_is_not_conserved_is_refused():
 def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):
     def height(k, energy):
         runner = eqx.tree_at(lambda x: x.k, running.system, k)
-        return hj.find_limit_cycle(runner, running, conserved={"energy": energy}).anchor.q[0, 0]
+        return hj.find_limit_cycle(
+            runner, running, conserved={"energy": energy}
+        ).anchor.q[0, 0]
 
     at = jnp.array(20000.0), jnp.array(1784.8)
-    by_k, by_energy = (jax.jvp(height, at, tangent)[1] for tangent in ((1.0, 0.0), (0.0, 1.0)))
+    by_k, by_energy = (
+        jax.jvp(height, at, tangent)[1] for tangent in ((1.0, 0.0), (0.0, 1.0))
+    )
     for exact, step in ((by_k, (4.0, 0.0)), (by_energy, (0.0, 0.05))):
         ends = [height(at[0] + s * step[0], at[1] + s * step[1]) for s in (-1, 1)]
-        np.testing.assert_allclose(exact, (ends[1] - ends[0]) / 2 / max(step), rtol=1e-5)
+        np.testing.assert_allclose(
+            exact, (ends[1] - ends[0]) / 2 / max(step), rtol=1e-5
+        )
 
 
 ENERGY = hj.Output("energy", lambda t, q, u: (q[0] ** 2 + q[1] ** 2) / 2)
 # x'' = -x, whose cycles are circles.
-CIRCLES = toy({"a": Field(("x", "v"), lambda t, q, u: (q[1], -q[0]))}, outputs=(ENERGY,))
+CIRCLES = toy(
+    {"a": Field(("x", "v"), lambda t, q, u: (q[1], -q[0]))}, outputs=(ENERGY,)
+)
 
 
 def find(**conserved):

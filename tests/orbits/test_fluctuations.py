@@ -45,7 +45,9 @@ def test_the_jitter_of_integrate_and_fire_neurons_has_its_closed_form():
 @pytest.mark.core
 def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
-    noisy = hj.find_limit_cycle(StuartLandau(), guess, section=section).fluctuations({"x": 1e-3})
+    noisy = hj.find_limit_cycle(StuartLandau(), guess, section=section).fluctuations(
+        {"x": 1e-3}
+    )
     # Of the amplitude r: r' = -0.2 r + cos(t w) dW; of the phase: see the closed form of Z.
     angle, w = 2 * np.pi * np.array([0.0, 0.2, 0.7]), 1.0 + 0.4 * 0.1
     wave = 0.4 * np.cos(2 * angle) + 2 * w * np.sin(2 * angle)
@@ -55,16 +57,24 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     C, later = (noisy.covariance([0.0, 0.2, 0.7], lag) for lag in (0, 1))
     np.testing.assert_allclose(C[:, 0, 1], radial * along[0] * along[1], rtol=1e-11)
     decay = np.exp(-0.2 * 2 * np.pi / w)
-    np.testing.assert_allclose(later[:, 1, 1], decay * radial * along[1] ** 2, rtol=1e-11)
-    np.testing.assert_allclose(noisy.diffusion, 1e-6 * (1 + 0.4**2) / 0.2 / w**2, rtol=1e-11)
+    np.testing.assert_allclose(
+        later[:, 1, 1], decay * radial * along[1] ** 2, rtol=1e-11
+    )
+    np.testing.assert_allclose(
+        noisy.diffusion, 1e-6 * (1 + 0.4**2) / 0.2 / w**2, rtol=1e-11
+    )
     # Periods are correlated, and over many of them their variance is that of the diffusion.
-    both = noisy.durations()[0, 0] + 2 * sum(noisy.durations(k)[0, 0] for k in range(1, 40))
+    both = noisy.durations()[0, 0] + 2 * sum(
+        noisy.durations(k)[0, 0] for k in range(1, 40)
+    )
     np.testing.assert_allclose(both, noisy.diffusion * noisy.period, rtol=1e-11)
 
 
 def test_states_may_have_no_correlation():
     noisy = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0)).fluctuations({"u": 0.2})
-    np.testing.assert_allclose(noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12
+    )
 
 
 def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
@@ -73,8 +83,14 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     fall = v - G  # the speed with which it lands, after a period of 1
     late = np.array([fall, -1.0, -1.0]) / (fall - slope(t))
     early = late - [1, 0, 0]
-    step = np.stack([late, slope(t) * late, 1.7 * bend(t) * late + 0.7 * G * early - [0, 0, 0.7]])
-    table = np.array([1.0, slope(t), 1.7 * bend(t) + 0.7 * G]) / (fall - slope(t)) + [0, 1, 0]
+    step = np.stack(
+        [late, slope(t) * late, 1.7 * bend(t) * late + 0.7 * G * early - [0, 0, 0.7]]
+    )
+    table = np.array([1.0, slope(t), 1.7 * bend(t) + 0.7 * G]) / (fall - slope(t)) + [
+        0,
+        1,
+        0,
+    ]
     noise = TABLE**2 * np.outer(table, table) + np.diag([0, 0, SPEED**2])
     C = solve_discrete_lyapunov(step, noise)
     ago = float(juggler.anchor.t[0]) + 1 - t  # from a bounce to the anchor
@@ -84,7 +100,9 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
         noisy.covariance([0.0], 2)[0], now @ step @ step @ C @ now.T, rtol=1e-11
     )
     lags = [C[0, 0], *((np.linalg.matrix_power(step, k) @ C)[0, 0] for k in (1, 2))]
-    np.testing.assert_allclose(noisy.durations()[0, 0], 2 * (lags[0] - lags[1]), rtol=1e-12)
+    np.testing.assert_allclose(
+        noisy.durations()[0, 0], 2 * (lags[0] - lags[1]), rtol=1e-12
+    )
     np.testing.assert_allclose(
         noisy.durations(1)[0, 0], 2 * lags[1] - lags[0] - lags[2], rtol=1e-11
     )
@@ -107,17 +125,25 @@ def test_a_million_simulated_bounces_scatter_as_computed(juggler):
             durations.append(tau - 1)
     x = np.array(durations)
     for lag in (0, 1, 2):
-        each = (x[lag:] * x[: len(x) - lag]).mean(axis=0)  # one for each of independent jugglers
+        each = (x[lag:] * x[: len(x) - lag]).mean(
+            axis=0
+        )  # one for each of independent jugglers
         error = each.std(ddof=1) / np.sqrt(draws)
         assert abs(each.mean() - noisy.durations(lag)[0, 0]) < 3 * error
 
 
 def test_noise_that_does_not_fit_is_refused(juggler):
-    with pytest.raises(hj.DefinitionError, match="`white`: there is no state or input 'w'"):
+    with pytest.raises(
+        hj.DefinitionError, match="`white`: there is no state or input 'w'"
+    ):
         juggler.fluctuations({"w": 1.0})
-    with pytest.raises(hj.DefinitionError, match="`guards`: there is no transition 'bounce'"):
+    with pytest.raises(
+        hj.DefinitionError, match="`guards`: there is no transition 'bounce'"
+    ):
         juggler.fluctuations(guards={"bounce": 1.0})
-    with pytest.raises(hj.DefinitionError, match="`resets`: after 'impact' there is no state 'w'"):
+    with pytest.raises(
+        hj.DefinitionError, match="`resets`: after 'impact' there is no state 'w'"
+    ):
         juggler.fluctuations(resets={"impact": {"w": 1.0}})
     unstable = hj.find_limit_cycle(hj.models.BuckConverter(Vin=26.0))
     with pytest.raises(hj.ComputationError, match="not stable"):

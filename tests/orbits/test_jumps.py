@@ -62,10 +62,14 @@ def is_refused(cycle, further):
         lambda x: 1e-6 * jnp.mod(x, 1.0),
         lambda x: jnp.where(jnp.abs(x - 0.5) < 3e-4, 1e-2, 0.0),  # a narrow pulse
         pytest.param(
-            lambda x: jax.lax.cond(x > 0, lambda: jnp.where(x > 0.7, 1e-6, 0.0), lambda: 0.0),
+            lambda x: jax.lax.cond(
+                x > 0, lambda: jnp.where(x > 0.7, 1e-6, 0.0), lambda: 0.0
+            ),
             marks=SLOW,
         ),
-        pytest.param(lambda x: 1e-6 * jnp.sin(GRID)[jnp.searchsorted(GRID, x)], marks=SLOW),
+        pytest.param(
+            lambda x: 1e-6 * jnp.sin(GRID)[jnp.searchsorted(GRID, x)], marks=SLOW
+        ),
         lambda x: 1e-4 * x / jnp.abs(x),
         lambda x: 1e-4 * jnp.tanh(1e11 * x),
         lambda x: 1e-3 * jnp.exp(-(((x - 0.5) / 1e-4) ** 2)),
@@ -79,7 +83,9 @@ def test_a_jump_is_refused(smooth, further):
 @pytest.mark.parametrize(
     "further",
     [
-        lambda x: jnp.where(x > 0, 1e-3 * x, 0.0) + 1e-3 * jnp.abs(jnp.mod(x, 1.0) - 0.5),
+        lambda x: (
+            jnp.where(x > 0, 1e-3 * x, 0.0) + 1e-3 * jnp.abs(jnp.mod(x, 1.0) - 0.5)
+        ),
         lambda x: 1e-6 * jnp.tanh(50 * x) + 1e-6 * x / jnp.sqrt(x**2 + 1e-4),
         pytest.param(lambda x: 1e-3 * jnp.interp(x, GRID, jnp.sin(GRID)), marks=SLOW),
     ],
@@ -95,7 +101,9 @@ def test_a_mass_matrix_may_have_poles_only():
 
 @SLOW
 def test_kinks_have_the_steps_that_they_need():
-    kinked = hj.find_limit_cycle(Turns(lambda x: 1e-2 * jnp.interp(x, GRID, jnp.sin(GRID))))
+    kinked = hj.find_limit_cycle(
+        Turns(lambda x: 1e-2 * jnp.interp(x, GRID, jnp.sin(GRID)))
+    )
     assert kinked.result == hj.Result.OK
 
 
@@ -112,7 +120,9 @@ def test_simulations_end_at_what_steps_pass_over():
 def test_a_guard_without_derivative_does_not_pass_as_one_that_never_falls():
     level = lambda t, q, u: 1.5 + 0.1 * jnp.maximum(0.5 - q[0], 0.0) ** 0.0 - q[0]  # noqa: E731
     event = hj.Transition("stop", "on", "on", level, "falling", lambda t, q, u: q)
-    stops = type("Stops", (Turns,), {"transitions": lambda self: [event]})(lambda x: 0.0)
+    stops = type("Stops", (Turns,), {"transitions": lambda self: [event]})(
+        lambda x: 0.0
+    )
     path = hj.simulate(stops, "on", (0.6, 2.0), 6.0, throw=False)
     assert path.result == hj.Result.FIELD_NOT_FINITE
 
@@ -123,13 +133,17 @@ class Pushed(Turning):
     def field(self, t, q, u):
         x, v = q
         pulse = 0.4 * jnp.exp(-(((t % 1.3 - 0.33) / 0.0055) ** 2))
-        return v, -3 * x - 0.7 * v + 2 * jnp.cos(2 * jnp.pi * t / 1.3) + u[0] * (1 + pulse)
+        return v, -3 * x - 0.7 * v + 2 * jnp.cos(2 * jnp.pi * t / 1.3) + u[0] * (
+            1 + pulse
+        )
 
 
 def test_a_pulse_in_the_gain_of_an_input_is_refused():
     make = {"charts": lambda self: {"on": Pushed(None)}, "period": lambda self: 1.3}
     system = type("Pushes", (Turns,), make)(None)
-    with pytest.raises(hj.DefinitionError, match="the gain from 'u' to the rate of 'v' .* pulse"):
+    with pytest.raises(
+        hj.DefinitionError, match="the gain from 'u' to the rate of 'v' .* pulse"
+    ):
         hj.find_limit_cycle(system, hj.Guess("on", (1.0, 0.0)), settle=10.0)
 
 

@@ -25,13 +25,20 @@ BEAT = kicked(schedule=1.0)
 @pytest.mark.parametrize("size", [1e300, 1e100])
 def test_a_guess_that_is_far_too_large_leads_to_the_same_cycle(size):
     cycle = hj.find_limit_cycle(BEAT, hj.Guess("a", (size,)))
-    np.testing.assert_allclose(cycle.state["x"], np.exp(-0.9) / (1 - np.exp(-1)), rtol=1e-12)
+    np.testing.assert_allclose(
+        cycle.state["x"], np.exp(-0.9) / (1 - np.exp(-1)), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
     "system, guess, options, message",
     [
-        (kicked(), (1 / np.expm1(1), 0.25), {}, "event 'kick' coincides with the beginning"),
+        (
+            kicked(),
+            (1 / np.expm1(1), 0.25),
+            {},
+            "event 'kick' coincides with the beginning",
+        ),
         (kicked(beat=2.0, schedule=3.0), (0.3,), {}, "schedule of 'kick' must divide"),
         (BEAT, (0.6,), {"multiplicity": 2}, "closes sooner than after the 2 periods"),
     ],
@@ -48,17 +55,31 @@ def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
     def make(r):
         grow = lambda t, q, u: (r * q[0] * (1 - q[0]),)  # noqa: E731
         still = {"a": Field(("x",), lambda t, q, u: (0.0 * jnp.sin(2 * jnp.pi * t),))}
-        return still, [hj.Transition("grow", "a", "a", hj.Scheduled(1, 0.5), reset=grow)], 1.0
+        return (
+            still,
+            [hj.Transition("grow", "a", "a", hj.Scheduled(1, 0.5), reset=grow)],
+            1.0,
+        )
 
-    cycle = hj.find_limit_cycle(Toys(make, [3.2]), hj.Guess("a", (0.8,)), multiplicity=2)
+    cycle = hj.find_limit_cycle(
+        Toys(make, [3.2]), hj.Guess("a", (0.8,)), multiplicity=2
+    )
     result = jax.jit(lambda r: hj.find_limit_cycle(Toys(make, r), cycle).result)
-    assert [result(np.array([r])) for r in (3.3, 2.8)] == [hj.Result.OK, hj.Result.EXTRA_TURNS]
+    assert [result(np.array([r])) for r in (3.3, 2.8)] == [
+        hj.Result.OK,
+        hj.Result.EXTRA_TURNS,
+    ]
 
 
 def test_outputs_of_a_call_have_the_period_of_the_clock():
     cycle = hj.find_limit_cycle(BEAT, hj.Guess("a", (0.6,)))
-    for value in (lambda t, q, u: jnp.cos(1.3 * t), lambda t, q, u: u[0] * jnp.cos(1.3 * t)):
-        with pytest.raises(hj.DefinitionError, match="output 'z' does not have the period 1"):
+    for value in (
+        lambda t, q, u: jnp.cos(1.3 * t),
+        lambda t, q, u: u[0] * jnp.cos(1.3 * t),
+    ):
+        with pytest.raises(
+            hj.DefinitionError, match="output 'z' does not have the period 1"
+        ):
             hj.linearize(cycle, hj.ClockPhase(4), hj.Output("z", value))
 
 
@@ -69,7 +90,9 @@ def test_a_ball_does_not_fall_through_the_floor():
 
 
 def test_a_cycle_of_another_kind_is_no_guess(hopper_cycle):
-    refused = pytest.raises(hj.DefinitionError, match=r"charts and states: \(2, 4\) and \(1, 2\)")
+    refused = pytest.raises(
+        hj.DefinitionError, match=r"charts and states: \(2, 4\) and \(1, 2\)"
+    )
     juggler = hj.models.PaddleJuggler()
     with refused:
         hj.find_limit_cycle(juggler, hopper_cycle)
@@ -85,4 +108,7 @@ def test_a_cycle_as_the_guess_begins_at_the_same_phase(hopper_cycle):
     slower = hj.models.VerticalHopper(omega=2 * jnp.pi / 1.05)
     cycle = hj.find_limit_cycle(slower, hopper_cycle)
     np.testing.assert_allclose(cycle.anchor.t, 1.05 * hopper_cycle.anchor.t, rtol=1e-14)
-    assert cycle.result == hj.Result.OK and cycle.event_sequence == hopper_cycle.event_sequence
+    assert (
+        cycle.result == hj.Result.OK
+        and cycle.event_sequence == hopper_cycle.event_sequence
+    )

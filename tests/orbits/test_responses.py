@@ -87,7 +87,9 @@ class Square(hj.HybridSystem):
     def charts(self):
         charts = {"inside": FieldChart(lambda t, q, u: self.rates(q), ("x", "y"))}
         for name, axis, _ in self.WALLS:
-            along = lambda t, q, u, k=axis: [r * (i != k) for i, r in enumerate(self.rates(q))]
+            along = lambda t, q, u, k=axis: [
+                r * (i != k) for i, r in enumerate(self.rates(q))
+            ]
             charts[name] = FieldChart(along, ("x", "y"))
         return charts
 
@@ -125,7 +127,9 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     np.testing.assert_allclose(responses.exponents, [-0.2], rtol=0, atol=1e-12)
     assert "exponent -0.2" in str(responses)
     fast = hj.find_limit_cycle(StuartLandau(mu=1.0), guess, section=section).responses()
-    amplitude = fast.amplitude(0, PHASES)  # without a part along the flow, which would grow
+    amplitude = fast.amplitude(
+        0, PHASES
+    )  # without a part along the flow, which would grow
     np.testing.assert_allclose(amplitude["x"], np.cos(angle), rtol=0, atol=1e-10)
     # Isochrons are logarithmic spirals: phase = angle + alpha log(r / sqrt(mu)).
     cycle = hj.find_limit_cycle(system, guess, section=section)
@@ -145,7 +149,9 @@ def test_responses_and_sensitivities_do_not_depend_on_the_units_of_states():
 
     section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
     cycle = hj.find_limit_cycle(Scaled(), guess, section=section)
-    exact = -(np.sin(2 * np.pi * PHASES) - 0.4 * np.cos(2 * np.pi * PHASES)) / np.sqrt(0.1)
+    exact = -(np.sin(2 * np.pi * PHASES) - 0.4 * np.cos(2 * np.pi * PHASES)) / np.sqrt(
+        0.1
+    )
     phase = cycle.responses().phase(PHASES, "radians")
     np.testing.assert_allclose(phase["x"], exact, rtol=0, atol=1e-12)
     slower = cycle.sensitivity("mu").period
@@ -191,14 +197,22 @@ def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
     np.testing.assert_allclose(
         pushed(PHASES), size * (np.sin(angle) + 0.4 * np.cos(angle)), rtol=1e-11
     )
-    np.testing.assert_allclose(pushed.locking, np.array([-1, 1]) * size * np.sqrt(1.16), rtol=1e-12)
+    np.testing.assert_allclose(
+        pushed.locking, np.array([-1, 1]) * size * np.sqrt(1.16), rtol=1e-12
+    )
     rates = [x.rate for x in pushed.locked()]
-    np.testing.assert_allclose(np.abs(rates), 2 * np.pi * size * np.sqrt(1.16), rtol=1e-11)
+    np.testing.assert_allclose(
+        np.abs(rates), 2 * np.pi * size * np.sqrt(1.16), rtol=1e-11
+    )
     together, apart = responses.coupling("x").locked(mutual=True)
     np.testing.assert_allclose([*together, *apart], [0, -1, 0.5, 1], rtol=0, atol=1e-12)
-    leads = [x.lead for x in type(pushed)(np.array([0.0, np.exp(0.5002j * np.pi)])).locked()]
+    leads = [
+        x.lead for x in type(pushed)(np.array([0.0, np.exp(0.5002j * np.pi)])).locked()
+    ]
     np.testing.assert_allclose(leads, [0.9999, 0.4999], rtol=1e-9)
-    with pytest.raises(hj.DefinitionError, match="`harmonics` = 64 does not resolve jumps"):
+    with pytest.raises(
+        hj.DefinitionError, match="`harmonics` = 64 does not resolve jumps"
+    ):
         hj.find_limit_cycle(Neuron(grip=0.3)).responses().coupling("v")
 
 
@@ -241,7 +255,9 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
     np.testing.assert_allclose(a.period - omega.period, 10.784262213426, rtol=1e-9)
     np.testing.assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
     # By symmetry each quarter takes its part.
-    np.testing.assert_allclose(np.reshape(a.durations, (4, 2)).sum(1), a.period / 4, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.reshape(a.durations, (4, 2)).sum(1), a.period / 4, rtol=1e-9
+    )
     # A cycle that begins where sliding ends can be followed.
     periods = [hj.find_limit_cycle(Square(a=x), cycle).period for x in (0.19, 0.21)]
     np.testing.assert_allclose(np.diff(periods)[0] / 0.02, a.period, rtol=1e-3)
@@ -307,16 +323,23 @@ def test_mathieus_equation_has_the_published_continuous_htf():
 
 
 def test_htfs_at_many_frequencies_come_from_fewer():
-    cycle, f = hj.find_limit_cycle(hj.models.BuckConverter()), np.linspace(0.013, 9.987, 620)
+    cycle, f = (
+        hj.find_limit_cycle(hj.models.BuckConverter()),
+        np.linspace(0.013, 9.987, 620),
+    )
     some = [0, 7, 311, 619]
     many, few = cycle.htf(f, (-1, 0, 1)).H, cycle.htf(f[some], (-1, 0, 1)).H
-    np.testing.assert_allclose(many[:, some], few, rtol=0, atol=1e-12 * np.abs(few).max())
+    np.testing.assert_allclose(
+        many[:, some], few, rtol=0, atol=1e-12 * np.abs(few).max()
+    )
 
 
 def test_harmonic_state_spaces_converge_to_the_exact_htf():
     cycle = hj.find_limit_cycle(hj.models.Mathieu())
     space = hj.convert.to_harmonic_state_space(cycle, outputs="x", tolerance=1e-12)
-    H = space.transfer(0.25, float(cycle.period))[0, space.order - 1 : space.order + 2, 0, 0]
+    H = space.transfer(0.25, float(cycle.period))[
+        0, space.order - 1 : space.order + 2, 0, 0
+    ]
     exact = cycle.htf(0.25, (-1, 0, 1), "x").H[:, 0, 0, 0]
     np.testing.assert_allclose(H, exact, rtol=1e-11)
     assert space.error < 1e-12 and space.order == 8
@@ -335,12 +358,24 @@ def test_the_continuous_htf_of_a_speed_that_jumps_is_that_of_the_derivative_of_t
 
 @pytest.mark.slow
 def test_the_curve_of_a_simulated_neuron_lies_in_the_band_of_its_estimate(tmp_path):
-    rng, system = np.random.default_rng(0), Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
+    rng, system = (
+        np.random.default_rng(0),
+        Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0),
+    )
     f, angle = rng.uniform(0.1, 0.9, (2, 12))
-    current = lambda t: 0.05 * jnp.sum(jnp.cos(2 * jnp.pi * (f * t + angle)), keepdims=True)
-    way, t = hj.simulate(system, "membrane", (-2.0,), 600.0, input=current), np.arange(0, 600, 0.02)
-    spikes = np.array([x.time for x in way.events]) + 0.01 * rng.normal(size=len(way.events))
-    recording = hj.Recording(t, {"u": jax.vmap(current)(t)[:, 0]}, events={"spike": spikes})
+    current = lambda t: (
+        0.05 * jnp.sum(jnp.cos(2 * jnp.pi * (f * t + angle)), keepdims=True)
+    )
+    way, t = (
+        hj.simulate(system, "membrane", (-2.0,), 600.0, input=current),
+        np.arange(0, 600, 0.02),
+    )
+    spikes = np.array([x.time for x in way.events]) + 0.01 * rng.normal(
+        size=len(way.events)
+    )
+    recording = hj.Recording(
+        t, {"u": jax.vmap(current)(t)[:, 0]}, events={"spike": spikes}
+    )
     measured = hj.recordings.phase_response(recording, hj.AtEvent("spike"), input="u")
     curve = hj.find_limit_cycle(system).responses().curve()
     (low, high), values = measured.interval(curve.phase), curve.values
@@ -369,31 +404,50 @@ def test_sensitivities_are_differences_of_cycles(system, name):
     def numbers(step):
         other = _shifted(cycle, name, step)
         events = [x.time for x in other.trajectory().events]
-        _, states = linear_flow(other).at(PHASES[1:], other.period, linear_flow(other).q)
+        _, states = linear_flow(other).at(
+            PHASES[1:], other.period, linear_flow(other).q
+        )
         return np.concatenate(
-            [[float(other.period)], np.array(events) - float(other.anchor.t[0]), states[:, 0]]
+            [
+                [float(other.period)],
+                np.array(events) - float(other.anchor.t[0]),
+                states[:, 0],
+            ]
         )
 
     central = lambda h: (numbers(h) - numbers(-h)) / (2 * h)
     difference = (4 * central(step / 2) - central(step)) / 3
     name = cycle.structure.charts[0].states[0]
     begin = float(cycle.anchor.t[0]) / float(cycle.period) * change.period
-    exact = [[change.period], np.array(change.times) - begin, change.shape(PHASES[1:])[name]]
+    exact = [
+        [change.period],
+        np.array(change.times) - begin,
+        change.shape(PHASES[1:])[name],
+    ]
     np.testing.assert_allclose(np.concatenate(exact), difference, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "system, name, output",
-    [(Neuron(grip=0.3), "current", "v"), (hj.models.VerticalHopper(), "k", "yM"),
-     (hj.models.BuckConverter(), "Vin", "v"), (hj.models.TwoLeggedBar(), "m", "y")],
+    [
+        (Neuron(grip=0.3), "current", "v"),
+        (hj.models.VerticalHopper(), "k", "yM"),
+        (hj.models.BuckConverter(), "Vin", "v"),
+        (hj.models.TwoLeggedBar(), "m", "y"),
+    ],
     ids=["a phase", "two charts", "a schedule", "four charts"],
-)  # fmt: skip
+)
 def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, output):
-    guess, begin = hj.find_limit_cycle(system), jnp.asarray(getattr(system, name), float)
+    guess, begin = (
+        hj.find_limit_cycle(system),
+        jnp.asarray(getattr(system, name), float),
+    )
 
     def result(value):
-        cycle = hj.find_limit_cycle(eqx.tree_at(lambda x: getattr(x, name), system, value), guess)
+        cycle = hj.find_limit_cycle(
+            eqx.tree_at(lambda x: getattr(x, name), system, value), guess
+        )
         responses, at = cycle.responses(modes=2 * guess.clocked), jnp.array([0.3])
         push = responses.amplitude(0, at) if guess.clocked else responses.phase(at)
         htf = cycle.htf(0.3, 1, output).H[0, 0, 0, 0]
@@ -414,22 +468,38 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
 
 
 def test_bad_questions_are_refused_in_one_sentence():
-    hopper, wheel = (hj.find_limit_cycle(x()) for x in (hj.models.VerticalHopper, Neuron))
-    with pytest.raises(hj.DefinitionError, match="has no phase response: its phase is that"):
+    hopper, wheel = (
+        hj.find_limit_cycle(x()) for x in (hj.models.VerticalHopper, Neuron)
+    )
+    with pytest.raises(
+        hj.DefinitionError, match="has no phase response: its phase is that"
+    ):
         hopper.responses().phase([0.1])
-    with pytest.raises(hj.DefinitionError, match="has no phase response: its phase is that"):
+    with pytest.raises(
+        hj.DefinitionError, match="has no phase response: its phase is that"
+    ):
         hopper.asymptotic_phase("flight", [0.0] * hopper.structure.dims[0])
-    with pytest.raises(hj.DefinitionError, match="for the 1 states v of chart 'membrane'"):
+    with pytest.raises(
+        hj.DefinitionError, match="for the 1 states v of chart 'membrane'"
+    ):
         wheel.asymptotic_phase("membrane", (0.3, 0.5))
-    with pytest.raises(hj.DefinitionError, match="no mode with an amplitude 2: there are 2"):
+    with pytest.raises(
+        hj.DefinitionError, match="no mode with an amplitude 2: there are 2"
+    ):
         hopper.responses().amplitude(2, [0.1])
-    with pytest.raises(hj.DefinitionError, match="3 modes were asked for; 2 have amplitudes"):
+    with pytest.raises(
+        hj.DefinitionError, match="3 modes were asked for; 2 have amplitudes"
+    ):
         hopper.responses(modes=3)
-    with pytest.raises(hj.DefinitionError, match="pole of the cycle, which lie at every whole"):
+    with pytest.raises(
+        hj.DefinitionError, match="pole of the cycle, which lie at every whole"
+    ):
         wheel.htf([0.3, 2.0])
     with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
         wheel.htf(0.3, inputs="force")
-    with pytest.raises(hj.DefinitionError, match=r"need 2.4e\+10 pieces of the cycle: lower"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"need 2.4e\+10 pieces of the cycle: lower"
+    ):
         wheel.htf(1e10)
     with pytest.raises(hj.DefinitionError, match="there is no parameter 'speed'"):
         wheel.sensitivity("speed")
@@ -440,5 +510,7 @@ def test_bad_questions_are_refused_in_one_sentence():
     apex = hj.Crossing("vy", "falling")
     family = dict(section=apex, conserved={"energy": 1784.8})
     runner = hj.find_limit_cycle(hj.models.SLIPRunner(), **family)
-    with pytest.raises(hj.ComputationError, match="has no phase of its own: its multiplier 1 is"):
+    with pytest.raises(
+        hj.ComputationError, match="has no phase of its own: its multiplier 1 is"
+    ):
         runner.responses()

@@ -37,12 +37,14 @@ def test_multipliers_beside_a_reset_to_zero_do_not_depend_on_units():
     """x' = cos - x / 2 and y' = x - y, with y = 0 after each tick."""
     small, large = 1e-9, 1e9
     field = lambda t, q, u: (  # noqa: E731
-        small * jnp.cos(2 * jnp.pi * t) - q[0] / 2, q[0] / small * large - q[1]
-    )  # fmt: skip
+        small * jnp.cos(2 * jnp.pi * t) - q[0] / 2,
+        q[0] / small * large - q[1],
+    )
     reset = lambda t, q, u: (q[0], 0.0)  # noqa: E731
     tick = hj.Transition("tick", "a", "a", hj.Scheduled(1.0, 0.5), reset=reset)
     cycle = hj.find_limit_cycle(
-        toy({"a": Field(("x", "y"), field)}, [tick], period=1.0), hj.Guess("a", (small, large))
+        toy({"a": Field(("x", "y"), field)}, [tick], period=1.0),
+        hj.Guess("a", (small, large)),
     )
     np.testing.assert_allclose(cycle.multipliers, [np.exp(-0.5)], rtol=1e-12)
 

@@ -14,7 +14,11 @@ from ..toys import RESTING, Field, hopper_in, toy
 # Units of length and time, in those of the models.
 UNITS = {"micrometers and milliseconds": (1e6, 1e3), "gigameters": (1e-9, 1.0)}
 units = pytest.mark.parametrize(
-    "unit", ["micrometers and milliseconds", pytest.param("gigameters", marks=pytest.mark.slow)]
+    "unit",
+    [
+        "micrometers and milliseconds",
+        pytest.param("gigameters", marks=pytest.mark.slow),
+    ],
 )
 CLOCK = hj.ClockPhase(4, anchor=APEX)
 FREQUENCIES = np.arange(0.1, 4.0, 0.4)
@@ -55,7 +59,10 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
     length, time = UNITS[unit]
     sizes = dimensions(length, time)
     cycle = hopper_cycle_in(length, time)
-    assert (cycle.result, cycle.event_sequence) == (hj.Result.OK, hopper_cycle.event_sequence)
+    assert (cycle.result, cycle.event_sequence) == (
+        hj.Result.OK,
+        hopper_cycle.event_sequence,
+    )
     assert cycle.iterations == hopper_cycle.iterations and cycle.residual < 1e-12
     np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
     for name, size in hopper_cycle.scale.items():
@@ -67,7 +74,9 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
     H, theirs = (x.htf(FREQUENCIES, (-1, 0, 1)).H for x in (model, other))
     for k, name in enumerate(model.outputs):
         mine, back = H[:, :, k], sizes["force"] / sizes[name[0]]
-        np.testing.assert_allclose(theirs[:, :, k] * back, mine, atol=1e-9 * np.abs(mine).max())
+        np.testing.assert_allclose(
+            theirs[:, :, k] * back, mine, atol=1e-9 * np.abs(mine).max()
+        )
 
 
 @pytest.mark.slow
@@ -78,7 +87,9 @@ def test_an_oscillator_without_a_clock(relaxation, unit):
     cycle = relaxation_in(length, time)
     assert cycle.result == hj.Result.OK
     np.testing.assert_allclose(cycle.period / time, relaxation.period, rtol=1e-9)
-    np.testing.assert_allclose(cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9)
+    np.testing.assert_allclose(
+        cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9
+    )
 
 
 def test_states_that_rest_stop_nothing(relaxation):
@@ -111,5 +122,7 @@ def test_sizes_that_are_given(hopper_cycle, factor):
     guess = dataclasses.replace(hopper_cycle, settings=settings)
     cycle = hj.find_limit_cycle(hopper_cycle.system, guess, scale={"ym": 5.0})
     assert cycle.residual < 1e-12
-    assert dict(cycle.scale) == pytest.approx(hopper_cycle.scale | {"ym": 5.0}, rel=1e-9)
+    assert dict(cycle.scale) == pytest.approx(
+        hopper_cycle.scale | {"ym": 5.0}, rel=1e-9
+    )
     np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)

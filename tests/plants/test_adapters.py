@@ -56,7 +56,14 @@ def fmu(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fmu")
     headers = pathlib.Path(fmpy.__file__).parent / "c-code"
     library = folder / f"vdp{fmpy.sharedLibraryExtension}"
-    command = ["cc", "-O2", "-shared", "-fPIC", f"-I{headers}", str(HERE / "vanderpol.c")]
+    command = [
+        "cc",
+        "-O2",
+        "-shared",
+        "-fPIC",
+        f"-I{headers}",
+        str(HERE / "vanderpol.c"),
+    ]
     subprocess.run([*command, "-o", str(library)], check=True)
     with zipfile.ZipFile(folder / "vdp.fmu", "w") as archive:
         archive.writestr("modelDescription.xml", DESCRIPTION)
@@ -68,11 +75,17 @@ def test_an_fmu_settles_where_the_equations_do_and_runs_in_processes(fmu):
     plant = hj.plants.FMUPlant(fmu, "u", ("x", "v"), dt=0.02)
     cycle = hj.plants.settle(plant, SECTIONS, "x", cycles=8)
     exact = hj.find_limit_cycle(hj.models.VanDerPol(mu=2.0))
-    assert abs(cycle.period - exact.period) < 0.2 * plant.dt**2  # (linear interpolation)
+    assert (
+        abs(cycle.period - exact.period) < 0.2 * plant.dt**2
+    )  # (linear interpolation)
     u = 0.05 * np.random.default_rng(0).standard_normal((2, 80, 1))
     data = cycle.run_experiments(u, discard=0, processes=0)
     again = cycle.run_experiments(u, discard=0, processes=1)
-    assert np.array_equal(data.y, again.y) and data.ok.all() and np.abs(data.y).max() > 1e-3
+    assert (
+        np.array_equal(data.y, again.y)
+        and data.ok.all()
+        and np.abs(data.y).max() > 1e-3
+    )
     with pytest.raises(hj.DefinitionError, match="whose state can be set"):
         cycle.perturbed_returns()
     with pytest.raises(hj.DefinitionError, match="no real variable 'z'"):
@@ -90,11 +103,15 @@ def test_sections_are_interpolated_between_fixed_steps():
     assert np.abs(data.y - true.y).max() < 0.05 * np.abs(true.y).max() and data.ok.all()
     assert 0.01 < data.simulated.late.max() <= 0.02 * (1 + 1e-9)
     event = hj.plants.settle(plant, hj.Crossing("y", "rising"), ("x", "y"), cycles=10)
-    assert abs(event.period - 2 * np.pi) < 1e-4 and abs(event.cycle_outputs[0, 1]) < 1e-9
+    assert (
+        abs(event.period - 2 * np.pi) < 1e-4 and abs(event.cycle_outputs[0, 1]) < 1e-9
+    )
     late = event.run_experiments(0.1 * u[:, :8], discard=0, processes=0).simulated.late
     assert (0 <= late).all() and 0.01 < late.max() <= 0.02
     facts = {"dt": np.pi / 40, "period": 2 * np.pi, "fixed_step": True}
-    clock = hj.plants.settle(type("", (Circle,), facts)(), hj.ClockPhase(8), "x", cycles=10)
+    clock = hj.plants.settle(
+        type("", (Circle,), facts)(), hj.ClockPhase(8), "x", cycles=10
+    )
     assert clock.run_experiments(u, discard=0, processes=0).simulated.late.max() < 1e-9
     fallen = cycle.run_experiments(np.full((1, 80, 1), 4.0), discard=0, processes=0)
     assert "terminated" in fallen.summary()
@@ -109,14 +126,18 @@ def ground():
         period=1.0,
         substeps=20,
     )
-    return hj.plants.settle(plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"), cycles=32)
+    return hj.plants.settle(
+        plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"), cycles=32
+    )
 
 
 def test_mujoco_continues_from_its_state(ground):
     """On soft ground the paper's hopper settles near its cycle on hard ground."""
     hard = hj.find_limit_cycle(hj.models.VerticalHopper())
     at = hj.place_sections(hard, hj.ClockPhase(10, anchor=0.7))
-    assert np.abs(ground.cycle_outputs - np.asarray(at.observe(("yM", "vM")))).max() < 0.05
+    assert (
+        np.abs(ground.cycle_outputs - np.asarray(at.observe(("yM", "vM")))).max() < 0.05
+    )
     plant = ground.plant
     start = ground.drive.start
     courses = []
@@ -129,14 +150,18 @@ def test_mujoco_continues_from_its_state(ground):
 
 def test_a_controller_may_keep_memory_in_userdata():
     xml = (
-        (HERE / "hopper.xml").read_text().replace("<worldbody>", '<size nuserdata="1"/><worldbody>')
+        (HERE / "hopper.xml")
+        .read_text()
+        .replace("<worldbody>", '<size nuserdata="1"/><worldbody>')
     )
 
     def remember(model, data):
         data.userdata[0] += 1
         return [data.userdata[0] % 7, 0.0]
 
-    plant = hj.plants.MuJoCoPlant(mujoco.MjModel.from_xml_string(xml), "push", control=remember)
+    plant = hj.plants.MuJoCoPlant(
+        mujoco.MjModel.from_xml_string(xml), "push", control=remember
+    )
     plant.reset(0)
     plant.step([0.0], 0.0015)
     state = plant.get_state()
@@ -154,7 +179,10 @@ def test_a_walker_in_mujoco():
     design = hj.multisine(n_sections=8, periods=16, amplitude=0.1, lines="odd")
     data = cycle.run_experiments(design, discard=24)
     fit = hj.fit_multipliers(hj.estimate_htf(data), order=2)
-    assert fit.contains(returns.multipliers[:2]).all() and (fit.standard_errors < 1e-3).all()
+    assert (
+        fit.contains(returns.multipliers[:2]).all()
+        and (fit.standard_errors < 1e-3).all()
+    )
     assert returns.contains(fit.multipliers).all()
     touchdown = hj.Crossing("left_foot[2]", "falling")
     events = hj.plants.settle(plant, touchdown, ("x_rate", "pitch"), cycles=40)

@@ -29,15 +29,27 @@ def circle():
 def test_a_plant_in_closed_form(circle):
     assert abs(circle.period - 2 * math.pi) < 1e-9
     angle = 2 * math.pi * np.arange(8) / 8
-    assert np.abs(circle.cycle_outputs - np.c_[np.cos(angle), np.sin(angle)]).max() < 1e-9
+    assert (
+        np.abs(circle.cycle_outputs - np.c_[np.cos(angle), np.sin(angle)]).max() < 1e-9
+    )
     returns = circle.perturbed_returns()
-    assert returns.contains(math.exp(-0.4 * math.pi)).all() and len(returns.multipliers) == 1
-    assert abs(returns.multipliers[0] - math.exp(-0.4 * math.pi)) < 1e-9 and returns.bound < 1e-6
+    assert (
+        returns.contains(math.exp(-0.4 * math.pi)).all()
+        and len(returns.multipliers) == 1
+    )
+    assert (
+        abs(returns.multipliers[0] - math.exp(-0.4 * math.pi)) < 1e-9
+        and returns.bound < 1e-6
+    )
     # A push held over one eighth of a turn moves the radius by push / rate (1 - exp(-rate T / 8)).
     u = np.zeros((1, 16, 1))
     u[0, 3] = 0.1
     data = circle.run_experiments(u, discard=0, processes=0)
-    away = 0.5 * (1 - math.exp(-0.05 * math.pi)) * math.exp(-0.05 * math.pi) ** np.arange(12)
+    away = (
+        0.5
+        * (1 - math.exp(-0.05 * math.pi))
+        * math.exp(-0.05 * math.pi) ** np.arange(12)
+    )
     y = data.y[0, 4:, 0] * np.cos(angle)[np.arange(4, 16) % 8]
     y += data.y[0, 4:, 1] * np.sin(angle)[np.arange(4, 16) % 8]
     assert np.abs(y - away).max() < 1e-8 and np.abs(data.y[0, :4]).max() < 1e-8
@@ -51,7 +63,10 @@ def test_sections_at_events():
     items = [hj.Crossing("y", "rising", level), hj.Crossing("y", "falling", level)]
     cycle = hj.plants.settle(Circle(), items, ("x", "y"), cycles=20)
     true = [[math.cos(0.2), level], [-math.cos(0.2), level]]
-    assert abs(cycle.period - math.tau) < 1e-9 and np.abs(cycle.cycle_outputs - true).max() < 1e-8
+    assert (
+        abs(cycle.period - math.tau) < 1e-9
+        and np.abs(cycle.cycle_outputs - true).max() < 1e-8
+    )
     returns = cycle.perturbed_returns()
     assert abs(returns.multipliers[0] - math.exp(-0.4 * math.pi)) < 1e-6
     assert len(returns.multipliers) == 1
@@ -80,7 +95,9 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
 
     cycle = hj.plants.settle(Falls(), ANGLE, "x", cycles=20)
     fall = cycle.trajectory(picture, [[0.0], [0.0], [2.0], [0.0]])
-    assert fall.result == hj.Result.PLANT_STOPPED and abs(fall.t[-1] - math.pi / 2) < 1e-8
+    assert (
+        fall.result == hj.Result.PLANT_STOPPED and abs(fall.t[-1] - math.pi / 2) < 1e-8
+    )
     with pytest.raises(ZeroDivisionError):  # a mistake in the plant is no fall
         cycle.trajectory(u=[[3.0]])
 
@@ -90,25 +107,41 @@ def test_an_unstable_cycle_is_found_from_a_guess():
         rate = -0.2
 
     cycle = hj.plants.settle(Unstable(), ANGLE, "x", guess=(1.02, 0.0))
-    assert abs(cycle.period - 2 * math.pi) < 1e-6 and abs(cycle.cycle_outputs[0, 0] - 1) < 1e-8
+    assert (
+        abs(cycle.period - 2 * math.pi) < 1e-6
+        and abs(cycle.cycle_outputs[0, 0] - 1) < 1e-8
+    )
     returns = cycle.perturbed_returns()
-    assert returns.contains(math.exp(0.4 * math.pi)).all() and len(returns.multipliers) == 1
+    assert (
+        returns.contains(math.exp(0.4 * math.pi)).all()
+        and len(returns.multipliers) == 1
+    )
 
 
 def test_failures_are_named_and_the_others_go_on():
     cycle = hj.plants.settle(Troubled(), ANGLE, "x", cycles=20)
-    data = cycle.run_experiments(np.zeros((9, 24, 1)), discard=0, processes=2, limit=4.0)
+    data = cycle.run_experiments(
+        np.zeros((9, 24, 1)), discard=0, processes=2, limit=4.0
+    )
     assert data.ok.tolist() == [True] + 7 * [False] + [True]
     causes = data.simulated.causes
     expected = (
-        "", "the plant raised ValueError: the hip broke", "no answer within the limit of 4 s",
-        "y became nan", "signals changed from ('x', 'y') to ('x', 'z')",
-        "the plant is not deterministic after `reset(seed)`", "the process ended with code 3",
-        "was not reached within", "",
-    )  # fmt: skip
+        "",
+        "the plant raised ValueError: the hip broke",
+        "no answer within the limit of 4 s",
+        "y became nan",
+        "signals changed from ('x', 'y') to ('x', 'z')",
+        "the plant is not deterministic after `reset(seed)`",
+        "the process ended with code 3",
+        "was not reached within",
+        "",
+    )
     assert [x in cause for x, cause in zip(expected, causes, strict=True)] == [True] * 9
     assert (data.result[1:8] == 7 * [hj.Result.PLANT_STOPPED]).all()
-    assert np.isfinite(data.y[[0, 8]]).all() and np.isnan(data.y[1, data.failed_at[1] :]).all()
+    assert (
+        np.isfinite(data.y[[0, 8]]).all()
+        and np.isnan(data.y[1, data.failed_at[1] :]).all()
+    )
     assert "#1: section" in data.summary(9) and "the hip broke" in data.summary(9)
 
 
@@ -131,7 +164,9 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
     data = circle.run_experiments(u, **options)
     assert seeds == [*range(1, 10), 9, 10]
     assert np.array_equal(data.y, whole.y) and data.simulated.causes == 10 * ("",)
-    assert not np.array_equal(circle.run_experiments(2 * u[:1], **options).y, data.y[:1])
+    assert not np.array_equal(
+        circle.run_experiments(2 * u[:1], **options).y, data.y[:1]
+    )
     monkeypatch.setattr(circle.drive.plant, "rate", 0.4)  # around the same cycle
     assert np.abs(circle.run_experiments(u, **options).y - data.y).max() > 1e-3
     hj.save(tmp_path / "data.npz", data)
@@ -144,7 +179,10 @@ def test_what_does_not_fit_is_refused(circle):
         (hj.KinematicPhase(8, "x", "z"), "no signal 'z'"),
         (hj.Crossing("z", "falling"), "no signal 'z'"),
         (hj.Crossing(lambda t, q: q[0], "falling"), "Crossings of signals by name"),
-        (hj.KinematicPhase(8, "x", "y", anchor=hj.Crossing("x", "falling")), "use KinematicPhase"),
+        (
+            hj.KinematicPhase(8, "x", "y", anchor=hj.Crossing("x", "falling")),
+            "use KinematicPhase",
+        ),
     ):
         with pytest.raises(hj.DefinitionError, match=message):
             hj.plants.settle(Circle(), sections, "x")
@@ -174,7 +212,9 @@ def hopper():
     return hj.find_limit_cycle(hj.models.VerticalHopper())
 
 
-@pytest.mark.parametrize("family", ["isochron", pytest.param("kinematic", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "family", ["isochron", pytest.param("kinematic", marks=pytest.mark.slow)]
+)
 def test_the_hopper_is_that_of_the_equations(hopper, family):
     """Perturbed returns against the exact multipliers; records against exact experiments."""
     cycle = hj.plants.settle(Hopper(), SECTIONS[family], ("yM", "vM"))

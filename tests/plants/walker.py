@@ -36,7 +36,9 @@ def control(model, data):
 
 def walker():
     model = mujoco.MjModel.from_xml_path(str(FILE))
-    return hj.plants.MuJoCoPlant(model, {"push": "N"}, control=control, period=PERIOD, substeps=40)
+    return hj.plants.MuJoCoPlant(
+        model, {"push": "N"}, control=control, period=PERIOD, substeps=40
+    )
 
 
 def coordinates(plant):

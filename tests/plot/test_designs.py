@@ -23,12 +23,16 @@ def test_the_spectrum_of_a_design(plan):
     H = np.abs(np.asarray(MODEL.htf(f, 0).H)[0, :, 0, 0])
     np.testing.assert_allclose(above.get_lines()[0].get_ydata(), H / H.max())
     usual, optimal = below.get_lines()
-    np.testing.assert_allclose(np.sum(np.square(optimal.get_ydata()) / 2), plan.power.sum())
+    np.testing.assert_allclose(
+        np.sum(np.square(optimal.get_ydata()) / 2), plan.power.sum()
+    )
     np.testing.assert_allclose(usual.get_ydata(), np.sqrt(2 * plan.usual_power))
     assert below.get_ylabel() == "amplitude, rms\nover experiments"
     legend = [x.get_text() for x in below.get_legend().get_texts()]
     assert legend == [plan.usual_name, "optimal"] == ["equal amplitudes", "optimal"]
-    with pytest.raises(hj.DefinitionError, match="not the one that the plan was made for"):
+    with pytest.raises(
+        hj.DefinitionError, match="not the one that the plan was made for"
+    ):
         hj.plot.spectrum(plan, hj.testing.synthetic_ldtp())
 
 
@@ -43,7 +47,9 @@ def test_what_strides_buy(plan):
     assert lines["here"].get_xdata() == studied.strides
     assert lines["here"].get_ydata() == np.linalg.norm(studied.standard_errors)
     equal = lines["equal amplitudes"]
-    at = np.interp(np.log(USUAL.cycles(0)), np.log(equal.get_xdata()), np.log(equal.get_ydata()))
+    at = np.interp(
+        np.log(USUAL.cycles(0)), np.log(equal.get_xdata()), np.log(equal.get_ydata())
+    )
     assert np.exp(at) == pytest.approx(np.linalg.norm(plan.usual_standard_errors))
     with pytest.raises(hj.DefinitionError, match="without a block"):
         hj.plot.strides(plan, {"here": study})

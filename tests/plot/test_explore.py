@@ -31,13 +31,17 @@ def test_an_event_passes_the_phase_at_which_the_clock_begins():
 
 
 def test_the_widget_sends_pictures():
-    pytest.importorskip("anywidget", reason="pip install 'hybridjax[explore]' installs it")
+    pytest.importorskip(
+        "anywidget", reason="pip install 'hybridjax[explore]' installs it"
+    )
     explorer = hj.explore(hj.models.VanDerPol(), "mu")
     widget = explorer.widget()
     before = widget.answer
     widget.asked = {"values": {"mu": 1.2}, "gain": False, "number": 1}
     assert float(explorer.cycle.system.mu) == 1.2
-    assert widget.answer["number"] == 1 and widget.answer["picture"] != before["picture"]
+    assert (
+        widget.answer["number"] == 1 and widget.answer["picture"] != before["picture"]
+    )
     # Only what moves is drawn anew, and the picture is that of the whole figure.
     with io.BytesIO(base64.b64decode(widget.answer["picture"].split(",")[1])) as file:
         sent = np.asarray(Image.open(file).convert("RGB")).astype(int)

@@ -41,7 +41,9 @@ def test_every_figure_is_shown_once(outputs):
 
 
 def test_a_column_has_150_points_per_inch(outputs):
-    head = base64.b64decode(images(outputs[1])[0])[16:20]  # of a PNG: where its width is
+    head = base64.b64decode(images(outputs[1])[0])[
+        16:20
+    ]  # of a PNG: where its width is
     assert struct.unpack(">I", head)[0] > 0.9 * 150 * COLUMN
 
 

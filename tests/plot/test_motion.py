@@ -14,7 +14,9 @@ from hybridjax.plot.pictures import Pictures
 
 @pytest.fixture(scope="module")
 def walk():
-    return hj.find_limit_cycle(hj.models.CompassGait(), section=hj.AtEvent("heelstrike"))
+    return hj.find_limit_cycle(
+        hj.models.CompassGait(), section=hj.AtEvent("heelstrike")
+    )
 
 
 def test_states_at_times_lie_on_the_trajectory(walk):
@@ -37,7 +39,9 @@ def test_feet_do_not_slide_and_the_loop_closes(walk):
     for new, old in (("stance foot", "swing foot"), ("swing foot", "stance foot")):
         np.testing.assert_allclose(after.points[new], before.points[old], atol=1e-7)
     times = path.t[0] + np.linspace(0.01, 0.9, 20) * period
-    feet = [x.points["stance foot"] for x in pictures.at(times)] + pictures.camera(times)
+    feet = [x.points["stance foot"] for x in pictures.at(times)] + pictures.camera(
+        times
+    )
     np.testing.assert_allclose(feet - feet[0], 0, atol=1e-12)
     # A step has the length of the line between the feet.
     step = before.points["swing foot"] - before.points["stance foot"]
@@ -50,7 +54,9 @@ def test_files_and_refusals(walk, tmp_path):
     assert motion.save(tmp_path / "walk.gif").read_bytes().startswith(b"GIF89a")
     page = motion.save(tmp_path / "walk.html").read_text()
     assert "<script>" in page and 'src="http' not in page
-    pictures = [base64.b64decode(x) for x in re.findall(r"base64,([\w+/=]+)['\"]", page)]
+    pictures = [
+        base64.b64decode(x) for x in re.findall(r"base64,([\w+/=]+)['\"]", page)
+    ]
     still, first, *shown = (Image.open(io.BytesIO(x)).convert("RGBA") for x in pictures)
     assert len(shown) == len(motion.times) and first == shown[0]
     for frame, over in zip(motion._frames(107), shown, strict=True):
@@ -63,10 +69,14 @@ def test_files_and_refusals(walk, tmp_path):
 
 def test_both_halves_of_a_cycle_are_drawn():
     duffing = hj.models.Duffing()
-    half = hj.find_limit_cycle(hj.Quotient(duffing, flipped=("x", "v"), half_period=True))
+    half = hj.find_limit_cycle(
+        hj.Quotient(duffing, flipped=("x", "v"), half_period=True)
+    )
     motion = hj.plot.animate(half)
     span = len(motion.times) * motion.times[1]
-    np.testing.assert_allclose([span, 2 * half.period], float(duffing.period()), rtol=1e-9)
+    np.testing.assert_allclose(
+        [span, 2 * half.period], float(duffing.period()), rtol=1e-9
+    )
 
 
 def test_no_input_gives_the_cycle():
@@ -75,10 +85,14 @@ def test_no_input_gives_the_cycle():
     path = hj.experiments.perturbed_trajectory(placed, np.zeros((8, 1)))
     end = path.at(path.t[-1:])[1] - path.at(path.t[:1])[1]
     np.testing.assert_allclose(end, 0, atol=1e-9)
-    data = hj.ExperimentData(np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2)
+    data = hj.ExperimentData(
+        np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2
+    )
     motion = hj.plot.animate(cycle, sections=placed, perturbed=data)
     assert abs(motion.interval * len(motion.times) - 2 * float(cycle.period)) < 1e-9
     motion.figure.draw_without_rendering()
-    assert all(motion.figure.bbox.y1 > x.title.get_tightbbox().y1 for x in motion.figure.axes)
+    assert all(
+        motion.figure.bbox.y1 > x.title.get_tightbbox().y1 for x in motion.figure.axes
+    )
     with pytest.raises(hj.DefinitionError, match="and their `sections`"):
         hj.plot.animate(cycle, perturbed=data)

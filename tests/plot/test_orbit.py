@@ -9,15 +9,23 @@ from .test_plots import labeled
 def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kinematic):
     lanes = placed_kinematic.lanes
     start = np.asarray(lanes.q[:, 0]) + [0.03, 0, 0, 0]
-    perturbed = hj.simulate(hopper_cycle.system, "flight", start, 2.0, time=float(lanes.t[0]))
+    perturbed = hj.simulate(
+        hopper_cycle.system, "flight", start, 2.0, time=float(lanes.t[0])
+    )
     ax = hj.plot.cycle(hopper_cycle, sections=placed_kinematic, perturbed=perturbed).ax
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("yM (m)", "vM (m/s)")
     lines = labeled(ax)
     assert set(lines) == {"stance", "flight", "sections (32)", "perturbed"}
     arrow, *texts = ax.texts
-    assert (arrow.xy[0] - arrow.xyann[0]) * arrow.xy[1] > 0  # x moves as its velocity says
+    assert (arrow.xy[0] - arrow.xyann[0]) * arrow.xy[
+        1
+    ] > 0  # x moves as its velocity says
     assert arrow.xy[1] < -1  # (both events lie above)
-    assert [t.get_text() for t in texts] == ["liftoff", "touchdown", *map(str, range(0, 32, 4))]
+    assert [t.get_text() for t in texts] == [
+        "liftoff",
+        "touchdown",
+        *map(str, range(0, 32, 4)),
+    ]
 
     # Bars lie on their sections: rays from the center of the kinematic phase, in equal angles.
     bars = lines["sections (32)"].get_xydata().reshape(32, 3, 2)[:, :2]
@@ -32,7 +40,9 @@ def test_a_cycle_that_was_not_found_is_refused():
     far = hj.Guess("flight", (1e3, 30.0, 1.0, 5.0))
     failed = hj.find_limit_cycle(hj.models.VerticalHopper(), far, throw=False)
     for function in (hj.plot.cycle, hj.coincidences):
-        with pytest.raises(hj.DefinitionError, match="the search for this cycle failed"):
+        with pytest.raises(
+            hj.DefinitionError, match="the search for this cycle failed"
+        ):
             function(failed)
 
 
@@ -40,7 +50,9 @@ def test_resets_that_jump_are_dashed(hopper_cycle):
     ax = hj.plot.cycle(hopper_cycle, "ym", "vm").ax
     (jump,) = [x for x in ax.get_lines() if x.get_linestyle() == "--"]
     touchdown = hopper_cycle.trajectory().events[1].before
-    np.testing.assert_allclose(jump.get_xydata(), [[0, touchdown["vm"]], [0, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        jump.get_xydata(), [[0, touchdown["vm"]], [0, 0]], atol=1e-12
+    )
 
 
 def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
@@ -48,4 +60,6 @@ def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
     ax = hj.plot.cycle(vanderpol_cycle, "v", sections=placed).ax
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("v", "x")
     bars = labeled(ax)["sections (6)"].get_xydata().reshape(6, 3, 2)
-    np.testing.assert_allclose(bars[:, :2].mean(axis=1).T, placed.lanes.q[::-1], atol=1e-9)
+    np.testing.assert_allclose(
+        bars[:, :2].mean(axis=1).T, placed.lanes.q[::-1], atol=1e-9
+    )

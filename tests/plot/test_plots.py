@@ -15,7 +15,9 @@ from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 
 def labeled(ax):
     """Lines by label, without the helpers that matplotlib or the axes hide."""
-    return {line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"}
+    return {
+        line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"
+    }
 
 
 def test_magnitude_draws_the_values(estimate, exact):
@@ -25,15 +27,26 @@ def test_magnitude_draws_the_values(estimate, exact):
     drawn = lines["$H_{1}$"]
     np.testing.assert_array_equal(drawn.get_xdata(), estimate.f)
     np.testing.assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
-    assert drawn.get_color() == lines["$H_{-1}$"].get_color() != lines["$H_{0}$"].get_color()
+    assert (
+        drawn.get_color()
+        == lines["$H_{-1}$"].get_color()
+        != lines["$H_{0}$"].get_color()
+    )
     assert drawn.get_linestyle() == "-" and lines["$H_{-1}$"].get_linestyle() == "--"
     assert ax.get_yscale() == "log" and "cycles/period" in ax.get_xlabel()
     assert ax.get_ylabel() == "$|H_m|$, vM"
 
 
 def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
-    for draw in (hj.plot.magnitude, hj.plot.bode, lambda *x: hj.plot.harmonics({"a": x})):
-        drawn = [[x.get_xydata() for x in draw(estimate, m).ax.lines] for m in (hopper, exact)]
+    for draw in (
+        hj.plot.magnitude,
+        hj.plot.bode,
+        lambda *x: hj.plot.harmonics({"a": x}),
+    ):
+        drawn = [
+            [x.get_xydata() for x in draw(estimate, m).ax.lines]
+            for m in (hopper, exact)
+        ]
         for line, expected in zip(*drawn, strict=True):
             np.testing.assert_allclose(line, expected, rtol=1e-9)
     with pytest.raises(hj.DefinitionError, match="model alone"):
@@ -55,14 +68,22 @@ def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
 def test_bode_with_fits(estimate, exact, rational, structured):
     figure = hj.plot.bode(estimate, exact, fits=[rational, structured]).figure
     upper, lower = figure.axes
-    assert list(labeled(upper)) == ["yM", "vM", "rational fit", "structured fit", "exact"]
+    assert list(labeled(upper)) == [
+        "yM",
+        "vM",
+        "rational fit",
+        "structured fit",
+        "exact",
+    ]
     assert upper.get_ylabel() == "$|H_{0}|$" and "degrees" in lower.get_ylabel()
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
     assert len(curves) == len(lower.get_lines()) == 2 * 4
     fitted = rational.htf(estimate.f).H[0, :, 0, 0]
     np.testing.assert_allclose(curves[2].get_ydata(), np.abs(fitted))
     phases = [x.get_ydata() for x in lower.get_lines()]
-    np.testing.assert_allclose(phases[0], phases[3], atol=2)  # no curve is a whole turn away
+    np.testing.assert_allclose(
+        phases[0], phases[3], atol=2
+    )  # no curve is a whole turn away
     np.testing.assert_allclose(phases[1], phases[0], atol=2)
 
 
@@ -70,14 +91,20 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     """Indices are those of the first HTF, and a fit is drawn over its own input."""
     exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
     names = exact.inputs[::-1], exact.outputs[::-1]
-    swapped = hj.HTF(exact.f, exact.H[..., ::-1, ::-1], 0, exact.n_sections, *names, "exact")
-    renamed = hj.HTF(exact.f, exact.H, 0, exact.n_sections, ("r", "s"), exact.outputs, "exact")
+    swapped = hj.HTF(
+        exact.f, exact.H[..., ::-1, ::-1], 0, exact.n_sections, *names, "exact"
+    )
+    renamed = hj.HTF(
+        exact.f, exact.H, 0, exact.n_sections, ("r", "s"), exact.outputs, "exact"
+    )
     for draw, shown in ((hj.plot.magnitude, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
         draw(exact, renamed, input=1, **shown)
         np.testing.assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
         np.testing.assert_array_equal(first.get_ydata(), second.get_ydata())
-    with pytest.raises(hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"):
+    with pytest.raises(
+        hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
+    ):
         hj.plot.bode(exact, fits=hj.fit_rational(exact, input=1))
 
 
@@ -95,9 +122,16 @@ def test_bodes(estimate, exact, rational):
 def test_multipliers(hopper, rational, structured):
     ax = hj.plot.multipliers(hopper, {"2p1z": rational, "structured": structured}).ax
     lines = labeled(ax)
-    assert [name.split(":")[0] for name in lines] == ["exact", "2p1z, yM", "2p1z, vM", "structured"]
+    assert [name.split(":")[0] for name in lines] == [
+        "exact",
+        "2p1z, yM",
+        "2p1z, vM",
+        "structured",
+    ]
     z = hopper.multipliers
-    np.testing.assert_array_equal(lines["exact"].get_xydata(), np.stack([z.real, z.imag], 1))
+    np.testing.assert_array_equal(
+        lines["exact"].get_xydata(), np.stack([z.real, z.imag], 1)
+    )
     assert len({(x.get_marker(), x.get_color()) for x in lines.values()}) == 4
     assert f"{structured.compare(z).max_error:.1e}".split("e")[0] in list(lines)[-1]
     (inset,) = ax.child_axes
@@ -110,7 +144,9 @@ def test_multipliers(hopper, rational, structured):
 
 
 def test_poles_and_zeros(rational):
-    moved = eqx.tree_at(lambda fit: fit.zeros, rational, np.array([[np.nan + 0j], [0.9 + 0j]]))
+    moved = eqx.tree_at(
+        lambda fit: fit.zeros, rational, np.array([[np.nan + 0j], [0.9 + 0j]])
+    )
     figure = hj.plot.poles_zeros({"isochron": rational, "kinematic": moved}).figure
     assert len(figure.axes) == 4
     for i, ax in enumerate(figure.axes[:2]):
@@ -126,7 +162,11 @@ def test_experiment(hopper):
     design = hj.multisine(periods=4, band=(0, 2.0))
     data = hj.experiments.simulate_experiments(hopper, design, discard=2)
     figure = hj.plot.experiment(data, -1).figure
-    assert [ax.get_ylabel() for ax in figure.axes] == ["u", r"$\delta$ yM", r"$\delta$ vM"]
+    assert [ax.get_ylabel() for ax in figure.axes] == [
+        "u",
+        r"$\delta$ yM",
+        r"$\delta$ vM",
+    ]
     y = figure.axes[2].get_lines()[0]
     np.testing.assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
     np.testing.assert_allclose(y.get_xdata()[32], 1.0)
@@ -137,10 +177,14 @@ def test_experiment(hopper):
 
 def test_saved_in_several_formats(tmp_path):
     plot = hj.plot.multipliers([0.5])
-    png, pdf, svg = hj.plot.save(tmp_path / "multipliers.png", plot, ("png", "pdf", "svg"))
+    png, pdf, svg = hj.plot.save(
+        tmp_path / "multipliers.png", plot, ("png", "pdf", "svg")
+    )
     assert png.read_bytes()[:4] == b"\x89PNG" and pdf.read_bytes()[:5] == b"%PDF-"
     assert "<svg" in svg.read_text()
-    assert [p.name for p in (png, pdf, svg)] == [f"multipliers.{x}" for x in ("png", "pdf", "svg")]
+    assert [p.name for p in (png, pdf, svg)] == [
+        f"multipliers.{x}" for x in ("png", "pdf", "svg")
+    ]
     assert hj.plot.save(str(tmp_path / "v1.0"), plot.figure) == (tmp_path / "v1.0.png",)
     assert len(list(tmp_path.iterdir())) == 4
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
@@ -178,9 +222,16 @@ def test_validation_draws_signals_and_correlations(found):
     np.testing.assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
     assert grid[1, 0].get_ylabel() == r"$\delta$ vM"
     assert grid[0, 0].get_title("right") == f"fit {found.fit[0]:.3g} %\n"
-    for k, values in ((1, found.autocorrelation[:, :, 0]), (2, found.cross_correlation[:, :, 0])):
-        heights = [path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()]
-        np.testing.assert_allclose(heights, values.sum(axis=0).ravel() / np.sqrt(32), atol=1e-12)
+    for k, values in (
+        (1, found.autocorrelation[:, :, 0]),
+        (2, found.cross_correlation[:, :, 0]),
+    ):
+        heights = [
+            path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()
+        ]
+        np.testing.assert_allclose(
+            heights, values.sum(axis=0).ravel() / np.sqrt(32), atol=1e-12
+        )
 
 
 def test_no_texts_overlap_at_the_width_of_a_column(found):
@@ -189,7 +240,9 @@ def test_no_texts_overlap_at_the_width_of_a_column(found):
         figure, axes = pyplot.subplots(2, 3, figsize=(3.5, 3.0), layout="constrained")
         hj.plot.validation(found, ax=axes)
         figure.canvas.draw()
-    texts = [x for x in figure.findobj(Text) if "mathdefault" not in x.get_text()]  # no ticks
+    texts = [
+        x for x in figure.findobj(Text) if "mathdefault" not in x.get_text()
+    ]  # no ticks
     words = [x for x in texts if any(map(str.isalpha, x.get_text()))]
     boxes = [x.get_window_extent().padded(-1) for x in words]
     assert len(boxes) == 13  # six titles, and seven labels of axes
@@ -198,7 +251,9 @@ def test_no_texts_overlap_at_the_width_of_a_column(found):
 
 
 def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():
-    estimate = MultiplierEstimate(np.array([0.3 + 0j]), -np.ones(1) * 0.3, np.eye(1) / 100, np.inf)
+    estimate = MultiplierEstimate(
+        np.array([0.3 + 0j]), -np.ones(1) * 0.3, np.eye(1) / 100, np.inf
+    )
     plot = hj.plot.multipliers([0.3], {"fit": estimate}, zoom=False)
     plot.figure.canvas.draw()
     picture = np.asarray(plot.figure.canvas.buffer_rgba())
@@ -214,7 +269,9 @@ def test_regions_are_drawn_around_estimates(hopper):
     c = np.poly(true).real[1:]
     estimate = MultiplierEstimate(true * 1.01, c, 1e-4 * np.eye(2), np.inf)
     (inset,) = hj.plot.multipliers(hopper, {"fit": estimate}).ax.child_axes
-    drawn = [line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100]
+    drawn = [
+        line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100
+    ]
     np.testing.assert_array_equal(drawn[0] @ [1, 1j], estimate.ellipse(0))
     (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
     border = estimate.ellipse(0)

@@ -12,12 +12,16 @@ MULTIPLIER = np.exp(-2 * DECAY)
 def hopper_recording(hopper_cycle):
     """200 strides of the paper's hopper under a random force, without noise."""
     force = hj.testing.random_force(200, 64, 8, rms=0.02, seed=0)
-    return hj.testing.simulate_recording(hopper_cycle, force[None], ("yM", "vM"), rate=64, steps=1)
+    return hj.testing.simulate_recording(
+        hopper_cycle, force[None], ("yM", "vM"), rate=64, steps=1
+    )
 
 
 @pytest.fixture(scope="session")
 def angle():
-    return hj.KinematicPhase(16, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9))
+    return hj.KinematicPhase(
+        16, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9)
+    )
 
 
 @pytest.fixture
@@ -39,7 +43,9 @@ def rhythm():
     force = hj.testing.random_force(STRIDES, RATE, 8, rms=0.02, seed=0)[:, 0]
     steps = 2
     h = 1 / RATE / steps
-    fine = np.interp(np.arange(2 * steps * len(force)) * h / 2, np.arange(len(force)) / RATE, force)
+    fine = np.interp(
+        np.arange(2 * steps * len(force)) * h / 2, np.arange(len(force)) / RATE, force
+    )
 
     def field(w, f, turn):  # w = z exp(-2 pi i t)
         pull = -1j * DECAY * 2 * np.angle(w) * w

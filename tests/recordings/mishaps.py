@@ -94,14 +94,24 @@ def clipped(which, low, high):
 
 
 def struck(which, share):
-    return signals(which, lambda x, s: x + (s.rng.random(len(x)) < share) * (
-        20.0 * x.std() * s.rng.choice([-1.0, 1.0], len(x))))  # fmt: skip
+    return signals(
+        which,
+        lambda x, s: (
+            x
+            + (s.rng.random(len(x)) < share)
+            * (20.0 * x.std() * s.rng.choice([-1.0, 1.0], len(x)))
+        ),
+    )
 
 
 def placeholder(value, cycles):
     def fail(x, s):
-        since = s.trial.time[:, None] - s.rng.uniform(s.trial.time[0], s.trial.time[-1], 5)
-        return np.where(((since > 0) & (since < cycles * s.period)).any(axis=1), value, x)
+        since = s.trial.time[:, None] - s.rng.uniform(
+            s.trial.time[0], s.trial.time[-1], 5
+        )
+        return np.where(
+            ((since > 0) & (since < cycles * s.period)).any(axis=1), value, x
+        )
 
     return signals("y0", fail)
 
@@ -110,7 +120,9 @@ def frozen(which, share):
     def freeze(x, s):
         first = int((1 - share) / 2 * len(x))
         rows = np.arange(len(x))
-        return np.where((rows >= first) & (rows < first + round(share * len(x))), x[first], x)
+        return np.where(
+            (rows >= first) & (rows < first + round(share * len(x))), x[first], x
+        )
 
     return signals(which, freeze, SECOND)
 
@@ -129,7 +141,9 @@ def overflow(bits):
 
 def renumbered(trial, s):
     n, step = len(trial.time), np.median(np.diff(trial.time))
-    t = kept(trial, ~np.isin(np.arange(n) // 32, s.rng.choice(n // 32, 3, replace=False)))
+    t = kept(
+        trial, ~np.isin(np.arange(n) // 32, s.rng.choice(n // 32, 3, replace=False))
+    )
     time = trial.time[0] + step * np.arange(len(t.time))
     events = {k: np.interp(at, t.time, time) for k, at in t.events.items()}
     return replace(t, time=time, events=events)
@@ -160,7 +174,10 @@ def swapped(trial, s):
 
 
 def pause(trial, s):
-    events = {k: t[np.abs(t - trial.time.mean()) > 2.2 * s.period] for k, t in trial.events.items()}
+    events = {
+        k: t[np.abs(t - trial.time.mean()) > 2.2 * s.period]
+        for k, t in trial.events.items()
+    }
     return replace(kept(trial, s.from_middle > 2.2), events=events)
 
 
@@ -209,31 +226,54 @@ def with_end(recording, *_):
 MISHAPS = {
     # sensors, amplifiers, converters
     "white noise": signals("y", lambda x, s: x + 0.01 * x.std() * s.normal()),
-    "rounded to 12 bits": signals("uy", lambda x, s: np.ptp(x) / 2**12 * np.round(
-        x / (np.ptp(x) / 2**12))),
-    "slow drift": signals("y", lambda x, s: x + 0.1 * x.std() * np.sin(
-        2 * np.pi * s.cycles / s.cycles[-1])),
-    "the zero wanders": signals("y", lambda x, s: x + 0.1 * x.std() * (
-        np.cumsum(s.normal()) / np.sqrt(len(x)))),
-    "hum of the mains": signals("uy", lambda x, s: x + 0.02 * x.std() * np.sin(
-        2 * np.pi * 50.2 * s.trial.time / s.period)),
-    "hum near the rhythm": signals("uy", lambda x, s: x + 0.02 * x.std() * np.sin(
-        2 * np.pi * 1.02 * s.trial.time / s.period)),
-    "push leaks into outputs": signals("y", lambda x, s: x + (
-        0.01 * x.std() / s.values(s.input).std() * s.values(s.input))),
+    "rounded to 12 bits": signals(
+        "uy", lambda x, s: np.ptp(x) / 2**12 * np.round(x / (np.ptp(x) / 2**12))
+    ),
+    "slow drift": signals(
+        "y",
+        lambda x, s: x + 0.1 * x.std() * np.sin(2 * np.pi * s.cycles / s.cycles[-1]),
+    ),
+    "the zero wanders": signals(
+        "y", lambda x, s: x + 0.1 * x.std() * (np.cumsum(s.normal()) / np.sqrt(len(x)))
+    ),
+    "hum of the mains": signals(
+        "uy",
+        lambda x, s: (
+            x + 0.02 * x.std() * np.sin(2 * np.pi * 50.2 * s.trial.time / s.period)
+        ),
+    ),
+    "hum near the rhythm": signals(
+        "uy",
+        lambda x, s: (
+            x + 0.02 * x.std() * np.sin(2 * np.pi * 1.02 * s.trial.time / s.period)
+        ),
+    ),
+    "push leaks into outputs": signals(
+        "y",
+        lambda x, s: x + (0.01 * x.std() / s.values(s.input).std() * s.values(s.input)),
+    ),
     "slow sensors": signals("y", slow_sensor),
-    "sensor saturates softly": signals("y0", lambda x, s: x.mean() + x.std() / 0.5 * np.tanh(
-        (x - x.mean()) / (x.std() / 0.5))),
+    "sensor saturates softly": signals(
+        "y0",
+        lambda x, s: (
+            x.mean() + x.std() / 0.5 * np.tanh((x - x.mean()) / (x.std() / 0.5))
+        ),
+    ),
     "clipped at the top": clipped("y0", 0.0, 0.95),
     "clipped at both ends": clipped("y0", 0.1, 0.9),
     "push clipped": clipped("u", 0.05, 0.95),
     "integers overflow": signals("y0", overflow(12)),
     "16 bits overflow": signals("y-1", overflow(16)),
     # missing and wrong samples
-    "1 % of the samples lost": signals("y", lambda x, s: np.where(
-        s.rng.random(len(x)) < 0.01, np.nan, x)),
-    "gap of five cycles": signals("y", lambda x, s: np.where(s.from_middle < 2.65, np.nan, x)),
-    "gap of the push": signals("u", lambda x, s: np.where(s.from_middle < 1.15, np.nan, x)),
+    "1 % of the samples lost": signals(
+        "y", lambda x, s: np.where(s.rng.random(len(x)) < 0.01, np.nan, x)
+    ),
+    "gap of five cycles": signals(
+        "y", lambda x, s: np.where(s.from_middle < 2.65, np.nan, x)
+    ),
+    "gap of the push": signals(
+        "u", lambda x, s: np.where(s.from_middle < 1.15, np.nan, x)
+    ),
     "gaps over the crossing": hidden(lambda at, s: s.rng.choice(at, 5, replace=False)),
     "a gap over each seventh crossing": hidden(lambda at, s: at[::7]),
     "packets lost and renumbered": trials(renumbered),
@@ -252,46 +292,82 @@ MISHAPS = {
     "sign of the push in one trial": scaled("u", -1.0),
     "other gain in one trial": scaled("y0", 1.1),
     "other zero in one trial": scaled("y0", offset=0.5),
-    "sensor slips in one trial": signals("y0", lambda x, s: x + 0.3 * x.std() * (
-        s.trial.time > s.trial.time.mean()), SECOND),
+    "sensor slips in one trial": signals(
+        "y0",
+        lambda x, s: x + 0.3 * x.std() * (s.trial.time > s.trial.time.mean()),
+        SECOND,
+    ),
     "columns swapped in one trial": trials(swapped, SECOND),
     "an output twice": signals("y1", lambda x, s: s.values(s.outputs[0])),
-    "push of another trial": signals("u", lambda x, s: np.resize(
-        s.recording.trials[2].values[:, s.recording.column(s.input)], len(x)), SECOND),
+    "push of another trial": signals(
+        "u",
+        lambda x, s: np.resize(
+            s.recording.trials[2].values[:, s.recording.column(s.input)], len(x)
+        ),
+        SECOND,
+    ),
     "push unrelated in all": signals("u", lambda x, s: np.roll(x, len(x) // 2)),
-    "push switched on late": signals("u", lambda x, s: np.where(s.cycles < 10.0, 0.0, x)),
+    "push switched on late": signals(
+        "u", lambda x, s: np.where(s.cycles < 10.0, 0.0, x)
+    ),
     "push lost in two trials": signals("u", lambda x, s: 0 * x, (1, 2)),
     "push not plugged in": signals("u", lambda x, s: 0 * x),
     "the same trial thrice": with_copies,
     "overlapping trials": with_end,
     # clocks
-    "a third of the samples not there": trials(lambda trial, s: kept(
-        trial, s.rng.random(len(trial.time)) > 1 / 3)),
+    "a third of the samples not there": trials(
+        lambda trial, s: kept(trial, s.rng.random(len(trial.time)) > 1 / 3)
+    ),
     "few samples": trials(lambda trial, s: kept(trial, slice(0, None, 8))),
-    "jitter of the time stamps": trials(lambda trial, s: replace(trial, time=trial.time + (
-        0.05 * np.median(np.diff(trial.time)) * s.rng.uniform(-1, 1, len(trial.time))))),
+    "jitter of the time stamps": trials(
+        lambda trial, s: replace(
+            trial,
+            time=trial.time
+            + (
+                0.05
+                * np.median(np.diff(trial.time))
+                * s.rng.uniform(-1, 1, len(trial.time))
+            ),
+        )
+    ),
     "a pause": trials(pause),
-    "clock slows down": clock(lambda t, s: t + 0.05 * (t - s.trial.time[0]) ** 2 / (
-        2 * np.ptp(s.trial.time))),
-    "clock set forward": clock(lambda t, s: t + 0.3 * s.period * (
-        t > s.trial.time.mean()), SECOND),
-    "clock set back": clock(lambda t, s: t - 0.3 * s.period * (t > s.trial.time.mean()), SECOND),
+    "clock slows down": clock(
+        lambda t, s: t + 0.05 * (t - s.trial.time[0]) ** 2 / (2 * np.ptp(s.trial.time))
+    ),
+    "clock set forward": clock(
+        lambda t, s: t + 0.3 * s.period * (t > s.trial.time.mean()), SECOND
+    ),
+    "clock set back": clock(
+        lambda t, s: t - 0.3 * s.period * (t > s.trial.time.mean()), SECOND
+    ),
     "milliseconds in one trial": clock(lambda t, s: 1000.0 * t, SECOND),
     "slow clock in one trial": clock(lambda t, s: 1.1 * t, SECOND),
     "push late": late(10),
     "push early": late(-10),
     "push late in one trial": late(25, SECOND),
     "clock of the push is fast": signals("u", other_clock),
-    "push feels an output": signals("u", lambda x, s: x + 0.3 * x.std() * (
-        s.values(s.outputs[0]) - s.values(s.outputs[0]).mean()) / s.values(s.outputs[0]).std()),
-}  # fmt: skip
+    "push feels an output": signals(
+        "u",
+        lambda x, s: (
+            x
+            + 0.3
+            * x.std()
+            * (s.values(s.outputs[0]) - s.values(s.outputs[0]).mean())
+            / s.values(s.outputs[0]).std()
+        ),
+    ),
+}
 EVENT_MISHAPS = {
     "events lost and doubled": misjudged(lost=0.05, doubled=0.05),
     "events inexact": misjudged(off=0.0005),
     "events jitter": misjudged(off=0.01),
-    "another event in one trial": trials(lambda trial, s: replace(
-        trial, events={s.event: trial.events[s.event] + 0.4 * s.period}), SECOND),
-}  # fmt: skip
+    "another event in one trial": trials(
+        lambda trial, s: replace(
+            trial, events={s.event: trial.events[s.event] + 0.4 * s.period}
+        ),
+        SECOND,
+    ),
+}
 
 
 def mishandle(recording, mishap, *, input, outputs, event, seed=0):
@@ -301,5 +377,7 @@ def mishandle(recording, mishap, *, input, outputs, event, seed=0):
     mishap = (MISHAPS | EVENT_MISHAPS).get(mishap, mishap)
     changed = mishap(recording, input, outputs, event, rng)
     for t in changed:
-        hj.Recording(t.time, dict(zip(recording.signals, t.values.T, strict=True)), name=t.name)
+        hj.Recording(
+            t.time, dict(zip(recording.signals, t.values.T, strict=True)), name=t.name
+        )
     return eqx.tree_at(lambda r: r.trials, recording, tuple(changed))

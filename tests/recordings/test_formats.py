@@ -54,7 +54,9 @@ def write_v73(path, variables):
                 fill(group.create_group(name), value)
                 group[name].attrs["MATLAB_class"] = np.bytes_("struct")
             elif isinstance(value, str):
-                group[name] = np.frombuffer(value.encode("utf-16-le"), np.uint16)[:, None]
+                group[name] = np.frombuffer(value.encode("utf-16-le"), np.uint16)[
+                    :, None
+                ]
                 group[name].attrs["MATLAB_class"] = np.bytes_("char")
             else:
                 array = np.atleast_2d(value)
@@ -86,7 +88,9 @@ def test_matlab(tmp_path, write):
     np.testing.assert_array_equal(found.trials[0].events["strike"], [0.05, 0.1])
     write(tmp_path / "y.mat", {"time": SLOW, "x": X, "f": F})
     refused("'f' has the shape .*190.*, but its group 20 times", tmp_path / "y.mat")
-    refused("no times 't' for '[ftx]", tmp_path / "y.mat", time="t", kind=hj.DefinitionError)
+    refused(
+        "no times 't' for '[ftx]", tmp_path / "y.mat", time="t", kind=hj.DefinitionError
+    )
     only = hj.read_recording(tmp_path / "x.mat", signals="pair", units={"pair.0": "m"})
     assert only.signals == ("pair.0", "pair.1") and only.unit("pair.0") == "m"
     assert len(only.trials[0].time) == len(SLOW)
@@ -97,7 +101,9 @@ def test_matlab(tmp_path, write):
 def test_arrays_of_structs(tmp_path):
     h5py = pytest.importorskip("h5py")
     kind = [("time", "O"), ("x", "O")]
-    write_v5(tmp_path / "x.mat", {"trials": np.array([(SLOW, X), (SLOW, X)], dtype=kind)})
+    write_v5(
+        tmp_path / "x.mat", {"trials": np.array([(SLOW, X), (SLOW, X)], dtype=kind)}
+    )
     refused("'trials' is an array of structs", tmp_path / "x.mat")
     write_v73(tmp_path / "y.mat", {"time": SLOW, "x": X})
     with h5py.File(tmp_path / "y.mat", "r+") as file:
@@ -139,7 +145,9 @@ def test_hdf5(tmp_path):
 
 def table(**more):
     pandas = pytest.importorskip("pandas")
-    return pandas.DataFrame({"time": SLOW, "x (m)": X, "event go": SLOW == SLOW[7], **more})
+    return pandas.DataFrame(
+        {"time": SLOW, "x (m)": X, "event go": SLOW == SLOW[7], **more}
+    )
 
 
 def test_feather(tmp_path):
@@ -148,7 +156,12 @@ def test_feather(tmp_path):
     found = hj.read_recording(tmp_path / "x.feather", signals="x")
     np.testing.assert_array_equal(samples(found, "x")[1], X)
     assert found.unit("x") == "m" and found.trials[0].events["go"] == [SLOW[7]]
-    refused("no signal 'z'; it has ", tmp_path / "x.feather", signals="z", kind=hj.DefinitionError)
+    refused(
+        "no signal 'z'; it has ",
+        tmp_path / "x.feather",
+        signals="z",
+        kind=hj.DefinitionError,
+    )
     with pytest.raises(hj.DefinitionError, match="different indices"):
         hj.Recording(table()["time"], {"y": table()["x (m)"][::-1]})
     with pytest.raises(hj.DefinitionError, match="different indices"):
@@ -160,7 +173,12 @@ def test_feather(tmp_path):
 def test_excel(tmp_path):
     path, book = tmp_path / "x.xlsx", pytest.importorskip("openpyxl").Workbook()
     book.active.title = "walk"
-    for row in (["# subject, 3"], ["time", "x"], ["ms", None], *zip(1000 * SLOW, X, strict=True)):
+    for row in (
+        ["# subject, 3"],
+        ["time", "x"],
+        ["ms", None],
+        *zip(1000 * SLOW, X, strict=True),
+    ):
         book.active.append([float(v) if isinstance(v, np.floating) else v for v in row])
     book.active["B8"] = None
     book.create_sheet("notes")
@@ -193,8 +211,12 @@ def test_trc(tmp_path):
     path = tmp_path / "walk.trc"
     path.write_text(TRC)
     found = hj.read_recording(path)
-    assert found.signals[:2] == ("R.ASIS.x", "R.ASIS.y") and found.unit("L.ASIS.z") == "mm"
-    np.testing.assert_array_equal(samples(found, "R.ASIS.x"), [[0, 0.01, 0.02], [1, 1.5, 2]])
+    assert (
+        found.signals[:2] == ("R.ASIS.x", "R.ASIS.y") and found.unit("L.ASIS.z") == "mm"
+    )
+    np.testing.assert_array_equal(
+        samples(found, "R.ASIS.x"), [[0, 0.01, 0.02], [1, 1.5, 2]]
+    )
     np.testing.assert_array_equal(samples(found, "L.ASIS.z"), [[0, 0.02], [6, 6.5]])
     assert hj.read_recording(path, signals="L.ASIS").signals[0] == "L.ASIS.x"
     path.write_text(TRC.replace("100.00\t3", "100.00\t4"))
@@ -206,7 +228,9 @@ def test_trc(tmp_path):
 # C3D
 
 
-def write_c3d(path, *, first=0, events=((0.05, "Left", "Strike"), (0.1, "Left", "Strike"))):
+def write_c3d(
+    path, *, first=0, events=((0.05, "Left", "Strike"), (0.1, "Left", "Strike"))
+):
     file = pytest.importorskip("ezc3d").c3d()
     points = np.ones((4, 2, len(SLOW)))
     points[0, 0], points[1, 0], points[2, 1, 3] = X, 2 * X, np.nan
@@ -238,18 +262,28 @@ def test_c3d(tmp_path):
     np.testing.assert_allclose(f[:190], F, atol=1e-6)
     assert [found.unit(x) for x in ("LASI.y", "LKnee.x", "Fz1")] == ["mm", "deg", "N"]
     assert len(samples(found, "LKnee.z")[0]) == len(SLOW) - 1
-    np.testing.assert_allclose(found.trials[0].events["Left Strike"], [0.05, 0.1], atol=1e-7)
+    np.testing.assert_allclose(
+        found.trials[0].events["Left Strike"], [0.05, 0.1], atol=1e-7
+    )
     analog = hj.read_recording(path, signals="Fz1")
     assert analog.signals == ("Fz1",) and "Left Strike" in analog.trials[0].events
-    refused("no signal 'EMG1'; it has LASI.x", path, signals="EMG1", kind=hj.DefinitionError)
+    refused(
+        "no signal 'EMG1'; it has LASI.x", path, signals="EMG1", kind=hj.DefinitionError
+    )
     path.write_bytes(path.read_bytes()[:2500])
     refused("frames, its header 20", path)
     write_c3d(tmp_path / "late.c3d", first=10)
     found = hj.read_recording(tmp_path / "late.c3d")
     np.testing.assert_allclose(found.trials[0].events["Left Strike"], [0.1], atol=1e-7)
-    assert "1 events 'Left Strike' outside of the recording were left out" in found.notes
+    assert (
+        "1 events 'Left Strike' outside of the recording were left out" in found.notes
+    )
     write_c3d(tmp_path / "late.c3d", first=50)
-    refused("all events 'Left Strike' .* are", tmp_path / "late.c3d", kind=hj.DefinitionError)
+    refused(
+        "all events 'Left Strike' .* are",
+        tmp_path / "late.c3d",
+        kind=hj.DefinitionError,
+    )
     path.write_bytes(b"no")
     refused("no C3D file, or damaged", path)
 
@@ -267,7 +301,10 @@ def write_bag(path, version):
     store = get_typestore(Stores.ROS1_NOETIC if is_1 else Stores.ROS2_HUMBLE)
     kinds, seq = store.types, {"seq": 0} if is_1 else {}
     time, header = kinds["builtin_interfaces/msg/Time"], kinds["std_msgs/msg/Header"]
-    point, stamped = kinds["geometry_msgs/msg/Point"], kinds["geometry_msgs/msg/PointStamped"]
+    point, stamped = (
+        kinds["geometry_msgs/msg/Point"],
+        kinds["geometry_msgs/msg/PointStamped"],
+    )
     layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
     image = kinds["std_msgs/msg/UInt8MultiArray"](layout, np.zeros(1000, np.uint8))
     messages = []
@@ -280,10 +317,15 @@ def write_bag(path, version):
         writer, pack = rosbag1.Writer(path), store.serialize_ros1
     else:
         plugin = rosbag2.StoragePlugin[version.upper()]
-        writer, pack = rosbag2.Writer(path, version=9, storage_plugin=plugin), store.serialize_cdr
+        writer, pack = (
+            rosbag2.Writer(path, version=9, storage_plugin=plugin),
+            store.serialize_cdr,
+        )
     with writer:
         topics = {topic: x.__msgtype__ for _, topic, x in messages}
-        connections = {x: writer.add_connection(x, k, typestore=store) for x, k in topics.items()}
+        connections = {
+            x: writer.add_connection(x, k, typestore=store) for x, k in topics.items()
+        }
         for t, topic, x in messages:
             arrival = round((5 + t) * 1e9) + 30_000_000
             writer.write(connections[topic], arrival, pack(x, topics[topic]))
@@ -294,13 +336,25 @@ def test_bags(tmp_path, version):
     path = tmp_path / ("x.bag" if version == "bag" else "x")
     write_bag(path, version)
     found = hj.read_recording(path, signals=["body.point", "count"])
-    assert found.signals == ("body.point.x", "body.point.y", "body.point.z", "count.data")
+    assert found.signals == (
+        "body.point.x",
+        "body.point.y",
+        "body.point.z",
+        "count.data",
+    )
     stamps = SLOW - 0.03  # of arrival, from which times count
-    np.testing.assert_allclose(samples(found, "body.point.y"), [stamps, 2 * X], atol=1e-12)
+    np.testing.assert_allclose(
+        samples(found, "body.point.y"), [stamps, 2 * X], atol=1e-12
+    )
     np.testing.assert_allclose(samples(found, "count.data"), [SLOW, SLOW], atol=1e-12)
     assert any("times of count are those of arrival" in note for note in found.notes)
     assert "image.data.0" not in hj.read_recording(path).signals
-    refused("no signal 'imu.x'; it has body, count", path, signals="imu.x", kind=hj.DefinitionError)
+    refused(
+        "no signal 'imu.x'; it has body, count",
+        path,
+        signals="imu.x",
+        kind=hj.DefinitionError,
+    )
     if version != "bag":
         (single,) = (x for x in path.iterdir() if x.suffix != ".yaml")
         alone = hj.read_recording(single, signals="body")
@@ -311,11 +365,21 @@ def test_bags(tmp_path, version):
 
 
 def test_libraries_that_are_not_there(tmp_path, monkeypatch):
-    tables, bags = (".feather", "pyarrow.dataset", "tables"), (".mcap", "rosbags.highlevel", "ros")
-    for suffix, library, extra in (".c3d", "ezc3d", "c3d"), (".h5", "h5py", "mat"), tables, bags:
+    tables, bags = (
+        (".feather", "pyarrow.dataset", "tables"),
+        (".mcap", "rosbags.highlevel", "ros"),
+    )
+    for suffix, library, extra in (
+        (".c3d", "ezc3d", "c3d"),
+        (".h5", "h5py", "mat"),
+        tables,
+        bags,
+    ):
         monkeypatch.setitem(sys.modules, library, None)
         (tmp_path / f"x{suffix}").write_bytes(b"x")
-        with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{extra}\]'"):
+        with pytest.raises(
+            hj.DefinitionError, match=rf"pip install 'hybridjax\[{extra}\]'"
+        ):
             hj.read_recording(tmp_path / f"x{suffix}")
 
 

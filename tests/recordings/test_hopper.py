@@ -19,13 +19,19 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     """At the sections of an angle of the two outputs, these are one number."""
     noisy = spoil(hopper_recording, noise=1e-4)
     apex = hj.Crossing("vM", "falling")
-    data = [hj.recordings.section_data(noisy, phase, **ABOUT) for phase in (angle, apex)]
+    data = [
+        hj.recordings.section_data(noisy, phase, **ABOUT) for phase in (angle, apex)
+    ]
     fits = [hj.fit_series(x.records, order=2) for x in data]
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
-    by_angle, by_apex = (hj.recordings.advise(*x).warnings for x in zip(data, fits, strict=True))
+    by_angle, by_apex = (
+        hj.recordings.advise(*x).warnings for x in zip(data, fits, strict=True)
+    )
     said = "Outputs: yM and vM carry the same information at sections"
-    assert any(repr(w).startswith(said) for w in by_angle) and "199.94 cycles" in repr(data[0])
+    assert any(repr(w).startswith(said) for w in by_angle) and "199.94 cycles" in repr(
+        data[0]
+    )
     assert not any(w.cause == "outputs" for w in by_apex)
 
 
@@ -41,25 +47,38 @@ def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycl
     assert np.abs(data[1].spikes - changed).max() <= 0.05 * max(changed) + 1
     assert fits[1].standard_errors[0] < 2 * fits[0].standard_errors[0]
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
-    assert any(w.cause == "spikes" for w in hj.recordings.advise(data[1], fits[1]).warnings)
+    assert any(
+        w.cause == "spikes" for w in hj.recordings.advise(data[1], fits[1]).warnings
+    )
 
 
 @pytest.mark.slow
 def test_responses_to_pushes(hopper_cycle, angle):
     """Against the exact linearization, averaged over the push, within the error of held inputs."""
     force = hj.testing.random_force(200, 256, 8, rms=0.002, seed=0)
-    recording = hj.testing.simulate_recording(hopper_cycle, force[None], ("yM", "vM"), rate=256)
+    recording = hj.testing.simulate_recording(
+        hopper_cycle, force[None], ("yM", "vM"), rate=256
+    )
     for N, most in ((16, 1e-3), (32, 2.5e-4)):
         sections = dataclasses.replace(angle, n_sections=N)
-        data = hj.recordings.section_data(recording, sections, **ABOUT | {"n_sections": N})
+        data = hj.recordings.section_data(
+            recording, sections, **ABOUT | {"n_sections": N}
+        )
         fit = hj.fit_series(data.records, order=2)
         found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
         sections = dataclasses.replace(sections, anchor=hj.Crossing("vM", "falling"))
         model = hj.linearize(hopper_cycle, sections, ("yM", "vM"))
-        theory, k, m, r = found.of_model(model), np.arange(-N // 4, N // 4 + 1), 5, 5 * N // 4
+        theory, k, m, r = (
+            found.of_model(model),
+            np.arange(-N // 4, N // 4 + 1),
+            5,
+            5 * N // 4,
+        )
         push = np.exp(-0.5 * (k / (N * found.width)) ** 2)
         area = push @ found.durations[(m + k) % N]
         value = push @ model.impulse_response(4 * N)[(m + r) % N, r - k, :, 0] / area
         np.testing.assert_allclose(theory[m, r, :, 0], value, rtol=1e-12)
         size = np.abs(theory).max(axis=(0, 1))
-        assert (np.sqrt(np.mean((found.values - theory) ** 2, axis=(0, 1))) < most * size).all()
+        assert (
+            np.sqrt(np.mean((found.values - theory) ** 2, axis=(0, 1))) < most * size
+        ).all()

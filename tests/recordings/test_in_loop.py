@@ -21,7 +21,9 @@ def field(t, x, u=0.0):
 
 @pytest.fixture(scope="module")
 def multipliers():
-    ends = [solve_ivp(field, (0, 1), x, rtol=1e-10, atol=1e-12).y[:, -1] for x in np.eye(2)]
+    ends = [
+        solve_ivp(field, (0, 1), x, rtol=1e-10, atol=1e-12).y[:, -1] for x in np.eye(2)
+    ]
     return np.linalg.eigvals(np.transpose(ends))
 
 
@@ -47,7 +49,9 @@ def recording():
 def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
     trial, out = (str(tmp_path / name) for name in ("trial.npz", "o"))
     np.savez(trial, **recording)
-    options = "--input u --reference r --outputs x,v --crossing clock:rising --sections 16"
+    options = (
+        "--input u --reference r --outputs x,v --crossing clock:rising --sections 16"
+    )
     with pytest.warns(FindingWarning):
         assert not main(["identify", trial, *options.split(), "--out", out])
     summary = json.loads((tmp_path / "o" / "summary.json").read_text())
@@ -56,7 +60,9 @@ def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
     assert "A controller makes u" in (tmp_path / "o" / "report.html").read_text()
     fit = hj.load(tmp_path / "o" / "fit.npz")
     assert fit.contains(multipliers).all() and fit.standard_errors.max() < 0.2
-    data = hj.Recording(recording["time"], {k: x for k, x in recording.items() if k != "time"})
+    data = hj.Recording(
+        recording["time"], {k: x for k, x in recording.items() if k != "time"}
+    )
     with pytest.raises(hj.DefinitionError, match="must name other signals"):
         names = {"inputs": "u", "outputs": "x", "reference": "u"}
         hj.identify_recording(data, hj.Crossing("clock", "rising"), **names)

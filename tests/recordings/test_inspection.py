@@ -28,7 +28,9 @@ def made_up(seed, force=0.1, noise=1e-3):
     time = np.arange(STRIDES * RATE) / RATE
     trials = []
     for k in range(TRIALS):
-        f = hj.testing.random_force(STRIDES, RATE, 6, rms=force, seed=100 * seed + k)[:, 0]
+        f = hj.testing.random_force(STRIDES, RATE, 6, rms=force, seed=100 * seed + k)[
+            :, 0
+        ]
         w = signal.lfilter([0, 1 / RATE], [1, -np.exp(-0.3 / RATE)], f)
         angle = 2 * np.pi * time
         x = 2.0 + np.cos(angle) + w + noise * rng.normal(size=len(f))
@@ -64,7 +66,10 @@ def test_findings_are_warnings_on_which_a_pipeline_can_stop():
     bad = mishandle(made_up(0), "clipped at the top", **NAMES)
     with pytest.warns(hj.errors.FindingWarning, match="^Clipp"):
         hj.recordings.inspect(bad, **names)
-    with pytest.raises(hj.errors.FindingWarning), warnings.catch_warnings(action="error"):
+    with (
+        pytest.raises(hj.errors.FindingWarning),
+        warnings.catch_warnings(action="error"),
+    ):
         hj.recordings.inspect(bad, **names)
 
 
@@ -73,13 +78,24 @@ CAUSES = {
     "clipped": ["clipped at the top", "clipped at both ends", "push clipped"],
     "overflow": ["integers overflow", "16 bits overflow"],
     "a silent input": ["push lost in two trials"],
-    "missed events": ["a gap over each seventh crossing", "a third of the samples not there"],
+    "missed events": [
+        "a gap over each seventh crossing",
+        "a third of the samples not there",
+    ],
     "odd cycles": ["packets lost and renumbered"],
     "inexact events": ["events jitter"],
     "no value": ["-9999 for no value"],
-    "frozen": ["0 for no value", "output frozen for a while", "push frozen for a while"],
+    "frozen": [
+        "0 for no value",
+        "output frozen for a while",
+        "push frozen for a while",
+    ],
     "an empty trial": ["output frozen"],
-    "another unit": ["millimeters in one trial", "kilonewtons in one trial", scaled("y0", 57.3)],
+    "another unit": [
+        "millimeters in one trial",
+        "kilonewtons in one trial",
+        scaled("y0", 57.3),
+    ],
     "another sign": ["sign of an output in one trial", "sign of the push in one trial"],
     "another zero": ["other zero in one trial"],
     "swapped columns": ["columns swapped in one trial"],
@@ -94,14 +110,24 @@ CAUSES = {
     "another period": ["slow clock in one trial"],
     "another event": ["another event in one trial"],
     "": [
-        "rounded to 12 bits", "slow sensors", "sensor saturates softly", "1 % of the samples lost",
-        "gap of five cycles", "gap of the push", "few samples",
-        "clock slows down", "push late", "push early", "events lost and doubled",
+        "rounded to 12 bits",
+        "slow sensors",
+        "sensor saturates softly",
+        "1 % of the samples lost",
+        "gap of five cycles",
+        "gap of the push",
+        "few samples",
+        "clock slows down",
+        "push late",
+        "push early",
+        "events lost and doubled",
     ],
-}  # fmt: skip
+}
 
 
-@pytest.mark.parametrize(("cause", "mishap"), [(c, x) for c in CAUSES for x in CAUSES[c]])
+@pytest.mark.parametrize(
+    ("cause", "mishap"), [(c, x) for c in CAUSES for x in CAUSES[c]]
+)
 def test_causes_are_named(cause, mishap):
     phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
     named = causes(mishandle(made_up(0), mishap, **NAMES), phase)
@@ -121,42 +147,65 @@ def test_an_order_that_is_too_low_is_named():
     edge = signal.butter(1, 0.1, "high", fs=RATE)
     filtered = signals("y", lambda x, s: signal.lfilter(*edge, x - x.mean()))
     names = {"inputs": "f", "outputs": ("x", "v"), "n_sections": 8, "order": 1}
-    for recording, named in ((made_up(0), 0), (mishandle(made_up(0), filtered, **NAMES), 1)):
+    for recording, named in (
+        (made_up(0), 0),
+        (mishandle(made_up(0), filtered, **NAMES), 1),
+    ):
         result = hj.identify_recording(recording, TOP, **names)
-        assert len([x for x in result.advice.warnings if "Compare order=2" in x.text]) == named
+        assert (
+            len([x for x in result.advice.warnings if "Compare order=2" in x.text])
+            == named
+        )
     names |= {"order": None, "n_sections": 32}
     with pytest.warns(hj.errors.FindingWarning) as seen:
-        twice = hj.Recording.join([made_up(0), made_up(0).with_trials(made_up(0).trials[:1])])
+        twice = hj.Recording.join(
+            [made_up(0), made_up(0).with_trials(made_up(0).trials[:1])]
+        )
         untried = hj.identify_recording(twice, TOP, **names)
     told = Counter(str(x.message) for x in seen)
-    assert set(told.values()) == {1} and set(told) >= {repr(x) for x in untried.findings}
+    assert set(told.values()) == {1} and set(told) >= {
+        repr(x) for x in untried.findings
+    }
     assert max(map(len, "\n".join(map(str, untried.findings)).split("\n"))) <= 100
     constant = mishandle(twice, signals("y0", lambda x, s: 0 * x + 1), **NAMES)
-    with pytest.raises(hj.DefinitionError, match="no trial has samples of all .*x does not change"):
+    with pytest.raises(
+        hj.DefinitionError, match="no trial has samples of all .*x does not change"
+    ):
         hj.identify_recording(constant, TOP, **names)
     with pytest.raises(hj.DefinitionError, match="'f' is in `inputs` and in `outputs`"):
         hj.identify_recording(twice, TOP, inputs="f", outputs=("f", "x"))
     text = "129 cycles (a quarter is held out) are too few for order 2 with 32 sections: record 28"
     assert f"since {text} more, or take 21 sections." in untried.advice.warnings[1].text
-    with pytest.warns(hj.errors.FindingWarning, match="orders above 1 could not be tried"):
+    with pytest.warns(
+        hj.errors.FindingWarning, match="orders above 1 could not be tried"
+    ):
         hj.recordings.choose_order(untried.data)
 
 
 def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_cycle):
     """A hundredth, which distortion of small pushes may be, is no reason to doubt; a third is."""
     force = hj.testing.random_force(100, 100, 8, rms=0.02, seed=0)
-    made = hj.testing.simulate_recording(hopper_cycle, force[None], ("yM", "vM"), rate=100)
+    made = hj.testing.simulate_recording(
+        hopper_cycle, force[None], ("yM", "vM"), rate=100
+    )
     names = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16, "order": 2}
     result = hj.identify_recording(made, APEX, **names)
     validation = result.held_out.validation
     assert validation.independent and validation.fit.min() > 99
     for fit, named in (99.3, False), (70.0, True):
         tests = np.full(2, fit), np.zeros(2), np.full(2, float(named))
-        worse = eqx.tree_at(lambda x: (x.fit, x.independence, x.no_better), validation, tests)
-        causes = [x.cause for x in hj.recordings.advise(result.data, result.fit, worse).warnings]
+        worse = eqx.tree_at(
+            lambda x: (x.fit, x.independence, x.no_better), validation, tests
+        )
+        causes = [
+            x.cause
+            for x in hj.recordings.advise(result.data, result.fit, worse).warnings
+        ]
         assert ("left over" in causes) == ("no fit" in causes) == named
     # So many strides as give no finite standard error are left out of the report.
-    few = eqx.tree_at(lambda x: x.advice.expected, result, result.advice.expected.copy())
+    few = eqx.tree_at(
+        lambda x: x.advice.expected, result, result.advice.expected.copy()
+    )
     few.advice.expected[0] = np.inf
     assert "<td>300</td>" in _page(few, {}) and "<td>inf" not in _page(few, {})
 
@@ -170,8 +219,12 @@ def test_none_is_silently_wrong(hopper_cycle, mishap):
     """Four trials of 75 strides, with noise, in which each apex is an event."""
     force = [hj.testing.random_force(75, 128, 8, rms=0.02, seed=k) for k in range(4)]
     outputs = ("yM", "vM")
-    made = hj.testing.simulate_recording(hopper_cycle, np.stack(force), outputs, rate=128, steps=1)
-    trials = hj.testing.spoil(made, outputs, noise=1e-4).mark("apex", APEX, bandwidth=16)
+    made = hj.testing.simulate_recording(
+        hopper_cycle, np.stack(force), outputs, rate=128, steps=1
+    )
+    trials = hj.testing.spoil(made, outputs, noise=1e-4).mark(
+        "apex", APEX, bandwidth=16
+    )
     phase = hj.AtEvent("apex") if mishap in EVENT_MISHAPS else APEX
     try:
         dirty = mishandle(trials, mishap, input="u", outputs=outputs, event="apex")

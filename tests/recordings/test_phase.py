@@ -39,7 +39,9 @@ def test_noise_gaps_and_irregular_samples(seed, noise, turned):
 
 def test_a_crossing_as_the_anchor(wave):
     """Section 0 lies at the angle at which the signal crosses the level, or at a given one."""
-    late = hj.recordings.estimate_phase(wave, dataclasses.replace(CIRCLE, anchor=-np.pi / 2))
+    late = hj.recordings.estimate_phase(
+        wave, dataclasses.replace(CIRCLE, anchor=-np.pi / 2)
+    )
     np.testing.assert_allclose(whole(late) % 1, 0.25, atol=2e-4)
     for crossing, clock in [
         (hj.Crossing("v", "rising"), 0.5),
@@ -53,7 +55,9 @@ def test_a_crossing_as_the_anchor(wave):
     t, (_, x, v) = wave.trials[0].time, wave.trials[0].values.T
     recording = hj.Recording(t, {"x": x, "v": v, "w": np.cos(6 * np.pi * t)})
     with pytest.raises(hj.DefinitionError, match="w falling, .* all around the cycle"):
-        hj.recordings.estimate_phase(recording, dataclasses.replace(CIRCLE, anchor=thrice))
+        hj.recordings.estimate_phase(
+            recording, dataclasses.replace(CIRCLE, anchor=thrice)
+        )
 
 
 @settings(max_examples=15)
@@ -64,7 +68,9 @@ def test_irregular_events(seed, jitter):
     t = np.arange(0.3, 60) + jitter * rng.uniform(-1, 1, 60)
     missed, doubled = 10 + rng.permutation(20)[0], 40 + rng.permutation(10)[0]
     events = np.sort(np.append(np.delete(t, missed), t[doubled] + 0.1))
-    recording = hj.Recording(np.arange(0, 61, 0.5), {"x": np.zeros(122)}, events={"e": events})
+    recording = hj.Recording(
+        np.arange(0, 61, 0.5), {"x": np.zeros(122)}, events={"e": events}
+    )
     phase = hj.recordings.estimate_phase(recording, hj.AtEvent("e"))
     assert phase.dropped == 1 and phase.missed == 2 and len(phase.stretches[0]) == 2
     assert phase.period == pytest.approx(1, abs=2 * jitter + 1e-9)
@@ -75,7 +81,9 @@ def test_irregular_events(seed, jitter):
         assert np.abs(at - at[0] - np.arange(len(own))).max() <= 1e-9
     exact = hj.Recording(t, {"x": t}, events={"e": 0.3 + np.arange(15)})
     hj.plot.phase(hj.recordings.estimate_phase(exact, hj.AtEvent("e")))
-    twice = hj.Recording(np.arange(62), {"x": np.zeros(62)}, events={"e": [*t, *(t + 0.02)]})
+    twice = hj.Recording(
+        np.arange(62), {"x": np.zeros(62)}, events={"e": [*t, *(t + 0.02)]}
+    )
     assert hj.recordings.estimate_phase(twice, hj.AtEvent("e")).dropped == 60
 
 
@@ -83,11 +91,20 @@ def test_what_is_no_phase(wave):
     t = wave.trials[0].time
     still = hj.Recording(t, {"x": np.cos(t) + 5, "v": np.sin(t) + 5, "c": 0 * t})
     for definition, message in [
-        (dataclasses.replace(CIRCLE, center=(0, 0), scale=(1, 1)), "the phase does not wind"),
+        (
+            dataclasses.replace(CIRCLE, center=(0, 0), scale=(1, 1)),
+            "the phase does not wind",
+        ),
         (dataclasses.replace(CIRCLE, velocity="c"), "c is constant: define"),
         (hj.AtEvent("strike"), "there is no event 'strike'; events are none"),
-        (hj.Crossing("x", "falling", value=3.0), "x is never seen to cross 3, falling.*between"),
-        (hj.Crossing(lambda t, q: q[0], "falling"), "must name a signal, and no charts"),
+        (
+            hj.Crossing("x", "falling", value=3.0),
+            "x is never seen to cross 3, falling.*between",
+        ),
+        (
+            hj.Crossing(lambda t, q: q[0], "falling"),
+            "must name a signal, and no charts",
+        ),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
             hj.recordings.estimate_phase(still, definition)
@@ -100,7 +117,11 @@ def test_splines_are_those_of_scipy(seed, n, bandwidth):
     t, y = np.cumsum(rng.uniform(0.5, 1.5, n)), rng.normal(size=n)
     x = np.linspace(t[0], t[-1], 200)
     step = np.median(np.diff(t))
-    reference = make_smoothing_spline(t / step, y, lam=(2 * np.pi * bandwidth * step) ** -4)
-    np.testing.assert_allclose(spline(t, y, bandwidth)(x), reference(x / step), atol=1e-9)
+    reference = make_smoothing_spline(
+        t / step, y, lam=(2 * np.pi * bandwidth * step) ** -4
+    )
+    np.testing.assert_allclose(
+        spline(t, y, bandwidth)(x), reference(x / step), atol=1e-9
+    )
     through = CubicSpline(t, y, bc_type="natural")
     np.testing.assert_allclose(spline(t, y, np.inf)(x), through(x), atol=1e-9)

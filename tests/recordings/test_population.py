@@ -53,21 +53,52 @@ def test_equal_errors_give_the_t_interval():
 
 def test_equal_estimates_have_the_error_of_their_fits():
     row = study(np.ones(N), np.full(N, 0.3)).mean("gain")
-    assert row["standard_error"][0] == pytest.approx(0.3 / np.sqrt(N)) and row["spread"][0] == 0
+    assert (
+        row["standard_error"][0] == pytest.approx(0.3 / np.sqrt(N))
+        and row["spread"][0] == 0
+    )
 
 
 def test_the_bcg_trials():
     """Vaccination trials of the R package metafor (Viechtbauer 2010): `rma(yi, vi, test="knha")`
     prints -0.7145 (0.1808), tau^2 0.3132, and `confint` tau 0.3460 to 1.0543."""
-    y = [-0.8893, -1.5854, -1.3481, -1.4416, -0.2175, -0.7861, -1.6209, 0.0120, -0.4694, -1.3713,
-         -0.3394, 0.4459, -0.0173]  # fmt: skip
-    v = [0.3256, 0.1946, 0.4154, 0.0200, 0.0512, 0.0069, 0.2230, 0.0040, 0.0564, 0.0730, 0.0124,
-         0.5325, 0.0714]  # fmt: skip
+    y = [
+        -0.8893,
+        -1.5854,
+        -1.3481,
+        -1.4416,
+        -0.2175,
+        -0.7861,
+        -1.6209,
+        0.0120,
+        -0.4694,
+        -1.3713,
+        -0.3394,
+        0.4459,
+        -0.0173,
+    ]
+    v = [
+        0.3256,
+        0.1946,
+        0.4154,
+        0.0200,
+        0.0512,
+        0.0069,
+        0.2230,
+        0.0040,
+        0.0564,
+        0.0730,
+        0.0124,
+        0.5325,
+        0.0714,
+    ]
     row = study(np.array(y), np.sqrt(v)).mean("gain")
     assert row["estimate"][0] == pytest.approx(-0.7145, abs=2e-4)
     assert row["standard_error"][0] == pytest.approx(0.1808, abs=2e-4)
     assert row["spread"][0] ** 2 == pytest.approx(0.3132, abs=2e-4)
-    assert (row["spread_low"][0], row["spread_high"][0]) == pytest.approx((0.346, 1.0543), abs=2e-4)
+    assert (row["spread_low"][0], row["spread_high"][0]) == pytest.approx(
+        (0.346, 1.0543), abs=2e-4
+    )
 
 
 def test_complete_pairs_give_the_paired_t_test():
@@ -89,7 +120,10 @@ def test_complete_pairs_give_the_paired_t_test():
 
 def test_the_mixed_model_maximizes_the_restricted_likelihood():
     """That of all contrasts without a mean, for errors that differ and missing conditions."""
-    y, v = RNG.normal(size=(8, 2)) + RNG.normal(size=(8, 1)), RNG.uniform(0.02, 0.2, (8, 2))
+    y, v = (
+        RNG.normal(size=(8, 2)) + RNG.normal(size=(8, 1)),
+        RNG.uniform(0.02, 0.2, (8, 2)),
+    )
     present = np.ones((8, 2), bool)
     present[0, 0] = present[1, 1] = False
     (subjects, cells), y, v = np.nonzero(present), y[present], v[present]
@@ -103,9 +137,13 @@ def test_the_mixed_model_maximizes_the_restricted_likelihood():
 
     for step in ([[1, 0], [0, 0]], [[0, 0], [0, 1]], [[0, 1], [1, 0]]):
         for size in (-1e-2, 1e-2):
-            assert likelihood(fit.between + size * np.array(step)) < likelihood(fit.between)
+            assert likelihood(fit.between + size * np.array(step)) < likelihood(
+                fit.between
+            )
     w = np.linalg.inv(covariance(fit.between))
-    np.testing.assert_allclose(fit.coefficients, np.linalg.solve(x.T @ w @ x, x.T @ w @ y))
+    np.testing.assert_allclose(
+        fit.coefficients, np.linalg.solve(x.T @ w @ x, x.T @ w @ y)
+    )
     assert (np.linalg.eigvalsh(fit.covariance - fit.plain) > -1e-12).all()
 
 
@@ -139,20 +177,28 @@ def test_quantities_of_fits():
     np.testing.assert_allclose(people.values["modulus"], [*modulus, 0.5])
     np.testing.assert_allclose(people.errors["modulus"], [*1e-2 / (2 * modulus), 1e-2])
     np.testing.assert_allclose(np.cos(people.values["angle"][:4]), -0.25 / modulus)
-    assert [people.mean(name)["subjects"][0] for name in ("angle", "c1", "c2")] == [4, 5, 4]
+    assert [people.mean(name)["subjects"][0] for name in ("angle", "c1", "c2")] == [
+        4,
+        5,
+        4,
+    ]
 
 
 def test_plans_agree_with_closed_forms():
     y = 1 + 0.2 * RNG.normal(size=12)
     people = study(y, np.full(12, 0.1), strides=np.full(12, 100))
-    with pytest.raises(hj.DefinitionError, match="subjects differ in 'gain' by no more than"):
+    with pytest.raises(
+        hj.DefinitionError, match="subjects differ in 'gain' by no more than"
+    ):
         study(y, np.ones(12), strides=np.full(12, 100)).allocation("gain")
     between = np.sqrt(y.var(ddof=1) - 0.01)
     plan = people.allocation("gain", subject_cost=4, trial_cost=1e-9, stride_cost=0.01)
     assert plan["strides"][0] == pytest.approx(np.sqrt(400) / between, rel=1e-4)
     spread = np.sqrt(between**2 + 0.01)
     (power,) = people.power("gain", 0.25, (12,), draws=40)["power"]
-    expected = stats.nct.sf(stats.t.isf(0.025, 22), 22, 0.25 / (spread * np.sqrt(2 / 12)))
+    expected = stats.nct.sf(
+        stats.t.isf(0.025, 22), 22, 0.25 / (spread * np.sqrt(2 / 12))
+    )
     assert abs(power - expected) < 3 * np.sqrt(expected * (1 - expected) / 40)
 
 
@@ -162,7 +208,9 @@ def test_trials_and_strides_have_the_smallest_variance_for_their_cost():
     people = Population(table, {"gain": y}, {"gain": np.full(36, 0.1)})
     wide = study([1.0, 2], [1.0, 1], condition=["a" * 60, "b" * 60])
     assert max(map(len, repr(wide).splitlines())) <= 100
-    row = people.allocation("gain", subject_cost=4, trial_cost=0.5, stride_cost=0.01).iloc[0]
+    row = people.allocation(
+        "gain", subject_cost=4, trial_cost=0.5, stride_cost=0.01
+    ).iloc[0]
     y = y.reshape(12, 3)
     trials = y.var(axis=1, ddof=1).mean() - 0.01
     subjects = y.mean(axis=1).var(ddof=1) - (trials + 0.01) / 3
@@ -187,8 +235,10 @@ def test_all_sign_flips_give_the_exact_p_value():
     y = RNG.normal(size=(7, 6, 8))
     both = maps_of(np.concatenate([y, 0 * y]), 7, condition=np.repeat(["a", "b"], 7))
     test = both.difference("a", "b")
-    largest = [np.abs(stats.ttest_1samp(np.array(s)[:, None, None] * y, 0).statistic).max()
-               for s in itertools.product([1, -1], repeat=7)]  # fmt: skip
+    largest = [
+        np.abs(stats.ttest_1samp(np.array(s)[:, None, None] * y, 0).statistic).max()
+        for s in itertools.product([1, -1], repeat=7)
+    ]
     t = stats.ttest_1samp(y, 0).statistic
     np.testing.assert_allclose(test.t, t)
     expected = (np.array(largest)[:, None, None] >= np.abs(t) * (1 - 1e-9)).mean(axis=0)
@@ -200,10 +250,14 @@ def test_permutations_of_groups_and_complex_maps():
     y = RNG.normal(size=(12, 6, 8))
     y[:6, [0, 5], 2:5] += 8.0
     test = maps_of(y, 12, group=np.repeat(["a", "b"], 6)).difference("a", "b")
-    assert "all 924 permutations" in test.methods and test.significant[[0, 5], 2:5].all()
+    assert (
+        "all 924 permutations" in test.methods and test.significant[[0, 5], 2:5].all()
+    )
     np.testing.assert_array_equal(test.significant, test.p <= 0.05)
     np.testing.assert_allclose(test.t, stats.ttest_ind(y[:6], y[6:]).statistic)
-    turned = maps_of(y * np.exp(1j), 12, group=np.repeat(["a", "b"], 6)).difference("a", "b")
+    turned = maps_of(y * np.exp(1j), 12, group=np.repeat(["a", "b"], 6)).difference(
+        "a", "b"
+    )
     np.testing.assert_allclose(turned.t, np.abs(test.t))
 
 
@@ -214,20 +268,36 @@ def test_the_band_holds_the_mean_and_draws_repeat():
     assert (first.reach > 1.2 * stats.t.isf(0.025, 14) * stats.sem(y)).all()
 
 
-@pytest.mark.parametrize("sentence, call", {
-    "'a' is in the groups 'x'": lambda: study([1.0, 2], [1.0, 1], subject=["a", "a"], group="xy"),
-    "row 1 of `table` has no subj": lambda: study([1.0, 2], [1.0, 1], subject=["a", None]),
-    "'x' has too few": lambda: study([1.0, 2, 3], np.ones(3), condition="xyy").mean("gain"),
-    "has no covariance": lambda: fitted(fit_of([0.5], scale=np.inf)),
-    "'a' and 'b' .*'y' .m.,. and .'y' .um.,": lambda: fitted(
-        fit_of([0.5], outputs=METERS), fit_of([0.5], outputs=MICROMETERS)),
-    "'all' has too few subjects: 0 of 2": lambda: fitted(fit_of([0.5])).mean("angle"),
-    "no column 'subject'": lambda: Population({}, {"q": [1.0]}, {"q": [1.0]}),
-    "standard error 0: it must": lambda: study([1.0], [0.0]),
-    "no two conditions": lambda: study([1.0, 2], [1.0, 1]).difference("gain", "a", "b"),
-    "must be two": lambda: study([1.0, 2, 3], np.ones(3)).power("gain", 1, labels=["a"]),
-    "no quantity 'x'": lambda: study([1.0, 2], [1.0, 1]).mean("x"),
-}.items())  # fmt: skip
+@pytest.mark.parametrize(
+    "sentence, call",
+    {
+        "'a' is in the groups 'x'": lambda: study(
+            [1.0, 2], [1.0, 1], subject=["a", "a"], group="xy"
+        ),
+        "row 1 of `table` has no subj": lambda: study(
+            [1.0, 2], [1.0, 1], subject=["a", None]
+        ),
+        "'x' has too few": lambda: study([1.0, 2, 3], np.ones(3), condition="xyy").mean(
+            "gain"
+        ),
+        "has no covariance": lambda: fitted(fit_of([0.5], scale=np.inf)),
+        "'a' and 'b' .*'y' .m.,. and .'y' .um.,": lambda: fitted(
+            fit_of([0.5], outputs=METERS), fit_of([0.5], outputs=MICROMETERS)
+        ),
+        "'all' has too few subjects: 0 of 2": lambda: fitted(fit_of([0.5])).mean(
+            "angle"
+        ),
+        "no column 'subject'": lambda: Population({}, {"q": [1.0]}, {"q": [1.0]}),
+        "standard error 0: it must": lambda: study([1.0], [0.0]),
+        "no two conditions": lambda: study([1.0, 2], [1.0, 1]).difference(
+            "gain", "a", "b"
+        ),
+        "must be two": lambda: study([1.0, 2, 3], np.ones(3)).power(
+            "gain", 1, labels=["a"]
+        ),
+        "no quantity 'x'": lambda: study([1.0, 2], [1.0, 1]).mean("x"),
+    }.items(),
+)
 def test_refusals(sentence, call):
     with pytest.raises(hj.DefinitionError, match=sentence):
         call()
@@ -243,22 +313,38 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     for k in range(6):
         (trial,) = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3, seed=k).trials
         table = np.column_stack([trial.time, trial.values])
-        np.savetxt(tmp_path / f"{k}.csv", table, "%.6g", delimiter=",", comments="",
-                   header="time (s),force (N),x (m),v (m/s)")  # fmt: skip
+        np.savetxt(
+            tmp_path / f"{k}.csv",
+            table,
+            "%.6g",
+            delimiter=",",
+            comments="",
+            header="time (s),force (N),x (m),v (m/s)",
+        )
         rows.append(f"{k}.csv,S{k},{'ab'[k % 2]},{30 + k}")
-    (tmp_path / "subjects.csv").write_text("\n".join([*rows, "none.csv,S9,a,40"]) + "\n")
+    (tmp_path / "subjects.csv").write_text(
+        "\n".join([*rows, "none.csv,S9,a,40"]) + "\n"
+    )
     # The figures of single reports are tested elsewhere and take long.
     monkeypatch.setattr(subjects, "write_results", write_numbers)
     monkeypatch.chdir(tmp_path)
     options = "--input force --outputs x,v --phase x,v --sections 8 --order 1 --out out".split()
     assert main(["identify", "--table", "subjects.csv", *options]) == 1
     printed = capsys.readouterr().out
-    assert "S9-a failed: cannot read" in printed and "a - b" in printed.replace("b - a", "a - b")
+    assert "S9-a failed: cannot read" in printed and "a - b" in printed.replace(
+        "b - a", "a - b"
+    )
     assert "S0-a is doubtful: odd." in printed
     assert Path("out/forest.png").exists() and not pyplot.get_fignums()
-    page, table = ((tmp_path / "out" / x).read_text() for x in ("population.html", "subjects.csv"))
-    assert page.count("report.html") == 6 and "Hartung" in page and "S9-a failed" in page
-    assert table.count("\n") == 7 and table.startswith("report,subject,group,age,strides,period")
+    page, table = (
+        (tmp_path / "out" / x).read_text() for x in ("population.html", "subjects.csv")
+    )
+    assert (
+        page.count("report.html") == 6 and "Hartung" in page and "S9-a failed" in page
+    )
+    assert table.count("\n") == 7 and table.startswith(
+        "report,subject,group,age,strides,period"
+    )
     monkeypatch.setattr(subjects, "read_recording", lambda *files, **options: 1 / 0)
     assert main(["identify", "--table", "subjects.csv", *options]) == 1
     printed = capsys.readouterr().out
@@ -282,6 +368,10 @@ def test_figures():
     y = RNG.normal(size=(12, 6, 8))
     y[:6, 2:4, 2:5] += 4.0
     test = maps_of(y, 12, group=np.repeat(["a", "b"], 6)).difference("a", "b")
-    assert len(hj.plot.subject_maps(test).ax.collections) == 2  # the map and its outline
-    curve = PopulationMaps({"subject": np.arange(12)}, y[:, 0], {"lag": AXES["lag"]}).mean()
+    assert (
+        len(hj.plot.subject_maps(test).ax.collections) == 2
+    )  # the map and its outline
+    curve = PopulationMaps(
+        {"subject": np.arange(12)}, y[:, 0], {"lag": AXES["lag"]}
+    ).mean()
     assert len(hj.plot.subject_maps(curve).ax.get_lines()) == 12 + 3

@@ -22,7 +22,12 @@ GOOD = {"a": T, "b": 2 * T}
         (T, {"a": list("abcde")}, {}, "a must be real numbers"),
         (T, GOOD, {"units": {"c": "N"}}, "there is no signal 'c'; signals are a, b"),
         (T, GOOD, {"events": {"e": [np.inf]}}, "e is infinite at sample 0"),
-        (T, GOOD, {"events": {"e": [9.0]}}, "events 'e' .* are outside of the recording"),
+        (
+            T,
+            GOOD,
+            {"events": {"e": [9.0]}},
+            "events 'e' .* are outside of the recording",
+        ),
         (T, GOOD, {"events": {"a": [1.0]}}, "'a' is a signal and an event"),
     ],
 )
@@ -37,9 +42,13 @@ def test_trials_must_belong_together():
     both = hj.Recording.join([one, other])
     np.testing.assert_array_equal(both.trials[1].values[:, both.column("b")], T)
     assert "Recording(2 trials: a (N), b)" in repr(both)
-    with pytest.raises(hj.DefinitionError, match="'two' have different units of a: N and kN"):
+    with pytest.raises(
+        hj.DefinitionError, match="'two' have different units of a: N and kN"
+    ):
         hj.Recording.join([one, hj.Recording(T, GOOD, units={"a": "kN"}, name="two")])
-    with pytest.raises(hj.DefinitionError, match="different signals: ..a', 'b'. and ..a"):
+    with pytest.raises(
+        hj.DefinitionError, match="different signals: ..a', 'b'. and ..a"
+    ):
         hj.Recording.join([one, hj.Recording(T, {"a": T})])
 
 
@@ -51,7 +60,12 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
     np.testing.assert_array_equal(found.trials[0].values[:, 0], [1, np.nan, np.nan, 4])
     np.testing.assert_array_equal(found.trials[0].events["strike"], [1.0])
     assert found.trials[0].name == "x"
-    np.savez(tmp_path / "x.npz", time=np.arange(4.0), force=np.ones(4), **{"event strike": [1.5]})
+    np.savez(
+        tmp_path / "x.npz",
+        time=np.arange(4.0),
+        force=np.ones(4),
+        **{"event strike": [1.5]},
+    )
     both = hj.read_recording([path, tmp_path / "x.npz"], units={"force": "kN"})
     assert both.units == ("kN",) and both.trials[1].events["strike"] == [1.5]
 
@@ -69,14 +83,19 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
         (",time (s),F (µN)\n0,0.5,1\n1,1.5,-0.25\n", "utf-8"),  # the index of pandas
         ('"time (s)","F (µN)"\n"0.5","1"\n"1.5","-0.25"\n', "utf-8"),
         ("time_ms,F (µN)\n500,1\n1500,-0.25\n", "utf-8"),
-        ("Subject; 3\n\n;time;F\n;s;µN\n1;0,5;1\n2;1,5;-0,25\n", "utf-8"),  # lines above
+        (
+            "Subject; 3\n\n;time;F\n;s;µN\n1;0,5;1\n2;1,5;-0,25\n",
+            "utf-8",
+        ),  # lines above
         ("time (min);F (µN)\n0.00833333333333333333;1\n0.025;-0.25\n", "utf-8"),
     ],
 )
 def test_what_spreadsheets_write(tmp_path, text, encoding):
     text = text.replace("\n", "\r\n" if ";" in text else "\r" if "\t" in text else "\n")
     (tmp_path / "x.csv").write_text(text, encoding=encoding, newline="")
-    found = hj.read_recording(tmp_path / "x.csv", time="time_ms" if "_ms" in text else "time")
+    found = hj.read_recording(
+        tmp_path / "x.csv", time="time_ms" if "_ms" in text else "time"
+    )
     assert found.signals == ("F",) and found.units == ("µN",)
     np.testing.assert_allclose(found.trials[0].time, [0.5, 1.5], rtol=1e-15)
     np.testing.assert_array_equal(found.trials[0].values[:, 0], [1.0, -0.25])
@@ -143,7 +162,9 @@ def test_vicon(tmp_path, separator):
     with pytest.raises(FileFormatError, match="of different rates"):
         hj.read_recording(path)
     path.write_text(VICON.replace("\n2,1,3.5", "\n1,1,3.5"))
-    with pytest.raises(FileFormatError, match="frames that are missing, or not in order"):
+    with pytest.raises(
+        FileFormatError, match="frames that are missing, or not in order"
+    ):
         hj.read_recording(path)
     path.write_text(VICON[: VICON.index("\n\n")])
     assert hj.read_recording(path).notes == ()
@@ -183,7 +204,11 @@ def test_the_unit_of_time(tmp_path):
     np.testing.assert_allclose(found.trials[0].events["e"], [1.5e-3, 2.5e-3])
     frame = hj.Recording.from_frame({"time (ms)": T, "a (N)": T, "event e": T == 1})
     np.testing.assert_allclose(frame.trials[0].time, T / 1000)
-    assert (frame.signals, frame.units, frame.trials[0].events["e"]) == (("a",), ("N",), 1e-3)
+    assert (frame.signals, frame.units, frame.trials[0].events["e"]) == (
+        ("a",),
+        ("N",),
+        1e-3,
+    )
     (tmp_path / "y.csv").write_text("frame,a\n0,1\n1,2\n2,4\n")
     both = hj.Recording.join([hj.read_recording(tmp_path / "y.csv", time="frame")] * 2)
     assert "(the times in 'frame' have no unit: taken as seconds)" in repr(both)

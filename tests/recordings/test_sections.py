@@ -35,19 +35,27 @@ def test_a_circle(wave):
     np.testing.assert_allclose(np.diff(times), 1 / 8, atol=1e-4)
     area = np.sin(3 * times)
     np.testing.assert_allclose(
-        (record.u + data.cycle_inputs[(record.first_section + np.arange(len(times))) % 8])[:-1, 0],
-        np.diff(area) / 3 / np.diff(times), atol=2e-3,
-    )  # fmt: skip
+        (
+            record.u
+            + data.cycle_inputs[(record.first_section + np.arange(len(times))) % 8]
+        )[:-1, 0],
+        np.diff(area) / 3 / np.diff(times),
+        atol=2e-3,
+    )
     assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
     timed = sample(wave, timing="clock")
     assert timed.outputs == ("x", "v", "time") and timed.rms()[1][2] < 1e-4
     with pytest.raises(hj.DefinitionError, match="different n_sections: 16 and 8"):
         sample(wave, n_sections=16)
-    with pytest.raises(hj.DefinitionError, match="events alone determine no multipliers"):
+    with pytest.raises(
+        hj.DefinitionError, match="events alone determine no multipliers"
+    ):
         sample(wave, inputs=(), outputs=())
     for phase in (CIRCLE, hj.Crossing("v", "rising")):
         for call in (sample, hj.recordings.estimate_phase):
-            with pytest.raises(hj.DefinitionError, match="`bandwidth` removes the rhythm of 1 Hz"):
+            with pytest.raises(
+                hj.DefinitionError, match="`bandwidth` removes the rhythm of 1 Hz"
+            ):
                 call(wave, phase, bandwidth=0.9)
     assert "SectionData(19.75 cycles of 8 sections in 1 records;" in repr(data)
 
@@ -56,16 +64,29 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
     (trial,), names = rhythm.trials, rhythm.signals
     t, z = trial.time, np.exp(2j * np.pi * trial.time)
     for inputs in ((), "force"):
-        with pytest.raises(hj.DefinitionError, match="^x is the same in all cycles, but for round"):
-            exact = hj.Recording(t, {"force": trial.values[:, 0], "x": z.real, "v": -z.imag})
+        with pytest.raises(
+            hj.DefinitionError, match="^x is the same in all cycles, but for round"
+        ):
+            exact = hj.Recording(
+                t, {"force": trial.values[:, 0], "x": z.real, "v": -z.imag}
+            )
             sample(exact, inputs=inputs)
     assert sample(rhythm, inputs="force", timing="clock").outputs == ("x", "v", "time")
-    for rate in (2 * np.pi, 6.1):  # (with 64 samples in a cycle, all cycles are sampled alike)
-        both = hj.Recording.beside([rhythm, hj.Recording(t, {"clock": np.sin(rate * t)})])
-        with pytest.raises(hj.DefinitionError, match="deviate only by rounding and interpolation"):
+    for rate in (
+        2 * np.pi,
+        6.1,
+    ):  # (with 64 samples in a cycle, all cycles are sampled alike)
+        both = hj.Recording.beside(
+            [rhythm, hj.Recording(t, {"clock": np.sin(rate * t)})]
+        )
+        with pytest.raises(
+            hj.DefinitionError, match="deviate only by rounding and interpolation"
+        ):
             sample(both, hj.Crossing("clock", "rising"), inputs="force", timing="clock")
     for step, few in ((13, True), (5, False)):
-        thin = hj.Recording(t[::step], dict(zip(names, trial.values[::step].T, strict=True)))
+        thin = hj.Recording(
+            t[::step], dict(zip(names, trial.values[::step].T, strict=True))
+        )
         data = sample(thin, inputs="force")
         advice = hj.recordings.advise(data, hj.fit_series(data, 1, check=False))
         assert any(w.cause == "sampling" for w in advice.warnings) == few
@@ -73,17 +94,23 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
 
 def test_gaps_are_masked_and_cut(wave):
     t, values = wave.trials[0].time, wave.trials[0].values.copy()
-    values[(t > 4.3) & (t < 4.5), 1] = np.nan  # of an output, too short to lose the count
+    values[(t > 4.3) & (t < 4.5), 1] = (
+        np.nan
+    )  # of an output, too short to lose the count
     values[(t > 9.1) & (t < 9.3), 0] = np.nan  # of the input, longer than a section
     values[(t > 14) & (t < 16), 1:] = np.nan
-    data = sample(hj.Recording(t, dict(zip("fxv", values.T, strict=True))), timing="duration")
+    data = sample(
+        hj.Recording(t, dict(zip("fxv", values.T, strict=True))), timing="duration"
+    )
     assert len(data.records) == 2
     for record, times in zip(data.records, data.times, strict=True):
         lost, x = np.isnan(record.y[:, [0, 2]]).T
         np.testing.assert_array_equal(x, lost | np.append(True, lost[:-1]))
         np.testing.assert_array_equal(lost & (times > 4.29) & (times < 4.51), lost)
         end = np.append(times[1:], times[-1] + 0.125)
-        np.testing.assert_array_equal(np.isnan(record.u[:, 0]), (end > 9.11) & (times < 9.29))
+        np.testing.assert_array_equal(
+            np.isnan(record.u[:, 0]), (end > 9.11) & (times < 9.29)
+        )
     assert 0 < data.missing < 0.1
 
 
@@ -91,9 +118,12 @@ def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     """They count where they can; what is left out is counted and said."""
     marked = rhythm.mark("top", hj.Crossing("v", "falling"), bandwidth=16)
     dirty = mishandle(
-        hj.testing.spoil(marked, ("x", "v"), noise=1e-3), misjudged(lost=0.05, doubled=0.05),
-        input="force", outputs=("x", "v"), event="top",
-    )  # fmt: skip
+        hj.testing.spoil(marked, ("x", "v"), noise=1e-3),
+        misjudged(lost=0.05, doubled=0.05),
+        input="force",
+        outputs=("x", "v"),
+        event="top",
+    )
     (trial,) = dirty.trials
     kept = np.abs(trial.time - 77) > 3.4
     events = {k: v[np.abs(v - 77) > 3.4] for k, v in trial.events.items()}
@@ -119,29 +149,45 @@ def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
         start = at + 0.5 - rng.uniform(0.02, 0.18)
         hidden[(t > start) & (t < start + 0.2), 1:] = np.nan
     options = {"inputs": "force", "n_sections": 16, "bandwidth": 8.0}
-    both = [hj.Recording(t, dict(zip(names, x.T, strict=True))) for x in (values, hidden)]
+    both = [
+        hj.Recording(t, dict(zip(names, x.T, strict=True))) for x in (values, hidden)
+    ]
     clean, dirty = (sample(x, top, **options) for x in both)
-    assert len(dirty.records) == 6 and dirty.cycles == pytest.approx(clean.cycles - 10, abs=0.1)
+    assert len(dirty.records) == 6 and dirty.cycles == pytest.approx(
+        clean.cycles - 10, abs=0.1
+    )
     (before,) = clean.times
     for record, times in zip(dirty.records, dirty.times, strict=True):
         first = int(np.argmin(np.abs(before - times[0])))
         true = slice(first, first + len(times))
         np.testing.assert_allclose(times, before[true], atol=2e-3)
-        assert np.nanstd(record.y - clean.records[0].y[true]) < 0.1 * clean.records[0].y.std()
+        assert (
+            np.nanstd(record.y - clean.records[0].y[true])
+            < 0.1 * clean.records[0].y.std()
+        )
 
 
 def test_slow_drift_is_taken_out(wave):
     t, values = wave.trials[0].time, wave.trials[0].values
-    drifting = dict(zip("fxv", (values + 0.3 * np.cos(np.pi * t / 20)[:, None]).T, strict=True))
+    drifting = dict(
+        zip("fxv", (values + 0.3 * np.cos(np.pi * t / 20)[:, None]).T, strict=True)
+    )
     recording = hj.Recording(t, drifting)
     assert sample(recording).rms()[1][0] > 0.1
     rough = hj.recordings.estimate_phase(recording, CIRCLE)
     flat = without_drift(recording, rough, ("f", "x", "v"), 4)
     assert sample(flat).rms()[1][0] < 0.02
-    assert [x.records[0].drift for x in (sample(flat), sample(flat).with_drift(9))] == [np.inf, 9]
+    assert [x.records[0].drift for x in (sample(flat), sample(flat).with_drift(9))] == [
+        np.inf,
+        9,
+    ]
     for phase, cycles, message in [
         (rough, 3, "four cycles or more, not 3"),
-        (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "numbers of trials: 0 and 1"),
+        (
+            eqx.tree_at(lambda p: p.stretches, rough, ()),
+            9,
+            "numbers of trials: 0 and 1",
+        ),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
             without_drift(wave, phase, "x", cycles)
@@ -151,11 +197,20 @@ def test_designs_as_tables(tmp_path, wave):
     design = hj.multisine(n_sections=8, periods=16, band=(0, 2.0))
     hj.recordings.write_design(tmp_path / "phase.csv", design, cycles=19)
     for period, rows in ((0.2901, 465), (0.29, 16 * 29)):  # (0.29 * 100 is 28.999...)
-        hj.recordings.write_design(tmp_path / "time.csv", design, period=period, rate=100)
-        assert (tmp_path / "time.csv").read_text().count("\n") - 1 == design.experiments * rows
-    for rate, message in ((None, "both the period and the rate"), (15.9, "must be 16 or more")):
+        hj.recordings.write_design(
+            tmp_path / "time.csv", design, period=period, rate=100
+        )
+        assert (tmp_path / "time.csv").read_text().count(
+            "\n"
+        ) - 1 == design.experiments * rows
+    for rate, message in (
+        (None, "both the period and the rate"),
+        (15.9, "must be 16 or more"),
+    ):
         with pytest.raises(hj.DefinitionError, match=message):
-            hj.recordings.write_design(tmp_path / "time.csv", design, period=0.5, rate=rate)
+            hj.recordings.write_design(
+                tmp_path / "time.csv", design, period=0.5, rate=rate
+            )
     # Applied at the phases of the recording, and found again in its section data.
     phase = hj.recordings.estimate_phase(wave, CIRCLE)
     with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):
@@ -167,7 +222,9 @@ def test_designs_as_tables(tmp_path, wave):
     section = (data.records[0].first_section + np.arange(len(data.records[0].u))) % 8
     u = data.records[0].u[:, 0] + data.cycle_inputs[section, 0]
     first = -data.records[0].first_section % 8
-    np.testing.assert_allclose(u[first : first + 150], design.inputs(19)[0, :150, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        u[first : first + 150], design.inputs(19)[0, :150, 0], atol=1e-9
+    )
     with pytest.raises(hj.DefinitionError, match="different numbers of trials: 1 and "):
         hj.recordings.add_command(wave, phase, tmp_path / "phase.csv")
     experiments = data.experiments(periods=16)
@@ -181,14 +238,29 @@ def files(tmp_path_factory, rhythm):
     half = len(trial.time) // 2
     for k, rows in enumerate((slice(0, half), slice(half, None))):
         table = np.column_stack([trial.time[rows], trial.values[rows]])
-        np.savetxt(folder / f"trial{k}.csv", table, "%.9g", delimiter=",", comments="",
-                   header="time (s),force (N),x (m),v (m/s)")  # fmt: skip
+        np.savetxt(
+            folder / f"trial{k}.csv",
+            table,
+            "%.9g",
+            delimiter=",",
+            comments="",
+            header="time (s),force (N),x (m),v (m/s)",
+        )
     return folder
 
 
 def identify(files, out, *more):
     trials = [str(files / f"trial{k}.csv") for k in (0, 1)]
-    options = ["--input", "force", "--outputs", "x,v", "--phase", "x,v", "--sections", "16"]
+    options = [
+        "--input",
+        "force",
+        "--outputs",
+        "x,v",
+        "--phase",
+        "x,v",
+        "--sections",
+        "16",
+    ]
     return main(["identify", *trials, *options, "--out", str(out), *more])
 
 
@@ -208,8 +280,12 @@ def test_the_command(files, tmp_path, monkeypatch):
     assert "± standard error" in top and f"<td>{found.real:.3f}" in top
     assert "from force (N) to x (m), v (m/s)" in top
     said = re.sub("</?code>", "`", top)
-    assert all(f'<p class="warn">{html.escape(w)}</p>' in said for w in summary["warnings"])
-    assert all((html.escape(x) in said) == bool(n) for x, n in summary["left_out"].items())
+    assert all(
+        f'<p class="warn">{html.escape(w)}</p>' in said for w in summary["warnings"]
+    )
+    assert all(
+        (html.escape(x) in said) == bool(n) for x, n in summary["left_out"].items()
+    )
     assert summary["sampling_rates"] == pytest.approx([64, 64])
     assert summary["units"] == {"time": "s", "force": "N", "x": "m", "v": "m/s"}
     assert "p &lt; 0.001" in page or "p = " in page
@@ -227,7 +303,9 @@ def test_the_command(files, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["summary.json", "figures/bode.png"])
-def test_the_command_computes_nothing_where_a_file_is_in_the_way(files, tmp_path, name, capsys):
+def test_the_command_computes_nothing_where_a_file_is_in_the_way(
+    files, tmp_path, name, capsys
+):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("mine")
     with pytest.raises(SystemExit, match=f"{name}' is in the way"):
@@ -241,7 +319,9 @@ def test_signals_with_clocks_of_their_own(rhythm):
     t, (force, x, v) = rhythm.trials[0].time, rhythm.trials[0].values.T
     parts = (t, {"force": force}), (t[::2], {"x": x[::2]}), (t[1::2], {"v": v[1::2]})
     own = hj.Recording.beside([hj.Recording(*part) for part in parts])
-    angle = hj.KinematicPhase(16, position="x", velocity="v", center=(0, 0), scale=(1, 1))
+    angle = hj.KinematicPhase(
+        16, position="x", velocity="v", center=(0, 0), scale=(1, 1)
+    )
     data = [sample(r, angle, inputs="force") for r in (rhythm, own)]
     assert data[1].missing == 0 and data[1].cycles == data[0].cycles
     together, apart = (hj.fit_series(d, order=1).multipliers for d in data)
@@ -251,7 +331,12 @@ def test_signals_with_clocks_of_their_own(rhythm):
 
 def test_responses_of_a_model_are_by_the_section_of_the_push():
     """One state: a push of area 1 at section m decays by A; sections last 0.2, ..., 0.8."""
-    N, a, b, c = 4, 0.8, np.array([1.0, 2.0, 3.0, 4.0]), np.array([5.0, 7.0, 11.0, 13.0])
+    N, a, b, c = (
+        4,
+        0.8,
+        np.array([1.0, 2.0, 3.0, 4.0]),
+        np.array([5.0, 7.0, 11.0, 13.0]),
+    )
     columns = (x[:, None, None] for x in (b, c))
     model = hj.LDTP(np.full((N, 1, 1), a), *columns, inputs="f", outputs="x")
     zero, grid = np.zeros((N, 7, 1, 1)), (np.arange(N) / N, np.arange(7) / N)
@@ -262,14 +347,22 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
     expected = b[m] * a ** (r - 1) * c[(m + r) % N] / steps[m]
     np.testing.assert_allclose(found.of_model(model)[:, 1:, 0, 0], expected, rtol=1e-13)
     # Their standard errors are the scatter of fits.
-    apart, rng, about = [], np.random.default_rng(0), dict(inputs=("f",), outputs=("x",))
+    apart, rng, about = (
+        [],
+        np.random.default_rng(0),
+        dict(inputs=("f",), outputs=("x",)),
+    )
     for _ in range(60):
         u = rng.normal(size=(240, 1))
         y = np.asarray(model.simulate(u)) + 20 * rng.normal(size=(240, 1))
         record, cycle = hj.Record(u, y, n_sections=N, **about), np.zeros((N, 1))
         data = SectionData((record,), (times,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))
-        found = impulse_responses(hj.fit_series(record, 1, check=False), data, 4, width=0.0)
+        found = impulse_responses(
+            hj.fit_series(record, 1, check=False), data, 4, width=0.0
+        )
         apart.append((found.values - found.of_model(model)) / found.errors)
     np.testing.assert_allclose(found.durations, steps)
-    size = np.sqrt(np.mean(np.array(apart)[:, :, [[1, 2, 3, 4], [13, 14, 15, 16]]] ** 2, (0, 1, 3)))
+    size = np.sqrt(
+        np.mean(np.array(apart)[:, :, [[1, 2, 3, 4], [13, 14, 15, 16]]] ** 2, (0, 1, 3))
+    )
     np.testing.assert_allclose(size, 1, atol=0.06)

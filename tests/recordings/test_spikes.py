@@ -72,7 +72,9 @@ def test_pulses_are_the_input_and_spikes_are_not():
     assert not input_spikes(single).any()
     assert not input_spikes(noisy(single, 0.1)).any()
     assert not input_spikes(hj.testing.random_force(40, 500, 8)[:, 0]).any()
-    assert not input_spikes(np.repeat(np.random.default_rng(0).normal(size=5000), 4)).any()
+    assert not input_spikes(
+        np.repeat(np.random.default_rng(0).normal(size=5000), 4)
+    ).any()
 
 
 def test_impacts_are_part_of_the_motion(wave):
@@ -92,5 +94,7 @@ def test_impacts_are_part_of_the_motion(wave):
     assert sampled(impact).spikes == (0, 0, 0)
     both = sampled(impact + spikes)
     assert both.spikes == (0, 3, 0) and "spikes left out: x 3)" in repr(both)
-    np.testing.assert_allclose(both.cycle_outputs, sampled(impact).cycle_outputs, atol=5e-3)
+    np.testing.assert_allclose(
+        both.cycle_outputs, sampled(impact).cycle_outputs, atol=5e-3
+    )
     assert np.ptp(both.cycle_outputs[:, 0] - sampled(0 * t).cycle_outputs[:, 0]) > 0.05

@@ -11,7 +11,10 @@ N = 8
 
 def variable(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
     """A linear rhythm with one multiplier, disturbed at every section, seen by three signals."""
-    rng, gains = np.random.default_rng(seed), np.random.default_rng(5).normal(size=(N, 3))
+    rng, gains = (
+        np.random.default_rng(seed),
+        np.random.default_rng(5).normal(size=(N, 3)),
+    )
     trials = []
     for count in strides:
         x, y = 0.0, []
@@ -25,7 +28,12 @@ def variable(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
         t, events = np.arange(len(y)) / N, {"e": np.arange(count)}
         trials.append(hj.Recording(t, signals, events=events, name=f"{len(trials)}"))
     recording = hj.Recording.join(trials)
-    options = {"inputs": (), "outputs": recording.signals, "n_sections": N, "bandwidth": np.inf}
+    options = {
+        "inputs": (),
+        "outputs": recording.signals,
+        "n_sections": N,
+        "bandwidth": np.inf,
+    }
     return hj.recordings.section_data(recording, hj.AtEvent("e"), **options)
 
 
@@ -39,8 +47,13 @@ def test_instruments_have_no_bias_by_noise():
     single, both = (hj.recordings.natural_multipliers(pair, order) for order in (1, 2))
     assert "Order: 2 multipliers give 0.5" in repr(single)
     half = hj.recordings.natural_multipliers(variable(0.1, (60, 60), 0.3 + 0.5j, 2))
-    assert not any(f.doubt for f in (*found, both, half))  # (one of two intervals is enough)
-    drifting = [hj.recordings.natural_multipliers(variable(0.1, seed=k, drift=1)) for k in range(3)]
+    assert not any(
+        f.doubt for f in (*found, both, half)
+    )  # (one of two intervals is enough)
+    drifting = [
+        hj.recordings.natural_multipliers(variable(0.1, seed=k, drift=1))
+        for k in range(3)
+    ]
     assert all("if outputs drift" in f.doubt for f in drifting)
 
 
@@ -50,7 +63,9 @@ def test_short_records_are_drawn_whole():
     assert np.ptp(found.interval()) > 0.2
     assert any(text.cause == "few cycles" for text in found.warnings)
     assert found.block * found.records == found.cycles
-    assert np.ptp(hj.recordings.natural_multipliers(variable(0.1, (11,))).interval()) > 0.2
+    assert (
+        np.ptp(hj.recordings.natural_multipliers(variable(0.1, (11,))).interval()) > 0.2
+    )
     many = hj.recordings.natural_multipliers(variable(0.1, (20,) * 60))
     assert abs(many.multipliers[0] - 0.6) < 0.06  # (0.13 without the correction)
 
@@ -64,7 +79,9 @@ def test_intervals_of_few_blocks_are_wider_than_percentiles():
 def test_an_input_that_repeats_with_the_rhythm_is_named(rhythm):
     sections = {"phase": hj.AtEvent("turn"), "n_sections": N}
     marked = rhythm.mark("turn", hj.Crossing("v", "falling"))
-    given = hj.recordings.section_data(marked, inputs="force", outputs=("x", "v"), **sections)
+    given = hj.recordings.section_data(
+        marked, inputs="force", outputs=("x", "v"), **sections
+    )
     assert list(feedback(given)) == []
     loop = hj.recordings.section_data(marked, inputs="x", outputs="v", **sections)
     (finding,) = feedback(loop)

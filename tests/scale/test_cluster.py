@@ -55,7 +55,10 @@ def fails(rng):
 @pytest.fixture(scope="module")
 def client():
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
-    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+    with (
+        distributed.LocalCluster(**options) as cluster,
+        distributed.Client(cluster) as client,
+    ):
         yield client
 
 
@@ -80,7 +83,10 @@ def test_draws_that_fail_are_named():
 
 
 def test_an_interruption_leaves_whole_pieces(tmp_path):
-    expected = [np.random.default_rng(np.random.SeedSequence(0, spawn_key=(i,))) for i in range(10)]
+    expected = [
+        np.random.default_rng(np.random.SeedSequence(0, spawn_key=(i,)))
+        for i in range(10)
+    ]
     expected, again = [rng.normal() for rng in expected], tmp_path / "again"
     seventh = expected[6]
 
@@ -122,7 +128,11 @@ def test_a_store_knows_its_function(tmp_path):
 )
 def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
     """A store that was made to look like that of the call."""
-    first, victim, store = partial(np.random.Generator.normal), tmp_path / "x", tmp_path / "s.zarr"
+    first, victim, store = (
+        partial(np.random.Generator.normal),
+        tmp_path / "x",
+        tmp_path / "s.zarr",
+    )
     hj.monte_carlo(first, 4, chunk=2, store=store)
     values = store / "value"
     victim.mkdir()
@@ -141,7 +151,9 @@ def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
         os.truncate(values / "c/1", 30 * 2**30)
     else:
         (values / "c/1").unlink()
-        (values / "c/1").symlink_to(victim / "1") if harm == "link" else os.mkfifo(values / "c/1")
+        (values / "c/1").symlink_to(victim / "1") if harm == "link" else os.mkfifo(
+            values / "c/1"
+        )
     with pytest.raises(hj.DefinitionError, match=r"s\.zarr"):
         hj.monte_carlo(first, 4, chunk=2, store=store)
     assert (victim / "1").read_text() == "mine"
@@ -168,9 +180,13 @@ def test_a_killed_worker_takes_nothing_with_it(client, whole, tmp_path):
     times = {path: path.stat().st_mtime_ns for path in store.glob("far/c/*[0-9]")}
     assert len(times) == DRAWS // 2  # (beside them, the victim may leave a `.partial`)
     (store / "end/c/3/0").unlink()
-    again = hj.monte_carlo(walk, DRAWS, seed=7, chunk=2, store=store)  # goes on without a cluster
+    again = hj.monte_carlo(
+        walk, DRAWS, seed=7, chunk=2, store=store
+    )  # goes on without a cluster
     assert again.load().identical(whole)
-    changed = [path.name for path, before in times.items() if path.stat().st_mtime_ns != before]
+    changed = [
+        path.name for path, before in times.items() if path.stat().st_mtime_ns != before
+    ]
     assert changed == ["3"]
 
 
@@ -178,7 +194,9 @@ def test_workers_with_another_version_are_refused(client, whole, monkeypatch):
     versions = client.get_versions(packages=("hybridjax", "jax", "jaxlib", "numpy"))
     versions["client"]["packages"]["jax"] = "9.9"
     monkeypatch.setattr(client, "get_versions", lambda packages: versions)
-    with pytest.raises(hj.DefinitionError, match="has jax .*, and this process has 9.9"):
+    with pytest.raises(
+        hj.DefinitionError, match="has jax .*, and this process has 9.9"
+    ):
         hj.monte_carlo(walk, DRAWS, client=client)
 
 
@@ -186,10 +204,14 @@ def test_workers_with_other_code_are_refused(client, monkeypatch):
     class Mine(Driven):
         """One that workers cannot import."""
 
-    with pytest.raises(hj.DefinitionError, match="`Mine` is defined in the script or notebook"):
+    with pytest.raises(
+        hj.DefinitionError, match="`Mine` is defined in the script or notebook"
+    ):
         hj.monte_carlo(lambda rng: Mine().period(), 2, client=client)
     monkeypatch.setitem(globals(), "STEPS", 50)
-    with pytest.raises(hj.DefinitionError, match="`walk` on a Dask worker is not what it is in"):
+    with pytest.raises(
+        hj.DefinitionError, match="`walk` on a Dask worker is not what it is in"
+    ):
         hj.monte_carlo(walk, DRAWS, client=client)
 
 
@@ -212,6 +234,8 @@ def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
         np.testing.assert_array_equal(mine.y, theirs.y)
     data = list(stored)
     parts, whole = (hj.fit_series(x, 2, check=False) for x in (stored, data))
-    np.testing.assert_allclose(parts.coefficients, whole.coefficients, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        parts.coefficients, whole.coefficients, rtol=0, atol=1e-12
+    )
     np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-12)
     assert repr(hj.validate(whole, stored)) == repr(hj.validate(whole, data))

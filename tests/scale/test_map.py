@@ -53,16 +53,22 @@ def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     )
     assert list(whole.coords) == ["slope", "spokes", "state_name", "state_unit"]
     alone = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.09, spokes=8.0))
-    assert whole.period.sel(slope=0.09, spokes=8.0) == pytest.approx(float(alone.period))
+    assert whole.period.sel(slope=0.09, spokes=8.0) == pytest.approx(
+        float(alone.period)
+    )
 
 
 def test_a_point_without_a_cycle_touches_no_other(wheel, options):
     """With so few spokes on so flat a slope, a wheel does not get over its next spoke."""
-    points = Points({"slope": [0.075, 0.08, 0.03, 0.09], "spokes": [8.0, 8.5, 7.0, 9.0]})
+    points = Points(
+        {"slope": [0.075, 0.08, 0.03, 0.09], "spokes": [8.0, 8.5, 7.0, 9.0]}
+    )
     found = hj.sweep(hj.models.RimlessWheel(), points, **options)
     assert np.flatnonzero(found.result).tolist() == [2] and np.isnan(found.period[2])
     expected = np.delete(np.cos(2 * np.pi / found.spokes.values) ** 2, 2)
-    np.testing.assert_allclose(np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7)
+    np.testing.assert_allclose(
+        np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7
+    )
 
 
 def test_a_store_is_resumed_and_checked_to_the_last_bit(whole, options, tmp_path):
@@ -91,9 +97,13 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
     run()
     with pytest.raises(hj.DefinitionError, match=r"`over.slope` is not the same"):
         run(over=small | {"slope": np.array([0.071, 0.08])})
-    with pytest.raises(hj.DefinitionError, match=r"`model.numbers.rate` is 1.0, not 1.1"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"`model.numbers.rate` is 1.0, not 1.1"
+    ):
         run(hj.models.RimlessWheel(rate=1.1))
-    with pytest.raises(hj.DefinitionError, match=r"`want` is \['period', .*, not \['period'\]"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"`want` is \['period', .*, not \['period'\]"
+    ):
         run(want="period")
     shutil.rmtree(store)
     store.mkdir()
@@ -103,7 +113,9 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
 
 
 def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
-    points = Points({"slope": [0.075, 0.09, 0.075, 0.09], "spokes": [8.0, 8.0, 9.0, 9.0]})
+    points = Points(
+        {"slope": [0.075, 0.09, 0.075, 0.09], "spokes": [8.0, 8.0, 9.0, 9.0]}
+    )
 
     def model(slope, spokes=8.0):
         return hj.models.RimlessWheel(slope=slope, spokes=spokes)
@@ -115,8 +127,12 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
 
     found = hj.sweep(model, points, ("period", twice), guess=wheel, chunk=4)
     assert found.period.dims == ("point",) and set(found.coords) == {"slope", "spokes"}
-    np.testing.assert_allclose(found.period, whole.period.values[::2, ::2].T.ravel(), rtol=1e-9)
-    np.testing.assert_allclose(found.twice[0], float(found.period[0]) * np.array([1, 2]))
+    np.testing.assert_allclose(
+        found.period, whole.period.values[::2, ::2].T.ravel(), rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        found.twice[0], float(found.period[0]) * np.array([1, 2])
+    )
     assert np.isnan(found.twice[1]).all()
     for wrong, message in (
         (lambda x: x, "a function of parameters that returns one"),
@@ -132,12 +148,18 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
     for name, (low, high) in ranges.items():
         values = points.values[name]
         assert len(points) == 48 and low <= values.min() and values.max() <= high
-        assert np.histogram(values, 4, (low, high))[0].tolist() == pytest.approx([12] * 4, abs=2)
-        np.testing.assert_array_equal(values, Points.sobol(ranges, 48, seed=3).values[name])
+        assert np.histogram(values, 4, (low, high))[0].tolist() == pytest.approx(
+            [12] * 4, abs=2
+        )
+        np.testing.assert_array_equal(
+            values, Points.sobol(ranges, 48, seed=3).values[name]
+        )
 
 
 def test_sweep_draws_a_map(tmp_path, capsys):
-    (tmp_path / "my_wheel.py").write_text("from hybridjax.models import RimlessWheel as Mine\n")
+    (tmp_path / "my_wheel.py").write_text(
+        "from hybridjax.models import RimlessWheel as Mine\n"
+    )
     model, out = f"{tmp_path}/my_wheel.py:Mine", str(tmp_path / "map.zarr")
     axes = ["--over", "slope=0.075:0.09:2", "--over", "spokes=8:9:2"]
     assert main(["sweep", model, *axes, "--want", "spectral_radius", "--out", out]) == 0
@@ -166,7 +188,9 @@ def test_each_is_the_cycle_that_is_found_alone(hopper_cycle, monkeypatch):
         alone = hj.find_limit_cycle(cycle.system, cycle)
         assert cycle.event_sequence == alone.event_sequence
         np.testing.assert_allclose(cycle.anchor.q, alone.anchor.q, atol=1e-9)
-        np.testing.assert_allclose(found.multipliers[i, :2], alone.multipliers, atol=1e-8)
+        np.testing.assert_allclose(
+            found.multipliers[i, :2], alone.multipliers, atol=1e-8
+        )
         np.testing.assert_allclose(cycle.multipliers, alone.multipliers, atol=1e-8)
     assert np.all(found.residual[:4] <= 1e-10)
     assert len(np.unique(found.anchor.chart[:4])) == 2  # also in other charts
@@ -191,7 +215,10 @@ def test_systems_that_are_alike_or_undefined(wheel):
     wheels = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(slopes)
     found = hj.find_limit_cycles(wheels, wheel, execution=FOUR)
     np.testing.assert_array_equal(found.failed, [9])
-    assert np.isnan(found.multipliers[9]).all() and np.isfinite(found.multipliers[:9]).all()
+    assert (
+        np.isnan(found.multipliers[9]).all()
+        and np.isfinite(found.multipliers[:9]).all()
+    )
     assert found.summary().startswith("10/11 found; #9: ")
     assert hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR).ok.all()
 
@@ -211,7 +238,10 @@ def test_many_systems_are_compiled_and_factorize_nothing(wheel, monkeypatch):
     repeat = lambda x: np.repeat(np.asarray(x)[None], 4, 0)  # noqa: E731
     start, period = jax.tree_util.tree_map(repeat, (wheel.anchor, wheel.period))
     arguments = systems, wheel.return_map, start, period, jnp.array(True)
-    assert "@lapack_" not in eqx.filter_jit(batches._turns).lower(*arguments).lowered.as_text()
+    assert (
+        "@lapack_"
+        not in eqx.filter_jit(batches._turns).lower(*arguments).lowered.as_text()
+    )
 
 
 def test_a_guess_with_too_long_a_period(wheel):

@@ -80,7 +80,9 @@ def test_equal_arc_lengths(hopper_cycle, isochron_ldtp):
     t, *signals = hopper_cycle.trajectory(3.0)(*OUTPUTS, per_step=200)
     steps = np.diff(np.stack(signals) / scale[:, None], axis=1)
     length = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=0)))
-    at = np.append(placed.lanes.t, placed.lanes.t[0] + 1.0) + np.ceil(t[0] - placed.lanes.t[0])
+    at = np.append(placed.lanes.t, placed.lanes.t[0] + 1.0) + np.ceil(
+        t[0] - placed.lanes.t[0]
+    )
     pieces = np.diff(np.interp(at, t, length))
     np.testing.assert_allclose(pieces, pieces.mean(), rtol=2e-3)
     assert np.ptp(placed.duration) > 0.004

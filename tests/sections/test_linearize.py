@@ -23,7 +23,9 @@ def test_isochrons_agree_with_the_reference(reference, placed_isochrons, isochro
     data = reference("ldtp_isochron")
     clock = np.asarray(placed_isochrons.lanes.t) % 1
     np.testing.assert_allclose(clock, data["clock"] % 1, atol=1e-10)
-    np.testing.assert_allclose(placed_isochrons.lanes.q.T, padded(data["q"]), atol=1e-10)
+    np.testing.assert_allclose(
+        placed_isochrons.lanes.q.T, padded(data["q"]), atol=1e-10
+    )
     np.testing.assert_array_equal(isochron_ldtp.dims, data["dim"])
     np.testing.assert_allclose(isochron_ldtp.A, padded(data["A"]), atol=1e-8)
     np.testing.assert_allclose(isochron_ldtp.B[..., 0], padded(data["B"]), atol=1e-8)
@@ -48,7 +50,9 @@ def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, reque
     np.testing.assert_allclose(ldtp.multipliers, truth, atol=1e-9)
     for i in range(32):
         found = sorted(np.linalg.eigvals(np.asarray(ldtp.monodromy(i))), key=abs)
-        np.testing.assert_allclose(sorted(found[-2:], key=np.imag), truth[::-1], atol=1e-9)
+        np.testing.assert_allclose(
+            sorted(found[-2:], key=np.imag), truth[::-1], atol=1e-9
+        )
         assert ldtp.rank(i) == 2
 
 
@@ -57,10 +61,14 @@ def test_resets_that_depend_on_time():
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
     time, *state, exact = cycle.system.exact()
     (impact,) = cycle.trajectory().events
-    np.testing.assert_allclose([impact.time % 1, *impact.after.values()], [time, *state], atol=1e-9)
+    np.testing.assert_allclose(
+        [impact.time % 1, *impact.after.values()], [time, *state], atol=1e-9
+    )
     np.testing.assert_allclose(*np.sort_complex([cycle.multipliers, exact]), atol=1e-9)
     found = hj.linearize(cycle, hj.ClockPhase(8)).multipliers
-    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(exact), atol=1e-9)
+    np.testing.assert_allclose(
+        np.sort_complex(found), np.sort_complex(exact), atol=1e-9
+    )
 
 
 def angles(apex, count):
@@ -89,13 +97,21 @@ def check_against_differences(ldtp, sections, points, retention, subset):
         J = hopper_scipy.jacobian(points[i], here, there, names, after, retention)
         A = np.asarray(ldtp.A)[i, : len(after), : len(names)]
         B = np.asarray(ldtp.B)[i, : len(after), 0]
-        np.testing.assert_allclose(A, J[:, :-1], rtol=0, atol=1e-7 * scale_A, err_msg=f"A[{i}]")
-        np.testing.assert_allclose(B, J[:, -1], rtol=0, atol=1e-7 * scale_B, err_msg=f"B[{i}]")
+        np.testing.assert_allclose(
+            A, J[:, :-1], rtol=0, atol=1e-7 * scale_A, err_msg=f"A[{i}]"
+        )
+        np.testing.assert_allclose(
+            B, J[:, -1], rtol=0, atol=1e-7 * scale_B, err_msg=f"B[{i}]"
+        )
 
 
-def test_kinematic_sections_agree_with_scipy(reference, kinematic_ldtp, placed_kinematic):
+def test_kinematic_sections_agree_with_scipy(
+    reference, kinematic_ldtp, placed_kinematic
+):
     sections = angles((0.0, 2.2, 0.0), 32)  # at the apex vM = 0, so the angle is 0
-    points = cycle_points(sections, (0.5, *reference("limit_cycle")["state_clock_half"]))
+    points = cycle_points(
+        sections, (0.5, *reference("limit_cycle")["state_clock_half"])
+    )
     for i, point in enumerate(points):
         assert abs(float(placed_kinematic.lanes.t[i]) - point[0]) < 1e-10
         found = placed_kinematic.lanes.q[: len(point) - 1, i]
@@ -117,7 +133,11 @@ def lossy_sections(kind, count):
 def test_a_touchdown_that_loses_speed_agrees_with_scipy(kind, lossy_cycle):
     # With 32 kinematic sections the jump at touchdown would throw the cycle back over one.
     N = 32 if kind == "isochron" else 8
-    family = ISOCHRONS if kind == "isochron" else dataclasses.replace(KINEMATIC, n_sections=N)
+    family = (
+        ISOCHRONS
+        if kind == "isochron"
+        else dataclasses.replace(KINEMATIC, n_sections=N)
+    )
     ldtp = hj.linearize(lossy_cycle, family, OUTPUTS)
     np.testing.assert_allclose(ldtp.multipliers, [LOSSY, np.conj(LOSSY)], atol=1e-9)
     sections, points = lossy_sections(kind, N)
@@ -129,7 +149,8 @@ def test_a_touchdown_that_loses_speed_agrees_with_scipy(kind, lossy_cycle):
 
 def test_a_jump_that_goes_back_over_a_section_is_reported(lossy_cycle):
     with pytest.raises(
-        hj.ComputationError, match=r"section 19 .* is crossed .* t = 1.34 in stance\. Choose"
+        hj.ComputationError,
+        match=r"section 19 .* is crossed .* t = 1.34 in stance\. Choose",
     ):
         hj.linearize(lossy_cycle, KINEMATIC, OUTPUTS)
 
@@ -147,7 +168,9 @@ def test_delays_agree_with_finer_sections(hopper_cycle, late):
     M = 25
     fine = hj.linearize(hopper_cycle, hj.ClockPhase(4 * M, anchor=APEX), OUTPUTS)
     delay = np.array(late) * float(hopper_cycle.period) / (4 * M)
-    model = hj.linearize(hopper_cycle, hj.ClockPhase(4, anchor=APEX), OUTPUTS, delay=delay)
+    model = hj.linearize(
+        hopper_cycle, hj.ClockPhase(4, anchor=APEX), OUTPUTS, delay=delay
+    )
     u = np.random.default_rng(0).normal(size=(24, 1))
     held = np.concatenate([np.zeros((4 * M + late[0], 1)), np.repeat(u, M, axis=0)])
     y = np.asarray(fine.simulate(held))[4 * M - late[1] :: M][: len(u)]

@@ -44,4 +44,6 @@ def test_many_systems_side_by_side(lossy_cycle):
         alone = loop(STIFFNESS[index])
         assert alone["result"] == hj.Result.OK
         for name, value in alone.items():
-            np.testing.assert_allclose(mapped[name][index], value, atol=1e-9, err_msg=name)
+            np.testing.assert_allclose(
+                mapped[name][index], value, atol=1e-9, err_msg=name
+            )

@@ -43,16 +43,26 @@ def agrees(system, measure, rtol):
     # (Under transformations, matrices are padded with zeros.)
     sizes = [np.shape(x) for x in at(0.0)]
     kept = lambda xs: np.concatenate(  # noqa: E731
-        [np.asarray(x)[tuple(map(slice, n))].ravel() for x, n in zip(xs, sizes, strict=True)]
+        [
+            np.asarray(x)[tuple(map(slice, n))].ravel()
+            for x, n in zip(xs, sizes, strict=True)
+        ]
     )
     by_host = jax.jvp(at, (0.0,), (1.0,))[1]
     e = 2e-4
     minus2, minus, plus, plus2 = (kept(at(k * e)) for k in (-2, -1, 1, 2))
-    differences, size = (8 * (plus - minus) - (plus2 - minus2)) / (12 * e), kept(by_host)
+    differences, size = (
+        (8 * (plus - minus) - (plus2 - minus2)) / (12 * e),
+        kept(by_host),
+    )
     np.testing.assert_allclose(kept(values), kept(at(0.0)), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(size, differences, rtol=rtol, atol=rtol * np.max(np.abs(size)))
+    np.testing.assert_allclose(
+        size, differences, rtol=rtol, atol=rtol * np.max(np.abs(size))
+    )
     weights = [np.cos(np.arange(np.size(x)).reshape(np.shape(x))) for x in values]
-    expected = sum(np.sum(w * np.asarray(x)) for w, x in zip(weights, by_host, strict=True))
+    expected = sum(
+        np.sum(w * np.asarray(x)) for w, x in zip(weights, by_host, strict=True)
+    )
     np.testing.assert_allclose(reverse(tuple(weights))[0], expected, rtol=1e-11)
 
 
@@ -93,7 +103,9 @@ def test_numbers_of_sections(hopper_cycle):
 
     e = 1e-4
     differences = (determinant(e) - determinant(-e)) / (2 * e)
-    np.testing.assert_allclose(jax.grad(determinant)(0.0), differences, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        jax.grad(determinant)(0.0), differences, rtol=1e-6, atol=1e-9
+    )
 
 
 @pytest.mark.usefixtures("compiles_none")
@@ -118,14 +130,18 @@ def test_the_multipliers_of_the_hopper_by_its_parameters(hopper_cycle):
 
     def multiplier(hopper):
         cycle = hj.find_limit_cycle(hopper, hopper_cycle)
-        monodromy = hj.linearize(cycle, hj.ClockPhase(8, anchor=APEX), outputs="yM").monodromy(5)
+        monodromy = hj.linearize(
+            cycle, hj.ClockPhase(8, anchor=APEX), outputs="yM"
+        ).monodromy(5)
         trace = jax.numpy.trace(monodromy)
         determinant = (trace**2 - jax.numpy.trace(monodromy @ monodromy)) / 2
         return jax.numpy.stack([trace / 2, jax.numpy.sqrt(determinant - trace**2 / 4)])
 
     slopes = eqx.filter_jit(eqx.filter_jacfwd(multiplier))(hopper_cycle.system)
     for name, value in true.items():
-        assert complex(*np.asarray(getattr(slopes, name))) == pytest.approx(value, abs=1e-9), name
+        assert complex(*np.asarray(getattr(slopes, name))) == pytest.approx(
+            value, abs=1e-9
+        ), name
 
 
 def test_later_calls_repeat_the_first_to_the_last_bit():
@@ -136,5 +152,9 @@ def test_later_calls_repeat_the_first_to_the_last_bit():
 
     cycle, matrices = hj.find_limit_cycle(Hopper()), []
     for _ in range(10):
-        matrices.append(hj.linearize(dataclasses.replace(cycle), KINEMATIC, "yM").matrices)
-    np.testing.assert_array_equal(ravel_pytree(matrices[-1])[0], ravel_pytree(matrices[0])[0])
+        matrices.append(
+            hj.linearize(dataclasses.replace(cycle), KINEMATIC, "yM").matrices
+        )
+    np.testing.assert_array_equal(
+        ravel_pytree(matrices[-1])[0], ravel_pytree(matrices[0])[0]
+    )

@@ -41,9 +41,13 @@ def test_a_list_of_sections_of_every_kind(hopper_cycle):
 
 
 def test_a_number_as_the_anchor(hopper_cycle):
-    first = np.nextafter(hopper_cycle.anchor.t[0], 0.0)  # by rounding before the cycle begins
+    first = np.nextafter(
+        hopper_cycle.anchor.t[0], 0.0
+    )  # by rounding before the cycle begins
     clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=first))
-    np.testing.assert_allclose(clock.lanes.t % 1, (first + np.arange(3) / 3) % 1, atol=1e-12)
+    np.testing.assert_allclose(
+        clock.lanes.t % 1, (first + np.arange(3) / 3) % 1, atol=1e-12
+    )
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=0.3)
     q = np.asarray(hj.place_sections(hopper_cycle, family).lanes.q)
     angle = np.unwrap(np.angle((q[0] - 1.9) / 0.3 + 1j * q[1] / 1.9))
@@ -60,10 +64,14 @@ def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle):
 
 def test_equal_steps_of_time_on_an_autonomous_cycle(vanderpol_cycle):
     """Time has no origin there: a multiplier of 1 beside the true one."""
-    ldtp = hj.linearize(vanderpol_cycle, hj.ClockPhase(8, anchor=Crossing("v", "falling")))
+    ldtp = hj.linearize(
+        vanderpol_cycle, hj.ClockPhase(8, anchor=Crossing("v", "falling"))
+    )
     assert ldtp.outputs == ("x", "v") and ldtp.coordinates[0] == ("x", "v")
     np.testing.assert_allclose(ldtp.multipliers, [1.0, VDP], rtol=1e-9)
-    family = hj.KinematicPhase(8, position="x", velocity="v", anchor=Crossing("v", "falling"))
+    family = hj.KinematicPhase(
+        8, position="x", velocity="v", anchor=Crossing("v", "falling")
+    )
     ldtp = hj.linearize(vanderpol_cycle, family, "x")
     np.testing.assert_array_equal(ldtp.dims, np.ones(8))
     np.testing.assert_allclose(ldtp.multipliers, [VDP], rtol=1e-9)
@@ -75,17 +83,38 @@ TOP = Crossing("v", "falling")
 @pytest.mark.parametrize(
     "sections, message",
     [
-        ([TOP, Crossing("x", "rising"), Crossing("x", "falling")], r"out of order: section \d \(x"),
-        ([TOP, Crossing("x", "rising", value=2.00861986)], r"section 1 \(x rising\) is tangent"),
+        (
+            [TOP, Crossing("x", "rising"), Crossing("x", "falling")],
+            r"out of order: section \d \(x",
+        ),
+        (
+            [TOP, Crossing("x", "rising", value=2.00861986)],
+            r"section 1 \(x rising\) is tangent",
+        ),
         (
             [TOP, Crossing(hj.Output("xv", lambda t, q, u: q[0] * q[1]), "falling")],
             r"1 \(xv falling\) is crossed more than once .*, at t = \S+ .* and t = \S+ in osc",
         ),
-        (hj.ClockPhase(4, Crossing(lambda t, q: q[0] * q[1], "falling")), "lies at .* once in one"),
-        ([Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / 6.6633), "falling")], "depends on time"),
-        (hj.ClockPhase(4, Crossing("x", "rising", 9.0)), "on the cycle: from -2.009 to 2.009"),
-        ([TOP, Crossing("x", "rising"), TOP], r"section 2 \(v falling\) coincides with section 0"),
-        (hj.KinematicPhase(8, "x", "v", (5.0, 0.0)), r"turn about the `center` \(5.0, 0.0\)"),
+        (
+            hj.ClockPhase(4, Crossing(lambda t, q: q[0] * q[1], "falling")),
+            "lies at .* once in one",
+        ),
+        (
+            [Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / 6.6633), "falling")],
+            "depends on time",
+        ),
+        (
+            hj.ClockPhase(4, Crossing("x", "rising", 9.0)),
+            "on the cycle: from -2.009 to 2.009",
+        ),
+        (
+            [TOP, Crossing("x", "rising"), TOP],
+            r"section 2 \(v falling\) coincides with section 0",
+        ),
+        (
+            hj.KinematicPhase(8, "x", "v", (5.0, 0.0)),
+            r"turn about the `center` \(5.0, 0.0\)",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_section_is_said(sections, message, vanderpol_cycle):
@@ -95,10 +124,14 @@ def test_what_is_wrong_with_a_section_is_said(sections, message, vanderpol_cycle
 
 def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
     text = "is crossed more than once in one period, at t = 0.75 in flight and t = 1.25 in flight"
-    with pytest.raises(hj.ComputationError, match=rf"section 0 \(function falling\) {text}"):
+    with pytest.raises(
+        hj.ComputationError, match=rf"section 0 \(function falling\) {text}"
+    ):
         twice = lambda t, q: jnp.sin(4 * jnp.pi * t)  # noqa: E731
         hj.place_sections(hopper_cycle, Crossing(twice, "falling"))
-    with pytest.raises(hj.DefinitionError, match=r"'function falling' .*`Crossing`.* \(t, q\)"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"'function falling' .*`Crossing`.* \(t, q\)"
+    ):
         hj.place_sections(hopper_cycle, Crossing(lambda t, q, u: q[0], "falling"))
 
 
@@ -123,28 +156,44 @@ def test_equal_sections_are_located_once(hopper_cycle):
 
 def test_an_output_that_a_chart_does_not_define(hopper_cycle, placed_isochrons):
     foot = hj.Output("foot", {"flight": lambda t, q, u: q[2]})
-    with pytest.raises(hj.DefinitionError, match="'foot' is not defined in chart 'stance'"):
+    with pytest.raises(
+        hj.DefinitionError, match="'foot' is not defined in chart 'stance'"
+    ):
         hj.linearize(hopper_cycle, placed_isochrons, foot)
 
 
-def test_outputs_of_any_kind_and_feedthrough(hopper_cycle, placed_isochrons, isochron_ldtp):
+def test_outputs_of_any_kind_and_feedthrough(
+    hopper_cycle, placed_isochrons, isochron_ldtp
+):
     def acceleration(t, q, u):
         leg = 10.0 * (2.0 - (q[0] - (q[2] if q.shape[0] == 4 else 0.0)))
         return (leg + 20.0 * jnp.sin(2 * jnp.pi * t) + u[0]) / 2.0 - 2.0
 
-    ldtp = hj.linearize(hopper_cycle, placed_isochrons, ["vM", hj.Output("aM", acceleration)])
-    np.testing.assert_allclose(ldtp.D[:, :, 0], np.tile([0.0, 0.5], (32, 1)), atol=1e-15)
+    ldtp = hj.linearize(
+        hopper_cycle, placed_isochrons, ["vM", hj.Output("aM", acceleration)]
+    )
+    np.testing.assert_allclose(
+        ldtp.D[:, :, 0], np.tile([0.0, 0.5], (32, 1)), atol=1e-15
+    )
     np.testing.assert_array_equal(ldtp.C[:, 0], isochron_ldtp.C[:, 1])
     flight = np.asarray(ldtp.dims) == 4
-    np.testing.assert_allclose(ldtp.C[flight, 1], [[-5.0, 0.0, 5.0, 0.0]] * flight.sum())
-    np.testing.assert_allclose(ldtp.C[~flight, 1], [[-5.0, 0.0, 0.0, 0.0]] * (~flight).sum())
+    np.testing.assert_allclose(
+        ldtp.C[flight, 1], [[-5.0, 0.0, 5.0, 0.0]] * flight.sum()
+    )
+    np.testing.assert_allclose(
+        ldtp.C[~flight, 1], [[-5.0, 0.0, 0.0, 0.0]] * (~flight).sum()
+    )
 
 
 def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
     monkeypatch.setattr("hybridjax.sections.place.PATIENCE", 3)
     settings = hj.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
-    with pytest.raises(hj.ComputationError, match="max_steps.* Give them to the search for the cy"):
-        hj.place_sections(dataclasses.replace(hopper_cycle, settings=settings), hj.ClockPhase(2))
+    with pytest.raises(
+        hj.ComputationError, match="max_steps.* Give them to the search for the cy"
+    ):
+        hj.place_sections(
+            dataclasses.replace(hopper_cycle, settings=settings), hj.ClockPhase(2)
+        )
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("VerticalHopper",)))
@@ -152,12 +201,16 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
     """The same places, steps and errors as one section after the other."""
     system = getattr(hj.models, name)()
     if system.guess() is None or name in ("SLIPRunner", "TrottingQuadruped"):
-        pytest.skip("has no guess, a family of cycles, or events that rounding puts in order")
+        pytest.skip(
+            "has no guess, a family of cycles, or events that rounding puts in order"
+        )
     cycle = hj.find_limit_cycle(system)
     s, (_, _, q) = cycle.structure, cycle.trajectory().dense()
     names, kept = s.states_everywhere()[:2], []
     families = [hj.ClockPhase(7)]
-    families += [[AtEvent(s.transitions[g].name)] for g in sorted(set(cycle.event_sequence))]
+    families += [
+        [AtEvent(s.transitions[g].name)] for g in sorted(set(cycle.event_sequence))
+    ]
     for state in names:
         k = s.charts[0].states.index(state)
         level = 0.53 * q[:, k].min() + 0.47 * q[:, k].max()
@@ -187,7 +240,9 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
             continue
         both = [(x.lanes, x.flow_jacobians, x.tape) for x in (placed, other)]
         (own, A, *tapes), (their, B, tape) = jax.device_get(both)
-        own, their = (x._replace(armed=x.armed & belongs(s, x.chart)[:-1]) for x in (own, their))
+        own, their = (
+            x._replace(armed=x.armed & belongs(s, x.chart)[:-1]) for x in (own, their)
+        )
         scale = np.asarray(cycle.settings.scale)[their.chart].T
         assert np.abs((own.q - their.q) / scale).max() < 1e-12
         np.testing.assert_allclose(own.t, their.t, rtol=1e-12)
@@ -204,11 +259,20 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
 def test_a_section_at_the_time_of_an_event_is_refused():
     wheel = hj.find_limit_cycle(hj.models.RimlessWheel())
     impact = float(wheel.trajectory().events[0].time / wheel.period)
-    apex = hj.ClockPhase(4, anchor=hj.Crossing("v", "falling"))  # (half a flight before the impact)
-    juggling = [hj.find_limit_cycle(hj.models.PaddleJuggler(A=A)) for A in (0.16, 0.160001)]
-    pairs = (wheel, hj.ClockPhase(2, anchor=impact), ""), *((x, apex, " 2 .*") for x in juggling)
+    apex = hj.ClockPhase(
+        4, anchor=hj.Crossing("v", "falling")
+    )  # (half a flight before the impact)
+    juggling = [
+        hj.find_limit_cycle(hj.models.PaddleJuggler(A=A)) for A in (0.16, 0.160001)
+    ]
+    pairs = (
+        (wheel, hj.ClockPhase(2, anchor=impact), ""),
+        *((x, apex, " 2 .*") for x in juggling),
+    )
     for cycle, family, which in pairs:
-        with pytest.raises(hj.ComputationError, match=f"section{which} coincides with an event"):
+        with pytest.raises(
+            hj.ComputationError, match=f"section{which} coincides with an event"
+        ):
             hj.place_sections(cycle, family)
     assert np.isnan(jax.jit(lambda c: hj.linearize(c, apex).A)(juggling[0])).any()
     with pytest.raises(hj.ComputationError, match="does not reach section 0"):

@@ -68,7 +68,9 @@ class Circle(hj.HybridSystem):
                     functions = [lambda t, q, u, f=f: f(t, q, u) for f in functions]
                 guard, reset, enabled = functions
                 name = f"{i} {way}"
-                found.append(hj.Transition(name, "turn", "turn", guard, way, reset, enabled))
+                found.append(
+                    hj.Transition(name, "turn", "turn", guard, way, reset, enabled)
+                )
         return found
 
 
@@ -91,7 +93,9 @@ def test_events_are_those_of_transitions_of_their_own(other):
     one, two = run(Circle()), run(other)
     assert len(one.events) == 8
     assert [e.name for e in one.events] == [e.name for e in two.events]
-    np.testing.assert_allclose([e.time for e in one.events], [e.time for e in two.events])
+    np.testing.assert_allclose(
+        [e.time for e in one.events], [e.time for e in two.events]
+    )
     assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
 
 
@@ -105,7 +109,9 @@ def test_numbers_are_those_of_python():
 def test_jacobians_are_those_of_each():
     s = Structure(to_host(Circle(mark=Growing)))
     with unchecked_host():
-        end, lanes, target, done = flow(s, 0.0, np.array([*START[:2], 1.0]), np.zeros(s.nu), 3.0)
+        end, lanes, target, done = flow(
+            s, 0.0, np.array([*START[:2], 1.0]), np.zeros(s.nu), 3.0
+        )
         jacobian = chain(s, lanes, target, done.tape, of_states=True)[0][0]
     assert end[3] == 6.0  # three different factors
     np.testing.assert_allclose(jacobian[3], [0.0, 0.0, 6.0], atol=1e-12)

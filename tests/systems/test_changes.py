@@ -78,10 +78,14 @@ def test_a_cycle_belongs_to_the_code_as_it_was(use, monkeypatch):
     cycle = hj.find_limit_cycle(Slowed())
     blown = eqx.tree_at(lambda x: x.system.wind, cycle, jnp.asarray(0.5))
     assert "find it again" in repr(blown)
-    with pytest.raises(hj.DefinitionError, match="`wind` of Slowed has changed since this limit"):
+    with pytest.raises(
+        hj.DefinitionError, match="`wind` of Slowed has changed since this limit"
+    ):
         use(blown)
     monkeypatch.setitem(globals(), "DRAG", 1.3)
-    with pytest.raises(hj.DefinitionError, match="have changed since this limit cycle was found"):
+    with pytest.raises(
+        hj.DefinitionError, match="have changed since this limit cycle was found"
+    ):
         use(cycle)
     assert hj.find_limit_cycle(Slowed(), cycle).stable  # (as a guess it will do)
 
@@ -90,7 +94,9 @@ def test_a_parameter_inside_of_a_cycle_is_not_differentiated():
     cycle = hj.find_limit_cycle(Slowed())
 
     def decay(wind):
-        return hj.linearize(eqx.tree_at(lambda x: x.system.wind, cycle, wind), SECTIONS).A[0, 0, 0]
+        return hj.linearize(
+            eqx.tree_at(lambda x: x.system.wind, cycle, wind), SECTIONS
+        ).A[0, 0, 0]
 
     for transform in (jax.jit, jax.grad, jax.vmap):
         with pytest.raises(hj.DefinitionError, match="find it again"):
@@ -103,7 +109,9 @@ def test_the_advice_to_find_a_changed_cycle_again_holds(hopper_cycle):
     changed = eqx.tree_at(lambda x: x.system.k, hopper_cycle, jnp.asarray(20.0))
     with pytest.raises(hj.DefinitionError, match="with this one as the guess"):
         changed.trajectory()
-    again, other = (hj.find_limit_cycle(changed.system, x) for x in (changed, hopper_cycle))
+    again, other = (
+        hj.find_limit_cycle(changed.system, x) for x in (changed, hopper_cycle)
+    )
     np.testing.assert_allclose(again.multipliers, other.multipliers, rtol=1e-9)
 
 
@@ -116,7 +124,9 @@ def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
     ends = []
     for drag in (0.7, 1.3):
         monkeypatch.setitem(globals(), "DRAG", drag)
-        ends.append(hj.simulate(Turns(), "on", (0.0, 0.0), 0.1, input=force).after[-1, 1])
+        ends.append(
+            hj.simulate(Turns(), "on", (0.0, 0.0), 0.1, input=force).after[-1, 1]
+        )
     np.testing.assert_allclose(ends[1], ends[0] * 1.3 / 0.7, rtol=1e-2)
     for use in (lambda: response(DESIGN.inputs(cycles=1)), lambda: next(chunks)):
         with pytest.raises(hj.DefinitionError, match="have changed since"):
@@ -145,12 +155,16 @@ class Turns(hj.HybridSystem):
     "search",
     [
         lambda guess: hj.find_limit_cycle(Turns(gain=0.1), section=TURN),
-        lambda guess: hj.find_limit_cycles([Turns(push=0.1), Turns(push=0.2)], guess=guess),
+        lambda guess: hj.find_limit_cycles(
+            [Turns(push=0.1), Turns(push=0.2)], guess=guess
+        ),
         lambda guess: hj.sweep(Turns(), {"push": [0.1, 0.2]}, guess=guess),
     ],
 )
 def test_time_without_a_period_is_refused(search, vanderpol_cycle):
-    with pytest.raises(hj.DefinitionError, match=r"depends on t, but Turns states no period"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"depends on t, but Turns states no period"
+    ):
         search(vanderpol_cycle)
 
 
@@ -158,9 +172,13 @@ class Pushed(Slowed):
     """The input acts with another period than the clock's."""
 
     def charts(self):
-        return {"air": Field(("x",), lambda t, q, u: (-q[0] + u[0] * jnp.cos(1.3 * t),))}
+        return {
+            "air": Field(("x",), lambda t, q, u: (-q[0] + u[0] * jnp.cos(1.3 * t),))
+        }
 
 
 def test_the_gain_of_an_input_has_the_clocks_period():
-    with pytest.raises(hj.DefinitionError, match=r"does not have the period 1 that Pushed.period"):
+    with pytest.raises(
+        hj.DefinitionError, match=r"does not have the period 1 that Pushed.period"
+    ):
         hj.find_limit_cycle(Pushed())

@@ -24,7 +24,9 @@ def test_a_network_and_a_scan():
 
     system = toy({"a": Field(("x",), learned)}, period=2 * np.pi)
     cycle = hj.find_limit_cycle(system, hj.Guess("a", (0.3,)))
-    (W, a), (V, b) = ((np.asarray(x.weight), np.asarray(x.bias)) for x in network.layers)
+    (W, a), (V, b) = (
+        (np.asarray(x.weight), np.asarray(x.bias)) for x in network.layers
+    )
 
     def field(t, z):
         x = z[0]
@@ -33,6 +35,8 @@ def test_a_network_and_a_scan():
         return [-x + (V @ hidden + b)[0] - 0.1 * x**2 + 0.2 * x + 0.3, slope[0]]
 
     start = [cycle.state["x"], 0.0]
-    there = solve_ivp(field, (0, 2 * np.pi), start, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    there = solve_ivp(field, (0, 2 * np.pi), start, "DOP853", rtol=1e-12, atol=1e-12).y[
+        :, -1
+    ]
     np.testing.assert_allclose(there[0], start[0], rtol=1e-10)
     np.testing.assert_allclose(cycle.multipliers, [np.exp(there[1])], rtol=1e-9)

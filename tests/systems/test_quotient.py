@@ -24,7 +24,10 @@ class Stands(hj.Chart):
     drag: float = 0.0
 
     def field(self, t, q, u):
-        a, b, w, v, rate = *self.walker.charts()["step"].field(t, seen(q, self.leg), u), 0.0
+        a, b, w, v, rate = (
+            *self.walker.charts()["step"].field(t, seen(q, self.leg), u),
+            0.0,
+        )
         rate = jnp.cos(q[self.leg]) * q[2 + self.leg] - self.drag * q[4]
         return told(self.leg, a, b, w, v, rate)
 
@@ -49,17 +52,22 @@ class Full(hj.HybridSystem):  # Nothing is relabeled in the resets.
     def charts(self):
         slopes = enumerate([("left", 0.009), ("right", 0.009 + self.skew)])
         walker = hj.models.SimplestWalker
-        return {f"{x} stands": Stands(walker(slope=y), k, self.drag) for k, (x, y) in slopes}
+        return {
+            f"{x} stands": Stands(walker(slope=y), k, self.drag) for k, (x, y) in slopes
+        }
 
     def transitions(self):
         for leg, (name, other) in enumerate([("left", "right"), ("right", "left")]):
             yield hj.Transition(
-                f"{other} lands", f"{name} stands", f"{other} stands",
+                f"{other} lands",
+                f"{name} stands",
+                f"{other} stands",
                 guard=lambda t, q, u, leg=leg: q[leg] + q[1 - leg] + leg * self.early,
                 reset=lambda t, q, u, k=leg, x=leg * self.early: told(
-                    1 - k, *_heelstrike(t, seen(q, k), u), q[4] + x),
+                    1 - k, *_heelstrike(t, seen(q, k), u), q[4] + x
+                ),
                 enabled=lambda t, q, u, leg=leg: q[leg] < 0,
-            )  # fmt: skip
+            )
 
     def guess(self):
         th, phi, w, p = hj.models.SimplestWalker().guess().state
@@ -88,26 +96,43 @@ def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section
 @pytest.mark.parametrize(
     "system, symmetry, message",
     [
-        (Full(drag=0.1), {**MIRROR, "translation": ("x",)}, "field of chart 'left stands' changes"),
+        (
+            Full(drag=0.1),
+            {**MIRROR, "translation": ("x",)},
+            "field of chart 'left stands' changes",
+        ),
         (Full(skew=0.1), MIRROR, "chart 'right stands' is not the mirror image"),
         (PLACED, {"translation": ("x",)}, "output 'far' changes under the translation"),
-        (Full(early=0.1), MIRROR, "'left lands' is not the mirror image of .* 'right lands'"),
+        (
+            Full(early=0.1),
+            MIRROR,
+            "'left lands' is not the mirror image of .* 'right lands'",
+        ),
     ],
 )
 def test_what_is_no_symmetry_is_refused(system, symmetry, message):
-    for use in (hj.find_limit_cycle, lambda q: hj.simulate(q, "left stands", q.guess().state, 1)):
+    for use in (
+        hj.find_limit_cycle,
+        lambda q: hj.simulate(q, "left stands", q.guess().state, 1),
+    ):
         with pytest.raises(hj.DefinitionError, match=message):
             use(hj.Quotient(system, **symmetry))
 
 
 def test_an_odd_oscillator_closes_after_half_a_period():
-    pol, duffing, at = hj.models.VanDerPol(), hj.models.Duffing(), hj.AtEvent("half period")
+    pol, duffing, at = (
+        hj.models.VanDerPol(),
+        hj.models.Duffing(),
+        hj.AtEvent("half period"),
+    )
     whole = hj.find_limit_cycle(pol, section=hj.Crossing("x", "falling"))
     folded = hj.Quotient(pol, flipped=("x", "v"), half_period="x")
     half = hj.find_limit_cycle(folded, hj.Guess("oscillation", (0.0, -1.9)), section=at)
     np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-11)
     np.testing.assert_allclose(half.multipliers**2, whole.multipliers, rtol=1e-9)
-    with pytest.raises(hj.DefinitionError, match="must be True if a clock drives the system"):
+    with pytest.raises(
+        hj.DefinitionError, match="must be True if a clock drives the system"
+    ):
         hj.Quotient(duffing, flipped=("x", "v"), half_period="x")
 
 
@@ -129,15 +154,21 @@ def test_the_symmetry_is_that_of_all_systems_in_all_units():
         lambda: jax.grad(lambda x: hj.find_limit_cycle(half(x), cycle).period)(0.0),
         lambda: hj.identifiability(cycle.system, seen, "system.bias", guess=cycle),
     ):
-        with pytest.raises(hj.DefinitionError, match="Biased does not have the symmetry"):
+        with pytest.raises(
+            hj.DefinitionError, match="Biased does not have the symmetry"
+        ):
             use()
     cycle.sensitivity("system.beta")
     check_symmetry(hj.Quotient(hj.models.Duffing(rate=1e16), **ODD))
-    with pytest.raises(hj.DefinitionError, match="'left lands' is not the mirror image"):
+    with pytest.raises(
+        hj.DefinitionError, match="'left lands' is not the mirror image"
+    ):
         check_symmetry(hj.Quotient(Full(early=1e-10), **MIRROR), {"left stands": SIZES})
 
 
-class Inverter(hj.HybridSystem):  # A coil between the poles of a supply, exchanged by switches.
+class Inverter(
+    hj.HybridSystem
+):  # A coil between the poles of a supply, exchanged by switches.
     early: float = 0.125
 
     def charts(self):
@@ -164,9 +195,19 @@ def test_scheduled_switches_close_after_half_a_period():
     whole = hj.find_limit_cycle(Inverter())
     np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-12)
     np.testing.assert_allclose(half.state["i"], whole.state["i"], rtol=1e-11)
-    np.testing.assert_allclose(half.multipliers[0] ** 2, whole.multipliers[0], rtol=1e-10)
-    assert [half.structure.transitions[g].name for g in half.event_sequence][0] == "down"
-    with pytest.raises(hj.DefinitionError, match="transition 'up' is not the mirror image"):
-        hj.find_limit_cycle(hj.Quotient(Inverter(), swap={"plus": "minus"}, flipped="i"))
-    with pytest.raises(hj.DefinitionError, match="'down' must not be scheduled at t = 0"):
+    np.testing.assert_allclose(
+        half.multipliers[0] ** 2, whole.multipliers[0], rtol=1e-10
+    )
+    assert [half.structure.transitions[g].name for g in half.event_sequence][
+        0
+    ] == "down"
+    with pytest.raises(
+        hj.DefinitionError, match="transition 'up' is not the mirror image"
+    ):
+        hj.find_limit_cycle(
+            hj.Quotient(Inverter(), swap={"plus": "minus"}, flipped="i")
+        )
+    with pytest.raises(
+        hj.DefinitionError, match="'down' must not be scheduled at t = 0"
+    ):
         hj.Quotient(Inverter(early=0.0), **symmetry)

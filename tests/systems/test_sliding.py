@@ -48,7 +48,11 @@ def field(drift, push):
 @pytest.mark.parametrize(
     "push, end, chart",
     [
-        (3.0, (0.5 + (3.0 * 0.5 + 1.0 * 2.0) / 4.0, 0.0), 2),  # (b f_a - a f_b) / (b - a)
+        (
+            3.0,
+            (0.5 + (3.0 * 0.5 + 1.0 * 2.0) / 4.0, 0.0),
+            2,
+        ),  # (b f_a - a f_b) / (b - a)
         (-1.0, (0.5 + 2.0, -1.0), 1),  # carried on
     ],
 )

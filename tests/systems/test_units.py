@@ -19,12 +19,21 @@ def small_htf(**names):
 
 
 def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
-    assert units(kinematic_ldtp.outputs) == ["m", "m/s"] and units(kinematic_ldtp.inputs) == ["N"]
+    assert units(kinematic_ldtp.outputs) == ["m", "m/s"] and units(
+        kinematic_ldtp.inputs
+    ) == ["N"]
     design = hj.multisine(periods=16, band=(0, 4.0))
     data = hj.experiments.simulate_experiments(kinematic_ldtp, design, start="periodic")
     estimate = hj.estimate_htf(data)
     fit = hj.fit_multipliers(estimate, 2, overhang=16)
-    for thing in (data, data.records[0], estimate, fit, fit.htf([0.1]), hj.fit_rational(estimate)):
+    for thing in (
+        data,
+        data.records[0],
+        estimate,
+        fit,
+        fit.htf([0.1]),
+        hj.fit_rational(estimate),
+    ):
         assert units(thing.outputs) == ["m", "m/s"]
     for thing in (kinematic_ldtp, data, estimate, fit):
         hj.save(tmp_path / "thing.npz", thing)

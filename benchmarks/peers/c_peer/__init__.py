@@ -48,9 +48,22 @@ def setup(job: Job):
         loop = ctypes.CDLL(str(library)).run
     integer, number = ctypes.c_int, ctypes.c_double
     loop.argtypes = (
-        ARRAY, integer, integer, ARRAY, integer, integer, number, ARRAY, ARRAY, ARRAY,
-        integer, ARRAY, integer, number, ARRAY,
-    )  # fmt: skip
+        ARRAY,
+        integer,
+        integer,
+        ARRAY,
+        integer,
+        integer,
+        number,
+        ARRAY,
+        ARRAY,
+        ARRAY,
+        integer,
+        ARRAY,
+        integer,
+        number,
+        ARRAY,
+    )
     return loop
 
 

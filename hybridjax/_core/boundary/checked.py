@@ -45,9 +45,13 @@ def checked(thing: Thing) -> Thing:
     """
     if not isinstance(thing, type):
         return cast(Thing, _wrapped(thing, thing.__qualname__))
-    for maker in ("__new__",) if issubclass(thing, tuple) else ("__init__", "__check_init__"):
+    for maker in (
+        ("__new__",) if issubclass(thing, tuple) else ("__init__", "__check_init__")
+    ):
         if maker in vars(thing):
-            setattr(thing, maker, _wrapped(getattr(thing, maker), thing.__name__, thing))
+            setattr(
+                thing, maker, _wrapped(getattr(thing, maker), thing.__name__, thing)
+            )
     return cast(Thing, checked_methods(thing))
 
 
@@ -57,8 +61,14 @@ def checked_methods(cls: Class) -> Class:
     for name, member in list(vars(cls).items()):
         if name.startswith("_") and name not in _OPERATORS:
             continue
-        function = member.__func__ if isinstance(member, classmethod | staticmethod) else member
-        if not inspect.isfunction(function) or getattr(function, "__isabstractmethod__", False):
+        function = (
+            member.__func__
+            if isinstance(member, classmethod | staticmethod)
+            else member
+        )
+        if not inspect.isfunction(function) or getattr(
+            function, "__isabstractmethod__", False
+        ):
             continue
         wrapped = _wrapped(function, f"{cls.__name__}.{name}")
         setattr(cls, name, type(member)(wrapped) if function is not member else wrapped)
@@ -75,11 +85,15 @@ def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
     fields = _fields.recall(cls, None, lambda: _Fields(constructor, cls))
     unknown = [name for name in kwargs if name not in fields.by_name]
     if unknown and inspect.getfullargspec(constructor).varkw is None:
-        require_among("parameter", unknown, list(fields.by_name)[1:], f"{cls.__name__}: ")
+        require_among(
+            "parameter", unknown, list(fields.by_name)[1:], f"{cls.__name__}: "
+        )
     try:
         fields.take((None, *args), dict(kwargs))
     except Misfit as misfit:
-        raise DefinitionError(f"{cls.__name__}: `{misfit.path}` {misfit.problem}.") from None
+        raise DefinitionError(
+            f"{cls.__name__}: `{misfit.path}` {misfit.problem}."
+        ) from None
 
 
 def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable:
@@ -91,7 +105,9 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
             args, kwargs = kinds.take(args, kwargs)
             return function(*args, **kwargs)
         except Misfit as misfit:
-            raise DefinitionError(f"{name}: `{misfit.path}` {misfit.problem}.") from None
+            raise DefinitionError(
+                f"{name}: `{misfit.path}` {misfit.problem}."
+            ) from None
         except (*_JAX_ERRORS, NeedsValues):
             if not is_hidden(args, kwargs):
                 raise
@@ -117,7 +133,10 @@ class _Kinds:
     @functools.cached_property
     def by_name(self) -> dict[str, Kind | None]:
         """Kinds of all parameters that can be given by name."""
-        hints, parameters = self.hints(), inspect.signature(self.function).parameters.values()
+        hints, parameters = (
+            self.hints(),
+            inspect.signature(self.function).parameters.values(),
+        )
         named = (p.name for p in parameters if p.kind is not p.VAR_KEYWORD)
         return {name: kind_of(hints.get(name, Any)) for name in named}
 
@@ -128,7 +147,10 @@ class _Kinds:
         parameters = inspect.signature(self.function).parameters.values()
         positional = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD]
         name = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
-        return [(x, self.by_name[x]) for x in positional], (name, self.by_name.get(name))
+        return [(x, self.by_name[x]) for x in positional], (
+            name,
+            self.by_name.get(name),
+        )
 
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:
         """The arguments in the form in which the function gets them.

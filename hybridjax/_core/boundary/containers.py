@@ -53,16 +53,22 @@ class Having(Kind):
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
     def fits(self, value):
-        return all(inspect.getattr_static(value, name, self) is not self for name in self.names)
+        return all(
+            inspect.getattr_static(value, name, self) is not self for name in self.names
+        )
 
 
 class Items(Kind):
     """A sequence all of whose items are of one kind: a list, a tuple, an array's first axis. With
     `form`, it is brought to that form; with `iterable`, whatever can be iterated over is taken."""
 
-    def __init__(self, item: Kind | None, *, form: type | None = None, iterable: bool = False):
+    def __init__(
+        self, item: Kind | None, *, form: type | None = None, iterable: bool = False
+    ):
         self.item, self.form, self.iterable = item, form, iterable
-        self.allowed = "a sequence" if item is None else f"a sequence (each item {item.allowed})"
+        self.allowed = (
+            "a sequence" if item is None else f"a sequence (each item {item.allowed})"
+        )
 
     def take(self, value):
         if isinstance(value, str | bytes | Mapping):
@@ -80,7 +86,11 @@ class Items(Kind):
             form = list if isinstance(value, list) else tuple
             with unchanged_code():
                 value = form(_taken(self.item, i, x) for i, x in enumerate(value))
-        return value if self.form is None or isinstance(value, self.form) else self.form(value)
+        return (
+            value
+            if self.form is None or isinstance(value, self.form)
+            else self.form(value)
+        )
 
 
 class Tuple(Kind):
@@ -88,7 +98,9 @@ class Tuple(Kind):
 
     def __init__(self, *kinds: Kind | None):
         self.kinds = kinds
-        parts = ", ".join("anything" if kind is None else kind.allowed for kind in kinds)
+        parts = ", ".join(
+            "anything" if kind is None else kind.allowed for kind in kinds
+        )
         self.allowed = f"a tuple of {len(kinds)} ({parts})"
 
     def take(self, value):
@@ -97,7 +109,9 @@ class Tuple(Kind):
         if not isinstance(value, list | tuple) or len(value) != len(self.kinds):
             raise self.refused(value)
         pairs = enumerate(zip(self.kinds, value, strict=True))
-        return tuple(x if kind is None else _taken(kind, i, x) for i, (kind, x) in pairs)
+        return tuple(
+            x if kind is None else _taken(kind, i, x) for i, (kind, x) in pairs
+        )
 
 
 class Table(Kind):
@@ -121,7 +135,9 @@ class Names(Kind):
     """One name, or several distinct ones, as a tuple. Objects of the class `other` may stand among
     them. Without `empty` there must be one. With `units`, they may be the units by name."""
 
-    def __init__(self, other: type | None = None, *, empty: bool = False, units: bool = False):
+    def __init__(
+        self, other: type | None = None, *, empty: bool = False, units: bool = False
+    ):
         self.empty, self.units = empty, units
         self.types = (str,) if other is None else (str, other)
         self.allowed = "a name, or a sequence of distinct names"
@@ -139,7 +155,9 @@ class Names(Kind):
             value = (value,)
         elif isinstance(value, np.ndarray) and value.ndim != 1:
             raise self.refused(value)
-        if not all(isinstance(x, self.types) for x in value) or not (len(value) or self.empty):
+        if not all(isinstance(x, self.types) for x in value) or not (
+            len(value) or self.empty
+        ):
             raise self.refused(value)
         given = tuple(str(x) if isinstance(x, np.str_) else current(x) for x in value)
         names = [x for x in given if isinstance(x, str)]
@@ -166,7 +184,9 @@ class Stream(Kind):
     def take(self, value):
         if isinstance(value, Sequence):
             return Items(self.item).take(value)
-        if isinstance(value, np.ndarray | jax.Array | Mapping) or not isinstance(value, Iterable):
+        if isinstance(value, np.ndarray | jax.Array | Mapping) or not isinstance(
+            value, Iterable
+        ):
             raise self.refused(value)
         return _Checked(self, value)
 

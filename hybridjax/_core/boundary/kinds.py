@@ -56,7 +56,9 @@ SignalNames = Annotated[str | Sequence[str], Names()]
 """One name, or several distinct ones; handed on as a tuple."""
 OptionalNames = Annotated[str | Sequence[str], Names(empty=True)]
 """The same, or none: `()`."""
-NewOptionalNames = Annotated[str | Sequence[str] | Mapping[str, str], Names(units=True, empty=True)]
+NewOptionalNames = Annotated[
+    str | Sequence[str] | Mapping[str, str], Names(units=True, empty=True)
+]
 NewNames = Annotated[str | Sequence[str] | Mapping[str, str], Names(units=True)]
 """Names that are given to something; or units by name, as in `{"yM": "m", "force": "N"}`."""
 FilePath = Annotated[str | os.PathLike[str], values.PATH]
@@ -106,7 +108,9 @@ def kind_of(hint: Any) -> Kind | None:
         return Tuple(*map(kind_of, arguments))
     container = hint if origin is None else origin
     if container in _SEQUENCES:
-        return Items(kind_of(arguments[0]) if arguments else None, **_SEQUENCES[container])
+        return Items(
+            kind_of(arguments[0]) if arguments else None, **_SEQUENCES[container]
+        )
     if container in _MAPPINGS:
         return Table(*map(kind_of, arguments)) if arguments else Table(None, None)
     if isinstance(container, type):
@@ -117,7 +121,9 @@ def kind_of(hint: Any) -> Kind | None:
 def _either(arguments: tuple[Any, ...]) -> Kind | None:
     kinds = [kind_of(x) for x in arguments]
     arrays = [kind for kind in kinds if isinstance(kind, Reals)]
-    if len(arrays) > 1 and arrays[0].form is not None:  # of NumPy or of JAX: stay what they are
+    if (
+        len(arrays) > 1 and arrays[0].form is not None
+    ):  # of NumPy or of JAX: stay what they are
         arrays[0].form = None
         kinds = [kind for kind in kinds if kind not in arrays[1:]]
     if len(kinds) == 1:
@@ -141,5 +147,10 @@ def _array(hint: Any) -> Kind:
     kind = next((kind for dtype, kind in _ARRAYS.items() if dtype in hint.dtypes), None)
     if kind is None:
         return Instance(hint)
-    forms: dict[Any, collections.abc.Callable] = {np.ndarray: np.asarray, jax.Array: jnp.asarray}
-    return kind(hint.dim_str, missing=True, infinite=True, form=forms.get(hint.array_type))
+    forms: dict[Any, collections.abc.Callable] = {
+        np.ndarray: np.asarray,
+        jax.Array: jnp.asarray,
+    }
+    return kind(
+        hint.dim_str, missing=True, infinite=True, form=forms.get(hint.array_type)
+    )

@@ -28,7 +28,9 @@ class Misfit(Exception):
     other sorts, which would do as well, need not be named.
     """
 
-    def __init__(self, problem: str | Callable[[], str], *, near: bool = False, path: str = ""):
+    def __init__(
+        self, problem: str | Callable[[], str], *, near: bool = False, path: str = ""
+    ):
         self._problem, self.near, self.path = problem, near, path
 
     @property
@@ -56,7 +58,11 @@ def show(value: Any) -> str:
         return f"an array of {value.dtype} with shape {value.shape}"
     if isinstance(value, np.generic):
         return show(value.item())
-    if value is None or value is ... or isinstance(value, int | float | complex | str | bytes):
+    if (
+        value is None
+        or value is ...
+        or isinstance(value, int | float | complex | str | bytes)
+    ):
         try:
             text = repr(value)
         except ValueError:  # an integer with more digits than Python writes
@@ -66,7 +72,9 @@ def show(value: Any) -> str:
         return f"the class {value.__name__} itself"
     if isinstance(value, list | tuple | set | frozenset | dict) and len(value) < 100:
         text = repr(value)
-        return text if len(text) <= _SHOWN else f"a {type(value).__name__} of {len(value)}"
+        return (
+            text if len(text) <= _SHOWN else f"a {type(value).__name__} of {len(value)}"
+        )
     if callable(value) and hasattr(value, "__name__"):
         return f"the function {value.__name__}"
     return with_article(type(value).__name__)
@@ -119,7 +127,9 @@ class Whole(Kind):
         self.high = math.inf if high is None else high
         self.allowed = "an integer"
         if low is not None:
-            self.allowed += f" of at least {low}" if high is None else f" from {low} to {high}"
+            self.allowed += (
+                f" of at least {low}" if high is None else f" from {low} to {high}"
+            )
 
     def take(self, value):
         number = value
@@ -154,7 +164,9 @@ class Number(Kind):
         number = value
         if type(value) is not float:
             number = _plain(value, self.allowed)
-            if isinstance(number, bool | np.bool_) or not isinstance(number, numbers.Real):
+            if isinstance(number, bool | np.bool_) or not isinstance(
+                number, numbers.Real
+            ):
                 raise self.refused(value)
             try:
                 number = float(number)
@@ -190,7 +202,9 @@ class OneOf(Kind):
         self.allowed = listed([repr(word) for word in words])
 
     def fits(self, value):
-        return any(value is x or (type(value) is type(x) and value == x) for x in self.words)
+        return any(
+            value is x or (type(value) is type(x) and value == x) for x in self.words
+        )
 
 
 class Plain(Kind):
@@ -214,12 +228,20 @@ def _is_path(value: Any) -> bool:
 def _plain(value: Any, allowed: str) -> Any:
     """A number of Python for an array without axes."""
     refuse_traced(value, allowed)
-    return value.item() if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0 else value
+    return (
+        value.item()
+        if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0
+        else value
+    )
 
 
 def unmasked(values: Any) -> np.ndarray:
     """An array of NumPy, NaN where it was masked (as readers of netCDF mask what is missing)."""
-    if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "fiub" and values.mask.any():
+    if (
+        isinstance(values, np.ma.MaskedArray)
+        and values.dtype.kind in "fiub"
+        and values.mask.any()
+    ):
         values = np.ma.filled(values.astype(float), np.nan)
     return np.asarray(values)
 
@@ -292,7 +314,9 @@ class Reals(Kind):
                 return jnp.asarray(value)
         except (ValueError, TypeError):
             if isinstance(value, list | tuple):
-                raise Misfit("must be rectangular: its rows differ in length", near=True) from None
+                raise Misfit(
+                    "must be rectangular: its rows differ in length", near=True
+                ) from None
         raise self.refused(value) from None
 
     def _wrong_type(self, value: Any, x: Any) -> Misfit:
@@ -301,7 +325,9 @@ class Reals(Kind):
         if x.ndim == 0 or isinstance(value, str | dict | set):
             return self.refused(value)
         wrong = {"U": "strings", "S": "bytes", "O": "other objects"}
-        return Misfit(f"must hold {self.items}, not {wrong.get(x.dtype.kind, x.dtype)}", near=True)
+        return Misfit(
+            f"must hold {self.items}, not {wrong.get(x.dtype.kind, x.dtype)}", near=True
+        )
 
     def _fits(self, shape: tuple[int, ...]) -> bool:
         if self.shape == ("...",):
@@ -309,7 +335,9 @@ class Reals(Kind):
         if len(shape) != len(self.shape):
             return False
         sizes = {word: int(word) for word in self.shape if word.isdecimal()}
-        return all(n == sizes.setdefault(x, n) for x, n in zip(self.shape, shape, strict=True))
+        return all(
+            n == sizes.setdefault(x, n) for x, n in zip(self.shape, shape, strict=True)
+        )
 
     def _check_values(self, array: np.ndarray | jax.Array) -> None:
         values = np.asarray(array)
@@ -317,21 +345,27 @@ class Reals(Kind):
         with np.errstate(all="ignore"):
             finite = (self.missing and self.infinite) or np.isfinite(np.sum(values))
         if not finite:
-            bad = np.isnan(values) & (not self.missing) | np.isinf(values) & (not self.infinite)
+            bad = np.isnan(values) & (not self.missing) | np.isinf(values) & (
+                not self.infinite
+            )
             self._refuse_any(bad, values, "finite")
         if self.sign == "positive":
             self._refuse_any(values <= 0, values, "positive")
         elif self.sign == "nonnegative":
             self._refuse_any(values < 0, values, "zero or positive")
 
-    def _refuse_any(self, bad: np.ndarray | np.bool_, values: np.ndarray, allowed: str) -> None:
+    def _refuse_any(
+        self, bad: np.ndarray | np.bool_, values: np.ndarray, allowed: str
+    ) -> None:
         if not bad.any():
             return
         if values.ndim == 0:
             raise Misfit(f"must be {self.single}, not {show(values.item())}", near=True)
         index = tuple(map(int, np.argwhere(bad)[0]))
         place = index[0] if len(index) == 1 else index
-        raise Misfit(f"must be {allowed}, but is {values[index]:.6g} at index {place}", near=True)
+        raise Misfit(
+            f"must be {allowed}, but is {values[index]:.6g} at index {place}", near=True
+        )
 
     def _written(self) -> str:
         return f"({', '.join(self.shape)}{',' * (len(self.shape) == 1)})"

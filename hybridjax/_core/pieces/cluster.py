@@ -32,7 +32,9 @@ _KEPT = 2**28
 _lock = threading.Lock()
 
 
-def run_on(client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]) -> None:
+def run_on(
+    client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]
+) -> None:
     """Compute pieces on the workers of a client.
 
     **Raises:** `DefinitionError` for a client whose workers cannot do it; `ComputationError` for a
@@ -47,10 +49,14 @@ def run_on(client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequen
     except (OSError, RuntimeError, CancelledError) as error:
         if isinstance(error, HybridJaxError) or client.status == "running":
             raise
-        raise ComputationError("the Dask cluster is lost: call again with a new client.") from error
+        raise ComputationError(
+            "the Dask cluster is lost: call again with a new client."
+        ) from error
 
 
-def _run(client: Client, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]) -> None:
+def _run(
+    client: Client, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]
+) -> None:
     # (As bytes: arrays keep their digits only if the precision is set before they are made.)
     packed = _packed((job, store.address))
     x64 = bool(jax.config.read("jax_enable_x64"))
@@ -81,13 +87,21 @@ class _Packer(cloudpickle.Pickler):
 
     def reducer_override(self, obj: Any) -> Any:
         way = super().reducer_override(obj)
-        if way is not NotImplemented and isinstance(obj, type) and issubclass(obj, eqx.Module):
+        if (
+            way is not NotImplemented
+            and isinstance(obj, type)
+            and issubclass(obj, eqx.Module)
+        ):
             raise DefinitionError(
                 f"`{obj.__name__}` is defined in the script or notebook: put it into a module."
             )
-        if way is NotImplemented and isinstance(obj, types.FunctionType | types.ModuleType | type):
+        if way is NotImplemented and isinstance(
+            obj, types.FunctionType | types.ModuleType | type
+        ):
             if not is_packaged(getattr(obj, "__module__", obj.__name__)):
-                with contextlib.suppress(DefinitionError):  # of a module's other functions
+                with contextlib.suppress(
+                    DefinitionError
+                ):  # of a module's other functions
                     self.imported.append((obj, meaning(obj)))
         return way
 

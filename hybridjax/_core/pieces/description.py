@@ -14,7 +14,9 @@ from ..meaning import meaning
 def versions() -> dict[str, str]:
     """Return the versions of the packages on which numbers depend to the last bit."""
     names = ("jax", "jaxlib", "numpy", "scipy")
-    return {"hybridjax": __version__} | {x: importlib.metadata.version(x) for x in names}
+    return {"hybridjax": __version__} | {
+        x: importlib.metadata.version(x) for x in names
+    }
 
 
 def difference(mine: Any, theirs: Any, name: str = "") -> str | None:
@@ -37,7 +39,9 @@ def difference(mine: Any, theirs: Any, name: str = "") -> str | None:
 def digest_of(*things: Any) -> str:
     """Return a digest of functions, definitions and values: see `meaning`. Arrays of JAX have the
     digests of NumPy's."""
-    return _DIGEST + meaning(*(np.asarray(x) if isinstance(x, jax.Array) else x for x in things))
+    return _DIGEST + meaning(
+        *(np.asarray(x) if isinstance(x, jax.Array) else x for x in things)
+    )
 
 
 _DIGEST = "digest:"

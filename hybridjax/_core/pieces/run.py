@@ -16,7 +16,9 @@ class DaskClient(Protocol):
     def wait_for_workers(self, n_workers: int) -> Any: ...
 
 
-def fill(job: Any, address: Any = None, client: DaskClient | None = None) -> ArrayStore | ZarrStore:
+def fill(
+    job: Any, address: Any = None, client: DaskClient | None = None
+) -> ArrayStore | ZarrStore:
     """Compute the pieces of a job that are missing, and return the results.
 
     **Arguments:**
@@ -40,7 +42,9 @@ def fill(job: Any, address: Any = None, client: DaskClient | None = None) -> Arr
         job = job.resume(store.layout, store.start)
     else:
         job, layout = job.begin()
-        store = make_store(address, layout, job.arrays()) if address else ArrayStore(layout)
+        store = (
+            make_store(address, layout, job.arrays()) if address else ArrayStore(layout)
+        )
     missing = store.missing()
     if missing and client is not None:
         package("distributed")

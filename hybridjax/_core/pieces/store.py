@@ -121,7 +121,9 @@ class ArrayStore:
 
     def __init__(self, layout: Layout):
         self.layout, arrays = layout, layout.variables.items()
-        self._arrays = {k: np.full(layout.array(k)[1], x.fill, x.dtype) for k, x in arrays}
+        self._arrays = {
+            k: np.full(layout.array(k)[1], x.fill, x.dtype) for k, x in arrays
+        }
 
     def missing(self) -> list[int]:
         """Return all pieces."""
@@ -137,7 +139,9 @@ class ArrayStore:
         of, arrays = self.layout, self._arrays.items()
         data = {k: (of.array(k)[0], x, of.variables[k].attributes) for k, x in arrays}
         data = package("xarray").Dataset({**of.constants, **data})
-        return data.set_coords(of.coordinates).assign_attrs({_ABOUT: json.dumps(of.description)})
+        return data.set_coords(of.coordinates).assign_attrs(
+            {_ABOUT: json.dumps(of.description)}
+        )
 
 
 class ZarrStore:
@@ -162,11 +166,15 @@ class ZarrStore:
             }
             first, p = next(iter(self._arrays.values())), len(about["dims"])
             arrays = {
-                name: Variable(x.dtype.str, tuple(x.metadata.dimension_names[p:]), x.shape[p:])
+                name: Variable(
+                    x.dtype.str, tuple(x.metadata.dimension_names[p:]), x.shape[p:]
+                )
                 for name, x in self._arrays.items()
             }
             blocks = Blocks(first.shape[:p], first.chunks[:p])
-            self.layout = Layout(tuple(about["dims"]), blocks, arrays, {}, (), about["description"])
+            self.layout = Layout(
+                tuple(about["dims"]), blocks, arrays, {}, (), about["description"]
+            )
             # (Zarr would read a chunk that was deleted as zeros.)
             kept = self._group[_START]
             start = [kept[f"{i}"] for i in range(about["start"])]
@@ -175,11 +183,17 @@ class ZarrStore:
                 raise FileNotFoundError(f"{min(lost)} is missing")
             self.start = [np.asarray(x[...]) for x in start]
         except Exception as error:  # (of many kinds)
-            raise DefinitionError(f"cannot open '{address}' as a store: {error}") from error
-        chunk = max(math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values())
+            raise DefinitionError(
+                f"cannot open '{address}' as a store: {error}"
+            ) from error
+        chunk = max(
+            math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values()
+        )
         for path, size in sizes.items():
             if size > max(limits.TEXT, chunk + _CHECKSUM):
-                raise DefinitionError(f"'{path}' exceeds all chunks of its store: delete it.")
+                raise DefinitionError(
+                    f"'{path}' exceeds all chunks of its store: delete it."
+                )
 
     def missing(self) -> list[int]:
         """Return the pieces of which a chunk is missing."""
@@ -210,7 +224,9 @@ class ZarrStore:
                 values[name] = array[(*self.layout.blocks.slices(k), ...)]
             except Exception as error:  # (of many kinds: checksums, sizes, headers)
                 text = f"piece {k} of '{self.address}' is damaged in `{name}`"
-                raise FileFormatError(f"{text}: make the call that wrote it again.") from error
+                raise FileFormatError(
+                    f"{text}: make the call that wrote it again."
+                ) from error
         return values
 
     def array(self, name: str) -> np.ndarray:
@@ -221,7 +237,9 @@ class ZarrStore:
         try:
             return np.asarray(self._group[name][...])
         except Exception as error:  # (of many kinds)
-            raise FileFormatError(f"'{self.address}' is damaged in `{name}`: delete it.") from error
+            raise FileFormatError(
+                f"'{self.address}' is damaged in `{name}`: delete it."
+            ) from error
 
     def discard_damaged(self) -> None:
         """Delete pieces whose checksums are wrong."""
@@ -239,7 +257,9 @@ class ZarrStore:
         options = {"consolidated": False, "chunks": None, "zarr_format": 3}
         try:
             data = package("xarray").open_zarr(self.address, **options)
-        except Exception as error:  # (of many kinds, for an array that another program has added)
+        except (
+            Exception
+        ) as error:  # (of many kinds, for an array that another program has added)
             raise FileFormatError(f"'{self.address}' is damaged: {error}") from error
         # (Zarr lists arrays in any order.)
         dims = [name for name in self.layout.dims if name in data.coords]
@@ -272,11 +292,17 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
             return None
         text = f"'{address}' is no store of results, or only begun ({error!r})"
         raise DefinitionError(f"{text}: choose another name, or delete it.") from error
-    if (change := difference(json.loads(json.dumps(job.description)), theirs)) is not None:
-        raise DefinitionError(f"'{address}' holds other results: {change}. Choose another store.")
+    if (
+        change := difference(json.loads(json.dumps(job.description)), theirs)
+    ) is not None:
+        raise DefinitionError(
+            f"'{address}' holds other results: {change}. Choose another store."
+        )
     store = ZarrStore(address)
     if store.layout.blocks != job.blocks:
-        raise DefinitionError(f"'{address}' is damaged: delete it, or choose another store.")
+        raise DefinitionError(
+            f"'{address}' is damaged: delete it, or choose another store."
+        )
     store.discard_damaged()
     return store
 
@@ -291,28 +317,44 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
 
     common = {"compressors": [Crc32cCodec()], "config": {"write_empty_chunks": True}}
 
-    def constant(group: Any, name: str, dims: Sequence[str], values: Any, attributes: Any = None):
+    def constant(
+        group: Any, name: str, dims: Sequence[str], values: Any, attributes: Any = None
+    ):
         values = np.asarray(values)
         group.create_array(
-            name, data=values, chunks=tuple(max(n, 1) for n in values.shape) or "auto",
-            dimension_names=dims, attributes=dict(attributes or {}), **common,
-        )  # fmt: skip
+            name,
+            data=values,
+            chunks=tuple(max(n, 1) for n in values.shape) or "auto",
+            dimension_names=dims,
+            attributes=dict(attributes or {}),
+            **common,
+        )
 
     with _writing(address), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # (Zarr announces that its format of texts may change.)
+        warnings.simplefilter(
+            "ignore"
+        )  # (Zarr announces that its format of texts may change.)
         group = _group(address, "a")
         for name, x in layout.variables.items():
             dims, shape = layout.array(name)
             group.create_array(
-                name, shape=shape, chunks=(*layout.blocks.block, *x.shape), dtype=x.dtype,
-                fill_value=x.fill, dimension_names=dims, attributes=dict(x.attributes), **common,
-            )  # fmt: skip
+                name,
+                shape=shape,
+                chunks=(*layout.blocks.block, *x.shape),
+                dtype=x.dtype,
+                fill_value=x.fill,
+                dimension_names=dims,
+                attributes=dict(x.attributes),
+                **common,
+            )
         for name, x in layout.constants.items():
             constant(group, name, *x)
         kept = group.require_group(_START)
         for i, x in enumerate(start):
             constant(kept, f"{i}", [f"axis_{j}" for j in range(np.ndim(x))], x)
-        if beside := [x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])]:
+        if beside := [
+            x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])
+        ]:
             group.attrs["coordinates"] = " ".join(beside)
         about = {
             "description": layout.description,
@@ -344,14 +386,20 @@ def _sizes(address: str) -> dict[str, int]:
     """
     if "://" in address:
         return {}
-    tree = ((at, name) for at, *names in os.walk(address) for name in itertools.chain(*names))
+    tree = (
+        (at, name)
+        for at, *names in os.walk(address)
+        for name in itertools.chain(*names)
+    )
     sizes = {}
     for path in [address, *itertools.starmap(os.path.join, tree)]:
         about = os.lstat(path) if os.path.lexists(path) else None
         if about is None or stat.S_ISDIR(about.st_mode):
             continue
         if not stat.S_ISREG(about.st_mode):
-            raise DefinitionError(f"'{path}' is a link or a pipe, which stores cannot hold.")
+            raise DefinitionError(
+                f"'{path}' is a link or a pipe, which stores cannot hold."
+            )
         if path.endswith(".json") and about.st_size > limits.TEXT:
             raise DefinitionError(f"'{path}' has {about.st_size} bytes: delete it.")
         sizes[path] = about.st_size

@@ -42,9 +42,13 @@ def solve_positive(
     singular = jnp.asarray(False)
     for j in range(n):
         for i in range(j, n):
-            below[i, j] = _less(matrix[..., i, j], [(below[i, k], lower[j, k]) for k in range(j)])
+            below[i, j] = _less(
+                matrix[..., i, j], [(below[i, k], lower[j, k]) for k in range(j)]
+            )
         pivot = below[j, j]
-        singular = singular | ~(pivot > n * jnp.finfo(right.dtype).eps * matrix[..., j, j])
+        singular = singular | ~(
+            pivot > n * jnp.finfo(right.dtype).eps * matrix[..., j, j]
+        )
         pivots.append(1 / pivot)
         for i in range(j + 1, n):
             lower[i, j] = below[i, j] * pivots[j]
@@ -55,15 +59,21 @@ def solve_positive(
             b = right[..., i] if i else jnp.where(singular, jnp.nan, right[..., i])
             x.append(_less(b, [(lower[i, k], x[k]) for k in range(i)]))
         for i in reversed(range(n)):
-            x[i] = _less(x[i] * pivots[i], [(lower[k, i], x[k]) for k in range(i + 1, n)])
+            x[i] = _less(
+                x[i] * pivots[i], [(lower[k, i], x[k]) for k in range(i + 1, n)]
+            )
         return jnp.stack(x, axis=-1)
 
     # (Derivatives use the factors, too.)
-    return jax.lax.custom_linear_solve(lambda x: x @ matrix, right, by_factors, symmetric=True)
+    return jax.lax.custom_linear_solve(
+        lambda x: x @ matrix, right, by_factors, symmetric=True
+    )
 
 
 @jax.jit
-def solve(matrix: Float[Array, "n n"], right: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
+def solve(
+    matrix: Float[Array, "n n"], right: Float[Array, "*b n"]
+) -> Float[Array, "*b n"]:
     """Return x in `matrix @ x = right`, by unrolled elimination with pairwise pivoting: a row
     trades places with any later one that has the larger number in its column.
 
@@ -111,7 +121,9 @@ def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in lower], axis=-2)
 
 
-@ft.partial(jax.jit, static_argnames=("left_side", "lower", "transpose_a", "unit_diagonal"))
+@ft.partial(
+    jax.jit, static_argnames=("left_side", "lower", "transpose_a", "unit_diagonal")
+)
 def triangular_solve(
     matrix: Float[Array, "*b n n"],
     right: Float[Array, "*b _ _"],
@@ -148,7 +160,9 @@ def lu(
     def traded(x, k, chosen):
         """x with rows k and `chosen` in each other's place."""
         mask = jnp.reshape(chosen, (*chosen.shape, *(1,) * (x.ndim - chosen.ndim)))
-        other = jnp.sum(jnp.where(mask, x, 0), axis=chosen.ndim - 1, dtype=x.dtype, keepdims=True)
+        other = jnp.sum(
+            jnp.where(mask, x, 0), axis=chosen.ndim - 1, dtype=x.dtype, keepdims=True
+        )
         row = jax.lax.dynamic_slice_in_dim(x, k, 1, chosen.ndim - 1)
         at_k = jnp.reshape(index == k, mask.shape[chosen.ndim - 1 :])
         return jnp.where(at_k, other, jnp.where(mask, row, x))
@@ -164,7 +178,11 @@ def lu(
         pivot = _row(column[..., None], k)
         share = jnp.where(index > k, column / jnp.where(pivot == 0, 1.0, pivot), 0.0)
         X = X - share[..., :, None] * jnp.where(index > k, row, 0.0)[..., None, :]
-        return jnp.where((index == k) & (index[:, None] > k), share[..., :, None], X), pivots, order
+        return (
+            jnp.where((index == k) & (index[:, None] > k), share[..., :, None], X),
+            pivots,
+            order,
+        )
 
     order = jnp.broadcast_to(jnp.arange(n, dtype=np.int32), matrix.shape[:-1])
     return jax.lax.fori_loop(0, n, eliminate, (matrix, jnp.zeros_like(order), order))

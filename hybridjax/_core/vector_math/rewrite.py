@@ -61,13 +61,17 @@ def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
         if not on_cpu():
             return function(*arguments)
         # A new function every time: a program of earlier parameters is never taken for this one.
-        trace = jax.make_jaxpr(lambda *arguments: function(*arguments), return_shape=True)
+        trace = jax.make_jaxpr(
+            lambda *arguments: function(*arguments), return_shape=True
+        )
         program, shapes = trace(*arguments)
         jaxpr = _row_by_row(program.jaxpr) if trigonometry else program.jaxpr
         program = program.replace(jaxpr=_replaced(jaxpr, trigonometry))
         values = jex.jaxpr_as_fun(program)(*jax.tree_util.tree_leaves(arguments))
         values = [v if isinstance(v, jax.Array) else jnp.asarray(v) for v in values]
-        return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(shapes), values)
+        return jax.tree_util.tree_unflatten(
+            jax.tree_util.tree_structure(shapes), values
+        )
 
     return call
 
@@ -78,14 +82,18 @@ def _number(eqn: jex.JaxprEqn) -> int:
         return 1
     if eqn.primitive.name not in _OUTER:
         return 0
-    return sum(_number(inner) for program in jaxprs(eqn.params) for inner in program.eqns)
+    return sum(
+        _number(inner) for program in jaxprs(eqn.params) for inner in program.eqns
+    )
 
 
 def jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:
     """Return the programs among the parameters of an equation, or in tuples of these.
     (`jax.extend.core` has a function for it since JAX 0.10.)"""
     parts = (x if isinstance(x, tuple) else (x,) for x in params.values())
-    programs = [x.jaxpr if isinstance(x, jex.ClosedJaxpr) else x for part in parts for x in part]
+    programs = [
+        x.jaxpr if isinstance(x, jex.ClosedJaxpr) else x for part in parts for x in part
+    ]
     return [x for x in programs if isinstance(x, jex.Jaxpr)]
 
 
@@ -99,10 +107,15 @@ def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
     eqns = []
     behind: dict[jex.Var, frozenset] = {}
     for k, eqn in enumerate(jaxpr.eqns):
-        sources = [behind.get(v, frozenset()) for v in eqn.invars if isinstance(v, jex.Var)]
+        sources = [
+            behind.get(v, frozenset()) for v in eqn.invars if isinstance(v, jex.Var)
+        ]
         functions = frozenset((k, j) for j in range(_number(eqn))).union(*sources)
         behind |= dict.fromkeys(eqn.outvars, functions)
-        vector = eqn.primitive.name in ("stack", "concatenate") and len(_shape(eqn.outvars[0])) == 1
+        vector = (
+            eqn.primitive.name in ("stack", "concatenate")
+            and len(_shape(eqn.outvars[0])) == 1
+        )
         if vector and len(functions) > 1:
             eqn = _in_place_of(eqn, _rows)
         eqns.append(eqn)
@@ -120,9 +133,13 @@ def _rows(*parts):
 
 def _replaced(jaxpr: jex.Jaxpr, trigonometry: bool) -> jex.Jaxpr:
     """A program of the same type with our functions; itself if there is nothing to replace."""
-    factors = {v: e for e in jaxpr.eqns if e.primitive is primitives.lu_p for v in e.outvars}
+    factors = {
+        v: e for e in jaxpr.eqns if e.primitive is primitives.lu_p for v in e.outvars
+    }
     solved = [_solved(eqn, factors) or eqn for eqn in jaxpr.eqns]
-    places = [*jaxpr.outvars, *(v for eqn in solved for v in eqn.invars)] if factors else []
+    places = (
+        [*jaxpr.outvars, *(v for eqn in solved for v in eqn.invars)] if factors else []
+    )
     needed = {v for v in places if isinstance(v, jex.Var)}
     eqns = [
         _replaced_equation(eqn, trigonometry)
@@ -137,7 +154,9 @@ def _replaced_equation(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn:
     if (ours := _ours(eqn, trigonometry)) is not None:
         return ours
     if eqn.primitive.name in _OUTER:
-        params = {k: _replaced_parameter(x, trigonometry) for k, x in eqn.params.items()}
+        params = {
+            k: _replaced_parameter(x, trigonometry) for k, x in eqn.params.items()
+        }
         if any(params[name] is not value for name, value in eqn.params.items()):
             return eqn.replace(params=params)
     return eqn
@@ -150,13 +169,22 @@ def _solved(eqn: jex.JaxprEqn, factors: dict) -> jex.JaxprEqn | None:
     times, lengths = eqn.params["jaxprs"].matvec, eqn.params["const_lengths"]
     matrix, *_, right = eqn.invars
     constants = eqn.invars[lengths.matvec + lengths.vecmat :][: lengths.solve]
-    by_factors = bool(constants) and all(v in factors for v in constants if isinstance(v, jex.Var))
+    by_factors = bool(constants) and all(
+        v in factors for v in constants if isinstance(v, jex.Var)
+    )
     product = times.jaxpr.eqns[0]
-    if lengths.matvec != 1 or not by_factors or product.primitive is not primitives.dot_general_p:
+    if (
+        lengths.matvec != 1
+        or not by_factors
+        or product.primitive is not primitives.dot_general_p
+    ):
         return None
     (left, last), batch = product.params["dimension_numbers"]
     n, axes = _shape(matrix)[-1], len(_shape(right))
-    shared = len(_shape(matrix)) == 2 and (tuple(left), tuple(last)) == ((1,), (axes - 1,))
+    shared = len(_shape(matrix)) == 2 and (tuple(left), tuple(last)) == (
+        (1,),
+        (axes - 1,),
+    )
     if not shared or batch != ((), ()) or n > factorizations.UNROLLED_PIVOTED:
         return None
     if product.invars != times.jaxpr.invars:
@@ -177,7 +205,9 @@ def _ours(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn | None:
         return _in_place_of(eqn, _FACTORIZATIONS[eqn.primitive], options)
     if not trigonometry or eqn.primitive not in _TRIGONOMETRY:
         return None
-    if eqn.params.get("accuracy") is not None or any(x.dtype != jnp.float64 for x in avals):
+    if eqn.params.get("accuracy") is not None or any(
+        x.dtype != jnp.float64 for x in avals
+    ):
         return None
     return _in_place_of(eqn, _TRIGONOMETRY[eqn.primitive])
 
@@ -208,7 +238,9 @@ def _replaced_parameter(value: Any, trigonometry: bool) -> Any:
 
 # JAX traces an inner jit once and keeps it: what becomes of it is kept as well, since JAX's caches
 # of its derivatives and its batched form go by the identity of a program.
-_REPLACED: dict[bool, WeakKeyDictionary] = {flag: WeakKeyDictionary() for flag in (False, True)}
+_REPLACED: dict[bool, WeakKeyDictionary] = {
+    flag: WeakKeyDictionary() for flag in (False, True)
+}
 
 
 def _replaced_program(program: jex.ClosedJaxpr, trigonometry: bool) -> jex.ClosedJaxpr:
@@ -216,12 +248,16 @@ def _replaced_program(program: jex.ClosedJaxpr, trigonometry: bool) -> jex.Close
     if program not in replaced:
         jaxpr = _replaced(program.jaxpr, trigonometry)
         # None: unchanged. (The program itself as the value would keep its own key alive.)
-        replaced[program] = None if jaxpr is program.jaxpr else program.replace(jaxpr=jaxpr)
+        replaced[program] = (
+            None if jaxpr is program.jaxpr else program.replace(jaxpr=jaxpr)
+        )
     return replaced[program] or program
 
 
 @ft.lru_cache(maxsize=256)
 def _equation(function: Callable, avals: tuple, options: tuple = ()) -> jex.JaxprEqn:
     """The equation that applies one of our functions to arguments of these types."""
-    (eqn,) = jax.make_jaxpr(lambda *arguments: function(*arguments, **dict(options)))(*avals).eqns
+    (eqn,) = jax.make_jaxpr(lambda *arguments: function(*arguments, **dict(options)))(
+        *avals
+    ).eqns
     return eqn

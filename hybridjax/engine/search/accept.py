@@ -63,7 +63,13 @@ def uneventful(state: State, aim: Aim, new: Attempt, task: Task) -> Mask:
     """Lanes whose step `accept` would accept on sight: accurate, no event, and no watched function
     near a zero, save the target's level on which the lane lands."""
     at_guard = new.lands & (aim.which < len(task.s.transitions))
-    calm = new.calm & accurate(new, task) & ~state.approach.on & (aim.schedule < 0) & ~at_guard
+    calm = (
+        new.calm
+        & accurate(new, task)
+        & ~state.approach.on
+        & (aim.schedule < 0)
+        & ~at_guard
+    )
     return calm | ~state.active
 
 

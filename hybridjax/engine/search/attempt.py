@@ -63,7 +63,13 @@ class Landing(NamedTuple):
 
 
 def land(
-    flow: ChartFlow, before: Watch, step: Step, allowed: States, t: Times, aim: Aim, span: Times
+    flow: ChartFlow,
+    before: Watch,
+    step: Step,
+    allowed: States,
+    t: Times,
+    aim: Aim,
+    span: Times,
 ) -> Landing:
     """The zero of the function aimed at, before or beyond the end of a step from t.
 
@@ -81,7 +87,11 @@ def land(
     end = flow.locate(t + tau, step.q, step.f1, which, first)
     share = xp.abs(first) / xp.where(aim.reach > 0, aim.reach, 1.0)
     # (A short step is explicit: where modes die out within it, it has no orders of the method's.)
-    weight = 1 / _LANDING_PART if flow.method.implicit else xp.where(share > 0, share, 0.0) ** 2
+    weight = (
+        1 / _LANDING_PART
+        if flow.method.implicit
+        else xp.where(share > 0, share, 0.0) ** 2
+    )
     error = xp.max(end.error / allowed * weight, axis=0)
     fine = xp.abs(end.last) <= LANDING * xp.abs(tau + end.past) + INSTANT * span
     lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(error) <= 1.0)
@@ -94,7 +104,9 @@ def land(
     )
 
 
-def attempt(state: State, aim: Aim, task: Task, unroll=False, in_step: bool = False) -> Attempt:
+def attempt(
+    state: State, aim: Aim, task: Task, unroll=False, in_step: bool = False
+) -> Attempt:
     """Let the active lanes step, and land those that come close to the zero they aim at.
 
     With `in_step`, all lanes are assumed to go equally far from the same time, to no zero; then
@@ -103,12 +115,18 @@ def attempt(state: State, aim: Aim, task: Task, unroll=False, in_step: bool = Fa
     s, lanes, L = task.s, state.lanes, state.lanes.t.shape[0]
     xp = namespace(lanes.t)
     zero, no, yes = xp.zeros(L), xp.zeros(L, bool), xp.ones(L, bool)
-    empty = Attempt(lanes.q, no_events(s, lanes.t), zero, zero, no, no, no, state.along, yes)
+    empty = Attempt(
+        lanes.q, no_events(s, lanes.t), zero, zero, no, no, no, state.along, yes
+    )
 
     def work(a, here, out):
         flow = chart_flow(s, a, here, task.u, task.target)
         n, rows, present = s.dims[a], flow.rows, here.any()
-        t, q, tau = only(here, lanes.t), only(here, lanes.q[:n]), xp.where(here, aim.step, 0.0)
+        t, q, tau = (
+            only(here, lanes.t),
+            only(here, lanes.q[:n]),
+            xp.where(here, aim.step, 0.0),
+        )
         if in_step:
             t, tau = t[:1], aim.step[xp.argmax(here)][None]
         before = None if out.along is None else only(here, out.along[:n])
@@ -125,16 +143,22 @@ def attempt(state: State, aim: Aim, task: Task, unroll=False, in_step: bool = Fa
                 goal = aim._replace(which=which, step=tau)
                 end = cond(
                     (which >= 0).any(),
-                    lambda: land(flow.only(which >= 0), before, step, allowed, t, goal, task.span),
+                    lambda: land(
+                        flow.only(which >= 0), before, step, allowed, t, goal, task.span
+                    ),
                     lambda: end,
                 )
             moved = tau if in_step else tau + xp.where(end.lands, end.past, 0.0)
-            after = cond(present, lambda: flow.watch(t + moved, end.q, end.f), lambda: before)
+            after = cond(
+                present, lambda: flow.watch(t + moved, end.q, end.f), lambda: before
+            )
             bent = _bent(flow, before, after, (q, step.f0), end, t, moved, task.span)
             chosen = (np.array(rows)[:, None] == which) & end.lands
             # (Where events coincide, the step to the second is rounding, and tells no speed.)
             judged = chosen & (xp.abs(before.value) > width(t, task.span, before.rate))
-            far, slow = _clearance(before, after, moved, take_rows(state.ready, rows), judged)
+            far, slow = _clearance(
+                before, after, moved, take_rows(state.ready, rows), judged
+            )
             calm = (far | chosen).all(axis=0) & ~bent & ~slow
             out = out._replace(
                 watched=write(out.watched, rows, here, after),
@@ -198,7 +222,9 @@ def _errors(
     assert settings.rtol is not None
     rounding = xp.zeros_like(q)
     if settings.scale is None:
-        rounding = rounding_error(flow.field, t, q, step.f0)  # (a bad step may end anywhere)
+        rounding = rounding_error(
+            flow.field, t, q, step.f0
+        )  # (a bad step may end anywhere)
     allowed = tolerance(settings, a, q, tau, step, rounding)
     motion = step.error if change is None else step.estimate
     error = xp.max(xp.abs(motion) / allowed, axis=0, initial=0.0)
@@ -216,7 +242,9 @@ def _errors(
     return allowed, xp.where(finite, error, xp.inf)
 
 
-def _bent(flow: ChartFlow, before: Watch, after: Watch, start, end, t, moved, span) -> Mask:
+def _bent(
+    flow: ChartFlow, before: Watch, after: Watch, start, end, t, moved, span
+) -> Mask:
     """Test whether the cubic interpolant misses a watched function halfway, or there is none.
     `start`: the state and the field at the start of the step."""
     xp, (q, f0) = namespace(moved), start
@@ -239,8 +267,12 @@ def _clearance(
     ends = before.value, after.value, moved * before.rate, moved * after.rate
     points = control_points(*ends)
     low = xp.minimum(xp.minimum(points[0], points[1]), xp.minimum(points[2], points[3]))
-    high = xp.maximum(xp.maximum(points[0], points[1]), xp.maximum(points[2], points[3]))
-    far = xp.where(armed, low > NEAR * xp.maximum(xp.abs(ends[0]), xp.abs(ends[1])), high <= 0)
+    high = xp.maximum(
+        xp.maximum(points[0], points[1]), xp.maximum(points[2], points[3])
+    )
+    far = xp.where(
+        armed, low > NEAR * xp.maximum(xp.abs(ends[0]), xp.abs(ends[1])), high <= 0
+    )
     fastest = xp.maximum(xp.abs(ends[2]), xp.abs(ends[0]))
     # (By rounding, the zero may lie a little before the start.)
     return far, (judged & (xp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)
@@ -255,7 +287,9 @@ def deviation(s: Structure, lanes: Lanes, settings: Settings) -> Padded:
         return put(out, slice(n), xp.where(here, scaled, out[:n]))
 
     xp = namespace(lanes.q)
-    return for_each_chart(s, lanes.chart, xp.ones(len(lanes.t), bool), work, xp.zeros_like(lanes.q))
+    return for_each_chart(
+        s, lanes.chart, xp.ones(len(lanes.t), bool), work, xp.zeros_like(lanes.q)
+    )
 
 
 def _direction(n: int) -> Float[np.ndarray, "n 1"]:

@@ -13,7 +13,9 @@ from .attempt import SLOW, deviation
 from .state import Aim, Approach, Attempt, State, Task
 
 
-def without_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State, Tape]:
+def without_events(
+    state: State, aim: Aim, new: Attempt, task: Task
+) -> tuple[State, Tape]:
     """The state after steps that are accepted in all active lanes, without events, and the row of
     the tape. Lanes may arrive."""
     lanes, active = state.lanes, state.active
@@ -77,7 +79,9 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
         result = update_result(result, failed, code)
     if (along := new.along) is not None:
         fresh = cond(
-            (fired >= 0).any(), lambda: deviation(task.s, after, task.settings), lambda: along
+            (fired >= 0).any(),
+            lambda: deviation(task.s, after, task.settings),
+            lambda: along,
         )
         along = xp.where(fired >= 0, fresh, xp.where(accepted, along, state.along))
     end = State(
@@ -93,12 +97,20 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
         state.i + 1,
     )
     code = xp.where(on_time, ARRIVE_TIME, xp.where(accepted, MOVE, IDLE))
-    code = xp.where(level, ARRIVE_LEVEL, xp.where(fired >= 0, fired, code)).astype(xp.int32)
+    code = xp.where(level, ARRIVE_LEVEL, xp.where(fired >= 0, fired, code)).astype(
+        xp.int32
+    )
     return end, Tape(moved, code, t, new.q, after.q, after.chart)
 
 
 def _after(
-    state: State, aim: Aim, new: Attempt, verdict: Verdict, fired: Index, t: Times, task: Task
+    state: State,
+    aim: Aim,
+    new: Attempt,
+    verdict: Verdict,
+    fired: Index,
+    t: Times,
+    task: Task,
 ) -> tuple[Lanes, Watch, Mask, Mask, Mask]:
     """Lanes after their steps and events, the watched functions there, whether the target's level
     counts, whether events accumulate, and whether a zero is crossed at a vanishing speed."""
@@ -181,10 +193,14 @@ def level_counts(watched: Watch, span: Times) -> Mask:
 
 def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:
     xp = namespace(new.value)
-    return Watch(xp.where(mask, new.value, old.value), xp.where(mask, new.rate, old.rate))
+    return Watch(
+        xp.where(mask, new.value, old.value), xp.where(mask, new.rate, old.rate)
+    )
 
 
-def _expected(sequence: tuple[int, ...] | None, events: Index, fired: Index) -> Bool[Array, " L"]:
+def _expected(
+    sequence: tuple[int, ...] | None, events: Index, fired: Index
+) -> Bool[Array, " L"]:
     """Test whether the next event of each lane is that of the limit cycle."""
     xp = namespace(fired)
     if not sequence:

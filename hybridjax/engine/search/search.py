@@ -49,7 +49,9 @@ def search(
 
     Lanes whose `result` is not OK at the start stay there.
     """
-    task = Task(s, u, target, target.limit - lanes.t, stride, settings, options.tangents)
+    task = Task(
+        s, u, target, target.limit - lanes.t, stride, settings, options.tangents
+    )
     begin = _begin(lanes, result, task, options.new_input)
     tape = blank_tape(settings.max_steps, lanes) if options.tape else None
 
@@ -61,7 +63,9 @@ def search(
             aim = take_aim(state, task)
             step = state, aim, attempt(state, aim, task), task
             calm = uneventful(*step).all()
-            end, row = cond(calm, lambda: without_events(*step), lambda: with_events(*step))
+            end, row = cond(
+                calm, lambda: without_events(*step), lambda: with_events(*step)
+            )
             return end, None if tape is None else write_row(tape, state.i, row)
 
         end, written = while_loop(going, iterate, (begin, tape))
@@ -86,9 +90,15 @@ def search(
 def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
     """The state of the iteration at its start."""
     s, xp, L, u = task.s, namespace(lanes.t), lanes.t.shape[0], task.u
-    finite = xp.isfinite(lanes.t) & xp.isfinite(lanes.q).all(axis=0) & xp.isfinite(u).all(axis=0)
+    finite = (
+        xp.isfinite(lanes.t)
+        & xp.isfinite(lanes.q).all(axis=0)
+        & xp.isfinite(u).all(axis=0)
+    )
     result = update_result(result, ~finite, Result.BAD_INPUT)
-    watched = watch(s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK)
+    watched = watch(
+        s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK
+    )
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
     follows, along = implicit and task.tangents is not False, task.stride.along
     none, zero, no = xp.zeros(L, xp.int32), xp.zeros(L), xp.zeros(L, bool)
@@ -109,12 +119,17 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
 def _one_step(begin: State, task: Task) -> tuple[Aim, Attempt, Mask]:
     """One step of all lanes, and in which of them it ends at the target."""
     s, levels = task.s, shared(task.target.levels)
-    clock = levels is None or not any(levels.present(s, a) for a in range(len(s.charts)))
+    clock = levels is None or not any(
+        levels.present(s, a) for a in range(len(s.charts))
+    )
     aim = take_aim(begin, task)
     new = attempt(begin, aim, task, unroll=True, in_step=clock)
     arrives = uneventful(begin, aim, new, task) & (new.lands | aim.last)
     if clock:
-        for x in (begin.lanes.t, aim.step):  # the same in all active lanes, as `attempt` assumed
+        for x in (
+            begin.lanes.t,
+            aim.step,
+        ):  # the same in all active lanes, as `attempt` assumed
             arrives = arrives & (x == x[namespace(x).argmax(begin.active)])
     return aim, new, arrives | ~begin.active
 
@@ -140,7 +155,9 @@ def take_aim(state: State, task: Task) -> Aim:
     level = np.arange(len(value))[:, None] == len(s.transitions)
     new = (state.i == 0) | (lanes.pace[0] == 0)  # at the start, or right after an event
     within = guess <= xp.where(level, 1.0, _AIM_WITHIN) * step
-    expected = state.ready & (guess > 0) & within & (level | new) & ~approach.on & (lead > 0)
+    expected = (
+        state.ready & (guess > 0) & within & (level | new) & ~approach.on & (lead > 0)
+    )
     guess = xp.where(expected, guess, xp.inf)
     nearest = xp.min(guess, axis=0)
     lands = xp.isfinite(nearest)
@@ -152,7 +169,9 @@ def take_aim(state: State, task: Task) -> Aim:
     return Aim(which, step, reach, due, xp.where(last, schedule, -1), last)
 
 
-def initial_step(s: Structure, lanes: Lanes, u: Inputs, span: Times, settings: Settings) -> Times:
+def initial_step(
+    s: Structure, lanes: Lanes, u: Inputs, span: Times, settings: Settings
+) -> Times:
     """A cautious first step: a part of the time in which the state changes by its size."""
 
     def work(a, here, out):
@@ -169,4 +188,6 @@ def initial_step(s: Structure, lanes: Lanes, u: Inputs, span: Times, settings: S
 
     assert settings.rtol is not None
     xp, rtol = namespace(lanes.t), settings.rtol
-    return for_each_chart(s, lanes.chart, xp.ones(lanes.t.shape[0], bool), work, _FIRST_STEP * span)
+    return for_each_chart(
+        s, lanes.chart, xp.ones(lanes.t.shape[0], bool), work, _FIRST_STEP * span
+    )

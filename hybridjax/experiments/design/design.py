@@ -12,7 +12,14 @@ from ..._core.arguments import Numbers, names, require_equal
 from ..._core.boundary import kinds
 from ..._core.boundary.checked import checked
 from ..._core.boundary.containers import Names
-from ..._core.boundary.kinds import Count, Index, PeriodCount, SectionCount, SignalNames, Vector
+from ..._core.boundary.kinds import (
+    Count,
+    Index,
+    PeriodCount,
+    SectionCount,
+    SignalNames,
+    Vector,
+)
 from ..._core.boundary.values import Integers
 from ...errors import DefinitionError
 from .partition import SINGULAR, check_sharing, is_real, needs_two_phases, regular
@@ -56,7 +63,9 @@ class Design(eqx.Module):
     n_sections: SectionCount = eqx.field(static=True)
     periods: PeriodCount = eqx.field(static=True)
     experiments: kinds.ExperimentCount = eqx.field(static=True)
-    input_names: Annotated[tuple[str, ...], Names()] = eqx.field(static=True, default=("u",))
+    input_names: Annotated[tuple[str, ...], Names()] = eqx.field(
+        static=True, default=("u",)
+    )
 
     def __check_init__(self):
         self.check()
@@ -91,7 +100,9 @@ class Design(eqx.Module):
             if np.isscalar(values):
                 return np.full(sum(sizes), values, dtype)
             if [np.size(v) for v in values] != sizes:
-                raise DefinitionError(f"`{name}` must be one number, or as many as `frequencies`.")
+                raise DefinitionError(
+                    f"`{name}` must be one number, or as many as `frequencies`."
+                )
             return np.concatenate([[], *map(np.ravel, values)]).astype(dtype)
 
         cosines = [
@@ -120,9 +131,16 @@ class Design(eqx.Module):
         for name in ("line", "channel", "amplitude", "phase"):
             shapes = self.experiment.shape, getattr(self, name).shape
             require_equal(f"`experiment` and `{name}`", "shapes", *shapes)
-        if not np.array_equal(np.unique(self.experiment), np.arange(max(1, self.experiments))):
-            raise DefinitionError("every experiment needs a frequency: `frequencies` skips some.")
-        self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
+        if not np.array_equal(
+            np.unique(self.experiment), np.arange(max(1, self.experiments))
+        ):
+            raise DefinitionError(
+                "every experiment needs a frequency: `frequencies` skips some."
+            )
+        self._refuse(
+            (self.line < 0) | (2 * self.line > N * P),
+            f"lies outside [0, N/2 = {N / 2}]",
+        )
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)
         self._refuse(~good, "has an amplitude that is not a positive number")
         self._refuse(~np.isfinite(self.phase), "has a phase that is not finite")
@@ -141,7 +159,10 @@ class Design(eqx.Module):
         u = self.amplitude * np.exp(1j * self.phase)
         _, group = np.unique(self.line * nu + self.channel, return_inverse=True)
         power, square = np.bincount(group, np.abs(u) ** 2), u**2
-        re, im = np.bincount(group, np.real(square)), np.bincount(group, np.imag(square))
+        re, im = (
+            np.bincount(group, np.real(square)),
+            np.bincount(group, np.imag(square)),
+        )
         alike = np.hypot(re, im) / power
         self._refuse(
             (needs_two_phases(self.line, P, N) & (alike > 1 - SINGULAR)[group]),
@@ -161,10 +182,13 @@ class Design(eqx.Module):
         nu = len(self.input_names)
         lines, place = np.unique(self.line, return_inverse=True)
         U = np.zeros((len(lines), self.experiments, nu), complex)
-        U[place, self.experiment, self.channel] = self.amplitude * np.exp(1j * self.phase)
+        U[place, self.experiment, self.channel] = self.amplitude * np.exp(
+            1j * self.phase
+        )
         gram = np.einsum("kei,kej->kij", U.conj(), U)
         self._refuse(
-            ~regular(gram)[place] & (np.sum(np.abs(U) > 0, axis=2).max(axis=1) > 1)[place],
+            ~regular(gram)[place]
+            & (np.sum(np.abs(U) > 0, axis=2).max(axis=1) > 1)[place],
             "excites several inputs together, and its experiments cannot tell them apart: excite "
             "it in as many experiments as inputs, with turned phases "
             "(multisine(division='orthogonal'))",
@@ -174,7 +198,9 @@ class Design(eqx.Module):
         if wrong.any():
             first = int(np.argmax(wrong))
             f = self.line[first] / self.periods
-            raise DefinitionError(f"experiment {self.experiment[first]}: f = {f:.10g} {reason}.")
+            raise DefinitionError(
+                f"experiment {self.experiment[first]}: f = {f:.10g} {reason}."
+            )
 
     @property
     def f(self) -> Float[np.ndarray, " K"]:
@@ -206,9 +232,13 @@ class Design(eqx.Module):
         k = slice(*np.searchsorted(self.experiment, (first, last)))
         experiment, line, channel = self.experiment[k], self.line[k], self.channel[k]
         length = self.n_sections * self.periods
-        spectrum = np.zeros((last - first, length // 2 + 1, len(self.input_names)), complex)
+        spectrum = np.zeros(
+            (last - first, length // 2 + 1, len(self.input_names)), complex
+        )
         value = 0.5 * length * self.amplitude[k] * np.exp(1j * self.phase[k])
-        value = np.where(is_real(line, self.periods, self.n_sections), 2 * value.real, value)
+        value = np.where(
+            is_real(line, self.periods, self.n_sections), 2 * value.real, value
+        )
         spectrum[experiment - first, line, channel] = value
         one = np.fft.irfft(spectrum, n=length, axis=1)
         return one[:, np.arange(cycles * self.n_sections) % length]
@@ -219,7 +249,9 @@ class Design(eqx.Module):
         Each signal (an input in one experiment) is scaled separately; the ratios of its amplitudes
         do not change.
         """
-        now = np.sqrt(np.mean(self.inputs() ** 2, axis=1))[self.experiment, self.channel]
+        now = np.sqrt(np.mean(self.inputs() ** 2, axis=1))[
+            self.experiment, self.channel
+        ]
         return eqx.tree_at(lambda d: d.amplitude, self, self.amplitude * rms / now)
 
     def realizations(self, count: Count, seed: kinds.Seed = 0) -> "Design":
@@ -253,8 +285,13 @@ class Design(eqx.Module):
     def _times(self, count: int, phase, experiment) -> "Design":
         """Return the cosines repeated, with other phases, in other experiments."""
         same = [np.tile(x, count) for x in (self.line, self.channel, self.amplitude)]
-        cosines, experiments = [experiment.ravel(), *same, phase.ravel()], count * self.experiments
-        return ordered(cosines, self.n_sections, self.periods, experiments, self.input_names)
+        cosines, experiments = (
+            [experiment.ravel(), *same, phase.ravel()],
+            count * self.experiments,
+        )
+        return ordered(
+            cosines, self.n_sections, self.periods, experiments, self.input_names
+        )
 
     def expected_variance(
         self, noise: kinds.NonNegative = 1.0, repeats: Count = 1
@@ -280,7 +317,9 @@ class Design(eqx.Module):
         """Return max |u| / rms(u) of each experiment, the largest over its inputs."""
         u = self.inputs()
         rms, peak = np.sqrt(np.mean(u**2, axis=1)), np.abs(u).max(axis=1)
-        return np.max(np.where(rms > 0, peak / np.where(rms > 0, rms, 1.0), 0.0), axis=1)
+        return np.max(
+            np.where(rms > 0, peak / np.where(rms > 0, rms, 1.0), 0.0), axis=1
+        )
 
     def __repr__(self) -> str:
         f, sizes = self.frequencies, np.bincount(self.experiment)
@@ -299,7 +338,11 @@ class Design(eqx.Module):
 
 
 def ordered(
-    cosines: Sequence[np.ndarray], n_sections: int, periods: int, experiments: int, names: tuple
+    cosines: Sequence[np.ndarray],
+    n_sections: int,
+    periods: int,
+    experiments: int,
+    names: tuple,
 ) -> Design:
     """Return the design of cosines in any order: their experiments, lines, channels, amplitudes and
     phases."""
@@ -318,7 +361,9 @@ def _count(number: int | str, noun: str) -> str:
     return f"{number} {noun}" if str(number) == "1" else f"{number} {noun}s"
 
 
-def require_inputs(design: Design, other: str, n_sections: int, inputs: tuple[str, ...]) -> None:
+def require_inputs(
+    design: Design, other: str, n_sections: int, inputs: tuple[str, ...]
+) -> None:
     """**Raises:** `DefinitionError` if sections or inputs differ from those of a system, or a name
     of one input is that of another one there."""
     what, names = f"design and {other}", design.input_names
@@ -335,7 +380,9 @@ def check_window(n_sections: int, periods: int) -> None:
         raise DefinitionError(f"{n_sections} sections in {periods} periods are {text}.")
 
 
-def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
+def to_lines(
+    frequencies: Float[np.ndarray, " K"], periods: int
+) -> Int[np.ndarray, " K"]:
     """Return frequencies as integers j with f = j / periods.
 
     **Raises:** `DefinitionError` for a frequency that is not a multiple of 1/periods.

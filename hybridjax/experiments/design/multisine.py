@@ -8,11 +8,23 @@ import numpy as np
 
 from ..._core.boundary import kinds
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import ExperimentCount, NonNegative, PeriodCount, SectionCount, Seed
+from ..._core.boundary.kinds import (
+    ExperimentCount,
+    NonNegative,
+    PeriodCount,
+    SectionCount,
+    Seed,
+)
 from ...errors import DefinitionError
 from . import partition
 from .design import OFF_LINE, Design, InputNames, check_window, input_names, ordered
-from .partition import assign, avoid_second_order, fewest_experiments, is_real, needs_two_phases
+from .partition import (
+    assign,
+    avoid_second_order,
+    fewest_experiments,
+    is_real,
+    needs_two_phases,
+)
 
 
 Band = tuple[NonNegative, NonNegative]
@@ -97,15 +109,27 @@ def multisine(
         phase = np.where(second, np.roll(phase, 1) + np.pi / 2, phase)
         phases.append(np.where(is_real(j, periods, n_sections), 0.0, phase))
     experiment = np.concatenate([sum(shares[:i]) + x for i, x in enumerate(sets)])
-    line, channel, phase = np.tile(j, nu), np.repeat(np.arange(nu), len(j)), np.concatenate(phases)
+    line, channel, phase = (
+        np.tile(j, nu),
+        np.repeat(np.arange(nu), len(j)),
+        np.concatenate(phases),
+    )
     if division == "disjoint" and nu > 1:
         experiment = assign(line, periods, total, rng)
     elif division == "orthogonal" and nu > 1:
         experiment, line, channel, phase = _orthogonal(sets[0], j, np.array(phases))
     size = np.asarray(amplitude(line / periods) if callable(amplitude) else amplitude)
     if size.dtype.kind not in "fiu":
-        raise DefinitionError(f"`amplitude` must return real numbers, not {size.dtype}.")
-    cosines = experiment, line, channel, np.full(line.shape, size, float), phase % (2 * np.pi)
+        raise DefinitionError(
+            f"`amplitude` must return real numbers, not {size.dtype}."
+        )
+    cosines = (
+        experiment,
+        line,
+        channel,
+        np.full(line.shape, size, float),
+        phase % (2 * np.pi),
+    )
     return ordered(cosines, n_sections, periods, int(experiment.max()) + 1, names)
 
 
@@ -123,17 +147,26 @@ def _number(j: np.ndarray, periods: int, nu: int, experiments: int | None) -> in
 
 def _check_choices(lines, division, periods) -> None:
     if lines == "two-phase" and division not in ("random", "sum-free"):
-        raise DefinitionError("lines='two-phase' goes with division='random' or 'sum-free' only.")
+        raise DefinitionError(
+            "lines='two-phase' goes with division='random' or 'sum-free' only."
+        )
     if lines == "odd" and periods % 2:
-        raise DefinitionError(f"lines='odd' needs an even number of periods, not {periods}.")
+        raise DefinitionError(
+            f"lines='odd' needs an even number of periods, not {periods}."
+        )
 
 
 def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarray:
     """Return the lines j of a band."""
     f_min, f_max = band
     if not f_min <= f_max <= n_sections / 2:
-        raise DefinitionError(f"`band` {band} must increase in [0, N/2 = {n_sections / 2}].")
-    low, high = int(np.ceil(f_min * periods - OFF_LINE)), int(np.floor(f_max * periods + OFF_LINE))
+        raise DefinitionError(
+            f"`band` {band} must increase in [0, N/2 = {n_sections / 2}]."
+        )
+    low, high = (
+        int(np.ceil(f_min * periods - OFF_LINE)),
+        int(np.floor(f_max * periods + OFF_LINE)),
+    )
     j = np.arange(low, high + 1)
     if lines != "two-phase":
         j = j[~partition.is_half_integer(j, periods)]
@@ -141,7 +174,9 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
         j = j[j % 2 == 1]
     if len(j) == 0:
         text = "take more periods or a wider band"
-        raise DefinitionError(f"lines='{lines}' excites nothing in `band` {band}: {text}.")
+        raise DefinitionError(
+            f"lines='{lines}' excites nothing in `band` {band}: {text}."
+        )
     return j
 
 
@@ -173,7 +208,12 @@ def paper_design(
     **Raises:** `DefinitionError` as `multisine`.
     """
     return multisine(
-        n_sections, periods, (0.0, 10.0), seed=seed, division=division, experiments=experiments
+        n_sections,
+        periods,
+        (0.0, 10.0),
+        seed=seed,
+        division=division,
+        experiments=experiments,
     )
 
 
@@ -209,7 +249,9 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
     for signal in np.unique(where):
         k = np.flatnonzero(where == signal)
         if free[k].any():
-            phase[k[free[k]]] = _lower(phase[k], free[k], design.line[k], size[k], length)
+            phase[k[free[k]]] = _lower(
+                phase[k], free[k], design.line[k], size[k], length
+            )
     return dataclasses.replace(design, phase=phase % (2 * np.pi))
 
 

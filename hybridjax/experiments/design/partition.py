@@ -34,12 +34,16 @@ def line_class(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K
     return np.minimum(remainder, periods - remainder)
 
 
-def is_half_integer(line: Int[np.ndarray, " K"], periods: int) -> Bool[np.ndarray, " K"]:
+def is_half_integer(
+    line: Int[np.ndarray, " K"], periods: int
+) -> Bool[np.ndarray, " K"]:
     """Return whether f is a multiple of 1/2: the cosine aliases with its conjugate (eq. 16)."""
     return (2 * line) % periods == 0
 
 
-def is_real(line: Int[np.ndarray, " K"], periods: int, n_sections: int) -> Bool[np.ndarray, " K"]:
+def is_real(
+    line: Int[np.ndarray, " K"], periods: int, n_sections: int
+) -> Bool[np.ndarray, " K"]:
     """Return whether f is 0 or N/2: `cos(w n + phi)` is a factor times a fixed sequence."""
     return (line == 0) | (2 * line == n_sections * periods)
 
@@ -67,7 +71,10 @@ def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
 
 
 def assign(
-    line: Int[np.ndarray, " K"], periods: int, experiments: int, rng: np.random.Generator
+    line: Int[np.ndarray, " K"],
+    periods: int,
+    experiments: int,
+    rng: np.random.Generator,
 ) -> Int[np.ndarray, " K"]:
     """Return a random partition that obeys the rules: the experiment of each line.
 
@@ -100,7 +107,9 @@ def avoid_second_order(
     **Raises:** `DefinitionError` if no such partition was found.
     """
     classes, products = line_class(line, periods).tolist(), _products(periods)
-    members = [np.flatnonzero(experiment == e).tolist() for e in range(experiment.max() + 1)]
+    members = [
+        np.flatnonzero(experiment == e).tolist() for e in range(experiment.max() + 1)
+    ]
     held = [[classes[i] for i in m] for m in members]
     hits = [_hits(c, products) for c in held]
     draws: Iterator[list[float]] = iter(())
@@ -131,8 +140,14 @@ def avoid_second_order(
             if hits_f and f not in bad:
                 bad.append(f)
     if any(hits):
-        more = "`periods` that 3 does not divide" if periods / 3 in classes else "more experiments"
-        raise DefinitionError(f"second-order products remain: take {more}, or division='random'.")
+        more = (
+            "`periods` that 3 does not divide"
+            if periods / 3 in classes
+            else "more experiments"
+        )
+        raise DefinitionError(
+            f"second-order products remain: take {more}, or division='random'."
+        )
     out = np.empty_like(experiment)
     for e, m in enumerate(members):
         out[m] = e
@@ -146,7 +161,10 @@ def _products(periods: int) -> list[list[int]]:
     def fold(x):
         return min(x % periods, -x % periods)
 
-    return [[(1 << fold(a + b)) | (1 << fold(a - b)) for b in range(top)] for a in range(top)]
+    return [
+        [(1 << fold(a + b)) | (1 << fold(a - b)) for b in range(top)]
+        for a in range(top)
+    ]
 
 
 def _hits(classes: list[int], products: list[list[int]]) -> int:
@@ -176,7 +194,9 @@ def check_sharing(
             relation = "add up to" if (high - low) % periods else "differ by"
             reason = f"{f} and {high / periods:.10g} {relation} an integer"
         remedy = "move one of them to another experiment"
-        if (experiment == number).sum() > periods // 2 + 1:  # more than any design may have
+        if (
+            experiment == number
+        ).sum() > periods // 2 + 1:  # more than any design may have
             remedy = f"a recorded input must repeat after P = {periods} periods, with noise below "
             remedy += "`threshold`; one that a controller makes needs its `reference`"
         text = f"{reason}, so their responses fall on the same frequencies: {remedy}"

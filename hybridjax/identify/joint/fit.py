@@ -29,7 +29,12 @@ from ..descent import FIRST_DAMPING, Spread, descend
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate, RoughFit
 from ..multipliers import exact_htf
-from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
+from ..periodic import (
+    LocalCoordinates,
+    PeriodicModel,
+    characteristic_slopes,
+    local_coordinates,
+)
 from ..series import prediction, residuals
 from ..series.prediction import Predictor, SeriesPart, SeriesProblem
 from ..series.records import MAY_DRIFT, CycleGrid, PreparedRecords, with_drift
@@ -108,16 +113,24 @@ class LDTPFit(MultiplierEstimate):
         """
         f = np.atleast_1d(np.asarray(f, float))
         N = self.n_sections
-        harmonics = self.harmonics if harmonics is None else check_harmonics(harmonics, N)
+        harmonics = (
+            self.harmonics if harmonics is None else check_harmonics(harmonics, N)
+        )
         H = transfer(self._coordinates.model, f, harmonics)
         variance = np.zeros(H.shape)
         for rows, slopes in transfer_slopes(self._coordinates, f, harmonics):
             variance[:, rows] = self._spread.variance(slopes)
         size = self._scale[:, None]
         return HTF(
-            f, H * size, harmonics, N, self.inputs, self.outputs, "fit",
+            f,
+            H * size,
+            harmonics,
+            N,
+            self.inputs,
+            self.outputs,
+            "fit",
             variance=variance * size**2,
-        )  # fmt: skip
+        )
 
     @checked
     def noise_spectrum(
@@ -136,8 +149,12 @@ class LDTPFit(MultiplierEstimate):
         **Raises:** `DefinitionError` if no noise was fitted, or if it grows without bound.
         """
         if self.noise is None:
-            raise DefinitionError("no noise is fitted to HTFs (`HTF.variance`): fit time series.")
-        return prediction.noise_spectrum(self.noise, np.atleast_1d(np.asarray(f, float)), harmonics)
+            raise DefinitionError(
+                "no noise is fitted to HTFs (`HTF.variance`): fit time series."
+            )
+        return prediction.noise_spectrum(
+            self.noise, np.atleast_1d(np.asarray(f, float)), harmonics
+        )
 
     def spread(self, grid: CycleGrid) -> Iterator[Float[np.ndarray, "S T ny r"]]:
         """Iterate over sections: roots of the covariance of the predictions by errors of the fit,
@@ -146,7 +163,9 @@ class LDTPFit(MultiplierEstimate):
         S = cast(Predictor, self.predictor).S / np.outer(self._scale, self._scale)
         path = SeriesProblem([part], S, True, True, 0).path(model, part)
         sizes = np.sqrt(np.diagonal(S, axis1=1, axis2=2))[:, :, None]
-        for J, size in zip(prediction.slopes_of(self._coordinates, part, path), sizes, strict=True):
+        for J, size in zip(
+            prediction.slopes_of(self._coordinates, part, path), sizes, strict=True
+        ):
             yield J @ self._spread.root / size
 
     @property
@@ -155,7 +174,9 @@ class LDTPFit(MultiplierEstimate):
         if self.noise is None:
             return None
         D = np.asarray(self.noise.D)
-        return Predictor(self._coordinates.model.times(self._scale), D @ D.swapaxes(1, 2))
+        return Predictor(
+            self._coordinates.model.times(self._scale), D @ D.swapaxes(1, 2)
+        )
 
     @property
     def determines_direct(self) -> bool:
@@ -167,7 +188,9 @@ class LDTPFit(MultiplierEstimate):
 
     def _about(self) -> str:
         about = f"misfit {self.cost:.6g}, expected {self.freedom}"
-        if self.cost > 2 * self.freedom or weights.are_alike(self.correlation or 0.0, self.freedom):
+        if self.cost > 2 * self.freedom or weights.are_alike(
+            self.correlation or 0.0, self.freedom
+        ):
             about += (
                 " (errors are larger than their variances, or alike at neighboring frequencies: "
                 "too few dimensions, or a local minimum that another guess avoids)"
@@ -176,7 +199,11 @@ class LDTPFit(MultiplierEstimate):
             size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
             about = f"errors one step ahead {signal_values(self.outputs, size)}"
         about = f"{about}; {self.unknowns} unknowns, {self.n_sections} sections"
-        unknown = "" if self.determines_direct else "the data do not determine D: excite more lines"
+        unknown = (
+            ""
+            if self.determines_direct
+            else "the data do not determine D: excite more lines"
+        )
         return "; ".join(filter(None, [about, unknown, self.doubt, self.feedback]))
 
 
@@ -269,7 +296,9 @@ def fit_ldtp(
         errors = lambda: cast(Predictor, fit.predictor).errors(grid, start == "free")  # noqa: E731
         unseen = innovations and direct and drive is None and fit.determines_direct
         feedback = residuals.UNSEEN * unseen
-        if drive is None and (answers := residuals.answering(grid, errors(), records.inputs)):
+        if drive is None and (
+            answers := residuals.answering(grid, errors(), records.inputs)
+        ):
             if innovations and direct and not isinstance(guess, LDTP):
                 fit, direct = _fit_to_series(records, guess, *how, False), False
             remedy = residuals.REMEDIES[innovations + (innovations and not direct)]
@@ -279,7 +308,9 @@ def fit_ldtp(
             begun = PreparedRecords(with_drift(records.records))
             model = fit._coordinates.model.times(fit._scale / begun.scale)
             slow = _fit_to_series(begun, model, *how[:2], False, direct)
-            return slow.coefficients, lambda: Covariance(slow.covariance, slow.covariance_freedom)
+            return slow.coefficients, lambda: Covariance(
+                slow.covariance, slow.covariance_freedom
+            )
 
         doubt = fit.doubt
         if check and not residuals.is_exact(grid, error := errors()).all():
@@ -302,36 +333,57 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
     freedom = problem.residuals - unknowns
     if freedom < 1:
         text = f"{problem.residuals} numbers, too few for {unknowns} unknowns"
-        raise DefinitionError(f"the HTFs hold {text}: give more frequencies, or smaller `guess`.")
+        raise DefinitionError(
+            f"the HTFs hold {text}: give more frequencies, or smaller `guess`."
+        )
     if not np.isfinite(problem.cost(model)):
-        raise DefinitionError("`guess` has an infinite response at a frequency: give a stable one.")
+        raise DefinitionError(
+            "`guess` has an infinite response at a frequency: give a stable one."
+        )
     point, converged = descend(ModelPoint(problem, model, direct), FIRST_DAMPING)
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
         square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
-        weight = problem.weight / np.maximum(np.sqrt(square / 2), weights.SMALLEST_ERROR)[:, None]
+        weight = (
+            problem.weight
+            / np.maximum(np.sqrt(square / 2), weights.SMALLEST_ERROR)[:, None]
+        )
         problem = problem._replace(weight=weight)
-        point, converged = descend(ModelPoint(problem, point.model, direct), FIRST_DAMPING)
+        point, converged = descend(
+            ModelPoint(problem, point.model, direct), FIRST_DAMPING
+        )
     if check:
         _require_answer(point)
     fit = _finished(point, converged, htf, scale, freedom)
     smaller = lambda dims: PeriodicModel.of(realize(htf, np.array(dims)), scale)  # noqa: E731
-    return dataclasses.replace(fit, doubt=_surplus(fit, point, smaller) if check else "")
+    return dataclasses.replace(
+        fit, doubt=_surplus(fit, point, smaller) if check else ""
+    )
 
 
-def _likelier(records: PreparedRecords, guess: Guess, how: tuple[bool, bool, bool]) -> LDTPFit:
+def _likelier(
+    records: PreparedRecords, guess: Guess, how: tuple[bool, bool, bool]
+) -> LDTPFit:
     """Return a fit with D = 0 if data that determine D do not contradict it; else one with D."""
     fit = _fit_to_series(records, guess, *how, True)
     model = fit._coordinates.model
     if not fit.determines_direct:
         return fit
-    for start in (guess, model._replace(D=[0.0 * D for D in model.D])):  # (may differ in minima)
+    for start in (
+        guess,
+        model._replace(D=[0.0 * D for D in model.D]),
+    ):  # (may differ in minima)
         zero = _fit_to_series(records, start, *how, False)
-        sizes = [np.linalg.slogdet(cast(Predictor, x.predictor).S)[1] for x in (zero, fit)]
+        sizes = [
+            np.linalg.slogdet(cast(Predictor, x.predictor).S)[1] for x in (zero, fit)
+        ]
         ratio = max(float(records.sampled.mean(axis=1) @ (sizes[0] - sizes[1])), 0.0)
         # (At 5 %: a D that is fitted in vain enlarges errors a little, a missing one is a bias.)
         degrees = fit.unknowns - zero.unknowns
-        if zero.result == Result.OK and special.gammaincc(degrees / 2, ratio / 2) > 0.05:
+        if (
+            zero.result == Result.OK
+            and special.gammaincc(degrees / 2, ratio / 2) > 0.05
+        ):
             return zero
     return fit
 
@@ -357,14 +409,18 @@ def _fit_to_series(
     first = [n for part in parts for n in part.first.tolist()]
     drift = sum(round(float((part.drift**2).sum())) for part in parts)
     numbers = int(records.sampled.sum()) - drift
-    problem = SeriesProblem(parts, np.tile(np.eye(ny), (N, 1, 1)), innovations, free_start, numbers)
+    problem = SeriesProblem(
+        parts, np.tile(np.eye(ny), (N, 1, 1)), innovations, free_start, numbers
+    )
     if isinstance(guess, PeriodicModel):
         model = guess
     elif isinstance(guess, LDTP):
         require_same("guess and data", guess, records)
         model = PeriodicModel.of(guess, scale, ny if innovations else 0)
     else:
-        model = subspace_model(records, given_dims(guess, N, "guess") or [], innovations, direct)
+        model = subspace_model(
+            records, given_dims(guess, N, "guess") or [], innovations, direct
+        )
     unknowns = local_coordinates(model, direct).size
     starts = sum(model.dims[n] for n in first) if free_start else 0
     freedom = numbers - unknowns - starts
@@ -380,13 +436,19 @@ def _fit_to_series(
             f"the sections, too few for {unknowns} unknowns: record more, or fit fewer dimensions."
         )
     if not np.isfinite(problem.cost(model)):
-        raise DefinitionError("the responses of `guess` are infinite: give a stable model.")
-    point, converged = descend(ModelPoint(problem.reweighted(model), model, direct), FIRST_DAMPING)
+        raise DefinitionError(
+            "the responses of `guess` are infinite: give a stable model."
+        )
+    point, converged = descend(
+        ModelPoint(problem.reweighted(model), model, direct), FIRST_DAMPING
+    )
     if check and not innovations:
         _require_answer(point)
     fit = _finished(point, converged, records, scale, freedom)
     smaller = lambda dims: subspace_model(records, dims, innovations, direct)  # noqa: E731
-    return dataclasses.replace(fit, doubt=_surplus(fit, point, smaller) if check else "")
+    return dataclasses.replace(
+        fit, doubt=_surplus(fit, point, smaller) if check else ""
+    )
 
 
 def _require_answer(point: ModelPoint) -> None:
@@ -400,7 +462,9 @@ def _require_answer(point: ModelPoint) -> None:
         )
 
 
-def _surplus(fit: LDTPFit, point: ModelPoint, smaller: Callable[[Any], PeriodicModel]) -> str:
+def _surplus(
+    fit: LDTPFit, point: ModelPoint, smaller: Callable[[Any], PeriodicModel]
+) -> str:
     """Return a sentence if a model with one dimension less at each section is nearly as good, or
     the data do not determine the multipliers; else "".
 
@@ -410,7 +474,9 @@ def _surplus(fit: LDTPFit, point: ModelPoint, smaller: Callable[[Any], PeriodicM
     with suppress(DefinitionError):
         if min(dims) > 0 and not unknown:
             start = ModelPoint(point.problem, smaller(dims), point.direct)
-            fewer, _ = descend(start, FIRST_DAMPING, max_steps=10)  # (enough to come near)
+            fewer, _ = descend(
+                start, FIRST_DAMPING, max_steps=10
+            )  # (enough to come near)
             unit = 1.0 if fit.covariance_freedom == np.inf else point.cost / fit.freedom
             rise = max(point.problem.cost(fewer.model) - point.cost, 0.0) / unit
             degrees = point.coordinates.size - fewer.coordinates.size
@@ -441,7 +507,9 @@ def _finished(
         if known:
             unit = weights.estimated_noise(weights.largest_misfit(data), unit)[1] ** 2
         size = problem.weight * problem.target
-        correlation = weights.neighbor_correlation(problem.errors(model), size, np.asarray(data.f))
+        correlation = weights.neighbor_correlation(
+            problem.errors(model), size, np.asarray(data.f)
+        )
     else:
         S = cast(SeriesProblem, point.problem).S
         noise = prediction.noise_model(model, S, scale, data.outputs)
@@ -484,7 +552,9 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
     """
     exact = exact_htf(model, htf)
-    minimal = realize(np.asarray(model.impulse_response(2 * default_horizon(model.n_sections) + 1)))
+    minimal = realize(
+        np.asarray(model.impulse_response(2 * default_horizon(model.n_sections) + 1))
+    )
     scale = weights.check_values(exact)
     problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
     direct = bool(np.asarray(model.D).any())

@@ -25,7 +25,12 @@ from jaxtyping import Complex, Float
 
 from ...linear.htf import HTF
 from ..descent import NormalEquations, Point
-from ..periodic import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
+from ..periodic import (
+    LocalCoordinates,
+    PeriodicModel,
+    characteristic_slopes,
+    local_coordinates,
+)
 from ..series.prediction import SeriesProblem
 
 
@@ -44,14 +49,19 @@ class FrequencyProblem(NamedTuple):
 
     @classmethod
     def of(
-        cls, htf: HTF, weight: Float[np.ndarray, "M F ny nu"], scale: Float[np.ndarray, " ny"]
+        cls,
+        htf: HTF,
+        weight: Float[np.ndarray, "M F ny nu"],
+        scale: Float[np.ndarray, " ny"],
     ) -> "FrequencyProblem":
         """Return the problem with outputs in units of `scale`.
 
         **Arguments:** `weight`: for outputs in their own units.
         """
         size = scale[:, None]
-        return cls(np.asarray(htf.f), htf.harmonics, np.asarray(htf.H) / size, weight * size)
+        return cls(
+            np.asarray(htf.f), htf.harmonics, np.asarray(htf.H) / size, weight * size
+        )
 
     @property
     def residuals(self) -> int:
@@ -87,7 +97,9 @@ def transfer(
     """Return the harmonic transfer functions of a model."""
     N = model.n_sections
     states = zip(states_at(model, f), model.C, model.D, strict=True)
-    G = np.stack([_real_times(C, x) + D[:, None] for x, C, D in states])  # (N, ny, F, nu)
+    G = np.stack(
+        [_real_times(C, x) + D[:, None] for x, C, D in states]
+    )  # (N, ny, F, nu)
     waves = np.exp(-2j * np.pi / N * np.outer(harmonics, np.arange(N))) / N
     return np.tensordot(waves, G, 1).swapaxes(1, 2)
 
@@ -103,7 +115,9 @@ def transfer_slopes(
     N, (ny, nu) = model.n_sections, model.D[0].shape
     weight = np.ones((len(m), len(f), ny, nu)) if weight is None else weight
     # Derivatives by later states are those of the transposed system, in the other order.
-    dual = model._replace(A=[A.T for A in model.A[::-1]], B=[C.T for C in model.C[::-1]])
+    dual = model._replace(
+        A=[A.T for A in model.A[::-1]], B=[C.T for C in model.C[::-1]]
+    )
     step = max(_HELD // (coordinates.size * len(m) * ny * nu), 1)
     for rows in (slice(k, min(k + step, len(f))) for k in range(0, len(f), step)):
         w, states = weight[:, rows], states_at(model, f[rows])
@@ -115,10 +129,14 @@ def transfer_slopes(
             shapes = dict(coordinates.blocks(n))
             left = _real_times(coordinates.to_A[n].T, after)  # (q, M, F, ny)
             left += coordinates.to_C[n].T[:, None, None, :] * wave
-            Y, B, K = (J[at[name]].reshape(*shapes[name], *w.shape) for name in ("Y", "B", "K"))
+            Y, B, K = (
+                J[at[name]].reshape(*shapes[name], *w.shape) for name in ("Y", "B", "K")
+            )
             outputs = _real_times(model.C[n], states[n]) + model.D[n][:, None]
             for j in range(nu):
-                x, y = (z[None, :, None, :, None, j] for z in (states[n], outputs))  # (1 d 1 F 1)
+                x, y = (
+                    z[None, :, None, :, None, j] for z in (states[n], outputs)
+                )  # (1 d 1 F 1)
                 np.multiply((left * w[..., j])[:, None], x, out=Y[..., j])
                 B[:, j, ..., j] = after * w[..., j]
                 K[..., j] = (after * w[..., j])[:, None] * y[:, : K.shape[1]]
@@ -148,7 +166,9 @@ def states_at(
 
     _, forced = around(np.zeros((len(phi), len(f), nu), complex))
     turn = phi * np.exp(-2j * np.pi * f)[:, None, None]
-    return around(np.einsum("fab,bfj->afj", np.linalg.inv(np.eye(len(phi)) - turn), forced))[0]
+    return around(
+        np.einsum("fab,bfj->afj", np.linalg.inv(np.eye(len(phi)) - turn), forced)
+    )[0]
 
 
 def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
@@ -213,8 +233,12 @@ class ModelPoint(Point):
         if gain > _SETTLED_GAIN * size * unit:
             return False
         _, slopes = characteristic_slopes(self.coordinates)
-        change = np.linalg.lstsq(slopes @ self.equations.spread().root, slopes @ step)[0]
+        change = np.linalg.lstsq(slopes @ self.equations.spread().root, slopes @ step)[
+            0
+        ]
         return bool(change @ change <= _SETTLED_SHIFT * unit * len(slopes))
 
     def stalled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
-        return bool(gain <= _STALLED_GAIN * self.cost or np.abs(step).max() < _STALLED_STEP)
+        return bool(
+            gain <= _STALLED_GAIN * self.cost or np.abs(step).max() < _STALLED_STEP
+        )

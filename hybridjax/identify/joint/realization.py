@@ -30,7 +30,9 @@ _NOISE_MARGIN = 1.1
 @checked
 def realize(
     source: HTF | SeriesFit | Annotated[Numbers, Reals("sections lags outputs inputs")],
-    dims: Order | Annotated[Numbers, Integers("sections", sign="positive")] | None = None,
+    dims: Order
+    | Annotated[Numbers, Integers("sections", sign="positive")]
+    | None = None,
     *,
     order: Order = 1,
 ) -> LDTP:
@@ -71,7 +73,9 @@ def realize(
         N, inputs, outputs = source.n_sections, source.inputs, source.outputs
         p = default_horizon(N)
         markov = source.impulse_response(2 * p + 1)
-        spread = (source.roots**2).sum(axis=4).mean(axis=(0, 2)) * source.noise[:, None] ** 2
+        spread = (source.roots**2).sum(axis=4).mean(axis=(0, 2)) * source.noise[
+            :, None
+        ] ** 2
     else:
         markov = np.asarray(source)
         N, lags = markov.shape[:2]
@@ -80,14 +84,20 @@ def realize(
             raise DefinitionError(f"{lags} lags are too few: 3 or more are needed.")
         spread = np.mean(markov**2, axis=(0, 1))
     ny, nu = markov.shape[2:]
-    edge = 0.0 if inputs is None else _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(p * nu))
+    edge = (
+        0.0
+        if inputs is None
+        else _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(p * nu))
+    )
     # Outputs and inputs in units of their noise, or else of the responses.
     unit = _scale(np.sqrt(spread.mean(axis=0)))
     scale = _scale(np.sqrt((spread / unit**2).mean(axis=1)))
     markov = markov / scale[:, None] / unit
 
     hankels = [
-        np.block([[markov[(n + i) % N, i + j + 1] for j in range(p)] for i in range(p + 1)])
+        np.block(
+            [[markov[(n + i) % N, i + j + 1] for j in range(p)] for i in range(p + 1)]
+        )
         for n in range(N)
     ]
     bases = _bases(hankels, given_dims(dims, N), order, edge, ny)
@@ -131,17 +141,24 @@ def _bases(
     return bases
 
 
-def _shifted(bases: list[np.ndarray], ny: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _shifted(
+    bases: list[np.ndarray], ny: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return A and C from O_n: its first rows are C[n], the others O_{n+1} A[n]."""
     after = [*bases[1:], bases[0]]
-    A = [np.linalg.lstsq(O[:-ny], now[ny:])[0] for O, now in zip(after, bases, strict=True)]
+    A = [
+        np.linalg.lstsq(O[:-ny], now[ny:])[0]
+        for O, now in zip(after, bases, strict=True)
+    ]
     return A, [O[:ny] for O in bases]
 
 
 def _from_htf(htf: HTF, dims: Any, order: int) -> LDTP:
     f, N = np.asarray(htf.f), htf.n_sections
     if not np.isfinite(htf.H).all():
-        raise DefinitionError("the HTFs hold NaN or infinity: leave these frequencies out.")
+        raise DefinitionError(
+            "the HTFs hold NaN or infinity: leave these frequencies out."
+        )
     F, ny, nu = htf.H.shape[1:]
     p = min(default_horizon(N), F - 1)
     if p < 1:
@@ -160,9 +177,13 @@ def _from_htf(htf: HTF, dims: Any, order: int) -> LDTP:
         edge = _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(2 * F * nu))
 
     # One weight for each column, that of its noise, keeps the rows of an input as they are.
-    column = np.sqrt(np.mean(weight**2 * scale[:, None] ** 2, axis=1)).T.ravel()  # (nu F)
+    column = np.sqrt(
+        np.mean(weight**2 * scale[:, None] ** 2, axis=1)
+    ).T.ravel()  # (nu F)
     powers = np.exp(2j * np.pi / N * f) ** np.arange(p + 1)[:, None]
-    _, s, vh = np.linalg.svd(_real(np.kron(np.eye(nu), powers) * column), full_matrices=False)
+    _, s, vh = np.linalg.svd(
+        _real(np.kron(np.eye(nu), powers) * column), full_matrices=False
+    )
     Q = vh[s > ROUNDING * s[0]]
     matrices = []
     for n in range(N):
@@ -178,7 +199,9 @@ def _from_htf(htf: HTF, dims: Any, order: int) -> LDTP:
     B, K = ([np.zeros((len(a), columns)) for a in A] for columns in (nu, 0))
     model = PeriodicModel(A, B, C, D, K)
     unit, harmonics = scale[:, None], tuple(m.tolist())
-    problem = FrequencyProblem(f, harmonics, H / unit, np.broadcast_to(weight * unit, H.shape))
+    problem = FrequencyProblem(
+        f, harmonics, H / unit, np.broadcast_to(weight * unit, H.shape)
+    )
     for _ in range(2):  # the second time removes rounding errors
         model = model.refined(True, problem.linearize)
     return model.to_ldtp(scale, htf.inputs, htf.outputs)

@@ -11,7 +11,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, SignalNames, Vector
+from ..._core.boundary.kinds import (
+    Index,
+    Order,
+    PeriodCount,
+    Scalar,
+    SignalNames,
+    Vector,
+)
 from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
@@ -30,7 +37,13 @@ from ..multipliers import NoiseRatios, unsupported
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
 from .in_loop import LoopEquations
-from .linearization import Linearization, each_fit, filtered_response, linearize, minimize
+from .linearization import (
+    Linearization,
+    each_fit,
+    filtered_response,
+    linearize,
+    minimize,
+)
 from .output_error import OutputErrorProblem, SectionRegression, TooFewCycles
 from .records import (
     MAY_DRIFT,
@@ -90,13 +103,17 @@ class SeriesFit(MultiplierEstimate):
     reference: tuple[str, ...] = eqx.field(static=True, default=())
 
     @checked
-    def impulse_response(self, n_lags: PeriodCount) -> Float[np.ndarray, "N lags ny nu"]:
+    def impulse_response(
+        self, n_lags: PeriodCount
+    ) -> Float[np.ndarray, "N lags ny nu"]:
         """Return the Markov parameters: the response at section n to a unit input r sections
         earlier."""
         N, R, *shape = self.numerators.shape
         cycles = -(-max(self.lead + n_lags, R) // N)
         h = np.pad(self.numerators, ((0, 0), (0, cycles * N - R), (0, 0), (0, 0)))
-        h = divide_by_chi(self.coefficients, h.reshape(N, cycles, -1)).reshape(N, -1, *shape)
+        h = divide_by_chi(self.coefficients, h.reshape(N, cycles, -1)).reshape(
+            N, -1, *shape
+        )
         return h[:, self.lead : self.lead + n_lags]
 
     @checked
@@ -123,12 +140,27 @@ class SeriesFit(MultiplierEstimate):
         H = sum_up(self.numerators)
         delays = period_delay ** np.arange(1, len(self.coefficients) + 1)[:, None]
         slope = sum_up(self.slopes) - (delays / below)[:, None, :, None, None] * H
-        by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj()).real
+        by_c = np.einsum(
+            "amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj()
+        ).real
         spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
-        by_b = (np.abs(spread) ** 2).sum(axis=(1, 4)) / N**2 / np.abs(below)[:, None, None] ** 2
+        by_b = (
+            (np.abs(spread) ** 2).sum(axis=(1, 4))
+            / N**2
+            / np.abs(below)[:, None, None] ** 2
+        )
         variance = by_c + by_b * self.noise[:, None] ** 2
         variance = np.where(np.isnan(variance), np.inf, variance)
-        return HTF(f, H, harmonics, N, self.inputs, self.outputs, "series fit", variance=variance)
+        return HTF(
+            f,
+            H,
+            harmonics,
+            N,
+            self.inputs,
+            self.outputs,
+            "series fit",
+            variance=variance,
+        )
 
     def _about(self) -> str:
         noise = signal_values(self.outputs, self.noise)
@@ -152,7 +184,9 @@ class SeriesFit(MultiplierEstimate):
         for n, root in enumerate(self.roots.reshape(N, ny, R * nu, r)):
             yield np.tensordot(lagged_inputs(v, n, R, self.lead), root, (2, 1))
 
-    def predict(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "S T N ny"]:
+    def predict(
+        self, grid: CycleGrid, free_start: bool
+    ) -> Float[np.ndarray, "S T N ny"]:
         """Return the outputs from the inputs, and from the starts and drift that fit best."""
         N, R, ny, nu = self.numerators.shape
         v, T = divide_by_chi(self.coefficients, grid.u), grid.u.shape[1]
@@ -160,13 +194,22 @@ class SeriesFit(MultiplierEstimate):
         free = min(self.free_cycles, T) if free_start else 0
         out = np.zeros(grid.y.shape)
         for n, i in np.ndindex(N, ny):
-            forced = lagged_inputs(v, n, R, self.lead) @ self.numerators[n, :, i].reshape(-1, 1)
+            forced = lagged_inputs(v, n, R, self.lead) @ self.numerators[
+                n, :, i
+            ].reshape(-1, 1)
             starts = start_responses(self.coefficients, grid.first[:, n], T, free)
-            unknown, none = np.concatenate([starts, grid.drift], axis=2), grid.drift[:, :, :0]
-            regression = SectionRegression.make(forced, unknown, none, grid.sampled[:, :, n, i])
+            unknown, none = (
+                np.concatenate([starts, grid.drift], axis=2),
+                grid.drift[:, :, :0],
+            )
+            regression = SectionRegression.make(
+                forced, unknown, none, grid.sampled[:, :, n, i]
+            )
             y, sampled = grid.y[:, :, n, i], grid.sampled[:, :, n, i]
             error = regression.residual(np.ones(1), y).reshape(y.shape)
-            out[:, :, n, i] = np.where(sampled, y - error, regression.response(np.ones(1), y))
+            out[:, :, n, i] = np.where(
+                sampled, y - error, regression.response(np.ones(1), y)
+            )
         return out
 
 
@@ -216,21 +259,34 @@ def fit_series(
         fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
         more = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
         return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), check))
-    records = data if isinstance(data, PreparedRecords) else PreparedRecords(data, start == "free")
+    records = (
+        data
+        if isinstance(data, PreparedRecords)
+        else PreparedRecords(data, start == "free")
+    )
     overhang = records.n_sections if overhang is None else overhang
 
     def weighted(order: int):
-        problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
+        problem = OutputErrorProblem.from_data(
+            records, order, overhang, start == "free"
+        )
         delayed = late_outputs(problem, order)
         solution, _ = minimize(problem, total_least_squares(delayed))
         _require_freedom(problem, solution)
         noise = _noise(solution)  # the weights that the residuals suggest
         problem = problem._replace(scale=problem.scale * noise)
         solution, converged = minimize(problem, solution.c)
-        return _noise_ratios(delayed, noise * _noise(solution)), problem, solution, converged
+        return (
+            _noise_ratios(delayed, noise * _noise(solution)),
+            problem,
+            solution,
+            converged,
+        )
 
     ratios, problem, solution, converged = weighted(order)
-    fit = assemble(problem, solution, coefficient_covariance(problem, solution), converged)
+    fit = assemble(
+        problem, solution, coefficient_covariance(problem, solution), converged
+    )
     grid = records.whole()
     error = np.where(grid.sampled, grid.y - fit.predict(grid, start == "free"), 0.0)
     feedback = answering(grid, error, records.inputs)
@@ -240,7 +296,9 @@ def fit_series(
         cause = about_answering(feedback, _BIASED) or drift
         raise DefinitionError(f"{surplus}, or pass check=False{cause and '; '}{cause}.")
     # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
-    more = [partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)]
+    more = [
+        partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)
+    ]
     doubt = "; ".join(filter(None, [surplus, drift])) or fit.contradiction(more)
     return dataclasses.replace(fit, feedback=feedback, doubt=warned(doubt, check))
 
@@ -252,7 +310,10 @@ def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> 
     multipliers that may be 1, which a constant resembles.
     """
     # (It is refused where an input acts later than the records begin, or drift was declared.)
-    slow, order = (lambda: PreparedRecords(with_drift(records.records))), len(fit.coefficients)
+    slow, order = (
+        (lambda: PreparedRecords(with_drift(records.records))),
+        len(fit.coefficients),
+    )
     may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
 
     def drifting() -> RoughFit:
@@ -271,7 +332,9 @@ def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> 
     return doubt
 
 
-def _of_order(order: int, records: PreparedRecords, fit: SeriesFit, free_start: bool) -> RoughFit:
+def _of_order(
+    order: int, records: PreparedRecords, fit: SeriesFit, free_start: bool
+) -> RoughFit:
     """Fit a higher order roughly, beginning at a fit.
 
     **Raises:** `DefinitionError` for too few cycles.
@@ -298,7 +361,10 @@ def _rough(problem: OutputErrorProblem, start: Coefficients) -> RoughFit:
 
 
 def assemble(
-    problem: OutputErrorProblem, solution: Linearization, covariance: Covariance, converged: bool
+    problem: OutputErrorProblem,
+    solution: Linearization,
+    covariance: Covariance,
+    converged: bool,
 ) -> SeriesFit:
     """Return the fit with the denominator of a solution, in the units of the data."""
     N, nu, ny = problem.shape
@@ -306,10 +372,14 @@ def assemble(
     widest = max(fit.root.shape[1] for section in solution.fits for fit in section)
     numerators, slopes = np.zeros((N, columns, ny)), np.zeros((d, N, columns, ny))
     roots = np.zeros((N, ny, columns, widest))
-    for n, (section, to_lags) in enumerate(zip(solution.fits, problem.to_lags, strict=True)):
+    for n, (section, to_lags) in enumerate(
+        zip(solution.fits, problem.to_lags, strict=True)
+    ):
         for fit in section:
             numerators[n][:, fit.outputs] = to_lags @ fit.coefficients[..., 0]
-            slopes[:, n][..., fit.outputs] = to_lags @ np.moveaxis(fit.slopes[..., 0], 1, 0)
+            slopes[:, n][..., fit.outputs] = to_lags @ np.moveaxis(
+                fit.slopes[..., 0], 1, 0
+            )
             roots[n, fit.outputs, :, : fit.root.shape[1]] = to_lags @ fit.root
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
@@ -336,7 +406,9 @@ def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
     return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), SMALLEST_ERROR)
 
 
-def missing_cycles(problem: OutputErrorProblem, solution: Linearization, least: int) -> int:
+def missing_cycles(
+    problem: OutputErrorProblem, solution: Linearization, least: int
+) -> int:
     """Return how many more cycles would leave this number of degrees of freedom, about."""
     n, i = np.unravel_index(np.argmin(solution.freedom), solution.freedom.shape)
     # (More lags than samples would use up more of them.)
@@ -351,7 +423,9 @@ def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> No
         raise TooFewCycles(problem, n, i, missing)
 
 
-def _noise_ratios(delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"]) -> NoiseRatios:
+def _noise_ratios(
+    delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"]
+) -> NoiseRatios:
     """Return the ratios of a fit to outputs with noise of this standard deviation."""
     rows = max(delayed.freedom, 1)
     gram = (delayed.gram / noise[:, None, None] ** 2).sum(axis=0)
@@ -363,19 +437,28 @@ def _noise_ratios(delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"]) -> N
 _WHITE_DRAWS, _FILTERED_DRAWS = 4, 16
 
 
-def coefficient_covariance(problem: OutputErrorProblem, solution: Linearization) -> Covariance:
+def coefficient_covariance(
+    problem: OutputErrorProblem, solution: Linearization
+) -> Covariance:
     """Return the covariance of c, for errors that may depend on each other and on the inputs."""
 
     def draws(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         sampled = part.sampled[:, :, n, :, None]
-        white = np.random.default_rng((k, n)).standard_normal((*sampled.shape[:3], _WHITE_DRAWS))
+        white = np.random.default_rng((k, n)).standard_normal(
+            (*sampled.shape[:3], _WHITE_DRAWS)
+        )
         return white * sampled
 
     noise = linearize(problem, solution.c, draws).curvature / _WHITE_DRAWS
-    curvature, whole = (solution.curvature - noise).sum(axis=0), solution.curvature.sum(axis=0)
+    curvature, whole = (
+        (solution.curvature - noise).sum(axis=0),
+        solution.curvature.sum(axis=0),
+    )
     if not np.linalg.eigvalsh(whole)[0] > 0:
         return sandwich(curvature, whole)
-    lags = denominator.correlated_cycles(multipliers_of(solution.c), problem.records.cycles)
+    lags = denominator.correlated_cycles(
+        multipliers_of(solution.c), problem.records.cycles
+    )
     gradient = gradient_covariance(problem, solution, lags + 1)
     return sandwich(curvature, gradient.matrix)._replace(freedom=gradient.freedom)
 
@@ -398,14 +481,18 @@ def gradient_covariance(
     def outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         """Return the outputs, and noise filtered by the system."""
         y = part.y[:, :, n, :, None]
-        draws = np.random.default_rng((k, n)).standard_normal((*y.shape[:3], _FILTERED_DRAWS))
+        draws = np.random.default_rng((k, n)).standard_normal(
+            (*y.shape[:3], _FILTERED_DRAWS)
+        )
         return np.concatenate([y, divide_by_chi(memory, draws)], axis=-1)
 
     def section(k, part, n, fit, regression):
         count = max(1, part.y.shape[1] // cycles)
         sampled = part.sampled[:, :, n, fit.outputs, None]
 
-        def backward(x):  # its product with white noise is that of x with filtered noise
+        def backward(
+            x,
+        ):  # its product with white noise is that of x with filtered noise
             return divide_by_chi(memory, (sampled * x)[:, ::-1])
 
         rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)
@@ -414,7 +501,9 @@ def gradient_covariance(
         x = outputs(k, part, n)[:, :, fit.outputs]
         error = regression.residual(fit.coefficients, x).reshape(x.shape)
         a, by_c, y = (v[..., :1] for v in (fit.coefficients, fit.slopes, x))
-        slopes = regression.residual(by_c, filtered_response(a, solution.c, regression, y))
+        slopes = regression.residual(
+            by_c, filtered_response(a, solution.c, regression, y)
+        )
         slopes = np.moveaxis(slopes[..., 0], 1, -1).reshape(*error.shape[:3], d)
         square = [(x**2).sum(axis=(0, 1, 2)) for x in (error, backward(error))]
         late = backward(slopes)
@@ -429,7 +518,8 @@ def gradient_covariance(
     fits = linearize(problem, solution.c, outputs).fits
     results = each_fit(problem, solution._replace(fits=fits), section)
     score, by_white = (
-        np.concatenate([sum(result[i] for result in grid) for grid in results]) for i in (0, 1)
+        np.concatenate([sum(result[i] for result in grid) for grid in results])
+        for i in (0, 1)
     )
     squares = np.sum([result[2] for grid in results for result in grid], axis=0)
     filtered = sum(result[3] for grid in results for result in grid)

@@ -63,9 +63,13 @@ def predicted(
     records = PreparedRecords(closed)
     grid = without_drift(records.whole())
     # (In units of what is left, or large drifts decide what the model explains.)
-    records.scale = np.maximum(np.sqrt((grid.y**2).mean(axis=(0, 1, 2))), RANK * records.scale)
+    records.scale = np.maximum(
+        np.sqrt((grid.y**2).mean(axis=(0, 1, 2))), RANK * records.scale
+    )
     model = subspace_model(records, [order] * records.n_sections, False)
-    predictor = Predictor(model, np.tile(np.eye(len(records.outputs)), (len(model.A), 1, 1)))
+    predictor = Predictor(
+        model, np.tile(np.eye(len(records.outputs)), (len(model.A), 1, 1))
+    )
     return predictor.predict(grid, False) * records.scale
 
 
@@ -96,16 +100,25 @@ class Solution(NamedTuple):
     """The number of multipliers that the references determine."""
 
 
-def best_order(data: RecordedData, reference: Sequence[str], most: int) -> tuple[int, str]:
+def best_order(
+    data: RecordedData, reference: Sequence[str], most: int
+) -> tuple[int, str]:
     """Return the largest number of multipliers, up to `most`, that the references determine, and
     the obstacle to a larger number, if there was one."""
     obstacle = ""
     for order in range(most, 1, -1):
         try:
-            if LoopEquations(*in_loop(data, reference), order, None).solution.determined >= order:
+            if (
+                LoopEquations(
+                    *in_loop(data, reference), order, None
+                ).solution.determined
+                >= order
+            ):
                 return order, obstacle
             obstacle = ""
-        except DefinitionError as error:  # too few cycles for so many: a finding shows its text
+        except (
+            DefinitionError
+        ) as error:  # too few cycles for so many: a finding shows its text
             obstacle = str(error)
     return 1, obstacle
 
@@ -113,21 +126,34 @@ def best_order(data: RecordedData, reference: Sequence[str], most: int) -> tuple
 class LoopEquations:
     """The equations of all sections."""
 
-    def __init__(self, plant: list[Record], drive: list[Record], order: int, overhang: int | None):
-        self.records, self.order, self.reference = PreparedRecords(plant), order, drive[0].inputs
+    def __init__(
+        self, plant: list[Record], drive: list[Record], order: int, overhang: int | None
+    ):
+        self.records, self.order, self.reference = (
+            PreparedRecords(plant),
+            order,
+            drive[0].inputs,
+        )
         self.grid = self.records.whole()
         N, z = self.records.n_sections, predicted(plant, drive, order)
         span = N if overhang is None else overhang
         self.lags = self.records.lead + order * N + span + 1
         self.sections = [self._section(n, z, order + -(-span // N)) for n in range(N)]
 
-    def _section(self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int) -> SectionEquations:
+    def _section(
+        self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int
+    ) -> SectionEquations:
         grid, delays = self.grid, range(self.order + 1)
         (_, T, _, nu), ny = grid.u.shape, grid.y.shape[3]
         sampled = [delay_cycles(grid.sampled[:, :, n], j).all(axis=2) for j in delays]
         used = np.all(sampled, axis=0) & (np.arange(T) >= grid.first[:, n, None] + free)
-        signals = [lagged_inputs(x, n, self.lags, self.records.lead) for x in (z[..., :nu], grid.u)]
-        signals += [delay_cycles(x[:, :, n], j) for x in (z[..., nu:], grid.y) for j in delays]
+        signals = [
+            lagged_inputs(x, n, self.lags, self.records.lead)
+            for x in (z[..., :nu], grid.u)
+        ]
+        signals += [
+            delay_cycles(x[:, :, n], j) for x in (z[..., nu:], grid.y) for j in delays
+        ]
         rows = SectionRegression.make(
             np.concatenate(signals, axis=2), grid.drift[:, :, :0], grid.drift, used
         ).remainder
@@ -137,7 +163,11 @@ class LoopEquations:
         noise = np.linalg.norm((U - Z) @ V.T, axis=0) / np.sqrt(max(used.sum(), 1))
         kept = size > np.maximum(_EXCITED * noise, RANK * size.max(initial=0))
         to_lags = V[kept].T / size[kept]
-        Z, U, inverse = Z @ to_lags, U @ to_lags, np.linalg.inv(to_lags.T @ (Z.T @ U) @ to_lags)
+        Z, U, inverse = (
+            Z @ to_lags,
+            U @ to_lags,
+            np.linalg.inv(to_lags.T @ (Z.T @ U) @ to_lags),
+        )
         late = late.reshape(len(late), 2, -1, ny)
         predictions, y = (np.swapaxes(late[:, k], 1, 2) for k in (0, 1))
         fitted = np.tensordot(inverse @ Z.T, y, 1)
@@ -157,8 +187,15 @@ class LoopEquations:
         **Raises:** `DefinitionError` as `solve`.
         """
         c, covariance, noise = self.solve(check)
-        N, R, nu, ny = *self.grid.u.shape[2:3], self.lags, self.grid.u.shape[3], len(noise)
-        b = np.array([x.numerators.reshape(R, nu, ny, -1).swapaxes(1, 2) for x in self.sections])
+        N, R, nu, ny = (
+            *self.grid.u.shape[2:3],
+            self.lags,
+            self.grid.u.shape[3],
+            len(noise),
+        )
+        b = np.array(
+            [x.numerators.reshape(R, nu, ny, -1).swapaxes(1, 2) for x in self.sections]
+        )
         roots = np.zeros((N, ny, R, nu, max(x.root.shape[1] for x in self.sections)))
         for n, x in enumerate(self.sections):
             roots[n, ..., : x.root.shape[1]] = x.root.reshape(R, nu, -1)
@@ -193,7 +230,9 @@ class LoopEquations:
         freedom = sum(x.freedom for x in sections)
         for _ in range(2):  # the second time with the weights that the errors suggest
             y, W = (
-                np.array([x[k] / scale[:, None] for x in sections]).reshape(-1, d + 1 - k)
+                np.array([x[k] / scale[:, None] for x in sections]).reshape(
+                    -1, d + 1 - k
+                )
                 for k in (0, 1)
             )
             along = W.T @ y
@@ -208,7 +247,9 @@ class LoopEquations:
         determined = int((part * freedom * len(scale) > _DETERMINED * (1 - part)).sum())
         return Solution(c, along, scale, determined)
 
-    def solve(self, check: bool) -> tuple[Coefficients, Covariance, Float[np.ndarray, " ny"]]:
+    def solve(
+        self, check: bool
+    ) -> tuple[Coefficients, Covariance, Float[np.ndarray, " ny"]]:
         """Return c, its covariance, and the standard deviations of the outputs' errors.
 
         **Raises:** `DefinitionError` for too few cycles, or, with `check`, for an order of which
@@ -222,15 +263,25 @@ class LoopEquations:
             )
         if determined < d:
             return c, Covariance.unknown(d), scale
-        cycles = denominator.correlated_cycles(multipliers_of(c), self.records.cycles) + 1
+        cycles = (
+            denominator.correlated_cycles(multipliers_of(c), self.records.cycles) + 1
+        )
         blocks = max(1, self.records.cycles // max(cycles, _BLOCK))
-        score = np.sum([self._scores(x, c, scale, blocks) for x in self.sections], axis=0)
+        score = np.sum(
+            [self._scores(x, c, scale, blocks) for x in self.sections], axis=0
+        )
         score = score[score.any(axis=1)]
         half = np.linalg.solve(along, score.T)
         share = np.tile(np.eye(d) / len(score), (len(score), 1, 1))
-        return c, Covariance(half @ half.T, denominator.block_freedom(score, share)), scale
+        return (
+            c,
+            Covariance(half @ half.T, denominator.block_freedom(score, share)),
+            scale,
+        )
 
-    def _scores(self, section: SectionEquations, c, scale, count: int) -> Float[np.ndarray, "B d"]:
+    def _scores(
+        self, section: SectionEquations, c, scale, count: int
+    ) -> Float[np.ndarray, "B d"]:
         """Return the sums of errors times instruments over blocks of cycles.
 
         The errors of a block are those of numerators that are fitted to the other blocks."""
@@ -240,5 +291,9 @@ class LoopEquations:
 
         error = blocks(section.outputs @ [1.0, *c] / scale)
         taken = blocks(section.taken[0]) @ blocks(section.taken[1]).swapaxes(1, 2)
-        error = denominator.inverse_of_remainder((taken + taken.swapaxes(1, 2)) / 2) @ error
-        return np.einsum("bki,bkid->bd", error, blocks(section.instruments / scale[:, None]))
+        error = (
+            denominator.inverse_of_remainder((taken + taken.swapaxes(1, 2)) / 2) @ error
+        )
+        return np.einsum(
+            "bki,bkid->bd", error, blocks(section.instruments / scale[:, None])
+        )

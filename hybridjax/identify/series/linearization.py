@@ -11,7 +11,13 @@ from jaxtyping import Float, Int
 from ..._core.execution import on_all_cores
 from ..descent import ROUGH, Coefficients, least_squares
 from .output_error import OutputErrorProblem, SectionRegression, root_of
-from .records import CycleGrid, delay_cycles, divide_by_chi, lagged_inputs, start_responses
+from .records import (
+    CycleGrid,
+    delay_cycles,
+    divide_by_chi,
+    lagged_inputs,
+    start_responses,
+)
 
 
 Outputs = Callable[[int, CycleGrid, int], Float[np.ndarray, "S T ny C"]]
@@ -59,7 +65,9 @@ class SectionFit(NamedTuple):
         first = solve(_total(r.along(r.reduced(x)) for r, x in pairs))
         a = first + solve(_total(r.along(r.residual(first, x)) for r, x in pairs))
         fitted = (r.reduced(filtered_response(first, c, r, x)) for r, x in pairs)
-        slopes = solve(_total(r.along(x) for r, x in zip(regressions, fitted, strict=True)))
+        slopes = solve(
+            _total(r.along(x) for r, x in zip(regressions, fitted, strict=True))
+        )
         errors = [r.residual(a, x) for r, x in pairs]
         by_c = [r.residual(slopes, filtered_response(a, c, r, x)) for r, x in pairs]
         missed = _total(r.along(s) for r, s in zip(regressions, by_c, strict=True))
@@ -71,7 +79,9 @@ class SectionFit(NamedTuple):
             slopes,
             sum(r.freedom for r in regressions),
             _total(np.einsum("rmk,rml->mkl", x, x) for x in errors),
-            _total(np.einsum("rjmk,rmk->mj", *x) for x in zip(by_c, errors, strict=True)),
+            _total(
+                np.einsum("rjmk,rmk->mj", *x) for x in zip(by_c, errors, strict=True)
+            ),
             curvature - np.einsum("rimk,rjmk->mij", missed, solve(missed)),
         )
 
@@ -109,7 +119,9 @@ class Linearization(NamedTuple):
     fits: list[list[SectionFit]]
     """The fits of each section."""
 
-    def as_residuals(self) -> tuple[Float[np.ndarray, " d1"], Float[np.ndarray, "d1 d"]]:
+    def as_residuals(
+        self,
+    ) -> tuple[Float[np.ndarray, " d1"], Float[np.ndarray, "d1 d"]]:
         """Return d + 1 residuals with their Jacobian that have the same sums."""
         values, vectors = np.linalg.eigh(self.curvature.sum(axis=0))
         size = np.sqrt(np.maximum(values, 0))
@@ -136,7 +148,9 @@ def sum_up(
         columns = [outputs(k, part, n) for k, part in enumerate(parts)]
         return [
             SectionFit.of(alike, c, list(each), [x[:, :, alike] for x in columns])
-            for alike, each in zip(problem.alike[n], zip(*regressions, strict=True), strict=True)
+            for alike, each in zip(
+                problem.alike[n], zip(*regressions, strict=True), strict=True
+            )
         ]
 
     return on_all_cores(section, range(problem.records.n_sections))
@@ -171,7 +185,10 @@ def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> Regress:
     inputs = [divide_by_chi(c, part.u) for part in problem.parts()]
 
     def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
-        rows = lagged_inputs(inputs[k], n, problem.lags, problem.records.lead) @ problem.to_lags[n]
+        rows = (
+            lagged_inputs(inputs[k], n, problem.lags, problem.records.lead)
+            @ problem.to_lags[n]
+        )
         T = part.y.shape[1]
         starts = start_responses(c, part.first[:, n], T, min(problem.free, T))
         sampled = (part.sampled[:, :, n, alike[0]] for alike in problem.alike[n])
@@ -193,7 +210,9 @@ def each_fit(
         return [work(k, parts[k], n, *pair) for pair in pairs]
 
     sections = range(problem.records.n_sections)
-    by_part = (on_all_cores(functools.partial(section, k), sections) for k in range(len(parts)))
+    by_part = (
+        on_all_cores(functools.partial(section, k), sections) for k in range(len(parts))
+    )
     return [list(itertools.chain(*by_section)) for by_section in by_part]
 
 
@@ -211,5 +230,7 @@ def minimize(
             last[:] = [linearize(problem, c)]
         return last[0]
 
-    c, converged = least_squares(lambda c: at(c).as_residuals(), start, **(ROUGH if rough else {}))
+    c, converged = least_squares(
+        lambda c: at(c).as_residuals(), start, **(ROUGH if rough else {})
+    )
     return at(c), converged

@@ -105,7 +105,9 @@ class SectionRegression(NamedTuple):
         """Return the response to the inputs and to the initial conditions that fit x best."""
         x_columns = x.reshape(*x.shape[:2], -1)
         forced = self.inputs @ a.reshape(len(a), x_columns.shape[2])
-        free = self.to_starts @ (self.basis.swapaxes(1, 2) @ (self.weight * (x_columns - forced)))
+        free = self.to_starts @ (
+            self.basis.swapaxes(1, 2) @ (self.weight * (x_columns - forced))
+        )
         return (forced + self.starts @ free).reshape(x.shape)
 
 
@@ -151,16 +153,23 @@ class OutputErrorProblem(NamedTuple):
             return np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
 
         # One section tells, before the work on all, that nothing is left of its samples.
-        n, i = map(int, np.unravel_index(np.argmin(records.sampled), records.sampled.shape))
+        n, i = map(
+            int, np.unravel_index(np.argmin(records.sampled), records.sampled.shape)
+        )
         rows = triangle(n)
-        if records.sampled[n, i] <= lags * nu and _independent(rows, nu).shape[1] == len(rows):
+        if records.sampled[n, i] <= lags * nu and _independent(rows, nu).shape[
+            1
+        ] == len(rows):
             problem = cls(records, lags, free, [], [], records.scale)
             raise TooFewCycles(problem, n, i, order + 1 - problem.freedom_left(n, i))
         triangles, equal = on_all_cores(triangle, range(N)), np.ones((N, ny, ny), bool)
         for grid in records.grids:
             for i in range(ny):
                 equal[:, i] &= (grid.sampled == grid.sampled[..., [i]]).all(axis=(0, 1))
-        alike = [[np.flatnonzero(x).tolist() for x in np.unique(e, axis=0)[::-1]] for e in equal]
+        alike = [
+            [np.flatnonzero(x).tolist() for x in np.unique(e, axis=0)[::-1]]
+            for e in equal
+        ]
         to_lags = on_all_cores(lambda x: _independent(x, nu), triangles)
         alone = [_independent(triangles[0][:, i::nu], 1).shape[1] for i in range(nu)]
         # (Ranks of inputs in a narrow band are not exact.)
@@ -173,11 +182,17 @@ class OutputErrorProblem(NamedTuple):
     @property
     def shape(self) -> tuple[int, int, int]:
         """N, and the numbers of inputs and outputs."""
-        return self.records.n_sections, len(self.records.inputs), len(self.records.outputs)
+        return (
+            self.records.n_sections,
+            len(self.records.inputs),
+            len(self.records.outputs),
+        )
 
     def freedom_left(self, n: int, i: int) -> int:
         """Return the samples of an output at a section less all unknowns."""
-        starts = (len(g.y) * (self.free + g.drift.shape[-1]) for g in self.records.grids)
+        starts = (
+            len(g.y) * (self.free + g.drift.shape[-1]) for g in self.records.grids
+        )
         return int(self.records.sampled[n, i]) - self.lags * self.shape[1] - sum(starts)
 
     def parts(self) -> list[CycleGrid]:
@@ -186,7 +201,9 @@ class OutputErrorProblem(NamedTuple):
 
 
 def _independent(triangle: np.ndarray, nu: int) -> np.ndarray:
-    size = np.linalg.norm(triangle.reshape(-1, nu), axis=0)  # inputs have units of their own
+    size = np.linalg.norm(
+        triangle.reshape(-1, nu), axis=0
+    )  # inputs have units of their own
     size = np.tile(np.where(size > 0, size, 1.0), triangle.shape[1] // nu)
     _, s, vh = np.linalg.svd(triangle / size, full_matrices=False)
     kept = s > RANK * s.max(initial=0)

@@ -143,13 +143,17 @@ class SeriesProblem(NamedTuple):
                 gram += flat.T @ flat
                 gradient += _times(path.whiten[n], path.error[n]).ravel() @ flat
                 along += path.starts[n].swapaxes(1, 2) @ J.reshape(R, -1, P)
-            gram -= np.tensordot(along, _solve_starts(path.start_gram, along), ((0, 1), (0, 1)))
+            gram -= np.tensordot(
+                along, _solve_starts(path.start_gram, along), ((0, 1), (0, 1))
+            )
         return NormalEquations(gram, gradient)
 
     def path(self, model: PeriodicModel, part: SeriesPart) -> Path:
         """Return states and errors for the initial states that fit best."""
         R, T = part.shape
-        given, whiten = zip(*[self._weights(part, n) for n in range(len(self.S))], strict=True)
+        given, whiten = zip(
+            *[self._weights(part, n) for n in range(len(self.S))], strict=True
+        )
         gain = [
             K @ G if K.shape[1] else np.zeros((1, 1, len(K), G.shape[-1]))
             for K, G in zip(model.K, given, strict=True)
@@ -164,11 +168,15 @@ class SeriesProblem(NamedTuple):
                 x[begins, 0, :, 1 : 1 + x.shape[2]] = np.eye(x.shape[2])
 
         def drive(n: int, later: Columns) -> None:
-            later[..., 0] += part.u[n] @ model.B[n].T + _times(gain[n], y[n] * part.sampled[n])
+            later[..., 0] += part.u[n] @ model.B[n].T + _times(
+                gain[n], y[n] * part.sampled[n]
+            )
 
         states, left, starts = [], [], []
         gram, along = np.zeros((R, s, s)), np.zeros((R, s, 1))
-        for n, x in enumerate(recursion(F, (R, T, 1 + s), enter, drive, [1 + s] * len(F))):
+        for n, x in enumerate(
+            recursion(F, (R, T, 1 + s), enter, drive, [1 + s] * len(F))
+        ):
             error = model.C[n] @ x
             error[..., 0] = y[n] - error[..., 0]
             error = part.without_drift(n, error)
@@ -193,9 +201,14 @@ class SeriesProblem(NamedTuple):
         whitens the sampled ones."""
         S, lost = self.S[n], part.lost[n]
         if not lost.any():
-            return np.eye(len(S))[None, None], np.linalg.inv(np.linalg.cholesky(S))[None, None]
+            return np.eye(len(S))[None, None], np.linalg.inv(np.linalg.cholesky(S))[
+                None, None
+            ]
         kept = 1.0 - lost
-        both = kept[..., :, None] * kept[..., None, :] * S + np.eye(len(S)) * lost[..., None]
+        both = (
+            kept[..., :, None] * kept[..., None, :] * S
+            + np.eye(len(S)) * lost[..., None]
+        )
         mean = (S * kept[..., None, :]) @ np.linalg.inv(both)
         return mean, np.linalg.inv(np.linalg.cholesky(both))
 
@@ -220,7 +233,10 @@ def recursion(
     - `filled`: number of columns that are not zero in the first cycle after each section.
     """
     R, T, columns = shape
-    x, phi = np.zeros((R, T, F[0].shape[-1], columns)), np.eye(F[0].shape[-1])[None, None]
+    x, phi = (
+        np.zeros((R, T, F[0].shape[-1], columns)),
+        np.eye(F[0].shape[-1])[None, None],
+    )
     for n, step in enumerate(F):
         enter(n, x)
         later = np.zeros((R, T, step.shape[-2], columns))
@@ -238,7 +254,9 @@ def recursion(
         drive(n, x)
 
 
-def slopes_of(coordinates: LocalCoordinates, part: SeriesPart, path: Path) -> Iterator[Columns]:
+def slopes_of(
+    coordinates: LocalCoordinates, part: SeriesPart, path: Path
+) -> Iterator[Columns]:
     """Iterate over the derivatives of the predictions at each section."""
     model, places = coordinates.model, coordinates.places
 
@@ -260,7 +278,9 @@ def slopes_of(coordinates: LocalCoordinates, part: SeriesPart, path: Path) -> It
         J = model.C[n] @ x
         J[..., places[n]["Y"]] += _outer(coordinates.to_C[n][None, None], path.x[n])
         if coordinates.direct:
-            J[..., places[n]["D"]] += _outer(np.eye(len(model.C[n]))[None, None], part.u[n])
+            J[..., places[n]["D"]] += _outer(
+                np.eye(len(model.C[n]))[None, None], part.u[n]
+            )
         yield J
 
 
@@ -269,7 +289,9 @@ def _times(matrix: np.ndarray, x: np.ndarray) -> np.ndarray:
     return (matrix @ x[..., None])[..., 0]
 
 
-def _outer(left: Float[np.ndarray, "R1 T1 a q"], right: Float[np.ndarray, "R T b"]) -> np.ndarray:
+def _outer(
+    left: Float[np.ndarray, "R1 T1 a q"], right: Float[np.ndarray, "R T b"]
+) -> np.ndarray:
     """Return (R, T, a, q b), the outer products of rows of the left matrix and right vectors."""
     product = left[..., None] * right[:, :, None, None, :]
     return product.reshape(*product.shape[:3], -1)
@@ -341,7 +363,9 @@ def noise_model(
         B, C = zero * np.ones(len(outputs)), np.zeros((len(S), len(outputs), 1))
         return LDTP(zero, B, C, D, None, names, outputs)
     B = [K @ root for K, root in zip(model.K, L, strict=True)]
-    return LDTP.from_blocks(model.A, B, [scale[:, None] * C for C in model.C], D, names, outputs)
+    return LDTP.from_blocks(
+        model.A, B, [scale[:, None] * C for C in model.C], D, names, outputs
+    )
 
 
 class Predictor(NamedTuple):
@@ -355,14 +379,20 @@ class Predictor(NamedTuple):
     def dims(self) -> list[int]:
         return self.model.dims
 
-    def predict(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "R T N ny"]:
+    def predict(
+        self, grid: CycleGrid, free_start: bool
+    ) -> Float[np.ndarray, "R T N ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
         part = SeriesPart.of(grid, np.ones(self.S.shape[1]))
         path = SeriesProblem([part], self.S, True, free_start, 0).path(self.model, part)
         states = zip(path.x, self.model.C, part.u, self.model.D, strict=True)
         outputs = np.stack([x @ C.T + u @ D.T for x, C, u, D in states])
-        return np.moveaxis(np.where(part.sampled, part.y - np.stack(path.error), outputs), 0, 2)
+        return np.moveaxis(
+            np.where(part.sampled, part.y - np.stack(path.error), outputs), 0, 2
+        )
 
-    def errors(self, grid: CycleGrid, free_start: bool) -> Float[np.ndarray, "R T N ny"]:
+    def errors(
+        self, grid: CycleGrid, free_start: bool
+    ) -> Float[np.ndarray, "R T N ny"]:
         """Return the errors of `predict`; NaN where an output was not sampled."""
         return np.where(grid.sampled, grid.y - self.predict(grid, free_start), np.nan)

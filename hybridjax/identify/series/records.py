@@ -9,7 +9,12 @@ from jaxtyping import Bool, Float, Int, Shaped
 from scipy.signal import lfilter
 
 from ...errors import DefinitionError
-from ...experiments.record import Record, RecordedData, require_deviations, uninterrupted_records
+from ...experiments.record import (
+    Record,
+    RecordedData,
+    require_deviations,
+    uninterrupted_records,
+)
 from ..descent import Coefficients
 
 
@@ -64,7 +69,9 @@ class CycleGrid(NamedTuple):
     @property
     def age(self) -> Int[np.ndarray, "S T N"]:
         """The number of samples from the start of each record to each sample, which counts."""
-        return np.cumsum(self.inside.reshape(len(self.u), -1), axis=1).reshape(self.inside.shape)
+        return np.cumsum(self.inside.reshape(len(self.u), -1), axis=1).reshape(
+            self.inside.shape
+        )
 
 
 def count_cycles(record: Record) -> int:
@@ -100,19 +107,29 @@ class PreparedRecords:
         """**Raises:** `DefinitionError` as `uninterrupted_records`, and for inputs that are
         zero and outputs that are constant at every sample, missing, or no deviations."""
         cut = _pieces if free_start else lambda record: [record]
-        self.records = uninterrupted_records(x for r in uninterrupted_records(data) for x in cut(r))
+        self.records = uninterrupted_records(
+            x for r in uninterrupted_records(data) for x in cut(r)
+        )
         names = "n_sections", "lead", "inputs", "outputs"
         self.about = {name: getattr(self.records[0], name) for name in names}
         self.n_sections, self.lead, self.inputs, self.outputs = self.about.values()
         self.grids = _grids(self.records)
         self.cycles = max(map(count_cycles, self.records))
-        self.sampled = np.sum([grid.sampled.sum(axis=(0, 1)) for grid in self.grids], axis=0)
-        u, y = (np.concatenate([getattr(r, name) for r in self.records]) for name in "uy")
-        varies = np.append(u.any(axis=0), np.fmax.reduce(y) > np.fmin.reduce(y))  # (without NaN)
+        self.sampled = np.sum(
+            [grid.sampled.sum(axis=(0, 1)) for grid in self.grids], axis=0
+        )
+        u, y = (
+            np.concatenate([getattr(r, name) for r in self.records]) for name in "uy"
+        )
+        varies = np.append(
+            u.any(axis=0), np.fmax.reduce(y) > np.fmin.reduce(y)
+        )  # (without NaN)
         for name, acts in zip(self.inputs + self.outputs, varies, strict=True):
             if not acts:
                 what = "constant" if name in self.outputs else "zero"
-                raise DefinitionError(f"{name} is {what} or missing: leave it out, or record more.")
+                raise DefinitionError(
+                    f"{name} is {what} or missing: leave it out, or record more."
+                )
         require_deviations(self.records)
         self.scale = np.sqrt(np.nansum(y**2, axis=0) / self.sampled.sum(axis=0))
 
@@ -126,7 +143,10 @@ def with_drift(records: Sequence[Record]) -> list[Record]:
 
     Records that may drift as fast already are left out.
     """
-    slower, n = [r for r in records if (r.drift or np.inf) > SLOW], 1000 * records[0].n_sections
+    slower, n = (
+        [r for r in records if (r.drift or np.inf) > SLOW],
+        1000 * records[0].n_sections,
+    )
     return [dataclasses.replace(r.part(0, n), drift=SLOW) for r in slower]
 
 
@@ -164,7 +184,9 @@ def delay_cycles(x: Columns, cycles: int, fill: float | bool = 0) -> Columns:
     """Delay x by a number of cycles; the first cycles become `fill`."""
     T = x.shape[1]
     cycles = min(cycles, T)
-    return np.concatenate([np.full_like(x[:, :cycles], fill), x[:, : T - cycles]], axis=1)
+    return np.concatenate(
+        [np.full_like(x[:, :cycles], fill), x[:, : T - cycles]], axis=1
+    )
 
 
 def divide_by_chi(c: Coefficients, x: Columns) -> Columns:

@@ -50,11 +50,15 @@ def whitened(error: Signals, spread: Sequence[Root]) -> Signals:
         for i in range(error.shape[3]):
             at = np.isfinite(error[:, :, n, i])
             left, s, _ = np.linalg.svd(root[:, :, i][at], full_matrices=False)
-            error[at, n, i] -= left @ ((left.T @ error[at, n, i]) * (1 - 1 / np.sqrt(1 + s**2)))
+            error[at, n, i] -= left @ (
+                (left.T @ error[at, n, i]) * (1 - 1 / np.sqrt(1 + s**2))
+            )
     return error
 
 
-def whiteness_test(error: Signals, lags: int) -> tuple[Float[np.ndarray, "N lags ny"], ByOutput]:
+def whiteness_test(
+    error: Signals, lags: int
+) -> tuple[Float[np.ndarray, "N lags ny"], ByOutput]:
     """Return correlations of residuals with earlier ones, section by section, and p-values."""
     S, T, N, ny = error.shape
     size = np.sqrt(np.nanmean(error**2, axis=(0, 1)))
@@ -101,7 +105,9 @@ def independence_test(
     nu = u.shape[3]
     z, deviates, tested = np.zeros((N, lags, ny, nu)), np.zeros(ny), np.zeros(ny)
     degrees, by_fits = np.zeros((2, ny)), np.zeros(ny)
-    for n, root in zip(range(N), spread or repeat(np.zeros((S, T, ny, 0))), strict=False):
+    for n, root in zip(
+        range(N), spread or repeat(np.zeros((S, T, ny, 0))), strict=False
+    ):
         past = lagged_inputs(u, n, lags, 0)
         for i in range(ny):
             present = np.isfinite(error[:, :, n, i])
@@ -121,7 +127,9 @@ def independence_test(
             a, b = left.shape[1], count - left.shape[1]
             inside = ((left.T @ rows) ** 2).sum(axis=0)
             outside, by_fit = (rows**2).sum(axis=0) - inside, inside[1:].sum()
-            p = stats.f.sf(inside[0] / (a + by_fit) * (b + outside[1:].sum()) / outside[0], a, b)
+            p = stats.f.sf(
+                inside[0] / (a + by_fit) * (b + outside[1:].sum()) / outside[0], a, b
+            )
             by_fits[i] += by_fit
             deviates[i] += stats.norm.isf(np.clip(p, 1e-300, 1 - 1e-16))
             degrees[:, i] += a, b
@@ -138,7 +146,9 @@ def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
     return left <= 1e3 * ROUNDING * size  # (iterations leave as much of exact data)
 
 
-def about_misfit(outside: CycleGrid, grid: CycleGrid, error: Signals, innovations: bool) -> str:
+def about_misfit(
+    outside: CycleGrid, grid: CycleGrid, error: Signals, innovations: bool
+) -> str:
     """Return a sentence about residuals that depend on inputs of the period before them; empty if
     there are none.
 
@@ -150,14 +160,18 @@ def about_misfit(outside: CycleGrid, grid: CycleGrid, error: Signals, innovation
     p = independence_test(outside.u, late, N, ANSWER)[1]
     if not ((p < ANSWER / ny) & ~is_exact(grid, error)).any():
         return ""
-    remedies = "more dimensions" if innovations else "more dimensions, noise='innovations'"
+    remedies = (
+        "more dimensions" if innovations else "more dimensions, noise='innovations'"
+    )
     return (
         "residuals depend on the inputs, so multipliers may be wrong by more than their standard "
         f"errors: give {remedies}, or another guess"
     )
 
 
-def answering(grid: CycleGrid, error: Signals, inputs: tuple[str, ...]) -> tuple[str, ...]:
+def answering(
+    grid: CycleGrid, error: Signals, inputs: tuple[str, ...]
+) -> tuple[str, ...]:
     """Return the inputs that answer earlier residuals, as by a controller."""
     answers = feedback_test(grid, error) < ANSWER * ~is_exact(grid, error).all()
     return tuple(compress(inputs, answers))
@@ -166,7 +180,10 @@ def answering(grid: CycleGrid, error: Signals, inputs: tuple[str, ...]) -> tuple
 def about_answering(inputs: Iterable[str], remedy: str) -> str:
     """Return a sentence about inputs that answer earlier residuals; empty if there are none."""
     names = ", ".join(inputs)
-    return names and f"inputs answer earlier residuals, as by a controller ({names}): {remedy}"
+    return (
+        names
+        and f"inputs answer earlier residuals, as by a controller ({names}): {remedy}"
+    )
 
 
 def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
@@ -184,6 +201,9 @@ def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
     new = np.full(grid.u.shape, np.nan)
     for n in range(N):
         rows = grid.inside[:, :, n] & (grid.age[:, :, n] > lags + 1)
-        past, u = lagged_inputs(grid.u, n, lags + 1, 0)[rows][:, nu:], grid.u[:, :, n][rows]
+        past, u = (
+            lagged_inputs(grid.u, n, lags + 1, 0)[rows][:, nu:],
+            grid.u[:, :, n][rows],
+        )
         new[:, :, n][rows] = u - past @ np.linalg.lstsq(past, u)[0]
     return independence_test(late.reshape(error.shape), new, lags, ANSWER)[1]

@@ -33,7 +33,10 @@ def default_horizon(N: int) -> int:
 
 
 def subspace_model(
-    records: PreparedRecords, dims: Sequence[int], innovations: bool, direct: bool = True
+    records: PreparedRecords,
+    dims: Sequence[int],
+    innovations: bool,
+    direct: bool = True,
 ) -> PeriodicModel:
     """Return a model with these dimensions, with or without K and D.
 
@@ -56,7 +59,9 @@ def subspace_model(
         )
     rows = (np.concatenate([x.u * direct, x.past(past)], axis=1) for x in sections)
     # The effect of the past of each section on its outputs.
-    rules = [_regress(x, s.y)[s.u.shape[1] :] for x, s in zip(rows, sections, strict=True)]
+    rules = [
+        _regress(x, s.y)[s.u.shape[1] :] for x, s in zip(rows, sections, strict=True)
+    ]
     horizon = max(-(-most // ny) + 1, min(past, N, default_horizon(0)))
     to_state = []
     for n, section in enumerate(sections):
@@ -97,13 +102,17 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
         later = age[section.record, section.time] > length
         if later.sum() <= columns * length + nr:
             continue
-        past, y, inputs = (x[later] for x in (section.past(length), section.y, section.u))
+        past, y, inputs = (
+            x[later] for x in (section.past(length), section.y, section.u)
+        )
         r, u = inputs[:, :nr], inputs[:, nr:]
         rows = np.concatenate([past, r], axis=1)
         errors = [y - x @ _regress(x, y) for x in (past, rows)]
         floor = _SHRINKAGE * y.T @ y  # errors of the regressions, without noise
         sizes = [np.linalg.slogdet(e.T @ e + floor)[1] for e in errors]
-        statistic += max(len(y) - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (sizes[0] - sizes[1])
+        statistic += max(len(y) - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (
+            sizes[0] - sizes[1]
+        )
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
     # (Rounding makes the statistic of a reference that its past predicts negative.)
@@ -129,14 +138,18 @@ def without_drift(grid: CycleGrid) -> CycleGrid:
 
     def left(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
         pairs = zip(np.moveaxis(x, 2, 0), np.moveaxis(weight, 2, 0), strict=True)
-        parts = [(make(none, none, grid.drift, w).reduced(z), z.shape) for z, w in pairs]
+        parts = [
+            (make(none, none, grid.drift, w).reduced(z), z.shape) for z, w in pairs
+        ]
         return np.stack([z.reshape(shape) for z, shape in parts], axis=2)
 
     y = left(grid.y, np.asarray(grid.sampled.all(axis=3)))
     return grid._replace(u=left(grid.u, grid.inside), y=y, drift=none)
 
 
-def _sections(records: PreparedRecords, *more: Float[np.ndarray, "S T N k"]) -> "list[_Section]":
+def _sections(
+    records: PreparedRecords, *more: Float[np.ndarray, "S T N k"]
+) -> "list[_Section]":
     """Return the samples of more signals, the inputs and the outputs at each section."""
     grid, ny = without_drift(records.whole()), len(records.outputs)
     z = np.concatenate([*more, grid.u, grid.y / records.scale], axis=3)
@@ -147,7 +160,9 @@ def _sections(records: PreparedRecords, *more: Float[np.ndarray, "S T N k"]) -> 
 class _Section:
     """The samples of a section of all records, where all outputs were sampled."""
 
-    def __init__(self, z: Signals, sampled: Bool[np.ndarray, "S T N"], section: int, ny: int):
+    def __init__(
+        self, z: Signals, sampled: Bool[np.ndarray, "S T N"], section: int, ny: int
+    ):
         self.record, cycle = np.nonzero(sampled[:, :, section])
         self.time = cycle * z.shape[2] + section
         self._z = z.reshape(len(z), -1, z.shape[3])
@@ -170,7 +185,11 @@ def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _from_states(
-    sections: list[_Section], to_state: list[np.ndarray], past: int, innovations: bool, direct: bool
+    sections: list[_Section],
+    to_state: list[np.ndarray],
+    past: int,
+    innovations: bool,
+    direct: bool,
 ) -> PeriodicModel:
     N, nu = len(sections), sections[0].u.shape[1]
     C, D, A, B, K = [], [], [], [], []
@@ -220,13 +239,20 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
         return np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=3)
 
     def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
-        inputs = lagged_inputs(part.u, n, problem.lags, problem.records.lead) @ problem.to_lags[n]
+        inputs = (
+            lagged_inputs(part.u, n, problem.lags, problem.records.lead)
+            @ problem.to_lags[n]
+        )
         later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
         sampled = part.sampled[:, :, n]
-        before = np.all([delay_cycles(sampled, j, not problem.free) for j in delays], axis=0)
+        before = np.all(
+            [delay_cycles(sampled, j, not problem.free) for j in delays], axis=0
+        )
         starts = part.drift[:, :, :0]
         return [
-            SectionRegression.make(inputs, starts, part.drift, later & before[..., alike[0]])
+            SectionRegression.make(
+                inputs, starts, part.drift, later & before[..., alike[0]]
+            )
             for alike in problem.alike[n]
         ]
 
@@ -234,7 +260,9 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
     for section in sum_up(problem, np.zeros(0), past, regress):
         for each in section:
             gram[each.outputs] += each.products
-            freedom += max(round(each.freedom) - each.root.shape[1], 0) * len(each.outputs)
+            freedom += max(round(each.freedom) - each.root.shape[1], 0) * len(
+                each.outputs
+            )
     return DelayedOutputs(gram, freedom)
 
 

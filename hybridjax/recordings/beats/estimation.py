@@ -70,7 +70,9 @@ class CurveFit(NamedTuple):
         return np.abs(self.residual * self.forecast.rate) < 0.5
 
 
-def fit_curve(intervals: Intervals, waves: int, start: CurveFit | None = None) -> CurveFit:
+def fit_curve(
+    intervals: Intervals, waves: int, start: CurveFit | None = None
+) -> CurveFit:
     """Return the curve of so many half waves that forecasts durations best (least squares), as
     smooth as the marginal likelihood suggests.
 
@@ -82,7 +84,9 @@ def fit_curve(intervals: Intervals, waves: int, start: CurveFit | None = None) -
         used = np.ones(len(intervals.start), bool)
         rates = intervals.sums(1.0 * used) / intervals.sums(intervals.duration)
         ahead = Forecast(0.0 * used, 0.0 * used, np.zeros((len(used), waves + 2)))
-        fit = CurveFit(np.zeros(waves + 1), rates, 0.0, used, ahead.rate, ahead, flat, True)
+        fit = CurveFit(
+            np.zeros(waves + 1), rates, 0.0, used, ahead.rate, ahead, flat, True
+        )
     else:
         a = np.pad(start.coefficients, (0, waves + 1 - len(start.coefficients)))
         fit = start._replace(coefficients=a, used=start.counted(), smoothness=flat)
@@ -93,10 +97,16 @@ def fit_curve(intervals: Intervals, waves: int, start: CurveFit | None = None) -
             fit = fit._replace(smoothness=_smoothness(intervals, rough))
         fit = _minimize(intervals, table, _look(intervals, table, fit))
         used = fit.counted()
-        fit = fit._replace(jitter=float((fit.residual * fit.forecast.rate)[used].std()), used=used)
+        fit = fit._replace(
+            jitter=float((fit.residual * fit.forecast.rate)[used].std()), used=used
+        )
         same = abs(fit.jitter - before.jitter) < _SAME * fit.jitter
         change = abs(before.penalty[-1] - fit.penalty[-1])
-        if same and (used == before.used).all() and change <= 10 * _SAME * fit.penalty[-1]:
+        if (
+            same
+            and (used == before.used).all()
+            and change <= 10 * _SAME * fit.penalty[-1]
+        ):
             break
     return fit
 
@@ -145,7 +155,9 @@ def projected(
     square = np.maximum(intervals.sums(by_rate**2 * fit.used), np.finfo(float).tiny)
     columns = np.column_stack([fit.residual, slopes]) * (by_rate * fit.used)[:, None]
     along = np.stack([intervals.sums(x) for x in columns.T], axis=1) / square[:, None]
-    return (slopes - by_rate[:, None] * along[intervals.trial, 1:]) * fit.used[:, None], along
+    return (slopes - by_rate[:, None] * along[intervals.trial, 1:]) * fit.used[
+        :, None
+    ], along
 
 
 def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
@@ -163,7 +175,9 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     """Maximize the marginal likelihood of the durations near a fit."""
     tiny = np.finfo(float).tiny
     across, along = projected(intervals, fit)
-    residual = (fit.residual - fit.forecast.slopes[:, -1] * along[intervals.trial, 0]) * fit.used
+    residual = (
+        fit.residual - fit.forecast.slopes[:, -1] * along[intervals.trial, 0]
+    ) * fit.used
     p = across.shape[1]
     curvature, pull = across.T @ across, across.T @ residual
     # Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
@@ -175,7 +189,9 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     values, axes = np.linalg.eigh(curvature)
     determined = values > 1e-6 * values[-1]  # beyond rounding
     excess = float(((sums @ axes[:, determined]) ** 2 / values[determined]).sum())
-    excess = max(excess / int(determined.sum()) / variance, 1.0) if variance > 0 else 1.0
+    excess = (
+        max(excess / int(determined.sum()) / variance, 1.0) if variance > 0 else 1.0
+    )
     noise, weight = variance * excess, np.arange(1.0, p) ** 4
     score = pull + curvature @ fit.coefficients
     # The mean is free: its part is taken out.
@@ -193,7 +209,9 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     # Logarithms of tau^2, around that at which the best direction is half noise.
     grid = np.arange(-24.0, 24.5, 0.5) - np.log(max(gain[-1], tiny))
     best = grid[np.argmin([improbable(x) for x in grid])]
-    top = optimize.minimize_scalar(improbable, bounds=(best - 0.5, best + 0.5), method="bounded")
+    top = optimize.minimize_scalar(
+        improbable, bounds=(best - 0.5, best + 0.5), method="bounded"
+    )
     penalty = np.append(0.0, noise * weight / np.exp(top.x))
     return Smoothness(penalty, noise, excess, max(-float(top.fun), 0.0))
 
@@ -211,7 +229,11 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float,
     data, smooth = across.T @ across, np.diag(fit.penalty)
     curvature, block = data + smooth, _blocks(intervals)
     count, p = int(block.max()) + 1, across.shape[1]
-    score, shares, left_out = np.zeros((count, p)), np.zeros((count, p, p)), np.zeros(count)
+    score, shares, left_out = (
+        np.zeros((count, p)),
+        np.zeros((count, p, p)),
+        np.zeros(count),
+    )
     for k in range(count):
         rows = (block == k) & fit.used
         x, error = across[rows], fit.residual[rows]

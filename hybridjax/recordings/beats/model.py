@@ -71,12 +71,16 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     """
     samples, pairs = recording.samples(name), phase.by_trial(recording)
     if not all(w.linear for _, parts in pairs for w in parts):
-        raise DefinitionError("`phase` must be of events or a Crossing, not a KinematicPhase.")
+        raise DefinitionError(
+            "`phase` must be of events or a Crossing, not a KinematicPhase."
+        )
     starts, durations, steps, inputs = [], [], [], []
     for (trial, x), (_, parts) in zip(samples, pairs, strict=True):
         finite = np.isfinite(x)
         if finite.sum() < 2:
-            raise DefinitionError(f"trial '{trial.name}' has no samples of {name}: leave it out.")
+            raise DefinitionError(
+                f"trial '{trial.name}' has no samples of {name}: leave it out."
+            )
         start = np.concatenate([np.zeros(0), *(w.time[:-1] for w in parts)])
         duration = np.concatenate([np.zeros(0), *(np.diff(w.time) for w in parts)])
         holes = gaps(trial.time[finite], bridgeable(trial.time[finite]))
@@ -95,7 +99,9 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     if not starts:
         raise DefinitionError(f"{name} has no samples between two events: record both.")
     if not any(np.ptp(x) > 0 for x in inputs):
-        raise DefinitionError(f"the input {name} is constant: name the signal that acted.")
+        raise DefinitionError(
+            f"the input {name} is constant: name the signal that acted."
+        )
     longest = max(map(len, inputs))
     inputs = [np.pad(x, ((0, longest - len(x)), (0, 0)), "edge") for x in inputs]
     trial = np.repeat(np.arange(len(starts)), list(map(len, starts)))
@@ -108,7 +114,9 @@ def basis(
 ) -> Float[np.ndarray, "n p"]:
     """Return 1 and half waves cos(pi k phase), as they act on a phase with this jitter."""
     angle = np.pi * np.arange(waves + 1)
-    return np.cos(angle * phase[:, None]) * np.exp(-((jitter * angle) ** 2) / 2 * phase[:, None])
+    return np.cos(angle * phase[:, None]) * np.exp(
+        -((jitter * angle) ** 2) / 2 * phase[:, None]
+    )
 
 
 def tabulated(waves: int, jitter: float) -> Table:
@@ -127,19 +135,25 @@ class Forecast(NamedTuple):
     without input."""
 
 
-def forecast(intervals: Intervals, table: Table, coefficients: Curve, rates: Curve) -> Forecast:
+def forecast(
+    intervals: Intervals, table: Table, coefficients: Curve, rates: Curve
+) -> Forecast:
     """Return durations of all intervals, and their derivatives."""
     curve, rate = table @ coefficients, rates[intervals.trial]
 
     def chunk(first: int) -> Forecast:
         rows = slice(first, first + _CHUNK)
-        return _integrate(intervals.inputs[:, rows], intervals.step[rows], rate[rows], curve, table)
+        return _integrate(
+            intervals.inputs[:, rows], intervals.step[rows], rate[rows], curve, table
+        )
 
     parts = on_all_cores(chunk, range(0, len(rate), _CHUNK))
     return Forecast(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _integrate(inputs: Nodes, h: Lanes, w: Lanes, curve: Curve, table: Table) -> Forecast:
+def _integrate(
+    inputs: Nodes, h: Lanes, w: Lanes, curve: Curve, table: Table
+) -> Forecast:
     """Integrate by the classical Runge-Kutta method, and derivatives by the trapezoidal rule."""
     L, p = len(h), table.shape[1] + 1
     result, rows = Forecast(np.zeros(L), np.zeros(L), np.zeros((L, p))), np.arange(L)
@@ -152,8 +166,12 @@ def _integrate(inputs: Nodes, h: Lanes, w: Lanes, curve: Curve, table: Table) ->
 
     def force(phase, u):
         """Return derivatives of the rate with respect to each coefficient, and to w."""
-        nearest = np.ceil(np.clip(phase, 0.0, 1.5 - 1e-6) * _POINTS - 0.5).astype(np.int64)
-        return np.concatenate([table[nearest] * u[:, None], np.ones((len(u), 1))], axis=1)
+        nearest = np.ceil(np.clip(phase, 0.0, 1.5 - 1e-6) * _POINTS - 0.5).astype(
+            np.int64
+        )
+        return np.concatenate(
+            [table[nearest] * u[:, None], np.ones((len(u), 1))], axis=1
+        )
 
     phase, drift, u0 = np.zeros(L), np.zeros((L, p)), inputs[0]
     forced, growth = force(phase, u0), at(slope, phase) * u0
@@ -174,7 +192,9 @@ def _integrate(inputs: Nodes, h: Lanes, w: Lanes, curve: Curve, table: Table) ->
         forced_after, growth_after = force(after, u2), at(slope, after) * u2
         half = short * h / 2
         exponent = half * ((2 - short) * growth + short * growth_after)
-        gain = np.exp(np.clip(exponent, -0.5, 0.5))  # where a curve jumps, its slope is unknown
+        gain = np.exp(
+            np.clip(exponent, -0.5, 0.5)
+        )  # where a curve jumps, its slope is unknown
         drift += half[:, None] * forced
         drift *= gain[:, None]
         drift[done] += (half * (1 - short))[done, None] * forced[done]
@@ -201,7 +221,11 @@ def _end(a: Lanes, b: Lanes, m0: Lanes, m1: Lanes, own: Lanes) -> tuple[Lanes, L
     for _ in range(4):  # Newton's iterations: to rounding
         value = a * (1 + 2 * s) * (1 - s) ** 2 + m0 * s * (1 - s) ** 2
         value += b * s * s * (3 - 2 * s) + m1 * s * s * (s - 1)
-        rate = 6 * s * (1 - s) * (b - a) + m0 * (1 - 4 * s + 3 * s * s) + m1 * s * (3 * s - 2)
+        rate = (
+            6 * s * (1 - s) * (b - a)
+            + m0 * (1 - 4 * s + 3 * s * s)
+            + m1 * s * (3 * s - 2)
+        )
         rate = np.where(rate > 0, rate, b - a)
         s = np.clip(s - (value - 1) / np.where(rate > 0, rate, 1.0), 0.0, 1.0)
     return np.where(beyond, s, 1 + (1 - b) / own), np.where(beyond, rate, own)

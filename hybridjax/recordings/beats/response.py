@@ -7,13 +7,13 @@ from scipy import stats
 
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability, Vector
+from ..._core.findings import Finding, print_findings
 from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.signal import Signal, with_unit
 from ...errors import DefinitionError
 from ...orbits.crossing import AtEvent, Crossing
 from ...orbits.responses import PhaseCurve
-from ..findings import Finding, print_findings
 from ..fit_warnings import about_phase_response
 from ..phase import Phase
 from ..phase_estimation import estimate_phase
@@ -75,7 +75,9 @@ class PhaseResponse(PhaseCurve):
         """Return the curve at some phases, in cycles."""
         return self._waves(phase) @ self.coefficients
 
-    def interval(self, phase: Vector, level: Probability = 0.95) -> tuple[Series, Series]:
+    def interval(
+        self, phase: Vector, level: Probability = 0.95
+    ) -> tuple[Series, Series]:
         """Return lower and upper bounds that hold the curve with this probability, as a mean over
         the phases: they are too narrow where it changes faster than elsewhere."""
         waves = self._waves(phase)
@@ -133,7 +135,9 @@ def phase_response(
     intervals = intervals_of(recording, phase, input)
     total = len(intervals.start)
     if total < 2 * (11 + intervals.trial[-1]):  # half of them for errors
-        text = f"{total} intervals are too few for a curve and the rates of their trials"
+        text = (
+            f"{total} intervals are too few for a curve and the rates of their trials"
+        )
         raise DefinitionError(f"{text}: record more.")
     say("flat")
     flat = fit_curve(intervals, 0)

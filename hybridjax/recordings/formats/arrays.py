@@ -41,7 +41,9 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
 
     def visit(name: str, node: Any) -> None:
         place = tuple(name.split("/"))
-        if not isinstance(node, h5py.Dataset) or name.startswith("#"):  # MATLAB's own data
+        if not isinstance(node, h5py.Dataset) or name.startswith(
+            "#"
+        ):  # MATLAB's own data
             return
         if h5py.check_ref_dtype(node.dtype) and "MATLAB_class" not in node.attrs:
             _refuse_structs(path, separator.join(place[:-1]), wanted)
@@ -49,13 +51,19 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
         text = "MATLAB_empty" in node.attrs or node.attrs.get("MATLAB_class") == b"char"
         if node.dtype.kind in "fiu" and not text:
             if node.external or node.is_virtual:
-                raise FileFormatError(f"'{path}': '{name}' lies in other files: copy it into this.")
+                raise FileFormatError(
+                    f"'{path}': '{name}' lies in other files: copy it into this."
+                )
             unit = node.attrs.get("units", "")
-            leaves[place] = Leaf(node, unit.decode() if isinstance(unit, bytes) else str(unit))
+            leaves[place] = Leaf(
+                node, unit.decode() if isinstance(unit, bytes) else str(unit)
+            )
 
     with reading(path, "HDF5 file"), h5py.File(path, "r") as file:
         file.visititems(visit)
-        check_declared(path, 8 * sum(int(np.prod(x.array.shape)) for x in leaves.values()))
+        check_declared(
+            path, 8 * sum(int(np.prod(x.array.shape)) for x in leaves.values())
+        )
         return _read_tree(path, leaves, separator, wanted)
 
 
@@ -76,11 +84,15 @@ def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
         wrong = not {x.split(".")[0] for x in wanted.signals or ()} <= set(shapes)
         chosen = [x for x in shapes if wrong or wanted.includes(x) or wanted.reaches(x)]
         content = loadmat(path, simplify_cells=True, variable_names=chosen)
-    variables = {name: value for name, value in content.items() if not name.startswith("__")}
+    variables = {
+        name: value for name, value in content.items() if not name.startswith("__")
+    }
     return _read_tree(path, dict(_leaves(path, (), variables, wanted)), ".", wanted)
 
 
-def _leaves(path: Path, place: Place, value: Any, wanted: Wanted) -> Iterator[tuple[Place, Leaf]]:
+def _leaves(
+    path: Path, place: Place, value: Any, wanted: Wanted
+) -> Iterator[tuple[Place, Leaf]]:
     """Yield arrays of numbers in a struct (a dictionary); an array of structs is a list."""
     if isinstance(value, dict):
         for name, part in value.items():
@@ -114,14 +126,20 @@ def _read_tree(
         is_signal = np.prod(leaf.array.shape) > 1 and wanted.reaches(name)
         if place in clocks.values() or not (is_event or is_signal):
             continue
-        around = next((place[:k] for k in range(len(place), -1, -1) if place[:k] in clocks), None)
+        around = next(
+            (place[:k] for k in range(len(place), -1, -1) if place[:k] in clocks), None
+        )
         if around is None:
             text = "in its group or one around it: add or name them (`time`), or choose `signals`."
-            raise DefinitionError(f"'{path}' has no times '{wanted.time}' for '{name}' {text}")
+            raise DefinitionError(
+                f"'{path}' has no times '{wanted.time}' for '{name}' {text}"
+            )
         if around not in tables:
             clock = leaves[clocks[around]]
             times = np.atleast_1d(np.squeeze(clock.array[()]))
-            tables[around] = Columns({with_unit(wanted.time, clock.unit): times}, events={})
+            tables[around] = Columns(
+                {with_unit(wanted.time, clock.unit): times}, events={}
+            )
         if is_event:
             tables[around].events[place[-1]] = np.ravel(leaf.array[()])
         else:
@@ -129,14 +147,18 @@ def _read_tree(
     return list(tables.values())
 
 
-def _columns(path: Path, name: str, leaf: Leaf, out: Columns) -> dict[str, Float[np.ndarray, " n"]]:
+def _columns(
+    path: Path, name: str, leaf: Leaf, out: Columns
+) -> dict[str, Float[np.ndarray, " n"]]:
     times = next(iter(out.values.values()))
     values = np.atleast_1d(np.squeeze(leaf.array[()]))
     if values.ndim == 2 and len(values) != len(times):
         values = values.T
     if values.ndim > 2 or len(values) != len(times):
         text = f"has the shape {leaf.array.shape}, but its group {times.size} times"
-        raise FileFormatError(f"'{path}': '{name}' {text}: add its own, or choose `signals`.")
+        raise FileFormatError(
+            f"'{path}': '{name}' {text}: add its own, or choose `signals`."
+        )
     if values.ndim == 1:
         return {with_unit(name, leaf.unit): values}
     return {with_unit(f"{name}.{k}", leaf.unit): x for k, x in enumerate(values.T)}
@@ -198,5 +220,9 @@ def read_npz(path: Path, wanted: Wanted) -> list[Columns]:
     **Raises:** as `read_arrays`.
     """
     arrays = read_arrays(path)
-    events = {x.removeprefix(EVENT): arrays.pop(x) for x in list(arrays) if x.startswith(EVENT)}
+    events = {
+        x.removeprefix(EVENT): arrays.pop(x)
+        for x in list(arrays)
+        if x.startswith(EVENT)
+    }
     return [Columns(arrays, events=events)]

@@ -30,7 +30,9 @@ def read_bag(path: Path, wanted: Wanted) -> list[Columns]:
     reader, typesys = package("rosbags.highlevel").AnyReader, package("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.LATEST)
     with reading(path, "bag of ROS"), reader([path], default_typestore=store) as bag:
-        wanted.require(path, sorted({x.topic.lstrip("/") for x in bag.connections}), groups=True)
+        wanted.require(
+            path, sorted({x.topic.lstrip("/") for x in bag.connections}), groups=True
+        )
         chosen = [x for x in bag.connections if wanted.reaches(x.topic.lstrip("/"))]
         topics = {x.topic: _Topic(x.topic.lstrip("/")) for x in chosen}
         for connection, arrival, data in bag.messages(chosen) if chosen else ():

@@ -28,11 +28,18 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
     ezc3d = package("ezc3d")
     with reading(path, "C3D file"):
         file, declared = ezc3d.c3d(str(path)), _declared_frames(path)
-    header, parameters, data = file["header"]["points"], file["parameters"], file["data"]
+    header, parameters, data = (
+        file["header"]["points"],
+        file["parameters"],
+        file["data"],
+    )
     first, frames = header["first_frame"], data["points"].shape[2]
     check_rows(path, frames, declared, "frames")
     tables = []
-    for columns in (_points(parameters["POINT"], data), _analogs(parameters["ANALOG"], data)):
+    for columns in (
+        _points(parameters["POINT"], data),
+        _analogs(parameters["ANALOG"], data),
+    ):
         two_columns(path, [name for name, _ in columns])
         if columns:
             per_frame = len(columns[0][1]) // frames
@@ -48,7 +55,9 @@ def _declared_frames(path: Path) -> int | None:
     """Return the number of frames in the header, which ezc3d corrects; None beyond 16 bits."""
     with open(path, "rb") as file:
         head = file.read(10)
-        file.seek(512 * (head[0] - 1) + 3)  # the type of the processor, in the parameters
+        file.seek(
+            512 * (head[0] - 1) + 3
+        )  # the type of the processor, in the parameters
         order = ">" if file.read(1) == b"\x56" else "<"
     first, last = struct.unpack(f"{order}HH", head[-4:])
     return last - first + 1 if last < 2**16 - 1 else None
@@ -74,8 +83,14 @@ def _points(parameters: Mapping[str, Any], data: Mapping[str, Any]) -> Named:
 
 def _analogs(parameters: Mapping[str, Any], data: Mapping[str, Any]) -> Named:
     labels, units = _texts(parameters, "LABELS"), _texts(parameters, "UNITS")
-    names = (with_unit(*x) if x[0] else "" for x in zip_longest(labels, units, fillvalue=""))
-    return [(name, row) for name, row in zip(names, data["analogs"][0], strict=False) if name]
+    names = (
+        with_unit(*x) if x[0] else "" for x in zip_longest(labels, units, fillvalue="")
+    )
+    return [
+        (name, row)
+        for name, row in zip(names, data["analogs"][0], strict=False)
+        if name
+    ]
 
 
 def _texts(parameters: Mapping[str, Any], name: str) -> list[str]:
@@ -89,8 +104,15 @@ def _texts(parameters: Mapping[str, Any], name: str) -> list[str]:
 
 def _events(parameters: Mapping[str, Any]) -> dict[str, Float[np.ndarray, " _"]]:
     """Return times in s by context and label; the file holds minutes and seconds."""
-    contexts, labels = iter(_texts(parameters, "CONTEXTS")), _texts(parameters, "LABELS")
-    times = np.reshape(parameters["TIMES"]["value"], (2, -1)) if labels else np.zeros((2, 0))
+    contexts, labels = (
+        iter(_texts(parameters, "CONTEXTS")),
+        _texts(parameters, "LABELS"),
+    )
+    times = (
+        np.reshape(parameters["TIMES"]["value"], (2, -1))
+        if labels
+        else np.zeros((2, 0))
+    )
     events: dict[str, list[float]] = {}
     for label, (minutes, seconds) in zip(labels, times.T, strict=False):
         name = f"{next(contexts, '')} {label}".strip()

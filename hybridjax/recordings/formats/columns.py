@@ -63,7 +63,9 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
     require_aligned(where, columns.values.values())
     headers = {x: split_header(x) for x in columns.values}
     exact = [x for x, (name, _) in headers.items() if time in (x, name)]
-    clocks = exact or [x for x, (name, _) in headers.items() if name.lower() == time.lower()]
+    clocks = exact or [
+        x for x, (name, _) in headers.items() if name.lower() == time.lower()
+    ]
     if len(clocks) > 1:
         raise FileFormatError(f"{where} has two columns '{time}': rename one.")
     if not clocks:
@@ -74,7 +76,9 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
     unit = time_unit(clock) or "s"
     if unit not in SECONDS:
         text = "convert them to s, ms, us, ns, min or h (divide frames by the sampling rate)"
-        raise DefinitionError(f"{where}: the times in '{clock}' are in '{unit}': {text}.")
+        raise DefinitionError(
+            f"{where}: the times in '{clock}' are in '{unit}': {text}."
+        )
     scale = SECONDS[unit]
     times = scale * numbers(where, clock, columns.values[clock])
     events = {name: at * scale for name, at in columns.events.items()}
@@ -88,7 +92,9 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
             events[name.removeprefix(EVENT)] = times[happened]
             continue
         if unit.lower() == "nan":
-            raise FileFormatError(f"{where}: the unit of '{name}' is nan: write it, or nothing.")
+            raise FileFormatError(
+                f"{where}: the unit of '{name}' is nan: write it, or nothing."
+            )
         if name in signals:
             raise FileFormatError(f"{where} has two columns '{name}': rename one.")
         signals[name] = columns.values[header]
@@ -100,7 +106,9 @@ def require_aligned(where: str, columns: Iterable[Any]) -> None:
     """**Raises:** `DefinitionError` for series of pandas with different indices."""
     series = [x.index for x in columns if hasattr(x, "iloc")]
     if not all(index.equals(series[0]) for index in series):
-        raise DefinitionError(f"{where}: series of pandas have different indices: align them.")
+        raise DefinitionError(
+            f"{where}: series of pandas have different indices: align them."
+        )
 
 
 def numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
@@ -114,7 +122,9 @@ def numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
         values = np.empty((0, 0), object)
     if values.dtype.kind not in "fiub" or values.ndim != 1:
         given = f"{values.dtype}{values.shape}"
-        raise DefinitionError(f"{where}: {name} must be real numbers on one axis, not {given}.")
+        raise DefinitionError(
+            f"{where}: {name} must be real numbers on one axis, not {given}."
+        )
     return values.astype(float)
 
 
@@ -136,11 +146,15 @@ class Wanted(NamedTuple):
     def reaches(self, group: str) -> bool:
         """Return whether a signal, or a member of a group, is wanted."""
         wanted = self.signals or ()
-        return self.signals is None or any(_belongs(group, x) or _belongs(x, group) for x in wanted)
+        return self.signals is None or any(
+            _belongs(group, x) or _belongs(x, group) for x in wanted
+        )
 
     def is_time(self, header: str) -> bool:
         """Return whether a column may hold the times."""
-        return header == self.time or split_header(header)[0].lower() == self.time.lower()
+        return (
+            header == self.time or split_header(header)[0].lower() == self.time.lower()
+        )
 
     def require(self, path: Path, names: Sequence[str], groups: bool = False) -> None:
         """Check that each wanted signal exists; `groups`: `names` may be groups of signals.
@@ -148,9 +162,15 @@ class Wanted(NamedTuple):
         **Raises:** `DefinitionError` that lists up to 20 names.
         """
         for name in self.signals or ():
-            if not any(_belongs(x, name) or (groups and _belongs(name, x)) for x in names):
-                listed = ", ".join([*names[:20], *["..."][: len(names) // 21]]) or "none"
-                raise DefinitionError(f"'{path}' has no signal '{name}'; it has {listed}.")
+            if not any(
+                _belongs(x, name) or (groups and _belongs(name, x)) for x in names
+            ):
+                listed = (
+                    ", ".join([*names[:20], *["..."][: len(names) // 21]]) or "none"
+                )
+                raise DefinitionError(
+                    f"'{path}' has no signal '{name}'; it has {listed}."
+                )
 
 
 def _belongs(name: str, group: str) -> bool:
@@ -186,7 +206,9 @@ def two_columns(path: Path, names: Sequence[str]) -> None:
 def check_rows(path: Path, rows: int, declared: Any, what: str) -> None:
     """**Raises:** `FileFormatError` for another number of rows than the header declares."""
     if declared is not None and str(declared) != str(rows):
-        raise FileFormatError(f"'{path}' is damaged: it has {rows} {what}, its header {declared}.")
+        raise FileFormatError(
+            f"'{path}' is damaged: it has {rows} {what}, its header {declared}."
+        )
 
 
 @contextmanager
@@ -199,10 +221,14 @@ def reading(path: Path, kind: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = textwrap.shorten(str(error) or type(error).__name__, 100)
-        raise FileFormatError(f"'{path}' is no {kind}, or damaged ({reason}).") from error
+        raise FileFormatError(
+            f"'{path}' is no {kind}, or damaged ({reason})."
+        ) from error
 
 
 def check_declared(path: Path, size: int) -> None:
     """**Raises:** `FileFormatError` if a file declares more than a file of its size can hold."""
     if size > limits.unpacked(path.stat().st_size):
-        raise damaged(path, f"it declares arrays of {size} bytes, and is not that large")
+        raise damaged(
+            path, f"it declares arrays of {size} bytes, and is not that large"
+        )

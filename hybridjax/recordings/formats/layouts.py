@@ -26,18 +26,26 @@ def read_text(path: Path, wanted: Wanted) -> list[Columns]:
         return [_opensim(path, lines, head.index("endheader"))]
     if head[0].startswith("pathfiletype"):
         return [_trc(path, lines)]
-    blocks = any(x.startswith(("frame", '"frame')) for x in head) and list(_vicon(path, lines))
+    blocks = any(x.startswith(("frame", '"frame')) for x in head) and list(
+        _vicon(path, lines)
+    )
     return blocks or [read_plain(path, lines)]
 
 
 def _opensim(path: Path, lines: list[str], end: int) -> Columns:
     """Read a motion or storage file: `key=value` up to `endheader`, then names, then numbers."""
-    facts = dict(x.replace(" ", "").lower().split("=", 1) for x in lines[:end] if "=" in x)
-    if (start := next((k for k in range(end + 1, len(lines)) if lines[k].strip()), None)) is None:
+    facts = dict(
+        x.replace(" ", "").lower().split("=", 1) for x in lines[:end] if "=" in x
+    )
+    if (
+        start := next((k for k in range(end + 1, len(lines)) if lines[k].strip()), None)
+    ) is None:
         raise FileFormatError(f"'{path}' has no line with the names of its columns.")
     separator = "\t" if "\t" in lines[start] else ""
     names = split_names(lines[start], separator)
-    names = ["time (s)" if x == "time" else x for x in names]  # times of OpenSim are seconds
+    names = [
+        "time (s)" if x == "time" else x for x in names
+    ]  # times of OpenSim are seconds
     table = read_table(path, names, lines, start + 1, separator)
     check_rows(path, len(next(iter(table.values.values()))), facts.get("nrows"), "rows")
     degrees = ("angles are in degrees",) if facts.get("indegrees") == "yes" else ()
@@ -49,10 +57,14 @@ def _trc(path: Path, lines: list[str]) -> Columns:
     head = [split_line(x, "\t") for x in lines[:5]]
     names = split_names(lines[3], "\t") if len(head) == 5 else []
     if [x.lower() for x in names[:2]] != ["frame#", "time"]:
-        raise FileFormatError(f"'{path}' does not name 'Frame#', 'Time' and its markers in line 4.")
+        raise FileFormatError(
+            f"'{path}' does not name 'Frame#', 'Time' and its markers in line 4."
+        )
     facts = dict(zip((x.lower() for x in head[1]), head[2], strict=False))
     unit = facts.get("units", "")
-    columns = [with_unit(f"{marker}.{axis}", unit) for marker in names[2::3] for axis in "xyz"]
+    columns = [
+        with_unit(f"{marker}.{axis}", unit) for marker in names[2::3] for axis in "xyz"
+    ]
     table = read_table(path, ["frame#", "time (s)", *columns], lines, 5, "\t")
     check_rows(path, len(table.values.pop("frame#")), facts.get("numframes"), "frames")
     return table
@@ -68,7 +80,9 @@ def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
     rates = set()
     for start in range(len(lines) - 4):
         separator = max("\t;,", key=lines[start + 3].count)
-        names = _names(*(split_names(x, separator) for x in lines[start + 2 : start + 5]))
+        names = _names(
+            *(split_names(x, separator) for x in lines[start + 2 : start + 5])
+        )
         rate = to_number(lines[start + 1].strip(" ,;\t")) or 0
         if not (rate > 0 and names and names[0].lower() == "frame"):
             continue
@@ -78,12 +92,21 @@ def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
         frame = table.values.pop(columns["frame"])
         sub = table.values.pop(columns.get("sub frame", ""), np.zeros(len(frame)))
         parts = int(np.nan_to_num(sub).max()) + 1
-        if not np.isfinite(frame + sub).all() or (np.diff(frame + sub / parts) <= 0).any():
-            raise FileFormatError(f"'{path}' has frames that are missing, or not in order.")
-        yield Columns({"time (s)": ((frame - 1) * parts + sub) / rate} | table.values, table.notes)
+        if (
+            not np.isfinite(frame + sub).all()
+            or (np.diff(frame + sub / parts) <= 0).any()
+        ):
+            raise FileFormatError(
+                f"'{path}' has frames that are missing, or not in order."
+            )
+        yield Columns(
+            {"time (s)": ((frame - 1) * parts + sub) / rate} | table.values, table.notes
+        )
         rates.add(rate / parts)
     if len(rates) > 1:
-        raise FileFormatError(f"'{path}' has blocks of different rates: export them one by one.")
+        raise FileFormatError(
+            f"'{path}' has blocks of different rates: export them one by one."
+        )
 
 
 def _names(devices: list[str], components: list[str], units: list[str]) -> list[str]:

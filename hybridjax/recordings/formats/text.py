@@ -62,13 +62,17 @@ def read_plain(path: Path, lines: list[str]) -> Columns:
         separator = _separator(before[-1], lines[first]) if before else separator
         width, names = len(names), split_names(before[-1], separator) if before else []
         if len(names) != width or any(to_number(x) is not None for x in names):
-            raise FileFormatError(f"'{path}' begins with numbers: its first line must be names.")
+            raise FileFormatError(
+                f"'{path}' begins with numbers: its first line must be names."
+            )
         return read_table(path, names, lines, first, separator)
     start, fields = first + 1, split_line(below, separator)
     units = [x for x in fields if x]
     if units and all(map(is_unit, units)) and any(to_number(x) is None for x in fields):
         below_names = zip_longest(names, fields[: len(names)], fillvalue="")
-        names = [with_unit(x, split_header(y)[1] or y) if x else "" for x, y in below_names]
+        names = [
+            with_unit(x, split_header(y)[1] or y) if x else "" for x, y in below_names
+        ]
         start = content[1] + 1
     table = read_table(path, names, lines, start, separator)
     skipped = ("lines above the names were left out",) * (content != whole)
@@ -82,7 +86,9 @@ def _from_names(lines: Sequence[str], content: list[int]) -> list[int]:
         fields = [split_names(lines[k], separator) for k in content[:100]]
         n = int(np.argmax([len(x) for x in fields]))
         if len(fields[-1]) > 1:
-            is_data = any(x and to_number(x.replace(",", ".")) is not None for x in fields[n])
+            is_data = any(
+                x and to_number(x.replace(",", ".")) is not None for x in fields[n]
+            )
             return content if is_data else content[n:]
     return content
 
@@ -135,14 +141,20 @@ def read_table(
     lines = ["" if x.lstrip().startswith(_COMMENTS) else x for x in lines[start:]]
     if sep != "," and any("," in x for x in lines):
         notes.append("decimal commas were read as such")
-        if (mixed := next((k for k, x in enumerate(lines) if "." in x), None)) is not None:
+        if (
+            mixed := next((k for k, x in enumerate(lines) if "." in x), None)
+        ) is not None:
             text = f"'{path}', line {start + mixed + 1}: there are points beside decimal commas; "
-            raise FileFormatError(f"{text}export one of the two, and no separators of thousands.")
+            raise FileFormatError(
+                f"{text}export one of the two, and no separators of thousands."
+            )
         lines = [x.replace(",", ".") for x in lines]
     values = np.zeros((0, 0))
     with suppress(ValueError), warnings.catch_warnings():  # a number in every field
         warnings.simplefilter("ignore")  # about an empty table
-        values = np.loadtxt(lines, delimiter=sep or None, ndmin=2, comments=None, quotechar='"')
+        values = np.loadtxt(
+            lines, delimiter=sep or None, ndmin=2, comments=None, quotechar='"'
+        )
     if values.shape[1] != len(headers):
         values = _by_line(path, headers, lines, start, sep)
     if not values.size:
@@ -164,7 +176,9 @@ def _by_line(
             continue
         if len(fields) < count or any(fields[count:]):
             text = f"'{path}', line {number}: {len(fields)} fields, but the header names {count} "
-            raise FileFormatError(f"{text}columns (decimal commas need another separator).")
+            raise FileFormatError(
+                f"{text}columns (decimal commas need another separator)."
+            )
         row = [to_number(x) for x in fields[:count]]
         if None in row:
             k = row.index(None)

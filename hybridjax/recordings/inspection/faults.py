@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import fft
 
-from ..findings import CLEAR, Finding, listed, places
+from ..._core.findings import Finding, listed
+from ..findings import CLEAR, places
 from ..phase import HARMONICS, Phase
 from ..recording import Recording
 from ..sampling import cycle_means
@@ -62,11 +63,15 @@ Rows = Bool[np.ndarray, " n"]
 def placeholders(x: Series, period: float, is_input: bool) -> Rows:
     """Find numbers such as -9999, far from all other samples."""
     whole = np.unique(x[x == np.round(x)])
-    marked = np.isin(x, [value for value in whole if _is_placeholder(abs(float(value)))])
+    marked = np.isin(
+        x, [value for value in whole if _is_placeholder(abs(float(value)))]
+    )
     usual = x[np.isfinite(x) & ~marked]
     if not marked.any() or not len(usual) or not np.ptp(usual):
         return np.zeros(len(x), bool)
-    return marked & (np.maximum(usual.min() - x, x - usual.max()) > RANGES * np.ptp(usual))
+    return marked & (
+        np.maximum(usual.min() - x, x - usual.max()) > RANGES * np.ptp(usual)
+    )
 
 
 def _is_placeholder(size: float) -> bool:
@@ -86,7 +91,9 @@ def frozen(x: Series, period: float, is_input: bool) -> Rows:
     plateaus = length[length >= 3]
     limit = max(_FROZEN[0] * period, _FROZEN[1])
     if len(plateaus) > 0.5 * len(x) / period:  # as those of a foot on the ground
-        limit = np.inf if is_input else max(limit, _FROZEN[2] * float(np.median(plateaus)))
+        limit = (
+            np.inf if is_input else max(limit, _FROZEN[2] * float(np.median(plateaus)))
+        )
     return np.repeat((length > limit) & ~(is_input & (x[first] == 0)), length)
 
 
@@ -103,12 +110,16 @@ def clipped(recording: Recording, name: str) -> Iterator[Finding]:
         value, length = x[first[length >= 3]], length[length >= 3]
         if not len(value):
             continue
-        ends = [v for v in (np.nanmin(x), np.nanmax(x)) if v != 0 and (value == v).sum() > 1]
+        ends = [
+            v for v in (np.nanmin(x), np.nanmax(x)) if v != 0 and (value == v).sum() > 1
+        ]
         at_ends = np.isin(value, ends)
         count = length[at_ends].sum()
         if count >= max(1, _CLIPPED * len(x), _MOSTLY * length[~at_ends].sum()):
             levels = " and ".join(f"{v:.4g}" for v in ends)
-            yield Finding("clipped", f"{name} is cut off at {levels} in trial '{trial.name}'.")
+            yield Finding(
+                "clipped", f"{name} is cut off at {levels} in trial '{trial.name}'."
+            )
             return
 
 
@@ -125,7 +136,9 @@ def wrapped(recording: Recording, name: str) -> Iterator[Finding]:
         bits = round(np.log2(whole))  # (of many levels, the outermost are not met)
         jumps = np.diff(count) / 2.0**bits
         both = min((jumps > 0.5).sum(), (jumps < -0.5).sum())
-        if off < 1e-3 and abs(whole / 2.0**bits - 1) < _ALL_LEVELS and both:  # but for rounding
+        if (
+            off < 1e-3 and abs(whole / 2.0**bits - 1) < _ALL_LEVELS and both
+        ):  # but for rounding
             remedy = f"undo it (`numpy.unwrap` with period={2**bits * step:.6g})"
             text = f"{name} jumps by its whole range in trial '{trial.name}': {remedy}."
             yield Finding("overflow", text, "refused")
@@ -138,7 +151,9 @@ def silent_inputs(recording: Recording, names: Iterable[str]) -> Iterator[Findin
         samples = recording.samples(name)
         finite = [x[np.isfinite(x)] for _, x in samples]
         width: list[Any] = [np.ptp(x) if len(x) else 0.0 for x in finite]
-        silent = [f"'{t.name}'" for (t, _), w in zip(samples, width, strict=True) if not w]
+        silent = [
+            f"'{t.name}'" for (t, _), w in zip(samples, width, strict=True) if not w
+        ]
         if silent and max(width):
             text = f"{name} does not change in trial {listed(silent)}: if it acted there and was "
             yield Finding("a silent input", f"{text}not recorded, leave the trial out.")
@@ -156,7 +171,9 @@ def doubled_signals(recording: Recording, names: Sequence[str]) -> Iterator[Find
                 break
 
 
-def repeated_rows(recording: Recording, names: Sequence[str]) -> tuple[list[Rows], list[Finding]]:
+def repeated_rows(
+    recording: Recording, names: Sequence[str]
+) -> tuple[list[Rows], list[Finding]]:
     """Return for each trial the samples that an earlier trial holds already.
 
     Windows of successive samples are compared first. If most of those that two trials share are at
@@ -182,13 +199,19 @@ def repeated_rows(recording: Recording, names: Sequence[str]) -> tuple[list[Rows
         if (same & ~repeated[j]).any():
             repeated[j] |= same
             text = f"{places([trials[j]], [same])}: these samples are in trial '{trials[i].name}'"
-            findings.append(Finding("a trial twice", f"{text} too, and count once.", "left out"))
+            findings.append(
+                Finding("a trial twice", f"{text} too, and count once.", "left out")
+            )
     return repeated, findings
 
 
 def _keys(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " m"]:
     """Return a number for each window of successive rows of rounded values (exactly: integers)."""
-    weights = np.random.default_rng(0).integers(1, 2**20, (_WINDOW, values.shape[1])).astype(float)
+    weights = (
+        np.random.default_rng(0)
+        .integers(1, 2**20, (_WINDOW, values.shape[1]))
+        .astype(float)
+    )
     rows, last = np.round(values), max(len(values) - _WINDOW + 1, 0)
     return np.sum([rows[k : k + last] @ weights[k] for k in range(_WINDOW)], axis=0)
 
@@ -202,7 +225,10 @@ def other_settings(
     width = high - low
     for s, trial in enumerate(recording.trials if len(recording.trials) > 1 else ()):
         peers = np.delete(middle, s, axis=1)
-        usual, span = np.median(peers, axis=1), np.median(np.delete(width, s, axis=1), axis=1)
+        usual, span = (
+            np.median(peers, axis=1),
+            np.median(np.delete(width, s, axis=1), axis=1),
+        )
         # alike[i, j]: signal i is where signal j usually is.
         widths = np.broadcast_arrays(width[:, s, None], span)
         alike = np.abs(middle[:, s, None] - usual) < np.minimum(*widths)
@@ -220,11 +246,17 @@ def other_settings(
             ratio, is_output = width[k, s] / span[k], name in outputs
             off = abs(middle[k, s] - usual[k])
             # Pushes may be chosen to be ten times as strong.
-            units = np.log((10, 180 / np.pi, 1e2, 1e3, 1e6) if is_output else (1e3, 1e6))
+            units = np.log(
+                (10, 180 / np.pi, 1e2, 1e3, 1e6) if is_output else (1e3, 1e6)
+            )
             if np.abs(abs(np.log(ratio)) - units).min() < np.log(_ALIKE):
                 text = f"{name} varies {ratio:.3g} times as much in trial '{trial.name}': its unit?"
-                yield Finding("another unit", text, "refused" if is_output else "warned")
-            elif is_output and off > max(span[k] / _OFF, _OFF * np.abs(peers[k] - usual[k]).max()):
+                yield Finding(
+                    "another unit", text, "refused" if is_output else "warned"
+                )
+            elif is_output and off > max(
+                span[k] / _OFF, _OFF * np.abs(peers[k] - usual[k]).max()
+            ):
                 place = f"{middle[k, s]:.4g} in trial '{trial.name}', at {usual[k]:.4g} elsewhere"
                 yield Finding("another zero", f"the median of {name} lies at {place}.")
 
@@ -242,7 +274,9 @@ def clocks(recording: Recording) -> Iterator[Finding]:
     for s, trial in enumerate(recording.trials):
         ratio = steps[s] / float(np.median(steps[:s] + steps[s + 1 :] or steps))
         thousands = np.log(ratio) / np.log(1000.0)
-        if round(thousands) and abs(thousands - round(thousands)) < np.log(_ALIKE) / np.log(1000.0):
+        if round(thousands) and abs(thousands - round(thousands)) < np.log(
+            _ALIKE
+        ) / np.log(1000.0):
             text = f"samples of trial '{trial.name}' are {ratio:.4g} times as far apart: its unit?"
             yield Finding("another unit of time", text, "refused")
         step = np.diff(trial.time) / steps[s]
@@ -270,33 +304,49 @@ def odd_cycles(recording: Recording, phase: Phase) -> Iterator[Finding]:
         text = f"{odd.sum()} cycles of trial '{trial.name}' last {period[odd].mean():.4g}, all "
         text += f"others about {usual:.4g}: if "
         if odd.mean() < 0.1:
-            text += "samples were lost and times numbered anew, make a trial of each part."
+            text += (
+                "samples were lost and times numbered anew, make a trial of each part."
+            )
             yield Finding("odd cycles", text)
         elif np.abs(period[odd] / usual - 2).max() < 2 * _ALIKE_PERIODS:
-            missed.append(f"{text}events were missed, in gaps or between levels, choose others.")
+            missed.append(
+                f"{text}events were missed, in gaps or between levels, choose others."
+            )
     for text in missed:
         everywhere = len(missed) == len(recording.trials)
         yield Finding("missed events", text, "refused" if everywhere else "warned")
 
 
-def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -> Iterator[Finding]:
+def other_cycles(
+    recording: Recording, phase: Phase, outputs: tuple[str, ...]
+) -> Iterator[Finding]:
     """Find trials with another period, sign of an output, or start of the cycles."""
     names = [t.name for t in recording.trials]
     periods = np.array([np.median(p) if len(p) else np.nan for p in phase.periods])
     for s in np.flatnonzero(np.isfinite(periods)):
         peers = np.delete(periods, s)
-        usual = np.median(peers[np.isfinite(peers)]) if np.isfinite(peers).any() else periods[s]
+        usual = (
+            np.median(peers[np.isfinite(peers)])
+            if np.isfinite(peers).any()
+            else periods[s]
+        )
         if abs(periods[s] / usual - 1) > max(_OTHER_PERIOD, CLEAR * phase.jitter):
             text = f"cycles of trial '{names[s]}' last {periods[s]:.4g}, of the others {usual:.4g}."
             yield Finding("another period", text)
     mean = np.array([_average_cycles(recording, phase, name) for name in outputs])
-    finite = np.flatnonzero(np.isfinite(mean).all(axis=(0, 2))) if outputs else np.zeros(0, int)
+    finite = (
+        np.flatnonzero(np.isfinite(mean).all(axis=(0, 2)))
+        if outputs
+        else np.zeros(0, int)
+    )
     for s in finite if len(finite) > 1 else ():
         usual = np.median(mean[:, finite[finite != s]], axis=1)
         yield from _difference(mean[:, s], usual, names[s], list(outputs))
 
 
-def _average_cycles(recording: Recording, phase: Phase, name: str) -> Float[np.ndarray, "S P"]:
+def _average_cycles(
+    recording: Recording, phase: Phase, name: str
+) -> Float[np.ndarray, "S P"]:
     """Return the mean of a signal at each phase, without the mean of all, for each trial."""
     cycles, trials = [], phase.by_trial(recording)
     for (_, x), (trial, parts) in zip(recording.samples(name), trials, strict=True):
@@ -306,12 +356,16 @@ def _average_cycles(recording: Recording, phase: Phase, name: str) -> Float[np.n
         finite = np.isfinite(at) & np.isfinite(x)
         bins = (np.mod(at[finite], 1) * _PHASES).astype(int) % _PHASES
         with np.errstate(invalid="ignore"):
-            mean = np.bincount(bins, x[finite], _PHASES) / np.bincount(bins, minlength=_PHASES)
+            mean = np.bincount(bins, x[finite], _PHASES) / np.bincount(
+                bins, minlength=_PHASES
+            )
         cycles.append(mean - mean.mean())
     return np.array(cycles)
 
 
-def _difference(mean: Cycles, usual: Cycles, name: str, outputs: list[str]) -> Iterator[Finding]:
+def _difference(
+    mean: Cycles, usual: Cycles, name: str, outputs: list[str]
+) -> Iterator[Finding]:
     """Find the cause of a low correlation of the average cycles of a trial with those of others."""
 
     def correlations(x):
@@ -331,7 +385,9 @@ def _difference(mean: Cycles, usual: Cycles, name: str, outputs: list[str]) -> I
         yield Finding("another event", text, "refused")
     elif len(unlike):
         which = ", ".join(outputs[k] for k in unlike)
-        text = f"the average cycle of {which} in trial '{name}' is not that of the others."
+        text = (
+            f"the average cycle of {which} in trial '{name}' is not that of the others."
+        )
         yield Finding("another cycle", text)
 
 
@@ -346,7 +402,9 @@ def slow_changes(
             for part in parts:
                 level = cycle_means(trial, x, [part], phase.period)[1]
                 if len(level) >= 2 * _COSINES:
-                    power += np.asarray(fft.dct(level, norm="ortho"))[1 : _COSINES + 1] ** 2
+                    power += (
+                        np.asarray(fft.dct(level, norm="ortho"))[1 : _COSINES + 1] ** 2
+                    )
         if power[: _COSINES // 4].mean() > _RATIO * power[_COSINES // 4 :].mean():
             text = f"{name} drifts or slips: if that is the sensor, "
             text += f"`drift={min(50.0, removed / 2):g}` takes it out."

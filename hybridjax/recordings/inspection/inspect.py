@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float
 from ..._core.arguments import require_apart
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import OptionalNames, SignalNames
+from ..._core.findings import Finding, listed, warn_of
 from ..data import SectionData
-from ..findings import CLEAR, NAME_REFERENCE, Finding, Inspection, listed, place, places, warn_of
+from ..findings import CLEAR, NAME_REFERENCE, Inspection, place, places
 from ..phase import Phase
 from ..recording import Recording
 from ..smoothing import FEWEST
@@ -35,8 +36,16 @@ _DISTURBED = 9.0
 _SHIFTED = 0.7
 
 _NOT_MEASURED = (
-    ("no value", faults.placeholders, "has samples that stand for no value, such as -9999"),
-    ("frozen", faults.frozen, "does not change at all, as if a sensor or wire had failed"),
+    (
+        "no value",
+        faults.placeholders,
+        "has samples that stand for no value, such as -9999",
+    ),
+    (
+        "frozen",
+        faults.frozen,
+        "does not change at all, as if a sensor or wire had failed",
+    ),
 )
 
 
@@ -79,7 +88,9 @@ def inspect(
             pairs = zip(clean.samples(name), periods, strict=True)
             bad = [samples_of(x, period, name in inputs) for (_, x), period in pairs]
             if any(map(np.any, bad)):
-                text = f"{name} {text} ({places(clean.trials, bad)}): taken for missing."
+                text = (
+                    f"{name} {text} ({places(clean.trials, bad)}): taken for missing."
+                )
                 findings.append(Finding(cause, text, "left out"))
                 clean = _masked(clean, [name], bad)
         findings += faults.clipped(clean, name)
@@ -99,7 +110,10 @@ def inspect(
             findings.append(Finding("an empty trial", text, "left out"))
     if kept:
         clean = clean.with_trials(kept)
-        findings += [*faults.other_settings(clean, names, outputs), *faults.clocks(clean)]
+        findings += [
+            *faults.other_settings(clean, names, outputs),
+            *faults.clocks(clean),
+        ]
     else:
         text = "no trial has samples of all outputs that can be used."
         findings.append(Finding("an empty recording", text, "refused"))
@@ -110,20 +124,26 @@ def inspect(
     return Inspection(tuple(findings), clean)
 
 
-def inspect_cycles(recording: Recording, phase: Phase, data: SectionData) -> list[Finding]:
+def inspect_cycles(
+    recording: Recording, phase: Phase, data: SectionData
+) -> list[Finding]:
     """Return the findings that need the phase and the data at the sections."""
     outputs = tuple(x for x in data.outputs if x in recording.signals)
     return [
         *faults.odd_cycles(recording, phase),
         *inexact_events(data),
         *faults.other_cycles(recording, phase, outputs),
-        *faults.slow_changes(recording, phase, outputs, data.records[0].drift or np.inf),
+        *faults.slow_changes(
+            recording, phase, outputs, data.records[0].drift or np.inf
+        ),
         *(unanswered(data, [t.name for t in recording.trials]) if outputs else ()),
         *feedback(data),
     ]
 
 
-def _masked(recording: Recording, names: list[str], bad: list[Bool[np.ndarray, " _"]]) -> Recording:
+def _masked(
+    recording: Recording, names: list[str], bad: list[Bool[np.ndarray, " _"]]
+) -> Recording:
     """Return the recording with NaN for some samples of some signals."""
     columns = np.array([recording.column(name) for name in names], int)
     trials = []
@@ -176,9 +196,13 @@ def unanswered(data: SectionData, names: Sequence[str]) -> Iterator[Finding]:
     """
     for i, name in enumerate(data.inputs):
         for sections in _SECTIONS:
-            parts = [p for r in range(len(data.records)) for p in _parts(data, r, sections)]
+            parts = [
+                p for r in range(len(data.records)) for p in _parts(data, r, sections)
+            ]
             size = [float(p.inputs[i].std()) for p in parts]
-            pushed = [p for p, x in zip(parts, size, strict=True) if x > 0.1 * np.median(size)]
+            pushed = [
+                p for p, x in zip(parts, size, strict=True) if x > 0.1 * np.median(size)
+            ]
             answers = _answers(pushed, i)
             if len(answers):
                 where = [place(names[p.trial], p.time) for p in pushed]
@@ -210,7 +234,9 @@ def _odd(
     for k, (cause, text) in enumerate(texts.items()):
         if spans := [where[n] for n in np.flatnonzero(first == k)]:
             text = text.format(name, listed(spans))
-            yield Finding(cause, text, "refused" if cause == "another sign" else "warned")
+            yield Finding(
+                cause, text, "refused" if cause == "another sign" else "warned"
+            )
 
 
 def _answers(parts: list[_Part], i: int) -> Float[np.ndarray, "n 4"]:
@@ -227,7 +253,9 @@ def _answers(parts: list[_Part], i: int) -> Float[np.ndarray, "n 4"]:
         if sum(len(regressors[k]) for k in training) < _ENOUGH * unknowns:
             return np.zeros((0, 4))
         square = np.sum([squares[k] for k in training], axis=0)
-        square += 1e-4 * np.trace(square) / unknowns * np.eye(unknowns)  # of collinear inputs
+        square += (
+            1e-4 * np.trace(square) / unknowns * np.eye(unknowns)
+        )  # of collinear inputs
         b = np.linalg.solve(square, np.sum([products[k] for k in training], axis=0))
         first = sum(u.shape[1] for u in (part.before, *part.inputs[:i]))
         predicted = part.inputs[i] @ b[first : first + part.inputs[i].shape[1]]
@@ -247,8 +275,12 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
     sections = min(N, sections)
     first, ahead = -record.first_section % N, -(-record.lead // N)
     size_u, size_y = data.rms()
-    robust = 1.4826 * np.nanmedian(np.abs(np.concatenate([x.y for x in data.records])), axis=0)
-    size_y = np.maximum(robust, 0.1 * size_y)  # (more than half of the samples may be zero)
+    robust = 1.4826 * np.nanmedian(
+        np.abs(np.concatenate([x.y for x in data.records])), axis=0
+    )
+    size_y = np.maximum(
+        robust, 0.1 * size_y
+    )  # (more than half of the samples may be zero)
     at = np.linspace(0, N, sections, endpoint=False).astype(int)
     cycles = (len(record.u) - first) // N
     number = min(_PARTS, cycles // _SHORTEST)
@@ -262,10 +294,15 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
         u, rows = np.stack(means, axis=1), np.arange(1, b - a - ahead)
         inputs = np.stack([u[rows + c] for c in range(-1, ahead + 1)], axis=1)
         usable = np.isfinite(inputs).all(axis=(1, 2, 3))
-        usable &= np.isfinite(y[rows - 1]).all(axis=1) & np.isfinite(y[rows]).all(axis=1)
+        usable &= np.isfinite(y[rows - 1]).all(axis=1) & np.isfinite(y[rows]).all(
+            axis=1
+        )
         if usable.sum() >= _SHORTEST / 2:
             rows, inputs = rows[usable], inputs[usable]
-            each = [_centered(inputs[..., i].reshape(len(rows), -1)) for i in range(u.shape[2])]
+            each = [
+                _centered(inputs[..., i].reshape(len(rows), -1))
+                for i in range(u.shape[2])
+            ]
             before, outputs = _centered(y[rows - 1]), _centered(y[rows])
             yield _Part(data.trials[r], data.times[r][where], before, each, outputs)
 
@@ -280,20 +317,29 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
     that do not depend on those of the events before."""
     N, size = data.n_sections, data.rms()[1]
     waves = 2j * np.pi * np.fft.fftfreq(N, 1 / N)[:, None]
-    slope = np.fft.ifft(waves * np.fft.fft(data.cycle_outputs, axis=0), axis=0).real / size
+    slope = (
+        np.fft.ifft(waves * np.fft.fft(data.cycle_outputs, axis=0), axis=0).real / size
+    )
     slope, late, whole, left = slope[: N // 5].ravel(), [], 0.0, 0.0
     for r in data.records:
         first = -r.first_section % N
-        y = (r.y[first:] / size)[: (len(r.y) - first) // N * N].reshape(-1, N * len(size))
+        y = (r.y[first:] / size)[: (len(r.y) - first) // N * N].reshape(
+            -1, N * len(size)
+        )
         y = y[np.isfinite(y[:, : len(slope)]).all(axis=1), : len(slope)]
         late.append(y @ slope / max(slope @ slope, np.finfo(float).tiny))
-        whole, left = whole + (y**2).sum(), left + ((y - late[-1][:, None] * slope) ** 2).sum()
+        whole, left = (
+            whole + (y**2).sum(),
+            left + ((y - late[-1][:, None] * slope) ** 2).sum(),
+        )
     times = np.concatenate(late)
     follows = abs(times[1:] @ times[:-1]) / max(times @ times, np.finfo(float).tiny)
     # (Times beyond a cycle are those of outputs that do not change along it.)
     if left < (1 - _SHIFTED) * whole and follows < 0.5 and times.std() < 1:
         text = f"the starts of cycles seem to scatter by {times.std():.2g} of a cycle: use an angle"
-        yield Finding("inexact events", f"{text}, or a crossing where the signal changes fast.")
+        yield Finding(
+            "inexact events", f"{text}, or a crossing where the signal changes fast."
+        )
 
 
 def feedback(data: SectionData) -> Iterator[Finding]:
@@ -309,12 +355,16 @@ def feedback(data: SectionData) -> Iterator[Finding]:
     shapes = np.nan_to_num(data.cycle_outputs - np.nanmean(data.cycle_outputs, axis=0))
     for i, name in enumerate(data.inputs if data.cycles >= 6 else ()):
         repeated = float(np.nanvar(data.cycle_inputs[:, i]))
-        share = repeated / max(repeated + float(deviations[i]) ** 2, np.finfo(float).tiny)
+        share = repeated / max(
+            repeated + float(deviations[i]) ** 2, np.finfo(float).tiny
+        )
         if share > 0.5:
             text = f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: "
             yield Finding("feedback", f"{text}fits are biased. {NAME_REFERENCE}")
         elif share > CLEAR**2 / data.cycles and data.n_sections > 2 * shapes.shape[1]:
-            mean = np.nan_to_num(data.cycle_inputs[:, i] - np.nanmean(data.cycle_inputs[:, i]))
+            mean = np.nan_to_num(
+                data.cycle_inputs[:, i] - np.nanmean(data.cycle_inputs[:, i])
+            )
             left = mean - shapes @ np.linalg.lstsq(shapes, mean)[0]
             if left @ left < 0.1 * (mean @ mean):
                 text = f"{name} contains the outputs ({100 * share:.0f} % of its variance repeats "

@@ -46,7 +46,11 @@ class MapResult:
     def __repr__(self) -> str:
         size, t = np.abs(self.values).max(), np.abs(self.t).max()
         inside = zip(self.axes.items(), np.nonzero(self.significant), strict=True)
-        spans = (f"{n} {x[i].min():.3g} to {x[i].max():.3g}" for (n, x), i in inside if len(i))
+        spans = (
+            f"{n} {x[i].min():.3g} to {x[i].max():.3g}"
+            for (n, x), i in inside
+            if len(i)
+        )
         where = ", ".join(spans) or "none"
         return (
             f"MapResult({' x '.join(self.axes)}: largest {size:.4g} {self.unit}".rstrip()
@@ -89,7 +93,9 @@ class PopulationMaps:
         count = self.table["subject"].nunique()
         return f"PopulationMaps({count} subjects, {len(self.values)} maps: {' x '.join(self.axes)})"
 
-    def mean(self, label: str | None = None, *, draws: Count = 10_000, seed: Seed = 0) -> MapResult:
+    def mean(
+        self, label: str | None = None, *, draws: Count = 10_000, seed: Seed = 0
+    ) -> MapResult:
         """Return the mean of a group or condition with a simultaneous 95 % band.
 
         The band has the width at which the largest |t| of sign flips of the deviations from the
@@ -106,7 +112,9 @@ class PopulationMaps:
         text = f"Mean of {len(y)} subjects with a simultaneous 95 % band"
         return self._result(y, np.ones(len(y)), y - y.mean(axis=0), draws, seed, text)
 
-    def difference(self, a: str, b: str, *, draws: Count = 10_000, seed: Seed = 0) -> MapResult:
+    def difference(
+        self, a: str, b: str, *, draws: Count = 10_000, seed: Seed = 0
+    ) -> MapResult:
         """Test the difference a - b of two conditions (sign flips of paired differences) or two
         groups (permutations of labels), with a family-wise error of 5 % over all points.
 
@@ -132,9 +140,13 @@ class PopulationMaps:
 
     def _by_subject(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         groups = self.table.iloc[rows].groupby("subject", sort=False).groups
-        return {str(name): self.values[index].mean(axis=0) for name, index in groups.items()}
+        return {
+            str(name): self.values[index].mean(axis=0) for name, index in groups.items()
+        }
 
-    def _result(self, y, true: np.ndarray, null, draws: int, seed: int, text: str) -> MapResult:
+    def _result(
+        self, y, true: np.ndarray, null, draws: int, seed: int, text: str
+    ) -> MapResult:
         """Return the mean, or of two groups the difference, with the band and p-values of the
         largest statistics of relabeled maps `null`."""
         paired, grid = bool((true > 0).all()), y.shape[1:]
@@ -152,7 +164,9 @@ class PopulationMaps:
         methods = signed(f"{text}, by the largest |t| of {amount} {way}.")
         each, p = y if paired else y[:0], np.maximum(count, 1) / len(largest)
         inside = np.abs(value) > reach
-        return MapResult(value, each, reach, t, p, inside, self.axes, self.unit, methods)
+        return MapResult(
+            value, each, reach, t, p, inside, self.axes, self.unit, methods
+        )
 
 
 def relabelings(
@@ -168,7 +182,9 @@ def relabelings(
     return signs[signs[:, 0] > 0] if paired else signs[signs.sum(axis=1) == true.sum()]
 
 
-def moments(y: Inexact[np.ndarray, "n *grid"], signs: Float[np.ndarray, "P n"], paired: bool):
+def moments(
+    y: Inexact[np.ndarray, "n *grid"], signs: Float[np.ndarray, "P n"], paired: bool
+):
     """Return means or differences of two means, standard errors and Student's t for each relabeling
     (P, V); of complex maps |t|, the root of the F ratio of a complex mean."""
     n, y = len(y), y.reshape(len(y), -1)

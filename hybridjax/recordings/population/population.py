@@ -59,23 +59,33 @@ class Population:
         freedom: Freedom | None = None,
     ):
         if not values or set(values) != set(errors):
-            raise DefinitionError("`values` and `errors` must hold the same quantities.")
+            raise DefinitionError(
+                "`values` and `errors` must hold the same quantities."
+            )
         rows = len(next(iter(values.values())))
         self.table = table_of(table, rows)
         self.values = {name: np.asarray(x, float) for name, x in values.items()}
         self.errors = {name: np.asarray(x, float) for name, x in errors.items()}
         for name, error in self.errors.items():
             if not len(values[name]) == len(error) == rows:
-                raise DefinitionError(f"`values` and `errors` of '{name}' must have {rows} rows.")
+                raise DefinitionError(
+                    f"`values` and `errors` of '{name}' must have {rows} rows."
+                )
             wrong = np.isfinite(values[name]) & ~(error > 0)
-            for subject, number in zip(self.table["subject"][wrong], error[wrong], strict=True):
+            for subject, number in zip(
+                self.table["subject"][wrong], error[wrong], strict=True
+            ):
                 text = f"has the standard error {number:.3g}: it must be a positive number."
                 raise DefinitionError(f"'{name}' of subject '{subject}' {text}")
         self.units = dict.fromkeys(values, "") | dict(units or {})
-        self.freedom = np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)
+        self.freedom = (
+            np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)
+        )
 
     @classmethod
-    def from_fits(cls, fits: Sequence[MultiplierEstimate], table: Columns) -> "Population":
+    def from_fits(
+        cls, fits: Sequence[MultiplierEstimate], table: Columns
+    ) -> "Population":
         """Return the population of some fits, with a row of the table for each.
 
         Quantities are `modulus` and `angle` (rad; missing if real) of the leading multiplier, and
@@ -94,18 +104,30 @@ class Population:
             require_equal(pair, "outputs", *outputs)
             if not np.isfinite(fit.covariance).all():
                 text = f"the fit of subject '{subject}' has no covariance"
-                raise DefinitionError(f"{text}: record more strides, or leave the subject out.")
+                raise DefinitionError(
+                    f"{text}: record more strides, or leave the subject out."
+                )
             z, covariance = complex(fit.multipliers[0]), fit.multiplier_covariances[0]
-            polar = np.array([[z.real, z.imag], [-z.imag / abs(z), z.real / abs(z)]]) / abs(z)
+            polar = np.array(
+                [[z.real, z.imag], [-z.imag / abs(z), z.real / abs(z)]]
+            ) / abs(z)
             squares = *np.diag(polar @ covariance @ polar.T), *np.diag(fit.covariance)
             values = abs(z), abs(np.angle(z)) if z.imag else np.nan, *fit.coefficients
             numbers[:, : len(values), row] = values, np.sqrt(squares)
         kinds = ["modulus", "angle", *(f"c{k}" for k in range(1, most + 1))]
         values, errors = (dict(zip(kinds, x, strict=True)) for x in numbers)
-        return cls(frame, values, errors, {"angle": "rad"}, [x.covariance_freedom for x in fits])
+        return cls(
+            frame,
+            values,
+            errors,
+            {"angle": "rad"},
+            [x.covariance_freedom for x in fits],
+        )
 
     def __repr__(self) -> str:
-        count = self.table.assign(cell=cells_of(self.table)).groupby("cell", sort=False)["subject"]
+        count = self.table.assign(cell=cells_of(self.table)).groupby(
+            "cell", sort=False
+        )["subject"]
         cells = "; ".join(f"{c}: {n} subjects" for c, n in count.nunique().items())
         names = ", ".join(self.values)
         return folded(f"Population({names}; {cells}; {len(self.table)} estimates)")
@@ -123,7 +145,11 @@ class Population:
         """
         parts = []
         for cell, data in self._cells(quantity, 2 + len(covariates), covariates):
-            y, v, slopes = data["y"].to_numpy(), data["v"].to_numpy(), data.filter(like=_SLOPE)
+            y, v, slopes = (
+                data["y"].to_numpy(),
+                data["v"].to_numpy(),
+                data.filter(like=_SLOPE),
+            )
             x = np.column_stack([np.ones(len(y)), slopes - slopes.mean()])
             fit, weights = meta(y, v, x), np.eye(x.shape[1])
             spread = np.sqrt(fit.between[0, 0]), *spread_interval(y, v, x)
@@ -136,7 +162,9 @@ class Population:
             "of each subject, by restricted maximum likelihood (Hartung and Knapp).",
         )
 
-    def difference(self, quantity: str, a: str, b: str, *, covariates: OptionalNames = ()) -> Any:
+    def difference(
+        self, quantity: str, a: str, b: str, *, covariates: OptionalNames = ()
+    ) -> Any:
         """Return the mean difference a - b of two conditions or two groups, and test it.
 
         Differences are paired in subjects that have both; subjects with one of them count, too.
@@ -156,7 +184,10 @@ class Population:
         weights[0, : len(w)] = w
         spread, (y, v) = (np.nan,) * 3, pairs.to_numpy().T
         if len(y) > 2:
-            spread = np.sqrt(w @ fit.between @ w), *spread_interval(y, v, np.ones((len(y), 1)))
+            spread = (
+                np.sqrt(w @ fit.between @ w),
+                *spread_interval(y, v, np.ones((len(y), 1))),
+            )
         n = subject.max() + 1
         rows = self._effects(quantity, [f"{a} - {b}", *slopes], n, fit, weights, spread)
         return _result(
@@ -185,9 +216,15 @@ class Population:
             square += 2 * v**2 / (v + between) ** 3 * fit.uncertainty[0, 0]
             value, error = mean + share * (y - mean), np.sqrt(square)
             reach = stats.t.ppf(0.975, fit.most) * error
-            part = data[["subject", "cell"]].assign(quantity=quantity, unit=self.units[quantity])
+            part = data[["subject", "cell"]].assign(
+                quantity=quantity, unit=self.units[quantity]
+            )
             part = part.assign(estimate=y, standard_error=np.sqrt(v), prediction=value)
-            parts.append(part.assign(prediction_error=error, low=value - reach, high=value + reach))
+            parts.append(
+                part.assign(
+                    prediction_error=error, low=value - reach, high=value + reach
+                )
+            )
         text = f"Single subjects: best linear unbiased predictions of {quantity} (Prasad and Rao)."
         return _result(parts, text)
 
@@ -222,13 +259,19 @@ class Population:
             pilots = [data[["y", "v"]] for _, data in self._cells(quantity, 3)]
         y, v = pilots[0].to_numpy().T
         if len(y) < 3 or len(pilots) > 1 or len(labels) not in (0, 2):
-            raise DefinitionError("`labels` must be two conditions of three or more subjects.")
+            raise DefinitionError(
+                "`labels` must be two conditions of three or more subjects."
+            )
         ones, rows = np.ones((len(y), 1)), []
         low, high = spread_interval(y, v, ones)
         spread = np.sqrt(meta(y, v, ones).between[0, 0])
         for n in subjects:
-            tests = [_test(v, n, x, difference, bool(labels)) for x in (spread, high, low)]
-            count, *bounds = (int(monte_carlo(f, draws, seed).value.sum()) for f in tests)
+            tests = [
+                _test(v, n, x, difference, bool(labels)) for x in (spread, high, low)
+            ]
+            count, *bounds = (
+                int(monte_carlo(f, draws, seed).value.sum()) for f in tests
+            )
             least, most = (stats.binomtest(k, draws).proportion_ci() for k in bounds)
             rows.append((n, count / draws, least.low, most.high, spread, draws))
         columns = ("subjects", "power", "power_low", "power_high", "spread", "draws")
@@ -262,7 +305,9 @@ class Population:
         """
         cells = [data[["y", "v"]].to_numpy().T for _, data in self._cells(quantity, 3)]
         between = np.mean([meta(y, v, np.ones((len(y), 1))).between for y, v in cells])
-        trials = self._trials(quantity).assign(strides=self._numbers("strides")).dropna()
+        trials = (
+            self._trials(quantity).assign(strides=self._numbers("strides")).dropna()
+        )
         by = trials.groupby(["subject", "cell"])
         count = by["y"].count()
         scatter = (count - 1) * (by["y"].var().fillna(0.0) - by["v"].mean())
@@ -278,20 +323,26 @@ class Population:
         row |= {"strides": np.sqrt(stride * cost / (k**2 * between + k * trial))}
         row |= {"subject_spread": np.sqrt(between), "trial_spread": np.sqrt(trial)}
         row |= {"stride_spread": np.sqrt(stride)}
-        text = "Trials and strides: smallest variance of the mean for its cost (Cochran)."
+        text = (
+            "Trials and strides: smallest variance of the mean for its cost (Cochran)."
+        )
         return _result([package("pandas").DataFrame([row])], text)
 
     def _numbers(self, name: str) -> np.ndarray:
         values = np.asarray(self.table.get(name, ""))
         if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
-            raise DefinitionError(f"`table` needs a column '{name}' with a number in each row.")
+            raise DefinitionError(
+                f"`table` needs a column '{name}' with a number in each row."
+            )
         return values.astype(float)
 
     def _trials(self, quantity: str) -> Any:
         """Return subject, factors, cell, estimate and moderated variance of each row."""
         if quantity not in self.values:
             listed = ", ".join(self.values)
-            raise DefinitionError(f"there is no quantity '{quantity}'; quantities are {listed}.")
+            raise DefinitionError(
+                f"there is no quantity '{quantity}'; quantities are {listed}."
+            )
         y, v = np.asarray(self.values[quantity]), np.asarray(self.errors[quantity]) ** 2
         trend, strides = np.ones((len(y), 1)), np.asarray(self.table.get("strides", ""))
         if strides.dtype.kind in "iuf" and np.ptp(strides) > 0:
@@ -302,7 +353,9 @@ class Population:
         frame = self.table[["subject", *factors_of(self.table)]]
         return frame.assign(cell=cells_of(frame), y=y, v=v)
 
-    def _merged(self, quantity: str, covariates: Sequence[str], rows: Any = None) -> Any:
+    def _merged(
+        self, quantity: str, covariates: Sequence[str], rows: Any = None
+    ) -> Any:
         """Return a row for each subject in each group and condition; trials are averaged."""
         slopes = {_SLOPE + name: self._numbers(name) for name in covariates}
         frame = self._trials(quantity).assign(**slopes)
@@ -313,7 +366,9 @@ class Population:
         return data.assign(y=data["wy"] / data["w"], v=1 / data["w"])
 
     def _cells(self, quantity: str, needed: int, covariates: Sequence[str] = ()) -> Any:
-        cells = dict(list(self._merged(quantity, covariates).groupby("cell", sort=False)))
+        cells = dict(
+            list(self._merged(quantity, covariates).groupby("cell", sort=False))
+        )
         require({c: x["subject"] for c, x in cells.items()} or {"all": ()}, needed)
         return cells.items()
 
@@ -326,18 +381,30 @@ class Population:
         cell, names = data["cell"].factorize()
         is_a = data.drop_duplicates("cell")[factor].to_numpy() == a
         w = np.where(is_a, 1 / max(is_a.sum(), 1), -1 / max((~is_a).sum(), 1))
-        parts = data.assign(y=data["y"] * w[cell], v=data["v"] * w[cell] ** 2).groupby("subject")
+        parts = data.assign(y=data["y"] * w[cell], v=data["v"] * w[cell] ** 2).groupby(
+            "subject"
+        )
         return data, cell, w, parts[["y", "v"]].sum()[parts.size() == len(names)]
 
     def _effects(
-        self, quantity: str, names: list[str], subjects: int, fit: Mixed, weights, spread
+        self,
+        quantity: str,
+        names: list[str],
+        subjects: int,
+        fit: Mixed,
+        weights,
+        spread,
     ) -> Any:
         value, error, freedom = np.array([fit.contrast(w) for w in weights]).T
         reach = stats.t.ppf(0.975, freedom) * error
         frame = package("pandas").DataFrame({"quantity": quantity, "effect": names})
-        frame = frame.assign(unit=self.units[quantity], subjects=subjects, estimate=value)
+        frame = frame.assign(
+            unit=self.units[quantity], subjects=subjects, estimate=value
+        )
         frame = frame.assign(standard_error=error, freedom=freedom, low=value - reach)
-        frame = frame.assign(high=value + reach, p=2 * stats.t.sf(abs(value) / error, freedom))
+        frame = frame.assign(
+            high=value + reach, p=2 * stats.t.sf(abs(value) / error, freedom)
+        )
         frame.loc[0, ["spread", "spread_low", "spread_high"]] = spread
         return frame
 

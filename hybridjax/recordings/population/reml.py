@@ -36,13 +36,21 @@ class Mixed(NamedTuple):
         """Return value, standard error and degrees of freedom of a contrast (of a single one, those
         of Kenward and Roger are Satterthwaite's), at most those of a t test."""
         slope = np.einsum("i,kij,j->k", w, self.slopes, w)
-        square = 2 * (w @ self.plain @ w) ** 2 / max(slope @ self.uncertainty @ slope, 1e-300)
+        square = (
+            2
+            * (w @ self.plain @ w) ** 2
+            / max(slope @ self.uncertainty @ slope, 1e-300)
+        )
         error = float(np.sqrt(w @ self.covariance @ w))
         return float(w @ self.coefficients), error, float(np.clip(square, 1, self.most))
 
 
 def mixed(
-    y: Reals, v: Reals, x: Design, subjects: Int[np.ndarray, " N"], cells: Int[np.ndarray, " N"]
+    y: Reals,
+    v: Reals,
+    x: Design,
+    subjects: Int[np.ndarray, " N"],
+    cells: Int[np.ndarray, " N"],
 ) -> Mixed:
     """Fit by restricted maximum likelihood, with covariances after Kenward and Roger (1997).
 
@@ -70,15 +78,21 @@ def mixed(
         return value / 2, (slope @ lower)[i, j]
 
     start = np.where(i == j, 0.7, 0.0)
-    best = optimize.minimize(cost, start, jac=True, method="L-BFGS-B", options={"ftol": 1e-13})
+    best = optimize.minimize(
+        cost, start, jac=True, method="L-BFGS-B", options={"ftol": 1e-13}
+    )
     # A spread below 1e-5 of the scale is zero, up to the accuracy of the optimizer.
     lower, _, phi, wx, projection = fitted(np.where(np.abs(best.x) < 1e-5, 0.0, best.x))
     # Derivatives of the covariance of all estimates by the elements of Psi, (k, N, N).
     both = np.einsum("nk,mk->knm", cell[:, i], cell[:, j])
     change = same * np.maximum(both, np.swapaxes(both, 1, 2))
     moved, effect = projection @ change, change @ wx
-    uncertainty = np.linalg.pinv(np.einsum("kij,lji->kl", moved, moved) / 2, hermitian=True)
-    extra = np.einsum("kl,kip,ij,ljq->pq", uncertainty, effect, projection, effect, optimize=True)
+    uncertainty = np.linalg.pinv(
+        np.einsum("kij,lji->kl", moved, moved) / 2, hermitian=True
+    )
+    extra = np.einsum(
+        "kl,kip,ij,ljq->pq", uncertainty, effect, projection, effect, optimize=True
+    )
     sums = np.array([x[row].sum(axis=0) for row in np.unique(same, axis=0)])
     square = scale**2
     return Mixed(

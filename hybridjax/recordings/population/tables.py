@@ -25,7 +25,9 @@ def table_of(table: Columns, rows: int) -> Any:
     """
     columns = {str(name): np.asarray(values) for name, values in table.items()}
     if "subject" not in columns:
-        raise DefinitionError("`table` has no column 'subject': add one, with a name in each row.")
+        raise DefinitionError(
+            "`table` has no column 'subject': add one, with a name in each row."
+        )
     for name, values in columns.items():
         require_axes(f"column '{name}' of `table`", values, {"estimates": rows})
     frame = package("pandas").DataFrame(columns)
@@ -34,7 +36,9 @@ def table_of(table: Columns, rows: int) -> Any:
         text = f"row {rows_without[0]} of `table` has no {' or no '.join(labels)}"
         raise DefinitionError(f"{text}: name it, or leave the row out.")
     frame = frame.astype(dict.fromkeys(labels, str))
-    for subject, groups in frame.groupby("subject")["group"] if "group" in frame else ():
+    for subject, groups in (
+        frame.groupby("subject")["group"] if "group" in frame else ()
+    ):
         if len(groups.unique()) > 1:
             text = f"{' and '.join(map(repr, groups.unique()))}: conditions may differ, not groups."
             raise DefinitionError(f"subject '{subject}' is in the groups {text}")
@@ -59,8 +63,12 @@ def rows_with(table: Any, *labels: str) -> tuple[str, Any]:
     for factor in factors_of(table):
         if len(set(labels)) == len(labels) and set(labels) <= set(table[factor]):
             return factor, table[factor].isin(labels)
-    listed = ", ".join(f"'{x}'" for factor in factors_of(table) for x in table[factor].unique())
-    text = f"are no two conditions or groups of `table`, which has {listed or 'neither'}"
+    listed = ", ".join(
+        f"'{x}'" for factor in factors_of(table) for x in table[factor].unique()
+    )
+    text = (
+        f"are no two conditions or groups of `table`, which has {listed or 'neither'}"
+    )
     raise DefinitionError(f"{' and '.join(map(repr, labels))} {text}.")
 
 
@@ -68,7 +76,9 @@ def require(subjects: Mapping[str, Iterable[str]], needed: int) -> None:
     """**Raises:** `DefinitionError` if a group or condition has fewer subjects."""
     for cell, names in subjects.items():
         if (count := len(set(names))) < needed:
-            raise DefinitionError(f"'{cell}' has too few subjects: {count} of {needed} needed.")
+            raise DefinitionError(
+                f"'{cell}' has too few subjects: {count} of {needed} needed."
+            )
 
 
 def signed(text: str) -> str:
