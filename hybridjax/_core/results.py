@@ -57,6 +57,14 @@ class Result(enum.IntEnum):
         "steps pass over a pulse: begin and end it by transitions (`hj.Scheduled`)",
     )
     PLANT_STOPPED = 18, "the plant ended the experiment: see `data.simulated.causes`"
+    GUARD_BEYOND = (
+        19,
+        "the cycle lies beyond a guard all along, so that its event can never happen",
+    )
+    NOT_VERIFIED = (
+        20,
+        "a check of the cycle failed: `find_limit_cycle` of its system says which",
+    )
 
 
 def update_result(

@@ -1,6 +1,7 @@
 """Single trajectories with their events, dense enough to plot."""
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease, host_first
+from .._core.findings import Finding, print_findings, warn_of
 from .._core.meaning import current
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -64,7 +66,7 @@ class Trajectory(eqx.Module):
     **Fields:** `t`, the ends of the steps; `chart`, the chart after each; `before` and `after`,
     the states at each before and after an event's reset; `slope_before`, `slope_after`, their
     time derivatives; `event`, the transition that fired there or -1; `result`, the reason of its
-    end.
+    end; `findings`, doubts about the start.
     """
 
     structure: Structure
@@ -76,6 +78,7 @@ class Trajectory(eqx.Module):
     slope_after: Float[np.ndarray, "n d"]
     event: Int[np.ndarray, " n"]
     result: Result = eqx.field(static=True)
+    findings: tuple[Finding, ...] = eqx.field(static=True, default=())
 
     @property
     def system(self) -> HybridSystem:
@@ -94,6 +97,7 @@ class Trajectory(eqx.Module):
             self.slope_after[to],
             self.event[to],
             result,
+            self.findings,
         )
 
     @property
@@ -176,10 +180,11 @@ class Trajectory(eqx.Module):
             or "no events"
         )
         span = f"t = {number(self.t[0])} to {number(self.t[-1], unit=system.time_unit)}"
-        return folded(
+        text = folded(
             f"Trajectory({type(system).__name__}: {span}, {len(self.t) - 1} steps; {events}; "
             f"ends in {s.names[self.chart[-1]]}: {self.result.message})"
         )
+        return "\n".join([text, *print_findings(self.findings, "  ").splitlines()])
 
 
 def observed(
@@ -220,7 +225,8 @@ def simulate(
     **Arguments:**
 
     - `chart`, `state`, `time`: the start. A guard that is zero or negative there is not an
-        event: a ball that starts below the floor falls on.
+        event: a ball that starts below the floor falls on. `findings` of the trajectory name such
+        guards.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of
@@ -254,6 +260,8 @@ def simulate(
         lanes, h, steps = moved.lanes, moved.h, steps + settings.max_steps
         result = Result(int(np.asarray(moved.result)[0]))
     path = recorded(s, begin, tapes, u, result)
+    path = dataclasses.replace(path, findings=tuple(_begins_beyond(s, begin, u)))
+    warn_of(path.findings)
     passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
     if passed is not None:
         path = path.until(passed, Result.GUARD_PASSED)
@@ -307,6 +315,29 @@ def _constant_input(system: HybridSystem, input) -> np.ndarray:
             f"({', '.join(system.inputs)}): give one number for each."
         )
     return np.broadcast_to(value, (nu,))
+
+
+def _begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
+    """Guards that have, at the start, the sign that they have after their event."""
+    a = int(begin.chart[0])
+    guards, n = s.guards(a), s.dims[a]
+    if not guards:
+        return
+    q, first = begin.q[:n], np.zeros(1, np.int32)
+    rows = kernels.watched(s, a, None, begin.t, q, u, first)[..., 0]
+    point = np.append(begin.t, q)
+    for g, row in zip(guards, rows, strict=True):
+        transition = s.transitions[g]
+        noise = _SAME * np.abs(row[1 : 2 + n] * point).sum()
+        holds = kernels.enabled(s, s.member(g), begin.t, q, u).all()
+        if row[0] < -noise and holds:
+            text = (
+                f"the start lies beyond the guard of '{transition.name}' (its value is "
+                f"{transition.sign * row[0]:.3g}; the event happens where it is "
+                f"{transition.direction} through zero), so that this event cannot happen before "
+                "the guard has come back."
+            )
+            yield Finding("beyond a guard", text)
 
 
 def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:

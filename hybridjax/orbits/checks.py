@@ -29,6 +29,7 @@ from .coincidence import SAME, coincident, events_of
 from .cycle import LimitCycle, orbit
 from .return_map import Turn
 from .scale import ROUNDING, STIFF, fastest, is_implicit, points
+from .verdict import verdict
 
 
 # The time at which functions are compared with those a period later, in parts of the period after
@@ -326,6 +327,10 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> st
             "is wanted by the value of the quantity (an output of the system), e.g. "
             f"`conserved={example}`, or take the one nearest to the guess with `throw=False`."
         )
+    if code in (Result.GUARD_BEYOND, Result.NOT_VERIFIED):
+        faults = [finding.text for finding in verdict(cycle).refused]
+        reason = " ".join(faults[:2]) or f"{code.message}."
+        return f"no limit cycle of {name} was found: Newton's method converged, but {reason}"
     limit = f" from {cycle.settings.max_steps} (reached: {turn.period:.2g} of {expected:.3g})"
     reason = code.message + limit * (code == Result.STEP_LIMIT)
     if code == Result.EXTRA_TURNS and cycle.multiplicity > 1:

@@ -12,6 +12,7 @@ from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers, Positive, SignalNames
 from .._core.boundary.values import Reals
 from .._core.executor import is_traced, is_tracer, to_host
+from .._core.findings import Finding
 from .._core.html import (
     CHARTS,
     Curve,
@@ -47,6 +48,7 @@ from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
 from .sensitivity import Sensitivity, sensitivity
+from .verdict import verdict
 
 
 Matrix = Float[np.ndarray, "_ _"]
@@ -211,6 +213,26 @@ class LimitCycle(eqx.Module):
         return logs
 
     @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Doubts about the cycle: the results of a second integration along it, by another method
+        with other steps (at the first access).
+
+        A cycle that `find_limit_cycle` returns has passed these checks, so that no finding is
+        "refused". One of a sweep or of a branch was checked at its guards; here it is checked in
+        full.
+        """
+        _require_values(self, "findings")
+        self.require_current()
+        return verdict(self).findings
+
+    @property
+    def not_reached(self) -> tuple[str, ...]:
+        """Names of transitions out of charts of the cycle that do not happen on it."""
+        _require_values(self, "not_reached")
+        self.require_current()
+        return verdict(self).not_reached
+
+    @property
     def stable(self) -> bool:
         """True if all multipliers lie inside the unit circle, but for those of exactly 1 that
         belong to conserved quantities."""
@@ -371,6 +393,8 @@ class LimitCycle(eqx.Module):
         message = (
             what_changed(self.system, self.numbers) or Result(int(self.result)).message
         )
+        if message == Result.OK.message and verdict(self).refused:
+            message = f"refused ({verdict(self).refused[0].cause})"
         # (By rounding, those of neutral cycles are a little larger than 1.)
         grows = (
             message == Result.OK.message
@@ -399,8 +423,22 @@ class LimitCycle(eqx.Module):
             "events": ", ".join(names[g] for g in self.event_sequence) or "none",
             **multipliers,
             "residual": f"{float(self.residual):.2g} after {int(self.iterations)} Newton steps",
+            **self._checks(),
             **({"stiff": "; ".join(sentences)} if stiff else {}),
         }
+
+    def _checks(self) -> dict[str, str]:
+        """The printed lines on the checks of a cycle that was found."""
+        changed = what_changed(self.system, self.numbers)
+        if changed or int(self.result) not in _FOUND:
+            return {}
+        checked = verdict(self)
+        lines = {"checked by": str(checked)}
+        if checked.not_reached:
+            lines["not reached"] = ", ".join(checked.not_reached)
+        for finding in checked.findings:
+            lines[finding.cause] = finding.text
+        return lines
 
 
 def _require_values(cycle: LimitCycle, name: str) -> None:

@@ -31,9 +31,9 @@ from .crossing import AtEvent, Crossing
 from .curve import away_from_events
 from .cycle import LimitCycle
 from .guess import require_similar, return_map_near
-from .linear_flow import keep_turn, last_turn
+from .linear_flow import keep_turn, last_turn, remembering
 from .newton import Solution, search, solve
-from .return_map import PATIENCE, ReturnMap
+from .return_map import PATIENCE, ReturnMap, Turn
 from .scale import (
     Sizes,
     given_sizes,
@@ -43,11 +43,15 @@ from .scale import (
     sizes_on,
     stiff_charts,
 )
+from .verdict import verdict
 
 
 # A cycle is computed again, in the sizes of its states, if a rough size was larger by more than
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
+# Periods of the flow after which a search begins again that ended beyond a guard, or in another
+# chart than it began. Fewer: slow transients remain. More: a vain search takes longer.
+_LATER = 8, 40
 # Steps of a piece of a turn where the default limit, which ends searches that run away, is reached.
 # Fewer: neurons have no cycle. More: vain searches last longer.
 _ENOUGH = 4096
@@ -192,35 +196,20 @@ def find_limit_cycle(
     )
     if isinstance(map.base, AtEvent) and not isinstance(guess, LimitCycle):
         check_begin(map)
-    solution = search(map, patient, near)
-    if int(solution.result) == Result.NOT_CONVERGED and isinstance(guess, LimitCycle):
-        distant = away_from_events(guess).return_map.at_phase_of(system)
-        if float(distant.anchor.t[0]) != float(map.anchor.t[0]):
-            say("the same from a phase far from events")
-            map = dataclasses.replace(map, anchor=distant.anchor)
-            solution = search(map, patient)
-    # (Where the end is out of reach even for steps that are 256 times as long, more do not help.)
-    reach = float(solution.turn.period) * _ENOUGH
-    if (
-        patient
-        and int(solution.result) == Result.STEP_LIMIT
-        and reach > float(map.expected)
-    ):
-        say("the same with more steps")
-        settings = dataclasses.replace(map.settings, max_steps=_ENOUGH)
-        map = dataclasses.replace(map, settings=settings)
-        solution = search(map)
-    map, solution = _in_own_sizes(map, solution, given)
-    cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
-    if (
-        solution.is_fixed_point
-        and coincident(map, solution.turn)
-        and not commutes(cycle)
-    ):
-        cycle = dataclasses.replace(
-            cycle, result=jax.device_put(np.int32(Result.COINCIDENCE))
-        )
-    keep_turn(cycle, solution.turn)
+    solution, map = _solution(map, patient, near, guess)
+    cycle, turn = _judged(map, solution, given)
+    ends_elsewhere = cycle.result == Result.NOT_CONVERGED and np.isnan(cycle.residual)
+    if (cycle.result == Result.GUARD_BEYOND or ends_elsewhere) and not settle:
+        # (From there the flow may lead to a cycle that is stable.)
+        for periods in _LATER:
+            say(f"the same after {periods} periods")
+            later = _map_after(map, section, periods)
+            if later is None:
+                break
+            other, other_turn = _judged(later, search(later, patient), given)
+            if int(other.result) in (Result.OK, Result.SINGULAR):
+                cycle, turn = other, other_turn
+                break
     code = Result(int(cycle.result))
     checks.check_found(cycle)
     if code in (Result.OK, Result.SINGULAR):
@@ -228,10 +217,88 @@ def find_limit_cycle(
         if conserved:
             checks.check_conserved(cycle)
     if throw and code != Result.OK:
-        raise ComputationError(
-            checks.explain(cycle, solution.turn, float(map.expected), settle)
-        )
+        raise ComputationError(checks.explain(cycle, turn, float(map.expected), settle))
     return cycle
+
+
+def _solution(
+    map: ReturnMap, patient: bool, near: Any, guess: Any
+) -> tuple[Solution, ReturnMap]:
+    """The end of Newton's method, and the map on which it ended: that of another phase where an
+    event has passed the phase of the guess, or one with more steps."""
+    solution = search(map, patient, near)
+    if int(solution.result) == Result.NOT_CONVERGED and isinstance(guess, LimitCycle):
+        distant = away_from_events(guess).return_map.at_phase_of(map.system)
+        if float(distant.anchor.t[0]) != float(map.anchor.t[0]):
+            say("the same from a phase far from events")
+            map = dataclasses.replace(map, anchor=distant.anchor)
+            solution = search(map, patient)
+    # (Where the end is out of reach even for steps that are 256 times as long, more do not help.)
+    reach = float(solution.turn.period) * _ENOUGH
+    short = patient and int(solution.result) == Result.STEP_LIMIT
+    if short and reach > float(map.expected):
+        say("the same with more steps")
+        settings = dataclasses.replace(map.settings, max_steps=_ENOUGH)
+        map = dataclasses.replace(map, settings=settings)
+        solution = search(map)
+    return solution, map
+
+
+def _judged(
+    map: ReturnMap, solution: Solution, given: Sizes
+) -> tuple[LimitCycle, Turn]:
+    """The cycle of a solution, in its own sizes, with the result of all checks; and its turn."""
+    map, solution = _in_own_sizes(map, solution, given)
+    cycle = _kept(map, solution)
+    if not solution.is_fixed_point:
+        return cycle, solution.turn
+    if coincident(map, solution.turn) and not commutes(cycle):
+        return _with_result(cycle, Result.COINCIDENCE), solution.turn
+    checked = verdict(cycle)
+    if checked.sooner is not None and map.base is not None and map.multiplicity == 1:
+        say("Newton's method, with the shorter period at which the cycle closes")
+        shorter = dataclasses.replace(
+            map, anchor=solution.anchor, expected=real(checked.sooner)
+        )
+        again = solve(shorter)
+        if again.is_fixed_point:
+            solution = again._replace(steps=solution.steps)
+            cycle = _kept(shorter, solution)
+            checked = verdict(cycle)
+    if checked.refused:
+        cycle = _with_result(cycle, checked.result)
+    return cycle, solution.turn
+
+
+def _kept(map: ReturnMap, solution: Solution) -> LimitCycle:
+    """The cycle of a solution, which remembers its last turn."""
+    cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
+    keep_turn(cycle, solution.turn)
+    return cycle
+
+
+def _with_result(cycle: LimitCycle, result: Result) -> LimitCycle:
+    """The cycle with another result, and what is remembered with it."""
+    other = dataclasses.replace(cycle, result=jax.device_put(np.int32(result)))
+    return remembering(other, cycle)
+
+
+def _map_after(
+    map: ReturnMap, section: Crossing | AtEvent | None, periods: int
+) -> ReturnMap | None:
+    """The return map at the state to which the flow leads within some periods; None if it fails."""
+    s, anchor = map.structure, to_host(map.anchor)
+    a = int(anchor.chart[0])
+    guess = Guess(s.names[a], anchor.q[: s.dims[a], 0], time=float(anchor.t[0]))
+    wait = periods * float(map.expected)
+    given = sizes_of(s, map.settings.scale)
+    try:
+        later = return_map_near(
+            s, guess, section, map.multiplicity, wait, None, map.settings, given
+        )
+    except ComputationError:
+        return None
+    return dataclasses.replace(later, conserved=map.conserved)
 
 
 def _find_with_auto(system, guess, first: dict, options: dict) -> LimitCycle:

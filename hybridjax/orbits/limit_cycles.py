@@ -28,12 +28,13 @@ from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle, require_unchanged
 from .return_map import ReturnMap, turn_product
+from .verdict import verdict
 
 
 # Cycles that are tested for whether events that coincide commute; all are, if one of these fails.
 # More: the test takes longer. Fewer: exceptions are missed.
 _LOOKED_AT = 50
-# Cycles that are tested for jumps and pulses of fields, which takes longer.
+# Cycles that are tested for jumps and pulses of fields, and checked in full, which takes longer.
 _TESTED = 8
 
 
@@ -210,21 +211,23 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
 
 def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
     """The cycles, with the result `COINCIDENCE` if events coincide (`together`) that do not
-    commute.
+    commute, and with those of their verdicts: of eight cycles and, if one of these has a fault, of
+    all.
 
     **Raises:** `DefinitionError` as `check_found`, for one of eight cycles.
     """
-    good = np.flatnonzero(cycles.ok)
-    for k in np.unique(
-        np.linspace(0, len(good) - 1, min(len(good), _TESTED)).astype(int)
-    ):
-        check_found(cycles[int(good[k])])
+    result = cycles.result.copy()
     rows = np.flatnonzero(together & cycles.ok)
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
-    if all(commutes(cycles[i]) for i in few):
-        return cycles
-    result = cycles.result.copy()
-    result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
+    if not all(commutes(cycles[i]) for i in few):
+        result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
+    good = np.flatnonzero(result == Result.OK)
+    places = np.linspace(0, len(good) - 1, min(len(good), _TESTED))
+    tested = good[np.unique(places.astype(int))]
+    for i in tested:
+        check_found(cycles[i])
+    if any(verdict(cycles[i]).refused for i in tested):
+        result[good] = [verdict(cycles[i]).result for i in good]
     return dataclasses.replace(cycles, result=result)
 
 

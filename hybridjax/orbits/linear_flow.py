@@ -262,6 +262,12 @@ def keep_turn(cycle: Any, turn: Turn) -> None:
         _turns.recall(hosted(cycle), None, lambda: (legs, side_by_side(tapes)))
 
 
+def remembering(cycle: Any, other: Any) -> Any:
+    """The cycle, which remembers the last turn of another one on the same orbit."""
+    _turns.recall(hosted(cycle), None, lambda: last_turn(other))
+    return cycle
+
+
 def hosted(cycle: Any) -> Any:
     """The cycle with its arrays on the host, the same at each call; itself if JAX traces it."""
     if is_hidden(cycle) or on_host(cycle.period):

@@ -30,7 +30,7 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.arrays import Array
-from ..engine.events import arm
+from ..engine.events import arm, belongs, enabled
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
 from ..engine.replay import projections
@@ -358,12 +358,45 @@ class ReturnMap(eqx.Module):
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
             code = xp.where(turn.closed & still, Result.EQUILIBRIUM, code)
+        code = xp.where(turn.closed & self._beyond(turn), Result.GUARD_BEYOND, code)
         for d in (d for d in range(1, self.multiplicity) if self.multiplicity % d == 0):
             sooner = self.expected * (d / self.multiplicity)
             part = dataclasses.replace(self, multiplicity=d, expected=sooner).turn(q)
             early = xp.max(xp.abs(part.residual) / sizes, axis=-1) <= CLOSED
             code = xp.where(turn.closed & early, Result.EXTRA_TURNS, code)
         return code.astype(np.int32)
+
+    def _beyond(self, turn: Turn) -> Bool[Array, "..."]:
+        """True if a guard has the sign that it has after its event at the beginnings of all pieces
+        in its chart: it was crossed by none of them, so that it was never armed."""
+        s, shape = self.structure, turn.distance.shape
+        if not any(s.guards(a) for a in range(len(s.charts))):
+            return namespace(turn.distance).zeros(shape, bool)
+        xp = namespace(turn.distance)
+        lanes = turn.legs
+        if shape:  # (turns of many systems: their pieces side by side)
+            lanes = side_by_side(
+                jax.tree_util.tree_map(
+                    lambda x: xp.moveaxis(x, (-1, 0), (0, -1)), lanes
+                )
+            )
+        watched = self.watch(lanes, until(lanes.t))
+        value, rate = watched.value[:-1], watched.rate[:-1]
+        error = CLOSED * xp.max(self.expected) * xp.abs(rate)
+        here = belongs(s, lanes.chart)[:-1]
+        u = xp.zeros((s.nu, len(lanes.t)))
+        holds = []
+        for g, transition in enumerate(s.transitions):
+            source = lanes.chart == s.chart_index(transition.source)
+            which = xp.where(source, np.int32(g), np.int32(-1))
+            holds.append(enabled(self._structure_of(lanes), lanes.t, lanes.q, u, which))
+        passed = here & ~lanes.armed & (value < -error)
+        fine = here & (lanes.armed | (value > error))
+        passed, fine = (
+            x.reshape(len(x), LEGS, *shape).any(axis=1)
+            for x in (passed & xp.stack(holds), fine)
+        )
+        return (passed & ~fine).any(axis=0)
 
     def held(
         self, q: Float[Array, " d"], varied: Varied | None = None

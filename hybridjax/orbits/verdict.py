@@ -1,0 +1,483 @@
+"""Checks of a limit cycle that was found: `verdict`.
+
+Newton's method shows only that a computed return map has a fixed point. The verdict walks along the
+cycle once more, by another method with other steps (`walk.py`), from each of the points that the
+first integration left, and tests what that integration assumed.
+
+It sees: pieces of the cycle that are not trajectories of the vector field; events at which the
+guard is not zero, or is not crossed in its direction; guards that the cycle passes, or lies beyond
+all along, without an event; scheduled events that were left out; a period that is a multiple of the
+shortest; multipliers that differ from those of the walk. It does not see: a guard that dips below
+zero and back between two of its points (eight in each step), whether functions mean what their
+author meant, and multipliers of systems with more than `_MANY` states.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .._core.findings import Finding
+from .._core.memo import Memory
+from .._core.results import Result
+from ..engine import kernels
+from ..engine.events import SAME_TIME
+from ..engine.replay import recorded_moves
+from ..systems.structure import Structure
+from ..systems.transition import Scheduled
+from .linear_flow import hosted, last_turn
+from .return_map import turn_product
+from .walk import ROUGH, Stretch, Walked, walk
+
+
+# Largest distance, in sizes of the states, between the walk and a point of the cycle; of cycles
+# that are computed with larger errors, this multiple of the error of a step. Larger: wrong cycles
+# pass. Smaller: errors of steps that add up are taken for faults.
+_APART, _STEPS = 1e-6, 1e4
+# Largest difference of sums of powers of multipliers of the two integrations, relative to their
+# size. Larger: a wrong multiplier passes. Smaller: errors of the walk are taken for faults.
+_DIFFERENT = 1e-4
+# A guard is beyond zero if its value exceeds the change that deviations of this size, in sizes of
+# the states, could make. Larger: shallow excursions pass. Smaller: errors of the walk count.
+_BEYOND = 1e-6
+# The shortest visit of a chart, in periods, in which guards are watched. Shorter: rounding decides
+# on the side of guards between events that nearly coincide.
+_SHORT = 1e-9
+# A cycle that runs several times around closes after a part 1/p of its period for a prime number p.
+# More: the verdict takes longer.
+_PRIMES = 2, 3, 5, 7
+# Largest number of states with which multipliers are compared. Larger: derivatives of the walk take
+# longer than the search.
+_MANY = 24
+# The cause of the finding on a cycle that lies beyond a guard.
+BEYOND = "beyond a guard"
+
+
+class Verdict(NamedTuple):
+    """The result of the checks of a cycle."""
+
+    distance: float
+    """Largest distance between the walk and the cycle, in sizes of the states; NaN if the walk did
+    not reach its accuracy."""
+    multipliers: float
+    """Difference from the multipliers of the walk, relative to their size or to 1; NaN if they were
+    not compared."""
+    not_reached: tuple[str, ...]
+    """Transitions out of charts of the cycle that do not happen on it."""
+    sooner: float | None
+    """The time after which the cycle closes, if that is less than its period."""
+    findings: tuple[Finding, ...]
+    """Faults (`refused`) and limits (`warned`)."""
+
+    @property
+    def refused(self) -> tuple[Finding, ...]:
+        """The faults."""
+        return tuple(x for x in self.findings if x.action == "refused")
+
+    @property
+    def result(self) -> Result:
+        """The code of the first fault."""
+        if not self.refused:
+            return Result.OK
+        if self.sooner is not None:
+            return Result.EXTRA_TURNS
+        beyond = any(finding.cause == BEYOND for finding in self.refused)
+        return Result.GUARD_BEYOND if beyond else Result.NOT_VERIFIED
+
+    def __str__(self) -> str:
+        if np.isnan(self.distance):
+            return "guards and events (a second integration did not reach its accuracy)"
+        text = f"second integration: closes to {self.distance:.1g}, events, shortest period"
+        if np.isnan(self.multipliers):
+            return text
+        return f"{text}, multipliers to {self.multipliers:.1g}"
+
+
+class _Path(NamedTuple):
+    """The walk along a cycle, in moves: pieces from one point that the first integration left to
+    the next, each without an event on its way."""
+
+    t: Float[np.ndarray, " M+1"]
+    """Times of the beginnings of moves, and of the end of the turn."""
+    chart: Int[np.ndarray, " M"]
+    event: Int[np.ndarray, " M"]
+    """Transitions at the ends of moves, by index; -1 for none."""
+    begin: Float[np.ndarray, "d M"]
+    walked: Walked
+    distance: float
+    """Largest distance to the cycle, in sizes of the states."""
+    monodromy: Float[np.ndarray, "d d"]
+    findings: list[Finding]
+    """Faults at events."""
+
+    @property
+    def error(self) -> float:
+        """Largest error of the walk, in sizes of the states."""
+        return float(self.walked.error.max())
+
+
+class _Visit(NamedTuple):
+    """A stay in a chart between two events, or a whole turn without any."""
+
+    chart: int
+    t: Float[np.ndarray, " P"]
+    q: Float[np.ndarray, "n P"]
+    event: int
+    """The transition at its end, by index; -1 for none."""
+
+
+_verdicts = Memory()
+
+
+def verdict(cycle) -> Verdict:
+    """Check a cycle (see the module). The result is remembered with the cycle."""
+    cycle = hosted(cycle)
+    return _verdicts.recall(cycle, None, lambda: _verdict(cycle))
+
+
+def _verdict(cycle) -> Verdict:
+    s, period = cycle.structure, float(cycle.period)
+    scale = np.asarray(cycle.settings.scale)
+    path = _walk_along(cycle)
+    visits = _visits(s, path)
+    findings = [*path.findings]
+    for visit in visits:
+        if visit.t[-1] - visit.t[0] > _SHORT * period:
+            findings += _passed_guards(s, visit, scale)
+            findings += _skipped_schedules(s, visit)
+    sooner, apart = None, np.nan
+    accurate = path.error <= ROUGH
+    if accurate:
+        findings += _departure(cycle, path)
+        sooner = _closes_sooner(cycle, path)
+    else:
+        findings.append(_not_walked(path))
+    if sooner is not None:
+        findings.append(_shorter(sooner, period))
+    findings += _rest(s, path, scale)
+    if accurate and s.d <= _MANY and not any(x.action == "refused" for x in findings):
+        apart = _apart(cycle, path.monodromy)
+        findings += _other_multipliers(apart)
+    return Verdict(
+        path.distance if accurate else np.nan,
+        apart,
+        _not_reached(cycle, visits),
+        sooner,
+        tuple(findings),
+    )
+
+
+def _walk_along(cycle) -> _Path:
+    """Walk along all moves of a cycle side by side, and through the events at their ends."""
+    map = cycle.return_map
+    s, scale = map.structure, np.asarray(map.scale)
+    moves = recorded_moves(*last_turn(cycle))
+    t = np.append(moves.t, moves.t[0] + float(cycle.period))
+    event = np.maximum(moves.code, -1)
+    stretch = Stretch(t[:-1], t[1:], moves.chart, moves.q)
+    walked = walk(s, stretch, scale)
+    chart, q = moves.chart.copy(), walked.q.copy()
+    by_state = np.moveaxis(walked.by_state, -1, 0).copy()
+    findings: list[Finding] = []
+    for k in np.flatnonzero(event >= 0):
+        jump = _jump(s, int(event[k]), float(t[k + 1]), int(chart[k]), q[:, k], scale)
+        findings += jump.findings
+        chart[k], q[:, k] = jump.chart, jump.q
+        by_state[k] = jump.by_state @ by_state[k]
+    monodromy = np.eye(s.d)
+    for of_move in by_state:
+        monodromy = of_move @ monodromy
+    points = np.column_stack([moves.q[:, 1:], map.anchor.q])
+    charts = np.append(moves.chart[1:], map.anchor.chart)
+    distance = _distance(s, scale, (chart, q), (charts, points))
+    return _Path(t, moves.chart, event, moves.q, walked, distance, monodromy, findings)
+
+
+def _distance(s: Structure, scale, ends: tuple, points: tuple) -> float:
+    """Largest distance between ends of moves and the points where the moves after them begin."""
+    chart, q = ends
+    other_chart, other = points
+    if (chart != other_chart).any():
+        return np.inf
+    sizes = np.maximum(scale[chart].T, np.abs(other))
+    exists = np.arange(s.d)[:, None] < np.array(s.dims)[chart]
+    return float(np.max(np.where(exists, np.abs(q - other) / sizes, 0.0)))
+
+
+class _Jump(NamedTuple):
+    """A state after an event, with its derivative by the state before."""
+
+    chart: int
+    q: Float[np.ndarray, " d"]
+    by_state: Float[np.ndarray, "d d"]
+    findings: list[Finding]
+
+
+def _jump(s: Structure, g: int, t: float, a: int, q, scale) -> _Jump:
+    r"""Event g of a state of chart a.
+
+    The saltation matrix is $R_q + (R_q f^- + R_t - f^+) h_q / \dot h$ for a guard h with the rate
+    $\dot h$ before the event, and $R_q$ for a scheduled event (M. A. Aizerman and F. R. Gantmacher,
+    Quarterly J. Mechanics and Applied Mathematics 11, 1958).
+    """
+    transition, n = s.transitions[g], s.dims[a]
+    b = s.chart_index(transition.target)
+    state, time, u = q[:n, None], np.array([t]), np.zeros((s.nu, 1))
+    reset = kernels.reset(s, s.member(g), time, state, u)[..., 0]
+    by_state = reset[:, 2 : 2 + n]
+    if isinstance(transition.guard, Scheduled):
+        late = t - float(transition.guard.nearest(time)[0])
+        findings = _off_schedule(transition, t, late)
+    else:
+        level, slope, rate = _guard(s, a, g, time, state)
+        findings = _off_guard(transition, t, level, rate, _noise(slope, scale[a, :n]))
+        before = kernels.field(s, a, time, state, u)[:, 0, 0]
+        after = kernels.field(s, b, time, reset[:, :1], u)[:, 0, 0]
+        slip = by_state @ before + reset[:, 1] - after
+        by_state = by_state - np.outer(slip, slope) / rate
+    out, full = np.zeros(s.d), np.zeros((s.d, s.d))
+    out[: s.dims[b]] = reset[:, 0]
+    full[: s.dims[b], :n] = by_state
+    return _Jump(b, out, full, findings)
+
+
+def _guard(s: Structure, a: int, g: int, time, state):
+    """Value, gradient and rate of a guard at one state; it falls through zero at its event."""
+    u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
+    row = kernels.watched(s, a, None, time, state, u, first)[s.guards(a).index(g), :, 0]
+    slope = row[2 : 2 + len(state)]
+    field = kernels.field(s, a, time, state, u)[:, 0, 0]
+    return row[0], slope, row[1] + slope @ field
+
+
+def _noise(slope: Float[np.ndarray, "n ..."], sizes: Float[np.ndarray, " n"]):
+    """The change of a guard that deviations of the size `_BEYOND` make."""
+    return _BEYOND * np.tensordot(sizes, np.abs(slope), axes=1)
+
+
+def _off_guard(transition, t: float, level: float, rate: float, noise: float):
+    if abs(level) <= 10 * noise and rate < 0:
+        return []
+    text = (
+        f"the event '{transition.name}' happens at t = {t:.6g}, where its guard is "
+        f"{transition.sign * level:.3g} and changes at a rate of {transition.sign * rate:.3g}: it "
+        f"should be zero and {transition.direction}."
+    )
+    return [Finding("an event without its guard", text, "refused")]
+
+
+def _off_schedule(transition, t: float, late: float):
+    if abs(late) <= 10 * SAME_TIME * float(transition.guard.period):
+        return []
+    text = (
+        f"the event '{transition.name}' happens at t = {t:.6g}, which is not one of the times of "
+        "its schedule."
+    )
+    return [Finding("an event without its schedule", text, "refused")]
+
+
+def _visits(s: Structure, path: _Path) -> list[_Visit]:
+    """The visits of charts on the cycle; one that the beginning of the turn divides is whole."""
+    M = len(path.event)
+    ends = np.flatnonzero(path.event >= 0)
+    period = path.t[-1] - path.t[0]
+    if not len(ends):
+        groups = [np.arange(M)]
+    else:
+        # (The first visit may begin before the turn, at negative indices.)
+        before = np.append(ends[-1] - M, ends[:-1])
+        groups = [np.arange(a + 1, b + 1) for a, b in zip(before, ends, strict=True)]
+    visits = []
+    for group in groups:
+        a = int(path.chart[group[0]])
+        times, states = [], []
+        for k in group:
+            own = path.walked.lane == k % M
+            later = period if k >= 0 else 0.0
+            times.append(later + np.append(path.t[k % M], path.walked.t[own]))
+            states.append(
+                np.column_stack([path.begin[:, k % M], path.walked.points[:, own]])
+            )
+        t, q = np.concatenate(times), np.concatenate(states, axis=1)
+        visits.append(_Visit(a, t, q[: s.dims[a]], int(path.event[group[-1]])))
+    return visits
+
+
+def _passed_guards(s: Structure, visit: _Visit, scale) -> Iterable[Finding]:
+    """Guards that a visit passes, or beyond which it lies all along, without an event."""
+    a, n = visit.chart, len(visit.q)
+    guards = s.guards(a)
+    if not guards:
+        return
+    u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
+    rows = kernels.watched(s, a, None, visit.t, visit.q, u, first)
+    noise = _noise(np.moveaxis(rows[:, 2 : 2 + n], 0, 1), scale[a, :n])
+    for k, g in enumerate(guards):
+        level, transition = rows[k, 0], s.transitions[g]
+        over, under = level > noise[k], level < -noise[k]
+        if under.any() and not over.any() and g != visit.event:
+            if _may_happen(s, g, visit, np.flatnonzero(under)):
+                yield _beyond(s, transition, visit, level)
+            continue
+        # (At the end of a visit the guard of its own event is zero up to errors.)
+        points = slice(None, -1) if g == visit.event else slice(None)
+        for point in _crossings(over[points], under[points]):
+            if _may_happen(s, g, visit, np.array([point])):
+                yield _passed(transition, visit.t[point])
+                break
+
+
+def _crossings(over: Bool[np.ndarray, " P"], under: Bool[np.ndarray, " P"]):
+    """Points at which a guard is below zero for the first time after it was above."""
+    side = np.where(over, 1, np.where(under, -1, 0))
+    points = np.flatnonzero(side)
+    falls = (side[points][1:] < 0) & (side[points][:-1] > 0)
+    return points[1:][falls]
+
+
+def _may_happen(s: Structure, g: int, visit: _Visit, points) -> bool:
+    """True if the predicate of a transition holds at one of some points of a visit."""
+    if s.transitions[g].enabled is None:
+        return True
+    u = np.zeros((s.nu, 1))
+    at = visit.t[points], visit.q[:, points]
+    return bool(kernels.enabled(s, s.member(g), *at, u).any())
+
+
+def _beyond(s: Structure, transition, visit: _Visit, level) -> Finding:
+    low, high = sorted(transition.sign * np.array([level.min(), level.max()]))
+    text = (
+        f"the cycle lies beyond the guard of '{transition.name}' all along its stay in chart "
+        f"'{s.names[visit.chart]}' (values from {low:.3g} to {high:.3g}; the guard should be "
+        f"{transition.direction}), so that this event can never happen. Begin with a guess on the "
+        "other side of the guard, or let the transition that leads there end in another chart."
+    )
+    return Finding(BEYOND, text, "refused")
+
+
+def _passed(transition, t: float) -> Finding:
+    text = (
+        f"the guard of '{transition.name}' passes zero ({transition.direction}) before "
+        f"t = {t:.6g}, and the event does not happen. Take smaller steps, e.g. "
+        "`settings=Settings(rtol=1e-13)`, or look for a guard that is not smooth."
+    )
+    return Finding("a guard was passed", text, "refused")
+
+
+def _skipped_schedules(s: Structure, visit: _Visit) -> Iterable[Finding]:
+    """Scheduled events that were due in a visit, and did not happen."""
+    for g in s.schedules(visit.chart):
+        transition = s.transitions[g]
+        guard = transition.guard
+        period, offset = float(guard.period), float(guard.offset)
+        since = (visit.t[0] - offset) / period
+        until = (visit.t[-1] - offset) / period
+        due = np.floor(since + 10 * SAME_TIME) + 1
+        if due >= until - 10 * SAME_TIME:
+            continue
+        time = offset + due * period
+        if not _may_happen(s, g, visit, np.array([np.searchsorted(visit.t, time) - 1])):
+            continue
+        text = (
+            f"the scheduled event '{transition.name}' is due at t = {time:.6g} in chart "
+            f"'{s.names[visit.chart]}', and does not happen."
+        )
+        yield Finding("a scheduled event was left out", text, "refused")
+
+
+def _departure(cycle, path: _Path) -> list[Finding]:
+    errors_of_steps = _STEPS * float(np.max(np.asarray(cycle.settings.rtol)))
+    if path.distance <= max(_APART, errors_of_steps):
+        return []
+    text = (
+        f"a second integration of {type(cycle.system).__name__}, by another method, leaves the "
+        f"cycle by {path.distance:.1g} (relative to the magnitudes of the states). Take smaller "
+        "steps, e.g. `settings=Settings(rtol=1e-13)`, or look for a function that is not smooth."
+    )
+    return [Finding("another integration", text, "refused")]
+
+
+def _not_walked(path: _Path) -> Finding:
+    text = (
+        "a second integration along the cycle did not reach its accuracy (estimated error "
+        f"{path.error:.1g}), so that only guards and events were checked."
+    )
+    return Finding("not checked", text)
+
+
+def _rest(s: Structure, path: _Path, scale) -> list[Finding]:
+    """A finding on a cycle on which nothing moves but the clock."""
+    apart = np.abs(path.begin - path.begin[:, :1]) / scale[path.chart].T
+    exists = np.arange(s.d)[:, None] < np.array(s.dims)[path.chart]
+    if (path.event >= 0).any() or np.where(exists, apart, 0.0).max() > _APART:
+        return []
+    text = (
+        "no state moves on the cycle: it is an equilibrium, and only the clock goes on."
+    )
+    return [Finding("at rest", text)]
+
+
+def _shorter(sooner: float, period: float) -> Finding:
+    text = (
+        f"the cycle closes after {sooner:.6g} already, a part of the period {period:.6g} that was "
+        "found."
+    )
+    return Finding("a shorter period", text, "refused")
+
+
+def _closes_sooner(cycle, path: _Path) -> float | None:
+    """The time after which the cycle closes, if that is a part of its period."""
+    map = cycle.return_map
+    s, period = map.structure, float(cycle.period)
+    parts = [p for p in _PRIMES if map.base is not None or cycle.multiplicity % p == 0]
+    if not parts:
+        return None
+    times = path.t[0] + period / np.array(parts)
+    moves = np.searchsorted(path.t, times) - 1
+    stretch = Stretch(path.t[moves], times, path.chart[moves], path.begin[:, moves])
+    reached = walk(s, stretch, np.asarray(map.scale)).q
+    sizes = np.asarray(map.scale)[path.chart[0]][:, None]
+    apart = np.max(np.abs(reached - path.begin[:, :1]) / sizes, axis=0)
+    closed = (apart <= _APART) & (stretch.chart == path.chart[0])
+    return min(times[closed] - path.t[0], default=None)
+
+
+def _apart(cycle, monodromy: Float[np.ndarray, "d d"]) -> float:
+    """Largest difference between the traces of powers of two monodromy matrices: that of the cycle
+    and that of the walk. Relative to the size of the larger power, or to 1.
+
+    Traces of powers are sums of powers of the multipliers, which need no matching.
+    """
+    first = turn_product(np.asarray(cycle.factors)[None])[0]
+    # (An autonomous flow keeps a deviation along itself, which is projected out of the factors.)
+    along = 0.0 if cycle.clocked else 1.0
+    size = np.asarray(cycle.settings.scale)[int(cycle.anchor.chart[0])]
+    units = size / size[:, None]
+    power, other, largest = np.eye(len(first)), np.eye(len(first)), 0.0
+    for _ in range(len(first)):
+        power, other = power @ first, other @ monodromy
+        weight = max(np.abs(power * units).max(), np.abs(other * units).max(), 1.0)
+        difference = np.trace(power) + along - np.trace(other)
+        largest = max(largest, abs(difference) / weight)
+    return float(largest)
+
+
+def _other_multipliers(apart: float) -> list[Finding]:
+    if apart <= _DIFFERENT:
+        return []
+    text = (
+        f"multipliers of a second integration along the cycle differ by {apart:.2g} from those of "
+        "the first."
+    )
+    return [Finding("other multipliers", text, "refused")]
+
+
+def _not_reached(cycle, visits: list[_Visit]) -> tuple[str, ...]:
+    s = cycle.structure
+    visited = {s.names[visit.chart] for visit in visits}
+    return tuple(
+        transition.name
+        for g, transition in enumerate(s.transitions)
+        if transition.source in visited and g not in cycle.event_sequence
+    )

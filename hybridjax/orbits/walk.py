@@ -1,0 +1,228 @@
+"""A second way along a cycle, which shares neither the method nor the steps of the first.
+
+The flow is computed by extrapolation: in explicit charts of the modified midpoint rule (W. B.
+Gragg, SIAM J. Numerical Analysis 2, 1965), in implicit ones of the linearly implicit Euler method
+(P. Deuflhard, SIAM Review 27, 1985). Both, with their tables of differences, are in E. Hairer and
+G. Wanner, Solving Ordinary Differential Equations, vol. I, sec. II.9, and vol. II, sec. IV.9.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..engine import kernels
+from ..systems.structure import Structure
+from .scale import is_implicit
+
+
+# Error of a step, in sizes of the states, at which it is accepted. Larger: small faults of a cycle
+# pass. Smaller: steps are shortened although rounding is all that is left.
+_ACCURATE = 1e-8
+# Largest error of a stretch that counts as known. Larger: errors of the walk are taken for faults
+# of the cycle. Smaller: fields with kinks cannot be walked.
+ROUGH = 1e-6
+# Steps after which a stretch is given up. More: a walk that cannot succeed takes longer. Fewer:
+# fast jumps of a neuron are not resolved.
+_PATIENCE = 400
+# Numbers of shorter steps of the methods that are extrapolated. More: each step costs more. Fewer:
+# more steps are needed.
+_MIDPOINT_STEPS = (2, 4, 6)
+_EULER_STEPS = (1, 2, 3, 4, 5, 6)
+# The change of the length of a step, at most and at least, and the safety factor: those of Hairer
+# and Wanner's codes ODEX and SEULEX.
+_LONGER, _SHORTER, _SAFE = 4.0, 0.2, 0.8
+# Points within a step at which the path is known, as fractions of it; the last is its end. More:
+# guards cost more. Fewer: a guard that dips below zero and back is missed.
+_FRACTIONS = np.linspace(0.0, 1.0, 9)[1:]
+
+
+class Stretch(NamedTuple):
+    """L pieces of flow without events, each in its chart."""
+
+    t0: Float[np.ndarray, " L"]
+    t1: Float[np.ndarray, " L"]
+    chart: Int[np.ndarray, " L"]
+    q: Float[np.ndarray, "d L"]
+    """States at t0, padded to the largest chart."""
+
+
+class Walked(NamedTuple):
+    """The ends of L stretches, and P points on the way."""
+
+    q: Float[np.ndarray, "d L"]
+    by_state: Float[np.ndarray, "d d L"]
+    """Derivatives of the ends with respect to the beginnings."""
+    error: Float[np.ndarray, " L"]
+    """Estimated errors of the ends, in sizes of the states."""
+    lane: Int[np.ndarray, " P"]
+    """The stretch of each point; points of a stretch stand in order of time."""
+    t: Float[np.ndarray, " P"]
+    points: Float[np.ndarray, "d P"]
+
+
+def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Walked:
+    """Integrate along stretches of flow, without inputs.
+
+    **Arguments:** `scale`: sizes of the states by chart.
+    """
+    d, L = stretch.q.shape
+    q, by_state, error = np.zeros((d, L)), np.zeros((d, d, L)), np.zeros(L)
+    points: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for a in np.unique(stretch.chart).tolist():
+        n, lanes = s.dims[a], np.flatnonzero(stretch.chart == a)
+        times = stretch.t0[lanes], stretch.t1[lanes]
+        x, error[lanes], path = _in_chart(
+            s, a, *times, stretch.q[:n, lanes], scale[a, :n]
+        )
+        q[:n, lanes] = x[..., 0].T
+        by_state[:n, :n, lanes] = np.moveaxis(x[..., 1:], 0, -1)
+        for within, t, states in path:
+            padded = np.zeros((d, len(within)))
+            padded[:n] = states
+            points.append((lanes[within], t, padded))
+    if not points:
+        nothing = np.zeros(0)
+        return Walked(
+            q, by_state, error, nothing.astype(int), nothing, np.zeros((d, 0))
+        )
+    lane, t = (np.concatenate([x[k] for x in points]) for k in (0, 1))
+    states = np.concatenate([x[2] for x in points], axis=1)
+    order = np.lexsort((t, lane))
+    return Walked(q, by_state, error, lane[order], t[order], states[:, order])
+
+
+# In a chart with n states, x (L, n, 1 + n) holds states in its first column, in the others their
+# derivatives by the state at the beginning. So do the rates of x.
+
+
+def _in_chart(s: Structure, a: int, t0, t1, q, sizes):
+    """The ends x of stretches in chart a, their errors, and the points on the way: lanes, times and
+    states of each part of a step."""
+    n, L = q.shape
+    implicit = is_implicit(s, a)
+    extrapolated = _linear_euler if implicit else _midpoint
+    order = len(_EULER_STEPS) if implicit else 2 * len(_MIDPOINT_STEPS) - 1
+
+    def field(t, x):
+        return np.moveaxis(
+            kernels.field(s, a, t, x[..., 0].T, np.zeros((s.nu, 1))), -1, 0
+        )
+
+    x = np.concatenate([q.T[..., None], np.tile(np.eye(n), (L, 1, 1))], axis=2)
+    t, h, error, path = t0.copy(), t1 - t0, np.zeros(L), []
+    with np.errstate(all="ignore"):
+        by_field = field(t, x).copy()
+        for _ in range(_PATIENCE):
+            going = np.flatnonzero(t < t1)
+            if not len(going):
+                break
+            begin = t[going], h[going], x[going]
+            end, change = extrapolated(field, by_field[going], *begin)
+            off = np.max(np.abs(change) / sizes, axis=1, initial=0.0)
+            off = np.where(np.isfinite(off), off, np.inf)
+            longer = _SAFE * (_ACCURATE / np.maximum(off, 1e-300)) ** (1 / order)
+            # (Steps as short as rounding of the time go on with the error that they have.)
+            shortest = h[going] <= 1e-13 * np.maximum(np.abs(t), t1 - t0)[going]
+            good = (off <= _ACCURATE) | shortest
+            lanes = going[good]
+            if len(lanes):
+                t_end = t[lanes] + h[lanes]
+                t_end = np.where(h[lanes] >= t1[lanes] - t[lanes], t1[lanes], t_end)
+                by_end = field(t_end, end[good])
+                step = t[lanes], h[lanes], x[lanes], end[good], by_field[lanes], by_end
+                path += [(lanes, time, state.T) for time, state in _between(*step)]
+                t[lanes], x[lanes], by_field[lanes] = t_end, end[good], by_end
+                error[lanes] += off[good]
+            h[going] *= np.clip(longer, _SHORTER, _LONGER)
+            h = np.minimum(h, t1 - t)
+    return x, np.where(t < t1, np.inf, error), path
+
+
+def _rates(by_field: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Rates of states and of their derivatives, from the field with its derivatives."""
+    n = x.shape[1]
+    rates = by_field[..., 2 : 2 + n] @ x
+    rates[..., 0] = by_field[..., 0]
+    return rates
+
+
+def _midpoint(field: Callable, by_field, t, length, x) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of steps by the modified midpoint rule, extrapolated, and the last change of states."""
+    table = []
+    rates = _rates(by_field, x)
+    for count in _MIDPOINT_STEPS:
+        h = (length / count)[:, None, None]
+        before, now = x, x + h * rates
+        for k in range(1, count):
+            ahead = before + 2 * h * _rates(field(t + k * length / count, now), now)
+            before, now = now, ahead
+        last = _rates(field(t + length, now), now)
+        table.append((before + now + h * last) / 2)
+    return _extrapolate(table, np.square(_MIDPOINT_STEPS))
+
+
+def _linear_euler(
+    field: Callable, by_field, t, length, x
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of steps by the linearly implicit Euler method, extrapolated, and the last change of
+    states."""
+    table = []
+    n = x.shape[1]
+    for count in _EULER_STEPS:
+        h = (length / count)[:, None, None]
+        matrix = np.linalg.inv(np.eye(n) - h * by_field[..., 2 : 2 + n])
+        now = x
+        for k in range(1, count + 1):
+            rates = _rates(field(t + k * length / count, now), now)
+            now = now + h * (matrix @ rates)
+        table.append(now)
+    return _extrapolate(table, np.array(_EULER_STEPS))
+
+
+def _extrapolate(
+    table: list[np.ndarray], divisors: Int[np.ndarray, " K"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The limit for infinite divisors of values that are series in their inverses (Aitken and
+    Neville), and the last change of the states."""
+    column = table
+    previous = column[-1]
+    for order in range(1, len(table)):
+        previous = column[-1]
+        weights = divisors[order:] / divisors[:-order] - 1
+        pairs = zip(column[1:], column[:-1], weights, strict=True)
+        column = [
+            finer + (finer - coarser) / weight for finer, coarser, weight in pairs
+        ]
+    return column[-1], column[-1][..., 0] - previous[..., 0]
+
+
+def _between(
+    t, length, x0, x1, by_begin, by_end
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Times and states within steps, by the polynomials of degree 5 that have the states, rates and
+    accelerations of both ends."""
+    n, h = x0.shape[1], length[:, None]
+
+    def rate_and_bend(by_field):
+        f = by_field[..., 0]
+        acceleration = (
+            by_field[..., 1] + (by_field[..., 2 : 2 + n] @ f[..., None])[..., 0]
+        )
+        return h * f, h**2 * acceleration
+
+    rate0, bend0 = rate_and_bend(by_begin)
+    rate1, bend1 = rate_and_bend(by_end)
+    q0 = x0[..., 0]
+    rise = x1[..., 0] - q0 - rate0 - bend0 / 2
+    slope = rate1 - rate0 - bend0
+    bend = bend1 - bend0
+    third = 10 * rise - 4 * slope + bend / 2
+    fourth = -15 * rise + 7 * slope - bend
+    fifth = 6 * rise - 3 * slope + bend / 2
+    path = []
+    for z in _FRACTIONS:
+        higher = third * z**3 + fourth * z**4 + fifth * z**5
+        path.append((t + z * length, q0 + rate0 * z + bend0 / 2 * z**2 + higher))
+    return path

@@ -1,0 +1,164 @@
+"""A cycle that is "ok" has passed checks that share no step with its search."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax._core.results import Result
+from hybridjax.errors import ComputationError
+
+
+class Charging(hj.Chart):
+    """The capacitor of an RC circuit whose comparator has an output of +1 or -1."""
+
+    circuit: "SchmittTrigger"
+    output: float
+    states = ("x",)
+
+    def field(self, t, q, u):
+        return ((self.output - q[0] + u[0]) / self.circuit.tau,)
+
+
+class SchmittTrigger(hj.HybridSystem):
+    """A relaxation oscillator whose thresholds move with a clock, to which it locks."""
+
+    tau: hj.Parameter = hj.parameter(0.8)
+    width: hj.Parameter = hj.parameter(0.3)
+    ripple: hj.Parameter = hj.parameter(0.1)
+
+    def threshold(self, t):
+        return self.width + self.ripple * jnp.sin(2 * jnp.pi * t)
+
+    def charts(self):
+        return {"up": Charging(self, 1.0), "down": Charging(self, -1.0)}
+
+    def transitions(self):
+        high = lambda t, q, u: q[0] - self.threshold(t)  # noqa: E731
+        low = lambda t, q, u: q[0] + self.threshold(t)  # noqa: E731
+        return [
+            hj.Transition("to down", "up", "down", guard=high, direction="rising"),
+            hj.Transition("to up", "down", "up", guard=low),
+        ]
+
+    def period(self):
+        return 1.0
+
+
+class Potentials(hj.Chart):
+    cells: "TwoCells"
+    states = ("v1", "v2")
+
+    def field(self, t, q, u):
+        drive = self.cells.drive
+        return drive - q[0], drive - q[1]
+
+
+class TwoCells(hj.HybridSystem):
+    """Two leaky integrate-and-fire cells, each of which inhibits the other."""
+
+    drive: hj.Parameter = hj.parameter(1.5)
+    inhibition: hj.Parameter = hj.parameter(0.2)
+
+    def charts(self):
+        return {"rest": Potentials(self)}
+
+    def transitions(self):
+        first = lambda t, q, u: (0.0, q[1] - self.inhibition)  # noqa: E731
+        second = lambda t, q, u: (q[0] - self.inhibition, 0.0)  # noqa: E731
+        return [
+            hj.Transition(
+                f"spike {k + 1}",
+                "rest",
+                "rest",
+                guard=lambda t, q, u, k=k: q[k] - 1.0,
+                direction="rising",
+                reset=reset,
+            )
+            for k, reset in enumerate((first, second))
+        ]
+
+
+def spikes_by_hand(state, drive=1.5, inhibition=0.2, count=200):
+    """Times of the last two spikes of the first cell, by the closed form of the potentials."""
+    v, t, times = np.array(state, float), 0.0, []
+    while len(times) < count:
+        wait = np.log((drive - v) / (drive - 1.0))
+        k = int(np.argmin(wait))
+        v = drive + (v - drive) * np.exp(-wait[k])
+        t += wait[k]
+        v[1 - k] -= inhibition
+        v[k] = 0.0
+        if k == 0:
+            times.append(t)
+    return times[-2:]
+
+
+def test_a_guess_on_the_right_side_of_the_guards_finds_the_rhythm():
+    # From between the thresholds Newton's method goes to the rest point beyond one of them.
+    for chart, x in (("up", 0.0), ("down", 0.0), ("up", -0.9), ("down", 0.9)):
+        cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess(chart, (x,)))
+        assert sorted(cycle.event_sequence) == [0, 1]
+        assert 0.69 < cycle.multipliers[0].real < 0.70
+        assert not cycle.findings and not cycle.not_reached
+
+
+def test_a_cycle_beyond_a_guard_is_refused_by_name():
+    with pytest.raises(ComputationError, match="beyond the guard of 'to down'.*'up'"):
+        hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.7,)))
+    section = hj.AtEvent("spike 1")
+    with pytest.raises(ComputationError, match="beyond the guard of 'spike 2'"):
+        hj.find_limit_cycle(TwoCells(), hj.Guess("rest", (0.0, 1.2)), section=section)
+    ghost = hj.find_limit_cycle(
+        TwoCells(), hj.Guess("rest", (0.0, 1.2)), section=section, throw=False
+    )
+    assert ghost.result == Result.GUARD_BEYOND
+    with pytest.raises(hj.errors.DefinitionError, match="beyond a guard"):
+        hj.linearize(ghost, [section, section])
+
+
+def test_the_rhythm_of_two_cells_is_that_of_the_closed_form():
+    cycle = hj.find_limit_cycle(
+        TwoCells(), hj.Guess("rest", (0.0, 0.5)), section=hj.AtEvent("spike 1")
+    )
+    before, last = spikes_by_hand((0.0, 0.5))
+    np.testing.assert_allclose(cycle.period, last - before, rtol=1e-12)
+    assert "checked by" in repr(cycle) and "not reached" not in repr(cycle)
+
+
+def ghost_beside(cycle):
+    """The cycle as if it rested at x = 1, beyond the threshold."""
+    found = cycle.anchor
+    anchor = found._replace(chart=jnp.zeros_like(found.chart), q=jnp.ones_like(found.q))
+    return dataclasses.replace(cycle, anchor=anchor)
+
+
+def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
+    cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
+    ghost = ghost_beside(cycle)
+    widths = jnp.linspace(0.297, 0.303, 4)
+    systems = eqx.filter_vmap(lambda w: SchmittTrigger(width=w))(widths)
+    cycles = hj.find_limit_cycles(systems, cycle)
+    assert cycles.ok.all() and ((cycles.codes >= 0).sum(axis=1) == 2).all()
+    ghosts = hj.find_limit_cycles(systems, ghost)
+    assert (ghosts.result == Result.GUARD_BEYOND).all()
+    result = eqx.filter_jit(
+        lambda w: hj.find_limit_cycle(SchmittTrigger(width=w), ghost).result
+    )(jnp.asarray(0.3))
+    assert int(result) == Result.GUARD_BEYOND
+
+
+def test_a_branch_does_not_begin_beyond_a_guard():
+    cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
+    with pytest.raises(hj.errors.DefinitionError, match="none of SchmittTrigger"):
+        hj.continuation(ghost_beside(cycle), "width", (0.25, 0.35))
+
+
+def test_simulate_names_a_guard_beyond_which_it_starts():
+    path = hj.simulate(TwoCells(), "rest", (0.0, 1.2), 3.0)
+    assert [x.cause for x in path.findings] == ["beyond a guard"]
+    assert "'spike 2'" in repr(path)
+    assert not hj.simulate(TwoCells(), "rest", (0.0, 0.5), 3.0).findings
