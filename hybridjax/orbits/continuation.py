@@ -22,14 +22,19 @@ from .._core.progress import say, working
 from .._core.results import Result
 from .._core.text import number
 from ..errors import DefinitionError
-from ..systems.system import copies_of
+from ..systems.system import Guess, copies_of
 from .batches import front
+from .branch_ends import explained
 from .coincidence import SAME, coincident
+from .crossing import AtEvent
 from .curve import Curve, Point
 from .cycle import LimitCycle
+from .find import find_limit_cycle
+from .guess import is_default
 from .limit_cycles import LimitCycles, examined
 from .newton import USUAL_STEPS
 from .return_map import SINGULAR
+from .verdict import verdict
 
 
 # A step is halved if the tangent turns by more than the angle of this cosine. Nearer to 1: more
@@ -199,6 +204,7 @@ def continuation(
     cycle that was not found or lies outside of the values.
     """
     values = _check(cycle, values)
+    cycle = _at_event(cycle)
     curve = Curve(cycle, parameter, float(np.ptp(values)))
     if not values.min() <= curve.value <= values.max():
         raise DefinitionError(
@@ -216,15 +222,79 @@ def continuation(
     back, begin = trace.run(first.oriented(-sense))
     ahead, end = trace.run(first.oriented(sense))
     points = [*back[:0:-1], *ahead]
+    return _branch(curve, points, len(back) - 1, (begin, end))
+
+
+def _at_event(cycle: LimitCycle) -> LimitCycle:
+    """The cycle with the state after its first event as the beginning, if its section is the plane
+    through a guess: other cycles of the branch may not cross that plane."""
+    if not is_default(cycle.base) or not cycle.event_sequence:
+        return cycle
+    events = cycle.trajectory().events
+    names = [event.name for event in events]
+    once = [event for event in events if names.count(event.name) == 1]
+    if not once or cycle.multiplicity > 1:
+        return cycle
+    event = once[0]
+    state = tuple(event.after.values())
+    guess = Guess(event.target, state, time=event.time, after=event.name)
+    moved = find_limit_cycle(
+        cycle.system,
+        guess,
+        section=AtEvent(event.name),
+        conserved=cycle.conserved or None,
+        settings=cycle.settings,
+        throw=False,
+    )
+    return moved if moved.result == Result.OK else cycle
+
+
+def _branch(
+    curve: Curve, points: list[Point], start: int, ends: tuple[BranchEnd, BranchEnd]
+) -> Branch:
+    """The branch through some points. It ends before points whose verdict has a fault.
+
+    **Arguments:** `start`: the index of the first cycle.
+    """
     cycles = _stack(curve, points)
+    bad = np.flatnonzero(~cycles.ok)
+    low = int(max(bad[bad < start], default=-1)) + 1
+    high = int(min(bad[bad > start], default=len(points)))
+    begin, end = ends
+    if low > 0:
+        begin = _refused(points[low].value, cycles[low - 1])
+    if high < len(points):
+        end = _refused(points[high - 1].value, cycles[high])
+    if (low, high) != (0, len(points)):
+        points = points[low:high]
+        cycles = _stack(curve, points)
+    begin = _explained(cycles[0], begin)
+    end = _explained(cycles[len(points) - 1], end)
     marked = tuple(
         BranchPoint(point.kind, k, point.value, cycles[k].multipliers)
         for k, point in enumerate(points)
         if point.kind
     )
-    return Branch(
-        parameter, np.array([p.value for p in points]), cycles, marked, (begin, end)
-    )
+    values = np.array([point.value for point in points])
+    return Branch(curve.parameter, values, cycles, marked, (begin, end))
+
+
+def _refused(value: float, cycle: LimitCycle) -> BranchEnd:
+    """The end of a branch before a cycle that its checks refuse."""
+    texts = [finding.text for finding in verdict(cycle).refused]
+    result = Result(int(cycle.result))
+    return BranchEnd(value, result, " ".join(texts[:1]) or result.message)
+
+
+def _explained(cycle: LimitCycle, end: BranchEnd) -> BranchEnd:
+    """The end of a branch after a cycle, with its cause."""
+    if end.result == Result.NOT_VERIFIED:  # (Linearizations fail near a grazing.)
+        cause = explained(cycle, Result.NOT_CONVERGED)
+        known = cause.message != Result.NOT_CONVERGED.message
+        return BranchEnd(end.value, *cause) if known else end
+    if end.result == Result.OK or end.message != end.result.message:
+        return end
+    return BranchEnd(end.value, *explained(cycle, end.result))
 
 
 def _check(cycle, values) -> np.ndarray:
@@ -365,7 +435,7 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
         np.array([p.steps for p in points]),
         np.zeros(len(points), np.int32),
         front(turn.codes.reshape(len(points), -1)),
-        cycle.settings,
+        dataclasses.replace(cycle.settings, max_steps=curve.map.settings.max_steps),
         cycle.conserved,
         cycle.multiplicity,
         copies_of(systems),

@@ -18,7 +18,7 @@ from .coincidence import SAME
 from .cycle import LimitCycle, as_found, what_changed
 from .linear_flow import begin_later, last_turn
 from .newton import FEW_STEPS
-from .return_map import ReturnMap, Turn, turn_product
+from .return_map import ENOUGH, ReturnMap, Turn, turn_product
 from .shooting import newton_steps
 
 
@@ -58,6 +58,11 @@ class Point:
     def value(self) -> float:
         """The value of the parameter."""
         return float(self.z[-1])
+
+    @property
+    def period(self) -> float:
+        """The period of the cycle."""
+        return float(self.turn.period)
 
     def oriented(self, sign: float) -> "Point":
         """The point with a tangent along which the parameter grows (or falls)."""
@@ -101,10 +106,12 @@ class Curve:
 
     def __init__(self, cycle: LimitCycle, parameter: str, span: float):
         self.cycle, self.parameter, self.span = cycle, parameter, span
-        self.map, self.sequence = (
-            to_host(cycle.return_map),
-            _rotated(cycle.event_sequence),
-        )
+        map = to_host(cycle.return_map)
+        # (As many steps as single searches take where the usual limit is reached.)
+        steps = max(map.settings.max_steps, ENOUGH)
+        settings = dataclasses.replace(map.settings, max_steps=steps)
+        self.map = dataclasses.replace(map, settings=settings)
+        self.sequence = _rotated(cycle.event_sequence)
         self.value = float(parameter_of(cycle.system, parameter))
 
     def system_at(self, value: float) -> HybridSystem:
@@ -113,21 +120,24 @@ class Curve:
 
     def first(self) -> Point | Result:
         """The cycle itself."""
-        anchor, size = self.map.anchor, np.append(self.map.sizes, self.span)
-        z = np.append(anchor.q, self.value)
-        return self._correct(z, self._by_value(size), size, self._by_value(), anchor)
+        size = np.append(self.map.sizes, self.span)
+        begin = self.map.anchor, float(self.map.expected)
+        z = np.append(self.map.anchor.q, self.value)
+        return self._correct(z, self._by_value(size), size, self._by_value(), begin)
 
     def step(self, before: Point | None, last: Point, length: float) -> Point | Result:
         """The next point, about `length` further along the tangent. `before`: the point a step
         before the last one, if any."""
         ahead, row = length * last.tangent * last.size, last.tangent / last.size
         guess = last.z + ahead
+        period = last.period
         if before and before.anchor is last.anchor:
-            guess = _cubic(
-                before, last, row, 1 + float(length / (row @ (last.z - before.z)))
-            )
+            further = float(length / (row @ (last.z - before.z)))
+            guess = _cubic(before, last, row, 1 + further)
+            period += further * (last.period - before.period)
+        begin = last.anchor, period
         point = self._correct(
-            last.z + ahead, row, last.size, last.tangent, last.anchor, guess
+            last.z + ahead, row, last.size, last.tangent, begin, guess
         )
         if isinstance(point, Result):
             return point
@@ -139,16 +149,18 @@ class Curve:
         chord = (b.z - a.z) / a.size
         row = chord / np.linalg.norm(chord) / a.size
         z = a.z + where * (b.z - a.z)
-        return self._correct(z, row, a.size, chord, a.anchor, _cubic(a, b, row, where))
+        begin = a.anchor, a.period + where * (b.period - a.period)
+        return self._correct(z, row, a.size, chord, begin, _cubic(a, b, row, where))
 
     def land(self, a: Point, b: Point, value: float) -> Point | Result:
         """The point between a and b where the parameter has a value."""
         change = b.z - a.z
-        z = a.z + (value - a.value) / change[-1] * change
+        where = (value - a.value) / change[-1]
+        z = a.z + where * change
         z[-1] = value
-        point = self._correct(
-            z, self._by_value(a.size), a.size, change / a.size, a.anchor
-        )
+        begin = a.anchor, a.period + where * (b.period - a.period)
+        forward = change / a.size
+        point = self._correct(z, self._by_value(a.size), a.size, forward, begin)
         if not isinstance(point, Result):
             point.z[-1] = value
         return point
@@ -167,7 +179,8 @@ class Curve:
         anchor = point.anchor._replace(t=phase, chart=legs.chart[[k]])
         forward = self._by_value() * np.sign(point.tangent[-1])
         z, row = np.append(legs.q[:, k], point.value), self._by_value(point.size)
-        moved = self._correct(z, row, point.size, forward, anchor)
+        begin = anchor, point.period
+        moved = self._correct(z, row, point.size, forward, begin)
         return None if k == 0 or isinstance(moved, Result) else moved
 
     def _by_value(
@@ -177,15 +190,19 @@ class Curve:
         return np.append(np.zeros(self.map.structure.d), 1.0) / size
 
     def _correct(
-        self, z0, row, size, forward, anchor: Lanes, guess=None
+        self, z0, row, size, forward, begin: tuple[Lanes, float], guess=None
     ) -> Point | Result:
-        """Newton's method for a point with row @ (z - z0) = 0, from a guess (default: z0)."""
-        z, last, rounding = (
-            z0 if guess is None else guess,
-            np.inf,
-            len(z0) * np.finfo(float).eps,
-        )
+        """Newton's method for a point with row @ (z - z0) = 0, from a guess (default: z0).
+
+        **Arguments:** `begin`: the anchor, and the period that is expected.
+        """
+        anchor, period = begin
         map = dataclasses.replace(self.map, anchor=anchor)
+        if map.base is not None:
+            map = dataclasses.replace(map, expected=np.asarray(period))
+        rounding = len(z0) * np.finfo(float).eps
+        z = z0 if guess is None else guess
+        last = np.inf
         for k in range(FEW_STEPS):
             turn = self.turn(map, z)
             if (failure := self._failure(turn)) is not None:
@@ -217,6 +234,8 @@ class Curve:
             return Result.GRAZING  # events come and go where a guard is touched
         if sequence != self.sequence or not np.all(np.isfinite(turn.residual)):
             return Result.EVENT_ORDER
+        if turn.closed and int(turn.meetings) > self.map.multiplicity:
+            return Result.EXTRA_TURNS
         return None
 
     def _settled(self, point: Point) -> Point | Result:

@@ -33,7 +33,7 @@ from .cycle import LimitCycle
 from .guess import require_similar, return_map_near
 from .linear_flow import keep_turn, last_turn, remembering
 from .newton import Solution, search, solve
-from .return_map import PATIENCE, ReturnMap, Turn
+from .return_map import ENOUGH, PATIENCE, ReturnMap, Turn
 from .scale import (
     Sizes,
     given_sizes,
@@ -52,9 +52,6 @@ _OFF = 4.0
 # Periods of the flow after which a search begins again that ended beyond a guard, or in another
 # chart than it began. Fewer: slow transients remain. More: a vain search takes longer.
 _LATER = 8, 40
-# Steps of a piece of a turn where the default limit, which ends searches that run away, is reached.
-# Fewer: neurons have no cycle. More: vain searches last longer.
-_ENOUGH = 4096
 
 
 @checked
@@ -234,11 +231,11 @@ def _solution(
             map = dataclasses.replace(map, anchor=distant.anchor)
             solution = search(map, patient)
     # (Where the end is out of reach even for steps that are 256 times as long, more do not help.)
-    reach = float(solution.turn.period) * _ENOUGH
+    reach = float(solution.turn.period) * ENOUGH
     short = patient and int(solution.result) == Result.STEP_LIMIT
     if short and reach > float(map.expected):
         say("the same with more steps")
-        settings = dataclasses.replace(map.settings, max_steps=_ENOUGH)
+        settings = dataclasses.replace(map.settings, max_steps=ENOUGH)
         map = dataclasses.replace(map, settings=settings)
         solution = search(map)
     return solution, map

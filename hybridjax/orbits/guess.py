@@ -45,6 +45,11 @@ class _Plane(eqx.Module):
         return jnp.dot(q - self.point, self.normal)
 
 
+def is_default(section: Crossing | AtEvent | None) -> bool:
+    """True for the plane through the guess, which is the section if none is given."""
+    return isinstance(section, Crossing) and isinstance(section.function, _Plane)
+
+
 def return_map_near(
     s: Structure,
     guess: Guess | None,

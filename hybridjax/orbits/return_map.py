@@ -52,6 +52,9 @@ LEGS = 16
 # section to the next. Smaller: a fast jump, as of van der Pol's oscillator at mu = 1000, or many
 # events reach it. Larger: vain searches last longer.
 PATIENCE = 1024
+# Steps of a piece of a turn where the default limit, which ends searches that run away, is reached.
+# Fewer: neurons have no cycle. More: vain searches last longer.
+ENOUGH = 4096
 # The part of the last period after which an autonomous system is integrated to its section.
 # Nearer to 1: a shorter return is missed. Smaller: an earlier crossing is taken for the return. At
 # a simple fraction, pieces end on the events of symmetric cycles.

@@ -117,7 +117,7 @@ class _Path(NamedTuple):
         return float(self.walked.error.max())
 
 
-class _Visit(NamedTuple):
+class Visit(NamedTuple):
     """A stay in a chart between two events, or a whole turn without any."""
 
     chart: int
@@ -134,6 +134,12 @@ def verdict(cycle) -> Verdict:
     """Check a cycle (see the module). The result is remembered with the cycle."""
     cycle = hosted(cycle)
     return _verdicts.recall(cycle, None, lambda: _verdict(cycle))
+
+
+def visits_of(cycle) -> list[Visit]:
+    """The visits of charts on a cycle."""
+    cycle = hosted(cycle)
+    return _visits(cycle.structure, _walk_along(cycle))
 
 
 def _verdict(cycle) -> Verdict:
@@ -277,7 +283,7 @@ def _off_schedule(transition, t: float, late: float):
     return [Finding("an event without its schedule", text, "refused")]
 
 
-def _visits(s: Structure, path: _Path) -> list[_Visit]:
+def _visits(s: Structure, path: _Path) -> list[Visit]:
     """The visits of charts on the cycle; one that the beginning of the turn divides is whole."""
     M = len(path.event)
     ends = np.flatnonzero(path.event >= 0)
@@ -300,11 +306,11 @@ def _visits(s: Structure, path: _Path) -> list[_Visit]:
                 np.column_stack([path.begin[:, k % M], path.walked.points[:, own]])
             )
         t, q = np.concatenate(times), np.concatenate(states, axis=1)
-        visits.append(_Visit(a, t, q[: s.dims[a]], int(path.event[group[-1]])))
+        visits.append(Visit(a, t, q[: s.dims[a]], int(path.event[group[-1]])))
     return visits
 
 
-def _passed_guards(s: Structure, visit: _Visit, scale) -> Iterable[Finding]:
+def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
     """Guards that a visit passes, or beyond which it lies all along, without an event."""
     a, n = visit.chart, len(visit.q)
     guards = s.guards(a)
@@ -336,7 +342,7 @@ def _crossings(over: Bool[np.ndarray, " P"], under: Bool[np.ndarray, " P"]):
     return points[1:][falls]
 
 
-def _may_happen(s: Structure, g: int, visit: _Visit, points) -> bool:
+def _may_happen(s: Structure, g: int, visit: Visit, points) -> bool:
     """True if the predicate of a transition holds at one of some points of a visit."""
     if s.transitions[g].enabled is None:
         return True
@@ -345,7 +351,7 @@ def _may_happen(s: Structure, g: int, visit: _Visit, points) -> bool:
     return bool(kernels.enabled(s, s.member(g), *at, u).any())
 
 
-def _beyond(s: Structure, transition, visit: _Visit, level) -> Finding:
+def _beyond(s: Structure, transition, visit: Visit, level) -> Finding:
     low, high = sorted(transition.sign * np.array([level.min(), level.max()]))
     text = (
         f"the cycle lies beyond the guard of '{transition.name}' all along its stay in chart "
@@ -365,7 +371,7 @@ def _passed(transition, t: float) -> Finding:
     return Finding("a guard was passed", text, "refused")
 
 
-def _skipped_schedules(s: Structure, visit: _Visit) -> Iterable[Finding]:
+def _skipped_schedules(s: Structure, visit: Visit) -> Iterable[Finding]:
     """Scheduled events that were due in a visit, and did not happen."""
     for g in s.schedules(visit.chart):
         transition = s.transitions[g]
@@ -473,7 +479,7 @@ def _other_multipliers(apart: float) -> list[Finding]:
     return [Finding("other multipliers", text, "refused")]
 
 
-def _not_reached(cycle, visits: list[_Visit]) -> tuple[str, ...]:
+def _not_reached(cycle, visits: list[Visit]) -> tuple[str, ...]:
     s = cycle.structure
     visited = {s.names[visit.chart] for visit in visits}
     return tuple(

@@ -1,0 +1,180 @@
+"""The reason for which a branch of limit cycles ends, read from its last cycle."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .._core.executor import to_host
+from .._core.results import Result
+from ..engine import kernels
+from ..engine.target import until
+from ..systems.transition import Scheduled
+from .crossing import AtEvent, Crossing, to_section
+from .cycle import LimitCycle
+from .guess import is_default
+from .verdict import Visit, visits_of
+
+
+# A guard or a section is touched if its rate is below this part of the rate that the motion along
+# the cycle could make. Larger: transversal events are called grazing. Smaller: the last cycle of a
+# branch, which ends a little before, is not recognized.
+_SLOW = 0.02
+# Two events, or a guard and zero, are close if less than this part of the period, or of the range
+# of the guard, is between them. Larger and smaller: as above.
+_CLOSE = 0.02
+
+# The cycle passes an equilibrium if nothing moves by more than this, in sizes of the states, in a
+# time of one period. Larger: slow cycles count. Smaller: a branch ends before.
+_REST = 0.1
+
+# Results of a turn that failed beyond the end of a branch, and may have one of these causes.
+_UNCLEAR = (
+    Result.GRAZING,
+    Result.EVENT_ORDER,
+    Result.NOT_CONVERGED,
+    Result.SECTION_MISSED,
+)
+
+
+class End(NamedTuple):
+    result: Result
+    message: str
+
+
+def explained(cycle: LimitCycle, result: Result) -> End:
+    """The cause of the end of a branch after a cycle, where the next turn had a result."""
+    if result not in _UNCLEAR:
+        return End(result, result.message)
+    visits = visits_of(cycle)
+    return (
+        _touched_section(cycle)
+        or _touched_guard(cycle, visits)
+        or _change_of_order(cycle, visits)
+        or _near_guard(cycle, visits)
+        or _near_rest(cycle, visits, result)
+        or _missed_section(cycle, result)
+        or End(result, result.message)
+    )
+
+
+def _touched_section(cycle: LimitCycle) -> End | None:
+    """An end at which the cycle touches its section tangentially."""
+    map = to_host(cycle.return_map)
+    if not isinstance(map.base, Crossing):
+        return None
+    a = int(map.anchor.chart[0])
+    n = map.structure.dims[a]
+    target = to_section(until(map.anchor.t), map.base)
+    at = map.anchor.t, map.anchor.q[:n], np.zeros((map.structure.nu, 1))
+    first = np.zeros(1, np.int32)
+    row = kernels.watched(map.structure, a, target.levels, *at, first)[-1, :, 0]
+    field = kernels.field(map.structure, a, *at)[:, 0, 0]
+    if not _is_slow(row, field, map.scale[a, :n], float(cycle.period)):
+        return None
+    text = (
+        f"the cycle touches its section ({map.base}) tangentially, and does not cross it any more: "
+        "find the first cycle with another `section=`"
+    )
+    return End(Result.GRAZING, text)
+
+
+def _touched_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
+    """An end at which an event of the cycle is grazing."""
+    s = cycle.structure
+    scale, period = np.asarray(cycle.settings.scale), float(cycle.period)
+    for visit in visits:
+        if visit.event < 0 or isinstance(s.transitions[visit.event].guard, Scheduled):
+            continue
+        a, n = visit.chart, len(visit.q)
+        at = visit.t[-1:], visit.q[:, -1:], np.zeros((s.nu, 1))
+        rows = kernels.watched(s, a, None, *at, np.zeros(1, np.int32))
+        row = rows[s.guards(a).index(visit.event), :, 0]
+        field = kernels.field(s, a, *at)[:, 0, 0]
+        if _is_slow(row, field, scale[a, :n], period):
+            name = s.transitions[visit.event].name
+            text = f"the guard of '{name}' is touched tangentially (grazing)"
+            return End(Result.GRAZING, text)
+    return None
+
+
+def _is_slow(row, field, sizes, period: float) -> bool:
+    """True if a function changes slowly along the flow, given its derivatives in a row."""
+    slope = row[2 : 2 + len(field)]
+    possible = abs(row[1]) + np.abs(slope) @ np.maximum(np.abs(field), sizes / period)
+    return bool(abs(row[1] + slope @ field) < _SLOW * possible)
+
+
+def _change_of_order(cycle: LimitCycle, visits: list[Visit]) -> End | None:
+    """An end at which two events of the cycle happen at the same time."""
+    s, period = cycle.structure, float(cycle.period)
+    for before, visit in zip([visits[-1], *visits[:-1]], visits, strict=True):
+        if visit.event < 0 or before.event < 0 or len(visits) < 2:
+            continue
+        if visit.t[-1] - visit.t[0] < _CLOSE * period:
+            first, second = (s.transitions[x.event].name for x in (before, visit))
+            text = (
+                f"the events '{first}' and '{second}' come to the same time, beyond which one of "
+                "them is lost or comes first"
+            )
+            return End(Result.EVENT_ORDER, text)
+    return None
+
+
+def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
+    """An end at which the cycle reaches a guard that led to no event before."""
+    s = cycle.structure
+    for visit in visits:
+        guards = s.guards(visit.chart)
+        if not guards:
+            continue
+        u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
+        rows = kernels.watched(s, visit.chart, None, visit.t, visit.q, u, first)[:, 0]
+        for g, level in zip(guards, rows, strict=True):
+            inside = level[1:-1]
+            if g == visit.event or not len(inside):
+                continue
+            name = s.transitions[g].name
+            low = int(np.argmin(inside))
+            if inside[low] > _CLOSE * np.ptp(level) or np.ptp(level) == 0:
+                continue
+            if 0 < low < len(inside) - 1:
+                text = f"the guard of '{name}' is touched tangentially (grazing)"
+                return End(Result.GRAZING, text)
+            if low == len(inside) - 1:
+                text = f"the event '{name}' begins to happen at the end of a stay"
+                return End(Result.EVENT_ORDER, text)
+    return None
+
+
+def _near_rest(cycle: LimitCycle, visits: list[Visit], result: Result) -> End | None:
+    """An end at which the period grows without bound, since the cycle passes an equilibrium."""
+    if result != Result.SECTION_MISSED or cycle.clocked:
+        return None
+    s, scale = cycle.structure, np.asarray(cycle.settings.scale)
+    slowest = np.inf
+    for visit in visits:
+        u = np.zeros((s.nu, 1))
+        rates = kernels.field(s, visit.chart, visit.t, visit.q, u)[:, 0]
+        speeds = np.abs(rates) / scale[visit.chart, : len(rates), None]
+        slowest = min(slowest, float(speeds.max(axis=0).min()))
+    if slowest * float(cycle.period) > _REST:
+        return None
+    text = (
+        f"the cycle comes close to an equilibrium, and its period ({float(cycle.period):.4g}) "
+        "grows without bound"
+    )
+    return End(result, text)
+
+
+def _missed_section(cycle: LimitCycle, result: Result) -> End | None:
+    """An end at which the cycle does not meet its section any more."""
+    if result != Result.SECTION_MISSED or isinstance(cycle.base, AtEvent):
+        return None
+    where = (
+        "the plane through the first guess" if is_default(cycle.base) else cycle.base
+    )
+    text = (
+        f"the cycle does not return to its section ({where}) within three periods: find the first "
+        "cycle with another `section=`"
+    )
+    return End(result, text)
