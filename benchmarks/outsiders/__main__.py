@@ -7,6 +7,7 @@ from the same guess: where that settles on a stable cycle, the refusal was not d
 
     python benchmarks/outsiders                      all models
     python benchmarks/outsiders --only "van der"     models whose names contain this
+    python benchmarks/outsiders --group relays       models of one kind
     python benchmarks/outsiders --seed 1             five random guesses more for each model
     python benchmarks/outsiders --part 1/4           every fourth model, beginning with the first
     python benchmarks/outsiders --out results.jsonl  one line of JSON for each guess
@@ -23,7 +24,7 @@ import numpy as np
 from build import answer
 from check import settle, verify
 from form import Start
-from models import MODELS
+from models import GROUPS, MODELS
 
 
 SLOW = 30.0  # seconds for one guess; slower ones are printed
@@ -148,6 +149,10 @@ VERDICTS = ("true", "other", "refused", "undeserved", "WRONG", "crash")
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="", help="part of the models' names")
+    parser.add_argument("--group", choices=GROUPS, help="models of one kind")
+    parser.add_argument(
+        "--limit", type=float, default=150.0, help="seconds for one model"
+    )
     parser.add_argument("--guess", type=int, help="index of one guess")
     parser.add_argument("--seed", type=int, help="seed of five more guesses each")
     parser.add_argument(
@@ -157,7 +162,8 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="print the models")
     options = parser.parse_args()
     first, step = map(int, options.part.split("/"))
-    chosen = [m for m in MODELS if options.only in m.name][first - 1 :: step]
+    models = GROUPS[options.group] if options.group else MODELS
+    chosen = [m for m in models if options.only in m.name][first - 1 :: step]
     if options.list:
         for model in chosen:
             print(
@@ -174,6 +180,9 @@ def main() -> int:
             guesses = [guesses[options.guess]]
         begin, settled, outcomes = time.monotonic(), {}, []
         for index, guess in guesses:
+            if time.monotonic() - begin > options.limit:
+                print(f"{model.name}: out of time before guess {index}")
+                break
             outcome = judge(model, index, guess, settled)
             outcomes.append(outcome)
             if options.out:

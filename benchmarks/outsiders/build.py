@@ -14,16 +14,16 @@ import hybridjax as hj
 hj.enable_x64()
 
 
-def flow(states: tuple, rule) -> type:
+def flow(names: tuple, rule) -> type:
     """A chart whose field is a rule of the model; `system` holds the parameters."""
 
     class Flow(hj.Chart):
+        states = names
         system: hj.HybridSystem
 
         def field(self, t, q, u):
             return rule(jnp, t, q, self.system)
 
-    Flow.states = states
     return Flow
 
 

@@ -254,7 +254,7 @@ class Simulator:
                     return None
                 if self.enabled(tick, bound, solver.y):
                     return tick
-                return self._stay(motion, end, deadline, fired, record)
+                return self._stay(motion, end, deadline, None, record)
 
     def _armed_at_entry(self, motion, event, value, values, fired) -> bool:
         size = np.max(np.abs(values))

@@ -13,11 +13,12 @@ import models_relays
 import models_schedules
 
 
-MODELS = (
-    *models_oscillators.MODELS,
-    *models_relays.MODELS,
-    *models_neurons.MODELS,
-    *models_converters.MODELS,
-    *models_mechanics.MODELS,
-    *models_schedules.MODELS,
-)
+GROUPS = {
+    "oscillators": models_oscillators.MODELS,
+    "relays": models_relays.MODELS,
+    "neurons": models_neurons.MODELS,
+    "converters": models_converters.MODELS,
+    "mechanics": models_mechanics.MODELS,
+    "schedules": models_schedules.MODELS,
+}
+MODELS = tuple(model for group in GROUPS.values() for model in group)
