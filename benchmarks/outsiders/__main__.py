@@ -66,6 +66,16 @@ def describe(guess: Start) -> str:
     return f"{guess.kind}: {guess.chart} {guess.state} at {guess.time}"
 
 
+def alternating(guesses: list) -> list:
+    """First, last, second, last but one: with little time, good and bad ones are tried."""
+    ordered, left = [], list(guesses)
+    while left:
+        ordered.append(left.pop(0))
+        if left:
+            ordered.append(left.pop())
+    return ordered
+
+
 def judge(model, index: int, guess: Start, settled: dict) -> Outcome:
     begin = time.monotonic()
     found = answer(model, guess)
@@ -158,12 +168,15 @@ def main() -> int:
     parser.add_argument(
         "--part", default="1/1", help="k/n: every n-th model from the k-th"
     )
+    parser.add_argument("--skip", type=int, default=0, help="models to leave out first")
     parser.add_argument("--out", help="file for one line of JSON for each guess")
     parser.add_argument("--list", action="store_true", help="print the models")
     options = parser.parse_args()
     first, step = map(int, options.part.split("/"))
     models = GROUPS[options.group] if options.group else MODELS
-    chosen = [m for m in models if options.only in m.name][first - 1 :: step]
+    chosen = [m for m in models if options.only in m.name][first - 1 :: step][
+        options.skip :
+    ]
     if options.list:
         for model in chosen:
             print(
@@ -178,8 +191,10 @@ def main() -> int:
             guesses += list(enumerate(extra, start=len(guesses)))
         if options.guess is not None:
             guesses = [guesses[options.guess]]
-        begin, settled, outcomes = time.monotonic(), {}, []
-        for index, guess in guesses:
+        begin = time.monotonic()
+        settled: dict = {}
+        outcomes: list = []
+        for index, guess in alternating(guesses):
             if time.monotonic() - begin > options.limit:
                 print(f"{model.name}: out of time before guess {index}")
                 break
