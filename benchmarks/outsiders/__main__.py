@@ -49,7 +49,12 @@ def random_guesses(model, seed: int, count: int = 5) -> tuple:
 
 @dataclasses.dataclass
 class Outcome:
-    """What became of one guess: 'true', 'other', 'refused', 'undeserved', 'WRONG' or 'crash'."""
+    """What became of one guess.
+
+    `verdict` is 'true'; 'other', a true cycle, but not the one found most often; 'constant', a
+    solution of a driven system that is at rest; 'refused'; 'undeserved', a refusal although a
+    simulation from the guess settles on a stable cycle; 'WRONG'; or 'crash'.
+    """
 
     model: str
     index: int
@@ -86,6 +91,8 @@ def judge(model, index: int, guess: Start, settled: dict) -> Outcome:
         report = verify(found.orbit, model)
         period, remarks = found.orbit.period, report.remarks
         verdict = "WRONG" if report.complaints else "true"
+        if report.complaints == ["an equilibrium"] and model.clock is not None:
+            verdict = "constant"
         shown = np.array2string(np.asarray(found.orbit.multipliers), precision=6)
         text = (
             "; ".join(report.complaints) or f"period {period:.9g}, multipliers {shown}"
@@ -153,7 +160,7 @@ def show(model, outcomes: list, seconds: float) -> None:
     sys.stdout.flush()
 
 
-VERDICTS = ("true", "other", "refused", "undeserved", "WRONG", "crash")
+VERDICTS = ("true", "other", "constant", "refused", "undeserved", "WRONG", "crash")
 
 
 def main() -> int:
