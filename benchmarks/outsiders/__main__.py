@@ -81,6 +81,13 @@ def alternating(guesses: list) -> list:
     return ordered
 
 
+def likeness(orbit) -> tuple:
+    """Equal for the same cycle found twice; its multipliers are then examined once."""
+    names = tuple(sorted(event.name for event in orbit.events))
+    values = tuple(f"{x:.6g}" for x in orbit.multipliers)
+    return names, f"{orbit.period:.9g}", values
+
+
 def judge(model, index: int, guess: Start, settled: dict) -> Outcome:
     begin = time.monotonic()
     found = answer(model, guess)
@@ -88,11 +95,14 @@ def judge(model, index: int, guess: Start, settled: dict) -> Outcome:
     verdict, text, period, remarks = "", found.text, None, []
     begin = time.monotonic()
     if found.orbit is not None:
-        report = verify(found.orbit, model)
+        known = likeness(found.orbit)
+        report = verify(found.orbit, model, multipliers=known not in settled)
         period, remarks = found.orbit.period, report.remarks
         verdict = "WRONG" if report.complaints else "true"
         if report.complaints == ["an equilibrium"] and model.clock is not None:
             verdict = "constant"
+        if verdict == "true":
+            settled[known] = True
         shown = np.array2string(np.asarray(found.orbit.multipliers), precision=6)
         text = (
             "; ".join(report.complaints) or f"period {period:.9g}, multipliers {shown}"

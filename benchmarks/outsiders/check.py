@@ -74,7 +74,7 @@ def clock_of(model: Model) -> float | None:
 
 class Simulator:
     def __init__(
-        self, model: Model, rtol: float = 1e-11, scale=None, per_period: int = 40
+        self, model: Model, rtol: float = 1e-11, scale=None, per_period: int = 16
     ):
         self.model = model
         self.p = parameters(model)
