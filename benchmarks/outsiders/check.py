@@ -62,6 +62,7 @@ class Motion:
     state: np.ndarray
     time: float
     ending: str = "ok"
+    together: list = dataclasses.field(default_factory=list)
 
 
 def parameters(model: Model) -> types.SimpleNamespace:
@@ -150,10 +151,14 @@ class Simulator:
             event = self._stay(motion, end, deadline, fired, record)
             if event is None:
                 return motion
+            before = motion.state
             motion.events.append(Occurrence(motion.time, event.name))
-            motion.state = self.reset(event, motion.time, motion.state)
+            motion.state = self.reset(event, motion.time, before)
             motion.chart = event.target
             fired = event
+            for other in motion.together:
+                fired = self._join(motion, event, other, before) or fired
+            motion.together = []
             if not np.all(np.isfinite(motion.state)):
                 motion.ending = "reset is not finite"
                 return motion
@@ -166,6 +171,23 @@ class Simulator:
                 motion.ending = "Zeno"
                 return motion
         return motion
+
+    def _join(self, motion, event, other, before) -> Event | None:
+        """Fires an event that coincides with `event`, and says whether the order matters."""
+        if other.source != motion.chart or other.guard is None:
+            motion.remarks.append(
+                f"'{event.name}' ends the chart of '{other.name}': order matters"
+            )
+            return None
+        motion.events.append(Occurrence(motion.time, other.name))
+        motion.state = self.reset(other, motion.time, motion.state)
+        motion.chart = other.target
+        swapped = self.reset(event, motion.time, self.reset(other, motion.time, before))
+        size = np.max(np.abs(before)) + 1e-300
+        same = np.shape(swapped) == np.shape(motion.state)
+        if not same or np.max(np.abs(swapped - motion.state)) > 1e-7 * size:
+            motion.remarks.append(f"'{event.name}' and '{other.name}': order matters")
+        return other
 
     def _stay(self, motion, end, deadline, fired, record) -> Event | None:
         """Integrates in one chart until an event, which it returns, or an end."""
@@ -242,6 +264,7 @@ class Simulator:
                     motion.remarks.append(
                         f"'{event.name}' coincides with '{other[1].name}'"
                     )
+                motion.together = [other[1] for other in others]
                 if record:
                     steps[-1] = Cut(dense, solver.t_old, when)
                 motion.time, motion.state = float(when), dense(when)
@@ -463,11 +486,12 @@ def verify(orbit: Orbit, model: Model, multipliers: bool = True) -> Report:
             report.complaints.append(
                 f"from t = {orbit.time[row]:.9g} the motion misses the next point by {error:.1e}"
             )
-    report.complaints += [r for r in report.remarks if "coincides" in r]
+    report.complaints += [r for r in report.remarks if "order matters" in r]
     report.complaints += compare_events(orbit, found)
     report.complaints += early_return(orbit, pieces, scale, nodes[0], clock)
     report.complaints += ghosts(simulator, pieces, found, report)
-    if multipliers and not report.complaints:
+    together = any("coincides" in r for r in report.remarks)
+    if multipliers and not report.complaints and not together:
         mine = monodromy(simulator, orbit, legs, scale, clock is None, report)
         if mine is not None:
             report.multipliers = mine
