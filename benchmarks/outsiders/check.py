@@ -418,6 +418,17 @@ def ranges_of(model: Model, orbit: Orbit) -> tuple[dict, dict]:
     return spread, size
 
 
+def usual_sizes(model: Model) -> dict:
+    """Sizes of states in the first guess: a state that is only rounding is zero beside them."""
+    first = model.guesses[0]
+    names = model.charts[first.chart][0]
+    known = dict(zip(names, map(abs, first.state), strict=True))
+    return {
+        chart: np.array([known.get(name, 0.0) for name in states])
+        for chart, (states, _) in model.charts.items()
+    }
+
+
 def nodes_of(orbit: Orbit, most: int = 12) -> list[int]:
     """Rows away from events, from which pieces of the orbit are simulated."""
     plain = np.flatnonzero(~orbit.is_event)
@@ -441,7 +452,11 @@ def verify(orbit: Orbit, model: Model, multipliers: bool = True) -> Report:
     report = Report([], [])
     clock = clock_of(model)
     spread, size = ranges_of(model, orbit)
-    scale = {c: np.maximum(spread[c], 1e-6 * size[c] + 1e-300) for c in spread}
+    usual = usual_sizes(model)
+    scale = {
+        c: np.maximum(np.maximum(spread[c], 1e-6 * size[c]), 1e-7 * usual[c] + 1e-300)
+        for c in spread
+    }
     report.ranges = scale
     motions = [spread[c] / np.maximum(size[c], 1e-300) for c in set(orbit.chart)]
     if not orbit.events and max(float(np.max(m)) for m in motions) < 1e-9:

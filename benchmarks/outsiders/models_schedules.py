@@ -159,7 +159,7 @@ def vaccination() -> Model:
             Start("people", (0.04, 1e-12), 1.0, kind="poor"),
             Start("people", (0.5, 0.5), 1.9, kind="far"),
         ),
-        truth="a stable cycle without infection",
+        truth="a stable cycle with infection, an unstable one without",
     )
 
 
