@@ -4,8 +4,8 @@ They are fixed before the first run of hybridjax on them: this is what the bench
 models get a new file, which names its own date. Afterwards only errors of the harness and errors
 against the sources are mended; no model and no guess changes in order to pass.
 
-Changes since the first run: the words of `truth` of "pulse vaccination" (its cycle without infection
-is unstable).
+Changes since the first run: the words of `truth` of "pulse vaccination" (its cycle without
+infection is unstable).
 """
 
 import models_converters
