@@ -65,6 +65,11 @@ CASES = {
         2,
         "second-order products on lines, and draws without",
     ),
+    "outsiders": (
+        "outsiders",
+        120,
+        "models by outsiders: true cycle or refusal, beside scipy",
+    ),
     "jumps": (
         "jumps.py --draws 200",
         6,
