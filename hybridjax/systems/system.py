@@ -148,6 +148,15 @@ class Guess(eqx.Module):
     __repr__ = fields
 
 
+# Made by a call, because Python may keep equal constants of two modules as one object: `inputs`
+# that an author wrote must not be taken for these.
+DEFAULT_INPUTS: tuple[str, ...] = tuple(["u"])
+"""The inputs of a system whose author named none."""
+
+SECOND_NAME = "input"
+"""The name of the default input where a state or an output is called as it is."""
+
+
 class HybridSystem(Definition):
     """A rhythmic hybrid system (paper Sec. II). Subclass it; its fields are the parameters.
 
@@ -169,12 +178,13 @@ class HybridSystem(Definition):
     Every system defines `charts`, and `transitions` if it has events; `period`, `outputs` and
     `guess` are optional. The class attribute `inputs` names the exogenous inputs û; `inputs = ()`
     for a system without. `input_units` gives their units in the same order (none, or one for each),
-    and `time_unit` that of time. `solver`, a keyword of every constructor, is the method of
-    integration of all charts, or of some by name (`{"stance": hj.Radau()}`); it overrides
-    `Chart.solver`.
+    and `time_unit` that of time. States, inputs and outputs share one space of names: without
+    `inputs`, there is one input `u`, or `input` if a state or an output is called `u`. `solver`, a
+    keyword of every constructor, is the method of integration of all charts, or of some by name
+    (`{"stance": hj.Radau()}`); it overrides `Chart.solver`.
     """
 
-    inputs: ClassVar[tuple[str, ...]] = ("u",)
+    inputs: ClassVar[tuple[str, ...]] = DEFAULT_INPUTS
     input_units: ClassVar[tuple[str, ...]] = ()
     time_unit: ClassVar[str] = ""
 
@@ -269,6 +279,23 @@ class Derived(HybridSystem):
 
     def draw(self, chart, t, q):
         return self.system.draw(chart, t, q)
+
+
+def input_names(system: HybridSystem) -> tuple[str, ...]:
+    """The names of the inputs of a system, of which the default one yields to states and outputs.
+
+    A system made of another one has the inputs of that one, though it may lack some of its states.
+    """
+    if system.inputs is not DEFAULT_INPUTS:
+        return system.inputs
+    while isinstance(system, Derived):
+        system = system.system
+    taken = {output.name for output in system.outputs()}
+    for chart in system.charts().values():
+        taken.update(chart.states, chart.absent)
+    if taken.isdisjoint(DEFAULT_INPUTS):
+        return DEFAULT_INPUTS
+    return (SECOND_NAME,)
 
 
 class Driven(Derived):
