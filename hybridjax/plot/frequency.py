@@ -148,7 +148,11 @@ def bode(
     names = first.outputs if outputs is None else outputs
     chosen = range(len(first.inputs)) if input is None else [input]
     curves = [
-        (_pick("output", name, first.outputs), _pick("input", which, first.inputs), which)
+        (
+            _pick("output", name, first.outputs),
+            _pick("input", which, first.inputs),
+            which,
+        )
         for name in names
         for which in chosen
     ]
