@@ -461,9 +461,7 @@ def test_one_blank_does_not_fill_a_sheet(tmp_path, monkeypatch):
         written.clear()
         found = hj.read_recording(path)
         assert found.signals == expected.signals == ("x", "y")
-        np.testing.assert_array_equal(
-            found.trials[0].values, expected.trials[0].values
-        )
+        np.testing.assert_array_equal(found.trials[0].values, expected.trials[0].values)
 
 
 def test_columns_take_time_in_proportion_to_their_number(tmp_path):

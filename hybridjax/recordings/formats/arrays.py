@@ -73,9 +73,7 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
 
     with reading(path, "HDF5 file"), h5py.File(path, "r") as file:
         file.visititems(visit)
-        check_declared(
-            path, 8 * sum(math.prod(x.array.shape) for x in leaves.values())
-        )
+        check_declared(path, 8 * sum(math.prod(x.array.shape) for x in leaves.values()))
         return _read_tree(path, leaves, separator, wanted)
 
 

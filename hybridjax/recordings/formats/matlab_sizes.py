@@ -126,7 +126,13 @@ def declared(path: Path) -> Iterator[int]:
                     yield from _array(path, source, size, 0)
             except HybridJaxError:
                 raise
-            except (EOFError, ValueError, IndexError, struct.error, zlib.error) as error:
+            except (
+                EOFError,
+                ValueError,
+                IndexError,
+                struct.error,
+                zlib.error,
+            ) as error:
                 raise FileFormatError(
                     f"'{path}' is no MATLAB file, or damaged ({error})."
                 ) from error
