@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core import limits
-from ..._core.archive import damaged
 from ..._core.boundary.values import unmasked
 from ..._core.signal import SECONDS
 from ...errors import DefinitionError, FileFormatError, HybridJaxError

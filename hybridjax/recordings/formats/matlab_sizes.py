@@ -143,7 +143,8 @@ def _array(path: Path, source: _Reader, size: int, depth: int) -> Iterator[int]:
     """Yield the sizes of an array, of which the tag has been read, and of its members."""
     if depth > limits.NESTED:
         raise FileFormatError(
-            f"'{path}' has arrays in more than {limits.NESTED} structs or cells: save them in fewer."
+            f"'{path}' has arrays in more than {limits.NESTED} structs or cells: save them in "
+            "fewer."
         )
     if not size:  # an empty member
         return
