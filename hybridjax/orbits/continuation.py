@@ -22,7 +22,7 @@ from .._core.progress import say, working
 from .._core.results import Result
 from .._core.text import number
 from ..errors import DefinitionError
-from ..systems.system import copies_of
+from ..systems.system import copies_of, require_positive
 from .batches import front
 from .coincidence import SAME, coincident
 from .curve import Curve, Point
@@ -200,6 +200,8 @@ def continuation(
     """
     values = _check(cycle, values)
     curve = Curve(cycle, parameter, float(np.ptp(values)))
+    for value in values:
+        require_positive(curve.system_at(value))
     if not values.min() <= curve.value <= values.max():
         raise DefinitionError(
             f"the cycle has {parameter} = {curve.value:.6g}, outside of the values "

@@ -21,7 +21,7 @@ from .._core.text import folded
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
-from ..systems.system import HybridSystem, arrays_of, copies_of
+from ..systems.system import HybridSystem, arrays_of, copies_of, require_positive
 from .batches import Rounds, Tiles, tiles_of
 from .checks import check_found, check_periodic
 from .coincidence import commutes
@@ -167,6 +167,7 @@ def find_limit_cycles(
     """
     execution = Execution() if execution is None else execution
     systems = _stacked(systems)
+    require_positive(systems)
     require_x64(systems)
     settings = Settings() if settings is None else settings
     systems = settings.system(systems)

@@ -15,7 +15,7 @@ from ..errors import ComputationError, DefinitionError
 from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
-from ..systems.system import HybridSystem, unit_of_parameter
+from ..systems.system import HybridSystem, require_positive, unit_of_parameter
 from ..systems.varied import parameter_of, with_parameters
 from .film import PNG, Easel, png
 from .frequency import FREQUENCY
@@ -233,6 +233,8 @@ def explore(
             raise DefinitionError(
                 f"`ranges` of '{name}' must enclose its value, {value:.6g}."
             )
+        for end in (low, high):
+            require_positive(with_parameters(cycle.system, {name: end}))
         sliders.append(
             [name, with_unit(name, unit_of_parameter(cycle.system, name)), low, high]
         )

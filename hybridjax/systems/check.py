@@ -16,7 +16,7 @@ from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart
 from .structure import Structure, hashable, quoted, require_inputs_apart
-from .system import HybridSystem, Output, arrays_of
+from .system import HybridSystem, Output, arrays_of, require_positive
 from .transition import Scheduled, Transition
 
 
@@ -45,6 +45,7 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
                 f"parameter `{name}` of {type(system).__name__} is {np.asarray(leaf)}"
             )
             raise DefinitionError(f"{text}; every parameter must be finite.")
+    require_positive(system)
     leaves, structure = jax.tree_util.tree_flatten(system)
     parts = ((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves)
     form = hashable((structure, *parts))

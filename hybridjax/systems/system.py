@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
-from .._core.boundary.kinds import Scalar, Vector
+from .._core.boundary.kinds import PositiveScalar, Scalar, Vector
 from .._core.executor import Definition, is_tracer
 from .._core.meaning import code_digest, current
 from .._core.pieces.description import digest_of
@@ -55,18 +55,26 @@ Parameter = Float[Array, ""] | float
 
 
 @checked
-def parameter(default: float | None = None, *, doc: str = "", unit: str = "") -> Any:
+def parameter(
+    default: float | None = None,
+    *,
+    doc: str = "",
+    unit: str = "",
+    positive: bool = False,
+) -> Any:
     """A physical parameter: a field of a `HybridSystem` that is stored as a floating-point array.
 
     An array is differentiable, and another value does not cause recompilation; a Python float has
     neither property. Declare it as `k: hj.Parameter = hj.parameter(10.0, unit="N/m")`.
 
     **Arguments:** `default`, a number (without it, the constructor needs one); `doc`, what it is;
-    `unit`, as text.
+    `unit`, as text; `positive`, whether zero and negative values are refused, as of a mass.
+    Default: False.
     """
-    metadata = {"doc": doc, "unit": unit}
+    metadata = {"doc": doc, "unit": unit, "positive": positive}
     options: dict[str, Any] = {} if default is None else {"default": default}
-    return eqx.field(converter=_number, metadata=metadata, **options)
+    converter = _positive_number if positive else _number
+    return eqx.field(converter=converter, metadata=metadata, **options)
 
 
 def unit_of_parameter(system: Any, path: str) -> str:
@@ -120,6 +128,31 @@ def own_fields(system: Any) -> tuple[dataclasses.Field, ...]:
 
 def _number(x: Scalar) -> Array:
     return real(x)
+
+
+def _positive_number(x: PositiveScalar) -> Array:
+    return real(x)
+
+
+def require_positive(system: "HybridSystem") -> None:
+    """**Raises:** `DefinitionError` for a parameter of a system, or of one of several, that must be
+    positive and is not. (The constructor does not see values that are traced or put in later.)"""
+    for part in jax.tree_util.tree_leaves(
+        system, is_leaf=lambda x: isinstance(x, HybridSystem) and x is not system
+    ):
+        if isinstance(part, HybridSystem):
+            require_positive(part)
+    for field in own_fields(system):
+        value = getattr(system, field.name)
+        if not field.metadata.get("positive") or is_tracer(value):
+            continue
+        wrong = np.asarray(value)[~(np.asarray(value) > 0)]
+        if wrong.size:
+            name, unit = type(system).__name__, field.metadata.get("unit", "")
+            raise DefinitionError(
+                f"parameter `{field.name}` of {name} is {wrong.flat[0]:g} {unit}".rstrip()
+                + ": it must be positive."
+            )
 
 
 @checked
