@@ -179,7 +179,10 @@ def test_animations_of_notebooks_run_in_a_browser(site, notebook, tmp_path):
     assert len(first) == count > 0
     options = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage")
     profile, moved = f"--user-data-dir={tmp_path}", set()
-    for time in (300, 700):  # ms after the start (a cycle may be as short as one of them)
+    for time in (
+        300,
+        700,
+    ):  # ms after the start (a cycle may be as short as one of them)
         budget = f"--virtual-time-budget={time}"
         run = [browser, *options, profile, budget, "--dump-dom", page.as_uri()]
         shown = subprocess.run(run, capture_output=True, text=True, timeout=120).stdout

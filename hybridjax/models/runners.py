@@ -44,7 +44,9 @@ class TwoLeggedBar(HybridSystem):
     time_unit = "s"
 
     m: Parameter = parameter(1.0, unit="kg", positive=True, doc="mass of the bar")
-    J: Parameter = parameter(0.2, unit="kg m^2", positive=True, doc="moment of inertia of the bar")
+    J: Parameter = parameter(
+        0.2, unit="kg m^2", positive=True, doc="moment of inertia of the bar"
+    )
     hind: Parameter = parameter(-0.5, unit="m", doc="position of the hind hip")
     front: Parameter = parameter(0.55, unit="m", doc="position of the front hip")
     k: Parameter = parameter(15.0, unit="N/m", doc="stiffness of a leg")
