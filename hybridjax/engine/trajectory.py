@@ -21,7 +21,7 @@ from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_system, evaluating
 from ..systems.quotient import check_symmetry
 from ..systems.structure import Structure
-from ..systems.system import Driven, Guess, HybridSystem, input_names
+from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
 from .cubic import interpolate
 from .lanes import IDLE, Lanes, Tape, lane_at
@@ -294,7 +294,7 @@ def recorded(
 
 def _constant_input(system: HybridSystem, input) -> np.ndarray:
     """The constant part of an input of the right shape; zero for a function of time."""
-    names = input_names(system)
+    names = system.inputs
     nu, value = len(names), np.asarray(0.0)
     if callable(input):
         with evaluating("input, a function of t alone,"):

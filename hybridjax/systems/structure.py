@@ -34,7 +34,7 @@ from .._core.vector_math.rewrite import jaxprs
 from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart, Method, as_method
-from .system import Driven, HybridSystem, Output, input_names
+from .system import Driven, HybridSystem, Output
 from .transition import Scheduled, Transition
 from .verner import VERNER76
 
@@ -203,7 +203,7 @@ class Structure:
 
     @ft.cached_property
     def inputs(self) -> tuple[Signal, ...]:
-        return signals(input_names(self.system), self.system.input_units)
+        return signals(self.system.inputs, self.system.input_units)
 
     def inputs_among(
         self, names: Sequence[str] | None

@@ -1,6 +1,7 @@
 """A hybrid system: charts, transitions, inputs, outputs, and perhaps a clock."""
 
 import abc
+import contextvars
 import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -181,13 +182,31 @@ class Guess(eqx.Module):
     __repr__ = fields
 
 
-# Made by a call, because Python may keep equal constants of two modules as one object: `inputs`
-# that an author wrote must not be taken for these.
-DEFAULT_INPUTS: tuple[str, ...] = tuple(["u"])
-"""The inputs of a system whose author named none."""
+DEFAULT_INPUT, SECOND_NAME = "u", "input"
+"""The name of the input of a system whose author named none, and its name where a state or an
+output is called so."""
 
-SECOND_NAME = "input"
-"""The name of the default input where a state or an output is called as it is."""
+_being_named: contextvars.ContextVar[tuple[int, ...]] = contextvars.ContextVar(
+    "being named", default=()
+)
+
+
+class _DefaultInputs:
+    """The inputs of a system whose author named none: one, whose name yields to those of states and
+    outputs."""
+
+    def __get__(self, system: "HybridSystem | None", owner: type) -> tuple[str, ...]:
+        if system is None or id(system) in _being_named.get():
+            return (DEFAULT_INPUT,)
+        # (Charts that ask their system for its inputs get the default.)
+        token = _being_named.set((*_being_named.get(), id(system)))
+        try:
+            taken = {output.name for output in system.outputs()}
+            for chart in system.charts().values():
+                taken.update(chart.states, chart.absent)
+        finally:
+            _being_named.reset(token)
+        return (SECOND_NAME if DEFAULT_INPUT in taken else DEFAULT_INPUT,)
 
 
 class HybridSystem(Definition):
@@ -217,7 +236,7 @@ class HybridSystem(Definition):
     (`{"stance": hj.Radau()}`); it overrides `Chart.solver`.
     """
 
-    inputs: ClassVar[tuple[str, ...]] = DEFAULT_INPUTS
+    inputs: ClassVar[tuple[str, ...]] = _DefaultInputs()  # type: ignore[assignment]
     input_units: ClassVar[tuple[str, ...]] = ()
     time_unit: ClassVar[str] = ""
 
@@ -312,23 +331,6 @@ class Derived(HybridSystem):
 
     def draw(self, chart, t, q):
         return self.system.draw(chart, t, q)
-
-
-def input_names(system: HybridSystem) -> tuple[str, ...]:
-    """The names of the inputs of a system, of which the default one yields to states and outputs.
-
-    A system made of another one has the inputs of that one, though it may lack some of its states.
-    """
-    if system.inputs is not DEFAULT_INPUTS:
-        return system.inputs
-    while isinstance(system, Derived):
-        system = system.system
-    taken = {output.name for output in system.outputs()}
-    for chart in system.charts().values():
-        taken.update(chart.states, chart.absent)
-    if taken.isdisjoint(DEFAULT_INPUTS):
-        return DEFAULT_INPUTS
-    return (SECOND_NAME,)
 
 
 class Driven(Derived):

@@ -58,6 +58,7 @@ def _cycle(system):
 
 def test_the_default_input_yields_to_a_state_of_its_name():
     cycle, named = _cycle(Oscillator()), _cycle(Named())
+    assert Oscillator().inputs == cycle.system.inputs == ("input",)
     phase = np.array([0.1, 0.4, 0.8])
     responses, expected = cycle.responses().phase(phase), named.responses().phase(phase)
     assert list(responses) == ["x", "u", "input"]
@@ -113,3 +114,13 @@ def test_an_output_of_a_call_with_the_name_of_a_state_or_an_input_is_refused():
         hj.linearize(cycle, phase, outputs=(hj.Output("x", twice),))
     with pytest.raises(hj.DefinitionError, match="'force' is an input and a state or"):
         hj.linearize(cycle, phase, outputs=(hj.Output("force", twice),))
+
+
+def test_charts_may_ask_for_the_inputs_of_their_system():
+    class Asked(Oscillator):
+        def charts(self):
+            assert len(self.inputs) == 1
+            return {"plane": Plane()}
+
+    assert Asked().inputs == ("input",)
+    assert hj.HybridSystem.inputs == Asked.inputs == ("u",)
